@@ -42,11 +42,11 @@ test-rest: setup
 
 test-all: test test-rest
 
-# Branch coverage of these rooms by their own fast tests and those of odd numbers and faults, with a floor.
+# Branch coverage of these packages by their own fast tests and those of odd numbers and faults, with a floor.
 COVERED := contact deformation fem geometry io locomotion meshing muscles render segmentation
 FLOOR := 95
 coverage: setup
-	$(PYTEST) -m "not (slow or data or example or browser)" $(COVERED:%=tests/%) tests/test_extremes.py tests/test_faults.py \
+	$(PYTEST) -m "not (slow or data or example or browser)" $(COVERED:%=tests/%) tests/test_extremes.py tests/test_disk_faults.py \
 		$(COVERED:%=--cov=egs_warp/%) --cov-branch --cov-report=term:skip-covered --cov-fail-under=$(FLOOR)
 
 # Damaged files for every reader; Atheris drives them where it installs. What breaks a reader is kept in tests/corpus.
@@ -54,9 +54,9 @@ fuzz: setup
 	-$(PIP) -e ".[fuzz]"
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --minutes $(MINUTES)
 
-# Small changes of the code that a room's fast tests must notice; goes on where it stopped. ROOMS and COUNT say how many.
+# Small changes of the code that a package's fast tests must notice; goes on where it stopped. PACKAGES and COUNT say how many.
 mutation: setup
-	$(BIN)/python -m tests.mutation --processes $(PROCESSES) $(ROOMS:%=--rooms %) $(COUNT:%=--count %)
+	$(BIN)/python -m tests.mutation --processes $(PROCESSES) $(PACKAGES:%=--packages %) $(COUNT:%=--count %)
 
 # The page is built anew when its sources have changed; where npm is missing, egs-warp view says what to do.
 setup: $(VENV)/setup.stamp $(if $(shell command -v npm),web)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from skimage import measure
 
-from egs_warp.deformation.peers import BoundSurface
+from egs_warp.deformation.baselines import BoundSurface
 from egs_warp.geometry.gaussians import GaussianCloud
 
 LEVEL = 0.3

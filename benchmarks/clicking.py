@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from drawn import DrawnScene, DrawnView
+from annotated_scenes import DrawnScene, DrawnView
 from egs_warp.errors import UserError
 from egs_warp.geometry.bitmaps import depth_inside
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
-from egs_warp.pipelines.prepare_scene import SceneOptions, take_apart
+from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, with_measured_ground
+from egs_warp.pipelines.prepare_scene import SceneOptions, segment_scene
 from egs_warp.render import render_gaussians
-from egs_warp.segmentation.clearance import Clearing
+from egs_warp.segmentation.clearance import StraddlingPolicy
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.object_spec import ObjectSpec
 from harness import timed
@@ -47,8 +47,8 @@ def found_by(
 ) -> tuple[LocatedPlane, GaussianCloud, GaussianCloud]:
     """Where the object is, it and its background; ``seconds`` of each stage."""
     located, seconds["plane"] = timed(locate_plane, cloud, spec, cameras=cameras)
-    located, seconds["ground"] = timed(on_its_ground, cloud, located, spec, cameras)
-    parts, seconds["segment"] = timed(take_apart, cloud, located, SceneOptions(clearing=Clearing.SPLIT))
+    located, seconds["ground"] = timed(with_measured_ground, cloud, located, spec, cameras)
+    parts, seconds["segment"] = timed(segment_scene, cloud, located, SceneOptions(clearing=StraddlingPolicy.SPLIT))
     return located, parts[0], parts[1]
 
 

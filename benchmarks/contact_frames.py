@@ -12,16 +12,16 @@ from egs_warp.contact.detection import contact_geometry
 from egs_warp.fem.body import BodyState, make_body
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.io import read_capture
-from egs_warp.locomotion.contact_pieces import ContactPieces
-from egs_warp.locomotion.objectives import SpinObjective, centre_of_mass_velocity, node_velocities
+from egs_warp.locomotion.contact_modes import CoulombProgram
+from egs_warp.locomotion.objectives import AngularMomentumObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.locomotion.rollout import FRAME_RATE, settle
-from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory, linear_steps_by
-from egs_warp.locomotion.strategies import Foreseen
+from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart, make_step_linearizer
+from egs_warp.locomotion.strategies import PredictedContact
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.meshing.cage import build_cage
 from egs_warp.motions.stance import Weights
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.segmentation.base_plane import find_base_plane
 from harness import data_folder
 
@@ -33,8 +33,8 @@ CAPTURES = {"monkey": ("monkey.ply", (0.0, 1.0, 0.0)), "plush dog": ("plush_dog.
 class Frame:
     """One step of the animation as every strategy gets it."""
 
-    pieces: ContactPieces
-    foreseen: Foreseen
+    pieces: CoulombProgram
+    foreseen: PredictedContact
     """What the known activations of the step before would bring."""
     known: np.ndarray
     """(M,) those of this step, in their bounds."""
@@ -128,7 +128,7 @@ def animation_frames(
     body, muscles = bench.stepper.body, bench.stepper.muscles
     stepper = LocomotionStepper(body, muscles, bench.stepper.geometry, device=bench.device)
     synergies = grouped_segments(muscles, body.mesh.nodes, activations, seed)
-    steps = linear_steps_by(stepper.respond, muscles, synergies)
+    steps = make_step_linearizer(stepper.linearizer, muscles, synergies)
     stepper.planner = replace(stepper.planner, synergies=synergies, linear_steps=steps)
     # No point joins those that were chosen, however deep.
     stepper.solver = replace(stepper.solver, penetration_tolerance=np.inf)
@@ -141,11 +141,11 @@ def animation_frames(
         before, now = (muscles.bounds * (synergies.members @ a) for a in (previous, current))
         problem = StepProblem(body, state, dt)
         contact_set = stepper.detector.contact_set(points, state.positions)
-        memory = StepMemory(points, forces, before)
-        prospect = stepper.foresee(stepper.start_of(problem, contact_set, memory))
+        memory = WarmStart(points, forces, before)
+        prospect = stepper.predict(stepper.step_inputs(problem, contact_set, memory))
         result = stepper.solver.solve(
-            prospect.response,
-            MuscleTension.of(muscles, now),
+            prospect.linearization,
+            MuscleEnergy.of(muscles, now),
             velocities=prospect.velocities,
             forces=prospect.forces,
         )
@@ -154,10 +154,10 @@ def animation_frames(
         after = BodyState(problem.end_positions(result.velocities), result.velocities, state.time + dt)
         objectives = [
             centre_of_mass_velocity(body, body.centre_of_mass(after.velocities), weights.com),
-            SpinObjective(body.angular_momentum(after.positions, after.velocities), weights.spin),
+            AngularMomentumObjective(body.angular_momentum(after.positions, after.velocities), weights.spin),
             node_velocities(body, after.velocities, weights.pose),
         ]
         program = stepper.planner.program(prospect, before, objectives)
-        made.append(Frame(program.pieces, program.foreseen, current))
+        made.append(Frame(program.program, program.predicted, current))
         state, forces = after, result.forces
     return made

@@ -9,13 +9,13 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from egs_warp.contact.detection import contact_geometry
+from egs_warp.fem.assembly_topology import Material
 from egs_warp.fem.body import GRAVITY, BodyState, SoftBody
-from egs_warp.fem.elastic_maps import Material
 from egs_warp.fem.elasticity import ElasticAssembly
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory
+from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart
 from egs_warp.muscles.muscle_set import automatic_muscles
 
 TIME_STEP = 1.0 / 120.0
@@ -86,7 +86,7 @@ def simulated_drop(
         result = stepper.passive_step(state, memory, TIME_STEP)
         end = state.positions + TIME_STEP * result.velocities
         state = BodyState(end, result.velocities, state.time + TIME_STEP)
-        memory = StepMemory(result.contacts.points, result.forces, memory.activations)
+        memory = WarmStart(result.contacts.points, result.forces, memory.activations)
         frames.append(end)
         energies.append(assembly.energy(end))
     return Drop(np.stack(frames), np.array(energies), mesh.nodes)

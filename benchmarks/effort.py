@@ -23,11 +23,11 @@ import numpy as np
 from egs_warp.assets import figurine, pawn, stool
 from egs_warp.errors import UserError
 from egs_warp.io import read_capture
-from egs_warp.locomotion.ledger import ledger
+from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.trajectory import Trajectory, measure
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import make_creature
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.simulated_run import simulate
 from harness import Row, Table, data_folder, flags, record, report, rows_of, timed, workers_flag
 from sweep import CAPTURES
 
@@ -85,19 +85,19 @@ def _run(body: str, name: str, *, device: str, seed: int, frames: int | None) ->
     except (UserError, ArithmeticError, np.linalg.LinAlgError) as error:
         return {"stopped": str(error)}
     trajectory = performance.trajectory
-    books, loads = ledger(trajectory), load(trajectory)
+    books, loads = energy_balance(trajectory), load(trajectory)
     turned = reversals(loads[: before_lift_off(loads)])
     return {
         "stopped": performance.fallen or None,
         "reached": {key: float(value) for key, value in vars(measure(trajectory)).items()},
         "steps": len(trajectory.dt),
-        "work": float(books.muscle_work.sum() / books.unit),
-        "peak_elastic": float(books.elastic.max() / books.unit),
-        "peak_deformation": float(books.kinetic_deformation.max() / books.unit),
+        "work": float(books.muscle_work.sum() / books.energy_unit),
+        "peak_elastic": float(books.elastic.max() / books.energy_unit),
+        "peak_deformation": float(books.kinetic_deformation.max() / books.energy_unit),
         "reversed": float(np.mean(turned > CHANGE)),
         "largest_reversal": float(turned.max(initial=0.0)),
         "largest_load": float(loads.max()),
-        "energy_residual": books.worst,
+        "energy_residual": books.max_residual,
         "load": loads.tolist(),
         "time": trajectory.time[1:].tolist(),
     }

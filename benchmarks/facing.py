@@ -13,12 +13,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bodies import Body, body
+from benchmark_bodies import Body, body
 from egs_warp.errors import UserError
 from egs_warp.geometry.body_frame import GROUND
-from egs_warp.geometry.camera_ring import camera_from
+from egs_warp.geometry.camera_ring import ring_camera
 from egs_warp.io.video import contact_sheet
-from egs_warp.pipelines.creature import Standing, face, stand
+from egs_warp.pipelines.creature import PlacedCage, choose_front, place_cage
 from egs_warp.render.rasteriser import render_gaussians
 from harness import Row, Table, data_folder, flags, report
 
@@ -42,9 +42,9 @@ RIGHT = 30.0
 COUNTED, ENOUGH = 11, 9
 
 
-def row(one: Body, standing: Standing) -> Row:
+def row(one: Body, standing: PlacedCage) -> Row:
     """The guess and its error."""
-    found = face(standing)
+    found = choose_front(standing)
     axes = standing.frame.axes
     truth = axes @ np.array(TRUTH[one.name])
     guessed, true = (float(np.arctan2(way[1], way[0])) for way in (found.direction, truth))
@@ -60,13 +60,13 @@ def row(one: Body, standing: Standing) -> Row:
     }
 
 
-def picture(standing: Standing, front: np.ndarray, *, size: int = 240) -> np.ndarray:
+def picture(standing: PlacedCage, front: np.ndarray, *, size: int = 240) -> np.ndarray:
     """(size, size, 3) the body from where it is taken to face, a little from above."""
     nodes = standing.cage.mesh.nodes
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
     way = front + 0.2 * GROUND.normal
     radius = 1.05 * float(np.linalg.norm(nodes - middle, axis=1).max())
-    camera = camera_from(way, middle, radius, GROUND.normal, size=size, vertical_fov_degrees=24.0)
+    camera = ring_camera(way, middle, radius, GROUND.normal, size=size, vertical_fov_degrees=24.0)
     return render_gaussians(standing.gaussians, camera, background=(1.0, 1.0, 1.0)).colour_srgb8()
 
 
@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             one = body(name)
         except (OSError, UserError):
             continue
-        standing = stand(one.cloud, plane=one.plane)
+        standing = place_cage(one.cloud, plane=one.plane)
         rows.append(row(one, standing))
         pictures.append(picture(standing, standing.frame.axes @ np.array(rows[-1]["front"])))
         front = ", ".join(f"{x:.2f}" for x in rows[-1]["front"])

@@ -26,12 +26,12 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.video import contact_sheet
 from egs_warp.render import render_gaussians
-from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane
+from egs_warp.segmentation.clearance import StraddlingOptions, StraddlingPolicy, clear_plane
 from harness import Row, Table, data_folder, flags, report, timed
 
 SCENES = ("koala.ply", "narcissus.sog", "fox.ply")
 HARD, OURS = "hard assignment", "L_seg"
-CLEARINGS = {"remove": Clearing.REMOVE, "static split": Clearing.SPLIT, OURS: Clearing.FINETUNE}
+CLEARINGS = {"remove": StraddlingPolicy.REMOVE, "static split": StraddlingPolicy.SPLIT, OURS: StraddlingPolicy.FINETUNE}
 MOST_RESIDUAL = 0.002
 LOOK_DOWN = 8.0
 """Degrees."""
@@ -44,7 +44,7 @@ def rows_of(name: str, device: str, side: int, seed: int, table: Table) -> tuple
     clouds = {HARD: (parts.hard, 0.0)}
     for way, clearing in CLEARINGS.items():
         cloud, milliseconds = timed(
-            clear_plane, parts.above, parts.located.plane, clearing, options=ClearingOptions(seed=seed)
+            clear_plane, parts.above, parts.located.plane, clearing, options=StraddlingOptions(seed=seed)
         )
         clouds[way] = (cloud, 1e-3 * milliseconds)
     wanted = [table3.picture(parts.hard, camera)[: side // 2] for camera in cameras]

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 import mesh_scenes as scenes
-from egs_warp.deformation.peers import CarryMethod, carry
+from egs_warp.deformation.baselines import DeformationMethod, deform_with_method
 from egs_warp.render import render_gaussians
-from egs_warp.training.likeness import psnr
+from egs_warp.training.metrics import psnr
 from harness import Table, flags, report
 from painted_meshes import bar
 
 LIBRARY = "library's default split"
-WAYS = {**{method.value: method for method in CarryMethod}, LIBRARY: CarryMethod.BIDIRECTIONAL}
+WAYS = {**{method.value: method for method in DeformationMethod}, LIBRARY: DeformationMethod.BIDIRECTIONAL}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         strip = [truth[0][0]]
         for name, method in WAYS.items():
             limit = {} if name == LIBRARY else {"max_growth": options.growth}
-            (carried,) = carry(cloud, cage, [nodes], method=method, **limit)
+            (carried,) = deform_with_method(cloud, cage, [nodes], method=method, **limit)
             images = [render_gaussians(carried, camera) for camera in cameras]
             pictures = [np.clip(image.colour.numpy(), 0.0, 1.0) for image in images]
             strip.append(pictures[0])
@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             table.row(degrees, name, row["outside_silhouette"], row["psnr"], row["gaussians"])
         strips.append(np.concatenate(strip, axis=1))
     spikes = {row["method"]: row["outside_silhouette"] for row in rows if row["twist_degrees"] == options.degrees}
-    whole, split = spikes[CarryMethod.BIDIRECTIONAL_NO_SPLIT.value], spikes[CarryMethod.BIDIRECTIONAL.value]
+    whole, split = spikes[DeformationMethod.BIDIRECTIONAL_NO_SPLIT.value], spikes[DeformationMethod.BIDIRECTIONAL.value]
     print(f"spikes fall by {whole / split if split else float('inf'):.1f} times")
     report(
         options,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from egs_warp.training.likeness import psnr
+from egs_warp.training.metrics import psnr
 
 COARSE = 0.05
 """Standard deviation of the blur before which pictures are compared in the large, of the hole's side."""

@@ -39,10 +39,10 @@ from egs_warp.io import read_capture
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import make_creature
-from egs_warp.pipelines.performance import simulate
-from egs_warp.render.ahead import PicturesAhead
+from egs_warp.pipelines.simulated_run import simulate
+from egs_warp.render.async_render import AsyncRenderer
+from frame_time import Studio
 from harness import Row, Table, data_folder, flags, record, report
-from picture import Studio
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -84,11 +84,11 @@ def measure_pictures(asked: int, frames: int, *, device: str, seed: int) -> Row:
     creature = replace(plain, stepper=stepper)
     for _ in range(2):
         simulate(creature, motion("jump"), frames=frames)
-    stepper.pictures.take()
+    stepper.pictures.result()
     stepper.stages = {}
     begun = time.perf_counter()
     simulate(creature, motion("jump"), frames=frames)
-    stepper.pictures.take()
+    stepper.pictures.result()
     whole = 1e3 * (time.perf_counter() - begun)
     means = {name: float(np.sum(spent)) / (frames - 1) for name, spent in stepper.stages.items()}
     return {"nodes": len(plain.body.mesh.nodes), "gaussians": plain.cloud.count, **means, "frame": whole / (frames - 1)}
@@ -100,9 +100,9 @@ class _Watched(LocomotionStepper):
     def __init__(self, creature: Creature, size: tuple[int, int]) -> None:
         vars(self).update(vars(creature.stepper))
         self.stages: dict[str, list[float]] = {}
-        self.pictures = PicturesAhead(*size, creature.cloud.device)
+        self.pictures = AsyncRenderer(*size, creature.cloud.device)
         wp.synchronize_device(creature.cloud.device)
-        with self.pictures.beside():
+        with self.pictures.stream_context():
             self._studio = Studio(creature, size)
 
     def advance(self, *given: Any) -> Any:
@@ -110,9 +110,9 @@ class _Watched(LocomotionStepper):
         studio, marks = self._studio, [time.perf_counter()]
         done = super().advance(*given)
         marks.append(time.perf_counter())
-        self.pictures.take()
+        self.pictures.result()
         marks.append(time.perf_counter())
-        self.pictures.begin(lambda: studio.begun(studio.carried(done[0].positions)))
+        self.pictures.submit(lambda: studio.begun(studio.carried(done[0].positions)))
         marks.append(time.perf_counter())
         for name, spent in zip(("step", "bytes", "picture"), 1e3 * np.diff(marks), strict=True):
             self.stages.setdefault(name, []).append(float(spent))

@@ -26,17 +26,17 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from bodies import NAMES, Body, body
+from benchmark_bodies import NAMES, Body, body
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io import read_capture
 from egs_warp.locomotion.audit import audit
-from egs_warp.locomotion.ledger import ledger
+from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.trajectory import measure
-from egs_warp.motions.feet import Base
+from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import Creature, make_creature
-from egs_warp.pipelines.performance import Performance, simulate
+from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
 from egs_warp.segmentation.base_plane import find_base_plane
 from harness import Row, Table, flags, record, report, rows_of, timed, workers_flag
 from modelled import MODELLED, UNSEEN, modelled
@@ -90,14 +90,14 @@ def _run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> 
     feet = place.feet()
     stands = place.base()
     height, gravity = creature.body.height, float(np.linalg.norm(creature.body.gravity))
-    books = ledger(trajectory)
-    work = float(books.muscle_work.sum() / books.unit)
+    books = energy_balance(trajectory)
+    work = float(books.muscle_work.sum() / books.energy_unit)
     moved = _moved(performance)
     way = float(np.linalg.norm(moved[:2]))
     (done,) = performance.sequence.done[:1]
-    own = done.motion.reached(trajectory, 0, len(trajectory.time) - 1)
+    own = done.motion.outcome_record(trajectory, 0, len(trajectory.time) - 1)
     reached: dict[str, Any] = asdict(measure(trajectory)) | (asdict(own) if own is not None else {})
-    if stands is Base.ROUND:
+    if stands is SupportKind.ROUND_BASE:
         # A ball lies any way up, and has a heading only as long as it does not roll.
         reached["tilt_degrees"] = 0.0
         moved[2] = moved[2] if cell in ("turn", "twist") else 0.0
@@ -115,11 +115,11 @@ def _run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> 
     return {
         "success": reason is None,
         "reason": reason,
-        "stands_on": f"{len(feet)} feet" if stands is Base.FEET else stands.value,
+        "stands_on": f"{len(feet)} feet" if stands is SupportKind.FEET else stands.value,
         "moved": moved.tolist(),
         "time": time,
         "tilt_degrees": reached["tilt_degrees"],
-        "slip": reached.get("slip") if stands is Base.FEET else None,
+        "slip": reached.get("slip") if stands is SupportKind.FEET else None,
         "work": work,
         "cost_of_transport": work / way if cell in ("walk", "walk to") and way > NEAR else None,
         "fallen": performance.fallen,
@@ -142,7 +142,7 @@ def creature_of(one: Body, nodes: int) -> Creature:
         return make_creature(one.cloud, plane=one.plane, nodes=2 * nodes)
 
 
-def _moved(performance: Performance) -> np.ndarray:
+def _moved(performance: SimulatedRun) -> np.ndarray:
     """(3,) body heights ahead and to the left that the centre of mass has gone, and degrees turned."""
     trajectory, place, body_ = performance.trajectory, performance.place, performance.creature.body
     first, last = (body_.centre_of_mass(place.ground.local(trajectory.positions[k])) for k in (0, -1))
@@ -162,11 +162,11 @@ def _missed(asked: dict[str, float], moved: np.ndarray, reached: dict[str, Any],
     return f"took {time:.0f} sqrt(H/g)" if time > LONGEST else None
 
 
-def _lies(performance: Performance, reached: dict[str, Any]) -> str | None:
+def _lies(performance: SimulatedRun, reached: dict[str, Any]) -> str | None:
     if reached["tilt_degrees"] >= GET_UP:
         return f"leans: tilt {reached['tilt_degrees']:.0f} degrees"
     rose = all(entry.got_up for entry in performance.sequence.done if entry.fell is not None)
-    return None if rose and performance.sequence.finished else "it has not got up within its time"
+    return None if rose and performance.sequence.is_finished else "it has not got up within its time"
 
 
 def _swept(reached: dict[str, Any]) -> str | None:

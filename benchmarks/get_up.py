@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from bodies import body
+from benchmark_bodies import body
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.audit import audit
-from egs_warp.locomotion.ledger import ledger
+from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.rollout import roll_out
 from egs_warp.motions.get_up import GetUp, lie_down
-from egs_warp.pipelines.creature import first_place
+from egs_warp.pipelines.creature import initial_stance
 from gaits import creature_of
 from harness import Row, Table, flags, record, report, timed
 from modelled import MODELLED, UNSEEN, modelled
@@ -51,7 +51,7 @@ def run(name: str, degrees: float, side: str, nodes: int) -> Row:
 def _run(name: str, degrees: float, side: str, nodes: int) -> Row:
     one = modelled(name) if name in MODELLED or name in UNSEEN else body(name)
     creature = creature_of(one, nodes)
-    place = first_place(creature)
+    place = initial_stance(creature)
     laid = lie_down(place, degrees, place.ground.axes[SIDES[side]])
     motion = GetUp(place)
     unit = creature.body.time_unit
@@ -68,13 +68,13 @@ def _run(name: str, degrees: float, side: str, nodes: int) -> Row:
     except (UserError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         return {"up": False, "tries": motion.tries, "reason": f"stopped: {error}"}
     trajectory = simulation.trajectory
-    books = ledger(trajectory)
+    books = energy_balance(trajectory)
     checked = asdict(audit(trajectory, newton_unconverged=sum(not r.converged for r in simulation.reports)))
     up = motion.up and motion.resting
     return {
         "up": up,
         "tries": motion.tries,
-        "work": float(books.muscle_work.sum() / books.unit),
+        "work": float(books.muscle_work.sum() / books.energy_unit),
         "time": float(trajectory.time[-1]) / unit,
         "reason": None if up else "; ".join(motion.notes()) or f"not within {LONGEST:g} sqrt(H/g)",
         "audit": bounds_broken(checked),

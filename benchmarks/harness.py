@@ -23,9 +23,9 @@ import warp as wp
 
 from egs_warp.io.video import write_png
 from egs_warp.launching import available_threads
-from egs_warp.pipelines.crew import Tell
-from egs_warp.pipelines.many import farmed
+from egs_warp.pipelines.many import map_tasks
 from egs_warp.pipelines.report import MECHANICS, versions
+from egs_warp.pipelines.worker_pool import ProgressCallback
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,7 +69,7 @@ def rows_of(run: Callable[..., Row], tasks: Sequence[tuple[Any, ...]], workers: 
     again. Raises ``RuntimeError`` for those that failed, after all others.
     """
     failed = []
-    for ended in farmed(_Run(run), tasks, workers=workers):
+    for ended in map_tasks(_Run(run), tasks, workers=workers):
         if ended.error is None:
             yield ended.value
         else:
@@ -82,7 +82,7 @@ def rows_of(run: Callable[..., Row], tasks: Sequence[tuple[Any, ...]], workers: 
 class _Run:
     run: Callable[..., Row]
 
-    def __call__(self, task: tuple[Any, ...], tell: Tell) -> Row:
+    def __call__(self, task: tuple[Any, ...], tell: ProgressCallback) -> Row:
         return self.run(*task)
 
 

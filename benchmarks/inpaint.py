@@ -29,7 +29,7 @@ from scipy import ndimage
 
 from egs_warp.assets import scene
 from egs_warp.geometry.camera import Camera, camera_rays
-from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, joined
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, disc, footprint
 from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
@@ -41,7 +41,7 @@ from egs_warp.io.video import contact_sheet
 from egs_warp.render import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
 from egs_warp.training.finetune import FinetuneOptions, TrainingView, finetune
-from egs_warp.training.likeness import psnr
+from egs_warp.training.metrics import psnr
 from floor_measures import coarse_psnr, from_beside, gradient_energy, similarity
 from harness import Row, Table, data_folder, flags, report, timed
 
@@ -103,7 +103,7 @@ def damaged(truth: GaussianCloud, hole: Hole) -> GaussianCloud:
         np.concatenate([np.full((count, 1, 3), -1.2), np.zeros((count, truth.sh.shape[1] - 1, 3))], axis=1),
         device=str(truth.device),
     )
-    return joined(kept, haze)
+    return concatenate(kept, haze)
 
 
 def cameras_around(hole: Hole, size: int) -> list[Camera]:
@@ -165,7 +165,7 @@ def without_plane(
         sh,
         device=str(kept.device),
     )
-    whole = joined(kept, scattered)
+    whole = concatenate(kept, scattered)
     trainable = np.arange(whole.count) >= kept.count
     mask = cv2.dilate(hole_pixels(result, camera).astype(np.float32), np.ones((9, 9), np.uint8))
     return finetune(

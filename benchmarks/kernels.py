@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from egs_warp.kernels.deformation.carried_cage import load_row, store_row
+from egs_warp.kernels.deformation.cage_maps import load_row, store_row
 from egs_warp.kernels.render.ellipse import ALPHA_CUT, TILE_PIXELS, TRANSMITTANCE_STOP, pixel_of_thread, splat_alpha
 
 wp.set_module_options({"enable_backward": False})

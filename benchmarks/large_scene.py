@@ -20,8 +20,8 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
+from annotated_scenes import NAMES, DrawnScene, read_drawn
 from clicking import clicked
-from drawn import NAMES, DrawnScene, read_drawn
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.inpainting.holes import hole_under
 from egs_warp.inpainting.inpaint import inpaint
@@ -31,9 +31,9 @@ from egs_warp.io.run_folder import run_folder
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.film import draw_film
-from egs_warp.pipelines.locate_plane import locate_plane, on_its_ground
-from egs_warp.pipelines.performance import simulate
-from egs_warp.pipelines.prepare_scene import SceneOptions, set_down, take_apart
+from egs_warp.pipelines.locate_plane import locate_plane, with_measured_ground
+from egs_warp.pipelines.prepare_scene import SceneOptions, segment_scene, snap_to_plane
+from egs_warp.pipelines.simulated_run import simulate
 from egs_warp.segmentation.object_spec import ObjectSpec
 from harness import Row, Table, flags, report, timed
 
@@ -98,9 +98,9 @@ def measure(options: argparse.Namespace, stages: Stages) -> None:
         spec = _written(drawn, place, options)
         cloud = stages.run("load", read_capture, place, device=options.device).cloud
         located = stages.run("plane", locate_plane, cloud, spec)
-        located = stages.run("ground", on_its_ground, cloud, located, spec)
-        thing, bare, _ = stages.run("object", take_apart, cloud, located, SceneOptions())
-        thing, _ = set_down(thing, located)
+        located = stages.run("ground", with_measured_ground, cloud, located, spec)
+        thing, bare, _ = stages.run("object", segment_scene, cloud, located, SceneOptions())
+        thing, _ = snap_to_plane(thing, located)
         hole = hole_under(cloud, located.plane, located.segmentation)
         del cloud
         background = bare if hole is None else stages.run("hole", inpaint, bare, hole).cloud

@@ -27,13 +27,13 @@ import numpy as np
 import torch
 
 from egs_warp.assets import pawn
-from egs_warp.fem.batch_factors import BatchFactors
+from egs_warp.fem.batch_factors import BatchCholesky
 from egs_warp.locomotion.batch import BatchStepper
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import Creature, make_creature
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.simulated_run import simulate
 from harness import Row, Table, flags, record, report
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def _apart(creature: Creature, activations: np.ndarray, friction: float, dt: flo
     stepper = LocomotionStepper(creature.body, creature.muscles, geometry, device=device)
     state, memory = creature.start, stepper.initial_memory()
     for row in activations:
-        state, memory, _ = stepper.advance_held(state, memory, row, dt)
+        state, memory, _ = stepper.advance_with_activations(state, memory, row, dt)
     return float(np.abs(state.positions - end).max()) / creature.body.height
 
 
@@ -145,7 +145,7 @@ def matrices(size: int, count: int, device: torch.device) -> list[Row]:
     given = half @ half.mT + size * torch.eye(size, dtype=torch.float64, device=device)
     slots = torch.arange(count, device=device)
 
-    def factored(factors: BatchFactors, spent: list[torch.Tensor]) -> None:
+    def factored(factors: BatchCholesky, spent: list[torch.Tensor]) -> None:
         factors.factor(slots, spent.pop())
 
     def took(action: Callable[..., object], *arguments: object) -> float:
@@ -158,7 +158,7 @@ def matrices(size: int, count: int, device: torch.device) -> list[Row]:
 
     rows: list[Row] = [{"size": size, "panel": None, "factor": took(torch.linalg.cholesky_ex, given)}]
     for panel in PANELS:
-        factors = BatchFactors(count, size, device, panel=panel)
+        factors = BatchCholesky(count, size, device, panel=panel)
         spent = [given.clone() for _ in range(3)]
         row: Row = {"size": size, "panel": panel, "factor": took(factored, factors, spent)}
         for columns in (1, 96):

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bodies import Body
-from egs_warp.assets.object import light_and_paint
+from benchmark_bodies import Body
+from egs_warp.assets.object import shade_gaussians
 from egs_warp.assets.solids import ellipsoid, even_samples, rounded_box, smooth_union, surface_mesh, tapered_rod
 from egs_warp.geometry.plane import Plane
 
@@ -138,5 +138,5 @@ def modelled(name: str) -> Body:
     vertices, faces = surface_mesh(distance, -_REACH * [1.0, 1.0, 0.05], _REACH, 0.02)
     samples = even_samples(distance, vertices, faces, _GAUSSIANS, random)
     grey, gloss = np.full((len(samples.points), 3), 0.5), np.full(len(samples.points), 0.1)
-    cloud = light_and_paint(samples, vertices, faces, grey, gloss, random=random, device="cpu")
+    cloud = shade_gaussians(samples, vertices, faces, grey, gloss, random=random, device="cpu")
     return Body(name, cloud, Plane(np.array([0.0, 0.0, 1.0]), 0.0), "modelled")

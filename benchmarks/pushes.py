@@ -13,13 +13,13 @@ from collections.abc import Sequence
 
 from egs_warp.assets import scene
 from egs_warp.locomotion.audit import audit
-from egs_warp.locomotion.ledger import ledger
+from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.script import motion
-from egs_warp.motions.stand import StandReached
+from egs_warp.motions.stand import StandOutcome
 from egs_warp.pipelines.creature import Creature, make_creature
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.simulated_run import simulate
 from harness import Row, Table, flags, record, report, timed
 from sweep import bounds_broken
 
@@ -35,24 +35,24 @@ def stood(creature: Creature, line: str) -> Row:
     """One push, and how the body stood it."""
     performance = simulate(creature, motion(STAND), pushes=read_pushes(line), get_up=False)
     trajectory = performance.trajectory
-    books = ledger(trajectory)
+    books = energy_balance(trajectory)
     (done,) = performance.sequence.done
-    reached = done.motion.reached(trajectory, 0, len(trajectory.dt))
-    assert isinstance(reached, StandReached)
+    reached = done.motion.outcome_record(trajectory, 0, len(trajectory.dt))
+    assert isinstance(reached, StandOutcome)
     tilt = measure(trajectory).tilt_degrees
-    kept = performance.fallen is None and done.motion.resting and reached.sole_shift < SHIFT and tilt < TILT
+    kept = performance.fallen is None and done.motion.is_at_rest and reached.sole_shift < SHIFT and tilt < TILT
     unconverged = sum(not one.converged for one in performance.simulation.reports)
     return {
         "push": line,
         "kept": kept,
         "fallen": performance.fallen,
-        "resting": done.motion.resting,
+        "resting": done.motion.is_at_rest,
         "sole_shift": reached.sole_shift,
         "lean": reached.lean,
         "tilt_degrees": tilt,
-        "work": float(books.pushes.sum() / books.unit),
-        "muscle_work": float(books.muscle_work.sum() / books.unit),
-        "energy_residual": books.worst,
+        "work": float(books.pushes.sum() / books.energy_unit),
+        "muscle_work": float(books.muscle_work.sum() / books.energy_unit),
+        "energy_residual": books.max_residual,
         "broken": bounds_broken(vars(audit(trajectory, energy=books, newton_unconverged=unconverged))),
     }
 

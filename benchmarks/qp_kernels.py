@@ -27,15 +27,15 @@ from unittest.mock import patch
 import numpy as np
 
 from egs_warp.assets import figurine, pawn, snake
-from egs_warp.locomotion import contact_pieces
-from egs_warp.locomotion.active_set import ReducedRows
-from egs_warp.locomotion.admm import AdmmPrograms, Dense, Ending, Iterate
+from egs_warp.locomotion import contact_modes
+from egs_warp.locomotion.active_set import WhitenedQp
+from egs_warp.locomotion.admm import AdmmPrograms, AdmmResult, AdmmStatus, DenseQp
+from egs_warp.locomotion.operator_splitting import AdmmSplitting, OperatorSplitting, OsqpSplitting
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, QuadraticProgram, quadratic_program
-from egs_warp.locomotion.splitting import AdmmSplitting, OsqpSplitting, Splitting
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import make_creature
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.simulated_run import simulate
 from harness import Row, Table, flags, report, timed
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Recorded:
     """A QP of a step."""
 
     motion: str
-    program: Dense
+    program: DenseQp
     lower: np.ndarray
     upper: np.ndarray
     """(m,)."""
@@ -87,7 +87,7 @@ def recording(name: str, most: int) -> Iterator[list[Recorded]]:
         """A ``QuadraticProgram`` that is told of."""
 
         def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, **options: Any) -> None:
-            self._program, self._solver = Dense(P, q, A), quadratic_program(P, q, A, **options)
+            self._program, self._solver = DenseQp(P, q, A), quadratic_program(P, q, A, **options)
 
         def solve(
             self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, beside: bool = False
@@ -99,7 +99,7 @@ def recording(name: str, most: int) -> Iterator[list[Recorded]]:
             made.append(Recorded(name, self._program, lower.copy(), upper.copy(), kept, beside))
             return self._solver.solve(lower, upper, start, beside=beside)
 
-    with patch.object(contact_pieces, "quadratic_program", Recorder), suppress(_EnoughError):
+    with patch.object(contact_modes, "quadratic_program", Recorder), suppress(_EnoughError):
         yield made
 
 
@@ -128,31 +128,33 @@ def _apart(first: np.ndarray, second: np.ndarray) -> float:
 def on_rows_that_matter(one: Recorded) -> Recorded:
     """The program that its step's first iterations see: rows that the minimum without bounds breaks; all if it breaks
     none."""
-    free = ReducedRows.of(one.program.P, one.program.q, one.program.A).free
+    free = WhitenedQp.of(one.program.P, one.program.q, one.program.A).values_at_minimum
     broken = (free < one.lower) | (free > one.upper)
     index = np.flatnonzero(broken) if broken.any() else np.arange(len(free))
-    program = Dense(one.program.P, one.program.q, one.program.A[index])
+    program = DenseQp(one.program.P, one.program.q, one.program.A[index])
     return Recorded(one.motion, program, one.lower[index], one.upper[index], one.start, one.beside)
 
 
 def iterated(
-    programs: Sequence[Recorded], splitting_of: Callable[[Dense], Splitting], most: int
-) -> tuple[list[Iterate], float]:
+    programs: Sequence[Recorded], splitting_of: Callable[[DenseQp], OperatorSplitting], most: int
+) -> tuple[list[AdmmResult], float]:
     """Where each ends, one after another, and the median of their milliseconds with their set-up."""
     ends, times = [], []
     for one in programs:
         end, milliseconds = timed(
-            lambda one=one: splitting_of(one.program).on(one.program.A, most).run(one.lower, one.upper, one.start)
+            lambda one=one: splitting_of(one.program).full_run(one.program.A, most).run(one.lower, one.upper, one.start)
         )
         ends.append(end)
         times.append(milliseconds)
     return ends, float(np.median(times))
 
 
-def together(programs: Sequence[Recorded], device: str, *, accuracy: float, most: int) -> tuple[list[Iterate], float]:
+def together(
+    programs: Sequence[Recorded], device: str, *, accuracy: float, most: int
+) -> tuple[list[AdmmResult], float]:
     """Where each ends, all at once, and the milliseconds of one's share."""
 
-    def solve() -> list[Iterate]:
+    def solve() -> list[AdmmResult]:
         return AdmmPrograms([one.program for one in programs], device=device).solve(
             [one.lower for one in programs],
             [one.upper for one in programs],
@@ -167,13 +169,13 @@ def together(programs: Sequence[Recorded], device: str, *, accuracy: float, most
 
 def compared(
     programs: Sequence[Recorded], device: str, *, accuracy: float, most: int
-) -> tuple[Row, list[Iterate], list[Iterate]]:
+) -> tuple[Row, list[AdmmResult], list[AdmmResult]]:
     """Milliseconds of both, and where all have ended, OSQP's first."""
 
-    def osqp(program: Dense) -> Splitting:
+    def osqp(program: DenseQp) -> OperatorSplitting:
         return OsqpSplitting(program.P, program.q, accuracy=accuracy)
 
-    def kernels(program: Dense) -> Splitting:
+    def kernels(program: DenseQp) -> OperatorSplitting:
         return AdmmSplitting(program.P, program.q, accuracy=accuracy, device=device)
 
     asked, osqp_ms = iterated(programs, osqp, most)
@@ -195,7 +197,7 @@ def full(programs: Sequence[Recorded], device: str) -> list[Row]:
     """A row for each motion and one for all: how often both end alike, and how far their solutions are apart."""
     times, asked, made = compared(programs, device, accuracy=FULL, most=MOST)
     differences = [
-        missed(one, b.x, a.x) if a.ending is b.ending is Ending.SOLVED else None
+        missed(one, b.x, a.x) if a.ending is b.ending is AdmmStatus.SOLVED else None
         for one, a, b in zip(programs, asked, made, strict=True)
     ]
     rows = []
@@ -220,7 +222,7 @@ def few(programs: Sequence[Recorded], device: str) -> Row:
     times, asked, made = compared(first, device, accuracy=ROUGH, most=FEW)
     ends = list(enumerate(zip(asked, made, strict=True)))
     # What a certificate has ended is no point.
-    points = (Ending.SOLVED, Ending.INEXACT, Ending.LIMIT)
+    points = (AdmmStatus.SOLVED, AdmmStatus.INEXACT, AdmmStatus.LIMIT)
     apart = [_apart(b.x, a.x) for _, (a, b) in ends if a.ending in points and b.ending in points]
     return {
         **{"kind": "few", "motion": "all", "programs": len(first)},

@@ -22,7 +22,7 @@ from egs_warp.locomotion.complementarity import SEPARATE, states_of_pairs
 from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, quadratic_program
-from egs_warp.locomotion.strategies import Strategy, contact_under, search_program
+from egs_warp.locomotion.strategies import Strategy, contact_response, search_program
 from harness import Row, Table, flags, report, timed
 
 if TYPE_CHECKING:
@@ -37,10 +37,10 @@ QP_LIMIT = LocomotionSettings.qp_limit
 def frame_figures(frame: Frame, solver: QpSolver, device: str) -> Row:
     """Figures of one program; ``device`` is that of kernels."""
     program = ContactProgram.of(frame.pieces, DIRECTIONS)
-    y = contact_under(program, frame.foreseen.activations)
+    y = contact_response(program, frame.foreseen.activations)
     separate = np.full(program.layout.contacts, SEPARATE)
     states = separate if y is None else states_of_pairs(program.layout, *program.pairs(y))
-    other = contact_under(program, frame.known)
+    other = contact_response(program, frame.known)
     changed = separate if other is None else states_of_pairs(program.layout, *program.pairs(other))
 
     def first() -> tuple[Any, QpSolution]:
@@ -52,7 +52,7 @@ def frame_figures(frame: Frame, solver: QpSolver, device: str) -> Row:
     found, search_time = timed(
         search_program,
         frame.pieces,
-        Strategy.PIECES,
+        Strategy.MODES,
         frame.foreseen,
         directions=DIRECTIONS,
         qp_limit=QP_LIMIT,

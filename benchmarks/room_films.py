@@ -15,8 +15,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from annotated_scenes import DrawnScene, read_drawn
 from clicking import clicked
-from drawn import DrawnScene, read_drawn
 from egs_warp.commands.object_flag import read_object
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -25,17 +25,17 @@ from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import write_png
-from egs_warp.locomotion.ledger import ledger
+from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import make_creature
-from egs_warp.pipelines.doubts import doubts
+from egs_warp.pipelines.facing_direction import mean_view
 from egs_warp.pipelines.film import draw_film
-from egs_warp.pipelines.front import mean_view
-from egs_warp.pipelines.ground_left import ground_left
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.ground_coverage import ground_coverage_warning
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
 from egs_warp.pipelines.prepare_scene import PreparedScene, prepare_scene, viewing_directions
 from egs_warp.pipelines.report import GaussianCounts, report_of_run
+from egs_warp.pipelines.segmentation_warnings import segmentation_warnings
+from egs_warp.pipelines.simulated_run import simulate
 from egs_warp.pipelines.train_capture import train
 from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.training.finetune import TrainingView
@@ -115,10 +115,12 @@ def film(
         )
         simulation = performance.simulation
         behind = creature.placed(scene.background)
-        left = ground_left(simulation.trajectory.positions[-1], behind, creature.solids[0], creature.body.height)
+        left = ground_coverage_warning(
+            simulation.trajectory.positions[-1], behind, creature.solids[0], creature.body.height
+        )
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
-            *(performance.sequence.done, ledger(performance.trajectory)),
+            *(performance.sequence.done, energy_balance(performance.trajectory)),
             gaussians=GaussianCounts.of(creature, made.splats.count),
             drawing=made.milliseconds,
             source=name,
@@ -196,9 +198,11 @@ def _pictures(run: RunFolder, cloud: GaussianCloud, scene: PreparedScene, camera
     """Written as ``egs-warp animate`` does; returns what looks wrong, in words."""
     centre, size = scene.located.centre, scene.located.size
     eyes = picture_cameras(scene.plane, centre, size, cameras)
-    words = doubts(cloud, scene.located, scene.object, eyes)
+    words = segmentation_warnings(cloud, scene.located, scene.object, eyes)
     write_png(run.file("plane.png"), plane_picture(cloud, [scene.plane], eyes, centre=centre, size=size))
-    write_png(run.file("segment.png"), segmentation_picture(cloud, scene.object, scene.bare, eyes, words))
+    write_png(
+        run.file("segment.png"), segmentation_picture(cloud, scene.object, scene.background_with_hole, eyes, words)
+    )
     if scene.filled is not None:
         write_png(run.file("filled.png"), before_and_after(scene.filled))
     scene.write(run)

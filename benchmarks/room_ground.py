@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from annotated_scenes import DrawnScene, DrawnView
 from clicking import GIVEN, JUDGED
-from drawn import DrawnScene, DrawnView
 from egs_warp.assets import scene
 from egs_warp.geometry.camera import camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud

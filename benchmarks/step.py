@@ -22,15 +22,15 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
 from egs_warp.assets import pawn
-from egs_warp.contact.response import ContactResponse
+from egs_warp.contact.newton import ContactLinearization
 from egs_warp.fem.elasticity import ElasticAssembly
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.stepper import StepMemory, StepReport
+from egs_warp.locomotion.stepper import StepReport, WarmStart
 from egs_warp.motions.script import motion
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.pipelines.creature import Creature, make_creature
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.simulated_run import simulate
 from harness import Row, Table, flags, median_ms, report
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def iterations(creature: Creature, before: StepReport, step: StepReport) -> Row:
     """Newton's iterations of one step by Hessian."""
 
     def again() -> int:
-        return creature.stepper.held_step(before.state, memory_of(before), step.activations, step.dt)[
+        return creature.stepper.step_with_activations(before.state, memory_of(before), step.activations, step.dt)[
             2
         ].newton_iterations
 
@@ -57,28 +57,30 @@ def iterations(creature: Creature, before: StepReport, step: StepReport) -> Row:
         return {**figures, "projected": again()}
 
 
-def memory_of(step: StepReport) -> StepMemory:
+def memory_of(step: StepReport) -> WarmStart:
     """What a step handed to the next."""
-    return StepMemory(step.contacts.points, step.forces, step.activations)
+    return WarmStart(step.contacts.points, step.forces, step.activations)
 
 
 def contact_errors(creature: Creature, before: StepReport, step: StepReport) -> dict[str, np.ndarray]:
     """(3k,) m/s by which a tangent misses the speeds of the k loaded contacts, by where it is."""
     stepper, contacts, muscles = creature.stepper, step.contacts, creature.muscles
     problem = StepProblem(creature.body, before.state, step.dt)
-    foreseen = stepper.foresee(stepper.start_of(problem, contacts, memory_of(before))).velocities
-    factors = SparseFactors(creature.body.assembly.upper_pattern)
-    now = MuscleTension.of(muscles, step.activations)
+    foreseen = stepper.predict(stepper.step_inputs(problem, contacts, memory_of(before))).velocities
+    factors = MultifrontalLdl(creature.body.assembly.upper_pattern)
+    now = MuscleEnergy.of(muscles, step.activations)
     loaded = np.repeat(step.forces[:, 0] > 0.0, 3)
     errors = {}
-    for place, velocities in (("rigid start", problem.start), ("foreseen end", foreseen)):
+    for place, velocities in (("rigid start", problem.rigid_guess), ("foreseen end", foreseen)):
         tangent = problem.tangent(factors, velocities, None)
-        response = ContactResponse.of(tangent, contacts)
+        response = ContactLinearization.of(tangent, contacts)
         free = velocities.ravel() - tangent.solve(problem.residual(velocities, now).ravel())
-        shift = stepper.solver.shift(contacts, step.dt)
-        forces, _ = response.forces(contacts.speeds(free), shift, creature.geometry.friction, step.forces)
+        shift = stepper.solver.normal_bias(contacts, step.dt)
+        forces, _ = response.solve_coulomb(
+            contacts.contact_velocities(free), shift, creature.geometry.friction, step.forces
+        )
         expected = free + response.columns @ forces.ravel()
-        errors[place] = (contacts.frame @ (expected - step.state.velocities.ravel()))[loaded]
+        errors[place] = (contacts.dense_jacobian @ (expected - step.state.velocities.ravel()))[loaded]
     return errors
 
 
@@ -90,7 +92,7 @@ def factor_times(creature: Creature, repeats: int) -> list[Row]:
     upper = assembly.matrix(entries)
     full = (upper + sparse.triu(upper, 1).T).tocsc()
     right = np.random.default_rng(0).standard_normal((full.shape[0], creature.muscles.segment_count + 3 * 32))
-    ours, theirs = SparseFactors(assembly.upper_pattern), splu(full)
+    ours, theirs = MultifrontalLdl(assembly.upper_pattern), splu(full)
     ours.update(entries)
     milliseconds = median_ms(
         {

@@ -31,8 +31,8 @@ from egs_warp.io import read_capture
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.trajectory import Trajectory, measure
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import first_place, make_creature, stand
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.creature import initial_stance, make_creature, place_cage
+from egs_warp.pipelines.simulated_run import simulate
 from harness import Row, Table, data_folder, flags, record, report, rows_of, timed, workers_flag
 
 if TYPE_CHECKING:
@@ -126,10 +126,10 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
         subject = {"cloud": built_in.cloud, "plane": built_in.plane}
     try:
         if case.height != 1.0:
-            subject["metres_per_unit"] = case.height * stand(**subject).frame.scale
+            subject["metres_per_unit"] = case.height * place_cage(**subject).frame.scale
         if case.slope:
             level = make_creature(**subject, friction=case.friction, sag=case.sag)
-            ahead = first_place(level).ground.axes[0]
+            ahead = initial_stance(level).ground.axes[0]
             angle = np.radians(case.slope)
             tilted = np.cos(angle) * GROUND.normal + np.sin(angle) * ahead
             subject["gravity_up"] = level.frame.axes.T @ tilted
@@ -144,11 +144,11 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
     parts: list[dict[str, float]] = []
     for done, (first, last) in zip(sequence.done, sequence.spans(trajectory.time), strict=True):
         reached = asdict(measure(trajectory, first=first, last=last))
-        if (also := done.motion.reached(trajectory, first, last)) is not None:
+        if (also := done.motion.outcome_record(trajectory, first, last)) is not None:
             reached |= asdict(also)
         parts.append({name: float(value) for name, value in reached.items()})
         reason = reason or judge(done.name, {"distance": 0.0, "height": 0.2, **done.asked}, reached, metres=case.height)
-    reason = reason or (f"{left[0]}" if (left := sequence.cut_short()) and frames is None else None)
+    reason = reason or (f"{left[0]}" if (left := sequence.unfinished_note()) and frames is None else None)
     if reason and friction_spent(trajectory) > 0.5:
         reason += "; friction was spent for over half of the time on the ground"
     return {

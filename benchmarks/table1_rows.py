@@ -14,8 +14,8 @@ import warp as wp
 import mesh_scenes as scenes
 from capture_surface import capture_surface
 from drop import Drop, simulated_drop
+from egs_warp.deformation.baselines import DeformationMethod, deform_with_method
 from egs_warp.deformation.embedding import CageLocator, embed_gaussians, embed_points
-from egs_warp.deformation.peers import CarryMethod, carry
 from egs_warp.deformation.splitting import SplitRule, split_for_motion
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -24,7 +24,7 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.meshing.cage import build_cage
 from egs_warp.render import render_gaussians
 from egs_warp.training.finetune import TrainingView
-from egs_warp.training.likeness import psnr, ssim
+from egs_warp.training.metrics import psnr, ssim
 from harness import Row, Table, timed
 from painted_meshes import PaintedMesh
 from perceptual import flip_error, lpips_distance
@@ -48,17 +48,17 @@ class Carried:
     """One row of the table."""
 
     capture: str
-    method: CarryMethod
+    method: DeformationMethod
     on_cage: bool = False
     """``SURFACE`` binds to the cage's own faces, not to a surface of the capture."""
     turns_colour: bool = True
 
 
-WHOLE = CarryMethod.BIDIRECTIONAL_NO_SPLIT
+WHOLE = DeformationMethod.BIDIRECTIONAL_NO_SPLIT
 PEERS = {
-    "SuGaR": CarryMethod.SURFACE,
-    "PhysGaussian": CarryMethod.MEAN_GRADIENT,
-    "VR-GS": CarryMethod.LOCAL_TETRAHEDRON,
+    "SuGaR": DeformationMethod.SURFACE,
+    "PhysGaussian": DeformationMethod.MEAN_GRADIENT,
+    "VR-GS": DeformationMethod.LOCAL_TETRAHEDRON,
 }
 MAIN = {
     **{name: Carried(GIVEN, method) for name, method in PEERS.items()},
@@ -75,7 +75,7 @@ SAME_TRAINING = {
 ROWS = {
     **MAIN,
     "ours, colours not turned": Carried(SPLIT, WHOLE, turns_colour=False),
-    "SuGaR, on the cage's faces": Carried(GIVEN, CarryMethod.SURFACE, on_cage=True),
+    "SuGaR, on the cage's faces": Carried(GIVEN, DeformationMethod.SURFACE, on_cage=True),
     **SAME_SPLIT,
     **SAME_TRAINING,
 }
@@ -245,7 +245,7 @@ def object_rows(
         for name, row in ROWS.items():
             capture = captures[row.capture]
             surface = None if row.on_cage else surfaces.get(row.capture)
-            (carried,) = carry(capture, subject.cage, [nodes], method=row.method, surface=surface)
+            (carried,) = deform_with_method(capture, subject.cage, [nodes], method=row.method, surface=surface)
             if not row.turns_colour:
                 carried = replace(carried, sh=capture.sh)
             scores, picture = judged(carried, views)
@@ -279,7 +279,9 @@ def settings_rows(mesh: PaintedMesh, options: argparse.Namespace, settings: Mapp
     for motion, nodes in subject.moved_nodes().items():
         views = subject.views(scenes.carried_vertices(subject.mesh, subject.cage, nodes, options.device))
         for name, splitting in settings.items():
-            (carried,) = carry(splitting.apply(cloud, subject.cage, nodes), subject.cage, [nodes], method=WHOLE)
+            (carried,) = deform_with_method(
+                splitting.apply(cloud, subject.cage, nodes), subject.cage, [nodes], method=WHOLE
+            )
             scores, _ = judged(carried, views)
             rows.append(
                 {"object": mesh.name, "motion": motion, "setting": name, "gaussians": carried.count, **_told(scores)}

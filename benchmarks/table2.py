@@ -37,9 +37,9 @@ from harness import Row, Table, data_folder, flags, report, timed
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from egs_warp.contact.coulomb import coulomb_forces
-from egs_warp.locomotion.contact_pieces import ContactPieces
+from egs_warp.locomotion.contact_modes import CoulombProgram
 from egs_warp.locomotion.solvers import QpSolver
-from egs_warp.locomotion.strategies import Foreseen, Strategy, search_program
+from egs_warp.locomotion.strategies import PredictedContact, Strategy, search_program
 from tests.support.contact_programs import small_problem
 
 if TYPE_CHECKING:
@@ -75,13 +75,13 @@ def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[St
 def answered(frame: Frame, x: np.ndarray) -> np.ndarray:
     """(m + 3n,) the activations of ``x`` (m + 3n,) and the forces that exact contact answers to them."""
     pieces = frame.pieces
-    activations, forces = np.split(x, [pieces.activations])
+    activations, forces = np.split(x, [pieces.activation_count])
     return np.concatenate([activations, contact_forces(pieces, activations, forces).ravel()])
 
 
-def contact_forces(pieces: ContactPieces, activations: np.ndarray, start: np.ndarray) -> np.ndarray:
+def contact_forces(pieces: CoulombProgram, activations: np.ndarray, start: np.ndarray) -> np.ndarray:
     """(n, 3) body weights that obey contact and friction under ``activations`` (m,)."""
-    m, n = pieces.activations, pieces.contacts
+    m, n = pieces.activation_count, pieces.contact_count
     free = pieces.rows[:, :m] @ activations + pieces.offset
     delassus = pieces.rows[:, m:].copy()
     delassus[np.diag_indices_from(delassus)] += 1e-7 * delassus.diagonal().mean()
@@ -160,10 +160,10 @@ def random_frames(count: int, seed: int) -> list[Frame]:
     frames = []
     for index in range(count):
         pieces = small_problem(1000 * seed + index, contacts=3).pieces
-        at_rest = np.zeros(pieces.activations)
+        at_rest = np.zeros(pieces.activation_count)
         forces = contact_forces(pieces, at_rest, np.zeros((3, 3)))
-        velocities = (pieces.rows[:, pieces.activations :] @ forces.ravel() + pieces.offset).reshape(-1, 3)
-        frames.append(Frame(pieces, Foreseen(at_rest, forces, velocities), at_rest))
+        velocities = (pieces.rows[:, pieces.activation_count :] @ forces.ravel() + pieces.offset).reshape(-1, 3)
+        frames.append(Frame(pieces, PredictedContact(at_rest, forces, velocities), at_rest))
     return frames
 
 
@@ -203,7 +203,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     qpcc, near = total[Strategy.QPCC], pooled(small)
     ratios = {
         strategy: tuple(float(column) for column in (total[strategy].mean(axis=0) / qpcc.mean(axis=0))[:3])
-        for strategy in (Strategy.PIECES, Strategy.PAPER, Strategy.EXACT)
+        for strategy in (Strategy.MODES, Strategy.PAPER, Strategy.EXACT)
     }
     within = {
         strategy: float((near[strategy][:, 1] <= 1.02 * near[Strategy.EXACT][:, 1] + 1e-12).mean())
@@ -215,7 +215,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"objective {true:.2f}; {total[strategy][:, 0].mean():.2f} QPs a frame; within 2 % of exact in "
             f"{within[strategy]:.0%} of the small problems"
         )
-    qps, objective, _ = ratios[Strategy.PIECES]
+    qps, objective, _ = ratios[Strategy.MODES]
     report(
         options,
         rows,
@@ -226,8 +226,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for strategy, found in ratios.items()
         },
         beyond={
-            "qps_a_frame": float(total[Strategy.PIECES][:, 0].mean()),
-            "small_within_two_percent": within[Strategy.PIECES],
+            "qps_a_frame": float(total[Strategy.MODES][:, 0].mean()),
+            "small_within_two_percent": within[Strategy.MODES],
         },
         skipped_bodies=skipped,
         aims={"qps_vs_qpcc": qps <= round(PAPER_QPS, 2), "objective_vs_qpcc": objective <= round(PAPER_OBJECTIVE, 2)},

@@ -27,11 +27,11 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io import read_capture
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane
 from egs_warp.render import render_gaussians
-from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane
+from egs_warp.segmentation.clearance import StraddlingOptions, StraddlingPolicy, clear_plane
 from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.segmentation.selection_masks import masks_from_selection
 from egs_warp.segmentation.votes import blending_votes
-from egs_warp.training.likeness import psnr, ssim
+from egs_warp.training.metrics import psnr, ssim
 from harness import Row, Table, data_folder, flags, report, timed
 from perceptual import flip_error, lpips_distance
 
@@ -39,12 +39,12 @@ BUILT_IN = ("pawn", "stool", "figurine")
 CAPTURES = ("koala.ply", "narcissus.sog")
 CLICKS = {"koala.ply": (0.1, -0.7, 0.15), "narcissus.sog": (0.0, -0.8, 0.0), "fox.ply": (0.0, 0.0, 2.0)}
 """One on the object of each capture."""
-METHODS: dict[str, tuple[Clearing, ClearingOptions | None]] = {
-    "mask only": (Clearing.NONE, None),
-    "remove": (Clearing.REMOVE, None),
-    "L_seg": (Clearing.FINETUNE, None),
-    "L_seg, no subdivision": (Clearing.FINETUNE, ClearingOptions(subdivisions=0, cut_rest=False)),
-    "static split": (Clearing.SPLIT, None),
+METHODS: dict[str, tuple[StraddlingPolicy, StraddlingOptions | None]] = {
+    "mask only": (StraddlingPolicy.NONE, None),
+    "remove": (StraddlingPolicy.REMOVE, None),
+    "L_seg": (StraddlingPolicy.FINETUNE, None),
+    "L_seg, no subdivision": (StraddlingPolicy.FINETUNE, StraddlingOptions(subdivisions=0, cut_rest=False)),
+    "static split": (StraddlingPolicy.SPLIT, None),
 }
 BLACK = (0.0, 0.0, 0.0)
 
@@ -127,9 +127,9 @@ def rows_of(name: str, device: str, side: int, seed: int, table: Table) -> tuple
     wanted = [picture(parts.claimed, camera)[:half] for camera in cameras]
     rows, shown = [], []
     for method, (clearing, chosen) in METHODS.items():
-        options = ClearingOptions(seed=seed) if chosen is None else chosen
+        options = StraddlingOptions(seed=seed) if chosen is None else chosen
         cloud, milliseconds = parts.claimed, 0.0
-        if clearing is not Clearing.NONE:
+        if clearing is not StraddlingPolicy.NONE:
             cloud, milliseconds = timed(clear_plane, parts.above, plane, clearing, options=options)
         pictures = [picture(cloud, camera) for camera in cameras]
         row = {
@@ -137,7 +137,7 @@ def rows_of(name: str, device: str, side: int, seed: int, table: Table) -> tuple
             "method": method,
             "gaussians": cloud.count,
             "seconds": 1e-3 * milliseconds,
-            **scores(pictures, None if clearing is Clearing.NONE else wanted),
+            **scores(pictures, None if clearing is StraddlingPolicy.NONE else wanted),
         }
         rows.append(row)
         table.row(name, method, row["psnr"], row["ssim"], row["flip"], row["residual"], row["seconds"])

@@ -21,9 +21,9 @@ from egs_warp.assets import pawn, scene
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import Creature, make_creature
-from egs_warp.pipelines.performance import simulate
 from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
 from egs_warp.pipelines.progress import scene_bar, simulation_bar
+from egs_warp.pipelines.simulated_run import simulate
 from egs_warp.segmentation.object_spec import ObjectSpec
 from harness import Row, Table, flags, report
 

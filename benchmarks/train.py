@@ -63,7 +63,7 @@ def run_case(case: str, options: argparse.Namespace, table: Table) -> tuple[list
     )
     clouds = {OURS: (result.cloud, result.background)}
     rows = [row_of(case, OURS, result.cloud, marks["judging"] - marks["training"], result.scores)]
-    rows[0]["left_out"] = [one.name for one in result.left_out]
+    rows[0]["left_out"] = [one.name for one in result.excluded]
     if has_peer:
         trained = [
             view

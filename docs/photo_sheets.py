@@ -16,7 +16,7 @@ import numpy as np
 from egs_warp.assets import scene
 from egs_warp.assets.scene import Scene
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.video import contact_sheet, write_png
 from egs_warp.pipelines.locate_plane import locate_plane
@@ -103,7 +103,7 @@ def on_haze(made: Scene, degrees: float = 8.0) -> tuple[GaussianCloud, Plane]:
         np.full(count, 1.0),
         white,
     )
-    return joined(made.object, haze), leaning
+    return concatenate(made.object, haze), leaning
 
 
 def taking(made: Scene) -> np.ndarray:

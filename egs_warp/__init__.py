@@ -12,13 +12,13 @@ from egs_warp.version import __version__
 
 if TYPE_CHECKING:
     from egs_warp.assets.scene import BUILT_IN_SCENES, Scene, scene
-    from egs_warp.commands.endings import one_line_errors
+    from egs_warp.commands.exit_handling import one_line_errors
     from egs_warp.contact.terrain import Solid
     from egs_warp.deformation.deformer import Deformer
     from egs_warp.deformation.embedding import embed_gaussians
     from egs_warp.errors import ArgumentError, UserError
     from egs_warp.geometry.camera import Camera
-    from egs_warp.geometry.gaussians import GaussianCloud, joined
+    from egs_warp.geometry.gaussians import GaussianCloud, concatenate
     from egs_warp.geometry.height_field import HeightField
     from egs_warp.geometry.plane import Plane
     from egs_warp.geometry.tetmesh import TetMesh
@@ -36,42 +36,42 @@ if TYPE_CHECKING:
     from egs_warp.locomotion.trajectory import Trajectory
     from egs_warp.motions.command import Drive
     from egs_warp.motions.push import Push, read_pushes
-    from egs_warp.motions.script import Script, driving, motion
+    from egs_warp.motions.script import Script, drive_script, motion
     from egs_warp.motions.style import Style, read_style
     from egs_warp.pipelines.animate import AnimateOptions, animate
     from egs_warp.pipelines.creature import Creature, make_creature
     from egs_warp.pipelines.job import Job
-    from egs_warp.pipelines.many import Outcome, simulate_many
-    from egs_warp.pipelines.performance import Performance, simulate
+    from egs_warp.pipelines.many import JobResult, simulate_many
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
     from egs_warp.pipelines.report import Report
     from egs_warp.pipelines.shot import Shot
+    from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
     from egs_warp.pipelines.train_capture import TrainResult, train
     from egs_warp.render.autograd import render_torch
     from egs_warp.render.rasteriser import render_gaussians
-    from egs_warp.segmentation.clearance import Clearing, ClearingOptions, Reach
+    from egs_warp.segmentation.clearance import ExtentMeasure, StraddlingOptions, StraddlingPolicy
     from egs_warp.segmentation.clicks import Click, click_at
     from egs_warp.segmentation.object_spec import Box, ObjectSpec
     from egs_warp.segmentation.votes import MaskedView
     from egs_warp.training.finetune import (
         Densification,
         FinetuneOptions,
-        Rates,
+        LearningRates,
         TrainingView,
         finetune,
-        views_of_capture,
+        render_views,
     )
-    from egs_warp.training.likeness import psnr
+    from egs_warp.training.metrics import psnr
 
-_HOMES: dict[str, tuple[str, ...]] = {
+_MODULES: dict[str, tuple[str, ...]] = {
     "assets.scene": ("BUILT_IN_SCENES", "Scene", "scene"),
-    "commands.endings": ("one_line_errors",),
+    "commands.exit_handling": ("one_line_errors",),
     "contact.terrain": ("Solid",),
     "deformation.deformer": ("Deformer",),
     "deformation.embedding": ("embed_gaussians",),
     "errors": ("ArgumentError", "UserError"),
     "geometry.camera": ("Camera",),
-    "geometry.gaussians": ("GaussianCloud", "joined"),
+    "geometry.gaussians": ("GaussianCloud", "concatenate"),
     "geometry.height_field": ("HeightField",),
     "geometry.plane": ("Plane",),
     "geometry.tetmesh": ("TetMesh",),
@@ -89,28 +89,35 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "locomotion.trajectory": ("Trajectory",),
     "motions.command": ("Drive",),
     "motions.push": ("Push", "read_pushes"),
-    "motions.script": ("Script", "driving", "motion"),
+    "motions.script": ("Script", "drive_script", "motion"),
     "motions.style": ("Style", "read_style"),
     "pipelines.animate": ("AnimateOptions", "animate"),
     "pipelines.creature": ("Creature", "make_creature"),
     "pipelines.job": ("Job",),
-    "pipelines.many": ("Outcome", "simulate_many"),
-    "pipelines.performance": ("Performance", "simulate"),
+    "pipelines.many": ("JobResult", "simulate_many"),
+    "pipelines.simulated_run": ("SimulatedRun", "simulate"),
     "pipelines.prepare_scene": ("PreparedScene", "SceneOptions", "prepare_scene"),
     "pipelines.report": ("Report",),
     "pipelines.shot": ("Shot",),
     "pipelines.train_capture": ("TrainResult", "train"),
     "render.autograd": ("render_torch",),
     "render.rasteriser": ("render_gaussians",),
-    "segmentation.clearance": ("Clearing", "ClearingOptions", "Reach"),
+    "segmentation.clearance": ("StraddlingPolicy", "StraddlingOptions", "ExtentMeasure"),
     "segmentation.clicks": ("Click", "click_at"),
     "segmentation.object_spec": ("Box", "ObjectSpec"),
     "segmentation.votes": ("MaskedView",),
-    "training.finetune": ("Densification", "FinetuneOptions", "Rates", "TrainingView", "finetune", "views_of_capture"),
-    "training.likeness": ("psnr",),
+    "training.finetune": (
+        "Densification",
+        "FinetuneOptions",
+        "LearningRates",
+        "TrainingView",
+        "finetune",
+        "render_views",
+    ),
+    "training.metrics": ("psnr",),
 }
 """Where each public name lives; the imports above say the same to type checkers."""
-_MODULE_OF = {name: f"egs_warp.{module}" for module, names in _HOMES.items() for name in names}
+_MODULE_OF = {name: f"egs_warp.{module}" for module, names in _MODULES.items() for name in names}
 
 __all__ = [
     "BUILT_IN_SCENES",
@@ -118,35 +125,35 @@ __all__ = [
     "ArgumentError",
     "Box",
     "Camera",
-    "Clearing",
-    "ClearingOptions",
     "Click",
     "Creature",
     "Deformer",
     "Densification",
     "Drive",
+    "ExtentMeasure",
     "FinetuneOptions",
     "GaussianCloud",
     "HeightField",
     "InpaintOptions",
     "Inpainter",
     "Job",
+    "JobResult",
+    "LearningRates",
     "LocomotionSettings",
     "MaskedView",
     "ObjectSpec",
-    "Outcome",
-    "Performance",
     "Plane",
     "PreparedScene",
     "Push",
-    "Rates",
-    "Reach",
     "Report",
     "Scene",
     "SceneOptions",
     "Script",
     "Shot",
+    "SimulatedRun",
     "Solid",
+    "StraddlingOptions",
+    "StraddlingPolicy",
     "Strategy",
     "Style",
     "TetMesh",
@@ -158,14 +165,14 @@ __all__ = [
     "__version__",
     "animate",
     "click_at",
+    "concatenate",
     "contact_sheet",
-    "driving",
+    "drive_script",
     "embed_gaussians",
     "finetune",
     "footprint",
     "inpaint",
     "inpainter_by_name",
-    "joined",
     "make_creature",
     "motion",
     "one_line_errors",
@@ -177,12 +184,12 @@ __all__ = [
     "read_style",
     "render_gaussians",
     "render_torch",
+    "render_views",
     "scene",
     "simulate",
     "simulate_many",
     "train",
     "use_device",
-    "views_of_capture",
     "writable_folder",
     "write_ply",
     "write_png",

@@ -12,12 +12,12 @@ from typing import NoReturn
 
 from egs_warp.commands import COMMANDS, GROUPS
 from egs_warp.commands.config import with_config
-from egs_warp.commands.endings import Ended, one_line_errors
+from egs_warp.commands.exit_handling import HandledExit, one_line_errors
 from egs_warp.version import __version__
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; whatever stops it prints one line (``commands.endings``) and is told by the status."""
+    """Run the command; whatever stops it prints one line (``commands.exit_handling``) and is told by the status."""
     # The matrices of a step are small: threads cost more than they bring, and tenfold beside other work.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 given = [given[0], *with_config(given[1:], command)]
             chosen = parser.parse_args(given)
             return chosen.run(chosen)
-    except Ended as ended:
+    except HandledExit as ended:
         assert isinstance(ended.code, int)
         return ended.code
 

@@ -14,18 +14,20 @@ class UserError(ValueError):
     def __init__(self, message: str, *, check: Sequence[str] = ()) -> None:
         """``check``: arguments that may be the cause; the message ends with their names."""
         self.message, self.check = message, tuple(check)
-        super().__init__(self.told())
+        super().__init__(self.format_message())
 
-    def told(self, name: Callable[[str], str] = str) -> str:
+    def format_message(self, name: Callable[[str], str] = str) -> str:
         """The message, in which each argument is called by its ``name``: a command's flag for it, say."""
         advice = f"; check {' and '.join(map(name, self.check))}" if self.check else ""
         # Names and values come from the user's files: line breaks and half characters are shown by their codes.
-        line = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in self._said(name) + advice)
+        line = "".join(
+            letter if letter.isprintable() else ascii(letter)[1:-1] for letter in self._argument_text(name) + advice
+        )
         if len(line) > _LONGEST:
             line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
         return line
 
-    def _said(self, name: Callable[[str], str]) -> str:
+    def _argument_text(self, name: Callable[[str], str]) -> str:
         return self.message
 
 
@@ -37,6 +39,6 @@ class ArgumentError(UserError):
         self.argument, self.value = argument, value
         super().__init__(problem, check=check)
 
-    def _said(self, name: Callable[[str], str]) -> str:
+    def _argument_text(self, name: Callable[[str], str]) -> str:
         given = "" if self.value is None else f" {self.value}"
         return f"{name(self.argument)}{given}: {self.message}"

@@ -24,7 +24,7 @@ import numpy as np
 import warp as wp
 
 from egs_warp.errors import ArgumentError, UserError
-from egs_warp.helpers import helpers
+from egs_warp.worker_threads import worker_threads
 
 Shape: TypeAlias = int | tuple[int, ...]
 T = TypeVar("T")
@@ -57,7 +57,7 @@ _left = 0
 
 
 @contextmanager
-def a_core_left() -> Iterator[None]:
+def reserve_core() -> Iterator[None]:
     """While it lasts, all threads of this process leave a core to whoever else computes here, where there is more than
     one and the environment does not say how many to use."""
     global _left
@@ -130,7 +130,7 @@ def launch_rows(
     (row_count,) is the expected effort of heavy rows, any unit; without it rows are light and alike.
     """
     if not device.is_cpu:
-        launch_again(kernel, row_count, inputs=[0, *inputs], outputs=outputs, device=device)
+        launch_cached(kernel, row_count, inputs=[0, *inputs], outputs=outputs, device=device)
         return
     threads = threads or available_threads()
     edges = _chunk_edges(row_count, threads, work)
@@ -153,13 +153,13 @@ def launch_rows(
                 launch.set_param_at_index_from_ctype(0, first)
             launch.launch()
 
-    tasks = [helpers().begin(launch_chunks) for _ in range(min(threads, len(edges) - 1) - 1)]
+    tasks = [worker_threads().begin(launch_chunks) for _ in range(min(threads, len(edges) - 1) - 1)]
     try:
         launch_chunks()
     finally:
         # Who has not begun would find nothing left to do.
         for task in tasks:
-            task.settle()
+            task.wait()
     for task in tasks:
         task.result()
 
@@ -174,7 +174,7 @@ class _Recorded(threading.local):
 _recorded = _Recorded()
 
 
-def launch_again(
+def launch_cached(
     kernel: Any, dim: int | tuple[int, int], *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device
 ) -> None:
     """``wp.launch`` at a third of its cost, for kernels that run many times a second.
@@ -242,7 +242,7 @@ def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[
     return np.unique(np.concatenate([[0], inner, [row_count]]).astype(int)).tolist()
 
 
-def kept_by_thread(most: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
+def thread_local_cache(most: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """A decorator: what was made for the last ``most`` different arguments is kept, by each thread for itself, as
     memory must be that is written to."""
 
@@ -259,16 +259,16 @@ def kept_by_thread(most: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
     return decorated
 
 
-def beside(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
+def run_concurrently(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
     """Both results; ``second`` runs in another thread where one is free."""
     if available_threads() == 1:
         return first(), second()
-    task = helpers().begin(second)
+    task = worker_threads().begin(second)
     try:
         return first(), task.result()
     except BaseException:
         # What it works with may be used again at once.
-        task.settle()
+        task.wait()
         raise
 
 
@@ -292,7 +292,7 @@ def empty(shape: Shape, dtype: Any, device: Device, *, pinned: bool = False) -> 
     return wp.empty(shape, dtype=dtype, device=device, pinned=pinned)
 
 
-def empty_together(device: Device, *wanted: tuple[Shape, Any]) -> list[wp.array]:
+def empty_pooled(device: Device, *wanted: tuple[Shape, Any]) -> list[wp.array]:
     """Arrays of undefined contents in one piece of memory, each given by its shape and type.
 
     An allocation on a GPU costs several times a look into it, and small pictures wait for both: arrays that nobody
@@ -354,28 +354,28 @@ _POOLED_BYTES, _POOLED_KINDS, _POOLED_ALIKE = 2**25, 16, 4
 """Largest piece that is kept for the next who wants it, and how many of different kinds and of one kind are."""
 
 
-class _Spare(threading.local):
+class _FreeList(threading.local):
     """What this thread made by ``empty_together``, oldest first."""
 
     def __init__(self) -> None:
         self.kept: OrderedDict[Any, list[list[wp.array]]] = OrderedDict()
 
 
-_spare = _Spare()
+_spare = _FreeList()
 
 
-def by_steps(count: int, step: int) -> int:
+def round_up(count: int, step: int) -> int:
     """The least multiple of ``step`` that is at least ``count``, and 1."""
     return -(-max(count, 1) // step) * step
 
 
-def with_room(count: int) -> int:
+def grow_capacity(count: int) -> int:
     """At least ``count``, at most a quarter more: counts that differ a little then ask for arrays of one size."""
     step = 1 << max(count.bit_length() - 3, 0)
     return -(-max(count, 1) // step) * step
 
 
-def put(target: wp.array, values: np.ndarray) -> None:
+def copy_into(target: wp.array, values: np.ndarray) -> None:
     """Copy ``values`` of the same shape and kind into ``target``; on a CPU without Warp's own way, which takes longer
     than a small copy."""
     if device_of(target).is_cpu:
@@ -384,7 +384,7 @@ def put(target: wp.array, values: np.ndarray) -> None:
         target.assign(np.ascontiguousarray(values, dtype=np.float64))
 
 
-class Mirror:
+class PinnedMirror:
     """Numbers of an ``array`` on the host, which come and go many times a second: by memory that a GPU reads and writes
     itself, in a fraction of the time that Warp's own ways take; on a CPU the array has no other."""
 
@@ -412,7 +412,7 @@ class Mirror:
         return self.get_all(self)[0]
 
     @staticmethod
-    def get_all(*mirrors: Mirror) -> list[np.ndarray]:
+    def get_all(*mirrors: PinnedMirror) -> list[np.ndarray]:
         """From the arrays of ``mirrors`` on one device, copies."""
         device = mirrors[0]._device
         if not device.is_cpu:

@@ -63,11 +63,11 @@ def main() -> None:
 
     built_in = egs.scene("pawn", device=arguments.device)
     cameras = ring_of_cameras(built_in.object, built_in.plane.normal, count=8, size=arguments.size)
-    views = egs.views_of_capture(built_in.object, cameras)
+    views = egs.render_views(built_in.object, cameras)
     grey = replace(built_in.object, sh=wp.zeros_like(built_in.object.sh))
     print(f"largest brightness gradient of a mean: {float(brightness_gradient(grey, cameras[0]).abs().max()):.2e}")
     result = egs.finetune(
-        grey, views, options=egs.FinetuneOptions(iterations=arguments.steps, rates=egs.Rates(sh_band_0=2e-2))
+        grey, views, options=egs.FinetuneOptions(iterations=arguments.steps, rates=egs.LearningRates(sh_band_0=2e-2))
     )
 
     pictures = {

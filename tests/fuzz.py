@@ -1,6 +1,6 @@
 """``make fuzz MINUTES=10``: many damaged files for every reader; ``python -m tests.fuzz --help``.
 
-The strategies of ``tests/support/damage.py`` are driven by Atheris (coverage of the package) where it is installed,
+The strategies of ``tests/support/corruption.py`` are driven by Atheris (coverage of the package) where it is installed,
 else by random bytes. A case that breaks a promise is kept in ``tests/corpus/READER/``, where the tests find it.
 """
 
@@ -129,9 +129,9 @@ def _fuzz(name: str, seed: int, seconds: float, inputs: int) -> None:
         import atheris
 
         with atheris.instrument_imports(include=["egs_warp.io", "egs_warp.motions", "egs_warp.muscles"]):
-            from tests.support import damage, readers
+            from tests.support import corruption, readers
     else:
-        from tests.support import damage, readers
+        from tests.support import corruption, readers
     import warp as wp
     from hypothesis import HealthCheck, Phase, given, settings
 
@@ -152,7 +152,7 @@ def _fuzz(name: str, seed: int, seconds: float, inputs: int) -> None:
             phases=[Phase.generate],
             suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
         )
-        @given(damage.damaged(reader))
+        @given(corruption.damaged(reader))
         def one(data: bytes) -> None:
             nonlocal peak
             counts["inputs"] += 1

@@ -25,7 +25,7 @@ from egs_warp.io.writing import WRITERS
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.pipelines.render_run import Show
 from egs_warp.pipelines.shot import CameraMove
-from egs_warp.segmentation.clearance import Clearing
+from egs_warp.segmentation.clearance import StraddlingPolicy
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_choices_of_flags_are_those_of_the_library() -> None:
     assert choices("convert", "--to") == set(WRITERS) == choices("export", "--to") - {"usd", "bundle"}
     assert choices("animate", "--qp") == choices("live", "--qp") == {solver.value for solver in QpSolver}
     assert choices("render", "--show") == {show.value for show in Show}
-    assert choices("segment", "--straddling") == {method.value for method in Clearing}
+    assert choices("segment", "--straddling") == {method.value for method in StraddlingPolicy}
     assert {"patch", TRANSPARENT, *CameraMove, *(method.value for method in OpenCvMethod)} == set(_WORDS)
 
 

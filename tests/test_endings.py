@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from egs_warp.commands.endings import Ended, one_line_errors
+from egs_warp.commands.exit_handling import HandledExit, one_line_errors
 from egs_warp.errors import UserError
 from egs_warp.io import atomic_write
 
 
 def program(body: str) -> list[str]:
-    code = "import os, signal, sys, threading, time\nfrom egs_warp.commands.endings import one_line_errors\n"
+    code = "import os, signal, sys, threading, time\nfrom egs_warp.commands.exit_handling import one_line_errors\n"
     code += "with one_line_errors('prog'):\n" + textwrap.indent(textwrap.dedent(body), "    ")
     return [sys.executable, "-c", code]
 
@@ -48,7 +48,7 @@ def ended(body: str) -> tuple[int, str]:
     ],
 )
 def test_each_end_is_one_line(error: BaseException, status: int, line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(Ended) as end, one_line_errors("prog"):
+    with pytest.raises(HandledExit) as end, one_line_errors("prog"):
         raise error
     assert end.value.code == status and capsys.readouterr().err == line
 
@@ -62,7 +62,7 @@ def test_a_file_that_cannot_be_written(
 ) -> None:
     """A full or broken disk is no bad input; a place where one may not write is."""
     reason = os.strerror(number)
-    with pytest.raises(Ended) as end, one_line_errors("prog"), atomic_write(tmp_path / "a.json"):
+    with pytest.raises(HandledExit) as end, one_line_errors("prog"), atomic_write(tmp_path / "a.json"):
         raise OSError(number, reason)
     said = f"prog: {tmp_path / 'a.json'}: cannot be written ({reason}); choose another place\n"
     assert end.value.code == status and capsys.readouterr().err == said
@@ -157,7 +157,7 @@ def test_output_that_goes_nowhere_changes_no_status(command: str, status: int) -
 
 def test_files_are_not_opened_in_the_place_of_closed_streams() -> None:
     """What a library prints would go into them."""
-    code = "from egs_warp.commands.endings import one_line_errors\nwith one_line_errors('prog'):\n"
+    code = "from egs_warp.commands.exit_handling import one_line_errors\nwith one_line_errors('prog'):\n"
     code += " import os, tempfile\n with tempfile.TemporaryFile() as file: os._exit(file.fileno())"
     assert told_by(f'{sys.executable} -c "$(cat <<"END"\n{code}\nEND\n)" <&- >&- 2>&-')[0] > 2
 

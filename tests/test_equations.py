@@ -2,7 +2,7 @@
 one.
 
 A test that only mentions its equation is none: it must call the code of that row, and for each equation one of the
-row's tests is shown to fail when the code of the row is wrong (``tests/test_teeth.py``).
+row's tests is shown to fail when the code of the row is wrong (``tests/test_formula_mutations.py``).
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from egs_warp.commands.endings import one_line_errors
+from egs_warp.commands.exit_handling import one_line_errors
 from egs_warp.commands.flags import flag_of
 from egs_warp.errors import ArgumentError, UserError
 
@@ -19,11 +19,11 @@ FLAG = re.compile(r"(?<![\w-])--[a-z]")
 def test_an_argument_is_called_by_its_name_or_by_its_flag() -> None:
     error = ArgumentError("metres_per_unit", "give a positive number", value=-2.0)
     assert str(error) == "metres_per_unit -2.0: give a positive number"
-    assert error.told(flag_of) == "--metres-per-unit -2.0: give a positive number"
+    assert error.format_message(flag_of) == "--metres-per-unit -2.0: give a positive number"
     error = ArgumentError("solids", "the body is inside number 2", check=("plane", "muscles_file"))
     assert str(error) == "solids: the body is inside number 2; check plane and muscles_file"
-    assert error.told(flag_of) == "--terrain: the body is inside number 2; check --plane and --muscles"
-    assert UserError("object: it is flat", check=("up",)).told(flag_of) == "object: it is flat; check --up"
+    assert error.format_message(flag_of) == "--terrain: the body is inside number 2; check --plane and --muscles"
+    assert UserError("object: it is flat", check=("up",)).format_message(flag_of) == "object: it is flat; check --up"
 
 
 def test_a_line_stays_one_line() -> None:

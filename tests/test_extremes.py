@@ -18,11 +18,11 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import LARGEST, LARGEST_LOG_SCALE, GaussianCloud, unit_quaternions
 from egs_warp.render import render_gaussians
-from tests.support.carrying_scenes import bent, box
+from tests.support.deformation_scenes import bent, box
 
 torch = pytest.importorskip("torch")
 from egs_warp.render.autograd import render_torch  # noqa: E402
-from egs_warp.training.finetune import FinetuneOptions, finetune, views_of_capture  # noqa: E402
+from egs_warp.training.finetune import FinetuneOptions, finetune, render_views  # noqa: E402
 
 COUNT, ODD = 40, 7
 NAMES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
@@ -124,7 +124,7 @@ def test_a_cage_carries_it_and_all_others_as_if_it_were_not_there(changed: dict[
 @settings(max_examples=30, derandomize=True, database=None, phases=[Phase.generate])
 @given(changed=changes())
 def test_training_stays_finite_or_says_why(changed: dict[str, tuple[int, float]]) -> None:
-    views = views_of_capture(cloud_of(ordinary()), [CAMERA])
+    views = render_views(cloud_of(ordinary()), [CAMERA])
     try:
         result = finetune(cloud_of(odd(changed)), views, options=FinetuneOptions(iterations=3))
     except UserError as error:

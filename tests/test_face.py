@@ -109,7 +109,7 @@ def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     names: dict[str, object] = {}
     exec(compile(readme_lines(), "README.md", "exec"), names)
     performance = names["performance"]
-    assert isinstance(performance, egs.Performance) and len(performance.frames) == 25
+    assert isinstance(performance, egs.SimulatedRun) and len(performance.frames) == 25
     heights = performance.frames @ performance.place.ground.axes[2]
     assert heights[-1].max() < heights[0].max() - 0.005
     assert np.isfinite(performance.frames).all()

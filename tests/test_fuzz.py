@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.support import readers
-from tests.support.damage import damaged
+from tests.support.corruption import damaged
 from tests.support.readers import READERS, BrokenPromiseError, Reader, outcome, prepare
 
 CORPUS = Path(__file__).parent / "corpus"

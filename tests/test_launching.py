@@ -12,15 +12,15 @@ import warp as wp
 
 from egs_warp.launching import (
     THREADS,
-    Mirror,
-    a_core_left,
+    PinnedMirror,
     available_threads,
-    beside,
-    empty_together,
-    kept_by_thread,
-    launch_again,
+    empty_pooled,
+    grow_capacity,
+    launch_cached,
     launch_rows,
-    with_room,
+    reserve_core,
+    run_concurrently,
+    thread_local_cache,
 )
 
 
@@ -78,7 +78,7 @@ def test_a_launch_made_again_takes_its_new_arguments(device: str) -> None:
             values, extra = random.normal(size=count), random.normal(size=count) if random.random() < 0.5 else None
             factor, offset = float(random.normal()), tuple(random.normal(size=3))
             result = wp.zeros(max(count, 1), dtype=wp.vec3, device=target)
-            launch_again(
+            launch_cached(
                 scaled_kernel,
                 count,
                 inputs=[
@@ -90,7 +90,7 @@ def test_a_launch_made_again_takes_its_new_arguments(device: str) -> None:
             )
             np.testing.assert_allclose(result.numpy()[:count], expected(values, factor, offset, extra), atol=1e-5)
 
-    launch_again(
+    launch_cached(
         scaled_kernel,
         1,
         inputs=[0, wp.zeros(1, dtype=wp.float32, device=target), 1.0, wp.vec3(), None],
@@ -106,7 +106,7 @@ def test_a_launch_made_again_takes_its_new_arguments(device: str) -> None:
 
 def test_arrays_in_one_piece_of_memory_do_not_touch_and_keep_it(device: str) -> None:
     wanted = [(7, wp.vec3), ((3, 5), wp.float32), (0, wp.vec4), (1, wp.int64), ((2, 2), wp.vec4)]
-    pieces = empty_together(device, *wanted)
+    pieces = empty_pooled(device, *wanted)
     for number, (piece, (shape, dtype)) in enumerate(zip(pieces, wanted, strict=True)):
         assert piece.shape == (shape if isinstance(shape, tuple) else (shape,))
         assert piece.dtype is dtype and piece.is_contiguous and (piece.ptr or 0) % 16 == 0
@@ -120,21 +120,21 @@ def test_arrays_in_one_piece_of_memory_do_not_touch_and_keep_it(device: str) -> 
 
 def test_arrays_that_nobody_holds_are_given_again(device: str) -> None:
     wanted = [(11, wp.vec3), (4, wp.float32)]
-    first = empty_together(device, *wanted)
+    first = empty_pooled(device, *wanted)
     places = [piece.ptr for piece in first]
-    assert empty_together(device, *wanted)[0].ptr not in places
+    assert empty_pooled(device, *wanted)[0].ptr not in places
     view = first[1].numpy() if device == "cpu" else pytest.importorskip("torch").as_tensor(first[1], device="cuda")
     del first
     # A view from outside keeps the whole, too.
-    assert empty_together(device, *wanted)[0].ptr not in places
+    assert empty_pooled(device, *wanted)[0].ptr not in places
     del view
-    second, third = empty_together(device, *wanted), empty_together(device, *wanted)
+    second, third = empty_pooled(device, *wanted), empty_pooled(device, *wanted)
     assert places in ([piece.ptr for piece in pieces] for pieces in (second, third))
     assert second[0].ptr != third[0].ptr
 
 
 def test_sizes_with_room_are_few_and_not_much_larger() -> None:
-    sizes = [with_room(count) for count in range(1, 100_000)]
+    sizes = [grow_capacity(count) for count in range(1, 100_000)]
     assert all(count <= size <= max(1.25 * count, count + 1) for count, size in enumerate(sizes, 1))
     assert len(set(sizes)) < 100
 
@@ -158,9 +158,9 @@ def test_a_core_is_left_to_others(cores: int, told: str, used: int, monkeypatch:
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(cores)), raising=False)
     monkeypatch.setenv(THREADS, told)
     before = available_threads()
-    with pytest.raises(ValueError, match=r"^over$"), a_core_left():
+    with pytest.raises(ValueError, match=r"^over$"), reserve_core():
         assert available_threads() == used
-        with a_core_left():
+        with reserve_core():
             assert available_threads() == (used if told else max(1, cores - 2))
         assert available_threads() == used
         raise ValueError("over")
@@ -170,7 +170,7 @@ def test_a_core_is_left_to_others(cores: int, told: str, used: int, monkeypatch:
 @pytest.mark.parametrize("told", ["1", ""])
 def test_beside_on_one_thread_is_one_after_the_other(told: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(THREADS, told)
-    used = beside(threading.get_ident, lambda: (threading.get_ident(), 7))
+    used = run_concurrently(threading.get_ident, lambda: (threading.get_ident(), 7))
     assert used[0] == threading.get_ident() and used[1][1] == 7
     assert told == "" or used[1][0] == used[0]
 
@@ -190,13 +190,13 @@ def test_what_goes_on_beside_an_error_has_ended_when_that_is_told(monkeypatch: p
         ended.set()
 
     with pytest.raises(ValueError, match="over"):
-        beside(first, second)
+        run_concurrently(first, second)
     assert ended.is_set()
 
 
 def test_each_thread_keeps_its_own() -> None:
     """The last few, by their arguments; another thread has others."""
-    make = kept_by_thread(2)(lambda *given: [*given])
+    make = thread_local_cache(2)(lambda *given: [*given])
     first = make(1, 2)
     assert first == [1, 2] and make(1, 2) is first and make(2, 1) is not first
     assert make(3) == [3] and make(1, 2) is not first
@@ -210,12 +210,12 @@ def test_each_thread_keeps_its_own() -> None:
 def test_mirrors_bring_and_fetch_what_lies_there_now(device: str) -> None:
     """What is brought twice, or is no number, and what has changed there since it was fetched."""
     arrays = [wp.zeros(3, dtype=wp.float64, device=device) for _ in range(2)]
-    one, other = mirrors = [Mirror(array) for array in arrays]
+    one, other = mirrors = [PinnedMirror(array) for array in arrays]
     for values in ([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [0.0, np.nan, 3.0], [0.0, np.nan, 3.0], [0.0, 0.0, 0.0]):
         one.put(np.array(values))
         np.testing.assert_array_equal(arrays[0].numpy(), values)
         arrays[1].fill_(values[0] + 7.0)
-        got = Mirror.get_all(*mirrors)
+        got = PinnedMirror.get_all(*mirrors)
         np.testing.assert_array_equal(got[0], values)
         np.testing.assert_array_equal(got[1], 3 * [values[0] + 7.0])
         np.testing.assert_array_equal(other.get(), got[1])

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests.support import mutants, mutation
-from tests.support.survivors import SURVIVORS
-from tests.support.survivors.survivor import Survivor
+from tests.support.surviving_mutants import SURVIVORS
+from tests.support.surviving_mutants.survivor import Survivor
 
 pytest.importorskip("cosmic_ray", reason="cosmic-ray is part of the dev extra")
 SOURCE = """
@@ -73,10 +73,10 @@ def test_an_edited_file_has_no_mutants_of_its_old_text(room: Path) -> None:
 
 def test_the_nearest_test_comes_first() -> None:
     """By the imports that lead from a test to the module, over host code to its kernels; its own before others."""
-    nearest = ["tests/contact/test_points.py", "tests/contact/test_batch_contacts.py"]
-    assert mutants.tests_of("contact", "egs_warp/contact/points.py")[:2] == nearest
-    assert mutants.tests_of("fem", "egs_warp/kernels/fem/elasticity.py")[0] == "tests/fem/test_element_vectors.py"
-    for chosen in mutants.ROOMS:
+    nearest = ["tests/contact/test_selection.py", "tests/contact/test_batch_contacts.py"]
+    assert mutants.tests_of("contact", "egs_warp/contact/selection.py")[:2] == nearest
+    assert mutants.tests_of("fem", "egs_warp/kernels/fem/elasticity.py")[0] == "tests/fem/test_simd_elasticity.py"
+    for chosen in mutants.PACKAGES:
         assert len(mutants.tests_of(chosen, "")) == len(list((mutants.ROOT / "tests" / chosen).glob("test_*.py"))) > 3
 
 
@@ -96,7 +96,7 @@ def test_a_run_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.Monk
 
     def run(*extra: str) -> int:
         session, survivors = str(tmp_path / "session.jsonl"), str(tmp_path / "survivors.json")
-        command = ["mutation", "--rooms", "fem", "--count", "6", "--session", session, "--json", survivors, *extra]
+        command = ["mutation", "--packages", "fem", "--count", "6", "--session", session, "--json", survivors, *extra]
         monkeypatch.setattr("sys.argv", command)
         return mutation.main()
 

@@ -20,7 +20,7 @@ from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.muscles.muscle_set import automatic_muscles
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.muscles.tension import MuscleEnergy
 from tests.support.creatures import coarse_creature
 from tests.support.meshes import block_mesh, coarse_stool
 from tests.support.passive import passive_body
@@ -44,12 +44,12 @@ def drawn(count: int, **given_: st.SearchStrategy[Any]) -> Callable[[Callable[..
     return lambda law: profile(given(**given_)(law))
 
 
-def some_tension(shape: Shape, share: float) -> MuscleTension:
+def some_tension(shape: Shape, share: float) -> MuscleEnergy:
     """Random pulls, and pushes a third as strong, of muscles that fit the body."""
     body = shape.body()
     muscles = automatic_muscles(body.mesh, FLOOR.normal, body_weight=body.weight, height=body.height)
     pulls = np.random.default_rng(shape.seed).uniform(-share / 3.0, share, muscles.segment_count)
-    return MuscleTension.of(muscles, pulls * muscles.bounds)
+    return MuscleEnergy.of(muscles, pulls * muscles.bounds)
 
 
 @at_length
@@ -78,8 +78,8 @@ def test_both_momenta_of_free_flight(count: int) -> None:
 def spin_work(problem: StepProblem, result: CoupledResult) -> float:
     """Joules of the turn w x r that a step without muscles takes off its forces: w times the momentum, with the arms of
     the start, of the velocities at its end."""
-    given = problem.spin(problem.internal_gradient(result.velocities, None))
-    momenta = problem.mass * np.cross(problem.arms, result.velocities)
+    given = problem.momentum_correction(problem.internal_gradient(result.velocities, None))
+    momenta = problem.mass * np.cross(problem.lever_arms, result.velocities)
     return float(given @ momenta.sum(axis=0))
 
 
@@ -118,18 +118,18 @@ def test_contact_gives_no_energy_and_both_momenta_are_its_impulse(count: int) ->
             problem, result = thrown.advance(dt)
             end = thrown.state
             assert result.converged and body.assembly.determinants(end.positions).min() > 0.0
-            speeds = (result.contacts.frame @ result.velocities.ravel()).reshape(-1, 3)
+            speeds = (result.contacts.dense_jacobian @ result.velocities.ravel()).reshape(-1, 3)
             assert dt * float((result.forces * speeds).sum()) <= 1e-10 * unit
             energies = [body.mechanical_energy(state.positions, state.velocities) for state in (before, end)]
             assert energies[1] < energies[0] + max(spin_work(problem, result), 0.0) + 1e-9 * unit
-            pushes = (result.contacts.frame.T @ result.forces.ravel()).reshape(-1, 3)
+            pushes = (result.contacts.dense_jacobian.T @ result.forces.ravel()).reshape(-1, 3)
             gained = body.mass * (body.centre_of_mass(end.velocities) - body.centre_of_mass(before.velocities))
             impulse = dt * (pushes.sum(axis=0) + body.mass * body.gravity)
-            assert np.abs(gained - impulse).max() < 1e-10 * problem.unit
+            assert np.abs(gained - impulse).max() < 1e-10 * problem.residual_scale
             arms = before.positions - body.centre_of_mass(before.positions)
             spins = [body.angular_momentum(state.positions, state.velocities) for state in (before, end)]
             twist = dt * np.cross(arms, pushes).sum(axis=0)
-            assert np.abs(spins[1] - spins[0] - twist).max() < 1e-10 * problem.unit * body.height
+            assert np.abs(spins[1] - spins[0] - twist).max() < 1e-10 * problem.residual_scale * body.height
 
     law()
 
@@ -248,7 +248,7 @@ def test_no_element_is_inverted_in_2000_frames_of_random_activations(mesh: TetMe
     random, bounds, least = np.random.default_rng(7), made.stepper.muscles.bounds, np.inf
     for _ in range(2000):
         activations = random.uniform(-1.0, 1.0, len(bounds)) * bounds
-        state, memory, report = stepper.held_step(state, memory, activations, 1.0 / 60.0)
+        state, memory, report = stepper.step_with_activations(state, memory, activations, 1.0 / 60.0)
         assert report.converged and np.isfinite(state.velocities).all()
         least = min(least, stepper.body.assembly.determinants(state.positions).min())
         assert least > 0.0

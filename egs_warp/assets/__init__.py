@@ -3,10 +3,10 @@
 In: a name, a seed. Out: a cloud, its plane and cameras.
 """
 
+from egs_warp.assets.environments import SQUARE
 from egs_warp.assets.figurine import figurine
 from egs_warp.assets.object import BuiltInObject
 from egs_warp.assets.pawn import pawn
-from egs_warp.assets.rooms import SQUARE
 from egs_warp.assets.scene import BUILT_IN_SCENES, Scene, scene
 from egs_warp.assets.snake import snake
 from egs_warp.assets.stool import stool

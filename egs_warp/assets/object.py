@@ -37,7 +37,7 @@ class BuiltInObject:
         return self.plane.normal
 
 
-def light_and_paint(
+def shade_gaussians(
     samples: SurfaceSamples,
     vertices: np.ndarray,
     faces: np.ndarray,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from egs_warp.assets.object import BuiltInObject, light_and_paint
+from egs_warp.assets.object import BuiltInObject, shade_gaussians
 from egs_warp.assets.surface import SurfaceSamples
 from egs_warp.geometry.plane import Plane
 
@@ -38,7 +38,7 @@ def pawn(*, gaussian_count: int = 22000, seed: int = 0, device: str | None = Non
     samples = _turned_surface(gaussian_count, random)
     vertices, faces = _turned_mesh()
     albedo, gloss = _wood(samples.points)
-    cloud = light_and_paint(samples, vertices, faces, albedo, gloss, random=random, device=device)
+    cloud = shade_gaussians(samples, vertices, faces, albedo, gloss, random=random, device=device)
     return BuiltInObject("pawn", cloud, Plane(_UP, 0.0))
 
 

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from egs_warp.assets.environments import bedroom, chess_board, cloth_table
 from egs_warp.assets.figurine import figurine
 from egs_warp.assets.object import BuiltInObject
 from egs_warp.assets.pawn import pawn
-from egs_warp.assets.rooms import bedroom, chess_board, cloth_table
 from egs_warp.assets.snake import snake
 from egs_warp.assets.stool import stool
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
 
 
@@ -44,7 +44,7 @@ class Scene:
         """Object and room as one capture, and which of its Gaussians (n,) bool are the object's."""
         mask = np.zeros(self.object.count + self.background.count, bool)
         mask[: self.object.count] = True
-        return joined(self.object, self.background), mask
+        return concatenate(self.object, self.background), mask
 
     def camera(self, *, width: int = 512, height: int = 512) -> Camera:
         """The suggested camera."""

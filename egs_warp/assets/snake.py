@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from egs_warp.assets.object import BuiltInObject, light_and_paint
+from egs_warp.assets.object import BuiltInObject, shade_gaussians
 from egs_warp.assets.solids import ellipsoid, even_samples, smooth_union, surface_mesh
 from egs_warp.geometry.plane import Plane
 
@@ -19,7 +19,7 @@ def snake(*, gaussian_count: int = 22000, seed: int = 0, device: str | None = No
     vertices, faces = surface_mesh(_distance, _LOW, _HIGH, 0.012)
     samples = even_samples(_distance, vertices, faces, gaussian_count, random)
     albedo, gloss = _paint(samples.points)
-    cloud = light_and_paint(samples, vertices, faces, albedo, gloss, random=random, device=device)
+    cloud = shade_gaussians(samples, vertices, faces, albedo, gloss, random=random, device=device)
     return BuiltInObject("snake", cloud, Plane(_UP, 0.0))
 
 

@@ -18,7 +18,7 @@ from egs_warp.commands.flags import (
     parse_direction,
     parse_up,
 )
-from egs_warp.commands.scene_flags import add_flat_flag, add_object_flags, add_overwrite_flag, say, start
+from egs_warp.commands.scene_flags import add_flat_flag, add_object_flags, add_overwrite_flag, print_note, start_device
 from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
 
@@ -114,11 +114,11 @@ def _animate(chosen: argparse.Namespace) -> int:
 
     check_run_folder(chosen.out, overwrite=chosen.overwrite, writes=_WRITES)
     if chosen.config is not None and changed_capture(chosen.config, chosen.capture):
-        say(f"{chosen.capture} is not the file that the run of {chosen.config} had; the result will be another")
-    return animated(chosen)
+        print_note(f"{chosen.capture} is not the file that the run of {chosen.config} had; the result will be another")
+    return run_animate(chosen)
 
 
-def animated(chosen: argparse.Namespace) -> int:
+def run_animate(chosen: argparse.Namespace) -> int:
     """What ``egs-warp animate`` does once ``chosen.out`` is known to be free, or a run in it to go on; its status."""
     try:
         report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
@@ -129,7 +129,7 @@ def animated(chosen: argparse.Namespace) -> int:
         raise
     print(report.summary())
     print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz{more} into {chosen.out}")
-    return FALLEN if report.state.bad else 0
+    return FALLEN if report.state.is_failure else 0
 
 
 def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
@@ -146,7 +146,7 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
     asked = _asked(chosen)
     asked["shot"], behind = shot_of(chosen)
     ffmpeg_program()
-    start(chosen.device)
+    start_device(chosen.device)
     up = parse_up(chosen.up) if chosen.up is not None else None
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
@@ -156,7 +156,7 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
     if plane is None and up is None:
         up, note = guessed_up(capture)
         notes = (*notes, note)
-        say(note)
+        print_note(note)
     with run_folder(chosen.out, overwrite=chosen.overwrite, resume=chosen.resume) as run:
         run.begin_with(lambda: write_config(run.file(NAME), chosen, chosen.parser))
         report = animate(
@@ -180,7 +180,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     from egs_warp.io.run_folder import run_folder
     from egs_warp.io.video import ffmpeg_program
     from egs_warp.pipelines.animate import animate
-    from egs_warp.pipelines.front import mean_view
+    from egs_warp.pipelines.facing_direction import mean_view
     from egs_warp.pipelines.prepare_scene import SceneOptions, viewing_directions
 
     shot, behind = shot_of(chosen)
@@ -191,7 +191,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     asked = _asked(chosen)
     asked["shot"] = shot
     ffmpeg_program()
-    start(chosen.device)
+    start_device(chosen.device)
     inpainter = chosen_inpainter(chosen)
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     given = read_scene(chosen)
@@ -205,7 +205,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
         scene.write(run)
         pictures = _write_pictures(run, given, scene)
         for note in scene.notes:
-            say(note)
+            print_note(note)
         report = animate(
             scene.object,
             run,
@@ -225,17 +225,17 @@ def _write_pictures(run: RunFolder, given: SceneInput, scene: PreparedScene) -> 
     """Pictures that show whether each step has worked, as the steps' own commands write them; returns their names."""
     from egs_warp.inpainting.picture import before_and_after
     from egs_warp.io.video import write_png
-    from egs_warp.pipelines.doubts import doubts
     from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
+    from egs_warp.pipelines.segmentation_warnings import segmentation_warnings
 
     centre, size = scene.located.centre, scene.located.size
     cameras = picture_cameras(scene.plane, centre, size, given.cameras)
-    words = doubts(given.cloud, scene.located, scene.object, cameras)
+    words = segmentation_warnings(given.cloud, scene.located, scene.object, cameras)
     for line in words:
-        say(f"the object {line}")
+        print_note(f"the object {line}")
     pictures = {
         "plane.png": plane_picture(given.cloud, [scene.plane], cameras, centre=centre, size=size),
-        "segment.png": segmentation_picture(given.cloud, scene.object, scene.bare, cameras, words),
+        "segment.png": segmentation_picture(given.cloud, scene.object, scene.background_with_hole, cameras, words),
     }
     if scene.filled is not None:
         pictures["filled.png"] = before_and_after(scene.filled)

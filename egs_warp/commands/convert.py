@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from egs_warp.commands.flags import SPLAT_FILES, Commands, named_path
-from egs_warp.commands.scene_flags import say
+from egs_warp.commands.scene_flags import print_note
 from egs_warp.errors import UserError
 
 EXAMPLES = (
@@ -42,7 +42,7 @@ def _convert(chosen: argparse.Namespace) -> int:
 
     from egs_warp.geometry.gaussians import with_degree
     from egs_warp.io import read_capture, writable_folder
-    from egs_warp.io.losses import losses
+    from egs_warp.io.conversion_loss import conversion_loss
     from egs_warp.io.run_folder import check_no_file_of_a_run
     from egs_warp.io.sequence import numbered_captures
     from egs_warp.io.writing import WRITERS, writer_of
@@ -76,9 +76,9 @@ def _convert(chosen: argparse.Namespace) -> int:
             if not told:
                 notes = [f"{source}: {note}" for note in before.notes]
                 begins("compare")
-                told = losses(before, read_capture(target))
+                told = conversion_loss(before, read_capture(target))
     for note in notes:
-        say(note)
+        print_note(note)
     size, was = (sum(_size(pair[k]) for pair in pairs) for k in (1, 0))
     names = str(pairs[0][1]) if len(pairs) == 1 else f"{pairs[0][1]} to {pairs[-1][1].name}"
     print(f"wrote {names} ({size / 1e6:.2f} MB from {was / 1e6:.2f} MB)")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from egs_warp.commands.flags import Commands, guessed_up, named_path, parse_direction, parse_up
-from egs_warp.commands.scene_flags import say, start
+from egs_warp.commands.scene_flags import print_note, start_device
 
 EXAMPLES = ("pawn.ply", "chair.ply --up=-y --plot info.png", "toy.spz --front 0,0,1 --muscles own.json --plot info.png")
 
@@ -34,12 +34,12 @@ def _info(chosen: argparse.Namespace) -> int:
     from egs_warp.errors import UserError
     from egs_warp.io import read_capture
     from egs_warp.pipelines.animate import AnimateOptions
-    from egs_warp.pipelines.info import draw_info, look_into
+    from egs_warp.pipelines.info import draw_info, inspect_capture
     from egs_warp.pipelines.progress import info_bar
 
     if chosen.plot is not None and chosen.plot.suffix.lower() != ".png":
         raise UserError(f"--plot {chosen.plot}: give the name of a .png")
-    start("cpu")
+    start_device("cpu")
     options = AnimateOptions(metres_per_unit=chosen.metres_per_unit)
     up = parse_up(chosen.up) if chosen.up is not None else None
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
@@ -50,7 +50,7 @@ def _info(chosen: argparse.Namespace) -> int:
         up, note = guessed_up(capture)
         notes = (*notes, note)
     with info_bar() as begins:
-        info = look_into(
+        info = inspect_capture(
             capture.cloud,
             source=chosen.capture,
             up=up,
@@ -64,5 +64,5 @@ def _info(chosen: argparse.Namespace) -> int:
     print("\n".join(info.lines()))
     if chosen.plot is not None:
         draw_info(chosen.plot, info)
-        say(f"wrote {chosen.plot}")
+        print_note(f"wrote {chosen.plot}")
     return 0

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.flags import Commands, add_inpainter_flags, chosen_inpainter, named_path, parse_plane, seed
-from egs_warp.commands.scene_flags import add_overwrite_flag, start
+from egs_warp.commands.scene_flags import add_overwrite_flag, start_device
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def _inpaint(chosen: argparse.Namespace) -> int:
             "inpaint: say where the hole is by one of --object, --mask with --cameras, or --hole,"
             " or give the plane.json that segment wrote by --plane"
         )
-    start(chosen.device)
+    start_device(chosen.device)
     inpainter = chosen_inpainter(chosen, seed=chosen.seed)
     background = read_capture(chosen.background, device=chosen.device)
     hole = _hole(chosen, plane, recorded, background.cloud)

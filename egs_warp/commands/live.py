@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.flags import Commands, add_qp_flag, guessed_up, named_path, parse_direction, parse_up
-from egs_warp.commands.scene_flags import say, start
+from egs_warp.commands.scene_flags import print_note, start_device
 
 if TYPE_CHECKING:
     from egs_warp.web.server import PageServer
@@ -50,7 +50,7 @@ def add_parser(commands: Commands) -> None:
 
 def _live(chosen: argparse.Namespace) -> int:
     from egs_warp.io import read_capture
-    from egs_warp.launching import a_core_left
+    from egs_warp.launching import reserve_core
     from egs_warp.web.feed import LiveFeed
     from egs_warp.web.page import page_text
     from egs_warp.web.server import PageServer, check_port
@@ -58,12 +58,12 @@ def _live(chosen: argparse.Namespace) -> int:
     # What can be told at once, before any long work.
     page_text()
     check_port(chosen.port)
-    start(chosen.device)
+    start_device(chosen.device)
     behind = read_capture(chosen.background, device=chosen.device).cloud if chosen.background is not None else None
     session = _session(chosen)
     scene = session.creature.placed(behind) if behind is not None else None
     server = PageServer([], port=chosen.port, feed=LiveFeed(session, scene=scene))
-    with a_core_left():
+    with reserve_core():
         _serve(session, server, opens=not chosen.no_browser)
     return 0
 
@@ -92,7 +92,7 @@ def _session(chosen: argparse.Namespace) -> Session:
     from egs_warp.pipelines.creature import make_creature
     from egs_warp.pipelines.progress import preparation_bar
     from egs_warp.web.feed import drawn_creature
-    from egs_warp.web.rehearsal import split_for_life
+    from egs_warp.web.presplit import presplit_gaussians
     from egs_warp.web.session import Session, SessionOptions
 
     check_out(chosen.out)
@@ -106,7 +106,7 @@ def _session(chosen: argparse.Namespace) -> Session:
     capture = read_capture(chosen.capture, device=chosen.device)
     if plane is None and up is None:
         up, note = guessed_up(capture)
-        say(note)
+        print_note(note)
     with preparation_bar() as begins:
         creature = make_creature(
             capture.cloud,
@@ -122,8 +122,8 @@ def _session(chosen: argparse.Namespace) -> Session:
             progress=begins,
         )
         begins("split")
-        drawn_as = drawn_creature(creature, split_for_life(creature))
+        drawn_as = drawn_creature(creature, presplit_gaussians(creature))
     if front is None:
-        say(creature.front.told(creature.frame))
+        print_note(creature.front.told(creature.frame))
     made = SessionOptions(source=Path(chosen.capture).name, takes=chosen.out, muscles_file=chosen.muscles)
     return Session(creature, drawn_as, made)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from egs_warp.commands.flags import Commands, guessed_up, named_path, parse_up
-from egs_warp.commands.scene_flags import say, start
+from egs_warp.commands.scene_flags import print_note, start_device
 
 EXAMPLES = ("pawn.ply --plot muscles.png",)
 
@@ -35,22 +35,22 @@ def _muscles(chosen: argparse.Namespace) -> int:
     from egs_warp.geometry.body_frame import GROUND
     from egs_warp.io import read_capture
     from egs_warp.muscles.plot import check_picture_name, plot_muscles
-    from egs_warp.pipelines.creature import body_muscles, stand
+    from egs_warp.pipelines.creature import body_muscles, place_cage
     from egs_warp.pipelines.progress import info_bar
 
-    start("cpu")
+    start_device("cpu")
     check_picture_name(chosen.plot)
     up = parse_up(chosen.up) if chosen.up else None
     plane = plane_of(chosen.plane) if chosen.plane else None
     capture = read_capture(chosen.capture)
     for note in capture.notes:
-        say(note)
+        print_note(note)
     if plane is None and up is None:
         up, note = guessed_up(capture)
-        say(note)
+        print_note(note)
     with info_bar() as begins:
         begins("cage")
-        standing = stand(capture.cloud, up=up, plane=plane)
+        standing = place_cage(capture.cloud, up=up, plane=plane)
         begins("muscles")
         body = make_body(standing.cage.mesh, GROUND)
         muscles = body_muscles(body, chosen.muscles, standing.frame)

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import shrunk
+from egs_warp.geometry.camera import downscale
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.geometry.lens import Straightening
+from egs_warp.geometry.lens import Undistortion
 from egs_warp.io.cameras import PosedImage
 from egs_warp.io.limits import FURTHEST, check_pixels, picture_size, read_bytes
-from egs_warp.segmentation.carried_masks import masks_of_clicks, salient_masks
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.mask_model import OnnxClickModel, SalientModel
 from egs_warp.segmentation.object_spec import Box, ObjectSpec
+from egs_warp.segmentation.propagated_masks import masks_of_clicks, salient_masks
 from egs_warp.segmentation.votes import MaskedView
 
 MAX_MASK_SIDE = 800
@@ -63,7 +63,7 @@ def read_object(
         elif text == _SALIENT and not _is_there(text):
             found.append(_salient(cloud, posed, flag))
         else:
-            found.append(_place(text, posed, view, flag))
+            found.append(_parse_location(text, posed, view, flag))
     if len(found) > 1:
         raise UserError(
             f"{flag}: {len(found)} places, {given[0]} and others; give one, and clicks +u,v@photo beside it"
@@ -93,7 +93,7 @@ def _salient(cloud: GaussianCloud, posed: Sequence[PosedImage] | None, flag: str
     return ObjectSpec(masks=tuple(masks))
 
 
-def _place(text: str, posed: Sequence[PosedImage] | None, view: str | None, flag: str) -> ObjectSpec:
+def _parse_location(text: str, posed: Sequence[PosedImage] | None, view: str | None, flag: str) -> ObjectSpec:
     """Masks, a point or a box."""
     if _is_there(text):
         return ObjectSpec(masks=tuple(_read_masks(Path(text), posed, view)))
@@ -134,7 +134,7 @@ def _click(cloud: GaussianCloud, one: PosedImage, u: str, v: str, text: str, *, 
     except ValueError:
         raise UserError(f"--object {text}: {u},{v} is no pixel; {_HELP}") from None
     if one.lens is not None:
-        x, y = Straightening.of(camera, one.lens).pixel(x, y)
+        x, y = Undistortion.of(camera, one.lens).pixel(x, y)
     if not (0.0 <= x < camera.width and 0.0 <= y < camera.height):
         raise UserError(f"--object {text}: outside of the view's {camera.width} x {camera.height} pixels")
     found = click_at(cloud, camera, x, y, inside=inside)
@@ -183,8 +183,8 @@ def _read_masks(path: Path, posed: Sequence[PosedImage] | None, view: str | None
         mask = read_mask(file)
         if one.lens is not None:
             # Drawn on the photo as the lens bent it.
-            mask = Straightening.of(camera, one.lens).mask(mask)
-        small = shrunk(camera, MAX_MASK_SIDE)
+            mask = Undistortion.of(camera, one.lens).mask(mask)
+        small = downscale(camera, MAX_MASK_SIDE)
         factor = camera.width // small.width
         # The middle pixel of each block; a mask's edge is not known better than that.
         mask = mask[factor // 2 :: factor, factor // 2 :: factor][: small.height, : small.width]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from egs_warp.commands.flags import Commands
-from egs_warp.commands.scene_flags import add_scene_flags, say
+from egs_warp.commands.scene_flags import add_scene_flags, print_note
 
 EXAMPLES = ("room.ply --out out/plane",)
 
@@ -46,7 +46,7 @@ def _plane(chosen: argparse.Namespace) -> int:
             told("plane", 0.0)
             found = planes_of_scene(given, plane_mask=chosen.plane_mask, view=chosen.view, count=chosen.count)
         for note in (*given.notes, *found.notes):
-            say(note)
+            print_note(note)
         cameras = picture_cameras(found.planes[0], found.centre, found.size, given.cameras)
         picture = plane_picture(given.cloud, found.planes, cameras, centre=found.centre, size=found.size)
         found.write(run.file("plane.json"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from egs_warp.commands.animate import FALLEN, animated
+from egs_warp.commands.animate import FALLEN, run_animate
 from egs_warp.commands.config import NAME, changed_capture, with_config
 from egs_warp.commands.flags import Commands, named_path
 from egs_warp.errors import UserError
@@ -26,19 +26,19 @@ def add_parser(commands: Commands) -> None:
 
 
 def _resume(chosen: argparse.Namespace) -> int:
-    from egs_warp.io.run_folder import has_finished, tidy
+    from egs_warp.io.run_folder import clean_up, has_finished
     from egs_warp.io.text import parse_json, read_text
-    from egs_warp.pipelines.ending import State
+    from egs_warp.pipelines.end_state import State
     from egs_warp.pipelines.finished_run import PARTS
 
     folder: Path = chosen.folder
     if has_finished(folder):
         report = parse_json(read_text(folder / "report.json"), folder / "report.json")
-        tidy(folder, PARTS)
+        clean_up(folder, PARTS)
         print(f"{folder}: this run has finished")
         return (
             FALLEN
-            if isinstance(report, dict) and report.get("state") in [state.value for state in State if state.bad]
+            if isinstance(report, dict) and report.get("state") in [state.value for state in State if state.is_failure]
             else 0
         )
     flags = folder / NAME
@@ -49,4 +49,4 @@ def _resume(chosen: argparse.Namespace) -> int:
     run.resume = True
     if changed_capture(str(flags), run.capture):
         raise UserError(f"{run.capture}: is not the file that the run had; bring that back, or begin the run again")
-    return animated(run)
+    return run_animate(run)

@@ -56,15 +56,15 @@ def add_scene_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
 
 
-def start(device: str) -> None:
+def start_device(device: str) -> None:
     """Choose the device; says so where its kernels are still to be compiled, which takes a minute or two."""
     from egs_warp.launching import kernels_are_compiled, use_device
 
     use_device(device)
     if not kernels_are_compiled():
-        say("the first run on this machine compiles its kernels on the way, once")
+        print_note("the first run on this machine compiles its kernels on the way, once")
 
 
-def say(text: str) -> None:
+def print_note(text: str) -> None:
     """A line for the user, beside the command's output."""
     print(f"egs-warp: {text}", file=sys.stderr)

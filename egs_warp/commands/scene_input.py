@@ -12,7 +12,7 @@ import numpy as np
 
 from egs_warp.commands.flags import parse_plane, parse_up
 from egs_warp.commands.object_flag import read_object
-from egs_warp.commands.scene_flags import start
+from egs_warp.commands.scene_flags import start_device
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -87,7 +87,7 @@ def ground_of(text: str | None, *, flat: bool) -> HeightField | None:
 
 def read_scene(chosen: argparse.Namespace) -> SceneInput:
     """Read what the flags name. Raises ``UserError`` with one line for whatever is wrong."""
-    start(chosen.device)
+    start_device(chosen.device)
     up = parse_up(chosen.up) if chosen.up is not None else None
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
     capture = read_capture(chosen.capture, device=chosen.device)

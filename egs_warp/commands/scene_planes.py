@@ -16,7 +16,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import writable_folder
 from egs_warp.io.cameras import write_cameras
-from egs_warp.io.planes import KnownPlane, write_planes
+from egs_warp.io.planes import PlaneRecord, write_planes
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.io.video import write_png
 from egs_warp.pipelines.locate_plane import known_of_fit, locate_plane
@@ -30,7 +30,7 @@ from egs_warp.segmentation.seen_surface import SeenSurface
 class ScenePlanes:
     """What was found; scene units."""
 
-    known: list[KnownPlane]
+    known: list[PlaneRecord]
     """The one that was asked for, then others."""
     centre: np.ndarray
     """(3,) of the object, or of what the masks show."""
@@ -77,7 +77,7 @@ def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | No
         size = 2.0 * float(np.median(np.linalg.norm(points - centre, axis=1)))
         notes = ()
     others = further_planes(given.cloud, first.plane, size, count - 1) if count > 1 else []
-    known = [first, *(KnownPlane(one.plane, support=one.support) for one in others)]
+    known = [first, *(PlaneRecord(one.plane, support=one.support) for one in others)]
     if len(known) < count:
         notes = (*notes, f"{len(known)} of {count} planes found")
     return ScenePlanes(known, centre, size, notes)

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.flags import Commands
-from egs_warp.commands.scene_flags import add_flat_flag, add_scene_flags, say
+from egs_warp.commands.scene_flags import add_flat_flag, add_scene_flags, print_note
 
 if TYPE_CHECKING:
-    from egs_warp.segmentation.clearance import Clearing
+    from egs_warp.segmentation.clearance import StraddlingPolicy
 
 _WRITES = ("object.ply", "background.ply", "plane.json", "segment.png")
 EXAMPLES = (
@@ -37,11 +37,11 @@ def add_straddling_flag(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def clearing_of(chosen: argparse.Namespace) -> Clearing | None:
+def clearing_of(chosen: argparse.Namespace) -> StraddlingPolicy | None:
     """What ``--straddling`` asks for; None without it."""
-    from egs_warp.segmentation.clearance import Clearing
+    from egs_warp.segmentation.clearance import StraddlingPolicy
 
-    return Clearing(chosen.straddling) if chosen.straddling else None
+    return StraddlingPolicy(chosen.straddling) if chosen.straddling else None
 
 
 def _segment(chosen: argparse.Namespace) -> int:
@@ -50,9 +50,9 @@ def _segment(chosen: argparse.Namespace) -> int:
     from egs_warp.io.planes import read_planes
     from egs_warp.io.run_folder import check_run_folder, run_folder
     from egs_warp.io.video import write_png
-    from egs_warp.pipelines.doubts import doubts
     from egs_warp.pipelines.pictures import picture_cameras, segmentation_picture
     from egs_warp.pipelines.prepare_scene import SceneOptions
+    from egs_warp.pipelines.segmentation_warnings import segmentation_warnings
 
     if not chosen.object:
         raise UserError("segment: give --object: a mask, a point, a box or a pixel")
@@ -62,12 +62,12 @@ def _segment(chosen: argparse.Namespace) -> int:
     with run_folder(chosen.out, command="segment", overwrite=chosen.overwrite) as run:
         scene = given.prepared(SceneOptions(clearing=clearing_of(chosen), flat=chosen.flat, inpaint=False))
         for note in (*given.notes, *scene.notes):
-            say(note)
+            print_note(note)
         scene.write(run, known)
         cameras = picture_cameras(scene.plane, scene.located.centre, scene.located.size, given.cameras)
-        words = doubts(given.cloud, scene.located, scene.object, cameras)
+        words = segmentation_warnings(given.cloud, scene.located, scene.object, cameras)
         for line in words:
-            say(f"the object {line}")
+            print_note(f"the object {line}")
         picture = segmentation_picture(given.cloud, scene.object, scene.background, cameras, words)
         write_png(run.file("segment.png"), picture)
         run.finish()

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 import warp as wp
 
-from egs_warp.contact.coulomb import ASTRAY, ITERATIONS, SOFT, TOLERANCE
+from egs_warp.contact.coulomb import FAILURE_TOLERANCE, MAX_ITERATIONS, REGULARIZATION_STEPS, TOLERANCE
 from egs_warp.contact.detection import ContactGeometry
-from egs_warp.contact.points import ContactPoints
+from egs_warp.contact.selection import ContactSelector
 from egs_warp.errors import ArgumentError
-from egs_warp.fem.worlds import Worlds, indices, launch_on, shared, tiled
+from egs_warp.fem.batched import BatchedRecord, as_warp, launch_on, nonzero, repeat_offsets
 from egs_warp.kernels.contact import batch_contacts as kernels
 from egs_warp.kernels.contact import coulomb
 from egs_warp.kernels.contact.gaps import point_gaps_kernel
@@ -21,7 +21,7 @@ from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 
 @dataclass(frozen=True)
-class BatchContacts(Worlds):
+class BatchContacts(BatchedRecord):
     """The points that take part in one step of c worlds: in each the first of K places, the rest without weight."""
 
     points: torch.Tensor
@@ -40,50 +40,50 @@ class BatchContacts(Worlds):
     """(c, K) int64."""
 
     @property
-    def most(self) -> int:
+    def capacity(self) -> int:
         """K."""
         return self.points.shape[1]
 
     @property
-    def there(self) -> torch.Tensor:
+    def valid(self) -> torch.Tensor:
         """(c, K) bool: the places that are taken."""
-        return torch.arange(self.most, device=self.counts.device) < self.counts[:, None]
+        return torch.arange(self.capacity, device=self.counts.device) < self.counts[:, None]
 
     def _each(self) -> list[Any]:
         pairs = (self.counts, wp.int32), (self.nodes, wp.vec4i), (self.weights, Vec4), (self.axes, Mat33)
         return [(each.contiguous(), kind) for each, kind in pairs]
 
-    def rows(self, node_count: int) -> torch.Tensor:
+    def jacobian_transposed(self, node_count: int) -> torch.Tensor:
         """(c, 3N, 3K): each column the impulses on the nodes of one along an axis of a contact."""
-        rows = self.weights.new_zeros((len(self.counts), 3 * node_count, 3 * self.most))
-        self._launch(kernels.contact_rows_kernel, (len(rows), self.most), [], rows, real)
+        rows = self.weights.new_zeros((len(self.counts), 3 * node_count, 3 * self.capacity))
+        self._launch(kernels.contact_jacobian_kernel, (len(rows), self.capacity), [], rows, real)
         return rows
 
-    def speeds(self, velocities: torch.Tensor) -> torch.Tensor:
+    def contact_velocities(self, velocities: torch.Tensor) -> torch.Tensor:
         """(c, 3K, m) of the contacts at nodal ``velocities`` (c, 3N, m)."""
-        made = self.weights.new_empty((len(self.counts), 3 * self.most, velocities.shape[2]))
-        dim = (len(made), self.most, velocities.shape[2])
-        self._launch(kernels.contact_speeds_kernel, dim, [(velocities.contiguous(), real)], made, real)
+        made = self.weights.new_empty((len(self.counts), 3 * self.capacity, velocities.shape[2]))
+        dim = (len(made), self.capacity, velocities.shape[2])
+        self._launch(kernels.contact_velocities_kernel, dim, [(velocities.contiguous(), real)], made, real)
         return made
 
-    def pushes(self, forces: torch.Tensor, node_count: int) -> torch.Tensor:
+    def nodal_forces(self, forces: torch.Tensor, node_count: int) -> torch.Tensor:
         """(c, N, 3) newtons of ``forces`` (c, K, 3) along the contacts' axes."""
         made = self.weights.new_empty((len(self.counts), node_count, 3))
-        self._launch(kernels.contact_pushes_kernel, made.shape[:2], [(forces.contiguous(), Vec3)], made, Vec3)
+        self._launch(kernels.nodal_forces_kernel, made.shape[:2], [(forces.contiguous(), Vec3)], made, Vec3)
         return made
 
     def end_gaps(self, dt: float, velocities: torch.Tensor) -> torch.Tensor:
         """(c, K) metres after ``dt`` seconds at nodal end ``velocities`` (c, N, 3)."""
-        return self.gaps + dt * self.speeds(velocities.flatten(1)[:, :, None])[:, 0::3, 0]
+        return self.gaps + dt * self.contact_velocities(velocities.flatten(1)[:, :, None])[:, 0::3, 0]
 
     def _launch(self, kernel: Any, dim: tuple[int, ...], given: list[Any], made: torch.Tensor, kind: Any) -> None:
         if made.numel() > 0:
             launch_on(made.device, kernel, tuple(dim), inputs=[*self._each(), *given], outputs=[(made, kind)])
 
-    def widened(self, most: int) -> BatchContacts:
+    def with_capacity(self, most: int) -> BatchContacts:
         """With places for ``most``, at least as many as now."""
-        more = most - self.most
-        wide = {name: padded(value, more) for name, value in self.parts() if name != "counts"}
+        more = most - self.capacity
+        wide = {name: padded(value, more) for name, value in self.batched_fields() if name != "counts"}
         return replace(self, **wide)
 
 
@@ -95,20 +95,25 @@ def padded(values: torch.Tensor, more: int) -> torch.Tensor:
 class BatchDetector:
     """Gaps, and the choice of points, of at most ``count`` worlds: ``ContactDetector`` and ``ContactPoints``."""
 
-    def __init__(self, geometry: ContactGeometry, points: ContactPoints, count: int, *, device: torch.device) -> None:
+    def __init__(self, geometry: ContactGeometry, points: ContactSelector, count: int, *, device: torch.device) -> None:
         """Raises ``ArgumentError`` for ground that is not flat."""
         if geometry.field is not None:
             raise ArgumentError("geometry", "many worlds stand on flat ground only; run these over processes")
-        self.device, self.near, self.lower, self.alike = device, points.near, points.lower, points.alike
+        self.device, self.near, self.lower, self.alike = (
+            device,
+            points.activation_distance,
+            points.hysteresis,
+            points.gap_tolerance,
+        )
         self.point_count = len(geometry.tet_from_point)
         tet_count, node_count = len(geometry.mesh.tets), len(geometry.mesh.nodes)
         planes = np.array([[*plane.normal, plane.offset] for plane in geometry.planes])
         self._model = [
-            shared(tiled(geometry.mesh.tets, count, node_count, device), wp.vec4i),
-            shared(tiled(geometry.tet_from_point, count, tet_count, device), wp.int32),
-            shared(self._reals(geometry.weights).repeat(count, 1), Vec4),
-            shared(self._reals(planes), Vec4),
-            shared(torch.as_tensor(geometry.solid_of_each_plane, device=device), wp.int32),
+            as_warp(repeat_offsets(geometry.mesh.tets, count, node_count, device), wp.vec4i),
+            as_warp(repeat_offsets(geometry.tet_from_point, count, tet_count, device), wp.int32),
+            as_warp(self._reals(geometry.weights).repeat(count, 1), Vec4),
+            as_warp(self._reals(planes), Vec4),
+            as_warp(torch.as_tensor(geometry.solid_of_each_plane, device=device), wp.int32),
         ]
         self._cells = torch.as_tensor(points.cell_from_point.astype(np.int64), device=device)
         self._cell_count = int(points.cell_from_point.max()) + 1
@@ -134,7 +139,7 @@ class BatchDetector:
         )
         return gaps, faces.long()
 
-    def choose(
+    def select(
         self, previous: torch.Tensor, there: torch.Tensor, loaded: torch.Tensor, gaps: torch.Tensor
     ) -> torch.Tensor:
         """(c, P) bool, the points of the next step: ``ContactPoints.choose``. ``previous`` (c, K) were the last's,
@@ -149,11 +154,11 @@ class BatchDetector:
         chosen = lowest & ~held.gather(1, self._cells.expand_as(gaps))
         return chosen | (torch.zeros_like(gaps, dtype=torch.int32).scatter_reduce_(1, previous, kept.int(), "amax") > 0)
 
-    def deeper(self, contacts: BatchContacts, gaps: torch.Tensor, depth: float) -> torch.Tensor:
+    def find_deeper(self, contacts: BatchContacts, gaps: torch.Tensor, depth: float) -> torch.Tensor:
         """(c, P) bool: ``ContactPoints.deeper`` of these ``contacts`` at ``gaps`` (c, P)."""
         deep = gaps < -depth
         taken = torch.zeros_like(gaps, dtype=torch.int32)
-        taken.scatter_reduce_(1, contacts.points, contacts.there.int(), "amax")
+        taken.scatter_reduce_(1, contacts.points, contacts.valid.int(), "amax")
         return self._lowest(deep & (taken == 0), gaps)
 
     def _lowest(self, among: torch.Tensor, gaps: torch.Tensor) -> torch.Tensor:
@@ -196,21 +201,21 @@ class BatchDetector:
             at,
         )
 
-    def joined(
+    def append_contacts(
         self, contacts: BatchContacts, forces: torch.Tensor, added: BatchContacts
     ) -> tuple[BatchContacts, torch.Tensor]:
         """The ``added`` behind the ``contacts``, with ``forces`` (c, K, 3) of zero. Waits for the device."""
-        wide = contacts.widened(max(int((contacts.counts + added.counts).max()), contacts.most))
-        forces = padded(forces, wide.most - contacts.most)
-        world, place = added.there.nonzero(as_tuple=True)
+        wide = contacts.with_capacity(max(int((contacts.counts + added.counts).max()), contacts.capacity))
+        forces = padded(forces, wide.capacity - contacts.capacity)
+        world, place = added.valid.nonzero(as_tuple=True)
         at = contacts.counts.long()[world] + place
         counts = contacts.counts + added.counts
-        grown = {name: value.clone() for name, value in wide.parts() if name != "counts"}
+        grown = {name: value.clone() for name, value in wide.batched_fields() if name != "counts"}
         for name, value in grown.items():
             value[world, at] = getattr(added, name)[world, place]
         return replace(wide, counts=counts, **grown), forces
 
-    def matched(
+    def transfer_forces(
         self, contacts: BatchContacts, before: torch.Tensor, there: torch.Tensor, forces: torch.Tensor
     ) -> torch.Tensor:
         """(c, K, 3) the ``forces`` (c, L, 3) of the points ``before`` (c, L), where ``there`` (c, L), on those of them
@@ -219,10 +224,10 @@ class BatchDetector:
         world, place = there.nonzero(as_tuple=True)
         every[world, before[world, place]] = forces[world, place]
         now = every.gather(1, contacts.points[:, :, None].expand(-1, -1, 3))
-        return now * contacts.there[:, :, None]
+        return now * contacts.valid[:, :, None]
 
 
-def coulomb_forces_of_many(
+def coulomb_forces_batch(
     counts: torch.Tensor,
     delassus: torch.Tensor,
     free_velocity: torch.Tensor,
@@ -237,7 +242,7 @@ def coulomb_forces_of_many(
     if worlds == 0 or most == 0:
         return start.clone(), start.new_zeros(worlds)
     found, missed = _found(counts, delassus, free_velocity, shift, frictions, start)
-    astray = indices(missed > ASTRAY)
+    astray = nonzero(missed > FAILURE_TOLERANCE)
     if len(astray) == 0:
         return found, missed
     counts, operators, free, shift, frictions, forces = (
@@ -245,7 +250,7 @@ def coulomb_forces_of_many(
     )
     diagonal = operators.diagonal(dim1=1, dim2=2)
     mean = diagonal.sum(dim=1, keepdim=True) / (3 * counts[:, None])
-    for softness in (*SOFT, 0.0):
+    for softness in (*REGULARIZATION_STEPS, 0.0):
         soft = operators + torch.diag_embed((softness * mean).expand_as(diagonal))
         forces, left = _found(counts, soft, free, shift, frictions, forces)
     better = left < missed[astray]
@@ -276,7 +281,7 @@ def _found(
         inputs=[
             (counts, wp.int32),
             *((each.contiguous(), real) for each in given),
-            *(TOLERANCE, ITERATIONS),
+            *(TOLERANCE, MAX_ITERATIONS),
             *((forces.view(worlds, size), real), (vectors, real), (numbers, wp.int32), (matrices, Vec4)),
         ],
         outputs=[(missed, real)],

@@ -11,26 +11,26 @@ from typing import Protocol
 
 import torch
 
-from egs_warp.contact.batch_contacts import BatchContacts, BatchDetector, coulomb_forces_of_many, padded
+from egs_warp.contact.batch_contacts import BatchContacts, BatchDetector, coulomb_forces_batch, padded
 from egs_warp.contact.coupled_step import (
-    ADDED,
-    ANSWERED,
-    CREEPS,
-    JOINING,
-    PUSH_OUT,
-    ROUNDS,
-    SHORTEST,
-    SINKS,
-    UNANSWERED,
+    ACTIVATION_DEPTH,
+    ACTIVATION_RESIDUAL,
+    COULOMB_TOLERANCE,
+    MAX_ACTIVATION_ROUNDS,
+    MAX_COULOMB_FAILURES,
+    MAX_CREEP,
+    MAX_SINK,
+    MIN_STEP_LENGTH,
+    PUSH_OUT_FRACTION,
 )
-from egs_warp.contact.course import ITERATIONS
-from egs_warp.contact.response import SINGULAR
-from egs_warp.fem.batch_problem import BatchProblem, BatchTurning, inverse_of
-from egs_warp.fem.worlds import Worlds, indices
-from egs_warp.kernels.contact.course import MEMORY, SLOW
+from egs_warp.contact.newton import DELASSUS_REGULARIZATION
+from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS
+from egs_warp.fem.batch_problem import BatchMomentumProjection, BatchProblem, apply_inverse
+from egs_warp.fem.batched import BatchedRecord, nonzero
+from egs_warp.kernels.contact.newton_convergence import REFACTOR_RATIO, RESIDUAL_WINDOW
 
 
-class Stages(Protocol):
+class StageTimer(Protocol):
     """Whoever wants to know where the time goes."""
 
     def __call__(self, name: str) -> AbstractContextManager[object]:
@@ -38,16 +38,16 @@ class Stages(Protocol):
         ...
 
 
-def untimed(name: str) -> AbstractContextManager[object]:
+def no_timer(name: str) -> AbstractContextManager[object]:
     """``Stages`` of nobody."""
     return nullcontext()
 
 
 @dataclass(frozen=True)
-class BatchResponse(Worlds):
+class BatchLinearization(BatchedRecord):
     """``ContactResponse`` of c worlds, by the tangents in their slots."""
 
-    turning: BatchTurning
+    momentum_projection: BatchMomentumProjection
     columns: torch.Tensor
     """(c, 3N, 3K)."""
     delassus: torch.Tensor
@@ -55,7 +55,7 @@ class BatchResponse(Worlds):
 
 
 @dataclass(frozen=True)
-class BatchResult(Worlds):
+class BatchResult(BatchedRecord):
     """``CoupledResult`` of c worlds."""
 
     velocities: torch.Tensor
@@ -66,9 +66,9 @@ class BatchResult(Worlds):
     """(c,) bool."""
     iterations: torch.Tensor
     """(c,) int64."""
-    lost: torch.Tensor
+    is_singular: torch.Tensor
     """(c,) bool: a tangent had no factors, ``UnsolvableStepError``."""
-    joined: torch.Tensor
+    contacts_added: torch.Tensor
     """(c,) bool: it ended where points were found that are to join."""
 
 
@@ -83,30 +83,34 @@ class BatchSolver:
     """Metres."""
     tolerance: float
     """Residual over dt x weight."""
-    stages: Stages = untimed
+    stages: StageTimer = no_timer
 
-    def shift(self, contacts: BatchContacts, dt: float) -> torch.Tensor:
+    def normal_bias(self, contacts: BatchContacts, dt: float) -> torch.Tensor:
         """(c, K) m/s: ``push_out_speeds``."""
         gaps = contacts.gaps
-        deep = ((gaps + self.penetration_tolerance).clamp(max=0.0) * PUSH_OUT / dt).clamp(min=-self.push_out_cap)
-        return (gaps.clamp(min=0.0) / dt + deep) * contacts.there
+        deep = ((gaps + self.penetration_tolerance).clamp(max=0.0) * PUSH_OUT_FRACTION / dt).clamp(
+            min=-self.push_out_cap
+        )
+        return (gaps.clamp(min=0.0) / dt + deep) * contacts.valid
 
-    def respond(
-        self, problem: BatchProblem, contacts: BatchContacts, turning: BatchTurning | None = None
-    ) -> BatchResponse:
+    def linearize(
+        self, problem: BatchProblem, contacts: BatchContacts, turning: BatchMomentumProjection | None = None
+    ) -> BatchLinearization:
         """By the tangents in the worlds' slots, with their ``turning`` if it is known."""
         with self.stages("substitute"):
-            columns, turning = inverse_of(problem, problem.dt * contacts.rows(problem.positions.shape[1]), turning)
-        delassus = contacts.speeds(columns)
+            columns, turning = apply_inverse(
+                problem, problem.dt * contacts.jacobian_transposed(problem.positions.shape[1]), turning
+            )
+        delassus = contacts.contact_velocities(columns)
         diagonal = delassus.diagonal(dim1=1, dim2=2)
         mean = diagonal.sum(dim=1, keepdim=True) / (3 * contacts.counts[:, None]).clamp(min=1)
-        diagonal += SINGULAR * mean
-        return BatchResponse(turning, columns, delassus)
+        diagonal += DELASSUS_REGULARIZATION * mean
+        return BatchLinearization(turning, columns, delassus)
 
-    def forces(
+    def solve_coulomb(
         self,
         contacts: BatchContacts,
-        response: BatchResponse,
+        response: BatchLinearization,
         free: torch.Tensor,
         shift: torch.Tensor,
         frictions: torch.Tensor,
@@ -115,14 +119,14 @@ class BatchSolver:
         """``ContactResponse.forces``: (c, K, 3) newtons where the bodies move at ``free`` (c, N, 3) without, and (c,)
         m/s by which they miss the laws."""
         with self.stages("coulomb"):
-            speeds = contacts.speeds(free.flatten(1)[:, :, None])[:, :, 0]
-            return coulomb_forces_of_many(contacts.counts, response.delassus, speeds, shift, frictions, start)
+            speeds = contacts.contact_velocities(free.flatten(1)[:, :, None])[:, :, 0]
+            return coulomb_forces_batch(contacts.counts, response.delassus, speeds, shift, frictions, start)
 
     def solve(
         self,
         problem: BatchProblem,
         contacts: BatchContacts,
-        response: BatchResponse,
+        response: BatchLinearization,
         tensions: torch.Tensor,
         frictions: torch.Tensor,
         *,
@@ -141,129 +145,154 @@ class BatchSolver:
             *torch.zeros((2, count), dtype=torch.bool, device=velocities.device),
         )
         todo = every = torch.arange(count, device=velocities.device)
-        for number in range(ROUNDS):
-            part, touched = problem.kept(todo), contacts.kept(todo)
-            shift, gaps = self.shift(touched, problem.dt), start_gaps[0][todo]
-            task = _Task(part, touched, shift, tensions[todo], frictions[todo], gaps)
-            last = number == ROUNDS - 1
+        for number in range(MAX_ACTIVATION_ROUNDS):
+            part, touched = problem.subset(todo), contacts.subset(todo)
+            shift, gaps = self.normal_bias(touched, problem.dt), start_gaps[0][todo]
+            task = _RoundInputs(part, touched, shift, tensions[todo], frictions[todo], gaps)
+            last = number == MAX_ACTIVATION_ROUNDS - 1
             done, left = self._round(task, response, whole.velocities[todo], whole.forces[todo], last=last)
             done = replace(done, iterations=done.iterations + whole.iterations[todo])
-            whole.put(todo, done)
+            whole.scatter(todo, done)
             if last:
                 break
             with self.stages("detect"):
-                added, ends = self._added(task, done.velocities)
-            more = indices(added.any(dim=1) & (done.converged | done.joined))
+                added, ends = self._points_to_add(task, done.velocities)
+            more = nonzero(added.any(dim=1) & (done.converged | done.contacts_added))
             if len(more) == 0:
                 break
             new = self.detector.contacts(added[more], *(each[todo[more]] for each in start_gaps), order=ends[more])
-            grown, forces = self.detector.joined(touched.of(more), done.forces[more], new)
-            wider = grown.most - contacts.most
+            grown, forces = self.detector.append_contacts(touched.gather(more), done.forces[more], new)
+            wider = grown.capacity - contacts.capacity
             # A copy: those that were given stay as they are.
-            contacts = contacts.widened(grown.most).of(every)
+            contacts = contacts.with_capacity(grown.capacity).gather(every)
             whole = replace(whole, forces=padded(whole.forces, wider))
             todo = todo[more]
-            contacts.put(todo, grown)
+            contacts.scatter(todo, grown)
             whole.forces[todo] = forces
-            response = self.respond(problem.kept(todo), grown, left.turning.of(more))
+            response = self.linearize(problem.subset(todo), grown, left.momentum_projection.gather(more))
         return contacts, whole
 
-    def _added(self, task: _Task, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _points_to_add(self, task: _RoundInputs, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(c, P) bool: the points that would end too deep by ``velocities`` (c, N, 3); (c, P) metres, the gaps of all
         at the end."""
         gaps, _ = self.detector.gaps(task.problem.end_positions(velocities))
         tolerance = self.penetration_tolerance
-        allowed = torch.where(gaps < -tolerance, CREEPS * tolerance, SINKS * tolerance)
+        allowed = torch.where(gaps < -tolerance, MAX_CREEP * tolerance, MAX_SINK * tolerance)
         sinking = torch.where(gaps < task.start_gaps - allowed, gaps, 0.0)
-        return self.detector.deeper(task.contacts, sinking, ADDED * tolerance), gaps
+        return self.detector.find_deeper(task.contacts, sinking, ACTIVATION_DEPTH * tolerance), gaps
 
     def _round(
-        self, task: _Task, response: BatchResponse, velocities: torch.Tensor, forces: torch.Tensor, *, last: bool
-    ) -> tuple[BatchResult, BatchResponse]:
+        self,
+        task: _RoundInputs,
+        response: BatchLinearization,
+        velocities: torch.Tensor,
+        forces: torch.Tensor,
+        *,
+        last: bool,
+    ) -> tuple[BatchResult, BatchLinearization]:
         """Newton's method with the task's contacts, until points are found that are to join, but in the ``last`` round;
         the last tangents' response comes along."""
         with self.stages("elasticity"):
-            every = _Search.begin(velocities, forces, *task.missing(velocities, forces))
-        for iteration in range(1, ITERATIONS + 1):
-            active = indices(every.active)
+            every = _NewtonState.begin(velocities, forces, *task.contact_free_residual(velocities, forces))
+        for iteration in range(1, MAX_NEWTON_STEPS + 1):
+            active = nonzero(every.active)
             if len(active) == 0:
                 break
-            part, search = task.kept(active), every.kept(active)
+            part, search = task.subset(active), every.subset(active)
             search.iterations.fill_(iteration)
-            slow = self._step(part, search, response.kept(active), first=iteration == 1)
-            looking = indices(search.near)
+            slow = self._newton_step(part, search, response.subset(active), first=iteration == 1)
+            looking = nonzero(search.is_near_end)
             if len(looking) > 0 and not last:
-                self._look(part.kept(looking), search, looking)
-            fresh = indices(slow & search.active)
+                self._check_penetration(part.subset(looking), search, looking)
+            fresh = nonzero(slow & search.active)
             if len(fresh) > 0:
-                again = part.kept(fresh)
+                again = part.subset(fresh)
                 with self.stages("factor"):
                     factored = again.problem.factor(search.velocities[fresh], again.tensions)
-                response.put(active[fresh], self.respond(again.problem, again.contacts))
-                search.fresh[fresh] = True
-                search.lost[fresh] = ~factored
+                response.scatter(active[fresh], self.linearize(again.problem, again.contacts))
+                search.tangent_is_current[fresh] = True
+                search.is_singular[fresh] = ~factored
                 search.active[fresh] = factored
             if search is not every:
-                every.put(active, search)
-        ends = every.velocities, every.forces, every.converged, every.iterations, every.lost, every.joined
+                every.scatter(active, search)
+        ends = (
+            every.velocities,
+            every.forces,
+            every.converged,
+            every.iterations,
+            every.is_singular,
+            every.contacts_added,
+        )
         return BatchResult(*ends), response
 
-    def _look(self, task: _Task, search: _Search, places: torch.Tensor) -> None:
+    def _check_penetration(self, task: _RoundInputs, search: _NewtonState, places: torch.Tensor) -> None:
         """Whether points are to join in the worlds of the ``task``, which are at ``places`` of the ``search``."""
         with self.stages("detect"):
-            added, _ = self._added(task, search.velocities[places])
+            added, _ = self._points_to_add(task, search.velocities[places])
         joined = added.any(dim=1)
-        search.joined[places], search.active[places] = joined, ~joined
+        search.contacts_added[places], search.active[places] = joined, ~joined
 
-    def _step(self, task: _Task, search: _Search, response: BatchResponse, *, first: bool) -> torch.Tensor:
+    def _newton_step(
+        self, task: _RoundInputs, search: _NewtonState, response: BatchLinearization, *, first: bool
+    ) -> torch.Tensor:
         """One Newton step of each world in ``search``, which has it then; (c,) bool, where the tangent is to be made
         anew."""
         problem = task.problem
-        answered = ANSWERED * problem.unit / problem.common.body.mass
+        answered = COULOMB_TOLERANCE * problem.residual_scale / problem.body.body.mass
         with self.stages("substitute"):
-            moved, _ = inverse_of(problem, search.free.flatten(1)[:, :, None], response.turning)
+            moved, _ = apply_inverse(
+                problem, search.contact_free_residual.flatten(1)[:, :, None], response.momentum_projection
+            )
         loose = search.velocities - moved.view_as(search.velocities)
-        wanted, missed = self.forces(task.contacts, response, loose, task.shift, task.frictions, search.forces)
+        wanted, missed = self.solve_coulomb(
+            task.contacts, response, loose, task.normal_bias, task.frictions, search.forces
+        )
         unanswered = missed > answered
-        search.unanswered.add_(unanswered)
+        search.coulomb_failures.add_(unanswered)
         pushed = (response.columns @ wanted.flatten(1)[:, :, None]).view_as(loose)
         change, turned = loose + pushed - search.velocities, wanted - search.forces
-        before = search.size.clone()
+        before = search.residual_norm.clone()
         better, whole = torch.zeros((2, len(before)), dtype=torch.bool, device=before.device)
-        most = search.recent.amax(dim=1)
+        most = search.recent_residuals.amax(dim=1)
         most = torch.where(most >= 0.0, most, torch.inf)
         waiting, length = torch.arange(len(before), device=before.device), 1.0
-        while length > SHORTEST and len(waiting) > 0:
+        while length > MIN_STEP_LENGTH and len(waiting) > 0:
             trial = search.velocities[waiting] + length * change[waiting]
             trial_forces = search.forces[waiting] + length * turned[waiting]
             with self.stages("elasticity"):
-                free, size = task.kept(waiting).missing(trial, trial_forces)
+                free, size = task.subset(waiting).contact_free_residual(trial, trial_forces)
             least = ((1.0 - 1e-4 * length) * most[waiting]).clamp(min=self.tolerance)
             good = size.isfinite() & (size < least) if not first else size.isfinite()
             at = waiting[good]
             better[at] = True
             whole[at] = length == 1.0
             search.velocities[at], search.forces[at] = trial[good], trial_forces[good]
-            search.free[at], search.size[at] = free[good], size[good]
+            search.contact_free_residual[at], search.residual_norm[at] = free[good], size[good]
             waiting, length = waiting[~good], 0.5 * length
-        recent = torch.cat([search.recent[:, 1:], search.size[:, None]], dim=1)
-        search.recent.copy_(torch.where(better[:, None], recent, search.recent))
-        search.converged.copy_(whole & (search.size <= self.tolerance) & ~unanswered)
-        search.near.copy_(whole & (before > JOINING) & (search.size <= JOINING) & ~unanswered & ~search.converged)
-        given_up = (~better & search.fresh) | (search.unanswered > UNANSWERED)
+        recent = torch.cat([search.recent_residuals[:, 1:], search.residual_norm[:, None]], dim=1)
+        search.recent_residuals.copy_(torch.where(better[:, None], recent, search.recent_residuals))
+        search.converged.copy_(whole & (search.residual_norm <= self.tolerance) & ~unanswered)
+        search.is_near_end.copy_(
+            whole
+            & (before > ACTIVATION_RESIDUAL)
+            & (search.residual_norm <= ACTIVATION_RESIDUAL)
+            & ~unanswered
+            & ~search.converged
+        )
+        given_up = (~better & search.tangent_is_current) | (search.coulomb_failures > MAX_COULOMB_FAILURES)
         search.active.copy_(~search.converged & ~given_up)
-        search.fresh.fill_(False)
+        search.tangent_is_current.fill_(False)
         slow = ~better | ~whole | unanswered
-        return slow if first else slow | (search.size > SLOW * before)
+        return slow if first else slow | (search.residual_norm > REFACTOR_RATIO * before)
 
 
 @dataclass(frozen=True)
-class _Task(Worlds):
+class _RoundInputs(BatchedRecord):
     """What a round of c worlds is asked."""
 
     problem: BatchProblem
     contacts: BatchContacts
-    shift: torch.Tensor
+    normal_bias: torch.Tensor
     """(c, K) m/s."""
     tensions: torch.Tensor
     """(c, M) newtons."""
@@ -272,51 +301,55 @@ class _Task(Worlds):
     start_gaps: torch.Tensor
     """(c, P) metres."""
 
-    def missing(self, velocities: torch.Tensor, forces: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def contact_free_residual(
+        self, velocities: torch.Tensor, forces: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """(c, N, 3) N s, the residual without contact at ``velocities`` (c, N, 3), and (c,) the size of that with
         ``forces`` (c, K, 3), over dt x weight."""
         problem = self.problem
         free = problem.residual(velocities, self.tensions)
-        rest = free - problem.dt * self.contacts.pushes(forces, velocities.shape[1])
-        return free, rest.flatten(1).norm(dim=1) / problem.unit
+        rest = free - problem.dt * self.contacts.nodal_forces(forces, velocities.shape[1])
+        return free, rest.flatten(1).norm(dim=1) / problem.residual_scale
 
 
 @dataclass(frozen=True)
-class _Search(Worlds):
+class _NewtonState(BatchedRecord):
     """Where Newton's method is in each of c worlds; written in place."""
 
     velocities: torch.Tensor
     """(c, N, 3) m/s."""
     forces: torch.Tensor
     """(c, K, 3) newtons."""
-    free: torch.Tensor
+    contact_free_residual: torch.Tensor
     """(c, N, 3) N s, the residual without contact."""
-    size: torch.Tensor
+    residual_norm: torch.Tensor
     """(c,) of the residual with it, over dt x weight."""
-    recent: torch.Tensor
+    recent_residuals: torch.Tensor
     """(c, MEMORY) sizes of the last steps; -1 where there was none."""
-    unanswered: torch.Tensor
+    coulomb_failures: torch.Tensor
     """(c,) int64: how often forces missed their laws."""
     iterations: torch.Tensor
     """(c,) int64."""
     active: torch.Tensor
     """(c,) bool."""
-    fresh: torch.Tensor
+    tangent_is_current: torch.Tensor
     """(c,) bool: the tangent is that of the velocities."""
     converged: torch.Tensor
     """(c,) bool."""
-    lost: torch.Tensor
+    is_singular: torch.Tensor
     """(c,) bool."""
-    near: torch.Tensor
+    is_near_end: torch.Tensor
     """(c,) bool: by its last step the end is known well enough to look for points that are to join."""
-    joined: torch.Tensor
+    contacts_added: torch.Tensor
     """(c,) bool: there were some."""
 
     @classmethod
-    def begin(cls, velocities: torch.Tensor, forces: torch.Tensor, free: torch.Tensor, size: torch.Tensor) -> _Search:
+    def begin(
+        cls, velocities: torch.Tensor, forces: torch.Tensor, free: torch.Tensor, size: torch.Tensor
+    ) -> _NewtonState:
         """All worlds are to go."""
         count, device = len(size), size.device
         numbers = torch.zeros((2, count), dtype=torch.int64, device=device)
         flags = torch.zeros((6, count), dtype=torch.bool, device=device)
         flags[0] = True
-        return cls(velocities, forces, free, size, size.new_full((count, MEMORY), -1.0), *numbers, *flags)
+        return cls(velocities, forces, free, size, size.new_full((count, RESIDUAL_WINDOW), -1.0), *numbers, *flags)

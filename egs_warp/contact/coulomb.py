@@ -9,14 +9,14 @@ import warp as wp
 
 from egs_warp.kernels.contact import coulomb as kernels
 from egs_warp.kernels.contact.coulomb_equations import Contacts
-from egs_warp.launching import kept_by_thread
+from egs_warp.launching import thread_local_cache
 from egs_warp.precision import Vec4, real
 
-TOLERANCE, ITERATIONS = 1e-12, 16
+TOLERANCE, MAX_ITERATIONS = 1e-12, 16
 """m/s by which forces may miss the laws, and steps of Newton's method until they do."""
-ASTRAY = 1e-8
+FAILURE_TOLERANCE = 1e-8
 """m/s: forces that miss the laws by more are sought by another way."""
-SOFT = (1e-4, 1e-5, 1e-6, 1e-7)
+REGULARIZATION_STEPS = (1e-4, 1e-5, 1e-6, 1e-7)
 """Of the mean of the operator's diagonal: what is added to it on that way, on which the forces of one are the start of
 the next. Many points on few nodes leave an operator next to singular, and from most starts no way to the forces that
 obey the laws; where contacts give way by so little there is one."""
@@ -30,7 +30,7 @@ def coulomb_forces(
     start: np.ndarray,
     *,
     tolerance: float = TOLERANCE,
-    iteration_limit: int = ITERATIONS,
+    iteration_limit: int = MAX_ITERATIONS,
 ) -> tuple[np.ndarray, float]:
     """Forces f (n, 3) with 0 <= f_n, 0 <= u_n + shift, complementary, and exact Coulomb friction; u = free + G f
     (Eq. 8, 9).
@@ -43,18 +43,18 @@ def coulomb_forces(
     if count == 0:
         return start, 0.0
     room = _room(count, tolerance, iteration_limit)
-    found, missed = room.found(delassus, free_velocity, shift, friction, start)
-    if missed <= ASTRAY:
+    found, missed = room.solve(delassus, free_velocity, shift, friction, start)
+    if missed <= FAILURE_TOLERANCE:
         return found, missed
     forces, left = start, missed
-    for softness in (*SOFT, 0.0):
+    for softness in (*REGULARIZATION_STEPS, 0.0):
         soft = delassus.copy()
         soft[np.diag_indices_from(soft)] += softness * delassus.diagonal().mean()
-        forces, left = room.found(soft, free_velocity, shift, friction, forces)
+        forces, left = room.solve(soft, free_velocity, shift, friction, forces)
     return (forces, left) if left < missed else (found, missed)
 
 
-class _Room:
+class _CoulombWorkspace:
     """Memory for a problem of so many contacts, and a launch that is made again and again: a new one costs as much as
     the forces of ten contacts."""
 
@@ -75,7 +75,7 @@ class _Room:
             record_cmd=True,
         )
 
-    def found(
+    def solve(
         self, delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray
     ) -> tuple[np.ndarray, float]:
         """See ``coulomb_forces``."""
@@ -85,14 +85,18 @@ class _Room:
         return self._forces.reshape(-1, 3).copy(), float(self._residual[0])
 
 
-_room = kept_by_thread(32)(_Room)
+_room = thread_local_cache(32)(_CoulombWorkspace)
 
 
-def contacts_of(delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float) -> Any:
+def pack_contacts(delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float) -> Any:
     """The kernels' ``Contacts``, where they lie in the arrays: see ``coulomb_forces``."""
     contacts = Contacts()
     contacts.count, contacts.friction = len(shift), friction
-    contacts.delassus, contacts.free, contacts.shifts = _shared(delassus), _shared(free_velocity), _shared(shift)
+    contacts.delassus, contacts.free_velocity, contacts.normal_bias = (
+        _shared(delassus),
+        _shared(free_velocity),
+        _shared(shift),
+    )
     return contacts
 
 

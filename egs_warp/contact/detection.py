@@ -19,14 +19,14 @@ from egs_warp.errors import ArgumentError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
-from egs_warp.geometry.rows import distinct_rows
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.geometry.unique_rows import distinct_rows
 from egs_warp.kernels.contact import gaps as kernels
 from egs_warp.kernels.contact.height_field import ground_gaps_kernel
-from egs_warp.launching import Mirror, launch_again
+from egs_warp.launching import PinnedMirror, launch_cached
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
-LEAST_OUTSIDE = 0.1
+MIN_OUTSIDE_FRACTION = 0.1
 """Share of the Gaussians above the ground that are outside of all solids at rest."""
 _SHORTENINGS = 40
 """Halvings in which an arm finds where it meets uneven ground."""
@@ -52,9 +52,9 @@ class ContactGeometry:
     """(P,) int32, tetrahedron of each point kept."""
     weights: np.ndarray
     """(P, 4) float64, barycentric weights in it (Eq. 2)."""
-    left_out: int
+    excluded_count: int
     """Gaussians whose mean lies below a plane at rest."""
-    left_out_opacity: float
+    excluded_opacity: float
     """Their share of the opacity mass."""
     solid_from_plane: tuple[int, ...] = ()
     """Which solid each plane is a face of, in ascending order; empty: each is a half space of its own."""
@@ -96,7 +96,7 @@ class ContactSet:
         return len(self.points)
 
     @cached_property
-    def rows(self) -> sparse.csr_matrix:
+    def jacobian(self) -> sparse.csr_matrix:
         """(3n, 3N): rows 3i, 3i+1, 3i+2 give the velocity of contact i along its normal and two tangents."""
         shares = self.weights[:, None, :, None] * self.axes[:, :, None]
         places = 3 * self.nodes[:, None, :, None] + np.arange(3, dtype=np.int32)
@@ -105,32 +105,32 @@ class ContactSet:
         return sparse.csr_matrix((shares.reshape(-1), indices, offsets), (3 * self.count, 3 * self.node_count))
 
     @cached_property
-    def _columns(self) -> sparse.csc_matrix:
-        return self.rows.T
+    def _jacobian_columns(self) -> sparse.csc_matrix:
+        return self.jacobian.T
 
     @property
-    def frame(self) -> np.ndarray:
+    def dense_jacobian(self) -> np.ndarray:
         """(3n, 3N) ``rows`` with their zeros."""
-        return self.rows.toarray()
+        return self.jacobian.toarray()
 
     @property
-    def nearest(self) -> np.ndarray:
+    def nearest_nodes(self) -> np.ndarray:
         """(n,) the node that each point goes with most."""
         return self.nodes[np.arange(self.count), np.argmax(self.weights, axis=1)]
 
-    def speeds(self, velocities: np.ndarray) -> np.ndarray:
+    def contact_velocities(self, velocities: np.ndarray) -> np.ndarray:
         """``rows`` times nodal velocities (3N,) or (3N, k)."""
-        return self.rows @ velocities
+        return self.jacobian @ velocities
 
-    def pushes(self, forces: np.ndarray) -> np.ndarray:
+    def nodal_forces(self, forces: np.ndarray) -> np.ndarray:
         """(3N,) ``rows`` transposed times ``forces`` (n, 3), newtons on each node's axes."""
-        return self._columns @ forces.ravel()
+        return self._jacobian_columns @ forces.ravel()
 
     def end_gaps(self, dt: float, velocities: np.ndarray) -> np.ndarray:
         """(n,) gap after a step of ``dt`` with nodal end velocities (N, 3), to the tangent plane of the start where the
         ground is not flat.
         """
-        return self.gaps + dt * self.speeds(velocities.ravel())[0::3]
+        return self.gaps + dt * self.contact_velocities(velocities.ravel())[0::3]
 
 
 def contact_geometry(
@@ -165,7 +165,7 @@ def contact_geometry(
     # Of a base that is flat many means and arms lie in the plane, to rounding: none of them is below it.
     slack = 0.0 if grid is None else _SLACK * grid
     above = np.all([ground.heights(means) >= -slack for ground in grounds], axis=0)
-    least = LEAST_OUTSIDE * np.count_nonzero(above)
+    least = MIN_OUTSIDE_FRACTION * np.count_nonzero(above)
     for number, solid in enumerate(solids, start=1):
         above &= np.any([face.heights(means) >= -slack for face in solid.faces], axis=0)
         if np.count_nonzero(above) < least:
@@ -282,11 +282,11 @@ class ContactDetector:
         self._corners = wp.array(geometry.mesh.tets[geometry.tet_from_point], dtype=wp.vec4i, device=device)
         self._heights = wp.zeros(len(rows) * len(geometry.mesh.nodes), dtype=real, device=device)
         self._positions = wp.zeros(len(geometry.mesh.nodes), dtype=Vec3, device=device)
-        self._positions_here = Mirror(self._positions)
+        self._positions_here = PinnedMirror(self._positions)
         count = len(geometry.tet_from_point)
         self._gaps = wp.zeros(count, dtype=real, device=device)
         self._nearest = wp.zeros(count, dtype=int, device=device)
-        self._gaps_here, self._nearest_here = Mirror(self._gaps), Mirror(self._nearest)
+        self._gaps_here, self._nearest_here = PinnedMirror(self._gaps), PinnedMirror(self._nearest)
         self._frames = np.array([[plane.normal, *plane.tangents()] for plane in geometry.planes]).reshape(-1, 3, 3)
         self._only_face: np.ndarray | None = None
         if len(geometry.planes) == 1:
@@ -313,7 +313,7 @@ class ContactDetector:
         self.enqueue_gaps(self._positions, self._gaps, self._nearest)
         nearest = self._only_face
         if nearest is None:
-            gaps, nearest = Mirror.get_all(self._gaps_here, self._nearest_here)
+            gaps, nearest = PinnedMirror.get_all(self._gaps_here, self._nearest_here)
             nearest.flags.writeable = False
         else:
             gaps = self._gaps_here.get()
@@ -325,12 +325,14 @@ class ContactDetector:
         solids, outputs = [self._planes, self._solids, positions], [gaps, nearest]
         if self.device.is_cpu:
             inputs = [self._corners, self._weights, *solids]
-            launch_again(
+            launch_cached(
                 kernels.all_gaps_kernel, 1, inputs=inputs, outputs=[self._heights, *outputs], device=self.device
             )
         else:
             inputs = [self._tets, self._tet_from_point, self._weights, *solids]
-            launch_again(kernels.point_gaps_kernel, len(self._gaps), inputs=inputs, outputs=outputs, device=self.device)
+            launch_cached(
+                kernels.point_gaps_kernel, len(self._gaps), inputs=inputs, outputs=outputs, device=self.device
+            )
         if self._field:
             wp.launch(
                 ground_gaps_kernel,

@@ -21,7 +21,7 @@ MOST_FACES = 64
 class Surface(Protocol):
     """Something to stand on: a ``Solid`` or a ``HeightField``."""
 
-    def top(self, point: np.ndarray, up: np.ndarray) -> float:
+    def distance_along(self, point: np.ndarray, up: np.ndarray) -> float:
         """How far along ``up`` (3,) from ``point`` (3,) it ends; -inf where it is not above or below the point."""
         ...
 
@@ -37,7 +37,7 @@ class Solid:
         """The same solid after all lengths are multiplied by ``factor``."""
         return Solid(tuple(face.scaled(factor) for face in self.faces))
 
-    def top(self, point: np.ndarray, up: np.ndarray) -> float:
+    def distance_along(self, point: np.ndarray, up: np.ndarray) -> float:
         """How far along ``up`` (3,) from ``point`` (3,) the solid ends;
         -inf where it is not above or below the point.
         """
@@ -93,4 +93,4 @@ def _is_face(face: object) -> bool:
 
 def surface_above(solids: Sequence[Surface], point: np.ndarray, up: np.ndarray) -> float:
     """How far along ``up`` (3,) from ``point`` (3,) the highest surface is; -inf over nothing."""
-    return max((solid.top(point, up) for solid in solids), default=-np.inf)
+    return max((solid.distance_along(point, up) for solid in solids), default=-np.inf)

@@ -12,7 +12,7 @@ import warp as wp
 from egs_warp.deformation.embedding import CageLocator, GaussianEmbedding
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.kernels.deformation import carried_cage
+from egs_warp.kernels.deformation import cage_maps
 from egs_warp.kernels.deformation import deformer as kernels
 from egs_warp.kernels.deformation import deformer_cuda as kernels_cuda
 from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
@@ -34,7 +34,7 @@ class DeformedGaussians:
 
     cloud: GaussianCloud
     """(n,) at their new places. ``opacity_logits`` is the rest cloud's own array."""
-    turns: wp.array
+    rotations: wp.array
     """(n,) vec4, unit quaternions w, x, y, z:
     the rotation R_polar of F by which each Gaussian and its colour were turned.
     """
@@ -52,7 +52,7 @@ class BendMeasure:
     """(n, 3) metres: what the affine F leaves out along each axis, at one standard deviation from the mean."""
 
 
-class CageCarrier:
+class CageMaps:
     """The map of every tetrahedron of a cage, frame after frame, in the same arrays."""
 
     def __init__(self, cage: CageLocator) -> None:
@@ -60,15 +60,15 @@ class CageCarrier:
         tet_count = len(cage.mesh.tets)
         with wp.ScopedDevice(cage.device):
             self._rest = wp.array(cage.mesh.nodes, dtype=Vec3)
-            self._carried = carried_cage.CarriedCage()
+            self._carried = cage_maps.CageMaps()
             self._carried.maps = empty(3 * tet_count, wp.vec4, cage.device)
             self._carried.frames = empty(2 * tet_count, wp.vec4, cage.device)
 
-    def carry(self, positions: wp.array | np.ndarray) -> Any:
+    def update(self, positions: wp.array | np.ndarray) -> Any:
         """A ``CarriedCage`` for node ``positions``, as for ``Deformer.deform``."""
         cage, device = self._cage, self._cage.device
         launch_rows(
-            carried_cage.carry_tets_kernel,
+            cage_maps.carry_tets_kernel,
             len(cage.mesh.tets),
             inputs=[
                 node_positions(positions, len(cage.mesh.nodes), device),
@@ -91,14 +91,14 @@ class Deformer:
         self.embedding = embedding
         self.max_stretch = max_stretch
         self._degree = cloud.sh_degree
-        self._carrier = CageCarrier(embedding.cage)
+        self._carrier = CageMaps(embedding.cage)
         with wp.ScopedDevice(cloud.device):
-            self.plan = carried_cage.ArmPlan()
+            self.plan = cage_maps.ArmPlan()
             """What each Gaussian asks of the cage, the same in every frame."""
             self.plan.mean_tets = empty(cloud.count, wp.int32, cloud.device)
             self.plan.end_tets = empty((6, cloud.count), wp.int32, cloud.device)
-            self.plan.shares = empty((6, cloud.count), wp.float32, cloud.device)
-            self.plan.bulges = empty((3, cloud.count), wp.float32, cloud.device)
+            self.plan.inside_fractions = empty((6, cloud.count), wp.float32, cloud.device)
+            self.plan.smoothing_lengths = empty((3, cloud.count), wp.float32, cloud.device)
             self._deformed = DeformedGaussians(
                 GaussianCloud(
                     means=wp.empty_like(cloud.means),
@@ -108,11 +108,11 @@ class Deformer:
                     # Band 0 never changes; without higher bands the colour is the rest cloud's own.
                     sh=wp.clone(cloud.sh) if self._degree else cloud.sh,
                 ),
-                turns=empty(cloud.count, wp.vec4, cloud.device),
+                rotations=empty(cloud.count, wp.vec4, cloud.device),
             )
         points, cage = embedding.points, embedding.cage
         launch_rows(
-            carried_cage.plan_arms_kernel,
+            cage_maps.plan_arms_kernel,
             cloud.count,
             inputs=[
                 cloud.rotations,
@@ -132,7 +132,7 @@ class Deformer:
         """The cloud for node positions (N, 3) or (N,) vec3d, metres (Eq. 14, 15); the next call overwrites it."""
         deformed, cloud, rest = self._deformed, self._deformed.cloud, self.rest
         inputs = self._carrying_inputs(positions)
-        outputs = [cloud.means, cloud.rotations, cloud.log_scales, deformed.turns]
+        outputs = [cloud.means, cloud.rotations, cloud.log_scales, deformed.rotations]
         if rest.device.is_cuda and self._degree == 3:
             kernels_cuda.deform_with_colour(rest.count, [*inputs, rest.sh], [*outputs, cloud.sh], rest.device)
             return deformed
@@ -141,7 +141,7 @@ class Deformer:
             launch_rows(
                 rotate_sh_kernel,
                 rest.count,
-                inputs=[deformed.turns, rest.sh, self._degree],
+                inputs=[deformed.rotations, rest.sh, self._degree],
                 outputs=[cloud.sh],
                 device=rest.device,
             )
@@ -169,7 +169,7 @@ class Deformer:
             rest.rotations,
             rest.log_scales,
             self.max_stretch,
-            self._carrier.carry(positions),
+            self._carrier.update(positions),
             self.plan,
         ]
 

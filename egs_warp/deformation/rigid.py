@@ -14,7 +14,7 @@ from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
 from egs_warp.launching import launch_rows
 
 
-def in_body_frame(cloud: GaussianCloud, frame: BodyFrame) -> GaussianCloud:
+def to_body_frame(cloud: GaussianCloud, frame: BodyFrame) -> GaussianCloud:
     """The capture's ``cloud`` in ``frame``, in the order of its own; looks the same from there."""
     turn = Rotation.from_matrix(frame.axes)
     rotations = cloud.rotations.numpy().astype(np.float64)

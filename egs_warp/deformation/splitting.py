@@ -23,7 +23,7 @@ SPLIT_DEGREES = 4.0
 the paper's 15 degrees at 3 are 9 here, which gave 0.01 to 0.02 dB less on Table 1's chair, and more where finer misfits
 split."""
 
-LEAST_MISFIT = 7e-4
+MIN_FIT_ERROR = 7e-4
 """Over the cage's diagonal: an affine motion that is wrong by less than this is good enough. Less would follow a motion
 better still (benchmarks/table1.py), but of a fuzzy capture so many would split that 45 dB at rest are missed."""
 
@@ -133,7 +133,7 @@ def split_bent(
         axes = np.argmax(cloud.log_scales.numpy(), axis=1)
         marked = bend.bend_degrees > threshold_degrees
     else:
-        least = LEAST_MISFIT * embedding.cage.extent if min_error is None else min_error
+        least = MIN_FIT_ERROR * embedding.cage.extent if min_error is None else min_error
         error = np.where(bend.curl_degrees > threshold_degrees, bend.fit_error, 0.0)
         axes = np.argmax(error, axis=1)
         marked = error.max(axis=1) > least

@@ -9,12 +9,12 @@ import scipy.sparse as sparse
 import torch
 import warp as wp
 
+from egs_warp.fem.batched import as_warp, launch_on, repeat_bounds, repeat_offsets
 from egs_warp.fem.elasticity import ElasticAssembly
-from egs_warp.fem.worlds import launch_on, shared, tiled, tiled_bounds
 from egs_warp.kernels.fem import elasticity as kernels
 from egs_warp.launching import lanes_on
 from egs_warp.muscles.muscle_set import MuscleSet
-from egs_warp.muscles.tension import FULL, SLACK
+from egs_warp.muscles.tension import LENGTH_FULL_FORCE, LENGTH_ZERO_FORCE
 from egs_warp.precision import Mat33, Vec3, real
 
 _NEGLIGIBLE = 1e-300
@@ -30,18 +30,18 @@ class BatchElasticity:
         self.device, self._lanes = torch.device(str(assembly.device)), lanes_on(assembly.device)
         self.node_count, self.tet_count = len(assembly.mesh.nodes), len(assembly.mesh.tets)
         self._material, maps = assembly.material, assembly.maps
-        self._tets = shared(tiled(assembly.mesh.tets, count, self.node_count, self.device), wp.vec4i)
-        self._rest_inverses = shared(self._tensor(maps.rest_inverses).repeat(count, 1, 1), Mat33)
-        self._volumes = shared(self._tensor(maps.volumes).repeat(count), real)
+        self._tets = as_warp(repeat_offsets(assembly.mesh.tets, count, self.node_count, self.device), wp.vec4i)
+        self._rest_inverses = as_warp(self._tensor(maps.rest_inverses).repeat(count, 1, 1), Mat33)
+        self._volumes = as_warp(self._tensor(maps.volumes).repeat(count), real)
         self._corners = [
-            shared(tiled_bounds(maps.corner_offsets, count, self.device), wp.int32),
-            shared(tiled(maps.corner_from_slot, count, 4 * self.tet_count, self.device), wp.int32),
+            as_warp(repeat_bounds(maps.corner_offsets, count, self.device), wp.int32),
+            as_warp(repeat_offsets(maps.corner_from_slot, count, 4 * self.tet_count, self.device), wp.int32),
         ]
         self._block_count, self._entry_count = len(maps.entry_from_block), assembly.upper_pattern.nnz
         self._gathering = [
-            shared(tiled_bounds(maps.contribution_offsets, matrices, self.device), wp.int32),
-            shared(tiled(maps.block_from_contribution, matrices, 16 * self.tet_count, self.device), wp.int32),
-            shared(tiled(maps.entry_from_block, matrices, self._entry_count, self.device), wp.int32),
+            as_warp(repeat_bounds(maps.contribution_offsets, matrices, self.device), wp.int32),
+            as_warp(repeat_offsets(maps.block_from_contribution, matrices, 16 * self.tet_count, self.device), wp.int32),
+            as_warp(repeat_offsets(maps.entry_from_block, matrices, self._entry_count, self.device), wp.int32),
         ]
         size, pattern = 3 * self.node_count, assembly.upper_pattern
         columns = np.repeat(np.arange(size), np.diff(pattern.indptr))
@@ -53,19 +53,19 @@ class BatchElasticity:
         self._rest_lengths = self._tensor(muscles.rest_lengths)
         self._lines = [
             *self._copies(rows, count, self.node_count),
-            shared(self._rest_lengths.repeat(count), real),
+            as_warp(self._rest_lengths.repeat(count), real),
         ]
         self._ends = self._copies(rows.T.tocsr(), count, self.segment_count)
         self._no_ends = self._copies(rows.T.tocsr(), 0, 0)
-        self._no_ends[0] = shared(torch.zeros(0, dtype=torch.int32, device=self.device), wp.int32)
-        self._no_gradients = shared(self._empty(0, 3, 3), Mat33)
+        self._no_ends[0] = as_warp(torch.zeros(0, dtype=torch.int32, device=self.device), wp.int32)
+        self._no_gradients = as_warp(self._empty(0, 3, 3), Mat33)
 
     def _copies(self, rows: sparse.csr_matrix, count: int, column_count: int) -> list[wp.array]:
         """``rows`` over so many columns, ``count`` times: where each begins, its columns, its entries."""
         return [
-            shared(tiled_bounds(rows.indptr, count, self.device), wp.int32),
-            shared(tiled(rows.indices, count, column_count, self.device), wp.int32),
-            shared(self._tensor(rows.data).repeat(count), real),
+            as_warp(repeat_bounds(rows.indptr, count, self.device), wp.int32),
+            as_warp(repeat_offsets(rows.indices, count, column_count, self.device), wp.int32),
+            as_warp(self._tensor(rows.data).repeat(count), real),
         ]
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
@@ -90,7 +90,7 @@ class BatchElasticity:
         )
         return gradients
 
-    def upright(self, positions: torch.Tensor) -> torch.Tensor:
+    def is_inversion_free(self, positions: torch.Tensor) -> torch.Tensor:
         """(c,) bool: whether no element is inverted at ``positions`` (c, N, 3)."""
         energies, determinants = self._empty(2, len(positions), self.tet_count)
         flat = positions.reshape(-1, 3)
@@ -116,9 +116,9 @@ class BatchElasticity:
             ends, pulls = self._ends, self._empty(count * self.segment_count, 3)
             launch_on(
                 self.device,
-                kernels.segment_pulls_kernel,
+                kernels.segment_forces_kernel,
                 (len(pulls), self._lanes),
-                inputs=[*self._lines, SLACK, FULL, (tensions.reshape(-1), real), flat],
+                inputs=[*self._lines, LENGTH_ZERO_FORCE, LENGTH_FULL_FORCE, (tensions.reshape(-1), real), flat],
                 outputs=[(pulls, Vec3)],
             )
         launch_on(
@@ -180,9 +180,11 @@ class BatchElasticity:
         lines = self._rows @ positions
         lengths = lines.norm(dim=2).clamp(min=_NEGLIGIBLE)
         directions = lines / lengths[:, :, None]
-        along = ((lengths / self._rest_lengths - SLACK) / (FULL - SLACK)).clamp(0.0, 1.0)
+        along = ((lengths / self._rest_lengths - LENGTH_ZERO_FORCE) / (LENGTH_FULL_FORCE - LENGTH_ZERO_FORCE)).clamp(
+            0.0, 1.0
+        )
         across = tensions * along**2 * (3.0 - 2.0 * along) / lengths
-        stretch = tensions * 6.0 * along * (1.0 - along) / (FULL - SLACK) / self._rest_lengths
+        stretch = tensions * 6.0 * along * (1.0 - along) / (LENGTH_FULL_FORCE - LENGTH_ZERO_FORCE) / self._rest_lengths
         largest = torch.maximum(across.abs(), stretch.abs()).amax(dim=1, keepdim=True).clamp(min=_NEGLIGIBLE)
         across, stretch = (torch.where(rate.abs() > least * largest, rate, 0.0) for rate in (across, stretch))
         blocks = matrices.view(len(matrices), self.node_count, 3, self.node_count, 3)

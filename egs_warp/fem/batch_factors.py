@@ -12,7 +12,7 @@ CHUNK_BYTES = 2**31
 """Of the matrices that are worked on at a time: what is needed beside the factors stays a few times as large."""
 
 
-class BatchFactors:
+class BatchCholesky:
     """A factor L of S = L L^T for each of B worlds, in slots.
 
     A left-looking factorisation by panels: a product with all columns before, the panel's own small factor, and a

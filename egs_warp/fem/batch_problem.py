@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from egs_warp.fem.batch_elasticity import BatchElasticity
-from egs_warp.fem.batch_factors import CHUNK_BYTES, PANEL, BatchFactors
+from egs_warp.fem.batch_factors import CHUNK_BYTES, PANEL, BatchCholesky
+from egs_warp.fem.batched import BatchedRecord, nonzero
 from egs_warp.fem.body import SoftBody
-from egs_warp.fem.step_problem import NEGLIGIBLE
-from egs_warp.fem.worlds import Worlds, indices
+from egs_warp.fem.step_problem import MIN_RELATIVE_STIFFNESS
 from egs_warp.muscles.muscle_set import MuscleSet
 
 
@@ -32,7 +32,7 @@ class BatchBody:
         self.body = body
         self.device = torch.device(str(body.assembly.device))
         size = 3 * len(body.mesh.nodes)
-        self.factors = BatchFactors(count, size, self.device, panel=panel, chunk_bytes=chunk_bytes)
+        self.factors = BatchCholesky(count, size, self.device, panel=panel, chunk_bytes=chunk_bytes)
         self.elasticity = BatchElasticity(body.assembly, muscles, count, matrices=min(count, self.factors.chunk))
         self.mass = torch.as_tensor(body.node_mass, device=self.device)
         self.gravity = torch.as_tensor(np.asarray(body.gravity, dtype=np.float64), device=self.device)
@@ -43,10 +43,10 @@ class BatchBody:
 
 
 @dataclass(frozen=True)
-class BatchProblem(Worlds):
+class BatchProblem(BatchedRecord):
     """A step of ``dt`` s of c worlds; see ``StepProblem``, whose names these are."""
 
-    common: BatchBody
+    body: BatchBody
     dt: float
     drag: float
     """1/s."""
@@ -58,9 +58,9 @@ class BatchProblem(Worlds):
     """(c, N, 3) m/s."""
     start_gradients: torch.Tensor
     """(c, T, 3, 3)."""
-    turns: torch.Tensor
+    rotation_modes: torch.Tensor
     """(c, 3N, 3)."""
-    turning_rates: torch.Tensor
+    inverse_inertia: torch.Tensor
     """(c, 3, 3) 1/(kg m^2), the inverse of the inertia; no numbers where there is none, in place of an error for all
     worlds."""
 
@@ -90,12 +90,12 @@ class BatchProblem(Worlds):
     @property
     def momenta(self) -> torch.Tensor:
         """(c, 3, 3N)."""
-        return (self.turns * self.common.mass.repeat_interleave(3)[:, None]).mT
+        return (self.rotation_modes * self.body.mass.repeat_interleave(3)[:, None]).mT
 
     @property
-    def unit(self) -> float:
+    def residual_scale(self) -> float:
         """N s."""
-        return self.dt * self.common.body.weight
+        return self.dt * self.body.body.weight
 
     @property
     def inertia_ratio(self) -> float:
@@ -106,40 +106,40 @@ class BatchProblem(Worlds):
         """(c, N, 3)."""
         return self.positions + self.dt * velocities
 
-    def feasible(self, velocities: torch.Tensor) -> torch.Tensor:
+    def is_inversion_free(self, velocities: torch.Tensor) -> torch.Tensor:
         """(c,) bool: whether no element is inverted at the end of ``velocities`` (c, N, 3)."""
-        return self.common.elasticity.upright(self.end_positions(velocities))
+        return self.body.elasticity.is_inversion_free(self.end_positions(velocities))
 
-    def start(self) -> torch.Tensor:
+    def rigid_guess(self) -> torch.Tensor:
         """(c, N, 3) m/s to solve the step from: the body goes on rigidly."""
-        arms = self.positions - self.common.centre(self.positions)
-        spin = (self.turning_rates @ (self.momenta @ self.velocities.flatten(1)[:, :, None]))[:, :, 0]
+        arms = self.positions - self.body.centre(self.positions)
+        spin = (self.inverse_inertia @ (self.momenta @ self.velocities.flatten(1)[:, :, None]))[:, :, 0]
         turned = _turned(self.dt * spin, arms)
-        return self.common.centre(self.velocities) + (turned - arms) / self.dt
+        return self.body.centre(self.velocities) + (turned - arms) / self.dt
 
     def internal_gradient(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
         """(c, N, 3) newtons; ``tensions`` (c, M) newtons of the muscles."""
         end = self.end_positions(velocities)
-        return self.common.elasticity.gradient(end, self.start_gradients, self.dt, tensions)
+        return self.body.elasticity.gradient(end, self.start_gradients, self.dt, tensions)
 
-    def spin(self, internal_gradient: torch.Tensor) -> torch.Tensor:
+    def momentum_correction(self, internal_gradient: torch.Tensor) -> torch.Tensor:
         """(c, 3) rad/s that the step gives back."""
-        torque = self.turns.mT @ internal_gradient.flatten(1)[:, :, None]
-        return self.dt * (self.turning_rates @ torque)[:, :, 0]
+        torque = self.rotation_modes.mT @ internal_gradient.flatten(1)[:, :, None]
+        return self.dt * (self.inverse_inertia @ torque)[:, :, 0]
 
     def residual(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
         """(c, N, 3) N s."""
         internal = self.internal_gradient(velocities, tensions)
-        turned = (self.turns @ self.spin(internal)[:, :, None]).view_as(velocities)
-        change = self.inertia_ratio * velocities - self.velocities - self.dt * self.common.gravity - turned
-        return self.common.mass[:, None] * change + self.dt * internal
+        turned = (self.rotation_modes @ self.momentum_correction(internal)[:, :, None]).view_as(velocities)
+        change = self.inertia_ratio * velocities - self.velocities - self.dt * self.body.gravity - turned
+        return self.body.mass[:, None] * change + self.dt * internal
 
     def factor(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
         """Factor the derivative of the residual at ``velocities`` (c, N, 3), or a definite one near it, into the
         worlds' slots; (c,) bool, whether there is one. In the order of ``StepProblem.tangent``."""
         fine = [
             self._factor(slice(part.start, part.stop), velocities, tensions)
-            for part in self.common.factors.chunks(len(velocities))
+            for part in self.body.factors.chunks(len(velocities))
         ]
         return torch.cat(fine)
 
@@ -149,23 +149,23 @@ class BatchProblem(Worlds):
         pulls = None if tensions is None else tensions[part]
         fine = torch.zeros(len(end), dtype=torch.bool, device=end.device)
         left = torch.arange(len(end), device=end.device)
-        diagonal = self.inertia_ratio * self.common.mass.repeat_interleave(3)
+        diagonal = self.inertia_ratio * self.body.mass.repeat_interleave(3)
         # With the muscles' stiffness, without it, and with the elements' alone that is surely definite.
         for muscles, projected in ((True, False), (False, False), (False, True)):
             if (muscles and pulls is None) or len(left) == 0:
                 continue
-            matrices = self.common.elasticity.matrices(
-                end[left], gradients[left], self.dt, diagonal, projected=projected
-            )
+            matrices = self.body.elasticity.matrices(end[left], gradients[left], self.dt, diagonal, projected=projected)
             if muscles and pulls is not None:
-                self.common.elasticity.add_stiffness(matrices, end[left], pulls[left], self.dt**2, least=NEGLIGIBLE)
-            fine[left] = self.common.factors.factor(slots[left], matrices)
-            left = indices(~fine)
+                self.body.elasticity.add_stiffness(
+                    matrices, end[left], pulls[left], self.dt**2, least=MIN_RELATIVE_STIFFNESS
+                )
+            fine[left] = self.body.factors.factor(slots[left], matrices)
+            left = nonzero(~fine)
         return fine
 
 
 @dataclass(frozen=True)
-class BatchTurning(Worlds):
+class BatchMomentumProjection(BatchedRecord):
     """What makes the inverse of the elements' matrix keep angular momentum, see ``Tangent``."""
 
     turned: torch.Tensor
@@ -174,19 +174,21 @@ class BatchTurning(Worlds):
     """(c, 3, 3)."""
 
 
-def inverse_of(
-    problem: BatchProblem, impulses: torch.Tensor, turning: BatchTurning | None = None
-) -> tuple[torch.Tensor, BatchTurning]:
+def apply_inverse(
+    problem: BatchProblem, impulses: torch.Tensor, turning: BatchMomentumProjection | None = None
+) -> tuple[torch.Tensor, BatchMomentumProjection]:
     """(c, 3N, m) m/s that ``impulses`` of that shape, N s, bring about by the factors in the worlds' slots, and the
     ``turning`` of these, if it is not known."""
-    factors, momenta = problem.common.factors, problem.momenta
+    factors, momenta = problem.body.factors, problem.momenta
     if turning is None:
         both = factors.solve(problem.slots, torch.cat([momenta.mT, impulses], dim=2))
         turned, plain = both[:, :, :3].contiguous(), both[:, :, 3:]
-        turning = BatchTurning(turned, torch.linalg.inv_ex(problem.inertia_ratio * (momenta @ turned)).inverse)
+        turning = BatchMomentumProjection(
+            turned, torch.linalg.inv_ex(problem.inertia_ratio * (momenta @ turned)).inverse
+        )
     else:
         plain = factors.solve(problem.slots, impulses)
-    missing = problem.turns.mT @ impulses - problem.inertia_ratio * (momenta @ plain)
+    missing = problem.rotation_modes.mT @ impulses - problem.inertia_ratio * (momenta @ plain)
     return plain + turning.turned @ (turning.inverse @ missing), turning
 
 

@@ -11,9 +11,9 @@ import scipy.sparse as sparse
 import scipy.sparse.linalg as sparse_linalg
 
 from egs_warp.errors import ArgumentError
-from egs_warp.fem.elastic_maps import Material
+from egs_warp.fem.assembly_topology import Material
 from egs_warp.fem.elasticity import ElasticAssembly
-from egs_warp.geometry.frames import best_turn
+from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 
@@ -23,7 +23,7 @@ DEFAULT_SAG = 0.05
 """rho g H / E of a column."""
 SMALLEST_HEIGHT, LARGEST_HEIGHT = 0.001, 1000.0
 """Metres; smaller and larger bodies are refused as a slip of the pen."""
-LARGEST_SINK = 0.02
+MAX_SAG = 0.02
 """Body heights by which the centre of mass may sink from the unloaded to the standing body."""
 
 _HINGED = 1e4
@@ -103,7 +103,7 @@ class SoftBody:
         """(3, 3) rotation that best carries the rest shape to ``positions`` (Kabsch, mass-weighted)."""
         rest = self.mesh.nodes - self.centre_of_mass(self.mesh.nodes)
         arms = positions - self.centre_of_mass(positions)
-        return best_turn(self.node_mass, rest, arms)
+        return kabsch_rotation(self.node_mass, rest, arms)
 
     def mechanical_energy(self, positions: np.ndarray, velocities: np.ndarray) -> float:
         """Kinetic + elastic + gravitational energy, joules."""
@@ -123,7 +123,7 @@ class BodyState:
     time: float = 0.0
     """Seconds."""
 
-    def kicked(self, kick: np.ndarray | None) -> BodyState:
+    def with_velocity_kick(self, kick: np.ndarray | None) -> BodyState:
         """With nodes that are faster by ``kick`` (N, 3) m/s, if something gives them that.
 
         An implicit step from there is, to the letter, the step from here with the impulses beside its forces,
@@ -171,7 +171,7 @@ def make_body(
     # It is no number, or below zero, where the stiffness is singular.
     if not 0.0 <= sink < _HINGED * height:
         raise ArgumentError("nodes", "the cage has parts that hang on a corner or an edge alone; give it more")
-    young *= max(1.0, sink / (LARGEST_SINK * height))
+    young *= max(1.0, sink / (MAX_SAG * height))
     undamped = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)
     frequency = _first_frequency(undamped, node_mass, free)
     damped = Material(young, poisson_ratio, density, 2.0 * damping_ratio / frequency)

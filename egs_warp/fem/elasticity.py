@@ -9,13 +9,13 @@ import numpy as np
 import scipy.sparse as sparse
 import warp as wp
 
-from egs_warp.fem.elastic_maps import Damping, ElasticMaps, Material
-from egs_warp.fem.element_kernels import ElementKernels
-from egs_warp.fem.element_vectors import ElementVectors
-from egs_warp.fem.factors import Factors
-from egs_warp.fem.sparse_factors import Analysis
+from egs_warp.fem.assembly_topology import AssemblyTopology, Damping, Material
+from egs_warp.fem.linear_solver import LinearSolver
+from egs_warp.fem.multifrontal import SymbolicFactorization
+from egs_warp.fem.simd_elasticity import SimdElasticity
+from egs_warp.fem.warp_elasticity import WarpElasticity
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.muscles.tension import MuscleEnergy
 
 
 class ElasticAssembly:
@@ -23,10 +23,10 @@ class ElasticAssembly:
 
     def __init__(self, mesh: TetMesh, material: Material, *, device: str | None = None) -> None:
         self.mesh, self.material, self.device = mesh, material, wp.get_device(device)
-        self.maps = ElasticMaps.of(mesh)
+        self.maps = AssemblyTopology.of(mesh)
         self.upper_pattern = self.maps.upper_pattern
         self.diagonal_entries = self.upper_pattern.indptr[1:] - 1
-        on_device = ElementVectors if self.device.is_cpu else ElementKernels
+        on_device = SimdElasticity if self.device.is_cpu else WarpElasticity
         self.elements = on_device(self.maps, material, self.device)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -34,9 +34,9 @@ class ElasticAssembly:
         return partial(ElasticAssembly, device=str(self.device)), (self.mesh, self.material)
 
     @cached_property
-    def analysis(self) -> Analysis:
+    def analysis(self) -> SymbolicFactorization:
         """Of ``upper_pattern``."""
-        return Analysis.of(self.upper_pattern)
+        return SymbolicFactorization.of(self.upper_pattern)
 
     def damping(self, positions: np.ndarray, dt: float) -> Damping:
         """Of a step of ``dt`` seconds that starts at ``positions`` (N, 3)."""
@@ -55,7 +55,7 @@ class ElasticAssembly:
         return self.elements.energy(positions, damping)[0]
 
     def gradient(
-        self, positions: np.ndarray, damping: Damping | None = None, tension: MuscleTension | None = None
+        self, positions: np.ndarray, damping: Damping | None = None, tension: MuscleEnergy | None = None
     ) -> np.ndarray:
         """(N, 3) newtons: the derivative of ``energy`` by the positions, minus the internal force; with that of
         ``tension``."""
@@ -76,7 +76,7 @@ class ElasticAssembly:
 
     def entries_for(
         self,
-        factors: Factors,
+        factors: LinearSolver,
         positions: np.ndarray,
         damping: Damping | None,
         *,
@@ -84,10 +84,10 @@ class ElasticAssembly:
         projected: bool = False,
     ) -> Any:
         """``hessian_entries`` where ``factors`` want them: a tensor of torch, or an array of the host."""
-        if factors.host:
+        if factors.is_host:
             return self.hessian_entries(positions, damping, factor=factor, projected=projected)
-        assert isinstance(self.elements, ElementKernels)
-        return self.elements.entries_there(positions, damping, factor=factor, projected=projected)
+        assert isinstance(self.elements, WarpElasticity)
+        return self.elements.entries_on_device(positions, damping, factor=factor, projected=projected)
 
     def matrix(self, entries: np.ndarray) -> sparse.csc_matrix:
         """Upper triangle (3N, 3N) with the given entries."""

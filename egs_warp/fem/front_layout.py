@@ -16,7 +16,7 @@ from egs_warp.kernels.vectors import BLOCK
 
 
 @dataclass(frozen=True)
-class Layout:
+class FrontLayout:
     """Places, and how many numbers there are of each kind."""
 
     fronts: Any
@@ -33,15 +33,15 @@ class Layout:
     """Of its diagonal blocks' inverses."""
 
     @classmethod
-    def of(cls, blocks: Supernodes, upper: sparse.csc_matrix) -> Layout:
+    def of(cls, blocks: Supernodes, upper: sparse.csc_matrix) -> FrontLayout:
         """Of ``blocks``, into which the entries of ``upper`` (n, n) go in the order of its columns."""
         widths, heights, parents = (part.astype(np.int64) for part in (blocks.widths, blocks.heights, blocks.parents))
         strides, inverses = -(-heights // 8) * 8, -(-widths // BLOCK) * BLOCK**2
         place_in = _places_in_fronts(blocks)
         # An entry lies in the columns of the block that is eliminated first.
         ends = (
-            blocks.place[upper.indices],
-            blocks.place[np.repeat(np.arange(len(upper.indptr) - 1), np.diff(upper.indptr))],
+            blocks.permutation[upper.indices],
+            blocks.permutation[np.repeat(np.arange(len(upper.indptr) - 1), np.diff(upper.indptr))],
         )
         column, row = np.minimum(*ends), np.maximum(*ends)
         block = np.repeat(np.arange(blocks.count), widths)[column]
@@ -68,9 +68,9 @@ class Layout:
             "factor_offsets": _offsets(heights * widths),
             "inverse_offsets": _offsets(inverses),
             "update_offsets": updates,
-            "place": blocks.place,
+            "place": blocks.permutation,
         }.items():
-            setattr(fronts, name, indices_of(values))
+            setattr(fronts, name, as_index_array(values))
         return cls(
             fronts,
             int((heights * strides).max()),
@@ -81,7 +81,7 @@ class Layout:
         )
 
 
-def indices_of(values: np.ndarray) -> wp.array:
+def as_index_array(values: np.ndarray) -> wp.array:
     """As the kernels take them."""
     return wp.array(np.asarray(values, dtype=np.int32), dtype=int, device="cpu")
 
@@ -92,10 +92,10 @@ def _offsets(counts: np.ndarray) -> np.ndarray:
 
 def _places_in_fronts(blocks: Supernodes) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Where permuted rows lie in the fronts of given blocks."""
-    keys = np.repeat(np.arange(blocks.count), blocks.heights) * len(blocks.place) + blocks.rows
+    keys = np.repeat(np.arange(blocks.count), blocks.heights) * len(blocks.permutation) + blocks.rows
 
     def found(block: np.ndarray, row: np.ndarray) -> np.ndarray:
-        return np.searchsorted(keys, block * len(blocks.place) + row) - blocks.row_offsets[block]
+        return np.searchsorted(keys, block * len(blocks.permutation) + row) - blocks.row_offsets[block]
 
     return found
 

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from egs_warp.fem.assembly_topology import Damping
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.elastic_maps import Damping
-from egs_warp.fem.factors import Factors
-from egs_warp.fem.kept import Kept
-from egs_warp.geometry.frames import turning
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.fem.linear_solver import LinearSolver
+from egs_warp.fem.momentum_projection import MomentumProjection
+from egs_warp.geometry.frames import cross_matrices
+from egs_warp.muscles.tension import MuscleEnergy
 
 UNSOLVABLE = "the tangent is singular or not finite"
-NEGLIGIBLE = 1e-3
+MIN_RELATIVE_STIFFNESS = 1e-3
 """Of the largest T / L of the muscles: those below it do not count in a tangent."""
 
 
@@ -43,7 +43,7 @@ class StepProblem:
     drag: float = 0.0
     """alpha of Rayleigh damping (drag against the air), 1/s."""
 
-    def is_of(self, state: BodyState, dt: float) -> bool:
+    def starts_from(self, state: BodyState, dt: float) -> bool:
         """Whether it is the step of ``dt`` seconds from that very ``state``."""
         return self.state is state and self.dt == dt
 
@@ -58,27 +58,27 @@ class StepProblem:
         return self.body.node_mass[:, None]
 
     @cached_property
-    def turns(self) -> np.ndarray:
+    def rotation_modes(self) -> np.ndarray:
         """(3N, 3) nodal velocities e_k x r of the rigid turns about the centre of mass, ``arms`` r."""
-        return turning(self.arms).reshape(-1, 3)
+        return cross_matrices(self.lever_arms).reshape(-1, 3)
 
     @cached_property
-    def arms(self) -> np.ndarray:
+    def lever_arms(self) -> np.ndarray:
         """(N, 3) metres from the centre of mass at the start of the step."""
         return self.state.positions - self.body.centre_of_mass(self.state.positions)
 
     @cached_property
     def momenta(self) -> np.ndarray:
         """(3, 3N) angular momentum of nodal velocities about the centre of mass, arms at the start of the step."""
-        return (self.turns * np.repeat(self.body.node_mass, 3)[:, None]).T
+        return (self.rotation_modes * np.repeat(self.body.node_mass, 3)[:, None]).T
 
     @cached_property
     def inertia(self) -> np.ndarray:
         """(3, 3) kg m^2 at the start of the step."""
-        return self.momenta @ self.turns
+        return self.momenta @ self.rotation_modes
 
     @cached_property
-    def turning_rates(self) -> np.ndarray:
+    def inverse_inertia(self) -> np.ndarray:
         """(3, 3) 1/(kg m^2), the inverse of the inertia."""
         return np.linalg.inv(self.inertia)
 
@@ -88,7 +88,7 @@ class StepProblem:
         return self.body.angular_momentum(self.state.positions, self.state.velocities)
 
     @property
-    def unit(self) -> float:
+    def residual_scale(self) -> float:
         """dt times the weight, N s: what residuals are told in."""
         return self.dt * self.body.weight
 
@@ -96,69 +96,69 @@ class StepProblem:
         """(N, 3) x + dt v."""
         return self.state.positions + self.dt * velocities
 
-    def feasible(self, velocities: np.ndarray) -> bool:
+    def is_inversion_free(self, velocities: np.ndarray) -> bool:
         """Whether no element is inverted at the end of ``velocities`` (N, 3)."""
         return bool(self.body.assembly.determinants(self.end_positions(velocities)).min() > 0.0)
 
     @cached_property
-    def start(self) -> np.ndarray:
+    def rigid_guess(self) -> np.ndarray:
         """(N, 3) m/s to solve the step from: the body goes on rigidly with its momenta, so no element is inverted, and
         what is stiff, whose speed at the start says nothing about the end, is at rest."""
         positions, mass = self.state.positions, self.body.node_mass
         centre = self.body.centre_of_mass(positions)
-        spin = self.turning_rates @ self.angular_momentum
+        spin = self.inverse_inertia @ self.angular_momentum
         turned = Rotation.from_rotvec(self.dt * spin).apply(positions - centre)
         return mass @ self.state.velocities / mass.sum() + (turned - (positions - centre)) / self.dt
 
-    def internal_gradient(self, velocities: np.ndarray, tension: MuscleTension | None) -> np.ndarray:
+    def internal_gradient(self, velocities: np.ndarray, tension: MuscleEnergy | None) -> np.ndarray:
         """(N, 3) newtons, minus the forces of elasticity, damping and muscles at the end of ``velocities`` (N, 3)."""
         end = self.end_positions(velocities)
         return self.body.assembly.gradient(end, self.damping, tension)
 
-    def spin(self, internal_gradient: np.ndarray) -> np.ndarray:
+    def momentum_correction(self, internal_gradient: np.ndarray) -> np.ndarray:
         """(3,) rad/s that the step gives back: the rigid turn whose momentum implicit Euler would have eaten."""
-        return self.spin_by(self.turns.T @ internal_gradient.ravel())
+        return self.momentum_correction_from_torque(self.rotation_modes.T @ internal_gradient.ravel())
 
-    def spin_by(self, torque: np.ndarray) -> np.ndarray:
+    def momentum_correction_from_torque(self, torque: np.ndarray) -> np.ndarray:
         """``spin`` of an internal gradient with this ``torque`` (3,) N m about the centre of mass."""
-        return self.dt * (self.turning_rates @ torque)
+        return self.dt * (self.inverse_inertia @ torque)
 
-    def residual(self, velocities: np.ndarray, tension: MuscleTension | None) -> np.ndarray:
+    def residual(self, velocities: np.ndarray, tension: MuscleEnergy | None) -> np.ndarray:
         """(N, 3) N s, left side less right side of the equation without contact forces; not finite where an element is
         inverted.
         """
         internal = self.internal_gradient(velocities, tension)
-        turned = (self.turns @ self.spin(internal)).reshape(velocities.shape)
+        turned = (self.rotation_modes @ self.momentum_correction(internal)).reshape(velocities.shape)
         change = (1.0 + self.dt * self.drag) * velocities - self.state.velocities - self.dt * self.body.gravity - turned
         return self.mass * change + self.dt * internal
 
-    def tangent(self, factors: Factors, velocities: np.ndarray, tension: MuscleTension | None) -> Tangent:
+    def tangent(self, factors: LinearSolver, velocities: np.ndarray, tension: MuscleEnergy | None) -> Tangent:
         """The derivative of the residual at ``velocities`` (N, 3), or a definite one near it, factored by
         ``factors``. Raises ``UnsolvableStepError`` where it has no factors, or, of what is only begun, ``settle`` does.
         """
-        if tension is None and not factors.host:
-            factors.begin(*self._matrix(factors, velocities, projected=False))
+        if tension is None and not factors.is_host:
+            factors.start_update(*self._matrix(factors, velocities, projected=False))
             return Tangent(self, factors, velocities)
         definite = self._factor(factors, velocities, projected=False)
         if tension is not None:
-            across, rates = tension.hessian(self.end_positions(velocities)).factors(least=NEGLIGIBLE)
-            if factors.add(across, self.dt**2 * rates):
+            across, rates = tension.hessian(self.end_positions(velocities)).factors(least=MIN_RELATIVE_STIFFNESS)
+            if factors.add_low_rank(across, self.dt**2 * rates):
                 return Tangent(self, factors)
         if not definite:
             self.factor_near(factors, velocities)
         return Tangent(self, factors)
 
-    def factor_near(self, factors: Factors, velocities: np.ndarray) -> None:
+    def factor_near(self, factors: LinearSolver, velocities: np.ndarray) -> None:
         """A definite matrix near S. Raises ``UnsolvableStepError`` where that has no factors."""
         self._factor(factors, velocities, projected=True)
-        if not factors.ready:
+        if not factors.is_ready:
             raise UnsolvableStepError(UNSOLVABLE)
 
-    def _factor(self, factors: Factors, velocities: np.ndarray, *, projected: bool) -> bool:
+    def _factor(self, factors: LinearSolver, velocities: np.ndarray, *, projected: bool) -> bool:
         """S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``; whether it is definite."""
         return factors.update(*self._matrix(factors, velocities, projected=projected))
 
-    def _matrix(self, factors: Factors, velocities: np.ndarray, *, projected: bool) -> tuple[Any, np.ndarray]:
+    def _matrix(self, factors: LinearSolver, velocities: np.ndarray, *, projected: bool) -> tuple[Any, np.ndarray]:
         """Entries and diagonal of S for ``factors``."""
         end = self.end_positions(velocities)
         entries = self.body.assembly.entries_for(factors, end, self.damping, factor=self.dt**2, projected=projected)
@@ -175,27 +175,29 @@ class Tangent:
     """
 
     problem: StepProblem
-    factors: Factors
-    begun_at: np.ndarray | None = None
+    factors: LinearSolver
+    pending_velocities: np.ndarray | None = None
     """(N, 3) m/s at which the matrix is whose factors are only begun; None if they are there."""
 
-    def settle(self) -> bool:
+    def wait(self) -> bool:
         """Wait for factors that are begun; whether they are there. If not, those of a definite matrix near by are
         then. Raises ``UnsolvableStepError`` if that has none."""
-        if self.begun_at is None or self.factors.ready:
+        if self.pending_velocities is None or self.factors.is_ready:
             return True
-        self.problem.factor_near(self.factors, self.begun_at)
+        self.problem.factor_near(self.factors, self.pending_velocities)
         return False
 
     @cached_property
-    def kept(self) -> Kept:
+    def momentum_projection(self) -> MomentumProjection:
         """Of the rigid turns of the step."""
         problem = self.problem
         ratio, momenta = 1.0 + problem.dt * problem.drag, np.ascontiguousarray(problem.momenta.T)
         turned = self.factors.solve(momenta)
-        return Kept(problem.turns, momenta, ratio, turned, np.linalg.inv(ratio * momenta.T @ turned))
+        return MomentumProjection(
+            problem.rotation_modes, momenta, ratio, turned, np.linalg.inv(ratio * momenta.T @ turned)
+        )
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:
         """(3N,) or (3N, m) m/s that ``impulses`` of that shape, N s, bring about."""
-        self.settle()
-        return self.factors.solve(impulses, self.kept)
+        self.wait()
+        return self.factors.solve(impulses, self.momentum_projection)

@@ -27,7 +27,7 @@ class Supernodes:
     ``rows[row_offsets[s] + widths[s] : row_offsets[s + 1]]`` below them: its front.
     """
 
-    place: np.ndarray
+    permutation: np.ndarray
     """(n,) the permuted place of each row of A."""
     first: np.ndarray
     """(S,)."""
@@ -55,7 +55,7 @@ class Supernodes:
         """Of a symmetric matrix with a pattern whose upper triangle is ``upper``, its diagonal included."""
         full = (upper + upper.T).tocsc()
         full.sort_indices()
-        groups = np.cumsum(first_of_alike(full)) - 1
+        groups = np.cumsum(first_of_equal_rows(full)) - 1
         sizes = np.bincount(groups)
         thin = _between_groups(upper, groups, len(sizes))
         order = _ordered(thin)
@@ -87,7 +87,7 @@ class Supernodes:
         )
 
 
-def first_of_alike(full: sparse.csc_matrix) -> np.ndarray:
+def first_of_equal_rows(full: sparse.csc_matrix) -> np.ndarray:
     """(n,) whether a row of a symmetric pattern, both triangles of it, sorted, reaches others than the row before; the
     three of a node reach the same."""
     keys = [full.indices[a:b].tobytes() for a, b in pairwise(full.indptr)]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.frames import square_to
+from egs_warp.geometry.frames import orthonormal_basis
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 
@@ -81,7 +81,7 @@ def upright_frame(points: np.ndarray, weights: np.ndarray, plane: Plane) -> Body
     """
     # Without any opacity the frame is as good as the points; what is wrong with them is said by who looks for a body.
     middle, reach, near = _middle(points, weights if weights.sum() > 0.0 else np.ones(len(points)))
-    first, second = square_to(plane.normal)
+    first, second = orthonormal_basis(plane.normal)
     arms = (points - middle) / reach
     flat = arms @ first + 1j * (arms @ second)
     moments = {fold: _angular_moment(flat, near, fold) for fold in _FOLDS}

@@ -65,7 +65,7 @@ class Camera:
         )
 
 
-def shrunk(camera: Camera, side: int) -> Camera:
+def downscale(camera: Camera, side: int) -> Camera:
     """The same view with its sides divided by the least whole number that makes them at most ``side`` pixels."""
     factor = -(-max(camera.width, camera.height) // side)
     if factor <= 1:

@@ -13,7 +13,7 @@ ELEVATIONS = (12.0, 30.0, 52.0)
 """Degrees above the plane."""
 
 
-def camera_from(
+def ring_camera(
     way: np.ndarray, centre: np.ndarray, radius: float, up: np.ndarray, *, size: int, vertical_fov_degrees: float
 ) -> Camera:
     """The camera that holds the ball of ``radius`` about ``centre`` (3,) and stands the ``way`` (3,) from it; ``size``

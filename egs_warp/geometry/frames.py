@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def square_to(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def orthonormal_basis(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two unit vectors (3,) square to the unit ``direction`` (3,), right-handed before it."""
     helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
     first = np.cross(helper, direction)
@@ -13,7 +13,7 @@ def square_to(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, np.cross(direction, first)
 
 
-def turning(arms: np.ndarray) -> np.ndarray:
+def cross_matrices(arms: np.ndarray) -> np.ndarray:
     """(n, 3, 3) whose columns k are e_k x arm, how ``arms`` (n, 3) go as they turn about axis k."""
     turns = np.zeros((len(arms), 3, 3))
     for k in range(3):
@@ -22,12 +22,12 @@ def turning(arms: np.ndarray) -> np.ndarray:
     return turns
 
 
-def best_turn(masses: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+def kabsch_rotation(masses: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """(3, 3) rotation that best carries the arms ``before`` (n, 3) to those ``after``, by ``masses`` (n,) (Kabsch)."""
-    return nearest_turn(np.einsum("n,ni,nj->ij", masses, after, before))
+    return nearest_rotation(np.einsum("n,ni,nj->ij", masses, after, before))
 
 
-def nearest_turn(matrix: np.ndarray) -> np.ndarray:
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     """(3, 3) rotation nearest to a ``matrix`` (3, 3)."""
     u, _, vt = np.linalg.svd(matrix)
     return u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))] @ vt

@@ -167,7 +167,7 @@ def unit_quaternions(quaternions: np.ndarray) -> np.ndarray:
     return unit
 
 
-def joined(*clouds: GaussianCloud) -> GaussianCloud:
+def concatenate(*clouds: GaussianCloud) -> GaussianCloud:
     """One cloud with all Gaussians in turn; all of the same SH degree."""
 
     def stack(name: str) -> np.ndarray:

@@ -53,7 +53,7 @@ class HeightField:
         """Two unit vectors (3,) that span that plane."""
         return self.axes[0], self.axes[1]
 
-    def lift(self, points: np.ndarray) -> np.ndarray:
+    def ground_height(self, points: np.ndarray) -> np.ndarray:
         """(...,) height of the ground over its plane, under or over ``points`` (..., 3)."""
         return self._spline(np.asarray(points, float))[0]
 
@@ -80,20 +80,20 @@ class HeightField:
         along = np.stack([one, zero, first], axis=1) / np.sqrt(1.0 + first**2)[:, None]
         return np.stack([normal, along, np.cross(normal, along)], axis=1) @ self.axes
 
-    def top(self, point: np.ndarray, up: np.ndarray) -> float:
+    def distance_along(self, point: np.ndarray, up: np.ndarray) -> float:
         """How far along ``up`` (3,) from ``point`` (3,) the ground is."""
         way = 0.0
         for _ in range(_TOP_STEPS):
             way -= float(self.heights(point + way * up)) / float(up @ self.axes[2])
         return way
 
-    def levelled(self, points: np.ndarray) -> np.ndarray:
+    def flatten(self, points: np.ndarray) -> np.ndarray:
         """``points`` (n, 3) moved along the plane's normal until their heights over the ground are over the plane."""
-        return points - self.lift(points)[:, None] * self.axes[2]
+        return points - self.ground_height(points)[:, None] * self.axes[2]
 
-    def raised(self, points: np.ndarray) -> np.ndarray:
+    def unflatten(self, points: np.ndarray) -> np.ndarray:
         """The inverse of ``levelled``."""
-        return points + self.lift(points)[:, None] * self.axes[2]
+        return points + self.ground_height(points)[:, None] * self.axes[2]
 
     def nodes(self) -> np.ndarray:
         """(rows, columns, 3) the nodes, on the ground."""

@@ -51,10 +51,10 @@ class Lens:
             thin_prism=of("sx1", "sy1"),
             field_of_view=float(numbers.get("omega", 0.0)),
         )
-        return lens if lens.bends else None
+        return lens if lens.is_distorted else None
 
     @property
-    def bends(self) -> bool:
+    def is_distorted(self) -> bool:
         """Whether a photo differs from a pinhole's."""
         numbers = (*self.radial, *self.rational, *self.tangential, *self.thin_prism, self.field_of_view)
         return self.fisheye or any(number != 0 for number in numbers)
@@ -83,7 +83,7 @@ class Lens:
             axis=-1,
         )
 
-    def reach(self, limit: float) -> float:
+    def valid_radius(self, limit: float) -> float:
         """Radius on the plane z = 1, at most ``limit``, up to which the polynomial grows: beyond, it folds back."""
         radii = np.linspace(0.0, limit, _RADII + 1)
         along = self.distorted(np.stack([radii, np.zeros_like(radii)], axis=-1))[:, 0]
@@ -92,7 +92,7 @@ class Lens:
 
 
 @dataclass(frozen=True)
-class Straightening:
+class Undistortion:
     """The way from a photo to the pinhole photo of the same size and intrinsics."""
 
     source: np.ndarray
@@ -101,7 +101,7 @@ class Straightening:
     """(H, W) bool: the photo has it."""
 
     @classmethod
-    def of(cls, camera: Camera, lens: Lens) -> Straightening:
+    def of(cls, camera: Camera, lens: Lens) -> Undistortion:
         """For photos of ``camera``'s size and intrinsics taken through ``lens``."""
         return _straightening(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, lens)
 
@@ -126,12 +126,12 @@ class Straightening:
 
 
 @lru_cache(maxsize=2)
-def _straightening(width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens) -> Straightening:
+def _straightening(width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens) -> Undistortion:
     # Most photos of a set share their camera.
     columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = np.stack([(columns - cx) / fx, (rows - cy) / fy], axis=-1)
     radius = np.linalg.norm(rays, axis=-1)
     bent = lens.distorted(rays) * [fx, fy] + [cx, cy]
     inside = ((bent > 0.5) & (bent < [width - 0.5, height - 0.5])).all(axis=-1)
-    known = inside & (radius < lens.reach(1.01 * float(radius.max())))
-    return Straightening(np.where(known[..., None], bent, -1e4).astype(np.float32), known)
+    known = inside & (radius < lens.valid_radius(1.01 * float(radius.max())))
+    return Undistortion(np.where(known[..., None], bent, -1e4).astype(np.float32), known)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.frames import square_to
+from egs_warp.geometry.frames import orthonormal_basis
 
 
 @dataclass(frozen=True)
@@ -47,4 +47,4 @@ class Plane:
 
     def tangents(self) -> tuple[np.ndarray, np.ndarray]:
         """Two unit vectors (3,) that span the plane; (t1, t2, N) is right-handed."""
-        return square_to(self.normal)
+        return orthonormal_basis(self.normal)

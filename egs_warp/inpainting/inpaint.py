@@ -17,12 +17,12 @@ from scipy import ndimage
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.bitmaps import connected_parts, depth_inside, distance_to
-from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, joined
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, concatenate
 from egs_warp.inpainting.holes import Hole
 from egs_warp.inpainting.inpainters import Inpainter
 from egs_warp.inpainting.new_floor import flat_gaussians, rim_heights, with_gloss
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis
-from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, matte, rectify
+from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, diffuse_only, rectify
 from egs_warp.inpainting.stains import shaded, stain_around
 from egs_warp.segmentation.plane_search import near_plane
 
@@ -158,7 +158,7 @@ def inpaint(
     clock.lap("train")
     floor = near_plane(kept, window.plane, thickness) & (kept.opacities() > _SOLID)
     new = with_gloss(new, kept.subset(floor), window)
-    cloud = joined(kept, new)
+    cloud = concatenate(kept, new)
     clock.lap("join")
     notes = (
         f"{int(junk.sum())} Gaussians in the hole were replaced by {new.count} on the plane",
@@ -264,7 +264,7 @@ def _trained(
 ) -> GaussianCloud:
     """``new`` after training against the inpainted picture, between what lies around the hole; degree 0."""
     try:
-        from egs_warp.training.finetune import FinetuneOptions, GaussianTensors, Rates, TrainingView, finetune
+        from egs_warp.training.finetune import FinetuneOptions, GaussianTensors, LearningRates, TrainingView, finetune
     except ImportError as error:
         advice = "training needs PyTorch; install egs-warp[torch] or give 0"
         raise ArgumentError("steps", advice, value=options.steps) from error
@@ -274,8 +274,8 @@ def _trained(
         np.abs(crop.pixels(kept.means.numpy()) - 0.5 * np.array([crop.columns, crop.rows])).max(axis=1)
         < max(crop.rows, crop.columns)
     )
-    around = matte(kept.subset(nearby), window.plane) if nearby.any() else None
-    whole = joined(around, new) if around is not None else new
+    around = diffuse_only(kept.subset(nearby), window.plane) if nearby.any() else None
+    whole = concatenate(around, new) if around is not None else new
     trainable = np.arange(whole.count) >= whole.count - new.count
     wanted = wp.to_torch(new.sh)
 
@@ -289,7 +289,9 @@ def _trained(
         options=FinetuneOptions(
             iterations=options.steps,
             # Places and directions are the plane's; only how it is painted is learnt.
-            rates=Rates(means=0.0, rotations=0.0, log_scales=5e-3, opacity_logits=2e-2, sh_band_0=2e-2, sh_rest=0.0),
+            rates=LearningRates(
+                means=0.0, rotations=0.0, log_scales=5e-3, opacity_logits=2e-2, sh_band_0=2e-2, sh_rest=0.0
+            ),
             background=(0.5, 0.5, 0.5),
             seed=options.seed,
         ),

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
-from egs_warp.geometry.soap_film import soap_film
+from egs_warp.geometry.laplace_fill import laplace_fill
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, mean_colours
 
 _WIDTH = 0.62
@@ -51,7 +51,7 @@ def rim_heights(before: RectifiedImage, hole: np.ndarray, known: np.ndarray) -> 
     rest = np.where(known, np.clip(before.height - level, -_OUTLIER * scale, _OUTLIER * scale), 0.0)
     share = ndimage.gaussian_filter(known.astype(np.float64), _RIM_SMOOTHING)
     rim = ndimage.gaussian_filter(rest, _RIM_SMOOTHING) / np.maximum(share, 0.05)
-    return level + soap_film(rim, hole)
+    return level + laplace_fill(rim, hole)
 
 
 def flat_gaussians(

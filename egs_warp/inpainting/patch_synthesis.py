@@ -68,7 +68,7 @@ class PatchSynthesis:
                 " make the hole smaller or show more of the floor"
             )
         _, wide_hole, wide_known, _ = wide
-        melded = meld(work.picture, wide_hole, wide_known | wide_hole, work.sources())[:, : hole.shape[1]]
+        melded = poisson_blend(work.picture, wide_hole, wide_known | wide_hole, work.sources())[:, : hole.shape[1]]
         return np.where(hole[..., None], np.clip(melded, 0.0, 1.0), image).astype(np.float32)
 
 
@@ -147,7 +147,7 @@ def _with_whole_patches(sources: np.ndarray, level: _Level) -> np.ndarray:
     return np.stack([nearest[k][inside[..., 0], inside[..., 1]] for k in (0, 1)], axis=-1).astype(np.int32)
 
 
-def meld(picture: np.ndarray, hole: np.ndarray, known: np.ndarray, sources: np.ndarray) -> np.ndarray:
+def poisson_blend(picture: np.ndarray, hole: np.ndarray, known: np.ndarray, sources: np.ndarray) -> np.ndarray:
     """(H, W, 3): ``picture`` (H, W, 3) in the hole with the gradients of its ``sources`` (H, W, 2), so that pieces from
     differently lit places join without a seam: a screened Poisson equation (Bhat et al. 2008)."""
     at = np.argwhere(hole)

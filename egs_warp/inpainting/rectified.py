@@ -151,7 +151,7 @@ def mean_colours(cloud: GaussianCloud, plane: Plane) -> np.ndarray:
     return colours.numpy()
 
 
-def matte(cloud: GaussianCloud, plane: Plane) -> GaussianCloud:
+def diffuse_only(cloud: GaussianCloud, plane: Plane) -> GaussianCloud:
     """The same Gaussians in their mean colours from all directions: SH degree 0."""
     sh = wp.array((mean_colours(cloud, plane)[:, None] - 0.5) / SH_BAND_0, dtype=wp.vec3, device=cloud.device)
     return replace(cloud, sh=sh)
@@ -170,7 +170,7 @@ def rectify(cloud: GaussianCloud, window: PlaneWindow, *, thickness: float) -> R
         nothing = np.zeros(shape, np.float32)
         return RectifiedImage(np.zeros((*shape, 3), np.float32), nothing, nothing)
     floor = cloud.subset(chosen)
-    above = render_gaussians(matte(floor, window.plane), window.camera(), background=(0.0, 0.0, 0.0))
+    above = render_gaussians(diffuse_only(floor, window.plane), window.camera(), background=(0.0, 0.0, 0.0))
     alpha = above.alpha.numpy()
     seen = alpha > _NOTHING
     height = np.where(seen, window.camera_distance - above.depth.numpy(), 0.0)

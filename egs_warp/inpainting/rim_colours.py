@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from egs_warp.geometry.bitmaps import connected_parts, nearest_set
-from egs_warp.geometry.soap_film import soap_film
+from egs_warp.geometry.laplace_fill import laplace_fill
 
 _SHADE = 0.1
 """Colours nearer to each other than this are the same."""
@@ -35,7 +35,7 @@ class RimColours:
         shades, index = np.unique(np.rint(self._broad / _SHADE).astype(int).reshape(-1, 3), axis=0, return_inverse=True)
         self._shade, self._usable, self._domain = index.reshape(usable.shape), usable, domain
         like = [np.linalg.norm(self._broad - shade, axis=-1) < 1.5 * _SHADE for shade in _SHADE * shades]
-        film = soap_film(np.stack(like, axis=-1).astype(float), ~usable)[domain[:, 0], domain[:, 1]]
+        film = laplace_fill(np.stack(like, axis=-1).astype(float), ~usable)[domain[:, 0], domain[:, 1]]
         top = film.max(axis=1, keepdims=True)
         self._common = (film > _COMMON * top) | (top < _PATTERN)
 

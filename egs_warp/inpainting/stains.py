@@ -10,7 +10,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from egs_warp.geometry.bitmaps import connected_parts, distance_to
-from egs_warp.geometry.soap_film import soap_film
+from egs_warp.geometry.laplace_fill import laplace_fill
 
 _BLUR = 2.0
 """Texels: standard deviation of the blur that takes the floor's texture out."""
@@ -121,7 +121,7 @@ def _carried_on(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     on every third row and column, which is enough for what is smooth.
     """
     few = (slice(None, None, _EVERY),) * 2
-    film = soap_film(np.where(known[few][..., None], values[few], 0.0), ~known[few])
+    film = laplace_fill(np.where(known[few][..., None], values[few], 0.0), ~known[few])
     whole = cv2.resize(film, known.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return np.where(known[..., None], values, whole)
 

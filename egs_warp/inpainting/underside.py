@@ -9,9 +9,9 @@ import warp as wp
 from scipy import ndimage
 
 from egs_warp.geometry.bitmaps import depth_inside, distance_to, nearest_set
-from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, joined
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, concatenate
 from egs_warp.geometry.height_field import HeightField
-from egs_warp.geometry.soap_film import soap_film
+from egs_warp.geometry.laplace_fill import laplace_fill
 from egs_warp.inpainting.new_floor import flat_gaussians
 from egs_warp.inpainting.rectified import PlaneWindow
 
@@ -62,10 +62,10 @@ def with_underside(thing: GaussianCloud, ground: HeightField, size: float) -> tu
     unseen = inside & ~covered
     if unseen.sum() < _FOOT * inside.sum():
         return thing, 0
-    film = soap_film(heights[tuple(near)], unseen)
-    painted = soap_film(colours[tuple(near)], unseen)
+    film = laplace_fill(heights[tuple(near)], unseen)
+    painted = laplace_fill(colours[tuple(near)], unseen)
     new = flat_gaussians(window, unseen, seen, painted, film, spacing=_SPACING, device=str(thing.device))
-    return joined(thing, _of_degree(new, thing.sh.shape[1])), new.count
+    return concatenate(thing, _of_degree(new, thing.sh.shape[1])), new.count
 
 
 def _of_degree(cloud: GaussianCloud, coefficients: int) -> GaussianCloud:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-DAMAGES = (
+READ_ERRORS = (
     *(OSError, EOFError, RuntimeError, KeyError, IndexError, ValueError, TypeError, OverflowError),
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error),
 )

@@ -30,7 +30,7 @@ class Frame:
     """Variance of the Laplacian."""
 
 
-def sharp_frames(video: Path, count: int) -> Iterator[Frame]:
+def select_sharp_frames(video: Path, count: int) -> Iterator[Frame]:
     """The sharpest frame of each of ``count`` equal parts of the ``video``; all frames where it has fewer.
 
     Raises ``UserError`` for a file that is no video.

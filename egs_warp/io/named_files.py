@@ -8,7 +8,7 @@ from pathlib import Path
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.atomic import lock, sweep_all, writable_folder
-from egs_warp.io.run_folder import check_out, move_aside
+from egs_warp.io.run_folder import back_up, check_out
 
 
 class NamedFiles:
@@ -20,7 +20,7 @@ class NamedFiles:
     def begin(self) -> None:
         """Move what is there aside: all files are about to be written."""
         for folder in dict.fromkeys(path.parent for path in self._paths):
-            move_aside(folder, [path.name for path in self._paths if path.parent == folder])
+            back_up(folder, [path.name for path in self._paths if path.parent == folder])
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.lens import Straightening
+from egs_warp.geometry.lens import Undistortion
 from egs_warp.io.cameras import PosedImage
 from egs_warp.io.limits import MOST_PIXELS, check_pixels, picture_size
 
@@ -58,7 +58,7 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None) -> Photo:
     pixels = decoded(posed.image)
     turn = _turn_to_fit(posed, pixels.shape[:2])
     shape = pixels.shape[:2]
-    pixels = turned(pixels, turn)
+    pixels = apply_orientation(pixels, turn)
     full = {"uint8": 255.0, "uint16": 65535.0}.get(pixels.dtype.name, 1.0)
     values = np.atleast_3d(np.asarray(pixels, dtype=np.float32)) / full
     colour = values[:, :, :3][:, :, ::-1] if values.shape[2] >= 3 else np.repeat(values[:, :, :1], 3, axis=2)
@@ -67,7 +67,7 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None) -> Photo:
     camera = at_size(posed.camera, colour.shape[1], colour.shape[0])
     known = None
     if posed.lens is not None:
-        straight = Straightening.of(camera, posed.lens)
+        straight = Undistortion.of(camera, posed.lens)
         colour = straight.picture(colour)
         alpha = None if alpha is None else straight.picture(np.ascontiguousarray(alpha))
         known = None if straight.known.all() else straight.known
@@ -118,7 +118,7 @@ def orientation(image: Path) -> int:
     return turn if turn in range(1, 9) else 1
 
 
-def turned(pixels: np.ndarray, turn: int) -> np.ndarray:
+def apply_orientation(pixels: np.ndarray, turn: int) -> np.ndarray:
     """``pixels`` (H, W, ...) as EXIF's orientation ``turn`` wants them shown."""
     if turn >= 5:
         pixels = pixels.swapaxes(0, 1)
@@ -212,7 +212,7 @@ def _mask_of(image: Path, name: str, shape: tuple[int, ...], turn: int) -> np.nd
         raise UserError(f"{path}: not a readable picture; export the mask again")
     if pixels.shape == shape:
         # Drawn on the photo as stored.
-        pixels = turned(pixels, turn)
+        pixels = apply_orientation(pixels, turn)
     elif pixels.shape != (shape if turn < 5 else shape[::-1]):
         raise UserError(
             f"{path}: {pixels.shape[1]} x {pixels.shape[0]} pixels, but its photo has {shape[1]} x {shape[0]};"

@@ -61,7 +61,7 @@ class HoleOutline:
 
 
 @dataclass(frozen=True)
-class KnownPlane:
+class PlaneRecord:
     """A plane and what was found out about it, as far as it is known; scene units."""
 
     plane: Plane
@@ -83,11 +83,11 @@ class KnownPlane:
     others: Mapping[str, Any] = field(default_factory=dict)
     """Further entries of the file, which go along as they are."""
 
-    def over(self, known: KnownPlane) -> KnownPlane:
+    def merged_with(self, known: PlaneRecord) -> PlaneRecord:
         """This plane; what is not found out about it is as ``known`` before."""
         facts = {name: value for name in _FACTS if (value := getattr(self, name)) is not None}
         earlier = {name: getattr(known, name) for name in _FACTS}
-        return KnownPlane(self.plane, **(earlier | facts), others={**known.others, **self.others})
+        return PlaneRecord(self.plane, **(earlier | facts), others={**known.others, **self.others})
 
     def to_json(self) -> dict[str, Any]:
         """An entry of ``planes``."""
@@ -101,7 +101,7 @@ class KnownPlane:
         return {"normal": self.plane.normal.tolist(), "offset": self.plane.offset, **facts, **self.others}
 
     @classmethod
-    def from_json(cls, entry: Any, path: Path, number: int) -> KnownPlane:
+    def from_json(cls, entry: Any, path: Path, number: int) -> PlaneRecord:
         """What ``to_json`` gave. Raises ``UserError`` where something is amiss."""
         try:
             normal = np.array(entry["normal"], dtype=float).reshape(3)
@@ -159,17 +159,17 @@ def _ground_from_json(entry: Any, path: Path) -> HeightField:
 
 
 _NUMBERS = ("size", "noise", "inlier_share", "support")
-_FACTS = tuple(one.name for one in fields(KnownPlane) if one.name not in ("plane", "others"))
+_FACTS = tuple(one.name for one in fields(PlaneRecord) if one.name not in ("plane", "others"))
 
 
-def write_planes(path: Path | str, planes: Sequence[KnownPlane]) -> None:
+def write_planes(path: Path | str, planes: Sequence[PlaneRecord]) -> None:
     """Write ``planes`` (capture's units), the first being the one that the object rests on."""
     entries = [known.to_json() for known in planes]
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps({"planes": entries}, indent=1))
 
 
-def read_planes(path: Path | str) -> list[KnownPlane]:
+def read_planes(path: Path | str) -> list[PlaneRecord]:
     """The planes of a ``plane.json``. Raises ``UserError`` for anything else."""
     path = Path(path)
     try:
@@ -182,4 +182,4 @@ def read_planes(path: Path | str) -> list[KnownPlane]:
     entries = tree.get("planes") if isinstance(tree, dict) else None
     if not isinstance(entries, list) or not entries:
         raise UserError(f"{path}: it has no planes; make it with egs-warp plane")
-    return [KnownPlane.from_json(entry, path, number) for number, entry in enumerate(entries)]
+    return [PlaneRecord.from_json(entry, path, number) for number, entry in enumerate(entries)]

@@ -59,13 +59,13 @@ class RunFolder:
         if begin is not None:
             begin()
         if not self._names:
-            move_aside(self.path, _known(self.path))
+            back_up(self.path, _known(self.path))
         if name not in self._names:
             self._names.append(name)
             if (self.path / name).exists():
                 if not self._overwrite:
                     raise _occupied(self.path, f"it has {name}")
-                move_aside(self.path, [name])
+                back_up(self.path, [name])
             self._write_manifest(dict.fromkeys(self._names), finished=False)
         return self.path / name
 
@@ -96,7 +96,7 @@ class RunFolder:
             temporary.write_text(json.dumps(content, indent=1) + "\n")
 
 
-def move_aside(folder: Path, names: Sequence[str]) -> None:
+def back_up(folder: Path, names: Sequence[str]) -> None:
     """Into the first free of ``earlier-1``, ``earlier-2``, ... below ``folder`` go the files ``names`` that are there.
 
     Raises ``UserError`` where that cannot be done.
@@ -141,7 +141,7 @@ def run_folder(
         yield RunFolder(folder, command=command, overwrite=overwrite, names=_known(folder)[:-1] if resume else ())
 
 
-def tidy(out: Path | str, scratch: str) -> None:
+def clean_up(out: Path | str, scratch: str) -> None:
     """Remove what a run that was killed as it ended has left in the folder ``out`` beside its files: its folder
     ``scratch``, its lock, half-written files. Of one that still runs it removes nothing.
     """
@@ -169,7 +169,7 @@ def has_finished(out: Path | str) -> bool:
     """
     check_out(out)
     path = Path(out) / MANIFEST
-    if not path.is_file() or _is_hollow(Path(out)):
+    if not path.is_file() or _is_unfinished(Path(out)):
         raise UserError(f"{out}: no run has begun to write here; begin it")
     manifest = parse_json(read_text(path), path)
     if not isinstance(manifest, dict) or not _names_in(manifest):
@@ -194,7 +194,7 @@ def check_run_folder(out: Path | str, *, overwrite: bool = False, writes: Sequen
     check_out(out)
     if overwrite:
         return
-    if (Path(out) / MANIFEST).is_file() and not _is_hollow(Path(out)):
+    if (Path(out) / MANIFEST).is_file() and not _is_unfinished(Path(out)):
         raise _occupied(out, "it has an earlier run")
     for name in writes:
         if (Path(out) / name).exists():
@@ -239,12 +239,12 @@ def _occupied(out: Path | str, what: str) -> UserError:
 
 def _known(folder: Path) -> list[str]:
     """Files of the earlier run in ``folder`` by its manifest, which comes last."""
-    if not (folder / MANIFEST).is_file() or _is_hollow(folder):
+    if not (folder / MANIFEST).is_file() or _is_unfinished(folder):
         return []
     return [*_names_in(_manifest(folder)), MANIFEST]
 
 
-def _is_hollow(folder: Path) -> bool:
+def _is_unfinished(folder: Path) -> bool:
     """Whether the manifest in ``folder`` is of a run that was killed between it and its first file: of no run."""
     manifest = _manifest(folder)
     names = _names_in(manifest)

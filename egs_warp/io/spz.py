@@ -28,7 +28,7 @@ from egs_warp.io.raw import (
     largest_restored,
     logits_from_bytes,
 )
-from egs_warp.io.spz_streams import declared_up, deflate_streams, inflate_streams
+from egs_warp.io.spz_streams import deflate_streams, inflate_streams, stored_up_axis
 
 _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")
@@ -74,7 +74,7 @@ def decode_spz(data: bytes, source: Path) -> RawCapture:
             raise UserError(f"{source}: .spz version 4 inside gzip; unpack it first")
         check_count(layout.count, len(data), source)
         body = header + inflate_streams(data, [layout.count * width for width in layout.widths], source)
-        up = declared_up(data, source) if layout.flags & _HAS_EXTENSIONS else None
+        up = stored_up_axis(data, source) if layout.flags & _HAS_EXTENSIONS else None
     elif gzipped:
         check_count(layout.count, len(data), source)
         body = header + _inflated(inflate, inflate.unconsumed_tail, layout.size - len(header), source)

@@ -77,7 +77,7 @@ def deflate_streams(header: bytes, blocks: Sequence[bytes]) -> list[bytes]:
     return [header[:_COMMON] + struct.pack("<BI12x", len(kept), _HEADER.size), table, *streams]
 
 
-def declared_up(data: bytes, source: Path) -> np.ndarray | None:
+def stored_up_axis(data: bytes, source: Path) -> np.ndarray | None:
     """(3,) up, where an extension says which way the axes point; None without one.
 
     Raises ``UserError`` for axes that are left-handed: the capture would be its mirror image.

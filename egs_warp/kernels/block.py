@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
     __syncthreads();
 #endif
 """)
-def wait_for_block():
+def sync_block():
     """Until all threads of the block are here, and see what the others have written."""
     ...
 
@@ -33,7 +33,7 @@ def wait_for_block():
 #endif
     return value;
 """)
-def largest_of_block(value: real) -> real:
+def block_max(value: real) -> real:
     """Of the threads' values; they have waited for each other."""
     ...
 
@@ -63,7 +63,7 @@ def sum_of_block(value: real) -> real:
     return 1;
 #endif
 """)
-def lanes() -> int:
+def warp_size() -> int:
     """Threads of a warp, see ``launching.lanes_on``."""
     ...
 
@@ -75,6 +75,6 @@ def lanes() -> int:
 #endif
     return value;
 """)
-def sum_of_lanes(value: real) -> real:
+def warp_sum(value: real) -> real:
     """Of the values of a warp's threads, all of which call."""
     ...

@@ -13,8 +13,8 @@ import numpy as np
 import warp as wp
 
 from egs_warp.kernels.locomotion import active_set as kernels
-from egs_warp.kernels.locomotion.reduced_rows import STEP, Reduced, reduce_kernel, room_of
-from egs_warp.launching import kept_by_thread
+from egs_warp.kernels.locomotion.whitened_constraints import STEP, WhitenedConstraints, reduce_kernel, room_of
+from egs_warp.launching import thread_local_cache
 from egs_warp.precision import Vec4, real
 
 _PIVOTS = 600
@@ -25,7 +25,7 @@ _HOPELESS = 1e6
 
 
 @dataclass(frozen=True)
-class ReducedRows:
+class WhitenedQp:
     """The rows A of min 1/2 x^T P x + q^T x in coordinates z = D^1/2 L^T (x - x0), P = L D L^T, in which distances from
     the minimum x0 are costs."""
 
@@ -37,15 +37,15 @@ class ReducedRows:
     """(m, n) A."""
     minimum: np.ndarray
     """(n,) x0, without any bounds."""
-    free: np.ndarray
+    values_at_minimum: np.ndarray
     """(m,) A x0."""
-    lengths: np.ndarray
+    row_norms: np.ndarray
     """(m,) of the rows by z, 1 for those without any."""
-    worth: float
+    objective_drop: float
     """By how much the objective is lower at x0 than at 0, or 1 if that is less."""
 
     @classmethod
-    def of(cls, P: np.ndarray, q: np.ndarray, A: np.ndarray) -> ReducedRows:
+    def of(cls, P: np.ndarray, q: np.ndarray, A: np.ndarray) -> WhitenedQp:
         """Of P (n, n), q (n,) and A (m, n). Raises ``numpy.linalg.LinAlgError`` where P is not positive definite; one
         that holds no number has no minimum."""
         P, q, A = (np.asarray(each, dtype=np.float64) for each in (P, q, A))
@@ -53,18 +53,18 @@ class ReducedRows:
         return cls(P, q, A, minimum, free, lengths, max(1.0, -0.5 * float(q @ minimum)))
 
     @property
-    def units(self) -> np.ndarray:
+    def unit_rows(self) -> np.ndarray:
         """(m, n) the rows by z, each of length 1 or 0; as long as no others of as many are made."""
         return _room_for(self.rows).units(self)
 
-    def place(self, x: np.ndarray) -> np.ndarray:
+    def whiten(self, x: np.ndarray) -> np.ndarray:
         """(n,) z of ``x`` (n,)."""
         return _room_for(self.rows).place(self, x)
 
     @cached_property
     def slack(self) -> np.ndarray:
         """(m,) by how much each row may break its bounds."""
-        return _BROKEN * np.maximum(1.0, self.lengths)
+        return _BROKEN * np.maximum(1.0, self.row_norms)
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Optimum:
     """Whether any point satisfies the bounds; else ``x`` means nothing."""
 
 
-class _Room:
+class _Workspace:
     """Memory for a program of so many rows and unknowns, and launches that are made again and again: a new one takes
     longer than the search. It has the rows of one program at a time, the last that was asked for."""
 
@@ -87,26 +87,26 @@ class _Room:
         wide = -(-unknowns // 8) * 8
         self._minimum, self._free, self._lengths = np.zeros(unknowns), np.zeros(rows), np.zeros(rows)
         self._units, self._unknowns = np.zeros((rows, wide)), unknowns
-        reduced = Reduced()
+        reduced = WhitenedConstraints()
         self._transpose, self._roots = np.zeros((unknowns, wide)), np.zeros(unknowns)
         reduced.lower, reduced.columns = _zeros((unknowns, wide)), _zeros((unknowns, rows))
         reduced.upper, reduced.roots = _shared(self._transpose), _shared(self._roots)
         reduced.scratch = _zeros((room_of(unknowns, wide),))
         reduced.minimum, reduced.free, reduced.lengths = map(_shared, (self._minimum, self._free, self._lengths))
         reduced.rows, reduced.products = map(_by_fours, (self._units, np.zeros((rows, rows))))
-        reduced.known = wp.zeros(rows, dtype=int, device="cpu")
+        reduced.has_products = wp.zeros(rows, dtype=int, device="cpu")
         self._definite, self._at_zero = np.zeros(1, np.int32), np.zeros(rows)
         self._lower, self._upper, self._slack = np.zeros((3, rows))
         self._most, self._pulls = np.zeros(1), np.zeros(unknowns)
         self._side, self._active, self._ended = (np.zeros(count, np.int32) for count in (rows, unknowns, 2))
-        program, search = kernels.Program(), kernels.Search()
-        program.reduced, program.free = reduced, _by_fours(self._at_zero)
+        program, search = kernels.Program(), kernels.ActiveSetState()
+        program.constraints, program.values_at_origin = reduced, _by_fours(self._at_zero)
         program.lower, program.upper, program.slack = map(_shared, (self._lower, self._upper, self._slack))
-        program.most, search.pulls = _shared(self._most), _shared(self._pulls)
+        program.cost_limit, search.multipliers = _shared(self._most), _shared(self._pulls)
         search.side, search.active = _shared(self._side), _shared(self._active)
-        search.at, search.outside = _by_fours(np.zeros(rows)), _by_fours(np.zeros(wide))
+        search.values, search.orthogonal_part = _by_fours(np.zeros(rows)), _by_fours(np.zeros(wide))
         search.factor = _zeros((unknowns, unknowns))
-        search.rates, search.across = _zeros((unknowns,)), _zeros((unknowns,))
+        search.rates, search.solved_products = _zeros((unknowns,)), _zeros((unknowns,))
         self._reducing: Any = wp.launch(
             reduce_kernel,
             1,
@@ -141,35 +141,35 @@ class _Room:
             self._minimum[:], self._free[:], self._lengths[:] = np.nan, np.nan, 1.0
         return self._minimum.copy(), self._free[: len(A)].copy(), self._lengths[: len(A)].copy()
 
-    def units(self, reduced: ReducedRows) -> np.ndarray:
+    def units(self, reduced: WhitenedQp) -> np.ndarray:
         """See ``ReducedRows``."""
         self._take(reduced)
         return self._units[: len(reduced.rows), : self._unknowns]
 
-    def place(self, reduced: ReducedRows, x: np.ndarray) -> np.ndarray:
+    def place(self, reduced: WhitenedQp, x: np.ndarray) -> np.ndarray:
         """See ``ReducedRows``."""
         self._take(reduced)
         away = x - reduced.minimum
         return (away + self._transpose[:, : self._unknowns] @ away) / self._roots
 
-    def _take(self, reduced: ReducedRows) -> None:
+    def _take(self, reduced: WhitenedQp) -> None:
         wanted = reduced.P, reduced.q, reduced.rows
         if self._has is None or any(one is not other for one, other in zip(self._has, wanted, strict=True)):
             self.reduce(*wanted)
             self._has = wanted
 
     def search(
-        self, reduced: ReducedRows, lower: np.ndarray, upper: np.ndarray, side: np.ndarray
+        self, reduced: WhitenedQp, lower: np.ndarray, upper: np.ndarray, side: np.ndarray
     ) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """How it ended, of the rows that hold the numbers, the sides and the multipliers, and the point."""
         self._take(reduced)
         m, point = len(reduced.rows), np.empty(self._unknowns)
-        self._at_zero[:m], self._at_zero[m:] = reduced.free / reduced.lengths, 0.0
-        self._lower[:m], self._lower[m:] = lower / reduced.lengths, -np.inf
-        self._upper[:m], self._upper[m:] = upper / reduced.lengths, np.inf
-        self._slack[:m], self._slack[m:] = reduced.slack / reduced.lengths, 0.0
+        self._at_zero[:m], self._at_zero[m:] = reduced.values_at_minimum / reduced.row_norms, 0.0
+        self._lower[:m], self._lower[m:] = lower / reduced.row_norms, -np.inf
+        self._upper[:m], self._upper[m:] = upper / reduced.row_norms, np.inf
+        self._slack[:m], self._slack[m:] = reduced.slack / reduced.row_norms, 0.0
         self._side[:m], self._side[m:] = side, 0
-        self._most[0] = _HOPELESS * reduced.worth
+        self._most[0] = _HOPELESS * reduced.objective_drop
         self._searching.set_param_at_index_from_ctype(4, point.ctypes.data)
         self._searching.launch()
         how, count = self._ended.tolist()
@@ -177,10 +177,10 @@ class _Room:
         return how, active, self._side[active], self._pulls[:count].copy(), point
 
 
-_room = kept_by_thread(16)(_Room)
+_room = thread_local_cache(16)(_Workspace)
 
 
-def _room_for(A: np.ndarray) -> _Room:
+def _room_for(A: np.ndarray) -> _Workspace:
     return _room(-(-len(A) // STEP) * STEP, A.shape[1])
 
 
@@ -196,8 +196,8 @@ def _by_fours(values: np.ndarray) -> wp.array:
     return wp.array(values.reshape(*values.shape[:-1], -1, 4), dtype=Vec4, device="cpu", copy=False)
 
 
-def optimum_near(
-    reduced: ReducedRows, lower: np.ndarray, upper: np.ndarray, low: np.ndarray, high: np.ndarray
+def solve_from_guess(
+    reduced: WhitenedQp, lower: np.ndarray, upper: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> Optimum | None:
     """Of l <= A x <= u, l < u; ``low`` and ``high`` (m,) guess which rows lie at which bound. None where rounding leads
     the search astray.
@@ -206,11 +206,11 @@ def optimum_near(
     side = np.where(low & np.isfinite(lower), 1, np.where(high & np.isfinite(upper), -1, 0))
     how, active, sides, pulls, x = _room_for(reduced.rows).search(reduced, lower, upper, side)
     multipliers = np.zeros(m)
-    if how == kernels.ASTRAY:
+    if how == kernels.NUMERICAL_FAILURE:
         return None
     if how == kernels.INFEASIBLE:
         return Optimum(np.zeros(n), multipliers, False)
-    multipliers[active] = -sides * pulls / reduced.lengths[active]
+    multipliers[active] = -sides * pulls / reduced.row_norms[active]
     at, slack = reduced.rows @ x, 10.0 * reduced.slack
     # Rows that contradict each other are met by none, whatever their multipliers.
     met = bool((at > lower - slack).all() and (at < upper + slack).all())

@@ -16,14 +16,14 @@ import warp as wp
 
 from egs_warp.kernels.locomotion import admm as kernels
 from egs_warp.kernels.locomotion import scaled_programs as scaled
-from egs_warp.launching import Device, empty_together
+from egs_warp.launching import Device, empty_pooled
 from egs_warp.precision import real
 
 _RHO = 0.1
 """Of a program's first iterations."""
 
 
-class Ending(Enum):
+class AdmmStatus(Enum):
     """How iterations end."""
 
     SOLVED = kernels.SOLVED
@@ -41,7 +41,7 @@ class Ending(Enum):
 
 
 @dataclass(frozen=True)
-class Dense:
+class DenseQp:
     """min 1/2 x^T P x + q^T x over rows A; their bounds come later."""
 
     P: np.ndarray
@@ -53,10 +53,10 @@ class Dense:
 
 
 @dataclass(frozen=True)
-class Iterate:
+class AdmmResult:
     """Where the iterations on a program have ended."""
 
-    ending: Ending
+    ending: AdmmStatus
     x: np.ndarray
     """(n,)."""
     multipliers: np.ndarray
@@ -69,7 +69,7 @@ class AdmmPrograms:
     have ended, with the rho that they have found."""
 
     def __init__(
-        self, programs: Sequence[Dense], *, device: Device, scaling: int = 4, adapt: int = 50, rho: float = _RHO
+        self, programs: Sequence[DenseQp], *, device: Device, scaling: int = 4, adapt: int = 50, rho: float = _RHO
     ) -> None:
         """``scaling`` passes equilibrate, rho begins with ``rho`` and may change every ``adapt`` iterations, a multiple
         of ``kernels.CHECK``."""
@@ -94,7 +94,7 @@ class AdmmPrograms:
         *,
         accuracy: float,
         iterations: int,
-    ) -> list[Iterate]:
+    ) -> list[AdmmResult]:
         """With each program's bounds l <= A x <= u (m,), from its start (n,) if there is one; at most ``iterations``
         each, to ``accuracy``, absolute and relative."""
         k, n = self._x.shape
@@ -120,20 +120,20 @@ class AdmmPrograms:
         how, count = ended.numpy(), taken.numpy()
         ends = []
         for i, (rows, columns) in enumerate(self._sizes):
-            ending, x, y = Ending(int(how[i])), self._x[i, :columns].copy(), self._y[i, :rows].copy()
+            ending, x, y = AdmmStatus(int(how[i])), self._x[i, :columns].copy(), self._y[i, :rows].copy()
             if not np.isfinite(x).all() or not np.isfinite(y).all():
-                ending = Ending.FAILED
-            if ending in (Ending.INFEASIBLE, Ending.DOUBTFUL, Ending.FAILED):
+                ending = AdmmStatus.FAILED
+            if ending in (AdmmStatus.INFEASIBLE, AdmmStatus.DOUBTFUL, AdmmStatus.FAILED):
                 # What was driven apart is no place to begin.
                 self._x[i], self._y[i], self._rho[i] = 0.0, 0.0, self._first
-            ends.append(Iterate(ending, x, y, int(count[i])))
+            ends.append(AdmmResult(ending, x, y, int(count[i])))
         return ends
 
     def _on_device(self, values: np.ndarray) -> wp.array:
         return wp.array(values, dtype=real, device=self._device, copy=False)
 
 
-class AdmmNear:
+class AdmmWarmStart:
     """Iterations on min 1/2 x^T x over rows A, of so many rows and unknowns: memory and a launch are made once, for
     only numbers change, which come and go in one piece. They begin where they are told to."""
 
@@ -169,7 +169,7 @@ class AdmmNear:
             record_cmd=True,
         )
 
-    def run(self, rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
+    def run(self, rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> AdmmResult:
         """With ``rows`` A (m, n), which may be fewer than there is room for, and bounds l <= A x <= u (m,), from
         ``start`` (n,), or from 0."""
         m, n = rows.shape
@@ -185,18 +185,18 @@ class AdmmNear:
         wp.copy(self._how, self._ended)
         wp.copy(self._count, self._taken)
         wp.synchronize_stream(self._device)
-        ending = Ending(int(self._how.numpy()[0]))
+        ending = AdmmStatus(int(self._how.numpy()[0]))
         if not np.isfinite(x).all() or not np.isfinite(y).all():
-            ending = Ending.FAILED
-        return Iterate(ending, x.copy(), y[:m].copy(), int(self._count.numpy()[0]))
+            ending = AdmmStatus.FAILED
+        return AdmmResult(ending, x.copy(), y[:m].copy(), int(self._count.numpy()[0]))
 
 
 def _memory(device: wp.Device, k: int, m: int, n: int) -> tuple[Any, wp.array, wp.array]:
     """Of k programs of so many rows and variables: to work in, how they end, and after how many iterations."""
-    memory = scaled.Memory()
+    memory = scaled.AdmmWorkspace()
     square, table = ((k, n, n), real), ((k, m, n), real)
     memory.P, memory.inverse, memory.rows, memory.columns, memory.by_variable, memory.by_row, ended, taken = (
-        empty_together(
+        empty_pooled(
             device,
             *(square, square, table, ((k, n, m), real), ((k, scaled.BY_VARIABLE, n), real)),
             *(((k, scaled.BY_ROW, m), real), (k, int), (k, int)),

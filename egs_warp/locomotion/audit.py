@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from egs_warp.locomotion.ledger import Ledger, ledger
+from egs_warp.locomotion.ledger import EnergyBalance, energy_balance
 from egs_warp.locomotion.trajectory import Trajectory
 
 
@@ -27,7 +27,7 @@ class Audit:
     newton_unconverged: int
 
 
-def audit(trajectory: Trajectory, *, energy: Ledger | None = None, newton_unconverged: int = 0) -> Audit:
+def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton_unconverged: int = 0) -> Audit:
     """Recompute every bound of the audit from the trajectory; ``energy`` is its ledger, if that is known."""
     t = trajectory
     unit = t.node_mass.sum() * np.linalg.norm(t.gravity) * t.height
@@ -45,11 +45,11 @@ def audit(trajectory: Trajectory, *, energy: Ledger | None = None, newton_unconv
     missed = np.linalg.norm(stored - way, axis=1) / t.dt[t.contact_step]
     deepest = min(float(t.min_gap.min()), float(_uneven_end_gaps(t).min(initial=0.0)))
     edges = t.positions[:, t.tets[:, 1:]] - t.positions[:, t.tets[:, :1]]
-    energy = energy or ledger(t)
+    energy = energy or energy_balance(t)
     return Audit(
         momentum_residual=float(np.linalg.norm(linear, axis=1).max(initial=0.0) * t.height / unit),
         angular_momentum_residual=float(np.linalg.norm(angular, axis=1).max(initial=0.0) / unit),
-        energy_residual=energy.worst,
+        energy_residual=energy.max_residual,
         cone_violation=float(np.maximum(rubbing - t.friction * normal, -normal).max(initial=0.0) * t.height / unit),
         friction_gap=float(friction_gap.max(initial=0.0) / unit),
         contact_velocity=float(missed[normal > 0.0].max(initial=0.0) / np.sqrt(np.linalg.norm(t.gravity) * t.height)),

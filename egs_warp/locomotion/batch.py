@@ -13,23 +13,23 @@ import numpy as np
 import torch
 
 from egs_warp.contact.batch_contacts import BatchContacts, BatchDetector, padded
-from egs_warp.contact.batch_step import BatchResponse, BatchResult, BatchSolver, Stages, untimed
+from egs_warp.contact.batch_step import BatchLinearization, BatchResult, BatchSolver, StageTimer, no_timer
 from egs_warp.contact.coupled_step import CoupledSolver
 from egs_warp.contact.detection import ContactGeometry, ContactSet
-from egs_warp.contact.points import ContactPoints
+from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.batch_factors import CHUNK_BYTES, PANEL
-from egs_warp.fem.batch_problem import BatchBody, BatchProblem, inverse_of
+from egs_warp.fem.batch_problem import BatchBody, BatchProblem, apply_inverse
+from egs_warp.fem.batched import BatchedRecord, nonzero
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.worlds import Worlds, indices
 from egs_warp.locomotion.rollout import SETTLING_STEP, SETTLING_STEPS, has_settled
 from egs_warp.locomotion.settings import LocomotionSettings
-from egs_warp.locomotion.stepper import LOOKS, MOST_HALVINGS, StepMemory, StepReport
+from egs_warp.locomotion.stepper import MAX_HALVINGS, PREDICTION_ITERATIONS, StepReport, WarmStart
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.render.autograd import torch_stream
 
 
 @dataclass(frozen=True)
-class BatchState(Worlds):
+class BatchState(BatchedRecord):
     """Where c worlds are, and what their last steps hand on."""
 
     worlds: torch.Tensor
@@ -48,13 +48,13 @@ class BatchState(Worlds):
     """(c, K, 3) newtons."""
 
     @property
-    def there(self) -> torch.Tensor:
+    def valid(self) -> torch.Tensor:
         """(c, K) bool: the places that are taken."""
         return torch.arange(self.points.shape[1], device=self.counts.device) < self.counts[:, None]
 
 
 @dataclass(frozen=True)
-class BatchStep(Worlds):
+class BatchStep(BatchedRecord):
     """What happened in one step of c worlds; on the device until it is asked for."""
 
     dt: float
@@ -143,7 +143,7 @@ class BatchStepper:
         settings: LocomotionSettings | None = None,
         panel: int = PANEL,
         chunk_bytes: int = CHUNK_BYTES,
-        stages: Stages = untimed,
+        stages: StageTimer = no_timer,
     ) -> None:
         """``frictions`` (B,): Coulomb coefficient of each world's ground, in place of the ``geometry``'s. Factors take
         72 N^2 bytes for each world; ``chunk_bytes`` bounds the matrices that are worked on at a time, beside which some
@@ -155,8 +155,8 @@ class BatchStepper:
         self.device = torch.device(str(body.assembly.device))
         count = len(frictions)
         self.body, self.muscles = body, muscles
-        near = self.settings.near * body.height
-        points = ContactPoints(geometry, near=near, lower=0.1 * near)
+        near = self.settings.activation_distance * body.height
+        points = ContactSelector(geometry, near=near, lower=0.1 * near)
         self.common = BatchBody(body, muscles, count, panel=panel, chunk_bytes=chunk_bytes)
         self.detector = BatchDetector(geometry, points, count, device=self.device)
         self.solver = BatchSolver(
@@ -172,7 +172,7 @@ class BatchStepper:
     def _tensor(self, values: Sequence[float] | np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.asarray(values, dtype=np.float64), device=self.device)
 
-    def start(self, states: Sequence[BodyState], memories: Sequence[StepMemory] | None = None) -> BatchState:
+    def start(self, states: Sequence[BodyState], memories: Sequence[WarmStart] | None = None) -> BatchState:
         """Each world at one of ``states``; what their last steps handed on is in ``memories``, nothing if None."""
         count = len(self._frictions)
         most = max((len(memory.points) for memory in memories or ()), default=0)
@@ -204,7 +204,7 @@ class BatchStepper:
                 state, moved, failed = self._passive_step(state, SETTLING_STEP * body.time_unit)
                 ends[state.worlds], lost[state.worlds] = state.positions, failed
                 gone = (self.common.centre(state.positions)[:, 0] - begun).norm(dim=1)
-                state = state.kept(indices(~has_settled(body, moved, gone) & ~failed))
+                state = state.subset(nonzero(~has_settled(body, moved, gone) & ~failed))
         return [BodyState(end, np.zeros_like(end)) for end in ends.cpu().numpy()], lost
 
     def _passive_step(self, state: BatchState, dt: float) -> tuple[BatchState, torch.Tensor, torch.Tensor]:
@@ -212,10 +212,10 @@ class BatchStepper:
         (c,) bool, for which a tangent had no factors."""
         problem = self._problem(state, dt, 0.0)
         contacts, known, start_gaps = self._detect(problem, state)
-        velocities = problem.start()
+        velocities = problem.rigid_guess()
         lost = ~problem.factor(velocities, None)
         contacts, result = self.solver.solve(
-            *(problem, contacts, self.solver.respond(problem, contacts)),
+            *(problem, contacts, self.solver.linearize(problem, contacts)),
             *(self._stiffness.new_zeros((len(velocities), len(self._stiffness))), self._frictions[state.worlds]),
             velocities=velocities,
             forces=known,
@@ -225,7 +225,7 @@ class BatchStepper:
             *(state.worlds, problem.end_positions(result.velocities), torch.zeros_like(velocities), state.time),
             *(contacts.points, contacts.counts, result.forces),
         )
-        return after, dt * result.velocities.abs().flatten(1).amax(dim=1), lost | result.lost
+        return after, dt * result.velocities.abs().flatten(1).amax(dim=1), lost | result.is_singular
 
     def advance(
         self, state: BatchState, activations: np.ndarray | torch.Tensor, dt: float
@@ -235,14 +235,14 @@ class BatchStepper:
         solved, not even in part. Those whose step does not converge make it again in halves."""
         with torch.no_grad(), torch_stream(self.device):
             given = torch.as_tensor(activations, dtype=torch.float64, device=self.device)
-            after, done, lost = self._parts(state, given, dt, MOST_HALVINGS)
+            after, done, lost = self._parts(state, given, dt, MAX_HALVINGS)
             fine = torch.zeros(len(self._frictions), dtype=torch.bool, device=self.device)
             for step in done:
                 fine[step.worlds] |= step.converged
             lost |= ~fine[state.worlds]
             fine[state.worlds[lost]] = False
-            told = [step.kept(indices(fine[step.worlds])) for step in done]
-            return after.kept(indices(fine[after.worlds])), [step for step in told if len(step.worlds) > 0], lost
+            told = [step.subset(nonzero(fine[step.worlds])) for step in done]
+            return after.subset(nonzero(fine[after.worlds])), [step for step in told if len(step.worlds) > 0], lost
 
     def _parts(
         self, state: BatchState, activations: torch.Tensor, dt: float, left: int
@@ -250,13 +250,13 @@ class BatchStepper:
         """Steps of ``dt``, those that do not converge in halves, so many times over as are ``left``; (c,) bool, which
         worlds were lost on the way."""
         step, lost = self._step(state, activations, dt)
-        again = indices(~step.converged & ~lost)
+        again = nonzero(~step.converged & ~lost)
         if left == 0 or len(again) == 0:
-            fine = indices(~lost)
-            return step.after.kept(fine), [step.kept(fine)], lost
-        fine = indices(step.converged & ~lost)
-        done, after = [step.kept(fine)], step.after.kept(fine)
-        half, rows, given = state.of(again), again, activations[again]
+            fine = nonzero(~lost)
+            return step.after.subset(fine), [step.subset(fine)], lost
+        fine = nonzero(step.converged & ~lost)
+        done, after = [step.subset(fine)], step.after.subset(fine)
+        half, rows, given = state.gather(again), again, activations[again]
         for _ in range(2):
             half, parts, gone = self._parts(half, given, 0.5 * dt, left - 1)
             done += parts
@@ -270,7 +270,7 @@ class BatchStepper:
         with self._stages("detect"):
             problem = self._problem(state, dt, self.settings.drag)
             contacts, known, start_gaps = self._detect(problem, state)
-        response, velocities, forces, lost = self._foresee(problem, contacts, known, tensions, frictions)
+        response, velocities, forces, lost = self._predict(problem, contacts, known, tensions, frictions)
         contacts, result = self.solver.solve(
             *(problem, contacts, response, tensions, frictions),
             velocities=velocities,
@@ -278,7 +278,7 @@ class BatchStepper:
             start_gaps=start_gaps,
         )
         step = self._finish(problem, contacts, result, state, activations)
-        lost |= result.lost
+        lost |= result.is_singular
         return replace(step, converged=step.converged & ~lost), lost
 
     def _problem(self, state: BatchState, dt: float, drag: float) -> BatchProblem:
@@ -290,50 +290,50 @@ class BatchStepper:
         """Contacts, the forces (c, K, 3) newtons that they had in the last step, and gaps and faces at the start."""
         ballistic = state.velocities + problem.dt * self.common.gravity
         gaps, _ = self.detector.gaps(problem.end_positions(ballistic))
-        chosen = self.detector.choose(state.points, state.there, state.forces[:, :, 0] > 0.0, gaps)
+        chosen = self.detector.select(state.points, state.valid, state.forces[:, :, 0] > 0.0, gaps)
         start_gaps = self.detector.gaps(state.positions)
         contacts = self.detector.contacts(chosen, *start_gaps)
-        return contacts, self.detector.matched(contacts, state.points, state.there, state.forces), start_gaps
+        return contacts, self.detector.transfer_forces(contacts, state.points, state.valid, state.forces), start_gaps
 
-    def _foresee(
+    def _predict(
         self,
         problem: BatchProblem,
         contacts: BatchContacts,
         known: torch.Tensor,
         tensions: torch.Tensor,
         frictions: torch.Tensor,
-    ) -> tuple[BatchResponse, torch.Tensor, torch.Tensor, torch.Tensor]:
+    ) -> tuple[BatchLinearization, torch.Tensor, torch.Tensor, torch.Tensor]:
         """``LocomotionStepper.foresee``: response, velocities (c, N, 3), forces (c, K, 3), and (c,) bool, for which a
         tangent had no factors."""
         solver, stages = self.solver, self._stages
-        velocities, shift = problem.start(), solver.shift(contacts, problem.dt)
+        velocities, shift = problem.rigid_guess(), solver.normal_bias(contacts, problem.dt)
         with stages("factor"):
             lost = ~problem.factor(velocities, None)
         with stages("elasticity"):
             missing = problem.residual(velocities, tensions)
-        missing = missing - problem.dt * contacts.pushes(known, velocities.shape[1])
+        missing = missing - problem.dt * contacts.nodal_forces(known, velocities.shape[1])
         with stages("substitute"):
-            moved, _ = inverse_of(problem, missing.flatten(1)[:, :, None])
+            moved, _ = apply_inverse(problem, missing.flatten(1)[:, :, None])
         ahead = velocities - moved.view_as(velocities)
-        taken = indices(problem.feasible(ahead) & ~lost)
+        taken = nonzero(problem.is_inversion_free(ahead) & ~lost)
         velocities[taken] = ahead[taken]
         if len(taken) > 0:
             with stages("factor"):
-                lost[taken] = ~problem.kept(taken).factor(velocities[taken], None)
-        response = solver.respond(problem, contacts)
-        looking, forces = indices(~lost), known.clone()
-        for _ in range(LOOKS):
+                lost[taken] = ~problem.subset(taken).factor(velocities[taken], None)
+        response = solver.linearize(problem, contacts)
+        looking, forces = nonzero(~lost), known.clone()
+        for _ in range(PREDICTION_ITERATIONS):
             if len(looking) == 0:
                 break
-            part, touched, answer = problem.kept(looking), contacts.kept(looking), response.kept(looking)
+            part, touched, answer = problem.subset(looking), contacts.subset(looking), response.subset(looking)
             with stages("elasticity"):
                 missing = part.residual(velocities[looking], tensions[looking])
             with stages("substitute"):
-                moved, _ = inverse_of(part, missing.flatten(1)[:, :, None], answer.turning)
+                moved, _ = apply_inverse(part, missing.flatten(1)[:, :, None], answer.momentum_projection)
             free = velocities[looking] - moved.view_as(missing)
-            found, _ = solver.forces(touched, answer, free, shift[looking], frictions[looking], known[looking])
+            found, _ = solver.solve_coulomb(touched, answer, free, shift[looking], frictions[looking], known[looking])
             ahead = free + (answer.columns @ found.flatten(1)[:, :, None]).view_as(free)
-            fine = part.feasible(ahead)
+            fine = part.is_inversion_free(ahead)
             forces[looking] = found
             looking = looking[fine]
             velocities[looking], known[looking] = ahead[fine], found[fine]
@@ -365,7 +365,7 @@ class BatchStepper:
             activations=activations,
             iterations=result.iterations,
             converged=result.converged,
-            added_spin=problem.spin(internal).norm(dim=1),
+            added_spin=problem.momentum_correction(internal).norm(dim=1),
         )
 
 
@@ -380,4 +380,4 @@ def _merged(one: BatchState, other: BatchState) -> BatchState:
         field.name: torch.cat([getattr(one, field.name), getattr(other, field.name)]) for field in fields(BatchState)
     }
     both = BatchState(**values)
-    return both.of(torch.argsort(both.worlds))
+    return both.gather(torch.argsort(both.worlds))

@@ -34,10 +34,10 @@ FLOWS = (
 
 
 @dataclass(frozen=True)
-class Ledger:
+class EnergyBalance:
     """Joules: F+1 states, F steps. What takes energy from the body is negative."""
 
-    unit: float
+    energy_unit: float
     """m g H."""
     kinetic_com: np.ndarray
     """(F+1,) of the centre of mass."""
@@ -86,17 +86,17 @@ class Ledger:
     @property
     def residual(self) -> np.ndarray:
         """(F,) what the stored energy gains beside all flows, over m g H."""
-        return (np.diff(self.stored) - np.sum([getattr(self, name) for name in FLOWS], axis=0)) / self.unit
+        return (np.diff(self.stored) - np.sum([getattr(self, name) for name in FLOWS], axis=0)) / self.energy_unit
 
     @property
-    def worst(self) -> float:
+    def max_residual(self) -> float:
         """Largest ``residual`` of any step, either way."""
         # Not max(initial=0): where an element is inverted there is no energy, and NaN must be seen.
         return float(np.abs(self.residual).max()) if len(self.residual) else 0.0
 
 
 @dataclass(frozen=True)
-class EnergySums:
+class EnergyTotals:
     """A ledger over all steps, over m g H but for its unit."""
 
     unit_joules: float
@@ -105,7 +105,7 @@ class EnergySums:
     """Sum over segments and steps of max(0, T (L before - L after))."""
     flows: Mapping[str, float]
     """Of each of ``FLOWS``, its sum."""
-    gained: float
+    change: float
     """Energy of the last state less that of the first."""
     peak_deformation: float
     """Largest kinetic energy of deformation."""
@@ -115,20 +115,20 @@ class EnergySums:
     """Of any step."""
 
     @classmethod
-    def of(cls, books: Ledger) -> EnergySums:
+    def of(cls, books: EnergyBalance) -> EnergyTotals:
         """Of a run."""
         return cls(
-            books.unit,
-            float(books.muscle_work.sum() / books.unit),
-            {name: float(getattr(books, name).sum() / books.unit) for name in FLOWS},
-            float((books.stored[-1] - books.stored[0]) / books.unit),
-            float(books.kinetic_deformation.max() / books.unit),
-            float(books.elastic.max() / books.unit),
-            books.worst,
+            books.energy_unit,
+            float(books.muscle_work.sum() / books.energy_unit),
+            {name: float(getattr(books, name).sum() / books.energy_unit) for name in FLOWS},
+            float((books.stored[-1] - books.stored[0]) / books.energy_unit),
+            float(books.kinetic_deformation.max() / books.energy_unit),
+            float(books.elastic.max() / books.energy_unit),
+            books.max_residual,
         )
 
 
-def ledger(trajectory: Trajectory) -> Ledger:
+def energy_balance(trajectory: Trajectory) -> EnergyBalance:
     """Every term of every step."""
     t = trajectory
     mass = t.node_mass.sum()
@@ -136,7 +136,7 @@ def ledger(trajectory: Trajectory) -> Ledger:
     muscles = _Muscles.of(t)
     stored = np.array([_stored(t, body, x, v) for x, v in zip(t.positions, t.velocities, strict=True)])
     flows = np.array([_flows(t, body, muscles, step) for step in range(len(t.dt))]).reshape(-1, len(FLOWS) + 1)
-    return Ledger(
+    return EnergyBalance(
         float(mass * np.linalg.norm(t.gravity) * t.height),
         **dict(zip(STORED, stored.T, strict=True)),
         **dict(zip((*FLOWS, "muscle_work"), flows.T, strict=True)),

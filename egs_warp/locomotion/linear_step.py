@@ -9,24 +9,24 @@ from typing import Any, Protocol
 import numpy as np
 
 from egs_warp.contact.detection import ContactSet
-from egs_warp.contact.response import ContactResponse
+from egs_warp.contact.newton import ContactLinearization
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.launching import beside
+from egs_warp.launching import run_concurrently
 from egs_warp.locomotion.objectives import Objective
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.muscle_set import MuscleSet
-from egs_warp.muscles.tension import GroupImpulses
+from egs_warp.muscles.tension import SynergyColumns
 
-LOOKS = 2
+PREDICTION_ITERATIONS = 2
 """Newton steps with contact in which a step is foreseen."""
 
 
 @dataclass(frozen=True)
-class Prospect:
+class PredictedStep:
     """Where a step would end under some activations, and the tangent there."""
 
-    response: ContactResponse
-    shift: np.ndarray
+    linearization: ContactLinearization
+    normal_bias: np.ndarray
     """(n,) m/s, the constants of the contacts' normal measures."""
     activations: np.ndarray
     """(M,) metres."""
@@ -37,12 +37,12 @@ class Prospect:
 
 
 @dataclass(frozen=True)
-class StepStart:
+class StepInputs:
     """What a step begins with."""
 
     problem: StepProblem
     contacts: ContactSet
-    shift: np.ndarray
+    normal_bias: np.ndarray
     """(n,) m/s, see ``Prospect``."""
     friction: float
     activations: np.ndarray
@@ -51,10 +51,12 @@ class StepStart:
     """(n, 3) newtons of the step before, as far as these contacts were there."""
 
     @classmethod
-    def again(cls, prospect: Prospect, friction: float, activations: np.ndarray) -> StepStart:
+    def from_prediction(cls, prospect: PredictedStep, friction: float, activations: np.ndarray) -> StepInputs:
         """Of the step of the ``prospect``, with its forces."""
-        response = prospect.response
-        return cls(response.tangent.problem, response.contacts, prospect.shift, friction, activations, prospect.forces)
+        response = prospect.linearization
+        return cls(
+            response.tangent.problem, response.contacts, prospect.normal_bias, friction, activations, prospect.forces
+        )
 
 
 @dataclass(frozen=True)
@@ -81,15 +83,15 @@ class LinearStep:
         """(3N,) m/s without muscles and contact."""
         return self.velocities[:, -1]
 
-    def end(self, x: np.ndarray) -> np.ndarray:
+    def end_velocities(self, x: np.ndarray) -> np.ndarray:
         """(3N,) m/s for ``x`` (k,)."""
         return self.base + self.columns @ x
 
-    def speeds(self, contacts: ContactSet) -> np.ndarray:
+    def contact_velocities(self, contacts: ContactSet) -> np.ndarray:
         """(3n, k + 1) m/s of ``contacts`` along their axes, as ``velocities``."""
-        return contacts.speeds(self.velocities)
+        return contacts.contact_velocities(self.velocities)
 
-    def squares(self, objectives: Sequence[Objective]) -> Callable[[], np.ndarray]:
+    def objective_quadratic(self, objectives: Sequence[Objective]) -> Callable[[], np.ndarray]:
         """Begins what gives (k + 1, k + 1) G with (x, 1) G (x, 1) / 2 the weighted squares of what ``objectives`` ask,
         (m/s)^2."""
         form = np.zeros((self.count + 1, self.count + 1))
@@ -100,31 +102,31 @@ class LinearStep:
         return lambda: form
 
 
-class LinearSteps(Protocol):
+class StepLinearizer(Protocol):
     """Linear steps of one body, about one prospect after the other."""
 
-    def about(self, prospect: Prospect, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
+    def linearize(self, prospect: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
         """The step about ``prospect``, of the groups' activations in their bounds and contact forces in body weights.
         And what ``other`` gives, which may be called meanwhile."""
         ...
 
 
-class HostLinearSteps:
+class HostStepLinearizer:
     """``LinearSteps`` in arrays of the host."""
 
     def __init__(self, muscles: MuscleSet, synergies: Synergies) -> None:
-        self._impulses = GroupImpulses(muscles, synergies.group_from_muscle)
+        self._impulses = SynergyColumns(muscles, synergies.group_from_muscle)
         self._count = synergies.count
 
-    def about(self, prospect: Prospect, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
+    def linearize(self, prospect: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
         """See ``LinearSteps``."""
-        response, foreseen, m = prospect.response, prospect.velocities, self._count
+        response, foreseen, m = prospect.linearization, prospect.velocities, self._count
         problem, contacts = response.tangent.problem, response.contacts
         weight = problem.body.weight
         # Without muscles and contact.
         free = problem.residual(foreseen, None).ravel()
-        impulses = self._impulses.beside(free, problem.end_positions(foreseen), problem.dt)
-        solved, given = beside(lambda: response.tangent.solve(impulses), other)
+        impulses = self._impulses.with_base(free, problem.end_positions(foreseen), problem.dt)
+        solved, given = run_concurrently(lambda: response.tangent.solve(impulses), other)
         velocities = np.empty((free.size, m + 3 * contacts.count + 1))
         velocities[:, :m] = solved[:, :-1]
         np.multiply(weight, response.columns, out=velocities[:, m:-1])
@@ -134,5 +136,5 @@ class HostLinearSteps:
 
 def torques_of(problem: StepProblem, contacts: ContactSet, m: int) -> np.ndarray:
     """(3, m + 3n) kg m^2/s of a step: none of ``m`` activations, of each contact force of a body weight."""
-    torques = problem.dt * problem.body.weight * contacts.speeds(problem.turns).T
+    torques = problem.dt * problem.body.weight * contacts.contact_velocities(problem.rotation_modes).T
     return np.hstack([np.zeros((3, m)), torques])

@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull
 from egs_warp.contact.detection import ContactSet
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.geometry.frames import square_to, turning
+from egs_warp.geometry.frames import cross_matrices, orthonormal_basis
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Objective:
     """(k,) m/s."""
     weight: float
 
-    def gap(
+    def residual(
         self, problem: StepProblem, contacts: ContactSet, velocities: np.ndarray, gained: np.ndarray, speed: float
     ) -> np.ndarray:
         """At the end of ``velocities`` (3N,), the angular momentum ``gained`` (3,)."""
@@ -44,7 +44,7 @@ def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -
 
 
 @dataclass(frozen=True)
-class SpinObjective:
+class AngularMomentumObjective:
     """weight |L+ - target|^2 / (m r)^2, r the radius of gyration, for the angular momentum about the centre of mass at
     the end of the step.
 
@@ -59,7 +59,7 @@ class SpinObjective:
         """See the module."""
         return torques / self._unit(problem, speed)
 
-    def gap(
+    def residual(
         self, problem: StepProblem, contacts: ContactSet, velocities: np.ndarray, gained: np.ndarray, speed: float
     ) -> np.ndarray:
         """At the end of a step in which contact forces have ``gained`` (3,) kg m^2/s."""
@@ -91,17 +91,17 @@ class LoadObjective:
         rows[np.arange(len(loaded)), torques.shape[1] - 3 * contacts.count + 3 * loaded] = 1.0
         return rows
 
-    def gap(
+    def residual(
         self, problem: StepProblem, contacts: ContactSet, velocities: np.ndarray, gained: np.ndarray, speed: float
     ) -> np.ndarray:
         """None: a load is judged in the program alone."""
         return np.zeros(len(self._loaded(contacts)))
 
     def _loaded(self, contacts: ContactSet) -> np.ndarray:
-        return np.flatnonzero(np.isin(contacts.nearest, self.nodes))
+        return np.flatnonzero(np.isin(contacts.nearest_nodes, self.nodes))
 
 
-AnyObjective = Objective | SpinObjective | LoadObjective
+AnyObjective = Objective | AngularMomentumObjective | LoadObjective
 
 
 def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
@@ -110,7 +110,7 @@ def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Object
     return Objective("pose", sparse.csr_matrix(sparse.diags(shares)), shares * target.ravel(), weight)
 
 
-def straining_velocities(body: SoftBody, positions: np.ndarray, target: np.ndarray, weight: float) -> Objective:
+def deformation_velocities(body: SoftBody, positions: np.ndarray, target: np.ndarray, weight: float) -> Objective:
     """Of velocities (N, 3) the part that strains the body as a whole, the same everywhere: a pose to move towards that
     leaves the finer shape to the body's elasticity, where it goes to objectives of their own, and how it turns to its
     angular momentum.
@@ -119,7 +119,7 @@ def straining_velocities(body: SoftBody, positions: np.ndarray, target: np.ndarr
     """
     arms = positions - body.centre_of_mass(positions)
     modes = np.zeros((12, len(arms), 3))
-    modes[:3], modes[3:6] = np.eye(3)[:, None], np.moveaxis(turning(arms), 2, 0)
+    modes[:3], modes[3:6] = np.eye(3)[:, None], np.moveaxis(cross_matrices(arms), 2, 0)
     for mode, (i, k) in enumerate(combinations_with_replacement(range(3), 2), start=6):
         modes[mode, :, k] += arms[:, i]
         modes[mode, :, i] += arms[:, k]
@@ -165,7 +165,7 @@ class BodyPart:
         """(3,) mass-weighted mean of ``points`` (N, 3) over the part."""
         return self.masses @ points[self.nodes] / self.masses.sum()
 
-    def spread(self, points: np.ndarray) -> np.ndarray:
+    def inertia(self, points: np.ndarray) -> np.ndarray:
         """(3, 3) kg m^2, inertia about the part's centre at ``points`` (N, 3)."""
         arms = points[self.nodes] - self.centre(points)
         second = np.einsum("n,ni,nj->ij", self.masses, arms, arms)
@@ -249,14 +249,14 @@ def part_angular_momentum(
         moving[part.nodes] = part.masses / part.masses.sum()
     arms = state.positions[part.nodes] - pivot
     crosses = np.zeros((len(body.node_mass), 3, 3))
-    crosses[part.nodes] = -part.masses[:, None, None] * turning(arms)
+    crosses[part.nodes] = -part.masses[:, None, None] * cross_matrices(arms)
     crosses -= moving[:, None, None] * crosses.sum(axis=0)
     unit = _gyration(part, state.positions) * part.masses.sum()
     rows = np.einsum("ij,njk->ink", coordinates.axes, crosses).reshape(3, -1) / unit
     return Objective(f"{part.name} momentum", rows, np.asarray(target, float) / unit, weight)
 
 
-def part_turning(
+def part_angular_velocity(
     body: SoftBody,
     part: BodyPart,
     state: BodyState,
@@ -270,7 +270,7 @@ def part_turning(
     momentum = part_angular_momentum(body, part, state, np.zeros(3), weight)
     unit = _gyration(part, state.positions) * part.masses.sum()
     radius = _gyration(part, state.positions)
-    rows = coordinates.axes @ np.linalg.inv(part.spread(state.positions)) * unit * radius
+    rows = coordinates.axes @ np.linalg.inv(part.inertia(state.positions)) * unit * radius
     return Objective(f"{part.name} turning", rows @ momentum.rows, radius * np.asarray(target, float), weight)
 
 
@@ -279,7 +279,7 @@ def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, w
 
     Told in m/s: dA/dt over the hull's perimeter is the speed at which its sides move outwards.
     """
-    plane = np.stack(square_to(up))
+    plane = np.stack(orthonormal_basis(up))
     hull = ConvexHull(state.positions[part.nodes] @ plane.T)
     corners = part.nodes[hull.vertices]  # anticlockwise in two dimensions
     flat = state.positions[corners] @ plane.T
@@ -309,11 +309,11 @@ def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float
     return Objective(f"{part.name} nodes", rows, share * np.asarray(target, float).ravel(), weight)
 
 
-def held_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> Objective:
+def no_slip_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> Objective:
     """That no contact slides, each weighted by its share of the weight in ``loads`` (n,)."""
     shares = np.sqrt(np.repeat(loads, 3))
     shares[::3] = 0.0
-    rows = sparse.csr_matrix(contacts.rows.multiply(shares[:, None]))
+    rows = sparse.csr_matrix(contacts.jacobian.multiply(shares[:, None]))
     return Objective("hold", rows, np.zeros(3 * contacts.count), weight)
 
 
@@ -324,4 +324,4 @@ def _along(shares: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
 def _gyration(part: BodyPart, points: np.ndarray) -> float:
     """Metres."""
-    return float(np.sqrt(0.5 * np.trace(part.spread(points)) / part.masses.sum()))
+    return float(np.sqrt(0.5 * np.trace(part.inertia(points)) / part.masses.sum()))

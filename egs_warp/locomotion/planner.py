@@ -10,39 +10,39 @@ from functools import cached_property
 import numpy as np
 
 from egs_warp.fem.body import SoftBody
-from egs_warp.fem.factors import Factors
+from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.contact_pieces import ContactPieces
-from egs_warp.locomotion.linear_step import LinearStep, LinearSteps, Prospect
+from egs_warp.locomotion.contact_modes import CoulombProgram
+from egs_warp.locomotion.linear_step import LinearStep, PredictedStep, StepLinearizer
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.settings import LocomotionSettings
-from egs_warp.locomotion.step_cost import Horizon, QuadraticCost, effort_cost, objectives_cost
-from egs_warp.locomotion.strategies import Foreseen, search_program
+from egs_warp.locomotion.step_cost import EffortModel, QuadraticCost, effort_cost, objectives_cost
+from egs_warp.locomotion.strategies import PredictedContact, search_program
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.muscle_set import MuscleSet
-from egs_warp.muscles.tension import shortenings
+from egs_warp.muscles.tension import shortening
 
-STEPS_A_UNIT = 19.0
+MIN_STEPS_PER_TIME_UNIT = 19.0
 """Least number of steps in sqrt(H / g) within which a body can be steered."""
 _ORDINARY_STRENGTH = 4.0
-WORK = 10.0
+WORK_WEIGHT = 10.0
 """Cost of the square of what a muscle gives or takes in a step, in m g H: muscles that shorten are else set against
 others that they stretch (jumps of pawn, robot and monkey work 1.64, 1.78 and 1.54 m g H in place of 1.49, 1.34, 1.40).
 """
 _FASTEST = 7.0
 """Bounds of activations, in their bounds a sqrt(H / g): how fast a muscle is switched on and off."""
-REGULAR = 1e-7
+REGULARIZATION = 1e-7
 
 
 @dataclass(frozen=True)
 class StepProgram:
     """What is asked of a step, and what it is asked of."""
 
-    pieces: ContactPieces
-    foreseen: Foreseen
+    program: CoulombProgram
+    predicted: PredictedContact
     linear: LinearStep
     """Of the activations of the synergies in their bounds, and of contact forces in body weights."""
-    speeds: np.ndarray
+    contact_velocities: np.ndarray
     """(3n, k + 1) m/s of the contacts, as its velocities."""
 
 
@@ -77,19 +77,21 @@ class StepPlanner:
     synergies: Synergies
     friction: float
     settings: LocomotionSettings
-    factors: Factors
+    factors: LinearSolver
     """Of the effort's horizon."""
-    linear_steps: LinearSteps
+    linear_steps: StepLinearizer
 
-    def plan(self, prospect: Prospect, last: np.ndarray, objectives: Sequence[AnyObjective], clock: StageClock) -> Plan:
+    def plan(
+        self, prospect: PredictedStep, last: np.ndarray, objectives: Sequence[AnyObjective], clock: StageClock
+    ) -> Plan:
         """Activations for what the ``objectives`` ask, after ``last`` (M,) metres of the step before."""
-        problem, settings, m = prospect.response.tangent.problem, self.settings, self.synergies.count
+        problem, settings, m = prospect.linearization.tangent.problem, self.settings, self.synergies.count
         program = self.program(prospect, last, objectives)
         clock.lap("program")
         found = search_program(
-            program.pieces,
+            program.program,
             settings.strategy,
-            program.foreseen,
+            program.predicted,
             directions=settings.directions,
             qp_limit=settings.qp_limit,
             solver=settings.qp_solver_on(self.body.assembly.device),
@@ -99,36 +101,36 @@ class StepPlanner:
         if found.x is None:
             return Plan(last, prospect.velocities, prospect.forces, found.qp_count, found.infeasible)
         activations = (self.synergies.members @ found.x[:m]) * self.muscles.bounds
-        moved = program.speeds[:, -1] + program.speeds[:, :m] @ found.x[:m]
+        moved = program.contact_velocities[:, -1] + program.contact_velocities[:, :m] @ found.x[:m]
         asked = self.body.weight * found.x[m:].reshape(-1, 3)
-        forces, _ = prospect.response.forces(moved, prospect.shift, self.friction, asked)
-        end = program.linear.end(np.append(found.x[:m], forces / self.body.weight))
+        forces, _ = prospect.linearization.solve_coulomb(moved, prospect.normal_bias, self.friction, asked)
+        end = program.linear.end_velocities(np.append(found.x[:m], forces / self.body.weight))
         velocities = end.reshape(prospect.velocities.shape)
         clock.lap("contact")
-        if not problem.feasible(velocities):
+        if not problem.is_inversion_free(velocities):
             velocities = prospect.velocities
         return Plan(activations, velocities, forces, found.qp_count, found.infeasible)
 
-    def program(self, prospect: Prospect, last: np.ndarray, objectives: Sequence[AnyObjective]) -> StepProgram:
+    def program(self, prospect: PredictedStep, last: np.ndarray, objectives: Sequence[AnyObjective]) -> StepProgram:
         """What is asked of the step, linear about the ``prospect``; ``last`` (M,) are the step before's activations."""
-        response, foreseen, body = prospect.response, prospect.velocities, self.body
+        response, foreseen, body = prospect.linearization, prospect.velocities, self.body
         problem, contacts = response.tangent.problem, response.contacts
         weight, speed = body.weight, body.speed_unit
         # What the kernels of elasticity are needed for goes on in one thread alone.
-        linear, horizon = self.linear_steps.about(prospect, lambda: Horizon.of(problem, foreseen, self.factors))
+        linear, horizon = self.linear_steps.linearize(prospect, lambda: EffortModel.of(problem, foreseen, self.factors))
         previous = self.synergies.mean(last / self.muscles.bounds)
         asked = objectives_cost(problem, linear, contacts, objectives, speed)
         activation = self._activation_cost(problem, foreseen, previous, linear.count)
         effort = effort_cost(problem, linear, foreseen.ravel(), horizon)
         cost = asked() + effort + activation
-        speeds = linear.speeds(contacts)
+        speeds = linear.contact_velocities(contacts)
         rows, offset = speeds[:, :-1] / speed, speeds[:, -1] / speed
-        offset[::3] += prospect.shift / speed
+        offset[::3] += prospect.normal_bias / speed
         bounds = self.activation_bounds(previous, problem.dt)
-        pieces = ContactPieces(cost.P, cost.q, cost.constant, rows, offset, self.friction, *bounds)
-        slip = contacts.speeds(foreseen.ravel()).reshape(-1, 3) / speed
+        pieces = CoulombProgram(cost.P, cost.q, cost.constant, rows, offset, self.friction, *bounds)
+        slip = contacts.contact_velocities(foreseen.ravel()).reshape(-1, 3) / speed
         start = self.synergies.mean(prospect.activations / self.muscles.bounds)
-        return StepProgram(pieces, Foreseen(start, prospect.forces / weight, slip), linear, speeds)
+        return StepProgram(pieces, PredictedContact(start, prospect.forces / weight, slip), linear, speeds)
 
     def activation_bounds(self, previous: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """(m,) each, how low and how high activations may go in ``dt`` seconds from the ``previous`` (m,)."""
@@ -141,17 +143,17 @@ class StepPlanner:
         """Of ``count`` unknowns that begin with the activations, how large they are, what their muscles give or take
         on the way to the end of ``foreseen`` (N, 3) m/s, and how they change from ``previous`` (m,)."""
         size, change = self.activation_weights(problem.dt)
-        shorter = shortenings(self.muscles, problem.state.positions, problem.end_positions(foreseen))
+        shorter = shortening(self.muscles, problem.state.positions, problem.end_positions(foreseen))
         works = self.muscles.max_forces * shorter / (self.body.weight * self.body.height)
-        size = size + WORK * (self.synergies.members.T @ works**2)
+        size = size + WORK_WEIGHT * (self.synergies.members.T @ works**2)
         diagonal, q = np.zeros(count), np.zeros(count)
-        diagonal[: len(previous)] = 2.0 * (size + change) + REGULAR
+        diagonal[: len(previous)] = 2.0 * (size + change) + REGULARIZATION
         q[: len(previous)] = -2.0 * change * previous
         return QuadraticCost(np.diag(diagonal), q, float(change @ previous**2))
 
     def activation_weights(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """(m,) of the squares of activations, and of their changes, in a step of ``dt`` seconds."""
-        share = dt * STEPS_A_UNIT / self.body.time_unit
+        share = dt * MIN_STEPS_PER_TIME_UNIT / self.body.time_unit
         strengths, squares = self._strengths
         settings = self.settings
         return settings.activation_weight * share**2 * strengths, settings.activation_change_weight * share * squares

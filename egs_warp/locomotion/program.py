@@ -12,7 +12,7 @@ import scipy.sparse as sparse
 
 from egs_warp.contact.detection import tangent_directions
 from egs_warp.locomotion.complementarity import ContactLayout
-from egs_warp.locomotion.contact_pieces import ContactPieces
+from egs_warp.locomotion.contact_modes import CoulombProgram
 
 _REGULAR = 1e-7
 
@@ -43,9 +43,9 @@ class ContactProgram:
     """(M,) of the activations."""
 
     @classmethod
-    def of(cls, pieces: ContactPieces, directions: int) -> ContactProgram:
+    def of(cls, pieces: CoulombProgram, directions: int) -> ContactProgram:
         """The same step with a friction pyramid of ``directions`` edges in place of the cone."""
-        layout = ContactLayout(pieces.activations, pieces.contacts, directions)
+        layout = ContactLayout(pieces.activation_count, pieces.contact_count, directions)
         spread = _spread(layout)
         P = spread.T @ (spread.T @ pieces.P).T
         A, offset = _contact_rows(pieces.rows @ spread, pieces.offset, layout, pieces.friction)

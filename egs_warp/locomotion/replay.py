@@ -19,7 +19,7 @@ import scipy.sparse as sparse
 from egs_warp.contact.detection import ContactDetector
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
-from egs_warp.io.arrays import DAMAGES
+from egs_warp.io.arrays import READ_ERRORS
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.recorder import REPORTED
 from egs_warp.locomotion.stepper import StepReport
@@ -59,7 +59,7 @@ class Replay:
                 reports = self._reports(part, positions, count)
                 ends = [*(np.flatnonzero(np.diff(part["asked_step"])) + 1), len(reports)]
                 digests = [int(part["asked_digest"][end - 1]) for end in ends]
-            except DAMAGES as error:
+            except READ_ERRORS as error:
                 raise _damaged(path, error) from error
             for digest_then, first, end in zip(digests, [0, *ends], ends, strict=False):
                 yield digest_then, reports[first:end]
@@ -112,7 +112,7 @@ def digest(objectives: Sequence[AnyObjective | np.ndarray]) -> int:
 def _read(path: Path) -> dict[str, np.ndarray]:
     try:
         return read_arrays(path)
-    except DAMAGES as error:
+    except READ_ERRORS as error:
         raise _damaged(path, error) from error
 
 

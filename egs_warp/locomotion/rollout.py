@@ -15,10 +15,10 @@ from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.step_problem import UnsolvableStepError
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.locomotion.objectives import AnyObjective
-from egs_warp.locomotion.planner import STEPS_A_UNIT
+from egs_warp.locomotion.planner import MIN_STEPS_PER_TIME_UNIT
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.replay import Replay, digest
-from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory, StepReport
+from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.locomotion.trajectory import Trajectory
 
@@ -39,7 +39,7 @@ class Motion(Protocol):
 
 
 @dataclass(frozen=True)
-class Simulation:
+class RolloutResult:
     """A finished simulation."""
 
     trajectory: Trajectory
@@ -54,7 +54,7 @@ def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]
     """Seconds of a solver step, and how many make a frame: steps of at most ``step`` seconds and of sqrt(H / g) / 19,
     within which a body can be steered (docs/concepts/conventions.md). A frame is as long as a ``step`` that is longer.
     """
-    longest = body.time_unit / STEPS_A_UNIT
+    longest = body.time_unit / MIN_STEPS_PER_TIME_UNIT
     frame = max(1.0 / FRAME_RATE, step or 0.0)
     count = int(np.ceil(frame / min(longest, step or longest) - 1e-3))
     return frame / count, count
@@ -103,7 +103,7 @@ def roll_out(
     kicks: Callable[[float, float], np.ndarray | None] = lambda time, dt: None,
     activations: np.ndarray | None = None,
     progress: Callable[[int], object] = lambda frame: None,
-) -> Simulation:
+) -> RolloutResult:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``, or a step
     cannot be solved.
 
@@ -145,15 +145,15 @@ def roll_out(
             given = [each for each in (kick, held) if each is not None]
             asked = digest([*objectives, *given]) if digested else 0
             done = replay.step(asked) if replay is not None else []
-            begin = state.kicked(kick)
+            begin = state.with_velocity_kick(kick)
             if held is None:
                 done = done or _advanced(partial(stepper.advance, begin, memory, objectives, dt))
             else:
-                done = done or _advanced(partial(stepper.advance_held, begin, memory, held, dt))
+                done = done or _advanced(partial(stepper.advance_with_activations, begin, memory, held, dt))
             stopped = not done
             if stopped:
                 break
-            state, memory = done[-1].state, StepMemory.after(done[-1])
+            state, memory = done[-1].state, WarmStart.from_report(done[-1])
             reports.extend(done)
             recorder.add(done, asked=asked, kick=kick)
         if shown[-1] < len(reports):
@@ -162,10 +162,10 @@ def roll_out(
         resting = resting + 1 if finished() else 0
         if stopped or resting == REST_FRAMES:
             break
-    return Simulation(recorder.trajectory(), tuple(reports), np.array(shown), stopped)
+    return RolloutResult(recorder.trajectory(), tuple(reports), np.array(shown), stopped)
 
 
-def _advanced(advance: Callable[[], tuple[BodyState, StepMemory, list[StepReport]]]) -> list[StepReport]:
+def _advanced(advance: Callable[[], tuple[BodyState, WarmStart, list[StepReport]]]) -> list[StepReport]:
     """A step in the parts it was divided into; none if it cannot be solved, nor any part of it."""
     try:
         _, _, done = advance()

@@ -14,7 +14,7 @@ from egs_warp.locomotion.strategies import Strategy
 class LocomotionSettings:
     """Numbers of the stepper; lengths are in body heights, forces in body weights, speeds in sqrt(g H)."""
 
-    near: float = 0.01
+    activation_distance: float = 0.01
     """A point takes part if the step may bring it this near to a plane."""
     penetration_tolerance: float = 5e-3
     push_out_cap: float = 0.05
@@ -22,7 +22,7 @@ class LocomotionSettings:
     """QPs a step at most; in doubt ``strategies.PATIENCE`` times as many for all strategies but ``pieces``."""
     qp_solver: QpSolver | str | None = None
     """None is OSQP, whose iterations are kernels where the body lies on a GPU."""
-    strategy: Strategy | str = Strategy.PIECES
+    strategy: Strategy | str = Strategy.MODES
     directions: int = 4
     """n_d, edges of the friction pyramid of all strategies but ``pieces``, which has the cone."""
     activation_weight: float = 2e-4

@@ -10,14 +10,14 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.launching import Device
-from egs_warp.locomotion.active_set import ReducedRows, optimum_near
-from egs_warp.locomotion.admm import Ending
-from egs_warp.locomotion.splitting import AdmmSplitting, Iterations, OsqpSplitting, Splitting
+from egs_warp.locomotion.active_set import WhitenedQp, solve_from_guess
+from egs_warp.locomotion.admm import AdmmStatus
+from egs_warp.locomotion.operator_splitting import AdmmSplitting, OperatorSplitting, OsqpSplitting, SplittingRun
 
-LARGEST_BREACH = 3e-3
+MAX_VIOLATION = 3e-3
 """By which a point of OSQP's iteration limit may leave its bounds and still be used."""
 _MOST_ITERATIONS = 4000
-_ROOM = 0.3
+_BOUND_PADDING = 0.3
 """Of the accuracy, by which bounds are moved apart."""
 _HELD = 1e-12
 """Between the bounds of a row that is held."""
@@ -34,12 +34,12 @@ class QpStatus(Enum):
 
 
 _STATUS = {
-    Ending.SOLVED: QpStatus.SOLVED,
-    Ending.INEXACT: QpStatus.INEXACT,
-    Ending.LIMIT: QpStatus.ITERATION_LIMIT,
-    Ending.INFEASIBLE: QpStatus.INFEASIBLE,
-    Ending.DOUBTFUL: QpStatus.INFEASIBLE,
-    Ending.FAILED: QpStatus.FAILED,
+    AdmmStatus.SOLVED: QpStatus.SOLVED,
+    AdmmStatus.INEXACT: QpStatus.INEXACT,
+    AdmmStatus.LIMIT: QpStatus.ITERATION_LIMIT,
+    AdmmStatus.INFEASIBLE: QpStatus.INFEASIBLE,
+    AdmmStatus.DOUBTFUL: QpStatus.INFEASIBLE,
+    AdmmStatus.FAILED: QpStatus.FAILED,
 }
 """Of a splitting that had all of its iterations."""
 
@@ -116,14 +116,14 @@ class SplittingProgram:
     """
 
     def __init__(
-        self, P: np.ndarray, q: np.ndarray, A: np.ndarray, splitting: Splitting, *, accuracy: float = 3e-5
+        self, P: np.ndarray, q: np.ndarray, A: np.ndarray, splitting: OperatorSplitting, *, accuracy: float = 3e-5
     ) -> None:
         self._P, self._q, self._A = P, q, A
         self._splitting = splitting
         # What has next to no room between its bounds is as good as without any: room to the accuracy that is asked.
-        self._room = _ROOM * accuracy
-        self._rows = ReducedRows.of(P, q, A)
-        self._whole: Iterations | None = None
+        self._room = _BOUND_PADDING * accuracy
+        self._rows = WhitenedQp.of(P, q, A)
+        self._whole: SplittingRun | None = None
         self._start: np.ndarray | None = None
 
     def solve(
@@ -136,7 +136,7 @@ class SplittingProgram:
             return self._by_iterations(lower, upper, start)
         rows = self._rows
         lower, upper = lower - self._room, upper + self._room
-        chosen = (rows.free < lower) | (rows.free > upper)
+        chosen = (rows.values_at_minimum < lower) | (rows.values_at_minimum > upper)
         if not chosen.any():
             # As in flight: there is nothing to iterate on.
             return self._exact(rows.minimum, np.zeros(len(lower)))
@@ -144,27 +144,33 @@ class SplittingProgram:
             return self._from_the_minimum(lower, upper, start)
         index = np.flatnonzero(chosen)
         # In coordinates in which costs are squares of distances, where a few iterations go far.
-        below, above = (lower - rows.free) / rows.lengths, (upper - rows.free) / rows.lengths
-        z = None if start is None else rows.place(start)
-        made = self._splitting.near(rows.units[index], below[index], above[index], z)
-        if made.ending not in (Ending.SOLVED, Ending.INEXACT, Ending.LIMIT) or not np.isfinite(made.x).all():
+        below, above = (
+            (lower - rows.values_at_minimum) / rows.row_norms,
+            (upper - rows.values_at_minimum) / rows.row_norms,
+        )
+        z = None if start is None else rows.whiten(start)
+        made = self._splitting.warm_start(rows.unit_rows[index], below[index], above[index], z)
+        if (
+            made.ending not in (AdmmStatus.SOLVED, AdmmStatus.INEXACT, AdmmStatus.LIMIT)
+            or not np.isfinite(made.x).all()
+        ):
             # Whether there is no point the search finds out: OSQP leaves 2e9 where it doubts that there is any.
             return self._from_the_minimum(lower, upper, start)
         multipliers = np.zeros(len(lower))
         multipliers[index] = made.multipliers
-        at = rows.units @ made.x
+        at = rows.unit_rows @ made.x
         low, high = at - below < -multipliers, above - at < multipliers
         found = self._finished(lower, upper, low, high & ~low)
         return found or self._by_iterations(lower, upper, start)
 
     def _from_the_minimum(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> QpSolution:
         """From the rows that the minimum without bounds breaks."""
-        free = self._rows.free
+        free = self._rows.values_at_minimum
         return self._finished(lower, upper, free < lower, free > upper) or self._by_iterations(lower, upper, start)
 
     def _finished(self, lower: np.ndarray, upper: np.ndarray, low: np.ndarray, high: np.ndarray) -> QpSolution | None:
         """The optimum, from a guess of the rows that hold it at which bound; None where rounding leads astray."""
-        found = optimum_near(self._rows, lower, upper, low, high)
+        found = solve_from_guess(self._rows, lower, upper, low, high)
         if found is None:
             return None
         if not found.feasible:
@@ -178,13 +184,13 @@ class SplittingProgram:
     def _by_iterations(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> QpSolution:
         """With all rows, set up once: the splitting's own accuracy."""
         if self._whole is None:
-            self._whole = self._splitting.on(self._A, _MOST_ITERATIONS)
+            self._whole = self._splitting.full_run(self._A, _MOST_ITERATIONS)
         made = self._whole.run(lower, upper, start)
         status = _STATUS[made.ending]
         if status is QpStatus.ITERATION_LIMIT:
             rows = self._A @ made.x
             broken = max(float((lower - rows).max()), float((rows - upper).max()))
-            status = status if broken <= LARGEST_BREACH else QpStatus.FAILED
+            status = status if broken <= MAX_VIOLATION else QpStatus.FAILED
         found = _solution(status, self._P, self._q, made.x, made.multipliers, len(lower))
         self._start = found.x if found.usable else None
         return found

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from egs_warp.contact.detection import ContactSet
-from egs_warp.fem.factors import Factors
+from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.step_problem import StepProblem, UnsolvableStepError
 from egs_warp.locomotion.linear_step import LinearStep
 from egs_warp.locomotion.objectives import AnyObjective, Objective
 
-EFFORT = 1.0
+EFFORT_WEIGHT = 1.0
 """Cost of m g H of elastic and damping energy."""
-HORIZON = 0.16
+EFFORT_HORIZON = 0.16
 """Of sqrt(H / g): how far ahead that energy is foreseen. One step ahead, a body that holds itself bent gains next to
 nothing by letting go."""
 
@@ -46,7 +46,7 @@ def objectives_cost(
     speed: float,
 ) -> Callable[[], QuadraticCost]:
     """Begins what gives the weighted squares that a motion asks for, in units of ``speed`` m/s, sqrt(g H)."""
-    squares = linear.squares([each for each in objectives if isinstance(each, Objective)])
+    squares = linear.objective_quadratic([each for each in objectives if isinstance(each, Objective)])
 
     def cost() -> QuadraticCost:
         form = squares() / speed**2
@@ -55,7 +55,7 @@ def objectives_cost(
             if isinstance(objective, Objective):
                 continue
             rows = objective.slopes(problem, contacts, linear.torques, speed)
-            gap = objective.gap(problem, contacts, np.zeros(0), np.zeros(3), speed)
+            gap = objective.residual(problem, contacts, np.zeros(0), np.zeros(3), speed)
             P += 2.0 * objective.weight * rows.T @ rows
             q += 2.0 * objective.weight * rows.T @ gap
             constant += objective.weight * float(gap @ gap)
@@ -64,7 +64,7 @@ def objectives_cost(
     return cost
 
 
-def objectives_missed(
+def objectives_value(
     problem: StepProblem,
     contacts: ContactSet,
     objectives: Sequence[AnyObjective],
@@ -74,30 +74,32 @@ def objectives_missed(
 ) -> float:
     """The same weighted squares of a step that ends at ``velocities`` (N, 3) under contact ``forces`` (n, 3); loads
     are left out."""
-    gained = problem.dt * (problem.turns.T @ contacts.pushes(forces))
-    gaps = [objective.gap(problem, contacts, velocities.ravel(), gained, speed) for objective in objectives]
+    gained = problem.dt * (problem.rotation_modes.T @ contacts.nodal_forces(forces))
+    gaps = [objective.residual(problem, contacts, velocities.ravel(), gained, speed) for objective in objectives]
     return sum(objective.weight * float(gap @ gap) for objective, gap in zip(objectives, gaps, strict=True))
 
 
 @dataclass(frozen=True)
-class Horizon:
+class EffortModel:
     """A foreseen end of a step, and one implicit step from there on, of which what is stiff is slack."""
 
-    end: np.ndarray
+    positions: np.ndarray
     """(N, 3) metres."""
-    time: float
+    duration: float
     """Seconds after the start of the step."""
     energy: float
     """Elastic, and what damping takes until then, joules."""
-    slope: np.ndarray
+    gradient: np.ndarray
     """(3N,) newtons, its derivative by the positions."""
-    entries: Any
+    stiffness_entries: Any
     """(nnz,) upper entries of the elements' stiffness at the end, made semi-definite, where ``factors`` are."""
-    factors: Factors
+    factors: LinearSolver
     """Of the step's matrix."""
 
     @classmethod
-    def of(cls, problem: StepProblem, foreseen: np.ndarray, factors: Factors, *, horizon: float = HORIZON) -> Horizon:
+    def of(
+        cls, problem: StepProblem, foreseen: np.ndarray, factors: LinearSolver, *, horizon: float = EFFORT_HORIZON
+    ) -> EffortModel:
         """``horizon`` sqrt(H / g) after the start, from the end of ``foreseen`` (N, 3) m/s; ``factors`` take its
         matrix."""
         body = problem.body
@@ -106,12 +108,17 @@ class Horizon:
         energy, slope = assembly.energy_and_gradient(end, damping)
         entries = assembly.entries_for(factors, end, damping, projected=True)
         # Last: what a GPU has begun it goes on with while the host does other things.
-        factors.begin(time**2 * entries, np.repeat(body.node_mass, 3))
+        factors.start_update(time**2 * entries, np.repeat(body.node_mass, 3))
         return cls(end, time, energy, slope.ravel(), entries, factors)
 
 
 def effort_cost(
-    problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, horizon: Horizon, *, weight: float = EFFORT
+    problem: StepProblem,
+    linear: LinearStep,
+    foreseen: np.ndarray,
+    horizon: EffortModel,
+    *,
+    weight: float = EFFORT_WEIGHT,
 ) -> QuadraticCost:
     """``weight`` / (m g H) times the elastic energy and what damping takes, at the ``horizon`` if the body goes on at
     its end velocity, around ``foreseen`` (3N,) m/s.
@@ -121,18 +128,18 @@ def effort_cost(
     one implicit step over the horizon: carried on at its speed, what lets go would seem to be strained the other way.
     """
     body, factors = problem.body, horizon.factors
-    if factors.host:
-        _insist(factors)
-    quadratic, force = factors.strain_ahead(
-        horizon.entries,
-        horizon.slope,
+    if factors.is_host:
+        _require_factors(factors)
+    quadratic, force = factors.effort_quadratic(
+        horizon.stiffness_entries,
+        horizon.gradient,
         np.repeat(body.node_mass, 3),
         linear.velocities,
-        near=problem.dt,
-        far=horizon.time - problem.dt,
-        away=problem.dt * foreseen,
+        dt_now=problem.dt,
+        dt_ahead=horizon.duration - problem.dt,
+        reference=problem.dt * foreseen,
     )
-    _insist(factors)
+    _require_factors(factors)
     unit = weight / (body.weight * body.height)
     return QuadraticCost(
         unit * quadratic[:-1, :-1],
@@ -141,6 +148,6 @@ def effort_cost(
     )
 
 
-def _insist(factors: Factors) -> None:
-    if not factors.ready:
+def _require_factors(factors: LinearSolver) -> None:
+    if not factors.is_ready:
         raise UnsolvableStepError("the matrix of what is foreseen has no factors")

@@ -24,34 +24,40 @@ from egs_warp.locomotion.complementarity import (
     states_from_prediction,
     states_of_pairs,
 )
-from egs_warp.locomotion.contact_pieces import ContactModes, ContactPieces, PieceSearch, search_pieces, solve_relaxed
-from egs_warp.locomotion.device_search import search_at_once
+from egs_warp.locomotion.contact_modes import (
+    ContactModes,
+    CoulombProgram,
+    ModeSearchResult,
+    search_modes,
+    solve_relaxed,
+)
+from egs_warp.locomotion.device_search import search_modes_device
 from egs_warp.locomotion.lemke import lemke
 from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, QpStatus, QuadraticProgram, quadratic_program
 
-GOOD_ENOUGH = 1.005
+STOP_GAP = 1.005
 """A search ends when the objective is within this factor of its bound."""
-DOUBTFUL = 1.2
+RESTART_GAP = 1.2
 """A search that ends further than this factor from its bound is done again from other states,
 with ``PATIENCE`` times as many QPs.
 """
-IMMATERIAL = 0.01
+NEGLIGIBLE_GAIN = 0.01
 """Unless there is no more to gain than this share of what it costs to do nothing,
 to fall without muscles and ground.
 """
-COSTLY = 0.3
+RESTART_COST = 0.3
 """Of the end of a step: what costs less is not doubted."""
-PRESSED = 1e-3
+LOADED_FORCE = 1e-3
 """Body weights, of a contact that holds."""
-PATIENCE = 3
+RESTART_BUDGET = 3
 """Feet that slide have many states that are nearly as likely."""
 
 
 class Strategy(Enum):
     """How the contact states are found."""
 
-    PIECES = "pieces"
+    MODES = "pieces"
     """Contact is what the activations make of it: from the piece that stage 1 foresees over the bounds that hold the
     optimum back (``contact_pieces``). The only one with the exact friction cone, and with no unknowns but activations.
     """
@@ -92,7 +98,7 @@ class SearchResult:
 
 
 @dataclass
-class _Search:
+class _StateSearch:
     """Solves for states, counts, and keeps the best."""
 
     program: ContactProgram
@@ -108,9 +114,9 @@ class _Search:
     moves: Callable[..., list[Pivot]] = proposed_pivots
     visited: set[bytes] = field(default_factory=set)
 
-    def attempt(self, states: np.ndarray) -> bool:
+    def try_states(self, states: np.ndarray) -> bool:
         """Solve for ``states`` unless that was done before; whether it is the best so far."""
-        limit = self.limit if self.settled else PATIENCE * self.limit
+        limit = self.limit if self.settled else RESTART_BUDGET * self.limit
         if self.count >= limit or states.tobytes() in self.visited:
             return False
         self.visited.add(states.tobytes())
@@ -124,20 +130,20 @@ class _Search:
         self.best, self.states = solution, states
         return True
 
-    def attempt_contact(self, activations: np.ndarray) -> bool:
+    def try_activations(self, activations: np.ndarray) -> bool:
         """Solve for the states that follow from ``activations`` (M,), which have a solution; whether there is one."""
-        y = contact_under(self.program, activations)
+        y = contact_response(self.program, activations)
         if y is None:
             return False
         states = states_of_pairs(self.program.layout, *self.program.pairs(y))
         objective = self.program.objective(y)
         self.best = QpSolution(QpStatus.SOLVED, y, np.zeros(len(self.program.A)), objective - self.program.constant)
         self.states = states
-        if not self.within(GOOD_ENOUGH):
-            self.attempt(states)
+        if not self.is_within_gap(STOP_GAP):
+            self.try_states(states)
         return True
 
-    def within(self, factor: float, share: float = 0.0) -> bool:
+    def is_within_gap(self, factor: float, share: float = 0.0) -> bool:
         """Whether no states can be better by more than ``factor``,
         or by more than a ``share`` of the cost of doing nothing.
         """
@@ -150,7 +156,7 @@ class _Search:
     @property
     def settled(self) -> bool:
         """Whether the best is good enough to stop looking elsewhere."""
-        return self.within(DOUBTFUL, IMMATERIAL)
+        return self.is_within_gap(RESTART_GAP, NEGLIGIBLE_GAIN)
 
     def pivots(self) -> list[Pivot]:
         """Of the best point."""
@@ -170,7 +176,7 @@ class _Search:
 
 
 @dataclass(frozen=True)
-class Foreseen:
+class PredictedContact:
     """Stage 1: what known activations, first those of the last step, would bring."""
 
     activations: np.ndarray
@@ -182,23 +188,23 @@ class Foreseen:
 
 
 def search_program(
-    program: ContactPieces,
+    program: CoulombProgram,
     strategy: Strategy | str,
-    foreseen: Foreseen,
+    foreseen: PredictedContact,
     *,
     directions: int,
     qp_limit: int,
     solver: QpSolver | str = QpSolver.OSQP,
     device: Device = None,
-) -> PieceSearch:
+) -> ModeSearchResult:
     """Activations and contact forces of a step's program by ``strategy`` (or its name), with at most ``qp_limit`` QPs
     (``PATIENCE`` times as many in doubt); all but ``PIECES`` have a friction pyramid of ``directions`` edges.
     ``solver`` and ``device``: see ``quadratic_program``.
     """
     strategy = Strategy(strategy)
-    if strategy is Strategy.PIECES:
-        how = _How(qp_limit, QpSolver(solver), device)
-        return _searched_on(program, _searched_first(program, foreseen, how), foreseen.forces, how)
+    if strategy is Strategy.MODES:
+        how = _SearchOptions(qp_limit, QpSolver(solver), device)
+        return _search_with_restart(program, _first_search(program, foreseen, how), foreseen.forces, how)
     paired = ContactProgram.of(program, directions)
     predicted = states_from_prediction(
         foreseen.forces[:, 0], foreseen.forces[:, 1:], foreseen.velocities[:, 1:], program.friction, directions
@@ -207,16 +213,16 @@ def search_program(
         paired, strategy, predicted, foreseen.activations, qp_limit=qp_limit, solver=solver, device=device
     )
     x = None if found.y is None else paired.forces_of(found.y)
-    return PieceSearch(x, found.objective, found.qp_count, found.infeasible)
+    return ModeSearchResult(x, found.objective, found.qp_count, found.infeasible)
 
 
-def is_doubted(objective: float, contacts: int) -> bool:
+def needs_restart(objective: float, contacts: int) -> bool:
     """Whether an end of a step may have a better one elsewhere."""
-    return contacts > 0 and not objective < COSTLY
+    return contacts > 0 and not objective < RESTART_COST
 
 
 @dataclass(frozen=True)
-class _How:
+class _SearchOptions:
     """Pieces are searched."""
 
     qp_limit: int
@@ -224,51 +230,57 @@ class _How:
     device: Device
 
 
-def _searched_first(program: ContactPieces, foreseen: Foreseen, how: _How) -> PieceSearch:
+def _first_search(program: CoulombProgram, foreseen: PredictedContact, how: _SearchOptions) -> ModeSearchResult:
     """From what is foreseen."""
     start = np.concatenate([foreseen.activations, foreseen.forces.ravel()])
-    return _searched_from(program, start, foreseen.forces, how)
+    return _search_from(program, start, foreseen.forces, how)
 
 
-def _searched_on(program: ContactPieces, found: PieceSearch, forces: np.ndarray, how: _How) -> PieceSearch:
+def _search_with_restart(
+    program: CoulombProgram, found: ModeSearchResult, forces: np.ndarray, how: _SearchOptions
+) -> ModeSearchResult:
     """``found``, or better if that costs so much that it is doubted."""
-    if not is_doubted(found.objective, program.contacts):
+    if not needs_restart(found.objective, program.contact_count):
         return found
-    return _searched_elsewhere(program, found, forces, how)
+    return _restart(program, found, forces, how)
 
 
-def _searched_from(program: ContactPieces, start: np.ndarray, forces: np.ndarray, how: _How) -> PieceSearch:
+def _search_from(
+    program: CoulombProgram, start: np.ndarray, forces: np.ndarray, how: _SearchOptions
+) -> ModeSearchResult:
     """From ``start`` (m + 3n,), in the piece of ``forces`` (n, 3), which are those of it or near them."""
     modes, solver = ContactModes.of(forces, program.friction), how.solver
     if solver is QpSolver.ADMM:
-        found = search_at_once(program, start, modes, qp_limit=how.qp_limit, device=wp.get_device(how.device))
+        found = search_modes_device(program, start, modes, qp_limit=how.qp_limit, device=wp.get_device(how.device))
         if found is not None:
             return found
         solver = QpSolver.OSQP
-    return search_pieces(program, start, modes, qp_limit=how.qp_limit, solver=solver, device=how.device)
+    return search_modes(program, start, modes, qp_limit=how.qp_limit, solver=solver, device=how.device)
 
 
-def _searched_elsewhere(program: ContactPieces, found: PieceSearch, forces: np.ndarray, how: _How) -> PieceSearch:
+def _restart(
+    program: CoulombProgram, found: ModeSearchResult, forces: np.ndarray, how: _SearchOptions
+) -> ModeSearchResult:
     """See ``better_elsewhere``; ``forces`` (n, 3) are a guess."""
     # Thousands of iterations, one after the other, are not for a GPU.
     bound_by = QpSolver.OSQP if how.solver is QpSolver.ADMM else how.solver
 
-    def search(activations: np.ndarray) -> PieceSearch:
-        start = program.under(activations, forces)
-        return _searched_from(program, start, start[program.activations :].reshape(-1, 3), how)
+    def search(activations: np.ndarray) -> ModeSearchResult:
+        start = program.contact_response(activations, forces)
+        return _search_from(program, start, start[program.activation_count :].reshape(-1, 3), how)
 
-    return better_elsewhere(found, solve_relaxed(program, bound_by, device=how.device), search)
+    return restart_from_relaxation(found, solve_relaxed(program, bound_by, device=how.device), search)
 
 
-def better_elsewhere(
-    found: PieceSearch,
+def restart_from_relaxation(
+    found: ModeSearchResult,
     relaxed: tuple[np.ndarray, float] | None,
-    search: Callable[[np.ndarray], PieceSearch],
-) -> PieceSearch:
+    search: Callable[[np.ndarray], ModeSearchResult],
+) -> ModeSearchResult:
     """The better of ``found`` and of a ``search`` from where the optimum without complementarity, ``relaxed`` (see
     ``solve_relaxed``), would end up under true contact: from its activations (m,)."""
     found = replace(found, qp_count=found.qp_count + 1)
-    if relaxed is None or found.objective <= DOUBTFUL * relaxed[1]:
+    if relaxed is None or found.objective <= RESTART_GAP * relaxed[1]:
         return found
     other = search(relaxed[0])
     best = min(found, other, key=lambda one: one.objective)
@@ -298,7 +310,7 @@ def find_states(
             return SearchResult(None, True, predicted, float("inf"), 0, 0)
         return SearchResult(found.y, False, found.states, found.objective, found.qp_count, 0)
     qp = quadratic_program(program.P, program.q, program.A, solver=solver, device=device)
-    search = _Search(program, qp, qp_limit)
+    search = _StateSearch(program, qp, qp_limit)
     if strategy is Strategy.RELAXED:
         _start_relaxed(search, predicted, activations)
         _move(search, together=True)
@@ -307,21 +319,21 @@ def find_states(
                 break
             kept = search.best, search.states
             search.best = None
-            search.attempt(start)
+            search.try_states(start)
             _move(search, together=True)
             if kept[0] is not None and (search.best is None or search.best.objective > kept[0].objective):
                 search.best, search.states = kept
         return search.result()
-    search.attempt(predicted if strategy is Strategy.PAPER else np.full(program.layout.contacts, STATIC))
+    search.try_states(predicted if strategy is Strategy.PAPER else np.full(program.layout.contacts, STATIC))
     if search.best is None:
-        search.attempt_contact(activations)
+        search.try_activations(activations)
     if strategy is not Strategy.STATIC:
         search.moves = proposed_pivots if strategy is Strategy.QPCC_OUR_MOVES else plain_pivots
         _move(search, together=False)
     return search.result()
 
 
-def contact_under(program: ContactProgram, activations: np.ndarray) -> np.ndarray | None:
+def contact_response(program: ContactProgram, activations: np.ndarray) -> np.ndarray | None:
     """(variables,) what contact and friction make of given ``activations`` (M,): the y that obeys Eq. (9); None if none
     is found.
 
@@ -333,7 +345,7 @@ def contact_under(program: ContactProgram, activations: np.ndarray) -> np.ndarra
     return None if x is None else np.concatenate([activations, x])
 
 
-def _start_relaxed(search: _Search, predicted: np.ndarray, activations: np.ndarray) -> None:
+def _start_relaxed(search: _StateSearch, predicted: np.ndarray, activations: np.ndarray) -> None:
     """Begin where the optimum without complementarity, 0 <= x and 0 <= w alone, would end up under true contact.
 
     Its objective is a bound on every state's; its activations are mostly right, its forces are not.
@@ -346,32 +358,32 @@ def _start_relaxed(search: _Search, predicted: np.ndarray, activations: np.ndarr
     if relaxed.usable:
         search.relaxed = relaxed
         activations = np.clip(relaxed.x[: layout.activations], program.lower, program.upper)
-    if not search.attempt_contact(activations):
-        search.attempt(predicted)
+    if not search.try_activations(activations):
+        search.try_states(predicted)
 
 
-def _other_starts(search: _Search, predicted: np.ndarray) -> Iterator[np.ndarray]:
+def _other_starts(search: _StateSearch, predicted: np.ndarray) -> Iterator[np.ndarray]:
     """States (n,) worth another search: feet that hold where the best point without complementarity presses, or where
     the prediction does, and the predicted states themselves."""
     if search.relaxed is not None:
         layout = search.program.layout
-        pressed = search.relaxed.x[layout.normal] > PRESSED
+        pressed = search.relaxed.x[layout.normal] > LOADED_FORCE
         yield np.where(pressed, STATIC, SEPARATE)
     yield np.where(predicted == SEPARATE, SEPARATE, STATIC)
     yield predicted
 
 
-def _move(search: _Search, *, together: bool) -> None:
+def _move(search: _StateSearch, *, together: bool) -> None:
     """Move contacts to their better states while that lowers the objective:
     each contact's best move ``together``, else one by one.
     """
     improved = search.best is not None
-    while improved and not search.within(GOOD_ENOUGH):
+    while improved and not search.is_within_gap(STOP_GAP):
         pivots = search.pivots()
         trials = [_moved(search.states, [pivot]) for pivot in pivots]
         if together:
             trials.insert(0, _moved(search.states, pivots[::-1]))  # the last word on a contact is its best
-        improved = any(search.attempt(trial) for trial in trials)
+        improved = any(search.try_states(trial) for trial in trials)
 
 
 def _moved(states: np.ndarray, pivots: list[Pivot]) -> np.ndarray:

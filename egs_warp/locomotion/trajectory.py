@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from egs_warp.geometry.body_frame import BodyFrame
-from egs_warp.geometry.frames import best_turn
+from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.io.arrays import read_npz
 from egs_warp.io.atomic import atomic_write
 
@@ -193,7 +193,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 @dataclass(frozen=True)
-class Reached:
+class MotionOutcome:
     """What a motion did; lengths in body heights."""
 
     distance: float
@@ -208,7 +208,7 @@ class Reached:
     """60 x the longest time during which every contact Gaussian is above the plane."""
 
 
-def measure(trajectory: Trajectory, *, first: int = 0, last: int = -1) -> Reached:
+def measure(trajectory: Trajectory, *, first: int = 0, last: int = -1) -> MotionOutcome:
     """What was reached between two states of the trajectory (indices into ``time``)."""
     t = trajectory
     last = last % len(t.time)
@@ -224,7 +224,7 @@ def measure(trajectory: Trajectory, *, first: int = 0, last: int = -1) -> Reache
             run_start = run_start if above else time
             longest = max(longest, time - run_start)
         above = gap > 0.0
-    return Reached(
+    return MotionOutcome(
         distance=float(np.linalg.norm(moved - (moved @ up) * up) / t.height),
         height=float(((com - com[0]) @ up).max() / t.height),
         heading_degrees=float(np.degrees(heading)),
@@ -236,7 +236,7 @@ def measure(trajectory: Trajectory, *, first: int = 0, last: int = -1) -> Reache
 def _best_fit(t: Trajectory, positions: np.ndarray) -> np.ndarray:
     rest = t.rest_positions - t.node_mass @ t.rest_positions / t.node_mass.sum()
     arms = positions - t.node_mass @ positions / t.node_mass.sum()
-    return best_turn(t.node_mass, rest, arms)
+    return kabsch_rotation(t.node_mass, rest, arms)
 
 
 def _headings(t: Trajectory, first: int, last: int, up: np.ndarray) -> np.ndarray:

@@ -14,12 +14,12 @@ from scipy.sparse.csgraph import connected_components
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.geometry.rows import distinct_rows
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.geometry.unique_rows import distinct_rows
 from egs_warp.kernels.meshing.occupancy import inside_mesh_kernel
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
 from egs_warp.meshing.occupancy import LatticeSolid, solid_from_gaussians
-from egs_warp.meshing.stuffing import stuff
+from egs_warp.meshing.stuffing import isosurface_stuffing
 from egs_warp.meshing.tetwild import tetwild
 
 _MIN_DIHEDRAL_DEGREES = 8.0
@@ -198,7 +198,7 @@ def _stuffed(
     best: tuple[float, np.ndarray, np.ndarray, float] | None = None
     for _ in range(6):
         field = _Field(distance, dilation, thin_radius=_THIN_RADIUS * cell)
-        nodes, tets = stuff(field, *field.bounds(), cell)
+        nodes, tets = isosurface_stuffing(field, *field.bounds(), cell)
         if len(tets) == 0:
             cell = _rung(0.7 * cell)
             continue

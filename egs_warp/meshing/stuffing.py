@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from egs_warp.geometry.rows import distinct_rows
+from egs_warp.geometry.unique_rows import distinct_rows
 
 Field = Callable[[np.ndarray], np.ndarray]
 """Signed distance (m,) at points (m, 3): negative inside."""
@@ -22,7 +22,7 @@ _SNAP_LONG, _SNAP_SHORT = 0.25, 0.41
 paper's 0.24999 and 0.41189 give dihedral angles of at least 10.78 degrees."""
 
 
-def stuff(field: Field, low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
+def isosurface_stuffing(field: Field, low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
     """Nodes (N, 3) and tetrahedra (T, 4) of either winding that fill ``field`` < 0 above z = 0.
 
     The box ``low`` (3,), ``high`` (3,) holds the solid; ``cell`` is the lattice's cube side, in the units of the

@@ -35,7 +35,7 @@ class Drive:
                 raise ArgumentError(name, f"give a speed from -{FASTEST:g} to {FASTEST:g}", value=value)
 
     @property
-    def stands(self) -> bool:
+    def is_zero(self) -> bool:
         """Whether it asks for nothing."""
         return self.forward == self.sideways == self.turn == 0.0
 
@@ -54,7 +54,7 @@ class DrivePlan:
             if not (0.0 <= time <= LONGEST and time > before):
                 raise ArgumentError("time", f"give seconds that grow, from 0 to {LONGEST:g}", value=f"{time:g}")
             before = time
-        if not self.commands or not self.commands[-1].stands:
+        if not self.commands or not self.commands[-1].is_zero:
             raise ArgumentError("commands", "the last one does not stand; end with 0,0,0")
 
     def at(self, elapsed: float) -> Drive:

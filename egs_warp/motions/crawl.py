@@ -13,23 +13,23 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState
-from egs_warp.geometry.frames import best_turn
+from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.locomotion.objectives import (
+    AngularMomentumObjective,
     AnyObjective,
     LoadObjective,
     Objective,
-    SpinObjective,
     centre_of_mass_velocity,
-    held_contacts,
+    no_slip_contacts,
     node_velocities,
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.gait import smooth
-from egs_warp.motions.route import Pace, Route
-from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import CALM, Calm
-from egs_warp.motions.way import check_way
+from egs_warp.motions.route import Route, StepLimits
+from egs_warp.motions.route_check import check_route
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.stance import REST_SPEED, RestDetector
 
 _ROUND = 3.0
 """Of sqrt(H / g): how long a slice takes from one stride to the next."""
@@ -66,7 +66,7 @@ class CrawlPlan:
 
 
 @dataclass(frozen=True)
-class CrawlReached:
+class CrawlOutcome:
     """How a body crawled."""
 
     rounds: float
@@ -92,7 +92,7 @@ class CrawlControl:
 class Crawl:
     """Goes by rounds, each planned from where the last one has ended, until it is there."""
 
-    def __init__(self, place: Place, route: Route, *, speed: float = 1.0, control: CrawlControl | None = None) -> None:
+    def __init__(self, place: Stance, route: Route, *, speed: float = 1.0, control: CrawlControl | None = None) -> None:
         """The body lies at ``place``; ``speed`` over the usual."""
         body = place.body
         self.body, self.ground, self.control = body, place.ground, control or CrawlControl()
@@ -106,9 +106,9 @@ class Crawl:
         """(N,) from 0 at the front end to 1 at the back."""
         stride = STRAIN * length * _CARRIED / (_STEEPEST * (1.0 - _CARRIED))
         aside = _ASIDE * body.height
-        self.pace = Pace(stride, 2.0 * aside / length, sideways=min(aside / stride, 1.0), faces=False)
+        self.pace = StepLimits(stride, 2.0 * aside / length, side_fraction=min(aside / stride, 1.0), faces_travel=False)
         self.places = route(self.pace)
-        check_way(place, self.places)
+        check_route(place, self.places)
         self._next, self._from, self._to = 1, np.zeros(3), self.places[1]
         """Of ``places`` the one it goes to; the body's place before and after this round."""
         self._speed, self._length = speed, length
@@ -118,7 +118,7 @@ class Crawl:
         self._began: float | None = None
         self.rounds = 0
         self._over = False
-        self._calm = Calm(body)
+        self._calm = RestDetector(body)
         self._resting = False
 
     @property
@@ -132,11 +132,11 @@ class Crawl:
         return self.seconds + self.body.time_unit
 
     @property
-    def resting(self) -> bool:
+    def is_at_rest(self) -> bool:
         """Whether it lies still at the end of its way."""
         return self._resting
 
-    def planned(self) -> CrawlPlan:
+    def plan_record(self) -> CrawlPlan:
         """What it aims at."""
         return CrawlPlan(float(len(self.places) - 1), self.pace.length, self.seconds)
 
@@ -149,11 +149,11 @@ class Crawl:
             return []
         return [f"it slid back as far as it came on, and gave up after {self.rounds} rounds"]
 
-    def reached(self, trajectory: Trajectory, first: int, last: int) -> CrawlReached:
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> CrawlOutcome:
         """What a round came to between two states of the trajectory."""
         ends = trajectory.positions[[first, last]]
         gone = (self.body.centre_of_mass(ends[1]) - self.body.centre_of_mass(ends[0])) @ self.ground.axes[:2].T
-        return CrawlReached(float(self.rounds), float(np.linalg.norm(gone)) / self.body.height / max(self.rounds, 1))
+        return CrawlOutcome(float(self.rounds), float(np.linalg.norm(gone)) / self.body.height / max(self.rounds, 1))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
@@ -174,7 +174,7 @@ class Crawl:
         pose = (after - before) / dt + follow * (before - local)
         return [
             centre_of_mass_velocity(body, com_velocity @ axes, control.com),
-            SpinObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
+            AngularMomentumObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
             node_velocities(body, pose @ axes, control.pose),
             *([LoadObjective(np.flatnonzero(swings), control.unload)] if swings.any() else []),
             *([self._hold(report, swings)] if report is not None else []),
@@ -211,7 +211,7 @@ class Crawl:
         """That a ``change`` of place (3,) takes."""
         cos, sin = np.cos(self._from[2]), np.sin(self._from[2])
         ahead, aside = cos * change[0] + sin * change[1], cos * change[1] - sin * change[0]
-        way = float(np.hypot(ahead, aside / self.pace.sideways)) / self.pace.length
+        way = float(np.hypot(ahead, aside / self.pace.side_fraction)) / self.pace.length
         return way + abs(float(change[2])) / self.pace.turn
 
     def _missing(self, place: np.ndarray) -> float:
@@ -222,14 +222,14 @@ class Crawl:
         """(3,) where the nodes at ``local`` (N, 3) have the body, its heading by whole turns as near to the last as may
         be."""
         com = self.body.centre_of_mass(local)
-        turn = best_turn(self.body.node_mass, self._standing - self._centre, local - com)
+        turn = kabsch_rotation(self.body.node_mass, self._standing - self._centre, local - com)
         heading = float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
         heading += 2.0 * np.pi * round((self._to[2] - heading) / (2.0 * np.pi))
         return np.array([*(com - self._centre)[:2], heading])
 
     def _note_rest(self, moving: np.ndarray, time: float) -> None:
-        calm = self._calm.held(moving, time)
-        slow = bool(np.linalg.norm(moving) <= CALM * self.body.speed_unit)
+        calm = self._calm.update(moving, time)
+        slow = bool(np.linalg.norm(moving) <= REST_SPEED * self.body.speed_unit)
         self._resting = (self._over and calm) or (self._resting and slow)
 
     def _carried(self, elapsed: float) -> np.ndarray:
@@ -253,14 +253,14 @@ class Crawl:
     def _hold(self, report: StepReport, swings: np.ndarray) -> Objective:
         """What stands does not slide."""
         contacts = report.contacts
-        stands = ~swings[contacts.nearest]
+        stands = ~swings[contacts.nearest_nodes]
         loads = np.where(stands, report.forces[:, 0], 0.0) / self.body.weight
-        return held_contacts(contacts, loads, self.control.hold)
+        return no_slip_contacts(contacts, loads, self.control.hold)
 
     def _turn(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """(3,) rotation vector that best carries ``before`` (N, 3) to ``after`` (N, 3)."""
         arms, aims = (x - self.body.centre_of_mass(x) for x in (before, after))
-        return Rotation.from_matrix(best_turn(self.body.node_mass, arms, aims)).as_rotvec()
+        return Rotation.from_matrix(kabsch_rotation(self.body.node_mass, arms, aims)).as_rotvec()
 
 
 def _slices(flat: np.ndarray) -> np.ndarray:

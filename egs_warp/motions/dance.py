@@ -15,11 +15,11 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.beats import Span, next_span
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget, height_of_flight, level_flight
-from egs_warp.motions.sequence import Place
+from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import heading_between, sole_shares
 from egs_warp.motions.stand import Stand
 from egs_warp.motions.turn import RESERVE, largest_turn
-from egs_warp.motions.twist import Turning
+from egs_warp.motions.twist import TurnHeading
 
 LOWEST, HIGHEST = 0.1, 0.6
 """Body heights: the jumps of a dance."""
@@ -77,7 +77,7 @@ class Event:
 
 
 @dataclass(frozen=True)
-class DanceReached:
+class DanceOutcome:
     """How well a dance kept time; seconds."""
 
     events: tuple[Event, ...]
@@ -144,7 +144,7 @@ class _Step:
 class Dance:
     """Stands until it is time for the next jump, jumps so high that it lands on a beat, and aims anew from there."""
 
-    def __init__(self, place: Place, beats: Sequence[float]) -> None:
+    def __init__(self, place: Stance, beats: Sequence[float]) -> None:
         """``beats``: seconds from the start of the dance, in their order.
 
         Raises ``UserError`` where it could not begin with any of them.
@@ -181,11 +181,11 @@ class Dance:
         return self._beats[-1] + float(np.sqrt(body.height / self._gravity))
 
     @property
-    def resting(self) -> bool:
+    def is_at_rest(self) -> bool:
         """Whether there is no beat left, and the body calm."""
         return self._next is None and self._dancing is None and (self._stand is None or self._stand.resting)
 
-    def planned(self) -> DancePlan:
+    def plan_record(self) -> DancePlan:
         """What it aims at."""
         return self._plan
 
@@ -196,11 +196,11 @@ class Dance:
                 return step.start - self._steps()[0].start + step.jump.planned_com(elapsed - step.began)
         return np.full(3, np.nan)
 
-    def reached(self, trajectory: Trajectory, first: int, last: int) -> DanceReached:
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> DanceOutcome:
         """How well it kept time."""
         events = tuple(event for step in self._steps() for event in step.events())
         worst = max((abs(event.error) for event in events), default=0.0)
-        return DanceReached(events, worst, self._skipped())
+        return DanceOutcome(events, worst, self._skipped())
 
     def notes(self) -> list[str]:
         """How well it kept time, and what kept it from a beat, for the user."""
@@ -234,7 +234,7 @@ class Dance:
         if step is not None and step.jump.resting:
             self._learn(step)
             self._done.append(step)
-            place = self._home.now(state.positions)
+            place = self._home.moved_to(state.positions)
             self._dancing, self._stand, self._next = None, Stand(place), self._aim(now)
         if self._next is not None and self._dancing is None:
             span = self._next
@@ -256,20 +256,20 @@ class Dance:
 
     def _begin(self, state: BodyState, now: float, span: Span, height: float) -> None:
         stance = self._figure[len(self._done) % len(self._figure)]
-        place = self._home.now(state.positions)
+        place = self._home.moved_to(state.positions)
         turned = heading_between(self._home.standing, state.positions, self._share, self._home.ground)
         jump = self._jump(place, stance, height, turn=stance.turned * self._turn - turned)
         com = place.body.centre_of_mass(state.positions)
         self._dancing, self._next = _Step(span, stance.move, jump, now, com), None
 
-    def _jump(self, place: Place, stance: _Stance, height: float, *, turn: float) -> Jump:
+    def _jump(self, place: Stance, stance: _Stance, height: float, *, turn: float) -> Jump:
         """From ``place`` to the ``stance``, ``height`` metres high, turning by ``turn`` radians."""
         home, body = self._home, place.body
         goal = self._share @ home.standing + stance.ahead * AHEAD * body.height * home.ground.axes[0]
         way = goal - self._share @ place.standing
         distance = float(np.linalg.norm(home.ground.axes[:2] @ way))
         if distance > _ON_THE_SPOT * body.height:
-            place = place.facing(way)
+            place = place.with_forward(way)
         else:
             distance = 0.0
         target = JumpTarget(distance, height)
@@ -277,7 +277,7 @@ class Dance:
         if not stance.twists:
             return straight
         most = RESERVE * largest_turn(straight, place)
-        return Jump(place, target, settled=True, facing=Turning(place, float(np.clip(turn, -most, most))))
+        return Jump(place, target, settled=True, facing=TurnHeading(place, float(np.clip(turn, -most, most))))
 
     def _aim(self, now: float) -> Span | None:
         """The next jump of a body that stands ``now``."""

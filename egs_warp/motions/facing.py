@@ -6,25 +6,25 @@ from typing import Protocol
 
 import numpy as np
 
-from egs_warp.motions.stance import Measurement, PoseFamily
+from egs_warp.motions.stance import BalanceController, Measurement
 
 
-class Facing(Protocol):
+class HeadingPolicy(Protocol):
     """What a jump asks about its turning; angles in radians about up, counter-clockwise from above."""
 
-    turn: float
+    target_heading: float
     """From the start to the landing."""
-    turned: float
+    heading: float
     """From the start until now, counted beyond whole turns."""
-    lands_at: float
+    predicted_heading: float
     """What ``turned`` will be at touch-down, as the body flies; told by ``airborne_pose``."""
 
-    def see(self, heading: float) -> None:
+    def update(self, heading: float) -> None:
         """Told before each step: how the body faces, from the start, whole turns apart."""
         ...
 
     def thrust_momentum(
-        self, pose: PoseFamily, seen: Measurement, upright: np.ndarray, *, left: float, flight_time: float
+        self, pose: BalanceController, seen: Measurement, upright: np.ndarray, *, left: float, flight_time: float
     ) -> np.ndarray:
         """(3,) kg m^2/s to leave the ground with, ``left`` seconds from now, so that a flight of ``flight_time``
         seconds ends upright and turned; ``upright`` (3,) is the rotation vector to the landing without its turn."""
@@ -34,24 +34,24 @@ class Facing(Protocol):
         """(3, 3) ``pose`` (3, 3) for a body with angular ``momentum`` (3,), ``left`` seconds before it lands."""
         ...
 
-    def landed_heading(self, pose: PoseFamily, positions: np.ndarray) -> float:
+    def landed_heading(self, pose: BalanceController, positions: np.ndarray) -> float:
         """How the body that has landed with its nodes at ``positions`` (N, 3) shall face, from the landing of
         ``pose``."""
         ...
 
 
-class Straight:
+class KeepHeading:
     """Lands facing as it stood."""
 
-    turn = 0.0
-    turned = 0.0
-    lands_at = 0.0
+    target_heading = 0.0
+    heading = 0.0
+    predicted_heading = 0.0
 
-    def see(self, heading: float) -> None:
+    def update(self, heading: float) -> None:
         """Nothing depends on it."""
 
     def thrust_momentum(
-        self, pose: PoseFamily, seen: Measurement, upright: np.ndarray, *, left: float, flight_time: float
+        self, pose: BalanceController, seen: Measurement, upright: np.ndarray, *, left: float, flight_time: float
     ) -> np.ndarray:
         """Upright alone."""
         return seen.inertia @ (upright / flight_time)
@@ -60,6 +60,6 @@ class Straight:
         """``pose`` as it is."""
         return pose
 
-    def landed_heading(self, pose: PoseFamily, positions: np.ndarray) -> float:
+    def landed_heading(self, pose: BalanceController, positions: np.ndarray) -> float:
         """Straight ahead."""
         return 0.0

@@ -32,19 +32,19 @@ standard deviation of this part."""
 _HALF, _MIDDLE, _BETWEEN = 0.3, 0.2, 0.6
 """Of a base that is taken for two feet: body heights up to which a side of it moves as a foot does, the part of its
 half width next to the middle that belongs to none, and the part over which the one side goes over into the other."""
-AHEAD = np.radians(15.0)
+FIRST_FOOT_ANGLE = np.radians(15.0)
 """A foot this little to the right of straight ahead is still the first."""
 
 
-class Base(Enum):
+class SupportKind(Enum):
     """What a body stands on."""
 
     FEET = "feet"
     """Two or more."""
-    ONE = "one base"
-    ROUND = "a round base"
+    SINGLE_BASE = "one base"
+    ROUND_BASE = "a round base"
     """It can roll."""
-    LONG = "its length"
+    LYING = "its length"
     """It lies, and has no foot."""
 
 
@@ -60,7 +60,7 @@ class Foot:
     """Metres from the ground to where the leg joins the body."""
     height: float = 0.0
     """Metres of its lowest node over that of the body: the leg is so much short."""
-    joined: bool = False
+    is_joined: bool = False
     """The cage joins it to another foot by an edge below where the legs meet."""
 
 
@@ -74,7 +74,7 @@ def find_feet(mesh: TetMesh, heights: np.ndarray, body_height: float, limbs: Lim
     limbs = limbs or find_limbs(Sections.of_mesh(mesh, heights), mesh.nodes)
     above = heights - heights.min()
     if limbs.count == 1:
-        if base_of(mesh, heights, 1) is Base.LONG:
+        if support_kind_of(mesh, heights, 1) is SupportKind.LYING:
             return ()
         sole = np.flatnonzero(above < _GROUND * body_height)
         everything = np.arange(len(above))
@@ -88,7 +88,7 @@ def find_feet(mesh: TetMesh, heights: np.ndarray, body_height: float, limbs: Lim
     lowest = [int(nodes[np.argmin(above[nodes])]) for nodes in roots]
     apart = np.ones(len(roots), bool)
     for level in np.unique(heights[above >= _FOOT * body_height]):
-        labels = _patches(graph, heights <= level)
+        labels = _connected_patches(graph, heights <= level)
         met = labels[lowest]
         for i in np.flatnonzero(apart & (met >= 0)):
             if (met == met[i]).sum() > 1:
@@ -109,34 +109,36 @@ def find_feet(mesh: TetMesh, heights: np.ndarray, body_height: float, limbs: Lim
     )
 
 
-def base_of(mesh: TetMesh, heights: np.ndarray, foot_count: int) -> Base:
+def support_kind_of(mesh: TetMesh, heights: np.ndarray, foot_count: int) -> SupportKind:
     """What a body stands on that has so many feet, or limbs that reach the ground; ``heights`` (N,): see
     ``find_feet``."""
     if foot_count > 1:
-        return Base.FEET
+        return SupportKind.FEET
     nodes = mesh.nodes[np.unique(mesh.boundary_faces())]
     size = float(np.ptp(heights))
     up = _up(mesh, heights)
     flat = mesh.nodes - np.outer(mesh.nodes @ up, up)
     long, wide = _sides(flat[heights < heights.min() + _FOOT * size])
     if long > _LONG * max(wide, size):
-        return Base.LONG
+        return SupportKind.LYING
     edge = 0.5 * mean_edge_length(mesh)
     sole, _ = _sides(flat[heights < heights.min() + _GROUND * size])
     away = np.linalg.norm(nodes - np.average(mesh.nodes, axis=0, weights=mesh.lumped_masses(1.0)), axis=1)
     # A coarse cage is flat where the body is round.
     is_ball = float(away.std()) < _ROUND * float(away.mean()) and sole - edge < _ROUND_SOLE * _sides(flat)[0]
-    return Base.ROUND if is_ball else Base.ONE
+    return SupportKind.ROUND_BASE if is_ball else SupportKind.SINGLE_BASE
 
 
-def around(places: np.ndarray) -> np.ndarray:
+def order_counterclockwise(places: np.ndarray) -> np.ndarray:
     """(feet,) indices of the feet at ``places`` (feet, 2), forward and left, as they are numbered: anticlockwise as
     seen from above, from straight ahead on."""
     ahead, left = (places - places.mean(axis=0)).T
-    return np.argsort((np.arctan2(left, ahead) + AHEAD) % (2.0 * np.pi))
+    return np.argsort((np.arctan2(left, ahead) + FIRST_FOOT_ANGLE) % (2.0 * np.pi))
 
 
-def halves(place_of_sole: np.ndarray, heights: np.ndarray, sole: np.ndarray, body_height: float) -> tuple[Foot, Foot]:
+def split_base(
+    place_of_sole: np.ndarray, heights: np.ndarray, sole: np.ndarray, body_height: float
+) -> tuple[Foot, Foot]:
     """The left and the right side of a base as two feet, each without what is near the middle.
 
     ``place_of_sole`` (N, 2) is ahead and to the left of each node, ``heights`` (N,) over the ground, ``sole`` (k,) the
@@ -164,7 +166,7 @@ def foot_of_node(feet: Sequence[Foot]) -> np.ndarray:
 
 def foot_of_contact(feet: Sequence[Foot], contacts: ContactSet) -> np.ndarray:
     """(n,) index of the foot that each contact point goes with."""
-    return foot_of_node(feet)[contacts.nearest]
+    return foot_of_node(feet)[contacts.nearest_nodes]
 
 
 def foot_loads(feet: Sequence[Foot], report: StepReport | None, weight: float) -> np.ndarray:
@@ -202,7 +204,7 @@ def _sides(flat: np.ndarray) -> tuple[float, float]:
     return float(spans.max()), float(spans.min())
 
 
-def _patches(graph: csr_matrix, kept: np.ndarray) -> np.ndarray:
+def _connected_patches(graph: csr_matrix, kept: np.ndarray) -> np.ndarray:
     """(N,) label of each kept node's connected patch, -1 for the rest."""
     nodes = np.flatnonzero(kept)
     labels = np.full(len(kept), -1)

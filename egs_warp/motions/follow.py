@@ -11,24 +11,24 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
-from egs_warp.geometry.frames import best_turn
+from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.locomotion.objectives import (
+    AngularMomentumObjective,
     AnyObjective,
     BodyPart,
     Coordinates,
-    SpinObjective,
     centre_of_mass_velocity,
     node_velocities,
     part_angular_momentum,
-    part_turning,
+    part_angular_velocity,
     part_velocity,
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import around
+from egs_warp.motions.feet import order_counterclockwise
 from egs_warp.motions.keyframes import Channel, Key, Quantity, channels
-from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import Calm, PoseFamily, Weights
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.stance import BalanceController, RestDetector, Weights
 
 MISSED = 0.1
 """Of the largest value of its channel: a key missed by more is noted."""
@@ -50,7 +50,7 @@ class FollowPlan:
 
 
 @dataclass(frozen=True)
-class FollowReached:
+class FollowOutcome:
     """How near a trajectory came to its key frames."""
 
     worst_miss: float
@@ -70,7 +70,7 @@ class Follow:
     balance, no spin, its shape, each unless a key rules it.
     """
 
-    def __init__(self, place: Place, keys: Sequence[Key], *, weights: Weights | None = None) -> None:
+    def __init__(self, place: Stance, keys: Sequence[Key], *, weights: Weights | None = None) -> None:
         """Raises ``UserError`` for a key of a part that the body does not have."""
         self.body, self.ground, self.weights = place.body, place.ground, weights or Weights()
         self.keys, self.channels = tuple(keys), channels(keys)
@@ -78,14 +78,14 @@ class Follow:
         for key in self.keys:
             if key.part not in self.parts:
                 raise UserError(f"{key.where}: the body has no part {key.part!r}; it has {', '.join(self.parts)}")
-        self.pose = PoseFamily(self.body, place.ground, place.standing, place.touching, place.friction)
+        self.pose = BalanceController(self.body, place.ground, place.standing, place.contact_points, place.friction)
         self.phase = FollowPhase.FOLLOW
         self._standing = place.standing
         self._gravity = float(np.linalg.norm(self.body.gravity))
         self._rate = 6.0 * float(np.sqrt(self._gravity / self.body.height))
         self._began: float | None = None
         self._end = max(key.time for key in self.keys)
-        self._calm = Calm(self.body)
+        self._calm = RestDetector(self.body)
         self._restless = False
         self._reached: dict[int, np.ndarray] = {}
         self._turned = {name: np.zeros(3) for name in self.parts}
@@ -96,11 +96,11 @@ class Follow:
         return self._end + USUAL_HOLD * float(np.sqrt(self.body.height / self._gravity))
 
     @property
-    def resting(self) -> bool:
+    def is_at_rest(self) -> bool:
         """Whether the body is calm after the last key, or was waited for long enough."""
         return self.phase is FollowPhase.REST
 
-    def planned(self) -> FollowPlan:
+    def plan_record(self) -> FollowPlan:
         """How many keys there are, how long they take, and the worst miss so far."""
         misses = [float(np.linalg.norm(self._miss(index))) for index in self._reached]
         return FollowPlan(float(len(self.keys)), self._end, max(misses, default=0.0))
@@ -108,9 +108,9 @@ class Follow:
     def planned_com(self, elapsed: float) -> None:
         """Nothing: keys are of parts of the body."""
 
-    def reached(self, trajectory: Trajectory, first: int, last: int) -> FollowReached:
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> FollowOutcome:
         """The worst miss of all keys."""
-        return FollowReached(self.planned().worst_miss)
+        return FollowOutcome(self.plan_record().worst_miss)
 
     def notes(self) -> list[str]:
         """Which keys were missed, and whether the body never came to rest."""
@@ -156,7 +156,7 @@ class Follow:
             self.phase = FollowPhase.HOLD
         if self.phase is not FollowPhase.HOLD:
             return
-        calm = self._calm.held(self.body.centre_of_mass(state.velocities), elapsed)
+        calm = self._calm.update(self.body.centre_of_mass(state.velocities), elapsed)
         late = elapsed - self._end > LONGEST_HOLD * np.sqrt(self.body.height / self._gravity)
         if calm or late:
             self.phase, self._restless = FollowPhase.REST, not calm
@@ -165,16 +165,16 @@ class Follow:
         self, state: BodyState, report: StepReport | None, dt: float, ruled: set[tuple[str, Quantity]]
     ) -> list[AnyObjective]:
         seen = self.pose.measure(state, report)
-        balance = np.array([*(seen.base - self.pose.base_offset), self.pose.standing_height])
+        balance = np.array([*(seen.foot_centre - self.pose.base_offset), self.pose.standing_height])
         rules: list[AnyObjective] = []
         velocity = self._rate / 3.0 * (balance - seen.com)
-        pose = self.pose.over_base(seen.com, seen.base, seen.heading)
+        pose = self.pose.over_base(seen.com, seen.foot_centre, seen.heading)
         upright = self.pose.turn_towards(seen, pose) * 0.7 * self._rate
-        velocity, spin = self.pose.balanced(seen, velocity, upright, dt)
+        velocity, spin = self.pose.balance_targets(seen, velocity, upright, dt)
         if not {("body", Quantity.POSITION), ("body", Quantity.VELOCITY)} & ruled:
             rules.append(centre_of_mass_velocity(self.body, self.ground.axes.T @ velocity, self.weights.com))
         if not {("body", Quantity.ORIENTATION), ("body", Quantity.ANGULAR_MOMENTUM)} & ruled:
-            rules.append(SpinObjective(seen.inertia @ spin, self.weights.spin))
+            rules.append(AngularMomentumObjective(seen.inertia @ spin, self.weights.spin))
         # The shape at rest goes along with the centre of mass.
         arms = self._standing - self.body.centre_of_mass(self._standing)
         now = state.positions - self.body.centre_of_mass(state.positions)
@@ -199,11 +199,11 @@ class Follow:
             before = value - dt * rate
             turning = np.radians(turn_between(before, value) / dt + self._rate * turn_between(now, before))
             if whole:
-                return SpinObjective(body.inertia(state.positions) @ (self.ground.axes.T @ turning), weight)
-            return part_turning(body, part, state, turning, weight, axes)
+                return AngularMomentumObjective(body.inertia(state.positions) @ (self.ground.axes.T @ turning), weight)
+            return part_angular_velocity(body, part, state, turning, weight, axes)
         momentum = body.mass * body.height**2 * value
         if whole:
-            return SpinObjective(self.ground.axes.T @ momentum, weight)
+            return AngularMomentumObjective(self.ground.axes.T @ momentum, weight)
         return part_angular_momentum(body, part, state, momentum, weight, axes)
 
     def _measured(self, name: str, quantity: Quantity, state: BodyState) -> np.ndarray:
@@ -217,7 +217,7 @@ class Follow:
             return axes @ part.centre(state.velocities) / height
         if quantity is Quantity.ORIENTATION:
             before, after = (x[part.nodes] - part.centre(x) for x in (self._standing, state.positions))
-            turn = best_turn(part.masses, before, after)
+            turn = kabsch_rotation(part.masses, before, after)
             shorter = axes @ Rotation.from_matrix(turn).as_rotvec(degrees=True)
             self._turned[name] = _lift_near(shorter, self._turned[name])
             return self._turned[name]
@@ -230,7 +230,7 @@ _LINEAR = (Quantity.POSITION, Quantity.VELOCITY)
 _HELD = (Quantity.POSITION, Quantity.ORIENTATION)
 
 
-def parts_of_body(place: Place) -> list[BodyPart]:
+def parts_of_body(place: Stance) -> list[BodyPart]:
     """The parts that keys may name: the whole body, its base, its head and its feet.
 
     A single foot is the base. Several are numbered anticlockwise as seen from above, from straight ahead on.
@@ -245,7 +245,7 @@ def parts_of_body(place: Place) -> list[BodyPart]:
     soles = [base.nodes[foot.leg[base.nodes] > 0.0] for foot in feet]
     # A leg that is too short to reach the base stands on its own lowest nodes.
     soles = [nodes if len(nodes) else foot.sole for nodes, foot in zip(soles, feet, strict=True)]
-    order = around(np.array([ground.local(standing[foot.sole])[:, :2].mean(axis=0) for foot in feet]))
+    order = order_counterclockwise(np.array([ground.local(standing[foot.sole])[:, :2].mean(axis=0) for foot in feet]))
     return found + [BodyPart.of(body, f"foot {number}", soles[index]) for number, index in enumerate(order, start=1)]
 
 

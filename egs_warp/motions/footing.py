@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 from egs_warp.motions.feet import Foot
 from egs_warp.motions.pendulum import is_line
-from egs_warp.motions.sequence import Place
+from egs_warp.motions.sequence import Stance
 
 DOWN = 0.005
 """Body heights over the ground at which a foot at the end of its swing counts as landed, too."""
@@ -20,10 +20,10 @@ _BETWEEN = 0.3
 """Of the distance of two feet: what is about as near to the one as to the other belongs to neither."""
 
 
-class Footing:
+class FootholdPlanner:
     """The soles of F feet, as they stand at the start, on level or sloping ground."""
 
-    def __init__(self, place: Place, feet: Sequence[Foot]) -> None:
+    def __init__(self, place: Stance, feet: Sequence[Foot]) -> None:
         """The body stands at ``place`` on ``feet``."""
         self._feet, self._height = feet, place.body.height
         normal = place.ground.axes @ place.ground.surface_normal
@@ -33,7 +33,7 @@ class Footing:
         self.soles = np.array([standing[foot.sole].mean(axis=0) for foot in feet])
         """(F, 3) their middles."""
         self._arms = [standing[foot.sole] - sole for foot, sole in zip(feet, self.soles, strict=True)]
-        self.grips = self._touching(place.ground.local(place.touching)[:, :2])
+        self.grips = self._touching(place.ground.local(place.contact_points)[:, :2])
         """For each foot (k, 2) where it touches the ground, from the middle of its sole; its whole sole where it
         hangs."""
 
@@ -56,12 +56,12 @@ class Footing:
         """(F, 4) where the feet stand at the start."""
         return np.column_stack([self.soles, np.zeros(len(self.soles))])
 
-    def home(self, place: np.ndarray, index: int) -> np.ndarray:
+    def nominal_foothold(self, place: np.ndarray, index: int) -> np.ndarray:
         """(4,) where foot ``index`` belongs when the body is at ``place`` (3,): see ``motions.route``."""
         level = self._centre + place[:2] + _flat(place[2]) @ (self.soles[index, :2] - self._centre)
         return self._on_ground(index, level, float(place[2]))
 
-    def landed(self, index: int, local: np.ndarray, planned: float) -> np.ndarray:
+    def landed_foothold(self, index: int, local: np.ndarray, planned: float) -> np.ndarray:
         """(4,) where foot ``index`` stands with the nodes at ``local`` (N, 3); its heading is told by whole turns as
         near to the ``planned`` one as may be."""
         now = local[self._feet[index].sole, :2]
@@ -70,7 +70,7 @@ class Footing:
         heading += 2.0 * np.pi * round((planned - heading) / (2.0 * np.pi))
         return self._on_ground(index, now.mean(axis=0), heading)
 
-    def now(self, local: np.ndarray, footprints: np.ndarray) -> np.ndarray:
+    def current_footholds(self, local: np.ndarray, footprints: np.ndarray) -> np.ndarray:
         """(F, 4) ``footprints`` moved to where the soles of the nodes at ``local`` (N, 3) are."""
         middles = np.array([local[foot.sole].mean(axis=0) for foot in self._feet])
         return np.column_stack([middles, footprints[:, 3]])
@@ -85,7 +85,7 @@ class Footing:
         arms = self._arms[index]
         return np.column_stack([arms[:, :2] @ _flat(footprint[3]).T, arms[:, 2]]) + footprint[:3]
 
-    def pressed(self, footprints: np.ndarray, standing: Sequence[int], margin: float) -> np.ndarray:
+    def support_points(self, footprints: np.ndarray, standing: Sequence[int], margin: float) -> np.ndarray:
         """(k, 2) where the feet ``standing`` on their ``footprints`` (F, 4) touch, each drawn in towards its middle to
         ``margin`` of its size."""
         pieces = []

@@ -12,7 +12,7 @@ _EXACT = 1e-4
 """Of the spin that is found."""
 
 
-def free_turn(inertia: np.ndarray, spin: np.ndarray, seconds: float) -> Rotation:
+def integrate_rotation(inertia: np.ndarray, spin: np.ndarray, seconds: float) -> Rotation:
     """By what a body of ``inertia`` (3, 3) kg m^2 has turned ``seconds`` after it had the ``spin`` (3,) rad/s, world
     axes. Its angular momentum stays, its spin need not: off its principal axes it wobbles."""
     momentum, turned = inertia @ spin, Rotation.identity()
@@ -28,10 +28,12 @@ def free_turn(inertia: np.ndarray, spin: np.ndarray, seconds: float) -> Rotation
     return turned
 
 
-def spin_that_turns(inertia: np.ndarray, upright: np.ndarray, turn: np.ndarray, seconds: float) -> np.ndarray:
+def spin_for_rotation(inertia: np.ndarray, upright: np.ndarray, turn: np.ndarray, seconds: float) -> np.ndarray:
     """(3,) rad/s with which a free body of ``inertia`` (3, 3) turns by the rotation vector ``upright`` (3,), then by
     ``turn`` (3,), which may be more than half a turn, in ``seconds``; as if it did not wobble where none is found."""
     asked = Rotation.from_rotvec(turn) * Rotation.from_rotvec(upright)
     steady = (upright + turn) / seconds
-    found = root(lambda spin: (asked * free_turn(inertia, spin, seconds).inv()).as_rotvec(), steady, tol=_EXACT)
+    found = root(
+        lambda spin: (asked * integrate_rotation(inertia, spin, seconds).inv()).as_rotvec(), steady, tol=_EXACT
+    )
     return found.x if found.success else steady

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Tempo:
+class GaitTiming:
     """How a gait shares out its time."""
 
-    swing: float
+    swing_time: float
     """Of sqrt(H / g): how long a swing takes,"""
-    double: float
+    double_support_time: float
     """and how long all feet stand after it."""
-    carried_from: float
+    transfer_start: float
     """Parts of a swing: when a foot begins to be carried ahead,"""
-    carried: float
+    transfer_fraction: float
     """and for how long. It has arrived before it lands, lest an early touch of the ground drag it."""
 
 
@@ -36,7 +36,7 @@ class Gait:
     """
 
     groups: tuple[tuple[int, ...], ...]
-    paces: int
+    step_count: int
     swing_time: float
     """Seconds."""
     double_time: float
@@ -47,23 +47,25 @@ class Gait:
     """Parts of a swing between which a foot is carried ahead."""
 
     @classmethod
-    def of(cls, feet: int, paces: int, lift: float, tempo: Tempo, *, time_unit: float) -> Gait:
+    def of(cls, feet: int, paces: int, lift: float, tempo: GaitTiming, *, time_unit: float) -> Gait:
         """The gait on so many ``feet``; ``lift`` in metres, ``time_unit`` seconds, as sqrt(H / g)."""
-        window = (tempo.carried_from, tempo.carried_from + tempo.carried)
-        return cls(feet_in_turn(feet), paces, tempo.swing * time_unit, tempo.double * time_unit, lift, window)
+        window = (tempo.transfer_start, tempo.transfer_start + tempo.transfer_fraction)
+        return cls(
+            feet_in_turn(feet), paces, tempo.swing_time * time_unit, tempo.double_support_time * time_unit, lift, window
+        )
 
     @property
     def swings(self) -> int:
         """Swings in all."""
-        return self.paces + len(self.groups) - 1
+        return self.step_count + len(self.groups) - 1
 
-    def group(self, swing: int) -> tuple[int, ...]:
+    def swing_feet(self, swing: int) -> tuple[int, ...]:
         """The feet that make swing ``swing`` (0, 1, ...)."""
         return self.groups[swing % len(self.groups)]
 
-    def landing(self, swing: int) -> int:
+    def target_step(self, swing: int) -> int:
         """The pace to whose place the feet of swing ``swing`` come."""
-        return min(swing + 1, self.paces)
+        return min(swing + 1, self.step_count)
 
     def progress(self, swing: int, elapsed: float) -> float:
         """Paces that the body should have done ``elapsed`` seconds after ``swing`` began, evenly: in the middle of a
@@ -81,19 +83,19 @@ class Gait:
         """Seconds into a swing at which it is over its next footprint."""
         return self.window[1] * self.swing_time
 
-    def lifted(self, progress: float) -> float:
+    def foot_height(self, progress: float) -> float:
         """Metres a foot is above the ground when ``progress`` (0 to 1) of its swing is over;
         it leaves and lands at rest.
         """
         return self.lift * smooth(progress / 0.4) * (1.0 - smooth((progress - 0.65) / 0.35))
 
-    def carried(self, progress: float) -> float:
+    def transfer_progress(self, progress: float) -> float:
         """Part of its way that a foot has gone when ``progress`` (0 to 1) of its swing is over."""
         start, end = self.window
         return smooth((progress - start) / (end - start))
 
     @staticmethod
-    def eased(progress: float) -> float:
+    def steering_progress(progress: float) -> float:
         """Part to which a foot is steered to its place when ``progress`` (0 to 1) of its swing is over."""
         return smooth(progress / 0.3)
 

@@ -15,20 +15,20 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
-from egs_warp.geometry.frames import best_turn
+from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.locomotion.objectives import (
+    AngularMomentumObjective,
     AnyObjective,
-    SpinObjective,
     centre_of_mass_velocity,
+    deformation_velocities,
     node_velocities,
-    straining_velocities,
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import Base
+from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.gait import smooth
-from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import Calm
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.stance import RestDetector
 from egs_warp.motions.stand import Stand
 
 UPRIGHT = 15.0
@@ -83,7 +83,7 @@ class GetUpPlan:
 
 
 @dataclass(frozen=True)
-class GetUpReached:
+class GetUpOutcome:
     """How it got up."""
 
     tries: float
@@ -124,9 +124,9 @@ class _Roll:
 class GetUp:
     """Presses itself up and stands, or gives up after ``_TRIES``."""
 
-    def __init__(self, place: Place, *, control: GetUpControl | None = None) -> None:
+    def __init__(self, place: Stance, *, control: GetUpControl | None = None) -> None:
         """``place``: how the body stands where it does; it lies anyhow. Raises ``UserError`` for a ball."""
-        if place.base() is Base.ROUND:
+        if place.base() is SupportKind.ROUND_BASE:
             raise UserError("get up: a ball lies any way up; walk or jump on")
         body = place.body
         self._place, self.body, self.ground = place, body, place.ground
@@ -138,7 +138,7 @@ class GetUp:
         self._base = np.flatnonzero(heights < heights.min() + _BASE * body.height)
         if len(self._base) < 4:
             self._base = np.argsort(heights)[:8]
-        self._calm = Calm(body)
+        self._calm = RestDetector(body)
         self.phase, self._entered = GetUpPhase.LIE, -1.0
         self.tries = 0
         self._push, self._in_hand = 0.0, 0.0
@@ -146,7 +146,7 @@ class GetUp:
         self._degrees = self._base_degrees = 180.0
 
     @property
-    def resting(self) -> bool:
+    def is_at_rest(self) -> bool:
         """Whether it stands calmly, or has given up."""
         if self.phase is GetUpPhase.STAND:
             return self._stand is not None and self._stand.resting and self._degrees < UPRIGHT
@@ -162,7 +162,7 @@ class GetUp:
         """Seconds, of one try."""
         return 8.0 * self._unit
 
-    def planned(self) -> GetUpPlan:
+    def plan_record(self) -> GetUpPlan:
         """How often it may try."""
         return GetUpPlan(float(len(_TRIES)))
 
@@ -173,9 +173,9 @@ class GetUp:
         """What kept it from its feet, for the user."""
         return [f"it does not get up: it lies after {self.tries} tries"] if self.phase is GetUpPhase.GIVEN_UP else []
 
-    def reached(self, trajectory: Trajectory, first: int, last: int) -> GetUpReached:
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> GetUpOutcome:
         """How often it tried."""
-        return GetUpReached(float(self.tries))
+        return GetUpOutcome(float(self.tries))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
@@ -212,7 +212,7 @@ class GetUp:
         if self._entered < 0.0:
             self._entered = state.time
         elapsed = (state.time - self._entered) / self._unit
-        calm = self._calm.held(self.body.centre_of_mass(state.velocities), state.time)
+        calm = self._calm.update(self.body.centre_of_mass(state.velocities), state.time)
         load = 0.0 if report is None else float(report.forces[:, 0].sum()) / self.body.weight
         upright = self._degrees < UPRIGHT
         if self.phase is GetUpPhase.LIE and (calm or elapsed > _LIES):
@@ -245,7 +245,7 @@ class GetUp:
         self.phase, self._entered = phase, time
 
     def _catch(self, state: BodyState, phase: GetUpPhase, crouch: float) -> None:
-        self._stand = Stand(self._place.now(state.positions), at_rest=False, crouch=crouch)
+        self._stand = Stand(self._place.moved_to(state.positions), at_rest=False, crouch=crouch)
         self._enter(phase, state.time)
 
     def _tilt(self, positions: np.ndarray, nodes: np.ndarray | slice = slice(None)) -> tuple[float, np.ndarray]:
@@ -253,7 +253,7 @@ class GetUp:
         world axes, about which that is undone."""
         mass, arms, up = self.body.node_mass[nodes], self._arms[nodes], self.ground.axes[2]
         now = positions[nodes]
-        turn = best_turn(mass, arms - mass @ arms / mass.sum(), now - mass @ now / mass.sum())
+        turn = kabsch_rotation(mass, arms - mass @ arms / mass.sum(), now - mass @ now / mass.sum())
         head = turn @ up
         axis = np.cross(head, up)
         size = float(np.linalg.norm(axis))
@@ -287,17 +287,17 @@ class GetUp:
         if carried:
             pose = node_velocities(body, velocity + rate * np.cross(roll.axis, arms), control.carried)
         else:
-            turn = best_turn(body.node_mass, self._arms, arms)
+            turn = kabsch_rotation(body.node_mass, self._arms, arms)
             shape = control.follow / unit * (self._arms @ turn.T - arms)
-            pose = straining_velocities(body, state.positions, shape, control.pose)
+            pose = deformation_velocities(body, state.positions, shape, control.pose)
         return [
             centre_of_mass_velocity(body, velocity, control.com),
-            SpinObjective(body.inertia(state.positions) @ (rate * roll.axis), control.spin),
+            AngularMomentumObjective(body.inertia(state.positions) @ (rate * roll.axis), control.spin),
             pose,
         ]
 
 
-def lie_down(place: Place, degrees: float, axis: np.ndarray) -> np.ndarray:
+def lie_down(place: Stance, degrees: float, axis: np.ndarray) -> np.ndarray:
     """(N, 3) the body that stands at ``place`` laid over by ``degrees`` about ``axis`` (3,), just over the ground."""
     body = place.body
     com = body.centre_of_mass(place.standing)

@@ -16,26 +16,26 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
-from egs_warp.motions.sequence import Part, Place
+from egs_warp.motions.sequence import MotionTask, Stance
 from egs_warp.motions.stance import sole_shares
 
 
 @dataclass(frozen=True)
-class HopReached:
+class HopOutcome:
     """How near a hop came to its square."""
 
-    square_miss: float
+    target_error: float
     """From the middle of the feet to that of the square at the end, in lengths of the jump."""
 
 
 class Hop:
     """A jump whose feet aim at a point of the ground."""
 
-    def __init__(self, place: Place, square: np.ndarray, height: float) -> None:
+    def __init__(self, place: Stance, square: np.ndarray, height: float) -> None:
         """``square`` (3,): where the middle of the feet shall land; ``height``: rise of the centre of mass, both
         metres."""
         way = square - sole_shares(place.body, place.ground, place.standing) @ place.standing
-        place = place.facing(way)
+        place = place.with_forward(way)
         forward, _, rise = place.ground.axes @ way
         target = JumpTarget(float(forward), height + max(float(rise), 0.0), float(rise))
         self.jump, self.square = Jump(place, target), square
@@ -47,7 +47,7 @@ class Hop:
         return self.jump.expected_time
 
     @property
-    def resting(self) -> bool:
+    def is_at_rest(self) -> bool:
         """Whether the jump is at rest."""
         return self.jump.resting
 
@@ -55,7 +55,7 @@ class Hop:
         """Those of the jump."""
         return self.jump.objectives(state, report, dt)
 
-    def planned(self) -> JumpPlan:
+    def plan_record(self) -> JumpPlan:
         """What the jump aims at."""
         return self.jump.plan
 
@@ -63,9 +63,9 @@ class Hop:
         """That of the jump."""
         return self.jump.planned_com(elapsed)
 
-    def reached(self, trajectory: Trajectory, first: int, last: int) -> HopReached:
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> HopOutcome:
         """How near the feet came to the square."""
-        return HopReached(self.miss(trajectory.positions[last]) / self.jump.target.distance)
+        return HopOutcome(self.miss(trajectory.positions[last]) / self.jump.target.distance)
 
     def notes(self) -> list[str]:
         """What kept the jump from its target, for the user."""
@@ -78,7 +78,7 @@ class Hop:
         return float(np.linalg.norm(off - (off @ up) * up))
 
 
-class Squares:
+class HopTargets:
     """A row of squares ahead of a place; made when the first hop begins, so that later ones do not add up their
     errors."""
 
@@ -89,20 +89,20 @@ class Squares:
         self._way = np.zeros(3)
         self._clearance = 0.0
 
-    def parts(self) -> list[Part]:
+    def parts(self) -> list[MotionTask]:
         """The hops, for a sequence."""
         return [
-            Part("hop", {**self.asked, "square": float(k)}, lambda place, k=k: self._begin(place, k))
+            MotionTask("hop", {**self.asked, "square": float(k)}, lambda place, k=k: self._begin(place, k))
             for k in range(1, self.count + 1)
         ]
 
-    def _begin(self, place: Place, number: int) -> Hop:
+    def _begin(self, place: Stance, number: int) -> Hop:
         if self._first is None:
             share = sole_shares(place.body, place.ground, place.standing)
             self._first = share @ place.standing
             self._way = place.ground.axes[0]
             # The middle of the feet is a little above what they stand on.
-            self._clearance = -place.rise_at(self._first)
+            self._clearance = -place.surface_height_above(self._first)
         square = self._first + number * self.distance * self._way
-        rise = place.rise_at(square) + self._clearance
+        rise = place.surface_height_above(square) + self._clearance
         return Hop(place, square + rise * place.ground.axes[2], self.height)

@@ -9,37 +9,37 @@ import numpy as np
 
 from egs_warp.motions.style import Style
 
-CARRIED = 2.0
+EXIT_SPEED_FACTOR = 2.0
 """Speed ahead at the end of a crouch, in leans over its time: 2 is a steady acceleration, 0 a stop."""
-LEAN = 0.15
+LEAN_FRACTION = 0.15
 """Of the distance: how far the weight is put ahead before take-off. With it over the middle of the feet a push forward
 would turn the body backward."""
-FURTHEST_LEAN = 0.35
+MAX_LEAN = 0.35
 """Of the way from under the centre of mass to the front of the feet."""
-DEEPEST_CROUCH = 0.26
+MAX_CROUCH = 0.26
 """Of the height of the centre of mass, deeper ones crush elements to a fifth; a higher jump thrusts harder instead."""
-PUSH = 2.8
+THRUST_ACCELERATION = 2.8
 """Of gravity: mean acceleration of a thrust. A harder one takes a shallower crouch, which strains a stiff body less.
 """
-GRIPPING = 0.9
+FRICTION_FRACTION = 0.9
 """Of what friction gives while a thrust lasts: what its speed ahead may take. A thrust to which it would give less
 lasts longer, in a crouch that is deeper by ``DEEPER`` body heights at most."""
 _LEAST_FRICTION = 1e-6
-SHALLOWEST, DEEPER = 0.02, 0.02
+MIN_CROUCH, MAX_EXTRA_CROUCH = 0.02, 0.02
 """Body heights that a crouch is deep at least, without the way of half a step; and more for the sake of friction."""
-ONSET, RAMP = 0.3, 0.4
+THRUST_START_FRACTION, THRUST_RAMP_FRACTION = 0.3, 0.4
 """Share of its full strength with which a thrust begins, where the crouch has left it, and share of its time until it
 is reached.
 """
 
 _EXTENSION, _EXTENDED = 0.04, 0.25
 """How much higher than it stands a body leaves the ground: body heights, and of the height of the jump at most."""
-SETTLING = 0.3
+SETTLE_TIME = 0.3
 """Of sqrt(H / g): when it begins to crouch."""
 USUAL_LANDING, USUAL_LANDING_AHEAD = 0.7, 1.0
 """Of sqrt(H / g): from touch-down until it is at rest, as a rule, and more for each body height ahead (measured on the
 pawn)."""
-LANDING = 0.35
+LANDING_TIME = 0.35
 """Of sqrt(H / g): in which the fall of a body on legs is stopped, while it goes on over its feet (measured on the
 robot, whose feet stay where they touch down).
 """
@@ -94,7 +94,7 @@ class JumpPlan:
     def _onset(self) -> np.ndarray:
         """(3,) m/s. The crouch ends at rest over the ground but already on the way ahead: friction has little left to
         give during the thrust."""
-        return np.array([min(CARRIED * self.lean / self.crouch_time, self.speed_forward), 0.0, 0.0])
+        return np.array([min(EXIT_SPEED_FACTOR * self.lean / self.crouch_time, self.speed_forward), 0.0, 0.0])
 
     def crouch(self, start: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
         """Position and velocity (3,) of the centre of mass that stood at ``start`` (3,), ``elapsed`` seconds into the
@@ -109,20 +109,20 @@ class JumpPlan:
         speed.
         """
         gained = np.array([self.speed_forward, 0.0, self.speed_up]) - self._onset
-        speed, way = ramped(elapsed / self.thrust_time)
+        speed, way = ramp_integrals(elapsed / self.thrust_time)
         position = start + self._down + self._onset * elapsed + way * self.thrust_time * gained
         return position, self._onset + speed * gained
 
-    def usual_time(self, ahead: float, time_unit: float) -> float:
+    def expected_duration(self, ahead: float, time_unit: float) -> float:
         """Seconds until a jump of ``ahead`` body heights is at rest; ``time_unit`` is sqrt(H / g)."""
         landing = USUAL_LANDING + USUAL_LANDING_AHEAD * ahead
-        return self.crouch_time + self.thrust_time + self.flight_time + (SETTLING + landing) * time_unit
+        return self.crouch_time + self.thrust_time + self.flight_time + (SETTLE_TIME + landing) * time_unit
 
     def take_off_time(self, step: float) -> float:
         """Seconds from the crouch until the thrust ends; both take whole steps of ``step`` s."""
         return step * float(sum(np.ceil(seconds / step - 1e-6) for seconds in (self.crouch_time, self.thrust_time)))
 
-    def way(self, elapsed: float, gravity: float) -> np.ndarray:
+    def planned_displacement(self, elapsed: float, gravity: float) -> np.ndarray:
         """(3,) metres from where the centre of mass stood, ``elapsed`` seconds after the crouch began; NaN after
         touch-down."""
         nothing = np.zeros(3)
@@ -146,20 +146,20 @@ def sufficient_speed(rise: float, gravity: float, dt: float) -> float:
     return float(max(-0.5 * step_gain + np.sqrt(max(2.0 * gravity * rise, 0.0)), 0.0))
 
 
-def ramped(share: float) -> tuple[float, float]:
+def ramp_integrals(share: float) -> tuple[float, float]:
     """Speed and way, of the speed gained and of that speed times the thrust's time, when a ``share`` of that time has
     passed.
 
     The push grows from ``ONSET`` to its full strength over the first ``RAMP`` of the thrust: muscles cannot be switched
     on at once.
     """
-    ramp = min(share, RAMP)
-    speed = ONSET * ramp + (1.0 - ONSET) * ramp**2 / (2.0 * RAMP)
-    way = ONSET * ramp**2 / 2.0 + (1.0 - ONSET) * ramp**3 / (6.0 * RAMP)
+    ramp = min(share, THRUST_RAMP_FRACTION)
+    speed = THRUST_START_FRACTION * ramp + (1.0 - THRUST_START_FRACTION) * ramp**2 / (2.0 * THRUST_RAMP_FRACTION)
+    way = THRUST_START_FRACTION * ramp**2 / 2.0 + (1.0 - THRUST_START_FRACTION) * ramp**3 / (6.0 * THRUST_RAMP_FRACTION)
     rest = share - ramp
     way += speed * rest + 0.5 * rest**2
     speed += rest
-    whole = 1.0 - 0.5 * (1.0 - ONSET) * RAMP
+    whole = 1.0 - 0.5 * (1.0 - THRUST_START_FRACTION) * THRUST_RAMP_FRACTION
     return speed / whole, way / whole
 
 
@@ -224,18 +224,20 @@ def plan_jump(
     capture_time = stopping_time(com_height, fall_speed, gravity, landing_time)
     footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
     crouch_time = np.ceil(style.anticipation * style.timing * 1.1 * time_unit / step) * step
-    acceleration = PUSH * gravity / style.timing
-    shortest = extension + SHALLOWEST * height
+    acceleration = THRUST_ACCELERATION * gravity / style.timing
+    shortest = extension + MIN_CROUCH * height
     stroke = max(speed_up**2 / (2.0 * acceleration), shortest)
     # A low jump far ahead is long on the ground: what friction gives ahead goes with what presses, speed up and weight.
-    ahead = (target.distance - lean + footprint_help) / (flight_time + capture_time) - CARRIED * lean / crouch_time
-    needed = (ahead / (GRIPPING * max(friction, _LEAST_FRICTION)) - speed_up) / gravity
-    stroke = max(stroke, min(ramped(1.0)[1] * speed_up * needed, shortest + DEEPER * height))
+    ahead = (target.distance - lean + footprint_help) / (
+        flight_time + capture_time
+    ) - EXIT_SPEED_FACTOR * lean / crouch_time
+    needed = (ahead / (FRICTION_FRACTION * max(friction, _LEAST_FRICTION)) - speed_up) / gravity
+    stroke = max(stroke, min(ramp_integrals(1.0)[1] * speed_up * needed, shortest + MAX_EXTRA_CROUCH * height))
     # Every step goes its whole way at the speed of its end: half a step's way more than the thrust itself.
     stroke += 0.5 * speed_up * step
-    crouch_depth = min(style.anticipation * (stroke - extension), DEEPEST_CROUCH * com_height)
+    crouch_depth = min(style.anticipation * (stroke - extension), MAX_CROUCH * com_height)
     way = crouch_depth + extension - 0.5 * speed_up * step
-    thrust_time = max(way / (ramped(1.0)[1] * speed_up), 2.0 * step)
+    thrust_time = max(way / (ramp_integrals(1.0)[1] * speed_up), 2.0 * step)
     speed_forward = (target.distance - lean + footprint_help) / (flight_time + capture_time + 0.5 * thrust_time)
     return JumpPlan(
         crouch_depth=float(crouch_depth),

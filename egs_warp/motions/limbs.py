@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 from egs_warp.meshing.occupancy import LatticeSolid
-from egs_warp.muscles.level_cells import LevelCells
+from egs_warp.muscles.level_set_cells import LevelSetCells
 
 _SLICE = 0.02
 """Body heights: thickness of a section of a mesh."""
@@ -59,7 +59,7 @@ class Sections:
         field = (heights - heights.min()) / thickness
         # A face that lies in a cut belongs to no cell.
         field = np.where(np.abs(field - np.rint(field)) < _CLEAR, np.rint(field) + _CLEAR, field)
-        cells = LevelCells.cut(mesh.tets, field, level_count=int(np.ceil(field.max())))
+        cells = LevelSetCells.cut(mesh.tets, field, level_count=int(np.ceil(field.max())))
         count, section = _components(cells.count, cells.touching)
         tet_from_node = np.zeros(len(mesh.nodes), int)
         tet_from_node[mesh.tets] = np.arange(len(mesh.tets))[:, None]

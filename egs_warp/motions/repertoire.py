@@ -11,17 +11,17 @@ import numpy as np
 from egs_warp.motions.beats import LATEST, MOST_BEATS, even_beats, read_beats
 from egs_warp.motions.command import DrivePlan, read_drive
 from egs_warp.motions.dance import Dance
-from egs_warp.motions.drive import DrivenBy
+from egs_warp.motions.drive import ScriptedDrive
 from egs_warp.motions.follow import Follow
+from egs_warp.motions.gait_selection import move_along, turn_in_place
 from egs_warp.motions.get_up import GetUp
-from egs_warp.motions.going import going, going_round
-from egs_warp.motions.hop import Squares
+from egs_warp.motions.hop import HopTargets
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.keyframes import Key, read_keyframes
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN, MotionRequest
-from egs_warp.motions.route import Route, along, read_path, straight
-from egs_warp.motions.sequence import BodyMotion, Part, Place
+from egs_warp.motions.route import Route, path_route, read_path, straight_route
+from egs_warp.motions.sequence import BodyMotion, MotionTask, Stance
 from egs_warp.motions.stand import StandFor
 from egs_warp.motions.style import Style
 from egs_warp.motions.turn import Turn
@@ -41,9 +41,9 @@ TRAJECTORY_TAIL = 200
 class MotionKind:
     """A motion that can be asked for by name."""
 
-    takes: tuple[Value, ...]
+    parameters: tuple[Value, ...]
     """In the order in which bare numbers are read."""
-    parts: Callable[[MotionRequest, float], list[Part]]
+    build_tasks: Callable[[MotionRequest, float], list[MotionTask]]
     """What a request, all of its repeats, comes to for a body of a height in metres. Raises ``UserError`` for a bad
     file."""
     frames: Callable[[MotionRequest], int]
@@ -57,7 +57,7 @@ class MotionKind:
 
     def usage(self, name: str) -> str:
         """What the motion called ``name`` takes, for messages."""
-        names = ", ".join(value.name for value in self.takes)
+        names = ", ".join(value.name for value in self.parameters)
         takes = f"{name} takes {names or ('a file' if self.file else 'no numbers')}"
         return f"{takes} or a file of beats" if self.beats else takes
 
@@ -66,67 +66,69 @@ def _target(asked: Mapping[str, float], height: float) -> JumpTarget:
     return JumpTarget(asked["distance"] * height, asked["height"] * height)
 
 
-def _repeated(request: MotionRequest, asked: Mapping[str, float], begin: Callable[[Place], BodyMotion]) -> list[Part]:
-    return [Part(request.name, asked, begin)] * request.repeat
+def _repeated(
+    request: MotionRequest, asked: Mapping[str, float], begin: Callable[[Stance], BodyMotion]
+) -> list[MotionTask]:
+    return [MotionTask(request.name, asked, begin)] * request.repeat
 
 
-def _jumps(request: MotionRequest, height: float) -> list[Part]:
+def _jumps(request: MotionRequest, height: float) -> list[MotionTask]:
     target = _target(request.asked, height)
     return _repeated(request, request.asked, lambda place: Jump(place, place.landing(target)))
 
 
-def _hops(request: MotionRequest, height: float) -> list[Part]:
+def _hops(request: MotionRequest, height: float) -> list[MotionTask]:
     target = _target(request.asked, height)
-    return Squares(target.distance, target.height, request.repeat, request.asked).parts()
+    return HopTargets(target.distance, target.height, request.repeat, request.asked).parts()
 
 
-def _turns(request: MotionRequest, height: float) -> list[Part]:
+def _turns(request: MotionRequest, height: float) -> list[MotionTask]:
     target, turn = _target(request.asked, height), float(np.radians(request.asked["heading_degrees"]))
     return _repeated(request, request.asked, lambda place: Turn(place, target, turn))
 
 
-def _walking(request: MotionRequest, asked: Mapping[str, float], route: Route, height: float) -> list[Part]:
+def _walking(request: MotionRequest, asked: Mapping[str, float], route: Route, height: float) -> list[MotionTask]:
     length = asked.get("step_length", _PACE) * height
-    return _repeated(request, asked, lambda place: going(place, route, length, speed=asked["speed"]))
+    return _repeated(request, asked, lambda place: move_along(place, route, length, speed=asked["speed"]))
 
 
-def _walks(request: MotionRequest, height: float) -> list[Part]:
-    return _walking(request, request.asked, straight(request.asked["distance"] * height), height)
+def _walks(request: MotionRequest, height: float) -> list[MotionTask]:
+    return _walking(request, request.asked, straight_route(request.asked["distance"] * height), height)
 
 
-def _walks_to(request: MotionRequest, height: float) -> list[Part]:
+def _walks_to(request: MotionRequest, height: float) -> list[MotionTask]:
     goal = np.array([[request.asked["ahead"], request.asked["left"]]])
     asked = {**request.asked, "distance": float(np.linalg.norm(goal))}
-    return _walking(request, asked, along(goal * height), height)
+    return _walking(request, asked, path_route(goal * height), height)
 
 
-def _walks_along(request: MotionRequest, height: float) -> list[Part]:
+def _walks_along(request: MotionRequest, height: float) -> list[MotionTask]:
     points = _path(request)
     asked = {**request.asked, "distance": float(np.linalg.norm(points[-1]))}
-    return _walking(request, asked, along(points * height), height)
+    return _walking(request, asked, path_route(points * height), height)
 
 
-def _turns_on_the_spot(request: MotionRequest, height: float) -> list[Part]:
+def _turns_on_the_spot(request: MotionRequest, height: float) -> list[MotionTask]:
     angle = float(np.radians(request.asked["heading_degrees"]))
     asked, length = {**request.asked, "distance": 0.0}, _PACE * height
-    return _repeated(request, asked, lambda place: going_round(place, angle, length, speed=asked["speed"]))
+    return _repeated(request, asked, lambda place: turn_in_place(place, angle, length, speed=asked["speed"]))
 
 
-def _stands(request: MotionRequest, height: float) -> list[Part]:
+def _stands(request: MotionRequest, height: float) -> list[MotionTask]:
     seconds = request.asked["seconds"]
     return _repeated(request, request.asked, lambda place: StandFor(place, seconds))
 
 
-def _gets_up(request: MotionRequest, height: float) -> list[Part]:
+def _gets_up(request: MotionRequest, height: float) -> list[MotionTask]:
     return _repeated(request, request.asked, GetUp)
 
 
-def _runs(request: MotionRequest, height: float) -> list[Part]:
-    route, length = straight(request.asked["distance"] * height), LARGEST_TARGET * height
-    return _repeated(request, request.asked, lambda place: going(place, route, length, speed=_SPEED.most))
+def _runs(request: MotionRequest, height: float) -> list[MotionTask]:
+    route, length = straight_route(request.asked["distance"] * height), LARGEST_TARGET * height
+    return _repeated(request, request.asked, lambda place: move_along(place, route, length, speed=_SPEED.most))
 
 
-def _dances(request: MotionRequest, height: float) -> list[Part]:
+def _dances(request: MotionRequest, height: float) -> list[MotionTask]:
     beats = _beats(request)
     asked = request.asked if request.file is None else {"beats": float(len(beats)), "duration": beats[-1]}
     return _repeated(request, asked, lambda place: Dance(place, beats))
@@ -155,10 +157,10 @@ def _frames_of_walk(way: float, request: MotionRequest) -> int:
     return 170 + int(np.ceil(36 * way / _SHORTEST / request.asked["speed"]))
 
 
-def _drives(request: MotionRequest, height: float) -> list[Part]:
+def _drives(request: MotionRequest, height: float) -> list[MotionTask]:
     plan = _commands(request)
     asked = {"commands": float(len(plan.commands)), "duration": plan.seconds}
-    return _repeated(request, asked, lambda place: DrivenBy(place, plan))
+    return _repeated(request, asked, lambda place: ScriptedDrive(place, plan))
 
 
 def _commands(request: MotionRequest) -> DrivePlan:
@@ -168,7 +170,7 @@ def _commands(request: MotionRequest) -> DrivePlan:
     return read_drive(request.file)
 
 
-def _follows(request: MotionRequest, height: float) -> list[Part]:
+def _follows(request: MotionRequest, height: float) -> list[MotionTask]:
     keys = _keys(request)
     asked = {"keys": float(len(keys)), "duration": max(key.time for key in keys)}
     return _repeated(request, asked, lambda place: Follow(place, keys))
@@ -180,7 +182,7 @@ def _keys(request: MotionRequest) -> tuple[Key, ...]:
 
 
 _SPEED = Value("speed", 1.0, 0.3, 1.6, "times the usual")
-_STEP_LENGTH = Value("step_length", _PACE, 0.0, LARGEST_TARGET, "body heights", above=True)
+_STEP_LENGTH = Value("step_length", _PACE, 0.0, LARGEST_TARGET, "body heights", is_exclusive=True)
 _ROUND = 2.5
 """Body heights of way that take as long as a turn on the spot all the way round."""
 _LONG_TURN = 10.0
@@ -190,10 +192,10 @@ _SHORTEST = 0.02
 
 
 def _length(name: str, default: float, *, above: bool = False) -> Value:
-    return Value(name, default, 0.0, LARGEST_TARGET, "body heights", above=above)
+    return Value(name, default, 0.0, LARGEST_TARGET, "body heights", is_exclusive=above)
 
 
-REPERTOIRE: Mapping[str, MotionKind] = {
+MOTIONS: Mapping[str, MotionKind] = {
     "jump": MotionKind(
         (_length("distance", 0.5), _length("height", 0.2, above=True)), _jumps, lambda request: 120, jumps=True
     ),
@@ -255,7 +257,7 @@ REPERTOIRE: Mapping[str, MotionKind] = {
         file="a file of speeds, as drive speeds.csv",
     ),
     "stand": MotionKind(
-        (Value("seconds", 2.0, 0.0, 60.0, "seconds", above=True),),
+        (Value("seconds", 2.0, 0.0, 60.0, "seconds", is_exclusive=True),),
         _stands,
         lambda request: int(np.ceil(60.0 * request.asked["seconds"])) + _CALMING,
     ),
@@ -264,7 +266,7 @@ REPERTOIRE: Mapping[str, MotionKind] = {
         (
             Value("tempo", 90.0, 10.0, 400.0, "beats a minute"),
             Value("first", 1.0, 0.0, LATEST, "seconds"),
-            Value("beats", 16.0, 2.0, MOST_BEATS, "beats", whole=True),
+            Value("beats", 16.0, 2.0, MOST_BEATS, "beats", is_integer=True),
         ),
         _dances,
         lambda request: int(np.ceil(60.0 * _beats(request)[-1])) + _CALMING,
@@ -280,14 +282,14 @@ REPERTOIRE: Mapping[str, MotionKind] = {
 }
 
 
-def parts_of(request: MotionRequest, height: float) -> list[Part]:
+def parts_of(request: MotionRequest, height: float) -> list[MotionTask]:
     """What ``request``, all of its repeats, comes to for a body of ``height`` metres, in its own style where it has
     one."""
-    parts, style = REPERTOIRE[request.name].parts(request, height), request.style
+    parts, style = MOTIONS[request.name].build_tasks(request, height), request.style
     if style is None:
         return parts
     return [replace(part, begin=partial(_begun_in, style, part.begin)) for part in parts]
 
 
-def _begun_in(style: Style, begin: Callable[[Place], BodyMotion], place: Place) -> BodyMotion:
+def _begun_in(style: Style, begin: Callable[[Stance], BodyMotion], place: Stance) -> BodyMotion:
     return begin(replace(place, style=style))

@@ -11,15 +11,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from egs_warp.fem.body import BodyState
-from egs_warp.geometry.frames import best_turn
-from egs_warp.locomotion.objectives import AnyObjective, SpinObjective, centre_of_mass_velocity, node_velocities
+from egs_warp.geometry.frames import kabsch_rotation
+from egs_warp.locomotion.objectives import (
+    AngularMomentumObjective,
+    AnyObjective,
+    centre_of_mass_velocity,
+    node_velocities,
+)
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.route import Pace, Route
-from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import CALM, Calm
-from egs_warp.motions.timetable import Moment, Timetable
-from egs_warp.motions.way import check_way
+from egs_warp.motions.route import Route, StepLimits
+from egs_warp.motions.route_check import check_route
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.stance import REST_SPEED, RestDetector
+from egs_warp.motions.velocity_profile import ProfileSample, VelocityProfile
 
 _STEP = 0.1
 """Body heights between two places of the way."""
@@ -43,7 +48,7 @@ class RollPlan:
 
 
 @dataclass(frozen=True)
-class RollReached:
+class RollOutcome:
     """How a ball rolled."""
 
     rolled_degrees: float
@@ -64,7 +69,7 @@ class RollControl:
 class Roll:
     """Rolls along a route, and comes to rest at its end."""
 
-    def __init__(self, place: Place, route: Route, *, speed: float = 1.0, control: RollControl | None = None) -> None:
+    def __init__(self, place: Stance, route: Route, *, speed: float = 1.0, control: RollControl | None = None) -> None:
         """``speed`` over the usual. The ball stands at ``place``."""
         body = place.body
         self.body, self.ground, self.control = body, place.ground, control or RollControl()
@@ -76,17 +81,19 @@ class Roll:
         com = place.ground.local(body.centre_of_mass(place.standing))
         self._start = com[:2]
         self._sunk = self._radius(place.standing) - self._over_ground(com)
-        self.places = route(Pace(_STEP * body.height, np.pi, sideways=1.0, faces=False))
-        check_way(place, self.places)
+        self.places = route(StepLimits(_STEP * body.height, np.pi, side_fraction=1.0, faces_travel=False))
+        check_route(place, self.places)
         self.top_push = speed * _PUSH * self._gravity
         """m/s^2."""
-        self.table = Timetable.of(self.places[:, :2], speed=speed * _SPEED * body.speed_unit, push=self.top_push)
+        self.table = VelocityProfile.of(
+            self.places[:, :2], speed=speed * _SPEED * body.speed_unit, acceleration=self.top_push
+        )
         self._began: float | None = None
-        self._calm = Calm(body)
+        self._calm = RestDetector(body)
         self._resting = False
 
     @property
-    def resting(self) -> bool:
+    def is_at_rest(self) -> bool:
         """Whether it lies still at the end of its way."""
         return self._resting
 
@@ -95,7 +102,7 @@ class Roll:
         """Seconds, with what coming to rest takes."""
         return self.table.seconds + 2.0 * self.body.time_unit
 
-    def planned(self) -> RollPlan:
+    def plan_record(self) -> RollPlan:
         """What it aims at."""
         return RollPlan(self.table.length, self.table.seconds, self.table.top_speed)
 
@@ -108,17 +115,17 @@ class Roll:
         """None."""
         return []
 
-    def reached(self, trajectory: Trajectory, first: int, last: int) -> RollReached:
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> RollOutcome:
         """How far it turned between two states of the trajectory."""
         mass, angle = self.body.node_mass, 0.0
         states = trajectory.positions[first : last % len(trajectory.time) + 1]
         arms = [x - mass @ x / mass.sum() for x in states]
         for before, after in zip(arms[:-1], arms[1:], strict=True):
-            turn = best_turn(mass, before, after)
+            turn = kabsch_rotation(mass, before, after)
             level = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
             level -= (level @ self.ground.axes[2]) * self.ground.axes[2]
             angle += float(np.arcsin(min(0.5 * np.linalg.norm(level), 1.0)))
-        return RollReached(float(np.degrees(angle)))
+        return RollOutcome(float(np.degrees(angle)))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
@@ -128,8 +135,8 @@ class Roll:
         com, moving = body.centre_of_mass(local), axes @ body.centre_of_mass(state.velocities)
         elapsed = state.time - self._began
         ahead = self._ahead(com, elapsed, dt)
-        calm = self._calm.held(moving, state.time)
-        slow = bool(np.linalg.norm(moving) <= CALM * body.speed_unit)
+        calm = self._calm.update(moving, state.time)
+        slow = bool(np.linalg.norm(moving) <= REST_SPEED * body.speed_unit)
         self._resting = (calm and self._is_over(com, elapsed)) or (self._resting and slow)
         rate = _RATE / body.time_unit
         off = self._start + ahead.place - com[:2]
@@ -141,15 +148,15 @@ class Roll:
         velocity = np.array([*level, climb]) @ axes
         turning = np.cross(self.ground.surface_normal, velocity) / radius
         arms = state.positions - body.centre_of_mass(state.positions)
-        shape = self._rest @ best_turn(body.node_mass, self._rest, arms).T
+        shape = self._rest @ kabsch_rotation(body.node_mass, self._rest, arms).T
         pose = velocity + np.cross(turning, arms) + control.follow / body.time_unit * (shape - arms)
         return [
             centre_of_mass_velocity(body, velocity, control.com),
-            SpinObjective(inertia @ turning, control.spin),
+            AngularMomentumObjective(inertia @ turning, control.spin),
             node_velocities(body, pose, control.pose),
         ]
 
-    def _ahead(self, com: np.ndarray, elapsed: float, dt: float) -> Moment:
+    def _ahead(self, com: np.ndarray, elapsed: float, dt: float) -> ProfileSample:
         """Where the centre of mass, now at ``com`` (3,), is to be at the end of the step; the way from its start."""
         return self.table.at(elapsed + dt)
 
@@ -186,6 +193,6 @@ class Roll:
     def _radius(self, positions: np.ndarray) -> float:
         """Metres from the centre of mass to the ground, of the body at rest turned as the nodes at ``positions`` (N, 3)
         are."""
-        turn = best_turn(self.body.node_mass, self._rest, positions - self.body.centre_of_mass(positions))
+        turn = kabsch_rotation(self.body.node_mass, self._rest, positions - self.body.centre_of_mass(positions))
         normal, up = self.ground.surface_normal, self.ground.axes[2]
         return float(-(self._rest @ (turn.T @ normal)).min() / (normal @ up))

@@ -15,7 +15,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.io.text import read_text
 
-MOST_PACES = 400
+MAX_STEPS = 400
 """Of one walk."""
 _LONGEST_GAP = 1.0
 """Body heights between two points of a path."""
@@ -24,67 +24,67 @@ _THERE = 1e-9
 
 
 @dataclass(frozen=True)
-class Pace:
+class StepLimits:
     """The most that a body's place changes by in one pace; what turns it leaves less for the way ahead."""
 
     length: float
     """Metres."""
     turn: float
     """Radians."""
-    sideways: float = 0.0
+    side_fraction: float = 0.0
     """Part of ``length`` that it may go to its side."""
-    faces: bool = True
+    faces_travel: bool = True
     """Whether it turns the way it goes; what rolls or crawls goes any way as it is."""
 
 
-Route = Callable[[Pace], np.ndarray]
+Route = Callable[[StepLimits], np.ndarray]
 """Gives the places (P+1, 3) before the first and after each pace."""
 
 
-def straight(distance: float) -> Route:
+def straight_route(distance: float) -> Route:
     """``distance`` metres ahead in even paces; backwards if it is negative."""
 
-    def places(pace: Pace) -> np.ndarray:
+    def places(pace: StepLimits) -> np.ndarray:
         count = max(int(np.ceil(abs(distance) / pace.length - _THERE)), 1)
         return np.linspace([0.0, 0.0, 0.0], [distance, 0.0, 0.0], count + 1)
 
     return places
 
 
-def turning(angle: float) -> Route:
+def turn_route(angle: float) -> Route:
     """By ``angle`` radians on the spot, in even paces."""
 
-    def places(pace: Pace) -> np.ndarray:
+    def places(pace: StepLimits) -> np.ndarray:
         count = max(int(np.ceil(abs(angle) / pace.turn - _THERE)), 1)
         return np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, angle], count + 1)
 
     return places
 
 
-def along(points: np.ndarray) -> Route:
+def path_route(points: np.ndarray) -> Route:
     """Past each of ``points`` (n, 2), metres, to the last, turned the way it goes if it ``faces`` that; it turns on the
     spot where it must.
 
     Raises ``UserError`` where that takes more than ``MOST_PACES``.
     """
 
-    def places(pace: Pace) -> np.ndarray:
+    def places(pace: StepLimits) -> np.ndarray:
         way = [np.zeros(3)]
         for number, point in enumerate(points):
             near = _THERE if number == len(points) - 1 else pace.length
             while np.linalg.norm(point - way[-1][:2]) > near:
-                if len(way) > MOST_PACES:
-                    raise UserError(f"walk: the way takes more than {MOST_PACES} paces; choose a shorter one")
+                if len(way) > MAX_STEPS:
+                    raise UserError(f"walk: the way takes more than {MAX_STEPS} paces; choose a shorter one")
                 way.append(_nearer(way[-1], point, pace))
         return np.array(way) if len(way) > 1 else np.zeros((2, 3))
 
     return places
 
 
-def _nearer(place: np.ndarray, point: np.ndarray, pace: Pace) -> np.ndarray:
+def _nearer(place: np.ndarray, point: np.ndarray, pace: StepLimits) -> np.ndarray:
     """(3,) one pace on from ``place`` (3,) towards ``point`` (2,)."""
     arm = point - place[:2]
-    if not pace.faces:
+    if not pace.faces_travel:
         way = float(np.linalg.norm(arm))
         return np.array([*(place[:2] + min(1.0, pace.length / way) * arm), place[2]])
     off = np.arctan2(arm[1], arm[0]) - place[2]

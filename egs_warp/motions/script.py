@@ -18,13 +18,13 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import parse_json, read_text, whole_number
 from egs_warp.motions.beats import asked_beats
 from egs_warp.motions.command import Drive, DrivePlan
-from egs_warp.motions.repertoire import REPERTOIRE, MotionKind, parts_of
+from egs_warp.motions.repertoire import MOTIONS, MotionKind, parts_of
 from egs_warp.motions.request import MotionRequest
-from egs_warp.motions.sequence import Part, Place
+from egs_warp.motions.sequence import MotionTask, Stance
 from egs_warp.motions.style import Style, read_style
 
 MOST_MOTIONS = 100
-_NAMES = ", ".join(REPERTOIRE)
+_NAMES = ", ".join(MOTIONS)
 _FILE = "file of beats"
 """Among the values that motions take which do not say their own."""
 
@@ -44,7 +44,7 @@ class Script:
     def frames(self, height: float = 1.0) -> int:
         """At 60 Hz, after which the script is cut off, for a body of ``height`` metres: motions take longer as the root
         of it. Raises ``UserError`` for a bad file."""
-        frames = sum(request.repeat * REPERTOIRE[request.name].frames(request) for request in self.requests)
+        frames = sum(request.repeat * MOTIONS[request.name].frames(request) for request in self.requests)
         return round(frames * max(1.0, height**0.5))
 
     def style(self, text: str | None) -> Style:
@@ -52,15 +52,15 @@ class Script:
         one, and where nothing jumps."""
         if text is None:
             return Style()
-        if not any(REPERTOIRE[request.name].jumps for request in self.requests):
+        if not any(MOTIONS[request.name].jumps for request in self.requests):
             raise ArgumentError("style", f"nothing jumps in {self.name!r}; ask for a jump, hop, twist or dance")
         return read_style(text)
 
-    def parts(self, height: float) -> list[Part]:
+    def parts(self, height: float) -> list[MotionTask]:
         """The motions in their order, for a body of ``height`` metres."""
         return [part for request in self.requests for part in parts_of(request, height)]
 
-    def check(self, place: Place) -> list[float]:
+    def check(self, place: Stance) -> list[float]:
         """Seconds that each motion is expected to take, for a body that stands at ``place``.
 
         Raises the ``UserError`` that a later motion would raise when its turn comes.
@@ -89,7 +89,7 @@ def motion(text: str, *, beats: str | None = None, **values: float | None) -> Sc
     count = sum(request.repeat for request in requests)
     if count > MOST_MOTIONS:
         raise ArgumentError("motion", f"{count} motions are asked for; at most {MOST_MOTIONS} are done in a row")
-    if beats is not None and not any(REPERTOIRE[request.name].beats for request in requests):
+    if beats is not None and not any(MOTIONS[request.name].beats for request in requests):
         raise ArgumentError("beats", f"no motion of {text.strip()!r} takes them; ask for a dance")
     for name in values.keys() & given.keys():
         if not any(name in request.asked for request in requests):
@@ -97,7 +97,7 @@ def motion(text: str, *, beats: str | None = None, **values: float | None) -> Sc
     return Script(tuple(requests))
 
 
-def driving(*steps: tuple[float, Drive]) -> Script:
+def drive_script(*steps: tuple[float, Drive]) -> Script:
     """To go by ``Drive`` commands, each from so many seconds after the start on, the last of them to stand. Raises
     ``ArgumentError`` for times that do not grow."""
     plan = DrivePlan(tuple(time for time, _ in steps), tuple(command for _, command in steps))
@@ -109,10 +109,10 @@ def _from_words(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRe
     if not words:
         raise UserError(f"{where}: nothing between two commas; name a motion: {_NAMES}")
     both = " ".join(words[:2]).lower()
-    name, words = (both, words[2:]) if both in REPERTOIRE else (words[0].lower(), words[1:])
+    name, words = (both, words[2:]) if both in MOTIONS else (words[0].lower(), words[1:])
     repeat, values, file = None, {}, None
     kind = _kind(name, where)
-    order = [value.name for value in kind.takes]
+    order = [value.name for value in kind.parameters]
     for word in words:
         if re.fullmatch(r"[xX]\d+", word):
             if repeat is not None:
@@ -181,16 +181,16 @@ def _is_number(word: str) -> bool:
 
 
 def _kind(name: str, where: str) -> MotionKind:
-    if name not in REPERTOIRE:
+    if name not in MOTIONS:
         raise UserError(f"{where}: unknown motion {name!r}; known motions are: {_NAMES}")
-    return REPERTOIRE[name]
+    return MOTIONS[name]
 
 
 def _request(
     name: str, values: Mapping[str, Any], repeat: float, file: Path | None, defaults: Mapping[str, Any], where: str
 ) -> MotionRequest:
     kind = _kind(name, where)
-    known = {value.name: value for value in kind.takes}
+    known = {value.name: value for value in kind.parameters}
     for key in values:
         if key not in known:
             raise UserError(f"{where}: {key!r} is unknown; {kind.usage(name)}")
@@ -204,5 +204,5 @@ def _request(
         file = defaults.get(_FILE)
     if kind.beats and file is not None and values:
         raise UserError(f"{where}: {', '.join(values)} beside the beats of {file}; give one of them")
-    asked = {key: value.read(values.get(key, defaults.get(key, value.default)), where) for key, value in known.items()}
+    asked = {key: value.parse(values.get(key, defaults.get(key, value.default)), where) for key, value in known.items()}
     return MotionRequest(name, asked, int(repeat), file)

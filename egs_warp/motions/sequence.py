@@ -10,15 +10,15 @@ import numpy as np
 
 from egs_warp.contact.terrain import Surface, surface_above
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.geometry.frames import best_turn
+from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import Base, Foot, base_of, find_feet
+from egs_warp.motions.feet import Foot, SupportKind, find_feet, support_kind_of
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.limbs import Limbs
-from egs_warp.motions.stance import Ground, heading_between, sole_shares
+from egs_warp.motions.stance import GroundFrame, heading_between, sole_shares
 from egs_warp.motions.style import Style
 
 if TYPE_CHECKING:
@@ -31,15 +31,15 @@ LATE = 0.03
 
 
 @dataclass(frozen=True)
-class Place:
+class Stance:
     """Where a body stands, upright and at rest, and which way is forward."""
 
     body: SoftBody
-    ground: Ground
+    ground: GroundFrame
     """Its origin is under the centre of mass; up is against gravity."""
     standing: np.ndarray
     """(N, 3) nodes, metres."""
-    touching: np.ndarray
+    contact_points: np.ndarray
     """(k, 3) points of the body on the ground, metres."""
     step: float
     """Seconds of a solver step."""
@@ -57,47 +57,47 @@ class Place:
         heights = (self.standing - self.ground.origin) @ self.ground.surface_normal
         return find_feet(self.body.mesh, heights, self.body.height, self.limbs)
 
-    def base(self) -> Base:
+    def base(self) -> SupportKind:
         """What kind of thing that is, of the body as it is without its weight."""
         nodes = self.body.mesh.nodes
         turn = self.body.best_fit_rotation(self.standing)
-        return base_of(self.body.mesh, nodes @ (turn.T @ self.ground.surface_normal), len(self.feet()))
+        return support_kind_of(self.body.mesh, nodes @ (turn.T @ self.ground.surface_normal), len(self.feet()))
 
-    def after(self, positions: np.ndarray, report: StepReport | None) -> Place:
+    def next_stance(self, positions: np.ndarray, report: StepReport | None) -> Stance:
         """Where a motion begins that finds the nodes at ``positions`` (N, 3) at rest; ``report`` of the step before.
 
         A ball stands on whatever it has rolled onto.
         """
-        if report is None or report.contacts.count == 0 or self.base() is not Base.ROUND:
-            return self.now(positions)
+        if report is None or report.contacts.count == 0 or self.base() is not SupportKind.ROUND_BASE:
+            return self.moved_to(positions)
         body, contacts = self.body, report.contacts
         com = body.centre_of_mass(positions)
         arms = self.standing - body.centre_of_mass(self.standing)
-        turn = best_turn(body.node_mass, arms, positions - com)
+        turn = kabsch_rotation(body.node_mass, arms, positions - com)
         axes = self.ground.axes
         if axes[2] @ turn @ axes[2] > np.cos(np.radians(_ROLLED)):
-            axes = self.now(positions).ground.axes
+            axes = self.moved_to(positions).ground.axes
         normal = self.ground.surface_normal
-        under = Ground.on(Plane(normal, -float(normal @ self.ground.origin)), axes[0], com, up=axes[2])
+        under = GroundFrame.on_plane(Plane(normal, -float(normal @ self.ground.origin)), axes[0], com, up=axes[2])
         touching = np.einsum("cw,cwi->ci", contacts.weights, positions[contacts.nodes])
-        return replace(self, ground=under, standing=positions.copy(), touching=touching)
+        return replace(self, ground=under, standing=positions.copy(), contact_points=touching)
 
-    def now(self, positions: np.ndarray) -> Place:
+    def moved_to(self, positions: np.ndarray) -> Stance:
         """The same stance turned about up and moved to where the feet of ``positions`` (N, 3) are."""
         share = sole_shares(self.body, self.ground, self.standing)
         angle = heading_between(self.standing, positions, share, self.ground)
         feet, moved = share @ self.standing, share @ positions
-        turn = self.ground.turn(angle)
+        turn = self.ground.rotation_about_up(angle)
         return replace(
             self,
-            ground=Ground(
+            ground=GroundFrame(
                 self.ground.axes @ turn.T, moved + (self.ground.origin - feet) @ turn.T, self.ground.surface_normal
             ),
             standing=moved + (self.standing - feet) @ turn.T,
-            touching=moved + (self.touching - feet) @ turn.T,
+            contact_points=moved + (self.contact_points - feet) @ turn.T,
         )
 
-    def rise_at(self, point: np.ndarray) -> float:
+    def surface_height_above(self, point: np.ndarray) -> float:
         """Metres from ``point`` (3,) up to the highest surface over or under it; 0 if there is none."""
         rise = surface_above(self.solids, point, self.ground.axes[2])
         return rise if np.isfinite(rise) else 0.0
@@ -112,10 +112,10 @@ class Place:
             return target
         return replace(target, rise=rise, height=max(target.height, rise + 0.5 * target.height))
 
-    def facing(self, direction: np.ndarray) -> Place:
+    def with_forward(self, direction: np.ndarray) -> Stance:
         """The same stance with another way forward (3,); the body is not turned."""
         x, y = self.ground.axes[:2] @ direction
-        turn = self.ground.turn(float(np.arctan2(y, x)))
+        turn = self.ground.rotation_about_up(float(np.arctan2(y, x)))
         return replace(self, ground=replace(self.ground, axes=self.ground.axes @ turn.T))
 
 
@@ -123,7 +123,7 @@ class BodyMotion(Protocol):
     """A state machine that ends at rest."""
 
     @property
-    def resting(self) -> bool:
+    def is_at_rest(self) -> bool:
         """Whether it has come to its end."""
         ...
 
@@ -136,7 +136,7 @@ class BodyMotion(Protocol):
         """Objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is of the step before."""
         ...
 
-    def planned(self) -> DataclassInstance:
+    def plan_record(self) -> DataclassInstance:
         """What it aims at."""
         ...
 
@@ -145,7 +145,7 @@ class BodyMotion(Protocol):
         motion began, before its first step; NaN where nothing was planned, None if nothing ever is."""
         ...
 
-    def reached(self, trajectory: Trajectory, first: int, last: int) -> DataclassInstance | None:
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> DataclassInstance | None:
         """What it did beside what is measured of all motions; ``first`` and ``last`` are indices into ``time``."""
         ...
 
@@ -155,7 +155,7 @@ class BodyMotion(Protocol):
 
 
 @dataclass
-class Done:
+class MotionRecord:
     """A motion of a sequence and when it began."""
 
     name: str
@@ -169,35 +169,35 @@ class Done:
 
 
 @dataclass(frozen=True)
-class Part:
+class MotionTask:
     """A motion to come."""
 
     name: str
     asked: Mapping[str, float]
-    begin: Callable[[Place], BodyMotion]
+    begin: Callable[[Stance], BodyMotion]
 
 
 class MotionSequence:
     """Runs ``parts`` one after the other from ``place``; itself a motion."""
 
-    def __init__(self, place: Place, parts: Sequence[Part]) -> None:
+    def __init__(self, place: Stance, parts: Sequence[MotionTask]) -> None:
         self._place = place
         self._parts = list(parts)
         self._count = len(self._parts)
-        self.done: list[Done] = []
+        self.done: list[MotionRecord] = []
         self._dropped = self._rises = False
         """Whether the present motion counts no more, and getting up is next."""
 
     @property
-    def finished(self) -> bool:
+    def is_finished(self) -> bool:
         """Whether the last motion has come to rest."""
         return not self._parts and self._resting
 
     @property
     def _resting(self) -> bool:
-        return bool(self.done) and (self._dropped or self.done[-1].motion.resting)
+        return bool(self.done) and (self._dropped or self.done[-1].motion.is_at_rest)
 
-    def rise(self, get_up: Part, why: str) -> None:
+    def start_get_up(self, get_up: MotionTask, why: str) -> None:
         """The body has fallen, as ``why`` tells: what it does ends, and it is to ``get_up`` before it goes on."""
         self.done[-1].fell = why
         self._parts.insert(0, get_up)
@@ -206,12 +206,12 @@ class MotionSequence:
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
         if self._parts and (not self.done or self._resting):
-            place = self._place.after(state.positions, report) if self.done else self._place
-            if place.base() is Base.ROUND:
+            place = self._place.next_stance(state.positions, report) if self.done else self._place
+            if place.base() is SupportKind.ROUND_BASE:
                 self._place = place
             part = self._parts.pop(0)
             self._dropped = self._rises = False
-            self.done.append(Done(part.name, part.asked, part.begin(place), state.time))
+            self.done.append(MotionRecord(part.name, part.asked, part.begin(place), state.time))
         return self.done[-1].motion.objectives(state, report, dt)
 
     def time_left(self, time: float, expected: Sequence[float]) -> float:
@@ -223,13 +223,13 @@ class MotionSequence:
         past = time - self.done[-1].start_time
         return later + max(self.done[-1].motion.expected_time - past, LATE * past)
 
-    def cut_short(self) -> list[str]:
+    def unfinished_note(self) -> list[str]:
         """What the last frame kept from its end, for the user."""
         if not self.done or self._resting:
-            return self.not_begun()
-        return [f"{self.done[-1].name} was cut off before it came to rest; give more frames", *self.not_begun()]
+            return self.unstarted_note()
+        return [f"{self.done[-1].name} was cut off before it came to rest; give more frames", *self.unstarted_note()]
 
-    def not_begun(self) -> list[str]:
+    def unstarted_note(self) -> list[str]:
         """What did not begin, for the user."""
         if not self._parts:
             return []
@@ -241,7 +241,7 @@ class MotionSequence:
         return spans_of(self.done, time)
 
 
-def spans_of(done: Sequence[Done], time: np.ndarray) -> list[tuple[int, int]]:
+def spans_of(done: Sequence[MotionRecord], time: np.ndarray) -> list[tuple[int, int]]:
     """First and last index into ``time`` (F+1,) of each of the motions ``done``, one after the other to the end."""
     starts = [int(np.searchsorted(time, entry.start_time - 1e-9)) for entry in done]
     return list(zip(starts, [*starts, len(time) - 1][1:], strict=True))

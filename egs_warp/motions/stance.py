@@ -9,31 +9,31 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.sparse_factors import SparseFactors
-from egs_warp.geometry.frames import best_turn
+from egs_warp.fem.multifrontal import MultifrontalLdl
+from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import (
+    AngularMomentumObjective,
     AnyObjective,
     Objective,
-    SpinObjective,
     centre_of_mass_velocity,
-    straining_velocities,
+    deformation_velocities,
 )
 from egs_warp.locomotion.stepper import StepReport
 
-SHEAR = np.einsum("ki,j->kij", np.eye(3)[:2], np.eye(3)[2])
+SHEAR_BASIS = np.einsum("ki,j->kij", np.eye(3)[:2], np.eye(3)[2])
 """(2, 3, 3) what a unit of lean ahead and to the left adds to a pose that is sheared by it."""
 _PINNED = 1e6
 """Of the largest stiffness: what holds a node where it stands."""
-SOLE = 0.06
+SOLE_HEIGHT = 0.06
 """Body heights: what is at most this far above a standing body's lowest node is its sole."""
-CALM = 0.03
+REST_SPEED = 0.03
 """Speed of the centre of mass, in sqrt(g H), below which a standing body is calm."""
-CALM_TIME = 0.3
+REST_TIME = 0.3
 """Of sqrt(H / g): for how long a body is calm before it is at rest."""
-MARGIN = 0.95
+SUPPORT_MARGIN = 0.95
 """Of the footprint: where the centre of pressure may be."""
-GRIP = 0.95
+FRICTION_FRACTION = 0.95
 """Of what friction could give at most: asked for more, feet slide, and what else is asked falls short."""
 
 
@@ -63,19 +63,19 @@ class Measurement:
     """(3,) metres, relative to the ground frame's origin."""
     velocity: np.ndarray
     """(3,) m/s."""
-    base: np.ndarray
+    foot_centre: np.ndarray
     """(2,) metres: centre of the feet (nodes near the sole at rest)."""
     sole_height: float
     """Metres: lowest contact point above the plane."""
-    touching: bool
+    in_contact: bool
     """Whether a contact force acts."""
-    load: float
+    normal_load: float
     """Normal contact forces, body weights."""
     heading: float
     """Radians about z, from the start."""
     support: np.ndarray
     """(2, 2) metres: least and largest coordinates along the ground of what the body can press on now."""
-    swing: np.ndarray
+    angular_velocity_term: np.ndarray
     """(2,) m/s: what the spin about the centre of mass adds to its speed along the ground in the momentum about the
     feet."""
     rotation: np.ndarray
@@ -87,7 +87,7 @@ class Measurement:
 
 
 @dataclass(frozen=True)
-class Ground:
+class GroundFrame:
     """A right-handed frame on the plane: rows of ``axes`` are forward, left and up."""
 
     axes: np.ndarray
@@ -98,7 +98,9 @@ class Ground:
     """(3,) unit, of the plane; up, but on a slope."""
 
     @classmethod
-    def on(cls, plane: Plane, forward: np.ndarray, below: np.ndarray, *, up: np.ndarray | None = None) -> Ground:
+    def on_plane(
+        cls, plane: Plane, forward: np.ndarray, below: np.ndarray, *, up: np.ndarray | None = None
+    ) -> GroundFrame:
         """Frame with its origin on the plane under the point ``below``; ``forward`` is made horizontal.
 
         ``up`` (3,) is against gravity where the plane is a slope.
@@ -109,7 +111,7 @@ class Ground:
         origin = below - plane.heights(below) / (plane.normal @ vertical) * vertical
         return cls(np.stack([flat, np.cross(vertical, flat), vertical]), origin, plane.normal)
 
-    def turn(self, angle: float) -> np.ndarray:
+    def rotation_about_up(self, angle: float) -> np.ndarray:
         """(3, 3) rotation by ``angle`` radians about up, world axes."""
         return Rotation.from_rotvec(angle * self.axes[2]).as_matrix()
 
@@ -122,16 +124,16 @@ class Ground:
         return self.origin + points @ self.axes
 
 
-class Calm:
+class RestDetector:
     """Whether the centre of mass has been slow for long enough."""
 
     def __init__(self, body: SoftBody) -> None:
         gravity = float(np.linalg.norm(body.gravity))
-        self._speed = CALM * np.sqrt(gravity * body.height)
-        self._time = CALM_TIME * float(np.sqrt(body.height / gravity))
+        self._speed = REST_SPEED * np.sqrt(gravity * body.height)
+        self._time = REST_TIME * float(np.sqrt(body.height / gravity))
         self._since: float | None = None
 
-    def held(self, velocity: np.ndarray, time: float) -> bool:
+    def update(self, velocity: np.ndarray, time: float) -> bool:
         """To be asked in every step, with the ``velocity`` (3,) of the centre of mass, m/s, and the ``time``, s."""
         if np.linalg.norm(velocity) > self._speed:
             self._since = None
@@ -140,14 +142,14 @@ class Calm:
         return self._since is not None and time - self._since > self._time
 
 
-class PoseFamily:
+class BalanceController:
     """Affine poses of the rest shape, A = stretch along up, bulge across it, shear by the lean.
 
     See docs/concepts/motions.md.
     """
 
     def __init__(
-        self, body: SoftBody, ground: Ground, standing: np.ndarray, touching: np.ndarray, friction: float
+        self, body: SoftBody, ground: GroundFrame, standing: np.ndarray, touching: np.ndarray, friction: float
     ) -> None:
         """``standing`` (N, 3): nodes at rest; ``touching`` (k, 3): points of the body on the ground then; ``friction``:
         Coulomb coefficient."""
@@ -164,7 +166,7 @@ class PoseFamily:
         self.support_low = np.minimum(footprint.min(axis=0), -0.01 * body.height)
         self.support_high = np.maximum(footprint.max(axis=0), 0.01 * body.height)
 
-    def balanced(
+    def balance_targets(
         self, seen: Measurement, velocity: np.ndarray, spin: np.ndarray, dt: float
     ) -> tuple[np.ndarray, np.ndarray]:
         """The end velocity (3,) m/s of the centre of mass, ground axes, and spin (3,) rad/s, world axes, nearest to
@@ -175,17 +177,19 @@ class PoseFamily:
         """
         gravity = float(np.linalg.norm(self.body.gravity))
         up = max(gravity + (velocity[2] - seen.velocity[2]) / dt, 0.2 * gravity)
-        height = self._lever(seen.com)
+        height = self._com_height(seen.com)
         level = velocity[:2] - seen.velocity[:2]
-        turn = self._swing(seen.inertia @ spin, height) - seen.swing
+        turn = self._angular_velocity_term(seen.inertia @ spin, height) - seen.angular_velocity_term
 
         def within_grip(change: np.ndarray) -> np.ndarray:
             push = np.array([*(change / dt), 0.0])
-            return change * min(1.0, _share_in_cone(push, np.array([0.0, 0.0, up]), self._normal, GRIP * self.friction))
+            return change * min(
+                1.0, _share_in_cone(push, np.array([0.0, 0.0, up]), self._normal, FRICTION_FRACTION * self.friction)
+            )
 
         level = within_grip(level)
         pressure = seen.com[:2] - height / up * (level + turn) / dt
-        middle, reach = seen.support.mean(axis=0), 0.5 * MARGIN * (seen.support[1] - seen.support[0])
+        middle, reach = seen.support.mean(axis=0), 0.5 * SUPPORT_MARGIN * (seen.support[1] - seen.support[0])
         # Never ask for a fall: some push either way stays allowed even where the centre of mass is past the edge.
         slack = 0.04 * self.body.height
         low = np.minimum(middle - reach, seen.com[:2] - slack)
@@ -196,7 +200,7 @@ class PoseFamily:
         share = 1.0 / (1.0 + 0.5 * np.trace(seen.inertia) / (self.body.mass * height**2))
         level = within_grip(level + share * (both - level - turn))
         turn = both - level
-        swing = seen.swing + turn
+        swing = seen.angular_velocity_term + turn
         momentum = self.ground.axes @ seen.inertia @ spin
         momentum[:2] = self.body.mass * height * np.array([-swing[1], swing[0]])
         return (
@@ -204,33 +208,33 @@ class PoseFamily:
             np.linalg.solve(seen.inertia, self.ground.axes.T @ momentum),
         )
 
-    def caught(self, seen: Measurement, goal: np.ndarray) -> np.ndarray:
+    def capture_acceleration(self, seen: Measurement, goal: np.ndarray) -> np.ndarray:
         """(2,) m/s^2 along the ground that brings a body that falls like a pendulum to rest over ``goal`` (2,).
 
         The capture point, of the momentum about the feet, is steered to it.
         """
-        pendulum = self._pendulum(seen)
+        pendulum = self._pendulum_rate2(seen)
         return -2.0 * pendulum * (self._capture(seen) - goal) + pendulum * (seen.com[:2] - goal)
 
-    def urgency(self, seen: Measurement) -> float:
+    def capture_margin(self, seen: Measurement) -> float:
         """How far the capture point is from the middle of what the body stands on, 1 at its edge: beyond it, it falls
         unless it steps."""
         middle, reach = seen.support.mean(axis=0), 0.5 * (seen.support[1] - seen.support[0])
         return float((np.abs(self._capture(seen) - middle) / np.maximum(reach, 1e-3 * self.body.height)).max())
 
-    def _pendulum(self, seen: Measurement) -> float:
+    def _pendulum_rate2(self, seen: Measurement) -> float:
         """1/s^2, of the linear inverted pendulum."""
-        return float(np.linalg.norm(self.body.gravity)) / self._lever(seen.com)
+        return float(np.linalg.norm(self.body.gravity)) / self._com_height(seen.com)
 
     def _capture(self, seen: Measurement) -> np.ndarray:
         """(2,) where the body, told to hold there, would come to rest over its feet."""
-        return seen.com[:2] + (seen.velocity[:2] + seen.swing) / np.sqrt(self._pendulum(seen))
+        return seen.com[:2] + (seen.velocity[:2] + seen.angular_velocity_term) / np.sqrt(self._pendulum_rate2(seen))
 
-    def _lever(self, com: np.ndarray) -> float:
+    def _com_height(self, com: np.ndarray) -> float:
         """Metres: height of the centre of mass ``com`` (3,), ground coordinates, over the feet."""
         return max(float(com[2]), 0.3 * self.standing_height)
 
-    def _swing(self, momentum: np.ndarray, height: float) -> np.ndarray:
+    def _angular_velocity_term(self, momentum: np.ndarray, height: float) -> np.ndarray:
         """(2,) of ``Measurement``, of an angular ``momentum`` (3,), world axes."""
         turning = self.ground.axes @ momentum / (self.body.mass * height)
         return np.array([turning[1], -turning[0]])
@@ -249,13 +253,13 @@ class PoseFamily:
         return Measurement(
             com=com,
             velocity=self.ground.axes @ self.body.centre_of_mass(state.velocities),
-            base=self._base(local),
+            foot_centre=self._base(local),
             sole_height=report.min_gap if report is not None else 0.0,
-            touching=bool(forces > 1e-6 * self.body.weight),
-            load=float(forces / self.body.weight),
+            in_contact=bool(forces > 1e-6 * self.body.weight),
+            normal_load=float(forces / self.body.weight),
             heading=float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])),
             support=self._support(local, report),
-            swing=self._swing(momentum, self._lever(com)),
+            angular_velocity_term=self._angular_velocity_term(momentum, self._com_height(com)),
             rotation=rotation,
             angular_momentum=momentum,
             inertia=self.body.inertia(state.positions),
@@ -271,7 +275,7 @@ class PoseFamily:
 
     def _rotation(self, positions: np.ndarray) -> np.ndarray:
         arms = positions - self.body.centre_of_mass(positions)
-        return best_turn(self.body.node_mass, self.arms, arms)
+        return kabsch_rotation(self.body.node_mass, self.arms, arms)
 
     def sole_heading(self, positions: np.ndarray) -> float:
         """Radians about the ground's normal by which the feet alone are turned from the standing pose."""
@@ -281,7 +285,7 @@ class PoseFamily:
         """(3, 3) the pose whose sole is flat at ``base`` (2,) while the centre of mass is at ``com`` (3,),
         ground coordinates: sheared by the lean between them.
         """
-        return self._leaning(com, base, heading, SHEAR)
+        return self._leaning(com, base, heading, SHEAR_BASIS)
 
     def bent_over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
         """(3, 3) the same of a body that bends as it does by itself: turned as far as that strains it least."""
@@ -306,7 +310,7 @@ class PoseFamily:
         entries = assembly.hessian_entries(self._standing, projected=True)
         held = np.repeat(self._sole_share > 0.0, 3)
         entries[assembly.diagonal_entries] += _PINNED * entries.max() * held
-        factors = SparseFactors(assembly.upper_pattern, assembly.analysis)
+        factors = MultifrontalLdl(assembly.upper_pattern, assembly.analysis)
         factors.update(entries)
         pulls = np.stack([np.kron(body.node_mass, axis) for axis in axes[:2]], axis=1)
         bent = factors.solve(pulls * ~held[:, None]).reshape(len(body.node_mass), 3, 2)
@@ -346,8 +350,8 @@ class PoseFamily:
         momentum = seen.inertia @ spin
         return [
             *self._balance(velocity, weights),
-            SpinObjective(momentum, weights.spin),
-            straining_velocities(body, state.positions, pose_velocity, weights.pose),
+            AngularMomentumObjective(momentum, weights.spin),
+            deformation_velocities(body, state.positions, pose_velocity, weights.pose),
         ]
 
     def _balance(self, velocity: np.ndarray, weights: Weights) -> list[Objective]:
@@ -363,7 +367,7 @@ class PoseFamily:
 
     def turn_towards(self, seen: Measurement, pose: np.ndarray) -> np.ndarray:
         """(3,) rotation vector, world axes, from the measured best-fit rotation to that of ``pose``."""
-        wanted = best_turn(self.body.node_mass, self.arms, self.arms @ pose.T)
+        wanted = kabsch_rotation(self.body.node_mass, self.arms, self.arms @ pose.T)
         return Rotation.from_matrix(wanted @ seen.rotation.T).as_rotvec()
 
 
@@ -381,16 +385,16 @@ def _share_in_cone(push: np.ndarray, held: np.ndarray, normal: np.ndarray, frict
     return (float(np.sqrt(b * b - a * c)) - b) / a
 
 
-def sole_shares(body: SoftBody, ground: Ground, standing: np.ndarray) -> np.ndarray:
+def sole_shares(body: SoftBody, ground: GroundFrame, standing: np.ndarray) -> np.ndarray:
     """(N,) weights, sum 1, whose mean is the centre of the feet:
     the mass of the nodes that are near the ground at rest.
     """
     heights = standing @ ground.surface_normal
-    mass = body.node_mass * (heights < heights.min() + SOLE * body.height)
+    mass = body.node_mass * (heights < heights.min() + SOLE_HEIGHT * body.height)
     return mass / mass.sum()
 
 
-def heading_between(before: np.ndarray, after: np.ndarray, share: np.ndarray, ground: Ground) -> float:
+def heading_between(before: np.ndarray, after: np.ndarray, share: np.ndarray, ground: GroundFrame) -> float:
     """Radians about the ground's up by which points ``before`` (N, 3), weighted by ``share`` (N,),
     best turn to ``after``.
     """

@@ -57,7 +57,7 @@ def read_style(text: str) -> Style:
         if not equals and number == 0 and name in PRESETS:
             values |= PRESETS[name]
         elif equals and name in _NAMES:
-            values[name] = Value(name, 1.0, LEAST, MOST, "times the usual").read(value, "style")
+            values[name] = Value(name, 1.0, LEAST, MOST, "times the usual").parse(value, "style")
         else:
             raise ArgumentError("style", f"unknown word {word!r}; give {_usage()}")
     return Style(**values)

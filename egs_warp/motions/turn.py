@@ -12,7 +12,7 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpPlan, JumpTarget
-from egs_warp.motions.sequence import Place
+from egs_warp.motions.sequence import Stance
 from egs_warp.motions.twist import AIRBORNE_SHARE, twist
 
 TOLERANCE = np.radians(8.0)
@@ -36,7 +36,7 @@ class TurnPlan(JumpPlan):
 class Turn:
     """Twists by ``turn`` radians in all that end ``target.distance`` ahead; what one leaves, the next ones make up."""
 
-    def __init__(self, place: Place, target: JumpTarget, turn: float) -> None:
+    def __init__(self, place: Stance, target: JumpTarget, turn: float) -> None:
         self._place, self._height = place, target.height
         self._goal = place.ground.origin + target.distance * place.ground.axes[0]
         self._left = turn
@@ -66,11 +66,11 @@ class Turn:
         return float(missing > TOLERANCE)
 
     @property
-    def resting(self) -> bool:
+    def is_at_rest(self) -> bool:
         """Whether the present jump is at rest."""
         return self.jumps[-1].resting
 
-    def planned(self) -> TurnPlan:
+    def plan_record(self) -> TurnPlan:
         """What the first jump aims at, and how many there were."""
         return TurnPlan(**asdict(self.jumps[0].plan), jumps=float(len(self.jumps)))
 
@@ -78,7 +78,7 @@ class Turn:
         """That of the first jump; what the next ones make up is not known before."""
         return self.jumps[0].planned_com(elapsed)
 
-    def reached(self, trajectory: Trajectory, first: int, last: int) -> None:
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> None:
         """Nothing beside what is measured of all motions."""
 
     def notes(self) -> list[str]:
@@ -94,10 +94,10 @@ class Turn:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
         result = self.jumps[-1].objectives(state, report, dt)
         jump = self.jumps[-1]
-        self._missing = self._left - jump.facing.lands_at if jump.phase is JumpPhase.FLIGHT else None
+        self._missing = self._left - jump.facing.predicted_heading if jump.phase is JumpPhase.FLIGHT else None
         if jump.phase in (JumpPhase.LAND, JumpPhase.REST):
             # The frame of a landed jump is turned by what was asked of it, so its feet tell what it fell short by.
-            self._missing = self._left - jump.facing.turn - jump.pose.sole_heading(state.positions)
+            self._missing = self._left - jump.facing.target_heading - jump.pose.sole_heading(state.positions)
             if jump.resting and len(self.jumps) < MOST_JUMPS and abs(self._missing) > TOLERANCE:
                 self._left, self._missing = self._missing, None
                 self.jumps.append(self._again(state))
@@ -109,24 +109,24 @@ class Turn:
         return self._left / float(np.ceil(abs(self._left) / self.most_in_a_jump))
 
     def _again(self, state: BodyState) -> Jump:
-        place = self._place.now(state.positions)
+        place = self._place.moved_to(state.positions)
         way = self._goal - place.ground.origin
         distance = float(np.linalg.norm(place.ground.axes[:2] @ way))
         if distance > 0.02 * place.body.height:
-            place = place.facing(way)
+            place = place.with_forward(way)
         else:
             distance = 0.0
         return twist(place, JumpTarget(distance, self._height), self._share())
 
 
-def largest_turn(jump: Jump, place: Place) -> float:
+def largest_turn(jump: Jump, place: Stance) -> float:
     """Radians that friction under the feet could turn the body by in one jump as planned (docs/concepts/motions.md).
 
     Its impulse is mu r_eff times that of the normal forces, m (v_z + g t), r_eff the mean distance of the feet from
     their middle.
     """
     plan, body, up = jump.plan, place.body, place.ground.axes[2]
-    arms = (place.touching - place.touching.mean(axis=0)) @ place.ground.axes[:2].T
+    arms = (place.contact_points - place.contact_points.mean(axis=0)) @ place.ground.axes[:2].T
     # Points are denser at the rim of a sole; over a disc the mean distance is 2/3 of the radius.
     lever = min(float(np.linalg.norm(arms, axis=1).mean()), 2.0 / 3.0 * float(np.linalg.norm(arms, axis=1).max()))
     impulse = body.mass * (plan.speed_up + jump.gravity * plan.thrust_time)

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from egs_warp.motions.free_turn import spin_that_turns
+from egs_warp.motions.free_turn import spin_for_rotation
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
-from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import Measurement, PoseFamily
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.stance import BalanceController, Measurement
 
 AIRBORNE_SHARE = 0.88
 """Of the planned time of flight the body is off the ground: it stretches before it leaves it and before it lands."""
@@ -24,24 +24,24 @@ WIDEST = 1.15
 """How much wider or narrower than standing the body makes itself in the air."""
 
 
-def twist(place: Place, target: JumpTarget, turn: float) -> Jump:
+def twist(place: Stance, target: JumpTarget, turn: float) -> Jump:
     """A jump that lands facing ``turn`` radians, counter-clockwise from above, from where it faced at the start."""
-    return Jump(place, place.landing(target), facing=Turning(place, turn))
+    return Jump(place, place.landing(target), facing=TurnHeading(place, turn))
 
 
-class Turning:
+class TurnHeading:
     """The ``Facing`` of a jump that turns."""
 
-    def __init__(self, place: Place, turn: float) -> None:
-        self.body, self.turn, self.turned, self.lands_at = place.body, turn, 0.0, 0.0
+    def __init__(self, place: Stance, turn: float) -> None:
+        self.body, self.target_heading, self.heading, self.predicted_heading = place.body, turn, 0.0, 0.0
         self._standing_inertia = place.body.inertia(place.standing)
 
-    def see(self, heading: float) -> None:
+    def update(self, heading: float) -> None:
         """Follows the turn from step to step, so that whole turns count."""
-        self.turned += float(np.remainder(heading - self.turned + np.pi, 2.0 * np.pi) - np.pi)
+        self.heading += float(np.remainder(heading - self.heading + np.pi, 2.0 * np.pi) - np.pi)
 
     def thrust_momentum(
-        self, pose: PoseFamily, seen: Measurement, upright: np.ndarray, *, left: float, flight_time: float
+        self, pose: BalanceController, seen: Measurement, upright: np.ndarray, *, left: float, flight_time: float
     ) -> np.ndarray:
         """(3,) kg m^2/s with which the body, once in the air, turns upright and by what is left.
 
@@ -53,20 +53,20 @@ class Turning:
         spinning = momentum / float(up @ inertia @ up)
         airborne = AIRBORNE_SHARE * flight_time + 0.5 * left
         turn = SPARE_SPIN * self._left_to_turn() - 0.5 * left * spinning
-        return inertia @ spin_that_turns(inertia, upright, turn * up, airborne)
+        return inertia @ spin_for_rotation(inertia, upright, turn * up, airborne)
 
     def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: float) -> np.ndarray:
         """Arms in, arms out: as wide as makes, with the spin that there is, the turn that is left."""
         to_turn, turning = self._left_to_turn(), float(up @ momentum) * left / float(up @ self._standing_inertia @ up)
-        self.lands_at = self.turned + turning
+        self.predicted_heading = self.heading + turning
         ratio = turning / to_turn if turning * to_turn > 0.0 else np.inf
         width = float(np.sqrt(np.clip(ratio, 1.0 / WIDEST**2, WIDEST**2)))
         return pose @ (width * np.eye(3) + (1.0 - width) * np.outer(up, up))
 
-    def landed_heading(self, pose: PoseFamily, positions: np.ndarray) -> float:
+    def landed_heading(self, pose: BalanceController, positions: np.ndarray) -> float:
         """As the feet stand, so shall the body: what it was turned too little is not made up by standing twisted."""
         return pose.sole_heading(positions)
 
     def _left_to_turn(self) -> float:
         """Radians until the feet should touch down; they slide on by some more."""
-        return self.turn - np.sign(self.turn) * min(SLIDE, abs(self.turn)) - self.turned
+        return self.target_heading - np.sign(self.target_heading) * min(SLIDE, abs(self.target_heading)) - self.heading

@@ -13,36 +13,36 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
-from egs_warp.geometry.frames import best_turn
+from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.locomotion.objectives import (
+    AngularMomentumObjective,
     AnyObjective,
     BodyPart,
     LoadObjective,
     Objective,
-    SpinObjective,
     centre_of_mass_velocity,
-    held_contacts,
+    no_slip_contacts,
     node_velocities,
     part_nodes,
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.carriage import carried_on
-from egs_warp.motions.feet import around, foot_loads, foot_of_contact, foot_of_node
+from egs_warp.motions.feet import foot_loads, foot_of_contact, foot_of_node, order_counterclockwise
 from egs_warp.motions.footfalls import Footfalls, footfalls
-from egs_warp.motions.footing import Footing
+from egs_warp.motions.footing import FootholdPlanner
 from egs_warp.motions.gait import Gait, smooth
 from egs_warp.motions.pendulum import PendulumPlan, drift, nearest_in_hull
-from egs_warp.motions.route import Pace, Route
-from egs_warp.motions.sequence import Place
+from egs_warp.motions.route import Route, StepLimits
+from egs_warp.motions.route_check import check_route
+from egs_warp.motions.sequence import Stance
 from egs_warp.motions.walk_plan import WalkControl, WalkPhase, WalkPlan
-from egs_warp.motions.way import check_way
+from egs_warp.motions.walk_posture import select_posture
 
-LOADED = 0.01
+MIN_FOOT_LOAD = 0.01
 """Share of the weight that a foot must carry to count as landed."""
-LOST = 0.5
+MAX_LAG = 0.5
 """Of a pace: so far behind, it is made again."""
-SHORTEST = 0.002
+MIN_STEP_LENGTH = 0.002
 """Body heights: a shorter pace is none."""
 _SHIFT, _GATHER, _REST = 1.5, 3.0, 1.0
 """Of sqrt(H / g): how long the first and the last phase take, and how long the body stands then."""
@@ -55,7 +55,7 @@ class Walk:
 
     def __init__(
         self,
-        place: Place,
+        place: Stance,
         route: Route,
         pace_length: float,
         *,
@@ -65,7 +65,7 @@ class Walk:
         """``pace_length`` in metres, shortened to what the body can do; ``speed`` over the usual. Raises ``UserError``
         for a body without a foot, and where something stands in the way."""
         body = place.body
-        feet, carriage = carried_on(place)
+        feet, carriage = select_posture(place)
         if not feet:
             raise UserError("walk: the body has no feet, and no flat base of which it could lift a side")
         self.body, self.ground = body, place.ground
@@ -74,43 +74,45 @@ class Walk:
         self._slope = -normal[:2] / normal[2]
         """Metres that the ground rises for each metre forward and to the left."""
         standing = self.ground.local(place.standing)
-        feet = tuple(feet[k] for k in around(np.array([standing[foot.sole, :2].mean(axis=0) for foot in feet])))
+        feet = tuple(
+            feet[k] for k in order_counterclockwise(np.array([standing[foot.sole, :2].mean(axis=0) for foot in feet]))
+        )
         self.feet = feet
         self._carriage = carriage(place, feet)
-        self._footing = Footing(place, feet)
+        self._footing = FootholdPlanner(place, feet)
         self._start_com = body.centre_of_mass(standing)
         self.gravity = float(np.linalg.norm(body.gravity))
         self._time_unit = float(np.sqrt(body.height / self.gravity))
         self._asked_length = pace_length
-        pace = Pace(min(pace_length, self._carriage.pace.length), self._carriage.pace.turn)
-        if pace.length < SHORTEST * body.height:
+        pace = StepLimits(min(pace_length, self._carriage.step_limits.length), self._carriage.step_limits.turn)
+        if pace.length < MIN_STEP_LENGTH * body.height:
             raise UserError(
                 f"walk: friction {place.friction:g} cannot turn the body about a side of its base; jump or hop"
             )
         self.places = route(pace)
         """(P+1, 3) the body before the first and after each pace: see ``motions.route``."""
-        check_way(place, self.places)
-        paces, lift, tempo = len(self.places) - 1, self._carriage.lift, self._carriage.tempo
+        check_route(place, self.places)
+        paces, lift, tempo = len(self.places) - 1, self._carriage.lift, self._carriage.timing
         self.gait = Gait.of(len(feet), paces, lift, tempo, time_unit=self._time_unit / speed)
         self._pace = pace
         self._parts = [BodyPart.of(body, f"foot {index}", foot.sole) for index, foot in enumerate(feet)]
-        self._near = [np.flatnonzero(foot_of_node(feet) == index) for index in range(len(feet))]
+        self._near_points = [np.flatnonzero(foot_of_node(feet) == index) for index in range(len(feet))]
         """Nodes that go with each foot."""
         self._rate = float(np.sqrt(self.gravity / self._start_com[2]))
         self.phase = WalkPhase.SHIFT
         self.swing = -1
         self._entered: float | None = None
         self._footprints = self._footing.start
-        """(F, 4) where each foot stands, or was lifted from: see ``motions.carriage``."""
+        """(F, 4) where each foot stands, or was lifted from: see ``motions.walk_posture``."""
         self.swinging: tuple[int, ...] = ()
         """The feet that are lifted, carried and set down."""
         self._sidestep = np.zeros(2)
         """Metres that the feet which swing come down off their place to catch the body."""
-        self._pressed: np.ndarray | None = None
+        self._support: np.ndarray | None = None
         """(2,) the centre of pressure that was asked for last."""
-        self._late = self._again = 0
-        self._asked_paces = paces
-        self._come = [0] * len(feet)
+        self._is_late = self._again = 0
+        self._requested_steps = paces
+        self._arrived_footholds = [0] * len(feet)
         """The pace to whose place each foot came last."""
 
     @property
@@ -121,23 +123,26 @@ class Walk:
         return self._duration(WalkPhase.SHIFT) + swings + self._duration(WalkPhase.GATHER)
 
     @property
-    def resting(self) -> bool:
+    def is_at_rest(self) -> bool:
         """Whether the body has gathered itself."""
         return self.phase is WalkPhase.REST
 
-    def planned(self) -> WalkPlan:
+    def plan_record(self) -> WalkPlan:
         """What the walk aims at."""
         gait, paces = self.gait, np.diff(self.places, axis=0)
         length = float(np.linalg.norm(paces[:, :2], axis=1).max())
-        return WalkPlan(float(gait.paces), length, gait.swing_time, gait.double_time, gait.lift, self._stride())
+        return WalkPlan(float(gait.step_count), length, gait.swing_time, gait.double_time, gait.lift, self._stride())
 
     def _stride(self) -> float:
         """Metres: the longest way between two footprints of one foot, of what turns as well."""
         rounds = len(self.gait.groups)
         prints = np.array(
-            [[self._footing.home(place, foot)[:2] for place in self.places] for foot in range(len(self.feet))]
+            [
+                [self._footing.nominal_foothold(place, foot)[:2] for place in self.places]
+                for foot in range(len(self.feet))
+            ]
         )
-        apart = prints[:, min(rounds, self.gait.paces) :] - prints[:, : -min(rounds, self.gait.paces)]
+        apart = prints[:, min(rounds, self.gait.step_count) :] - prints[:, : -min(rounds, self.gait.step_count)]
         return float(np.linalg.norm(apart, axis=2).max())
 
     def planned_com(self, elapsed: float) -> None:
@@ -151,11 +156,11 @@ class Walk:
             found.append(f"steps of {asked:.2f} body heights were asked; the body goes by {reached:.2f} at most")
         if self._again:
             found.append(f"the feet slipped: {self._again} pace{'s' * (self._again > 1)} made again")
-        if self._late:
-            found.append(f"{self._late} swings took too long: a foot found no ground")
+        if self._is_late:
+            found.append(f"{self._is_late} swings took too long: a foot found no ground")
         return found
 
-    def reached(self, trajectory: Trajectory, first: int, last: int) -> Footfalls:
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> Footfalls:
         """What the feet did between two states of a trajectory."""
         return footfalls(trajectory, self.feet, stride=self._stride(), first=first, last=last)
 
@@ -174,12 +179,12 @@ class Walk:
         spin = control.turn_rate / self._time_unit * self._turn(local, pose) + self._turn(pose, next_pose) / dt
         follow = min(control.follow / self._time_unit, 0.7 / dt)
         return [
-            centre_of_mass_velocity(body, com_velocity @ axes, self._carriage.com),
-            SpinObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
+            centre_of_mass_velocity(body, com_velocity @ axes, self._carriage.com_weight),
+            AngularMomentumObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
             node_velocities(body, follow * (next_pose - local) @ axes, control.pose),
             *(self._foot_objective(index, local, before, after, elapsed, dt) for index in self.swinging),
-            *(self._let_go(index, elapsed) for index in self.swinging if elapsed < self.gait.carried_until),
-            *([self._hold(report, elapsed)] if report is not None else []),
+            *(self._unload_objectives(index, elapsed) for index in self.swinging if elapsed < self.gait.carried_until),
+            *([self._no_slip_objectives(report, elapsed)] if report is not None else []),
         ]
 
     def _advance_phase(self, local: np.ndarray, report: StepReport | None, time: float) -> None:
@@ -190,18 +195,18 @@ class Walk:
         if self.swinging and elapsed >= gait.carried_until:
             loads = foot_loads(self.feet, report, self.body.weight)
             for index in self.swinging:
-                if loads[index] > LOADED or (elapsed >= gait.swing_time and self._footing.is_down(index, local)):
-                    self._stands(index, local)
+                if loads[index] > MIN_FOOT_LOAD or (elapsed >= gait.swing_time and self._footing.is_down(index, local)):
+                    self._has_landed(index, local)
         if self.phase is WalkPhase.SWING and elapsed >= gait.swing_time:
             if not self.swinging or elapsed >= 2.0 * gait.swing_time:
-                self._late += bool(self.swinging)
+                self._is_late += bool(self.swinging)
                 for index in self.swinging:
-                    self._stands(index, local)
+                    self._has_landed(index, local)
                 self._enter(self._after_swing(self.swing), time, local)
         elif self.phase in (WalkPhase.SHIFT, WalkPhase.STAND) and elapsed >= self._duration(self.phase):
             self._plan_swing(self.swing + 1, local)
             self.swing += 1
-            self.swinging, self._sidestep = gait.group(self.swing), np.zeros(2)
+            self.swinging, self._sidestep = gait.swing_feet(self.swing), np.zeros(2)
             self._enter(WalkPhase.SWING, time, local)
         elif self.phase is WalkPhase.GATHER and elapsed >= self._duration(self.phase):
             self._enter(WalkPhase.REST, time, local)
@@ -209,30 +214,34 @@ class Walk:
     def _plan_swing(self, swing: int, local: np.ndarray) -> None:
         """``swing`` is to begin with the nodes at ``local`` (N, 3); a pace that slipping feet have lost is made again.
         What is driven (``motions.drive``) chooses now where it goes."""
-        if self._again < self._asked_paces and self._behind(local) > LOST and swing < self.gait.paces:
+        if self._again < self._requested_steps and self._mean_lag(local) > MAX_LAG and swing < self.gait.step_count:
             self.places = np.insert(self.places, swing + 1, self.places[swing], axis=0)
-            self.gait = replace(self.gait, paces=self.gait.paces + 1)
+            self.gait = replace(self.gait, step_count=self.gait.step_count + 1)
             self._again += 1
 
-    def _behind(self, local: np.ndarray) -> float:
+    def _mean_lag(self, local: np.ndarray) -> float:
         """Paces by which the feet are short of where they came to, in the mean."""
-        ahead = self._homes([pace + 1 for pace in self._come]) - self._homes(self._come)
-        return float((self._short(local) * ahead).sum() / max((ahead**2).sum(), 1e-12))
+        ahead = self._nominal_footholds([pace + 1 for pace in self._arrived_footholds]) - self._nominal_footholds(
+            self._arrived_footholds
+        )
+        return float((self._foothold_error(local) * ahead).sum() / max((ahead**2).sum(), 1e-12))
 
-    def _short(self, local: np.ndarray) -> np.ndarray:
+    def _foothold_error(self, local: np.ndarray) -> np.ndarray:
         """(F, 2) metres from where each foot is to where it came to."""
-        return self._homes(self._come) - np.array([local[foot.sole, :2].mean(axis=0) for foot in self.feet])
+        return self._nominal_footholds(self._arrived_footholds) - np.array(
+            [local[foot.sole, :2].mean(axis=0) for foot in self.feet]
+        )
 
-    def _homes(self, paces: Sequence[int]) -> np.ndarray:
+    def _nominal_footholds(self, paces: Sequence[int]) -> np.ndarray:
         """(F, 2) where each foot belongs after so many paces."""
-        places = [self.places[min(pace, self.gait.paces)] for pace in paces]
-        return np.array([self._footing.home(place, foot)[:2] for foot, place in enumerate(places)])
+        places = [self.places[min(pace, self.gait.step_count)] for pace in paces]
+        return np.array([self._footing.nominal_foothold(place, foot)[:2] for foot, place in enumerate(places)])
 
     def _enter(self, phase: WalkPhase, time: float, local: np.ndarray) -> None:
         self.phase, self._entered = phase, time
         for foot in set(range(len(self.feet))) - set(self.swinging):
             # Where it stands now: it may have slid.
-            self._footprints[foot] = self._footing.landed(foot, local, float(self._footprints[foot, 3]))
+            self._footprints[foot] = self._footing.landed_foothold(foot, local, float(self._footprints[foot, 3]))
         self._plan = self._planned_pendulum()
 
     def _after_swing(self, swing: int) -> WalkPhase:
@@ -248,26 +257,26 @@ class Walk:
             WalkPhase.REST: _REST * self._time_unit,
         }[phase]
 
-    def _stands(self, index: int, local: np.ndarray) -> None:
+    def _has_landed(self, index: int, local: np.ndarray) -> None:
         """Foot ``index`` has landed where it is."""
         self.swinging = tuple(foot for foot in self.swinging if foot != index)
-        self._come[index] = self.gait.landing(self.swing)
-        planned = float(self.places[self._come[index]][2])
-        self._footprints[index] = self._footing.landed(index, local, planned)
+        self._arrived_footholds[index] = self.gait.target_step(self.swing)
+        planned = float(self.places[self._arrived_footholds[index]][2])
+        self._footprints[index] = self._footing.landed_foothold(index, local, planned)
 
     def _progress(self, phase: WalkPhase, swing: int, elapsed: float) -> float:
         """Paces that the body should have done ``elapsed`` seconds into a phase."""
         if phase is WalkPhase.SHIFT:
             return 0.0
         if phase in (WalkPhase.GATHER, WalkPhase.REST):
-            return float(self.gait.paces)
+            return float(self.gait.step_count)
         if phase is WalkPhase.STAND:
             elapsed = self.gait.swing_time + min(elapsed, self.gait.double_time)
         return self.gait.progress(swing, elapsed)
 
     def _place_at(self, progress: float) -> np.ndarray:
         """(3,) the body's place after so many paces."""
-        count = self.gait.paces
+        count = self.gait.step_count
         progress = min(max(progress, 0.0), float(count))
         k = min(int(progress), count - 1)
         return self.places[k] + (progress - k) * (self.places[k + 1] - self.places[k])
@@ -284,7 +293,7 @@ class Walk:
         for number, (phase, pressure) in enumerate(phases):
             if phase is not WalkPhase.SWING:
                 ways = (np.arange(len(pressure)) + 0.5) / len(pressure)
-                start = phases[number - 1][1][-1] if number else self._pressed
+                start = phases[number - 1][1][-1] if number else self._support
                 if start is None or phase is WalkPhase.SHIFT:
                     start = pressure[0]
                 end = phases[number + 1][1][0] if number + 1 < len(phases) else pressure[-1]
@@ -309,12 +318,12 @@ class Walk:
                     return
                 phase, swing = WalkPhase.SWING, swing + 1
                 continue
-            lifted = self.gait.group(swing)
+            lifted = self.gait.swing_feet(swing)
             standing = [foot for foot in range(len(self.feet)) if foot not in lifted]
-            under = self._footing.pressed(footprints, standing, self.control.planned_margin)
+            under = self._footing.support_points(footprints, standing, self.control.planned_margin)
             yield phase, np.array([nearest_in_hull(under, place) for place in wanted])
             for foot in lifted:
-                footprints[foot] = self._footing.home(self.places[self.gait.landing(swing)], foot)
+                footprints[foot] = self._footing.nominal_foothold(self.places[self.gait.target_step(swing)], foot)
             phase = self._after_swing(swing)
 
     def _com_at(self, progress: float) -> np.ndarray:
@@ -328,13 +337,15 @@ class Walk:
         pressure, divergent = self._plan.at(elapsed)
         off = com[:2] + velocity[:2] / self._rate - divergent
         standing = [foot for foot in range(len(self.feet)) if foot not in self.swinging]
-        under = self._footing.pressed(self._footing.now(local, self._footprints), standing, self.control.margin)
+        under = self._footing.support_points(
+            self._footing.current_footholds(local, self._footprints), standing, self.control.margin
+        )
         pressed = nearest_in_hull(under, pressure + self.control.balance * off)
-        self._pressed = pressed
+        self._support = pressed
         if self.swinging and elapsed < self.gait.carried_until:
             left = max(self.gait.swing_time - elapsed, 0.0)
             caught = drift(off, pressed - pressure, float(np.exp(self._rate * left)))
-            caught *= min(1.0, self._carriage.catch / max(float(np.linalg.norm(caught)), 1e-12))
+            caught *= min(1.0, self._carriage.capture_range / max(float(np.linalg.norm(caught)), 1e-12))
             share = 1.0 - float(np.exp(-self.control.sidestep * dt / self._time_unit))
             self._sidestep = self._sidestep + share * (caught - self._sidestep)
         level = velocity[:2] + dt * self._rate**2 * (com[:2] - pressed)
@@ -347,11 +358,11 @@ class Walk:
         targets, gait = self._footprints.copy(), self.gait
         for index in self.swinging:
             progress = elapsed / gait.swing_time
-            goal = self._footing.home(self.places[gait.landing(self.swing)], index)
+            goal = self._footing.nominal_foothold(self.places[gait.target_step(self.swing)], index)
             goal[:3] += [*self._sidestep, self._slope @ self._sidestep]
-            targets[index] += gait.carried(progress) * (goal - self._footprints[index])
+            targets[index] += gait.transfer_progress(progress) * (goal - self._footprints[index])
             # One that has found no ground in time reaches down for it.
-            targets[index, 2] += gait.lifted(progress) - 0.02 * self.body.height * max(progress - 1.0, 0.0)
+            targets[index, 2] += gait.foot_height(progress) - 0.02 * self.body.height * max(progress - 1.0, 0.0)
         return targets
 
     def _foot_objective(
@@ -360,24 +371,26 @@ class Walk:
         sole, part, control = self.feet[index].sole, self._parts[index], self.control
         now, then = (self._footing.sole(index, place[index]) for place in (before, after))
         # The sole that stood is not the flat one that swings: torn straight in the first step, it would drag.
-        share = control.foot_share * self.gait.eased(elapsed / self.gait.swing_time)
+        share = control.foot_share * self.gait.steering_progress(elapsed / self.gait.swing_time)
         velocity = (share * (now - local[sole]) + then - now) / dt
-        return part_nodes(self.body, part, velocity @ self.ground.axes, self._carriage.swing)
+        return part_nodes(self.body, part, velocity @ self.ground.axes, self._carriage.swing_weight)
 
-    def _let_go(self, index: int, elapsed: float) -> LoadObjective:
+    def _unload_objectives(self, index: int, elapsed: float) -> LoadObjective:
         """A foot is unloaded bit by bit before it rises."""
-        return LoadObjective(self._near[index], self.control.unload * self.gait.eased(elapsed / self.gait.swing_time))
+        return LoadObjective(
+            self._near_points[index], self.control.unload * self.gait.steering_progress(elapsed / self.gait.swing_time)
+        )
 
-    def _hold(self, report: StepReport, elapsed: float) -> Objective:
+    def _no_slip_objectives(self, report: StepReport, elapsed: float) -> Objective:
         """What stands does not slide, nor does what is lifted before it goes ahead."""
         contacts = report.contacts
         ahead = self.swinging if elapsed > self.gait.carried_from else ()
         stands = ~np.isin(foot_of_contact(self.feet, contacts), ahead)
-        return held_contacts(
-            contacts, np.where(stands, report.forces[:, 0], 0.0) / self.body.weight, self._carriage.hold
+        return no_slip_contacts(
+            contacts, np.where(stands, report.forces[:, 0], 0.0) / self.body.weight, self._carriage.stance_weight
         )
 
     def _turn(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """(3,) rotation vector that best carries ``before`` (N, 3) to ``after`` (N, 3)."""
         arms, aims = (x - self.body.centre_of_mass(x) for x in (before, after))
-        return Rotation.from_matrix(best_turn(self.body.node_mass, arms, aims)).as_rotvec()
+        return Rotation.from_matrix(kabsch_rotation(self.body.node_mass, arms, aims)).as_rotvec()

@@ -25,7 +25,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.body_frame import BodyFrame
-from egs_warp.geometry.frames import square_to
+from egs_warp.geometry.frames import orthonormal_basis
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.muscles.fibres import Fibre, FibreKind
@@ -163,7 +163,7 @@ _SHAPES: dict[str, tuple[Callable[[str, dict[str, Any]], list[np.ndarray]], set[
 
 def _around(where: str, entry: dict[str, Any], angles: np.ndarray) -> np.ndarray:
     """Points at ``angles`` on the entry's circle."""
-    first, second = square_to(_direction(where, entry, "axis"))
+    first, second = orthonormal_basis(_direction(where, entry, "axis"))
     spokes = -np.cos(angles)[:, None] * first - np.sin(angles)[:, None] * second
     return _point(where, entry, "centre") + _positive(where, entry, "radius", None) * spokes
 

@@ -6,22 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from egs_warp.geometry.frames import square_to
+from egs_warp.geometry.frames import orthonormal_basis
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
+from egs_warp.muscles.branch_cylinder import BranchCylinder, FibreDensity, Surface
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.skeleton import Branch, Skeleton
-from egs_warp.muscles.tube import Detail, Surface, Tube
 
 _DETAILS = (
-    Detail(8, 5, 4, 4, 2, 2),
-    Detail(8, 4, 3, 2, 1, 2),
-    Detail(4, 3, 2, 2, 1, 2),
-    Detail(4, 2, 1, 2, 1, 2),
-    Detail(4, 2, 1, 2, 1, 1),
-    Detail(4, 1, 1, 2, 1, 1),
+    FibreDensity(8, 5, 4, 4, 2, 2),
+    FibreDensity(8, 4, 3, 2, 1, 2),
+    FibreDensity(4, 3, 2, 2, 1, 2),
+    FibreDensity(4, 2, 1, 2, 1, 2),
+    FibreDensity(4, 2, 1, 2, 1, 1),
+    FibreDensity(4, 1, 1, 2, 1, 1),
 )
 """From the richest to the poorest."""
-_LEG_DETAILS = (Detail(4, 4, 1, 2, 1, 1), Detail(4, 3, 1, 1, 1, 1), *_DETAILS[-2:])
+_LEG_DETAILS = (FibreDensity(4, 4, 1, 2, 1, 1), FibreDensity(4, 3, 1, 1, 1, 1), *_DETAILS[-2:])
 """The same of each leg of a body on ``_LEGS`` or more. A foot is carried ahead and set down flat by a leg that bends
 one way above and the other way below, which takes three segments on each side of it."""
 _LEGS = 3
@@ -47,7 +47,7 @@ def lay_fibres(
     forward = _principal_horizontal(mesh, skeleton.up)
     fibres: list[Fibre] = []
     for group, (branch, detail) in enumerate(_share_segments(skeleton, edge, max_segments)):
-        tube = Tube(branch, skeleton.up, forward, surface, edge, detail)
+        tube = BranchCylinder(branch, skeleton.up, forward, surface, edge, detail)
         name = "trunk" if group == 0 else f"limb {group}"
         fibres += [
             replace(fibre, group=group, max_force=np.minimum(max_force, max_stress * fibre.max_force))
@@ -56,7 +56,7 @@ def lay_fibres(
     return _with_partners(fibres, _centre(mesh), skeleton.up, forward, tolerance=0.75 * edge)
 
 
-def _share_segments(skeleton: Skeleton, edge: float, budget: int | None) -> list[tuple[Branch, Detail]]:
+def _share_segments(skeleton: Skeleton, edge: float, budget: int | None) -> list[tuple[Branch, FibreDensity]]:
     """The detail of each branch; like branches (the four legs of a stool) get the same."""
     legged = is_legged(skeleton)
     budget = budget or (_LEGGED_SEGMENTS if legged else _SEGMENTS)
@@ -72,7 +72,7 @@ def _share_segments(skeleton: Skeleton, edge: float, budget: int | None) -> list
     levels = [0] * len(families)
     ladders = [_LEG_DETAILS if legged and family[0].starts_on_ground else _DETAILS for family in families]
 
-    def detail(family: int) -> Detail:
+    def detail(family: int) -> FibreDensity:
         chosen = ladders[family][levels[family]]
         shortest = min(branch.length for branch in families[family])
         return replace(chosen, intervals=int(np.clip(round(shortest / (1.2 * edge)), 1, chosen.intervals)))
@@ -107,7 +107,7 @@ def _principal_horizontal(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
 
     Its sign is fixed too: rounding must not choose between a direction and its opposite.
     """
-    plane = np.stack(square_to(up))
+    plane = np.stack(orthonormal_basis(up))
     flat = (mesh.nodes - _centre(mesh)) @ plane.T
     second_moments = (flat * mesh.lumped_masses(1.0)[:, None]).T @ flat
     values, vectors = np.linalg.eigh(second_moments)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.frames import square_to
+from egs_warp.geometry.frames import orthonormal_basis
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.atomic import atomic_write
 from egs_warp.muscles.fibres import FibreKind
@@ -45,7 +45,7 @@ def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarra
     """
     check_picture_name(path)
     up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    left, near = square_to(up)
+    left, near = orthonormal_basis(up)
     right, away = -left, -near
     views = {"front": (right, up, away), "side": (away, up, -right), "above": (right, away, -up)}
     panels = [_panel(title, np.stack(axes), mesh, muscles) for title, axes in views.items()]

@@ -1,8 +1,8 @@
 """Curve skeleton of a body: branches (legs, trunk, arms) from the ground up, each a polyline with sections.
 
-Connected slabs of a height-like function (``egs_warp.muscles.ascent``) are the body's sections; how they join is its
-Reeb graph, whose short and thin chains are merged into their neighbours. Slabs cut through tetrahedra (the function is
-linear inside each), so that a coarse mesh has as fine a skeleton as a dense one.
+Connected slabs of a height-like function (``egs_warp.muscles.geodesic_height``) are the body's sections; how they
+join is its Reeb graph, whose short and thin chains are merged into their neighbours. Slabs cut through tetrahedra (the
+function is linear inside each), so that a coarse mesh has as fine a skeleton as a dense one.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.muscles.ascent import ascent_field
-from egs_warp.muscles.level_cells import LevelCells
+from egs_warp.muscles.geodesic_height import geodesic_height
+from egs_warp.muscles.level_set_cells import LevelSetCells
 
 _SECTION_COUNT = 24
 """Sections from the base to the farthest tip."""
@@ -68,7 +68,7 @@ def skeleton(mesh: TetMesh, up: np.ndarray) -> Skeleton:
     The same mesh gives the same bits every time.
     """
     up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    graph = _SectionGraph(mesh, ascent_field(mesh, up), up)
+    graph = _SectionGraph(mesh, geodesic_height(mesh, up), up)
     graph.merge_insignificant_chains()
     branches = [graph.branch(chain) for chain in graph.joined_chains()]
     branches.sort(key=lambda branch: -branch.volume)
@@ -81,7 +81,7 @@ class _SectionGraph:
     def __init__(self, mesh: TetMesh, ascent: np.ndarray, up: np.ndarray) -> None:
         self.thickness = float(ascent.max()) / _SECTION_COUNT
         self.up = up
-        cells = LevelCells.cut(mesh.tets, ascent / self.thickness, level_count=_SECTION_COUNT)
+        cells = LevelSetCells.cut(mesh.tets, ascent / self.thickness, level_count=_SECTION_COUNT)
         joined = sp.coo_matrix((np.ones(len(cells.touching)), cells.touching.T), shape=(cells.count,) * 2)
         count, section_from_cell = connected_components(joined, directed=False)
         self.level = dict.fromkeys(range(count), 0)

@@ -16,24 +16,24 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import ffmpeg_program
-from egs_warp.locomotion.ledger import ledger
+from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN
 from egs_warp.motions.script import motion as script
-from egs_warp.pipelines import drawn
+from egs_warp.pipelines import render_data
+from egs_warp.pipelines.capture_warnings import capture_warnings
 from egs_warp.pipelines.creature import make_creature
-from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.pipelines.film import draw_film
 from egs_warp.pipelines.finished_run import PARTS
-from egs_warp.pipelines.ground_left import ground_left
-from egs_warp.pipelines.oddities import oddities
-from egs_warp.pipelines.performance import check_frames, simulate
+from egs_warp.pipelines.ground_coverage import ground_coverage_warning
 from egs_warp.pipelines.plots import draw_plots
 from egs_warp.pipelines.progress import preparation_bar, simulation_bar
+from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import GaussianCounts, Report, report_of_run
 from egs_warp.pipelines.shot import LARGEST_SIDE, SMALLEST_SIDE, Shot
+from egs_warp.pipelines.simulated_run import check_frames, simulate
 
 LARGEST_FRICTION = 10.0
 
@@ -89,7 +89,7 @@ class AnimateOptions:
 
 
 @dataclass(frozen=True)
-class Asked:
+class RequestedOptions:
     """Everything that was asked of a run, besides the capture and the motion; frame and units of the capture."""
 
     options: AnimateOptions
@@ -181,7 +181,7 @@ def animate(
             )
         if front is None:
             notes = (*notes, creature.front.told(creature.frame))
-        notes = (*notes, *oddities(creature.cloud, creature.cage.mesh, creature.body.height))
+        notes = (*notes, *capture_warnings(creature.cloud, creature.cage.mesh, creature.body.height))
         with simulation_bar(quiet=quiet) as told:
             performance = simulate(
                 creature,
@@ -196,7 +196,7 @@ def animate(
             )
         # Whatever becomes of the film, the simulation is not lost.
         performance.trajectory.save(run.file("trajectory.npz"))
-        books = ledger(performance.trajectory)
+        books = energy_balance(performance.trajectory)
         draw_plots(run.file("plots.png"), performance.trajectory, books)
         with atomic_write(run.file("cage.vtu")) as temporary:
             creature.cage.mesh.write_vtu(temporary)
@@ -211,9 +211,9 @@ def animate(
             shadow=options.shadow,
             quiet=quiet,
         )
-        made = DrawnCreature.of(film.splats, film.camera, creature.muscles, performance.place.feet())
-        made.save(run.file(drawn.FILE))
-        asked_for = Asked(
+        made = RenderData.of(film.splats, film.camera, creature.muscles, performance.place.feet())
+        made.save(run.file(render_data.FILE))
+        asked_for = RequestedOptions(
             options,
             shot,
             up=_numbers(up),
@@ -230,7 +230,9 @@ def animate(
         )
         simulation = performance.simulation
         behind = creature.placed(background) if background is not None else None
-        left = ground_left(simulation.trajectory.positions[-1], behind, creature.solids[0], creature.body.height)
+        left = ground_coverage_warning(
+            simulation.trajectory.positions[-1], behind, creature.solids[0], creature.body.height
+        )
         notes = (*notes, *performance.cut_short(), *left)
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),

@@ -12,7 +12,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import with_degree
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import check_no_file_of_a_run
-from egs_warp.kernels.deformation.carried_cage import RIGID
+from egs_warp.kernels.deformation.cage_maps import RIGID
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.pipelines.export import chosen_frames
 from egs_warp.pipelines.finished_run import FinishedRun
@@ -28,7 +28,7 @@ def export_bundle(run: FinishedRun, path: Path, *, every: int = 1, degree: int |
     check_no_file_of_a_run(path)
     frames = chosen_frames(run, frame=None, every=every)
     t, splats, plan = run.trajectory, with_degree(run.creature.splats, degree), run.deformer().plan
-    codes, shares = plan.mean_tets.numpy(), plan.shares.numpy()
+    codes, shares = plan.mean_tets.numpy(), plan.inside_fractions.numpy()
     rigid = (codes < 0) & (shares[0] == float(RIGID))
     rows = np.flatnonzero((codes < 0) & ~rigid)
     arrays: dict[str, Any] = {
@@ -47,7 +47,7 @@ def export_bundle(run: FinishedRun, path: Path, *, every: int = 1, degree: int |
         "arm_rows": rows.astype(np.int32),
         "arm_tets": plan.end_tets.numpy()[:, rows],
         "arm_shares": shares[:, rows],
-        "arm_bulges": plan.bulges.numpy()[:, rows],
+        "arm_bulges": plan.smoothing_lengths.numpy()[:, rows],
         "max_stretch": np.float64(MAX_STRETCH),
         "body_axes": t.body_axes,
         "body_origin": t.body_origin,

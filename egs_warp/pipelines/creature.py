@@ -10,7 +10,7 @@ import numpy as np
 
 from egs_warp.contact.detection import ContactGeometry, contact_geometry
 from egs_warp.contact.terrain import Solid, Surface
-from egs_warp.deformation.rigid import in_body_frame
+from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
@@ -24,14 +24,14 @@ from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
 from egs_warp.meshing.cage import Cage, cage_of_body
 from egs_warp.meshing.occupancy import solid_from_gaussians
-from egs_warp.motions.feet import Base, base_of
+from egs_warp.motions.feet import SupportKind, support_kind_of
 from egs_warp.motions.limbs import Limbs, Sections, find_limbs
-from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import Ground
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.stance import GroundFrame
 from egs_warp.motions.style import Style
 from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
-from egs_warp.pipelines.front import Front, find_front
+from egs_warp.pipelines.facing_direction import Front, find_front
 from egs_warp.segmentation.base_plane import find_base_plane
 
 SMALLEST_SAG = 0.004
@@ -74,7 +74,7 @@ class Creature:
 
     def placed(self, cloud: GaussianCloud) -> GaussianCloud:
         """Something else of the same capture, such as what is behind it, in the frame of the body."""
-        return in_body_frame(cloud, self.frame)
+        return to_body_frame(cloud, self.frame)
 
     def with_friction(self, friction: float) -> Creature:
         """The same body on ground of another Coulomb coefficient, standing anew. Raises ``ArgumentError`` for one below
@@ -140,7 +140,7 @@ def make_creature(
     if front is not None:
         check_front(normal if gravity_up is None else gravity_up, front)
     progress("cage")
-    standing = stand(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, nodes=nodes)
+    standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, nodes=nodes)
     progress("contact")
     device, frame, cage = str(cloud.device), standing.frame, standing.cage
     solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in solids)
@@ -160,7 +160,7 @@ def make_creature(
     )
     against_gravity = None if gravity_up is None else frame.axes @ gravity_up
     progress("front")
-    faces = face(standing, front, seen_from=seen_from)
+    faces = choose_front(standing, front, seen_from=seen_from)
     while True:
         progress("body and muscles")
         body = make_body(cage.mesh, GROUND, up=against_gravity, sag=sag, device=device)
@@ -170,7 +170,7 @@ def make_creature(
         start = settle(stepper)
         if sag < SMALLEST_SAG or _stands(stepper, start):
             everything = (field or Solid((GROUND,)), *solids)
-            placed = in_body_frame(cloud, frame)
+            placed = to_body_frame(cloud, frame)
             return Creature(frame, placed, faces, standing.limbs, cage, stepper, start, everything)
         sag *= 0.5
 
@@ -184,7 +184,7 @@ def plane_below(cloud: GaussianCloud, ground: HeightField) -> Plane:
     if len(means) == 0 or not (heights > 0.0).any():
         raise ArgumentError("ground", "nothing of the object lies above it; check the plane", check=("plane",))
     low = means[(heights > 0.0) & (heights < _FOOT * float(np.quantile(heights, 0.99)))]
-    lift = float(ground.lift(low).min()) if len(low) else 0.0
+    lift = float(ground.ground_height(low).min()) if len(low) else 0.0
     return Plane(ground.normal, ground.plane.offset - lift)
 
 
@@ -203,7 +203,7 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
 
 
 @dataclass(frozen=True)
-class Standing:
+class PlacedCage:
     """A capture's cage, in metres and in the frame of the body."""
 
     frame: BodyFrame
@@ -215,14 +215,14 @@ class Standing:
     """On which it stands, found where the capture shows them."""
 
 
-def stand(
+def place_cage(
     cloud: GaussianCloud,
     *,
     up: np.ndarray | None = None,
     plane: Plane | None = None,
     metres_per_unit: float | None = None,
     nodes: int = 500,
-) -> Standing:
+) -> PlacedCage:
     """Find the body's own frame on ``plane``, or on its base square to ``up`` (3,), and make its cage there.
 
     Without ``metres_per_unit`` the body is 1 m tall. The cage has about so many ``nodes``.
@@ -240,7 +240,7 @@ def stand(
     metres = 1.0 / cage.height(GROUND) if metres_per_unit is None else metres_per_unit / frame.scale
     cage = _rounded(cage.scaled(metres))
     limbs = find_limbs(Sections.of_solid(solid.scaled(metres), cage.mesh), cage.mesh.nodes)
-    return Standing(frame.moved(anchor).scaled(metres), gaussians.scaled(metres), cage, limbs)
+    return PlacedCage(frame.moved(anchor).scaled(metres), gaussians.scaled(metres), cage, limbs)
 
 
 def _rounded(cage: Cage) -> Cage:
@@ -249,14 +249,16 @@ def _rounded(cage: Cage) -> Cage:
     return replace(cage, mesh=TetMesh(step * np.rint(cage.mesh.nodes / step), cage.mesh.tets))
 
 
-def face(standing: Standing, front: np.ndarray | None = None, *, seen_from: np.ndarray | None = None) -> Front:
+def choose_front(
+    standing: PlacedCage, front: np.ndarray | None = None, *, seen_from: np.ndarray | None = None
+) -> Front:
     """Which way it faces: ``front`` (3,) if that is given, else as ``find_front`` finds; ``front`` and ``seen_from`` as
     in ``make_creature``."""
     axes = standing.frame.axes
     if front is None:
         seen = None if seen_from is None else axes @ seen_from
         mesh = standing.cage.mesh
-        lies = base_of(mesh, mesh.nodes[:, 2], standing.limbs.count) is Base.LONG
+        lies = support_kind_of(mesh, mesh.nodes[:, 2], standing.limbs.count) is SupportKind.LYING
         found = find_front(standing.gaussians, mesh, seen_from=seen, lengthwise=lies)
         angle = _FRONT_GRID * np.rint(np.arctan2(found.direction[1], found.direction[0]) / _FRONT_GRID)
         return replace(found, direction=np.array([np.cos(angle), np.sin(angle), 0.0]))
@@ -314,16 +316,16 @@ def checked_friction(friction: float) -> float:
     return friction
 
 
-def first_place(creature: Creature, *, step: float | None = None, style: Style | None = None) -> Place:
+def initial_stance(creature: Creature, *, step: float | None = None, style: Style | None = None) -> Stance:
     """Where the creature stands at the start, its front ahead.
 
     ``step``: seconds that a solver step takes at most, see ``solver_steps``; ``style``: how it jumps.
     """
     body, start = creature.body, creature.start
     up = -body.gravity / np.linalg.norm(body.gravity)
-    return Place(
+    return Stance(
         body,
-        Ground.on(GROUND, creature.front.direction, body.centre_of_mass(start.positions), up=up),
+        GroundFrame.on_plane(GROUND, creature.front.direction, body.centre_of_mass(start.positions), up=up),
         start.positions,
         creature.stepper.detector.points_within(start.positions, 0.01 * body.height),
         solver_steps(body, step)[0],

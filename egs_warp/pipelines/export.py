@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from egs_warp.deformation.rigid import in_body_frame
+from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.gaussians import with_degree
@@ -50,6 +50,6 @@ def export_splats(
     deformer = run.deformer()
     place = _Y_UP if kind == "glb" else run.capture_frame
     for index, path in zip(tqdm(frames, desc="export", unit="frame", disable=quiet), paths, strict=True):
-        cloud = in_body_frame(deformer.deform(run.trajectory.positions[run.steps[index]]).cloud, place)
+        cloud = to_body_frame(deformer.deform(run.trajectory.positions[run.steps[index]]).cloud, place)
         write(path, with_degree(cloud, degree))
     return paths

@@ -21,12 +21,12 @@ from egs_warp.io.run_folder import RunFolder
 from egs_warp.io.video import VideoWriter, contact_sheet, write_png
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.pipelines.performance import Performance
 from egs_warp.pipelines.shot import Shot, nearest_steps, resized
-from egs_warp.render.backdrop import Behind, captured_scene, grid_floor, plain_colour
+from egs_warp.pipelines.simulated_run import SimulatedRun
+from egs_warp.render.backdrop import Backdrop, captured_scene, grid_floor, plain_colour
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.rasteriser import render_gaussians
-from egs_warp.render.shadow import ContactShadow, grain_of
+from egs_warp.render.shadow import ContactShadow, shadow_blur_radius
 
 SHEET_FRAMES = 12
 SPLIT_KEY_FRAMES = 24
@@ -66,7 +66,7 @@ class Frame:
 
 
 def draw_film(
-    performance: Performance,
+    performance: SimulatedRun,
     run: RunFolder,
     *,
     name: str,
@@ -142,8 +142,8 @@ def drawn_frames(
     from one to the next is made once. ``scene`` lies in the body's frame.
     """
     path = np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
-    grain, device = grain_of(deformer.rest), deformer.rest.device
-    behind: Behind | None = None
+    grain, device = shadow_blur_radius(deformer.rest), deformer.rest.device
+    behind: Backdrop | None = None
     for index, (step, camera) in enumerate(zip(steps, cameras, strict=True)):
         marks = [time.perf_counter()]
         deformed = deformer.deform(trajectory.positions[step])
@@ -151,7 +151,7 @@ def drawn_frames(
         cloud = deformed.cloud
         if behind is None or camera is not cameras[index - 1]:
             behind = _behind(path, trajectory.height, camera, scene, shot, grain=grain, shadow=shadow, device=device)
-        shade = behind.cover(cloud) if shot.transparent else None
+        shade = behind.shadow_opacity(cloud) if shot.transparent else None
         backdrop = behind.background(cloud) if shade is None else (0.0, 0.0, 0.0)
         image = render_gaussians(cloud, camera, background=backdrop)
         wp.synchronize_device(cloud.device)
@@ -181,7 +181,7 @@ def _behind(
     grain: float,
     shadow: bool,
     device: wp.Device,
-) -> Behind:
+) -> Backdrop:
     """``path`` (F+1, 3) is that of the centre of mass of a body ``height`` tall."""
     com = path.mean(axis=0)
     centre = com * [1.0, 1.0, 0.0]

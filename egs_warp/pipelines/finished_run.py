@@ -11,19 +11,19 @@ import numpy as np
 
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
-from egs_warp.deformation.rigid import in_body_frame
+from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.io.arrays import DAMAGES
+from egs_warp.io.arrays import READ_ERRORS
 from egs_warp.io.capture import read_capture
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.locomotion.rollout import FRAME_RATE
-from egs_warp.locomotion.soundness import check_trajectory
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.pipelines import drawn
-from egs_warp.pipelines.drawn import DrawnCreature
+from egs_warp.locomotion.trajectory_validation import check_trajectory
+from egs_warp.pipelines import render_data
+from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.shot import nearest_steps
 
 PARTS = "trajectory.parts"
@@ -45,7 +45,7 @@ def read_trajectory(path: Path) -> Trajectory:
                 f" (what it did is in {PARTS})"
             ) from error
         raise UserError(f"{path}: is missing; give the folder that egs-warp animate wrote") from error
-    except DAMAGES as error:
+    except READ_ERRORS as error:
         raise UserError(f"{path}: is no trajectory ({error}); run egs-warp animate again, which writes it") from error
     return trajectory
 
@@ -56,7 +56,7 @@ class FinishedRun:
 
     folder: Path
     trajectory: Trajectory
-    creature: DrawnCreature
+    creature: RenderData
     report: dict[str, Any]
     scene: GaussianCloud | None
     """What is behind the creature, in its frame."""
@@ -70,10 +70,10 @@ class FinishedRun:
         if not folder.is_dir():
             raise UserError(f"{folder}: is no folder; give the one that egs-warp animate wrote")
         trajectory = read_trajectory(folder / "trajectory.npz")
-        creature = DrawnCreature.load(folder / drawn.FILE, node_count=len(trajectory.rest_positions))
+        creature = RenderData.load(folder / render_data.FILE, node_count=len(trajectory.rest_positions))
         if len(creature.muscle_bounds) != trajectory.activations.shape[1]:
             advice = "run egs-warp animate again, which writes both"
-            raise UserError(f"{folder / drawn.FILE}: has other muscles than trajectory.npz; {advice}")
+            raise UserError(f"{folder / render_data.FILE}: has other muscles than trajectory.npz; {advice}")
         report = parse_json(read_text(folder / "report.json"), folder / "report.json")
         if not isinstance(report, dict):
             raise UserError(f"{folder / 'report.json'}: is no report; run egs-warp animate again, which writes it")
@@ -83,7 +83,7 @@ class FinishedRun:
         if file is not None:
             t = trajectory
             frame = BodyFrame(t.body_axes, t.body_origin, t.metres_per_unit)
-            scene = in_body_frame(read_capture(file).cloud, frame)
+            scene = to_body_frame(read_capture(file).cloud, frame)
         return cls(folder, trajectory, creature, report, scene)
 
     @property

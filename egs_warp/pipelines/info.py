@@ -14,22 +14,22 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.fem.body import SoftBody, make_body
 from egs_warp.geometry.body_frame import GROUND
-from egs_warp.geometry.camera_ring import camera_from
+from egs_warp.geometry.camera_ring import ring_camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.rollout import solver_steps
-from egs_warp.motions.feet import Base, Foot, around, base_of
-from egs_warp.motions.repertoire import REPERTOIRE
+from egs_warp.motions.feet import Foot, SupportKind, order_counterclockwise, support_kind_of
+from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script
-from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import SOLE, Ground
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.stance import SOLE_HEIGHT, GroundFrame
 from egs_warp.muscles.fibres import FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet
-from egs_warp.pipelines.creature import Standing, body_muscles, check_front, face, stand
-from egs_warp.pipelines.front import Front
-from egs_warp.pipelines.oddities import oddities
+from egs_warp.pipelines.capture_warnings import capture_warnings
+from egs_warp.pipelines.creature import PlacedCage, body_muscles, check_front, choose_front, place_cage
+from egs_warp.pipelines.facing_direction import Front
 from egs_warp.render.rasteriser import render_gaussians
 
 if TYPE_CHECKING:
@@ -52,12 +52,12 @@ class BodyInfo:
     """A capture as the program sees it, in the frame of its body, metres; at rest, not yet bent by its weight."""
 
     source: str
-    standing: Standing
+    standing: PlacedCage
     body: SoftBody
     muscles: MuscleSet
     front: Front
-    base: Base
-    place: Place
+    base: SupportKind
+    place: Stance
     feet: tuple[Foot, ...]
     """As they are numbered: anticlockwise as seen from above, from straight ahead on."""
     notes: tuple[str, ...]
@@ -69,13 +69,13 @@ class BodyInfo:
 
     def motions(self) -> dict[str, str | None]:
         """Why the body cannot do a motion, None where it can."""
-        return {name: self._refused(name) for name in REPERTOIRE}
+        return {name: self._refused(name) for name in MOTIONS}
 
     def _refused(self, name: str) -> str | None:
-        kind = REPERTOIRE[name]
+        kind = MOTIONS[name]
         if kind.file is not None:
             return None
-        asked = {value.name: value.default for value in kind.takes}
+        asked = {value.name: value.default for value in kind.parameters}
         try:
             Script((MotionRequest(name, asked),)).check(self.place)
         except UserError as error:
@@ -100,13 +100,13 @@ class BodyInfo:
             f"stands   on {self._stands()}",
         ]
         for number, (foot, sole) in enumerate(zip(self.feet, self.soles() / height, strict=True), start=1):
-            found.append(f"  foot {number}: {_place(sole)}, leg {foot.length / height:.2f}{_oddity(foot, height)}")
+            found.append(f"  foot {number}: {_place(sole)}, leg {foot.length / height:.2f}{_foot_note(foot, height)}")
         found.append(
             f"muscles  {self.muscles.fibre_count} fibres, {self.muscles.segment_count} segments"
             f" ({', '.join(f'{count} {kind.value}' for kind, count in kinds.items())})"
         )
         for name, why in self.motions().items():
-            needs = REPERTOIRE[name].file
+            needs = MOTIONS[name].file
             can = f"yes, with {needs}" if needs is not None else "yes"
             found.append(f"{name:<10} {can if why is None else f'no: {why}'}")
         return [*found, *(f"note: {note}" for note in self.notes)]
@@ -115,12 +115,12 @@ class BodyInfo:
         return dict(Counter(self.muscles.fibre_kinds[fibre] for fibre in self.muscles.fibre_from_segment))
 
     def _stands(self) -> str:
-        if self.base is Base.FEET:
+        if self.base is SupportKind.FEET:
             return f"{len(self.feet)} feet, numbered anticlockwise from straight ahead"
         return {
-            Base.ONE: "one base",
-            Base.ROUND: "a round base: it rolls",
-            Base.LONG: "its length: it crawls",
+            SupportKind.SINGLE_BASE: "one base",
+            SupportKind.ROUND_BASE: "a round base: it rolls",
+            SupportKind.LYING: "its length: it crawls",
         }[self.base]
 
 
@@ -135,12 +135,12 @@ def _place(sole: np.ndarray) -> str:
     return f"{abs(ahead):.2f} {along}, {abs(left):.2f} {aside}"
 
 
-def _oddity(foot: Foot, height: float) -> str:
+def _foot_note(foot: Foot, height: float) -> str:
     short = f", ends {foot.height / height:.3f} over the ground" if foot.height > 0.0 else ""
-    return f"{short}{', joined to another in the cage' if foot.joined else ''}"
+    return f"{short}{', joined to another in the cage' if foot.is_joined else ''}"
 
 
-def look_into(
+def inspect_capture(
     cloud: GaussianCloud,
     *,
     source: str = "capture",
@@ -161,27 +161,27 @@ def look_into(
     if front is not None and normal is not None:
         check_front(normal, front)
     progress("cage")
-    standing = stand(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, nodes=nodes)
+    standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, nodes=nodes)
     mesh = standing.cage.mesh
     progress("front")
-    faces = face(standing, front)
+    faces = choose_front(standing, front)
     progress("muscles")
     body = make_body(mesh, GROUND, device=str(cloud.device))
     muscles = body_muscles(body, muscles_file, standing.frame)
-    place = Place(
+    place = Stance(
         body,
-        Ground.on(GROUND, faces.direction, body.centre_of_mass(mesh.nodes)),
+        GroundFrame.on_plane(GROUND, faces.direction, body.centre_of_mass(mesh.nodes)),
         mesh.nodes,
         mesh.nodes[mesh.nodes[:, 2] < _NEAR_GROUND * body.height],
         solver_steps(body, None)[0],
         limbs=standing.limbs,
     )
     feet = place.feet()
-    base = base_of(mesh, mesh.nodes[:, 2], len(feet))
+    base = support_kind_of(mesh, mesh.nodes[:, 2], len(feet))
     if len(feet) > 1:
         soles = np.array([place.ground.local(mesh.nodes[foot.sole])[:, :2].mean(axis=0) for foot in feet])
-        feet = tuple(feet[index] for index in around(soles))
-    notes = (*notes, *oddities(standing.gaussians, mesh, body.height))
+        feet = tuple(feet[index] for index in order_counterclockwise(soles))
+    notes = (*notes, *capture_warnings(standing.gaussians, mesh, body.height))
     return BodyInfo(source, standing, body, muscles, faces, base, place, feet, notes)
 
 
@@ -225,7 +225,7 @@ def _draw_capture(axes: Axes, info: BodyInfo, way: np.ndarray) -> None:
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
     direction = np.array([*way, 0.12]) / np.hypot(1.0, 0.12) @ ground.axes
     radius = 1.1 * float(np.linalg.norm(nodes - middle, axis=1).max())
-    camera = camera_from(direction, middle, radius, GROUND.normal, size=_SIDE, vertical_fov_degrees=24.0)
+    camera = ring_camera(direction, middle, radius, GROUND.normal, size=_SIDE, vertical_fov_degrees=24.0)
     image = render_gaussians(info.standing.gaussians, camera, background=(1.0, 1.0, 1.0))
     axes.imshow(image.colour_srgb8())
 
@@ -270,7 +270,7 @@ def _draw_base(axes: Axes, info: BodyInfo) -> None:
         return np.stack([-points[:, 1], points[:, 0]], axis=1)
 
     _fill(axes, flat(local), "0.93")
-    _fill(axes, flat(local[local[:, 2] < SOLE]), "0.8")
+    _fill(axes, flat(local[local[:, 2] < SOLE_HEIGHT]), "0.8")
     for number, foot in enumerate(info.feet):
         colour = _COLOURS[number % len(_COLOURS)]
         points = flat(local[foot.sole])
@@ -283,7 +283,7 @@ def _draw_base(axes: Axes, info: BodyInfo) -> None:
     axes.set_ylim(-1.1 * reach, 1.45 * reach)
     axes.set_xlim(-1.1 * reach, 1.1 * reach)
     axes.set_aspect("equal")
-    stands = f"{len(info.feet)} feet" if info.base is Base.FEET else info.base.value
+    stands = f"{len(info.feet)} feet" if info.base is SupportKind.FEET else info.base.value
     axes.set_title(f"stands on {stands}; from above")
     axes.set_xlabel("to the right, body heights; + is under the centre of mass")
     axes.set_ylabel("ahead, body heights")

@@ -8,16 +8,16 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from egs_warp.locomotion.ledger import ledger
+from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
 from egs_warp.motions.style import Style
 from egs_warp.pipelines.creature import Creature
-from egs_warp.pipelines.performance import Performance, simulate
 from egs_warp.pipelines.report import GaussianCounts, Report, report_of_run
+from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
 
-Told: TypeAlias = tuple[Report, np.ndarray, Trajectory]
+RunSummary: TypeAlias = tuple[Report, np.ndarray, Trajectory]
 """Of a run: report, index into the trajectory's times for each frame of a video, and trajectory."""
 
 
@@ -29,7 +29,7 @@ class Job:
     friction: float | None = None
     """Of the ground (``Creature.with_friction``), if not the creature's own."""
     frames: int | None = None
-    longest: float | None = None
+    max_seconds: float | None = None
     """Seconds."""
     step: float | None = None
     """Seconds."""
@@ -39,27 +39,27 @@ class Job:
     activations: np.ndarray | None = None
     """(steps, M) metres."""
 
-    def perform(
+    def run(
         self, creature: Creature, *, progress: Callable[[int, int], object] = lambda done, expected: None
-    ) -> Performance:
+    ) -> SimulatedRun:
         """The run alone, here."""
         if self.friction is not None:
             creature = creature.with_friction(self.friction)
-        return self.performed(creature, progress=progress)
+        return self.run_on_ground(creature, progress=progress)
 
-    def performed(
+    def run_on_ground(
         self, creature: Creature, *, progress: Callable[[int, int], object] = lambda done, expected: None
-    ) -> Performance:
+    ) -> SimulatedRun:
         """The run of a ``creature`` that stands on its ground already."""
         asked = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("motion", "friction")}
         return simulate(creature, self.motion, **asked, progress=progress)
 
-    def outcome(self, creature: Creature, performance: Performance) -> Told:
+    def outcome(self, creature: Creature, performance: SimulatedRun) -> RunSummary:
         """What is told of the run: report, frames and trajectory."""
         simulation = performance.simulation
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
-            *(performance.sequence.done, ledger(simulation.trajectory)),
+            *(performance.sequence.done, energy_balance(simulation.trajectory)),
             gaussians=GaussianCounts.of(creature),
             drawing={},
             source="",

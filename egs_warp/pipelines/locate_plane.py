@@ -9,19 +9,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera, shrunk
+from egs_warp.geometry.camera import Camera, downscale
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
-from egs_warp.io.planes import KnownPlane
+from egs_warp.io.planes import PlaneRecord
 from egs_warp.segmentation.base_plane import guess_up
 from egs_warp.segmentation.ground import ROUGH, measure_ground
 from egs_warp.segmentation.object_mask import TOUCHING, segment
 from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
 from egs_warp.segmentation.plane_fit import PlaneFit
 from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under, refine_plane
-from egs_warp.segmentation.resting_plane import resting_plane, without_fringe
+from egs_warp.segmentation.resting_plane import remove_foot_remnants, resting_plane
 from egs_warp.segmentation.table_top import planes_below, surface_around
 from egs_warp.segmentation.votes import votes_of_masks
 
@@ -66,15 +66,15 @@ class LocatedPlane:
     in_sight: bool = True
     """Whether views tell what the object stands on; else the plane was laid under it."""
 
-    def known(self) -> KnownPlane:
+    def known(self) -> PlaneRecord:
         """What ``plane.json`` says of it."""
-        found = KnownPlane(self.plane, centre=self.centre, size=self.size, ground=self.ground)
-        return found if self.fit is None else found.over(known_of_fit(self.fit))
+        found = PlaneRecord(self.plane, centre=self.centre, size=self.size, ground=self.ground)
+        return found if self.fit is None else found.merged_with(known_of_fit(self.fit))
 
 
-def known_of_fit(fit: PlaneFit) -> KnownPlane:
+def known_of_fit(fit: PlaneFit) -> PlaneRecord:
     """What ``plane.json`` says of a fitted plane."""
-    return KnownPlane(fit.plane, noise=fit.noise, inlier_share=fit.inlier_share, pixels=fit.pixel_count)
+    return PlaneRecord(fit.plane, noise=fit.noise, inlier_share=fit.inlier_share, pixels=fit.pixel_count)
 
 
 def locate_plane(
@@ -104,7 +104,7 @@ def locate_plane(
     centre = _middle(cloud, found)
     radius = 0.75 * found.size
     if cameras:
-        views = [shrunk(camera, _PLANE_SIDE) for camera in cameras]
+        views = [downscale(camera, _PLANE_SIDE) for camera in cameras]
     else:
         level = centre - coarse.heights(centre) * coarse.normal
         views = ring_cameras(coarse, level, radius, count=9, elevations=_PLANE_ELEVATIONS, size=_PLANE_SIDE)
@@ -119,7 +119,7 @@ def locate_plane(
         with contextlib.suppress(UserError):
             laid = resting_plane(cloud, beside, seen, up, degrees=tilt, size=found.size)
             if fit is None or _lean(laid, up) < _lean(seen, up) - _CLEARLY_DEGREES:
-                return _laid(cloud, spec, laid, tuple(notes))
+                return _fallback_plane(cloud, spec, laid, tuple(notes))
         leaning = (
             f"the plane leans by {_lean(seen, up):.0f} degrees if the cameras were held upright; look at plane.png"
         )
@@ -130,20 +130,21 @@ def locate_plane(
     found = segment(cloud, fit.plane, spec, hover=_HOVERING)
     notes += _hovering(cloud, fit.plane, found)
     notes.append(
-        f"{_said(fit.plane)}: fits {fit.pixel_count} pixels "
+        f"{_describe_plane(fit.plane)}: fits {fit.pixel_count} pixels "
         f"to {100 * fit.noise:.2f} % of depth, {100 * fit.inlier_share:.0f} % of them inliers"
     )
     return LocatedPlane(fit.plane, fit, _middle(cloud, found), found.size, found, tuple(notes))
 
 
-def _laid(cloud: GaussianCloud, spec: ObjectSpec, plane: Plane, notes: tuple[str, ...]) -> LocatedPlane:
+def _fallback_plane(cloud: GaussianCloud, spec: ObjectSpec, plane: Plane, notes: tuple[str, ...]) -> LocatedPlane:
     """The object on the ``plane`` that was laid under it."""
-    found = without_fringe(cloud, plane, segment(cloud, plane, spec, hover=_HOVERING))
-    note = f"{_said(plane)}: laid under the object's lowest parts, as no view tells where the ground is; see plane.png"
+    found = remove_foot_remnants(cloud, plane, segment(cloud, plane, spec, hover=_HOVERING))
+    where = _describe_plane(plane)
+    note = f"{where}: laid under the object's lowest parts, as no view tells where the ground is; see plane.png"
     return LocatedPlane(plane, None, _middle(cloud, found), found.size, found, (*notes, note), in_sight=False)
 
 
-def _said(plane: Plane) -> str:
+def _describe_plane(plane: Plane) -> str:
     return f"plane {','.join(f'{x:.4f}' for x in (*plane.normal, plane.offset))}"
 
 
@@ -152,7 +153,7 @@ def _lean(plane: Plane, up: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(plane.normal @ up / np.linalg.norm(up), -1.0, 1.0))))
 
 
-def on_its_ground(
+def with_measured_ground(
     cloud: GaussianCloud, located: LocatedPlane, spec: ObjectSpec, cameras: Sequence[Camera] = ()
 ) -> LocatedPlane:
     """``located``, and where the ground is not flat, what is there, and the object down to it; or why not."""

@@ -106,7 +106,7 @@ def inspect_machine() -> Machine:
         ffmpeg = ffmpeg_program()
         encoders = _encoders(ffmpeg)
     except UserError as error:
-        problems.append(error.told())
+        problems.append(error.format_message())
     if len(devices) == 1:
         advice.append("everything runs on the CPU; for device cuda:0 give this machine an NVIDIA GPU and its driver")
     for device in devices:

@@ -15,21 +15,28 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import available_threads, use_device
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.pipelines.batched_runs import choose_batch_size, is_batchable, run_batched
 from egs_warp.pipelines.creature import Creature
-from egs_warp.pipelines.crew import Crew, Ended, Processes, Tell, Work, ended_tasks
-from egs_warp.pipelines.ending import State
-from egs_warp.pipelines.job import Job, Told
-from egs_warp.pipelines.ray_crew import HERE, RayCrew
+from egs_warp.pipelines.end_state import State
+from egs_warp.pipelines.job import Job, RunSummary
+from egs_warp.pipelines.ray_pool import HERE, RayPool
 from egs_warp.pipelines.report import GaussianCounts, Report
-from egs_warp.pipelines.side_by_side import fits, performed, worth_worlds
+from egs_warp.pipelines.worker_pool import (
+    ProcessPool,
+    ProgressCallback,
+    TaskFunction,
+    TaskResult,
+    WorkerPool,
+    ended_tasks,
+)
 
 
 @dataclass(frozen=True)
-class Outcome:
+class JobResult:
     """How a job ended."""
 
     job: Job
-    runs: int
+    attempts: int
     """How often it was begun: more than once where a worker was lost."""
     error: str | None
     """Why there is nothing else, in a line."""
@@ -39,7 +46,7 @@ class Outcome:
     """(n,) index into the trajectory's times for each frame of a video at 60 Hz."""
     file: Path | None
     """Where the trajectory was written, if that was asked for."""
-    held: Trajectory | None
+    in_memory_trajectory: Trajectory | None
     """The trajectory, otherwise."""
 
     @property
@@ -50,9 +57,9 @@ class Outcome:
     @property
     def trajectory(self) -> Trajectory:
         """Every solver step, read from its file where it lies in one. Raises ``UserError`` where there is none."""
-        if self.held is None and self.file is None:
+        if self.in_memory_trajectory is None and self.file is None:
             raise UserError(f"job: it has no trajectory: {self.error}")
-        return self.held if self.held is not None else Trajectory.load(self.file)  # pyright: ignore[reportArgumentType]
+        return self.in_memory_trajectory if self.in_memory_trajectory is not None else Trajectory.load(self.file)  # pyright: ignore[reportArgumentType]
 
 
 def simulate_many(
@@ -62,9 +69,9 @@ def simulate_many(
     workers: int | str | None = None,
     worlds: int | None = None,
     out: Path | str | None = None,
-    ended: Callable[[int, Outcome], object] = lambda number, outcome: None,
+    ended: Callable[[int, JobResult], object] = lambda number, outcome: None,
     progress: Callable[[int, int], object] = lambda done, expected: None,
-) -> tuple[Outcome, ...]:
+) -> tuple[JobResult, ...]:
     """Run all ``jobs`` of one ``creature``, several at a time; the outcomes are in the order of the jobs. Each has the
     bits of its run alone (``Job.perform``) on a machine of this kind, or, made side by side, its nodes within 1e-9 body
     heights of those for 30 steps.
@@ -84,9 +91,9 @@ def simulate_many(
     folder = None if out is None else Path(out)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-    outcomes: list[Outcome | None] = [None] * len(jobs)
-    counts = _Frames(len(jobs), progress)
-    for task in _over(creature, jobs, workers, worlds, counts):
+    outcomes: list[JobResult | None] = [None] * len(jobs)
+    counts = _FrameCounter(len(jobs), progress)
+    for task in _run_jobs(creature, jobs, workers, worlds, counts):
         report, frames, trajectory = task.value or (None, np.zeros(0, int), None)
         if report is not None:
             report = replace(report, gaussians=GaussianCounts.of(creature))
@@ -94,8 +101,8 @@ def simulate_many(
         if folder is not None and trajectory is not None:
             file = folder / f"job-{task.number:04d}.npz"
             trajectory.save(file)
-        outcome = Outcome(
-            jobs[task.number], task.runs, task.error, report, frames, file, trajectory if file is None else None
+        outcome = JobResult(
+            jobs[task.number], task.attempts, task.error, report, frames, file, trajectory if file is None else None
         )
         outcomes[task.number] = outcome
         counts.over(task.number)
@@ -103,16 +110,16 @@ def simulate_many(
     return tuple(outcome for outcome in outcomes if outcome is not None)
 
 
-def _over(
-    creature: Creature, jobs: Sequence[Job], workers: int | str | None, worlds: int | None, counts: _Frames
-) -> Iterator[Ended]:
+def _run_jobs(
+    creature: Creature, jobs: Sequence[Job], workers: int | str | None, worlds: int | None, counts: _FrameCounter
+) -> Iterator[TaskResult]:
     """The jobs as they end: first those side by side."""
     if worlds is not None and worlds < 0:
         raise ArgumentError("worlds", "give how many are made side by side, at least 0", value=worlds)
-    beside = [number for number, job in enumerate(jobs) if fits(job)]
-    worlds = worth_worlds(creature, len(beside)) if worlds is None else worlds
+    beside = [number for number, job in enumerate(jobs) if is_batchable(job)]
+    worlds = choose_batch_size(creature, len(beside)) if worlds is None else worlds
     beside = beside if worlds > 0 else []
-    yield from performed(creature, [(number, jobs[number]) for number in beside], worlds=worlds, told=counts.all_told)
+    yield from run_batched(creature, [(number, jobs[number]) for number in beside], worlds=worlds, told=counts.all_told)
     left = sorted(set(range(len(jobs))) - set(beside))
     given = [jobs[number] for number in left]
 
@@ -120,17 +127,17 @@ def _over(
         counts.told(left[number], *values)
 
     if given:
-        for task in farmed(_Performing(creature), given, workers=workers, told=told):
+        for task in map_tasks(_RunJob(creature), given, workers=workers, told=told):
             yield replace(task, number=left[task.number])
 
 
-def farmed(
-    work: Work,
+def map_tasks(
+    work: TaskFunction,
     tasks: Sequence[Any],
     *,
     workers: int | str | None = None,
     told: Callable[..., object] = lambda number, *values: None,
-) -> Iterator[Ended]:
+) -> Iterator[TaskResult]:
     """Each of ``tasks`` as ``work(task, tell)`` ends it, in whatever order; ``workers`` as in ``simulate_many``,
     ``told`` gets the number of a task and what it tells.
 
@@ -141,17 +148,17 @@ def farmed(
     yield from ended_tasks(_crew(work, workers, len(tasks)), tasks, told)
 
 
-def _crew(work: Work, workers: int | str | None, tasks: int) -> Crew:
+def _crew(work: TaskFunction, workers: int | str | None, tasks: int) -> WorkerPool:
     if isinstance(workers, str):
         if workers not in (HERE, "auto") and ":" not in workers:
             raise ArgumentError("workers", "give a number of processes, ray, or a Ray cluster's address", value=workers)
-        return RayCrew(work, tasks, workers)
+        return RayPool(work, tasks, workers)
     if workers is not None and workers < 1:
         raise ArgumentError("workers", "give a number of processes, at least 1", value=workers)
-    return Processes(work, min(tasks, workers or available_threads()))
+    return ProcessPool(work, min(tasks, workers or available_threads()))
 
 
-class _Performing:
+class _RunJob:
     """What a worker does with a job."""
 
     def __init__(self, creature: Creature) -> None:
@@ -163,16 +170,16 @@ class _Performing:
         self._sent: bytes = pickle.dumps(replace(creature, cloud=cloud))
         self._creature: Creature | None = None
 
-    def __call__(self, job: Job, tell: Tell) -> Told:
+    def __call__(self, job: Job, tell: ProgressCallback) -> RunSummary:
         if self._creature is None:
             use_device(self._device)
             self._creature = pickle.loads(self._sent)
             assert self._creature is not None, "it was sent"
         creature = self._creature
-        return job.outcome(creature, job.perform(creature, progress=tell))
+        return job.outcome(creature, job.run(creature, progress=tell))
 
 
-class _Frames:
+class _FrameCounter:
     """Frames of all jobs, done and expected; those not begun are expected to have as many as the others have."""
 
     def __init__(self, jobs: int, progress: Callable[[int, int], object]) -> None:

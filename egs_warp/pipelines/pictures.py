@@ -7,7 +7,7 @@ from colorsys import hsv_to_rgb
 
 import numpy as np
 
-from egs_warp.geometry.camera import Camera, shrunk
+from egs_warp.geometry.camera import Camera, downscale
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
@@ -25,7 +25,7 @@ def picture_cameras(plane: Plane, centre: np.ndarray, size: float, cameras: Sequ
     """Four views: of the capture's own cameras above the plane, evenly picked, else of a ring."""
     above = [camera for camera in cameras if plane.heights(camera.centre) > 0.0]
     if len(above) >= 4:
-        return [shrunk(above[len(above) * k // 4], _SIDE) for k in range(4)]
+        return [downscale(above[len(above) * k // 4], _SIDE) for k in range(4)]
     return ring_cameras(plane, centre, 0.7 * size, count=4, elevations=(12.0, 35.0), size=_SIDE)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from egs_warp.io.atomic import atomic_write
-from egs_warp.locomotion.ledger import Ledger
+from egs_warp.locomotion.ledger import EnergyBalance
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.report import AUDIT_LIMITS
 
@@ -36,7 +36,7 @@ _LOUDEST = 99.0
 """Percentile of the tensions at which their colours end."""
 
 
-def draw_plots(path: Path, trajectory: Trajectory, ledger: Ledger) -> None:
+def draw_plots(path: Path, trajectory: Trajectory, ledger: EnergyBalance) -> None:
     """Energies and their flows, the load on the ground, the centre of mass beside its plan, and the muscles' pull."""
     # Takes a quarter of a second to import.
     from matplotlib.figure import Figure
@@ -56,22 +56,22 @@ def draw_plots(path: Path, trajectory: Trajectory, ledger: Ledger) -> None:
         figure.savefig(temporary, dpi=100, format="png")
 
 
-def _draw_stored(axes: Axes, t: Trajectory, ledger: Ledger) -> None:
+def _draw_stored(axes: Axes, t: Trajectory, ledger: EnergyBalance) -> None:
     for name, label in _STORED.items():
         values = getattr(ledger, name)
-        axes.plot(t.time, (values - (values[0] if name == "potential" else 0.0)) / ledger.unit, label=label)
+        axes.plot(t.time, (values - (values[0] if name == "potential" else 0.0)) / ledger.energy_unit, label=label)
     axes.set_title("Energy in the body, over m g H")
     axes.legend(fontsize="small")
 
 
-def _draw_flows(axes: Axes, t: Trajectory, ledger: Ledger) -> None:
+def _draw_flows(axes: Axes, t: Trajectory, ledger: EnergyBalance) -> None:
     total = np.zeros(len(t.time))
     for label, names in _FLOWS.items():
         flow = np.concatenate([[0.0], np.sum([getattr(ledger, name) for name in names], axis=0).cumsum()])
         total += flow
-        axes.plot(t.time, flow / ledger.unit, label=f"{label} {flow[-1] / ledger.unit:+.2f}")
-    axes.plot(t.time, total / ledger.unit, "k", linewidth=2.0, label="sum")
-    axes.plot(t.time, (ledger.stored - ledger.stored[0]) / ledger.unit, "w--", linewidth=1.0, label="gained")
+        axes.plot(t.time, flow / ledger.energy_unit, label=f"{label} {flow[-1] / ledger.energy_unit:+.2f}")
+    axes.plot(t.time, total / ledger.energy_unit, "k", linewidth=2.0, label="sum")
+    axes.plot(t.time, (ledger.stored - ledger.stored[0]) / ledger.energy_unit, "w--", linewidth=1.0, label="gained")
     axes.set_title("Energy given and taken since the start, over m g H")
     axes.legend(fontsize="small", facecolor="0.85", ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.14))
 
@@ -87,7 +87,7 @@ def _draw_load(axes: Axes, t: Trajectory) -> None:
     axes.legend(fontsize="small")
 
 
-def _draw_residual(axes: Axes, t: Trajectory, ledger: Ledger) -> None:
+def _draw_residual(axes: Axes, t: Trajectory, ledger: EnergyBalance) -> None:
     residual = np.abs(ledger.residual)
     axes.stairs(np.maximum(residual, 1e-17), t.time, label="what a step misses", baseline=1e-17)
     axes.axhline(AUDIT_LIMITS["energy_residual"], color="k", linestyle=":", label="bound")

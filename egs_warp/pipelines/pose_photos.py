@@ -19,8 +19,8 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.io.cameras import read_cameras, read_points
-from egs_warp.io.frames import VIDEO_SUFFIXES, sharp_frames
-from egs_warp.io.photos import decoded, orientation, turned
+from egs_warp.io.frames import VIDEO_SUFFIXES, select_sharp_frames
+from egs_warp.io.photos import apply_orientation, decoded, orientation
 from egs_warp.io.run_folder import check_run_folder, run_folder
 
 _PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
@@ -86,7 +86,7 @@ def pose_photos(
         say(f"choosing {frames} frames of {source}" if is_video else f"reading {source}")
         unreadable = () if is_video else _copied(source, images)
         if is_video:
-            for frame in sharp_frames(source, frames):
+            for frame in select_sharp_frames(source, frames):
                 _write_picture(images / f"frame_{frame.number:06d}.jpg", frame.pixels, quality=95)
         for reason in unreadable:
             say(f"left out {reason}")
@@ -160,7 +160,7 @@ def _copied(source: Path, images: Path) -> tuple[str, ...]:
             shutil.copyfile(path, target)
         else:
             # Written without the tag: programs differ in whether they heed it.
-            _write_picture(target, turned(pixels, turn), quality=97)
+            _write_picture(target, apply_orientation(pixels, turn), quality=97)
     return tuple(unreadable)
 
 

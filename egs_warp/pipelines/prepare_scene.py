@@ -17,11 +17,11 @@ from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, hole_under
 from egs_warp.inpainting.underside import with_underside
-from egs_warp.io.planes import KnownPlane, write_planes
+from egs_warp.io.planes import PlaneRecord, write_planes
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder
-from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
-from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane, reach_across
+from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, with_measured_ground
+from egs_warp.segmentation.clearance import StraddlingOptions, StraddlingPolicy, clear_plane, plane_extents
 from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.training import has_torch
 
@@ -31,15 +31,15 @@ if TYPE_CHECKING:
     from egs_warp.training.finetune import TrainingView
 
 _CLEARED = {
-    Clearing.NONE: "left as they are",
-    Clearing.REMOVE: "left out",
-    Clearing.FINETUNE: "fine-tuned clear of it",
-    Clearing.SPLIT: "split at it",
+    StraddlingPolicy.NONE: "left as they are",
+    StraddlingPolicy.REMOVE: "left out",
+    StraddlingPolicy.FINETUNE: "fine-tuned clear of it",
+    StraddlingPolicy.SPLIT: "split at it",
 }
 
 
 _SOLID = 0.1
-_AFLOAT = 0.03
+_HOVER_FRACTION = 0.03
 """Of the object's size: what hangs higher above its plane does not stand there."""
 
 
@@ -47,25 +47,25 @@ _AFLOAT = 0.03
 class SceneOptions:
     """What may be chosen."""
 
-    clearing: Clearing | None = None
+    clearing: StraddlingPolicy | None = None
     """None: fine-tuning where PyTorch is installed, else the static split."""
     flat: bool = False
     """Stand on the plane, whatever the ground is like."""
     inpaint: bool = True
     inpainter: Inpainter | None = None
     """None: patch synthesis."""
-    clearing_options: ClearingOptions = field(default_factory=ClearingOptions)
+    clearing_options: StraddlingOptions = field(default_factory=StraddlingOptions)
 
     @property
-    def method(self) -> Clearing:
+    def method(self) -> StraddlingPolicy:
         """How the object is cleared of the plane."""
-        return self.clearing or (Clearing.FINETUNE if has_torch() else Clearing.SPLIT)
+        return self.clearing or (StraddlingPolicy.FINETUNE if has_torch() else StraddlingPolicy.SPLIT)
 
     @property
     def stages(self) -> dict[str, bool]:
         """Names of what ``prepare_scene`` will do, in its order, and whether all of it, training included."""
         asked = {"plane": True, "ground": not self.flat, "segment": True, "inpaint": self.inpaint}
-        whole = {"segment": self.method is Clearing.FINETUNE, "inpaint": has_torch()}
+        whole = {"segment": self.method is StraddlingPolicy.FINETUNE, "inpaint": has_torch()}
         return {name: whole.get(name, True) for name, wanted in asked.items() if wanted}
 
 
@@ -77,7 +77,7 @@ class PreparedScene:
     """Clear of the plane."""
     background: GaussianCloud
     """Without the object; with new floor where it stood, if that was asked for."""
-    bare: GaussianCloud
+    background_with_hole: GaussianCloud
     """The background before inpainting."""
     plane: Plane
     hole: Hole | None
@@ -93,7 +93,7 @@ class PreparedScene:
         """What the object stands on where that is not flat."""
         return self.located.ground
 
-    def write(self, out: Path | RunFolder, known: Sequence[KnownPlane] = ()) -> None:
+    def write(self, out: Path | RunFolder, known: Sequence[PlaneRecord] = ()) -> None:
         """``object.ply``, ``background.ply`` and ``plane.json`` into the folder ``out``, or as files of a run.
 
         ``known`` is what the file that gave the plane held; what is not found anew goes along.
@@ -102,7 +102,7 @@ class PreparedScene:
         write_ply(place("object.ply"), self.object)
         write_ply(place("background.ply"), self.background)
         first = replace(self.located.known(), hole=self.hole.outline() if self.hole else None)
-        write_planes(place("plane.json"), [first.over(known[0]) if known else first, *known[1:]])
+        write_planes(place("plane.json"), [first.merged_with(known[0]) if known else first, *known[1:]])
 
 
 def prepare_scene(
@@ -127,12 +127,12 @@ def prepare_scene(
     located = locate_plane(cloud, spec, cameras=cameras, up=up, plane=plane)
     if not options.flat:
         progress("ground", 0.0)
-        located = on_its_ground(cloud, located, spec, cameras)
+        located = with_measured_ground(cloud, located, spec, cameras)
     progress("segment", 0.0)
-    thing, bare, notes = take_apart(
+    thing, bare, notes = segment_scene(
         cloud, located, options, photographs, progress=lambda done: progress("segment", done)
     )
-    thing, came_down = set_down(thing, located)
+    thing, came_down = snap_to_plane(thing, located)
     notes = (*notes, *came_down)
     filled, hole = None, hole_under(cloud, located.plane, located.segmentation)
     if options.inpaint and hole is None:
@@ -156,7 +156,7 @@ def prepare_scene(
     return PreparedScene(thing, background, bare, located.plane, hole, located, (*located.notes, *notes), filled)
 
 
-def take_apart(
+def segment_scene(
     cloud: GaussianCloud,
     located: LocatedPlane,
     options: SceneOptions,
@@ -171,8 +171,8 @@ def take_apart(
     untouched, ground = cloud.subset(found.object_mask), located.ground
     if ground is not None:
         # Where the ground is the plane, what stands on it can be cleared of the plane.
-        untouched, photographs = _moved(untouched, ground.levelled), None
-    heights, reach = reach_across(untouched, located.plane, options.clearing_options.reach)
+        untouched, photographs = _moved(untouched, ground.flatten), None
+    heights, reach = plane_extents(untouched, located.plane, options.clearing_options.reach)
     if not found.background_mask.any():
         raise UserError("object: it is the whole capture, so there is no background; animate the capture itself")
     thing = clear_plane(
@@ -186,25 +186,25 @@ def take_apart(
     )
     closed = ()
     if ground is not None:
-        thing, count = with_underside(_moved(thing, ground.raised), ground, found.size)
+        thing, count = with_underside(_moved(thing, ground.unflatten), ground, found.size)
         closed = (f"its underside, which no view shows, was closed by {count} Gaussians",) if count else ()
     notes = (
         f"the object has {untouched.count} of {cloud.count} Gaussians; {int(found.buried_mask.sum())} under it and "
         f"{int(found.floater_mask.sum())} floaters beside it were dropped",
         f"{int((np.abs(heights) < reach).sum())} of the object's Gaussians straddled the plane: {_CLEARED[method]}"
-        + (f" against {len(photographs)} photographs" if photographs and method is Clearing.FINETUNE else ""),
+        + (f" against {len(photographs)} photographs" if photographs and method is StraddlingPolicy.FINETUNE else ""),
         *closed,
     )
     return thing, cloud.subset(found.background_mask), notes
 
 
-def set_down(thing: GaussianCloud, located: LocatedPlane) -> tuple[GaussianCloud, tuple[str, ...]]:
+def snap_to_plane(thing: GaussianCloud, located: LocatedPlane) -> tuple[GaussianCloud, tuple[str, ...]]:
     """``thing``, moved down onto its plane if it hangs above it, as a robot may that was captured afloat; and what to
     say of that.
     """
     plane, size = located.plane, located.segmentation.size
     lowest = float(np.quantile(plane.heights(thing.means.numpy()[thing.opacities() > _SOLID]), 0.002))
-    if located.ground is not None or lowest <= _AFLOAT * size:
+    if located.ground is not None or lowest <= _HOVER_FRACTION * size:
         return thing, ()
     note = f"the object hung {lowest / size:.2f} of its size above the ground, and was set down on it"
     return _moved(thing, lambda means: means - lowest * plane.normal), (note,)

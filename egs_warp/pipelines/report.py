@@ -14,12 +14,12 @@ import numpy as np
 
 from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.audit import Audit, audit
-from egs_warp.locomotion.ledger import EnergySums, Ledger
+from egs_warp.locomotion.ledger import EnergyBalance, EnergyTotals
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import Reached, Trajectory, measure
-from egs_warp.motions.sequence import Done, spans_of
+from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory, measure
+from egs_warp.motions.sequence import MotionRecord, spans_of
 from egs_warp.pipelines.creature import Creature
-from egs_warp.pipelines.ending import Ending, State
+from egs_warp.pipelines.end_state import EndCause, State
 from egs_warp.version import __version__
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class MotionReport:
     """Lengths in body heights."""
     planned: DataclassInstance
     """The record of its state machine."""
-    reached: Reached
+    reached: MotionOutcome
     state: State
     also_reached: DataclassInstance | None
     """The record of what only such a motion is measured by."""
@@ -173,7 +173,7 @@ class GaussianCounts:
     def of(cls, creature: Creature, drawn: int | None = None) -> GaussianCounts:
         """Of pictures with so many ``drawn``; all of the capture, unsplit, if None."""
         read, geometry = creature.cloud.count, creature.geometry
-        return cls(read, read if drawn is None else drawn, geometry.left_out, geometry.left_out_opacity)
+        return cls(read, read if drawn is None else drawn, geometry.excluded_count, geometry.excluded_opacity)
 
     def to_json(self) -> dict[str, Any]:
         """``gaussians``."""
@@ -194,7 +194,7 @@ class Report:
     """Name of the capture."""
     motion: tuple[MotionReport, ...]
     audit: Audit
-    energy: EnergySums
+    energy: EnergyTotals
     qp: QpCounts
     timing: Mapping[str, StageTime]
     cage: CageFacts
@@ -277,8 +277,8 @@ def report_of_run(
     trajectory: Trajectory,
     steps: Sequence[StepReport],
     frames: np.ndarray,
-    done: Sequence[Done],
-    books: Ledger,
+    done: Sequence[MotionRecord],
+    energy: EnergyBalance,
     *,
     gaussians: GaussianCounts,
     drawing: Mapping[str, Sequence[float]],
@@ -286,7 +286,7 @@ def report_of_run(
     notes: Sequence[str],
     seed: int,
     asked: Mapping[str, Any],
-    ending: Ending | None = None,
+    ending: EndCause | None = None,
 ) -> Report:
     """Of the motions ``done`` on a ``trajectory`` with its ``books``; ``frames`` (n,) are indices into its times.
     ``ending`` says what ended the last motion before its time.
@@ -296,9 +296,9 @@ def report_of_run(
     mesh = creature.cage.mesh
     return Report(
         source=source,
-        motion=_motion_reports(trajectory, done, ending or Ending()),
-        audit=audit(trajectory, energy=books, newton_unconverged=sum(not step.converged for step in steps)),
-        energy=EnergySums.of(books),
+        motion=_motion_reports(trajectory, done, ending or EndCause()),
+        audit=audit(trajectory, energy=energy, newton_unconverged=sum(not step.converged for step in steps)),
+        energy=EnergyTotals.of(energy),
         qp=QpCounts.of(steps, frames),
         timing=stage_times(steps, frames, drawing),
         cage=CageFacts(len(mesh.nodes), len(mesh.tets), mesh.min_dihedral_degrees(), creature.body.mass),
@@ -311,14 +311,14 @@ def report_of_run(
     )
 
 
-def _motion_reports(trajectory: Trajectory, done: Sequence[Done], ending: Ending) -> tuple[MotionReport, ...]:
+def _motion_reports(trajectory: Trajectory, done: Sequence[MotionRecord], ending: EndCause) -> tuple[MotionReport, ...]:
     reports = []
     for entry, (first, last) in zip(done, spans_of(done, trajectory.time), strict=True):
         reached = measure(trajectory, first=first, last=last)
         state, why = ending.of(entry, reached, last=entry is done[-1])
-        also = entry.motion.reached(trajectory, first, last)
+        also = entry.motion.outcome_record(trajectory, first, last)
         notes = (*entry.motion.notes(), *why)
-        reports.append(MotionReport(entry.name, entry.asked, entry.motion.planned(), reached, state, also, notes))
+        reports.append(MotionReport(entry.name, entry.asked, entry.motion.plan_record(), reached, state, also, notes))
     return tuple(reports)
 
 

@@ -16,10 +16,10 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import read_points
 from egs_warp.render import render_gaussians
 from egs_warp.training.finetune import Densification, FinetuneOptions, TrainingView, finetune
-from egs_warp.training.likeness import in_tone_of, psnr, ssim_of
-from egs_warp.training.misfits import misfitting
-from egs_warp.training.posed_photos import LeftOut, backdrop_colour, laid_over, read_views
-from egs_warp.training.rough_cloud import LEAST_POINTS, cloud_from_points, rough_cloud
+from egs_warp.training.initial_cloud import LEAST_POINTS, cloud_from_points, initial_cloud
+from egs_warp.training.metrics import match_tone, psnr, ssim_of
+from egs_warp.training.outlier_views import is_outlier
+from egs_warp.training.posed_photos import ExcludedPhoto, backdrop_colour, laid_over, read_views
 
 _HOLD_OUT_EVERY = 8
 """As published methods do: every eighth photo is judged on and not trained on."""
@@ -42,7 +42,7 @@ class PhotoScore:
     plain_psnr: float
     """dB, of the render as it is."""
     plain_ssim: float
-    misfit: bool = False
+    is_outlier: bool = False
     """It fits the other photos badly: its pose is wrong, or something moved. It is not counted in the means."""
 
 
@@ -72,12 +72,12 @@ class TrainResult:
     """One for each of ``views``."""
     background: tuple[float, float, float]
     """The colour behind the capture."""
-    left_out: tuple[LeftOut, ...] = ()
+    excluded: tuple[ExcludedPhoto, ...] = ()
     """Photos that are not used, or no longer, and why."""
 
     def mean_score(self, *, held_out: bool) -> MeanScore | None:
         """Of photos held out, or of those trained on, misfits apart; None where there are none."""
-        chosen = [(s.psnr, s.ssim) for s in self.scores if s.held_out is held_out and not s.misfit]
+        chosen = [(s.psnr, s.ssim) for s in self.scores if s.held_out is held_out and not s.is_outlier]
         return MeanScore(*np.mean(chosen, axis=0).tolist()) if chosen else None
 
 
@@ -136,8 +136,8 @@ def train(
         densification=Densification.RELOCATION,
         max_gaussians=max_gaussians,
         sh_steps=max(1, iterations // _SH_TURNS),
-        tones=True,
-        leave_out_misfits=True,
+        fit_exposure=True,
+        exclude_outliers=True,
         seed=seed,
         threads=threads,
     )
@@ -151,8 +151,8 @@ def train(
     unfit = _unfit(scores) | {trained[number] for number in result.misfits}
     left_out = list(photos.left_out)
     for number in sorted(unfit):
-        scores[number] = replace(scores[number], misfit=True)
-        left_out.append(LeftOut(views[number].name, _misfit(scores[number])))
+        scores[number] = replace(scores[number], is_outlier=True)
+        left_out.append(ExcludedPhoto(views[number].name, _misfit(scores[number])))
         say(f"left out {left_out[-1].name}: {left_out[-1].reason}")
     return TrainResult(
         *(result.cloud, result.losses, views, photos.views, cut_out, tuple(scores), background, tuple(left_out))
@@ -173,7 +173,7 @@ def _start(
     if points is not None and len(points.positions) >= LEAST_POINTS:
         return cloud_from_points(points, count=max_gaussians, sh_degree=sh_degree, seed=seed, device=device)
     count = max(100, max_gaussians // 3) if max_gaussians is not None else _FIRST_GAUSSIANS
-    return rough_cloud(chosen, count=count, sh_degree=sh_degree, seed=seed, device=device)
+    return initial_cloud(chosen, count=count, sh_degree=sh_degree, seed=seed, device=device)
 
 
 def score_photo(
@@ -187,7 +187,7 @@ def score_photo(
     """How well ``cloud`` shows the photo of ``view``, before and after its exposure and white balance are removed."""
     picture = render_gaussians(cloud, view.camera, background=background, threads=threads).colour.numpy()
     known = None if view.weight is None else view.weight > 0
-    plain, toned = np.clip(picture, 0, 1), np.clip(in_tone_of(view.image, picture, known), 0, 1)
+    plain, toned = np.clip(picture, 0, 1), np.clip(match_tone(view.image, picture, known), 0, 1)
     return PhotoScore(
         view.name,
         held_out,
@@ -202,7 +202,7 @@ def _unfit(scores: list[PhotoScore]) -> set[int]:
     """Numbers of the held-out photos that no capture would show: their errors lie far above those of the others."""
     judged = [number for number, score in enumerate(scores) if score.held_out]
     errors = np.array([10.0 ** (-scores[number].psnr / 20.0) for number in judged])
-    return {judged[i] for i in np.flatnonzero(misfitting(errors))}
+    return {judged[i] for i in np.flatnonzero(is_outlier(errors))}
 
 
 def _misfit(score: PhotoScore) -> str:

@@ -13,7 +13,7 @@ from egs_warp.pipelines.report import versions, write_report
 
 if TYPE_CHECKING:
     from egs_warp.pipelines.train_capture import MeanScore, PhotoScore, TrainResult
-    from egs_warp.training.posed_photos import LeftOut
+    from egs_warp.training.posed_photos import ExcludedPhoto
 
 _LAST_STEPS = 100
 """Steps whose mean loss is the final one."""
@@ -25,7 +25,7 @@ class TrainReport:
 
     photos: int
     """Used, those held out included."""
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[ExcludedPhoto, ...]
     photo_size: tuple[int, int]
     """Width and height of the first, pixels."""
     gaussians: int
@@ -53,7 +53,7 @@ class TrainReport:
         photo = result.views[0].camera
         return cls(
             photos=len(result.views),
-            left_out=result.left_out,
+            left_out=result.excluded,
             photo_size=(photo.width, photo.height),
             gaussians=result.cloud.count,
             iterations=len(result.losses),

@@ -17,9 +17,9 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import available_threads, warp_stream
 from egs_warp.render.backward import backward
-from egs_warp.render.compositing import BegunImage, RenderedImage
+from egs_warp.render.compositing import PendingImage, RenderedImage
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
-from egs_warp.render.rasteriser import background_of, drawn_tiles, refusing_what_does_not_fit
+from egs_warp.render.rasteriser import background_of, tile_mask_array, translate_out_of_memory
 from egs_warp.render.tiles import TileLists
 
 _ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
@@ -181,7 +181,7 @@ def _draw(
         cloud = _cloud_of(tensors)
         view = view_from_camera(camera)
         threads = task.threads
-        with refusing_what_does_not_fit(cloud, camera):
+        with translate_out_of_memory(cloud, camera):
             projected = project(cloud, view, antialiased=task.antialiased, threads=threads)
             shape = (camera.height, camera.width)
             # torch's memory, for to make a tensor of Warp's takes as long as three launches.
@@ -195,8 +195,8 @@ def _draw(
                 *(_array_at(t.data_ptr(), d, shape, alias) for t, d in zip(picture, _PIXEL_TYPES, strict=True))
             )
             behind = background_of(task.background, camera, cloud.device)
-            drawn = drawn_tiles(task.mask, camera, cloud.device)
-            begun = BegunImage(projected, view, background=behind, threads=threads, onto=onto, drawn=drawn).settled()
+            drawn = tile_mask_array(task.mask, camera, cloud.device)
+            begun = PendingImage(projected, view, background=behind, threads=threads, onto=onto, drawn=drawn).result()
     # The picture's own tensors will hold this.
     owners = (*tensors, *(tensor.detach() for tensor in picture))
     return picture, _Forward(owners, cloud, view, projected, begun.lists, begun.image)
@@ -227,7 +227,7 @@ class _Render(torch.autograd.Function):
                 None if gradient is None else _array_at(gradient.data_ptr(), dtype, shape, alias)
                 for gradient, dtype in zip(given, _PIXEL_TYPES, strict=True)
             )
-            with refusing_what_does_not_fit(done.cloud, ctx.task.camera):
+            with translate_out_of_memory(done.cloud, ctx.task.camera):
                 by_attributes = tuple(torch.empty_like(tensor) for tensor in done.owners[:5])
                 gradients = backward(
                     *(done.cloud, done.view, done.projected, done.lists, done.image),

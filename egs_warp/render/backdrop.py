@@ -26,16 +26,16 @@ _SOFTENED = 0.25
 
 
 @dataclass(frozen=True)
-class Behind:
+class Backdrop:
     """What an animation is drawn over, and where on it the shadow of what moves falls. Made for one camera."""
 
-    bare: wp.array
+    unshadowed: wp.array
     """(H W,) vec3."""
     shadow: ContactShadow
     strength: wp.array | None
     """(H W,) float32: how much of the shadow each pixel takes; None without one."""
 
-    def cover(self, body: GaussianCloud) -> wp.array:
+    def shadow_opacity(self, body: GaussianCloud) -> wp.array:
         """(H, W) float32, 0 to about 0.5: how much of what is behind the shadow hides."""
         camera = self.shadow.camera
         if self.strength is None:
@@ -47,14 +47,14 @@ class Behind:
         camera, device = self.shadow.camera, self.shadow.device
         shape = (camera.height, camera.width)
         if self.strength is None:
-            return self.bare.reshape(shape)
-        colour = empty(len(self.bare), wp.vec3, device)
+            return self.unshadowed.reshape(shape)
+        colour = empty(len(self.unshadowed), wp.vec3, device)
         cover = self.shadow.cover(body, self.strength)
-        launch_rows(kernels.dim_kernel, len(colour), inputs=[self.bare, cover], outputs=[colour], device=device)
+        launch_rows(kernels.dim_kernel, len(colour), inputs=[self.unshadowed, cover], outputs=[colour], device=device)
         return colour.reshape(shape)
 
 
-def grid_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> Behind:
+def grid_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> Backdrop:
     """A pale plane with a grid whose lines are ``cell`` (world units) apart."""
     colour = empty(len(ground.depth), wp.vec3, ground.device)
     launch_rows(
@@ -64,13 +64,13 @@ def grid_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> Be
         outputs=[colour],
         device=ground.device,
     )
-    return Behind(colour, ground, ground.fade if shadow else None)
+    return Backdrop(colour, ground, ground.fade if shadow else None)
 
 
-def plain_colour(ground: ContactShadow, colour: tuple[float, float, float], *, shadow: bool = True) -> Behind:
+def plain_colour(ground: ContactShadow, colour: tuple[float, float, float], *, shadow: bool = True) -> Backdrop:
     """One colour, on which only the shadow falls; its ``cover`` is a shadow to be laid over something else."""
     bare = wp.full(len(ground.depth), wp.vec3(*colour), dtype=wp.vec3, device=ground.device)
-    return Behind(bare, ground, ground.fade if shadow else None)
+    return Backdrop(bare, ground, ground.fade if shadow else None)
 
 
 def captured_scene(
@@ -83,7 +83,7 @@ def captured_scene(
     grain: float,
     height: float,
     shadow: bool = True,
-) -> Behind:
+) -> Backdrop:
     """The rest of a capture, rendered once; the shadow falls where the plane is what one sees.
 
     ``scene`` in the world's units; ``centre`` (3,) and ``reach`` bound the shadow, ``grain`` and ``height`` are as
@@ -105,7 +105,7 @@ def captured_scene(
     )
     bare = wp.array(np.clip(image.colour.numpy(), 0.0, 1.0).reshape(-1, 3), dtype=wp.vec3, device=scene.device)
     if not shadow:
-        return Behind(bare, ground, None)
+        return Backdrop(bare, ground, None)
     lift = ground.lift.numpy().reshape(shape) / (_BUMP * reach)
     on_plane = np.clip(1.5 - np.where(lift > 0.0, lift, -0.5 * lift), 0.0, 1.0)
     on_plane *= ground.depth.numpy().reshape(shape) > 0.0
@@ -114,4 +114,4 @@ def captured_scene(
     on_plane = np.asarray(cv2.medianBlur(np.rint(255.0 * on_plane).astype(np.uint8), kernel), np.float32) / 255.0
     on_plane = cv2.GaussianBlur(on_plane, (0, 0), _SOFTENED * kernel)
     strength = on_plane * ground.fade.numpy().reshape(shape) * image.alpha.numpy()
-    return Behind(bare, ground, wp.array(strength.ravel(), dtype=wp.float32, device=scene.device))
+    return Backdrop(bare, ground, wp.array(strength.ravel(), dtype=wp.float32, device=scene.device))

@@ -12,7 +12,7 @@ from egs_warp.kernels.render.backward import pose_backward_kernel, project_backw
 from egs_warp.kernels.render.compositing import composite_backward_block_kernel, composite_backward_tile_kernel
 from egs_warp.kernels.render.ellipse import TILE_PIXELS
 from egs_warp.kernels.render.pixel_gradients import pixel_gradients_kernel
-from egs_warp.launching import empty, empty_together, launch_again, launch_rows, with_room
+from egs_warp.launching import empty, empty_pooled, grow_capacity, launch_cached, launch_rows
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists
@@ -61,15 +61,15 @@ def backward(
     The gradients by the attributes go into the arrays of ``onto`` where given.
     """
     device, count = cloud.device, cloud.count
-    (moments,) = empty_together(device, ((with_room(projected.slot_count), 3), wp.vec4))
+    (moments,) = empty_pooled(device, ((grow_capacity(projected.slot_count), 3), wp.vec4))
     walked = [
-        *(view.width, view.height, lists.tile_start, lists.drawn),
+        *(view.width, view.height, lists.tile_start, lists.tile_mask),
         *(lists.gaussian_from_intersection, lists.slot_from_intersection),
         *(projected.ellipse, projected.falloff, projected.colour_depth),
     ]
     pixels = [image.colour, image.alpha, image.depth, colour_gradient, alpha_gradient, depth_gradient]
     if device.is_cuda:
-        launch_again(
+        launch_cached(
             composite_backward_block_kernel,
             lists.tile_count * TILE_PIXELS,
             inputs=[*walked, *pixels],
@@ -95,10 +95,10 @@ def backward(
             outputs=[moments],
             device=device,
             threads=threads,
-            work=lists.work,
+            work=lists.tile_work,
         )
     by_attributes = onto or GaussianCloud(
-        *empty_together(
+        *empty_pooled(
             device,
             *((count, wp.vec3), (count, wp.vec4), (count, wp.vec3), (count, wp.float32)),
             (cloud.sh.shape, wp.vec3),

@@ -14,7 +14,7 @@ from egs_warp.kernels.render.compositing import composite_tile_kernel
 from egs_warp.kernels.render.ellipse import TILE_PIXELS
 from egs_warp.kernels.render.geometry import composite_geometry_kernel, splat_normals_kernel
 from egs_warp.kernels.render.quantise import quantise_kernel
-from egs_warp.launching import device_of, empty, empty_together, launch_rows
+from egs_warp.launching import device_of, empty, empty_pooled, launch_rows
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists, build_tile_lists, lists_fit
 
@@ -64,7 +64,7 @@ class RenderedImage:
         )
 
 
-class BegunImage:
+class PendingImage:
     """A picture and its tile lists, queued: a GPU that waited for the number of pairs would stand still meanwhile, so
     that is guessed, and looked at later."""
 
@@ -80,13 +80,13 @@ class BegunImage:
         guess: bool = True,
     ) -> None:
         self.projected, self.view = projected, view
-        self.lists = replace(build_tile_lists(projected, view, threads=threads, guess=guess), drawn=drawn)
+        self.lists = replace(build_tile_lists(projected, view, threads=threads, guess=guess), tile_mask=drawn)
         self.image = composite(projected, self.lists, view, background=background, threads=threads, onto=onto)
         self._fit = partial(lists_fit, self.lists, projected)
         given = {"background": background, "threads": threads, "drawn": drawn}
-        self._anew = partial(BegunImage, projected, view, onto=self.image, guess=False, **given)
+        self._anew = partial(PendingImage, projected, view, onto=self.image, guess=False, **given)
 
-    def settled(self) -> BegunImage:
+    def result(self) -> PendingImage:
         """This, once it is known that all pairs had room; where they had not, another into the same arrays."""
         return self if self._fit() else self._anew()
 
@@ -104,12 +104,12 @@ def composite(
     device = device_of(projected.ellipse)
     width, height = int(view.width), int(view.height)
     shape = (height, width)
-    image = onto or RenderedImage(*empty_together(device, (shape, wp.vec3), (shape, wp.float32), (shape, wp.float32)))
+    image = onto or RenderedImage(*empty_pooled(device, (shape, wp.vec3), (shape, wp.float32), (shape, wp.float32)))
     inputs = [
         width,
         height,
         lists.tile_start,
-        lists.drawn,
+        lists.tile_mask,
         lists.gaussian_from_intersection,
         projected.ellipse,
         projected.falloff,
@@ -124,7 +124,7 @@ def composite(
         outputs=[image.colour, image.alpha, image.depth],
         device=device,
         threads=threads,
-        work=lists.work,
+        work=lists.tile_work,
     )
     return image
 
@@ -157,7 +157,7 @@ def add_geometry(
         composite_geometry_kernel,
         lists.tile_count * TILE_PIXELS,
         inputs=[
-            *(width, height, lists.tile_start, lists.drawn, lists.gaussian_from_intersection),
+            *(width, height, lists.tile_start, lists.tile_mask, lists.gaussian_from_intersection),
             *(projected.ellipse, projected.falloff, projected.colour_depth, splat_normals),
         ],
         outputs=[median_depth, median_gaussian, normal],

@@ -17,7 +17,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.render.projection import NOT_FINITE, View, project_kernel
-from egs_warp.launching import device_of, empty, empty_together, launch_rows
+from egs_warp.launching import device_of, empty, empty_pooled, launch_rows
 
 _ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
@@ -83,7 +83,7 @@ def _view(width: int, height: int, lens: tuple[float, ...], rotation: bytes, tra
 def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int) -> ProjectedGaussians:
     """Project every Gaussian of ``cloud``; those outside the view, or fainter than 1/255 everywhere, reach no tile."""
     device, count = cloud.device, cloud.count
-    ellipse, falloff, colour_depth, tile_count = empty_together(
+    ellipse, falloff, colour_depth, tile_count = empty_pooled(
         device, (count, wp.vec4), (count, wp.vec2), (count, wp.vec4), (count, wp.int64)
     )
     launch_rows(

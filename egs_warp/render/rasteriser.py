@@ -19,7 +19,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import Device, available_threads
-from egs_warp.render.compositing import Background, BegunImage, RenderedImage, add_geometry
+from egs_warp.render.compositing import Background, PendingImage, RenderedImage, add_geometry
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.tiles import TILE_SIDE
 
@@ -45,15 +45,15 @@ def render_gaussians(
     """
     threads = threads or available_threads()
     given = {"background": background, "antialiased": antialiased, "mask": mask, "threads": threads}
-    begun = begin_image(cloud, camera, **given)
-    with refusing_what_does_not_fit(cloud, camera):
-        begun = begun.settled()
+    begun = enqueue_image(cloud, camera, **given)
+    with translate_out_of_memory(cloud, camera):
+        begun = begun.result()
         if geometry:
             return add_geometry(begun.image, cloud, begun.projected, begun.lists, begun.view, threads=threads)
     return begun.image
 
 
-def begin_image(
+def enqueue_image(
     cloud: GaussianCloud,
     camera: Camera,
     *,
@@ -61,15 +61,15 @@ def begin_image(
     antialiased: bool = False,
     mask: np.ndarray | None = None,
     threads: int | None = None,
-) -> BegunImage:
+) -> PendingImage:
     """The picture of ``render_gaussians`` on its way, for which nobody has waited: to be ``settled``."""
     threads = threads or available_threads()
     view = view_from_camera(camera)
-    with refusing_what_does_not_fit(cloud, camera):
+    with translate_out_of_memory(cloud, camera):
         behind = background_of(background, camera, cloud.device)
-        drawn = drawn_tiles(mask, camera, cloud.device)
+        drawn = tile_mask_array(mask, camera, cloud.device)
         projected = project(cloud, view, antialiased=antialiased, threads=threads)
-        return BegunImage(projected, view, background=behind, threads=threads, drawn=drawn)
+        return PendingImage(projected, view, background=behind, threads=threads, drawn=drawn)
 
 
 def render_views(
@@ -94,7 +94,7 @@ def render_views(
 
 
 @contextmanager
-def refusing_what_does_not_fit(cloud: GaussianCloud, camera: Camera) -> Iterator[None]:
+def translate_out_of_memory(cloud: GaussianCloud, camera: Camera) -> Iterator[None]:
     """Turn a failed allocation into a ``UserError`` that says how much there was to render."""
     try:
         yield
@@ -119,7 +119,7 @@ def _is_finite_number(value: Any) -> bool:
     return isinstance(value, float | int) and math.isfinite(value)
 
 
-def drawn_tiles(mask: np.ndarray | None, camera: Camera, device: Device) -> wp.array | None:
+def tile_mask_array(mask: np.ndarray | None, camera: Camera, device: Device) -> wp.array | None:
     """``mask`` (tile rows, tile columns) bool as ``TileLists`` wants it. Raises ``UserError`` for another shape."""
     if mask is None:
         return None

@@ -11,7 +11,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.render import backdrop as kernels
-from egs_warp.launching import empty, launch_again, launch_rows, zeros
+from egs_warp.launching import empty, launch_cached, launch_rows, zeros
 from egs_warp.render.projection import view_from_camera
 
 _LAYERS = ((0.0, 0.08, 0.02), (0.08, 0.3, 0.06), (0.3, 2.0, 0.13))
@@ -23,7 +23,7 @@ _TAPS = 4.0
 _MAP = int(kernels.TEXELS)
 
 
-def grain_of(body: GaussianCloud) -> float:
+def shadow_blur_radius(body: GaussianCloud) -> float:
     """World units: by how much the shadow of ``body`` is blurred to show none of its Gaussians, the median of their
     middle standard deviations."""
     return float(np.exp(np.median(np.median(body.log_scales.numpy(), axis=1))))
@@ -92,7 +92,7 @@ class ContactShadow:
         shape = (len(_LAYERS), _MAP, _MAP)
         hidden = zeros(shape, wp.int64, self.device)
         # One after the other on a CPU, whose threads may not add to one texel at once.
-        launch_again(
+        launch_cached(
             kernels.hide_ground_kernel,
             body.count,
             inputs=[self._ground, self._layers, body.means, body.log_scales, body.opacity_logits],

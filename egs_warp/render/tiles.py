@@ -15,7 +15,7 @@ from egs_warp.kernels.render.tiles import (
     fill_tiles_kernel,
     finish_lists_kernel,
 )
-from egs_warp.launching import device_of, empty, empty_together, launch_again, launch_rows, with_room, zeros
+from egs_warp.launching import device_of, empty, empty_pooled, grow_capacity, launch_cached, launch_rows, zeros
 from egs_warp.render.projection import ProjectedGaussians
 
 TILE_SIDE = int(TILE)
@@ -33,9 +33,9 @@ class TileLists:
     """(at least tile_start[-1],) int32, nearest first within a tile; equal depths in index order."""
     slot_from_intersection: wp.array
     """(at least tile_start[-1],) int32: place of the same pair when pairs are numbered Gaussian by Gaussian."""
-    work: np.ndarray | None
+    tile_work: np.ndarray | None
     """(tiles,) number of intersections, on a CPU; to share the tiles out between threads."""
-    drawn: wp.array | None = None
+    tile_mask: wp.array | None = None
     """(tiles,) int32: 0 for tiles that show the background alone; None draws all."""
 
     @property
@@ -61,7 +61,7 @@ def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int, 
 def lists_fit(lists: TileLists, projected: ProjectedGaussians) -> bool:
     """Whether the pairs had room in ``lists``, made by a guess; where not, the lists are empty."""
     pairs = projected.slot_count
-    _remember(device_of(lists.tile_start), pairs)
+    _update_guess(device_of(lists.tile_start), pairs)
     return pairs <= len(lists.gaussian_from_intersection)
 
 
@@ -119,7 +119,7 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, g
         pairs = len(room.gaussians)
     else:
         pairs = projected.slot_count
-        _remember(device, pairs)
+        _update_guess(device, pairs)
     if pairs == 0:
         return TileLists(
             zeros(tiles + 1, wp.int32, device), empty(1, wp.int32, device), empty(1, wp.int32, device), None
@@ -132,7 +132,7 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, g
     depth_bits = max((farthest - nearest).bit_length(), 1)
     tile_bits = tiles.bit_length()
     kept_bits = min(depth_bits, _KEY_BITS - tile_bits)
-    launch_again(
+    launch_cached(
         emit_tiles_kernel,
         count,
         inputs=[
@@ -146,7 +146,7 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, g
         # The sort takes scratch memory inside Warp, which does not report a failure: see first whether there is any.
         empty((pairs, 2), wp.int32, device)
     wp.utils.radix_sort_pairs(keys, scratch, pairs, end_bit=kept_bits + tile_bits)
-    launch_again(
+    launch_cached(
         finish_lists_kernel,
         pairs + 1,
         inputs=[pairs, kept_bits, keys, scratch, projected.colour_depth],
@@ -160,7 +160,7 @@ _MOST_GUESSED = 2_000_000
 """Expected pairs up to which it takes less time to sort some room that stays empty than to wait for their number."""
 
 
-def _remember(device: wp.Device, pairs: int) -> None:
+def _update_guess(device: wp.Device, pairs: int) -> None:
     """What to expect next: views change, so the most of late, which is slowly forgotten."""
     lately = _expected.get(device.alias, 0) * 15 // 16
     _expected[device.alias] = max(pairs, lately) if pairs <= _LARGE_SORT else 0
@@ -171,7 +171,7 @@ _expected: dict[str, int] = {}
 
 
 @dataclass(frozen=True)
-class _Room:
+class _PairBuffers:
     """Memory for the lists of so many pairs, and to make them in."""
 
     keys: wp.array
@@ -182,12 +182,12 @@ class _Room:
     slots: wp.array
 
 
-def _lists_for(pairs: int, tiles: int, device: wp.Device) -> _Room | None:
+def _lists_for(pairs: int, tiles: int, device: wp.Device) -> _PairBuffers | None:
     if pairs == 0:
         return None
-    pairs = with_room(pairs)
+    pairs = grow_capacity(pairs)
     # Two pieces: what the lists are made in goes at once.
-    return _Room(
-        *empty_together(device, (2 * pairs, wp.uint32), (3 * pairs, wp.int32)),
-        *empty_together(device, (tiles + 1, wp.int32), (pairs, wp.int32), (pairs, wp.int32)),
+    return _PairBuffers(
+        *empty_pooled(device, (2 * pairs, wp.uint32), (3 * pairs, wp.int32)),
+        *empty_pooled(device, (tiles + 1, wp.int32), (pairs, wp.int32), (pairs, wp.int32)),
     )

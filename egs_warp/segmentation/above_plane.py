@@ -38,7 +38,7 @@ _NEAR_CLICK = 0.1
 
 
 @dataclass(frozen=True)
-class AbovePlane:
+class SceneAbovePlane:
     """What is asked of the capture again and again; all (n, ...)."""
 
     cloud: GaussianCloud
@@ -48,31 +48,31 @@ class AbovePlane:
     """(n, 2) along the plane."""
     heights: np.ndarray
     opacity: np.ndarray
-    solid: np.ndarray
+    is_opaque: np.ndarray
     """(n,) bool: opaque enough to connect."""
-    level: np.ndarray
+    is_level: np.ndarray
     """(n,) bool: flat, and lying along the plane as a floor's Gaussians do."""
 
     @classmethod
-    def of(cls, cloud: GaussianCloud, plane: Plane | HeightField) -> AbovePlane:
+    def of(cls, cloud: GaussianCloud, plane: Plane | HeightField) -> SceneAbovePlane:
         means, opacity = cloud.means.numpy().astype(np.float64), cloud.opacities()
         level = lies_along(cloud, plane)
         flat = means @ np.stack(plane.tangents(), axis=1)
         return cls(cloud, plane, means, flat, plane.heights(means), opacity, opacity >= _MIN_OPACITY, level)
 
-    def under(self, chosen: np.ndarray, height: float, size: float) -> np.ndarray:
+    def is_under(self, chosen: np.ndarray, height: float, size: float) -> np.ndarray:
         """(n,) bool: within the outline, seen along the normal, of what ``chosen`` has below ``height``."""
         return enclosed(self.flat, self.flat[chosen & (self.heights < height)], size / CELLS)
 
-    def within(self, these: np.ndarray, chosen: np.ndarray, size: float) -> np.ndarray:
+    def is_within(self, these: np.ndarray, chosen: np.ndarray, size: float) -> np.ndarray:
         """(m,) bool: which of ``these`` (m,) lie within what is ``chosen`` (n,), which the plane closes from below."""
         upright = np.column_stack([self.flat, self.heights])
         skin = upright[chosen]
         return enclosed(upright[these], np.concatenate([skin, skin * [1.0, 1.0, 0.0]]), 2.0 * size / CELLS)
 
 
-def hanging_parts(
-    scene: AbovePlane, indices: np.ndarray, parts: np.ndarray, meant: np.ndarray, size: float
+def detached_parts(
+    scene: SceneAbovePlane, indices: np.ndarray, parts: np.ndarray, meant: np.ndarray, size: float
 ) -> np.ndarray:
     """Those of the ``parts`` (m,) of the Gaussians ``indices`` (m,) that hang in the air beside the ``meant`` ones, and
     are less than these: where a capture is coarse, leaves come off their twigs, and nothing else holds them. What is no
@@ -116,7 +116,7 @@ def _gaps(points: np.ndarray, parts: np.ndarray, these: np.ndarray, those: np.nd
 
 
 def clicked_parts(
-    indices: np.ndarray, parts: np.ndarray, scene: AbovePlane, clicks: Sequence[Click], size: float
+    indices: np.ndarray, parts: np.ndarray, scene: SceneAbovePlane, clicks: Sequence[Click], size: float
 ) -> np.ndarray:
     """Those of the ``parts`` (m,) of the Gaussians ``indices`` (m,) that clicks on the object hit or just miss."""
     found = []

@@ -11,7 +11,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.body_frame import upright_frame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.geometry.rows import distinct_rows
+from egs_warp.geometry.unique_rows import distinct_rows
 from egs_warp.meshing.body_gaussians import canonical_order, centred
 
 _COLUMNS = 64

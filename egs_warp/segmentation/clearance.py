@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from egs_warp.deformation.splitting import SplitRule, child_layout, child_opacities
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
-from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.deformation.splitting import split_kernel
 from egs_warp.kernels.segmentation.clearance import half_space_kernel, reach_kernel
@@ -29,7 +29,7 @@ GAMMA = 3.0
 """Standard deviations that a Gaussian counts for, as in Eq. (3)."""
 
 
-class Reach(enum.Enum):
+class ExtentMeasure(enum.Enum):
     """How far a Gaussian is said to reach towards the plane."""
 
     AXIS_TIPS = "axis-tips"
@@ -38,7 +38,7 @@ class Reach(enum.Enum):
     """Its whole ellipsoid, gamma sqrt(N^T Sigma N): up to sqrt 3 times as far."""
 
 
-class Clearing(enum.Enum):
+class StraddlingPolicy(enum.Enum):
     """What happens to Gaussians of the object that straddle its plane."""
 
     NONE = "none"
@@ -52,11 +52,11 @@ class Clearing(enum.Enum):
 
 
 @dataclass(frozen=True)
-class ClearingOptions:
+class StraddlingOptions:
     """What may be chosen about the fine-tune."""
 
     iterations: int = 100
-    reach: Reach = Reach.ELLIPSOID
+    reach: ExtentMeasure = ExtentMeasure.ELLIPSOID
     weight: float = 0.3
     """Of L_seg beside the photometric loss; 0.3 and 3 give the same to 0.4 dB."""
     subdivisions: int = 5
@@ -69,7 +69,9 @@ class ClearingOptions:
     seed: int = 0
 
 
-def reach_across(cloud: GaussianCloud, plane: Plane, reach: Reach = Reach.ELLIPSOID) -> tuple[np.ndarray, np.ndarray]:
+def plane_extents(
+    cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure = ExtentMeasure.ELLIPSOID
+) -> tuple[np.ndarray, np.ndarray]:
     """(n,) height d0 of each mean over the plane and (n,) reach eta_seg along its normal, Eq. (20); scene units.
 
     A Gaussian straddles the plane where |d0| < eta_seg.
@@ -84,18 +86,18 @@ def reach_across(cloud: GaussianCloud, plane: Plane, reach: Reach = Reach.ELLIPS
         device=device,
     )
     heights, tips, deviation = (output.numpy().astype(np.float64) for output in outputs)
-    return heights, GAMMA * (tips if reach is Reach.AXIS_TIPS else deviation)
+    return heights, GAMMA * (tips if reach is ExtentMeasure.AXIS_TIPS else deviation)
 
 
 def clear_plane(
     cloud: GaussianCloud,
     plane: Plane,
-    method: Clearing,
+    method: StraddlingPolicy,
     *,
     cameras: Sequence[Camera] = (),
     views: Sequence[TrainingView] | None = None,
     surroundings: GaussianCloud | None = None,
-    options: ClearingOptions | None = None,
+    options: StraddlingOptions | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> GaussianCloud:
     """``cloud``, an object above ``plane``, with its straddling Gaussians treated by ``method``.
@@ -104,14 +106,14 @@ def clear_plane(
     above the plane only; or with photographs ``views`` of the whole scene, for which it draws the ``surroundings`` as
     well but does not change them. Gaussians whose means end up below the plane are left out.
     """
-    options = options or ClearingOptions()
-    heights, reach = reach_across(cloud, plane, options.reach)
+    options = options or StraddlingOptions()
+    heights, reach = plane_extents(cloud, plane, options.reach)
     straddling = np.abs(heights) < reach
-    if method is Clearing.NONE or not straddling.any():
+    if method is StraddlingPolicy.NONE or not straddling.any():
         return cloud
-    if method is Clearing.REMOVE:
+    if method is StraddlingPolicy.REMOVE:
         return cloud.subset(~straddling)
-    if method is Clearing.SPLIT:
+    if method is StraddlingPolicy.SPLIT:
         return half_space(cloud, plane, straddling)
     if views is None:
         views = views_above(cloud, plane, cameras or foot_ring(cloud, plane))
@@ -121,7 +123,7 @@ def clear_plane(
         fine = _subdivided(fine, plane, options.reach, fine_reach)
     tuned = _finetuned(fine, plane, views, surroundings, options, progress)
     tuned = tuned.subset(plane.heights(tuned.means.numpy()) > 0.0)
-    heights, reach = reach_across(tuned, plane, options.reach)
+    heights, reach = plane_extents(tuned, plane, options.reach)
     rest = np.abs(heights) < reach
     return half_space(tuned, plane, rest) if options.cut_rest and rest.any() else tuned
 
@@ -186,10 +188,10 @@ def foot_ring(cloud: GaussianCloud, plane: Plane, *, size: int = 256) -> list[Ca
     return ring_cameras(plane, centre, 1.1 * radius, elevations=(1.0, 10.0, 25.0), size=size)
 
 
-def _subdivided(cloud: GaussianCloud, plane: Plane, reach: Reach, fine_reach: float) -> GaussianCloud:
+def _subdivided(cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure, fine_reach: float) -> GaussianCloud:
     """``cloud`` with straddling Gaussians that reach farther than ``fine_reach`` (scene units) split in three along
     the axis that reaches farthest across the plane."""
-    heights, extent = reach_across(cloud, plane, reach)
+    heights, extent = plane_extents(cloud, plane, reach)
     chosen = (np.abs(heights) < extent) & (extent > fine_reach)
     if not chosen.any():
         return cloud
@@ -220,7 +222,7 @@ def _finetuned(
     plane: Plane,
     views: Sequence[TrainingView],
     surroundings: GaussianCloud | None,
-    options: ClearingOptions,
+    options: StraddlingOptions,
     progress: Callable[[int, float], None] | None,
 ) -> GaussianCloud:
     # torch is slow to import, and wanted only here.
@@ -228,11 +230,11 @@ def _finetuned(
 
     from egs_warp.training.finetune import FinetuneOptions, finetune
 
-    heights, reach = reach_across(cloud, plane, options.reach)
+    heights, reach = plane_extents(cloud, plane, options.reach)
     straddling = np.abs(heights) < reach
     if not straddling.any():
         return cloud
-    whole = cloud if surroundings is None else joined(cloud, surroundings)
+    whole = cloud if surroundings is None else concatenate(cloud, surroundings)
     scale = float(np.median(reach[straddling]))
     # Those just above take over what the straddling ones give up.
     free = np.zeros(whole.count, bool)
@@ -259,7 +261,7 @@ def _finetuned(
     return result.cloud.subset(np.arange(whole.count) < cloud.count)
 
 
-def straddling_loss(tensors: GaussianTensors, near: Any, normal: Any, offset: float, reach: Reach) -> Any:
+def straddling_loss(tensors: GaussianTensors, near: Any, normal: Any, offset: float, reach: ExtentMeasure) -> Any:
     """L_seg of Eq. (21): the sum of eta_seg - |d0| over those of the Gaussians ``near`` (m,) that straddle the plane.
 
     A scalar tensor, scene units; ``normal`` (3,) and ``offset`` are the plane's.
@@ -272,6 +274,8 @@ def straddling_loss(tensors: GaussianTensors, near: Any, normal: Any, offset: fl
     n = normal.expand_as(v)
     turned = n + 2.0 * torch.cross(-v, torch.cross(-v, n, dim=1) + w * n, dim=1)
     along = turned * torch.exp(tensors.log_scales[near])
-    eta = GAMMA * (along.abs().amax(dim=1) if reach is Reach.AXIS_TIPS else (along.square().sum(dim=1) + 1e-20).sqrt())
+    eta = GAMMA * (
+        along.abs().amax(dim=1) if reach is ExtentMeasure.AXIS_TIPS else (along.square().sum(dim=1) + 1e-20).sqrt()
+    )
     height = tensors.means[near] @ normal + offset
     return torch.relu(eta - height.abs()).sum()

@@ -68,7 +68,7 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
         return None
     depths = cloud.means.numpy().astype(np.float64) @ camera.rotation[2] + camera.translation[2]
     clear, seen = weights.copy(), np.flatnonzero(weights)
-    clear[seen[_veils(cloud, seen, depths)]] = 0.0
+    clear[seen[_is_haze(cloud, seen, depths)]] = 0.0
     weights = clear if clear.sum() > _FIRST * weights.sum() else weights
     order = np.argsort(depths, kind="stable")
     depth = float(depths[order[np.searchsorted(np.cumsum(weights[order]), _FIRST * weights.sum())]])
@@ -78,7 +78,7 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
     return Click(point, np.flatnonzero(hits), inside, camera, (u, v))
 
 
-def _veils(cloud: GaussianCloud, rows: np.ndarray, depths: np.ndarray) -> np.ndarray:
+def _is_haze(cloud: GaussianCloud, rows: np.ndarray, depths: np.ndarray) -> np.ndarray:
     """(m,) bool: which of the ``rows`` (m,) of ``cloud`` are wide and faint as seen from ``depths`` (n,) of all."""
     return (cloud.breadths(rows) > _WIDE * depths[rows]) & (cloud.opacities()[rows] < _FAINT)
 
@@ -89,7 +89,7 @@ def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> n
     return np.isin(nodes, np.concatenate(hits)) if hits else np.zeros(len(nodes), bool)
 
 
-def cut_off_by(
+def removed_by_clicks(
     cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], heights: np.ndarray, low: float
 ) -> np.ndarray:
     """(m,) bool: which of the ``nodes`` (m,), indices of ``cloud``, ``clicks`` take away; ``heights`` (m,) of them over
@@ -108,15 +108,15 @@ def cut_off_by(
     on_ground = [click for click in clicks if flat.get(id(click), np.inf) < low]
     others = [click for click in clicks if not click.inside and click not in on_ground]
     if others:
-        gone |= ~cut_apart(cloud, nodes, [*mine, *others])
+        gone |= ~cut_by_clicks(cloud, nodes, [*mine, *others])
     for click in on_ground:
         left = np.flatnonzero(~gone)
         higher = heights[left] > 2.0 * max(flat[id(click)], 0.5 * low)
-        gone[left[~cut_apart(cloud, nodes[left], [*mine, click], held=higher)]] = True
+        gone[left[~cut_by_clicks(cloud, nodes[left], [*mine, click], held=higher)]] = True
     return gone
 
 
-def cut_apart(
+def cut_by_clicks(
     cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], *, held: np.ndarray | None = None
 ) -> np.ndarray:
     """(m,) bool: which of the ``nodes`` (m,), indices of ``cloud``, the ``clicks`` leave; of them those that are

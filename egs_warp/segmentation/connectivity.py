@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
-from egs_warp.geometry.rows import distinct_rows
+from egs_warp.geometry.unique_rows import distinct_rows
 
 _ARM = 1.5
 """Standard deviations: how far a Gaussian reaches to touch another, four cells at most."""

@@ -10,12 +10,12 @@ import numpy as np
 from scipy import ndimage
 
 from egs_warp.geometry.bitmaps import connected_parts, depth_inside
-from egs_warp.geometry.camera import Camera, shrunk
+from egs_warp.geometry.camera import Camera, downscale
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
+from egs_warp.geometry.laplace_fill import laplace_fill
 from egs_warp.geometry.plane import Plane
-from egs_warp.geometry.soap_film import soap_film
 from egs_warp.segmentation.seen_surface import SeenSurface
 
 ROUGH = 0.01
@@ -111,7 +111,7 @@ def measure_ground(
     axes = np.stack([first, second, plane.normal])
     middle = centre - plane.heights(centre) * plane.normal
     origin = middle - 0.5 * (count - 1) * spacing * (first + second)
-    above = [shrunk(camera, _SIDE) for camera in cameras if plane.heights(camera.centre) > 0.2 * size]
+    above = [downscale(camera, _SIDE) for camera in cameras if plane.heights(camera.centre) > 0.2 * size]
     if len(above) < _LEAST_VIEWS:
         above = ring_cameras(plane, middle, 1.2 * size, count=_VIEWS - 1, elevations=_ELEVATIONS, size=_SIDE)
     bare = cloud.subset(~thing)
@@ -133,7 +133,7 @@ def measure_ground(
     share = ndimage.gaussian_filter(known.astype(np.float64), _SMOOTHING)
     smooth = ndimage.gaussian_filter(np.where(known, heights, 0.0), _SMOOTHING) / np.maximum(share, 1e-6)
     inner = np.pad(np.ones((count - 2, count - 2), bool), 1)
-    whole = soap_film(np.where(known & inner, smooth, 0.0), ~known & inner)
+    whole = laplace_fill(np.where(known & inner, smooth, 0.0), ~known & inner)
     rows, columns = np.indices(whole.shape) - 0.5 * (count - 1)
     beside = known & (np.hypot(rows, columns) < _BESIDE / _SPACING)
     noise = float(np.median(apart[beside])) if beside.any() else 0.0

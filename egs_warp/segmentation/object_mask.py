@@ -13,10 +13,10 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
-from egs_warp.segmentation.above_plane import CELLS, AbovePlane, clicked_parts, hanging_parts
-from egs_warp.segmentation.clicks import cut_off_by
+from egs_warp.segmentation.above_plane import CELLS, SceneAbovePlane, clicked_parts, detached_parts
+from egs_warp.segmentation.clicks import removed_by_clicks
 from egs_warp.segmentation.connectivity import close_to, connected_parts, enclosed, nearer_to
-from egs_warp.segmentation.floor_shreds import floor_top, wisps
+from egs_warp.segmentation.floor_remnants import floor_remnants, floor_scatter_height
 from egs_warp.segmentation.labels import labels_of_votes, smoothed_labels
 from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
 from egs_warp.segmentation.votes import votes_of_masks
@@ -69,7 +69,7 @@ def segment(
     its size, it may hang above the plane. Raises ``UserError`` where masks are empty, miss the object or have the wrong
     size, where box or point hold nothing, and where the object does not touch the plane.
     """
-    scene = AbovePlane.of(cloud, plane)
+    scene = SceneAbovePlane.of(cloud, plane)
     if spec.masks:
         wanted, unknown = _masked(scene, spec)
     else:
@@ -91,11 +91,11 @@ def segment(
         raise
 
 
-def _masked(scene: AbovePlane, spec: ObjectSpec) -> tuple[np.ndarray, np.ndarray]:
+def _masked(scene: SceneAbovePlane, spec: ObjectSpec) -> tuple[np.ndarray, np.ndarray]:
     """(n,) bool: Gaussians that masks and clicks mean, and (n,) bool: those that nobody knows of."""
     votes = votes_of_masks(scene.cloud, spec.masks)
     wanted, unknown = labels_of_votes(votes)
-    standing = scene.solid & (scene.heights > 0.0)
+    standing = scene.is_opaque & (scene.heights > 0.0)
     if not (wanted & standing).any():
         return wanted, unknown
     size = _diagonal(scene.means[wanted & standing])
@@ -108,7 +108,7 @@ def _masked(scene: AbovePlane, spec: ObjectSpec) -> tuple[np.ndarray, np.ndarray
 
 
 def _of_size(
-    scene: AbovePlane, wanted: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, size: float, hover: float
+    scene: SceneAbovePlane, wanted: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, size: float, hover: float
 ) -> Segmentation:
     """The object, if it is roughly of ``size`` (scene units)."""
     foot, floor = _FOOT * size, 0.0
@@ -119,23 +119,23 @@ def _of_size(
         size = _diagonal(scene.means[chosen])
         if size == 0.0:
             raise UserError(_NOTHING_ABOVE, check=("plane",))
-        floor = floor_top(scene, chosen, size)
+        floor = floor_scatter_height(scene, chosen, size)
         foot = max(_FOOT * size, 1.2 * floor)
-    outline = scene.under(chosen, max(3.0 * foot, FOOTPRINT_HEIGHT * size), size)
+    outline = scene.is_under(chosen, max(3.0 * foot, FOOTPRINT_HEIGHT * size), size)
     near = close_to(scene.means, scene.means[chosen], 2.0 * size / CELLS)
     above = scene.heights > foot
     # Where masks decide, they decide on the foot as well; else it is what stands under the object, off the floor.
     claimed = wanted & near & bool(spec.masks)
-    standing = (scene.heights > floor) & scene.under(chosen, 3.0 * foot, size)
+    standing = (scene.heights > floor) & scene.is_under(chosen, 3.0 * foot, size)
     at_foot = ~above & (scene.heights > 0.0) & (claimed if spec.masks else standing)
-    faint = ~scene.solid & above & (wanted | unknown) & near
+    faint = ~scene.is_opaque & above & (wanted | unknown) & near
     object_mask = (chosen | at_foot | faint) & ~cut_off
     for click in spec.clicks:
         object_mask[click.hits] = click.inside & (scene.heights[click.hits] > 0.0) & ~cut_off[click.hits]
     veils = _veils(scene, np.flatnonzero(object_mask), size)
     object_mask[veils] = False
     ghosts = np.zeros_like(object_mask)
-    ghosts[veils] = _of_its_own(scene, veils, object_mask & scene.solid, size)
+    ghosts[veils] = _of_its_own(scene, veils, object_mask & scene.is_opaque, size)
     lowest = float(np.quantile(scene.heights[object_mask], 0.002))
     if lowest > hover * size:
         raise UserError(
@@ -145,9 +145,9 @@ def _of_size(
         )
     # What lies below the object's foot is hidden, so nobody can tell whose it is; inpainting makes new floor there.
     buried = ~object_mask & ~above & (scene.heights > -0.25 * size) & (outline | claimed)
-    halo = (small | ~scene.solid) & above & close_to(scene.means, scene.means[chosen], _HALO * size)
+    halo = (small | ~scene.is_opaque) & above & close_to(scene.means, scene.means[chosen], _HALO * size)
     if not spec.masks:
-        shreds = wisps(scene, object_mask, size)
+        shreds = floor_remnants(scene, object_mask, size)
         for click in spec.clicks:
             shreds[click.hits] = False
         object_mask &= ~shreds
@@ -156,17 +156,17 @@ def _of_size(
     return Segmentation(object_mask, buried, floaters, size)
 
 
-def _veils(scene: AbovePlane, thing: np.ndarray, size: float) -> np.ndarray:
+def _veils(scene: SceneAbovePlane, thing: np.ndarray, size: float) -> np.ndarray:
     """(k,) int: the haze among the Gaussians ``thing`` (m,)."""
     across = scene.cloud.breadths(thing)
     wide = across > max(_VEIL * size, _USUAL * float(np.median(across)))
     return thing[wide & (scene.opacity[thing] < _FAINT)]
 
 
-def _of_its_own(scene: AbovePlane, veils: np.ndarray, thing: np.ndarray, size: float) -> np.ndarray:
+def _of_its_own(scene: SceneAbovePlane, veils: np.ndarray, thing: np.ndarray, size: float) -> np.ndarray:
     """(k,) bool: which of the ``veils`` (k,) lie within the ``thing`` (n,) bool, or near to it in its colours: left
     behind, they would be a ghost of it."""
-    own = scene.within(veils, thing, size)
+    own = scene.is_within(veils, thing, size)
     if len(veils) == 0 or not thing.any():
         return own
     solid = np.flatnonzero(thing)
@@ -178,14 +178,14 @@ def _of_its_own(scene: AbovePlane, veils: np.ndarray, thing: np.ndarray, size: f
 
 
 def _body(
-    scene: AbovePlane, wanted: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, foot: float, size: float
+    scene: SceneAbovePlane, wanted: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, foot: float, size: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(n,) bool: the connected parts that are meant, all of them higher than ``foot``; (n,) bool: all small others; and
     (n,) bool: what clicks took away.
     """
-    core = (wanted | unknown) & scene.solid & (scene.heights > foot)
+    core = (wanted | unknown) & scene.is_opaque & (scene.heights > foot)
     # A rumpled floor must not join the object: what lies flat near the plane connects nothing.
-    lying = core & scene.level & (scene.heights < 3.0 * foot) & (not spec.masks)
+    lying = core & scene.is_level & (scene.heights < 3.0 * foot) & (not spec.masks)
     indices = np.flatnonzero(core & ~lying)
     if len(indices) == 0:
         raise UserError(_NOTHING_ABOVE, check=("plane",))
@@ -216,11 +216,11 @@ def _body(
     chosen[indices[np.isin(parts, meant)]] = True
     small[indices[(mass[parts] < _SMALL * mass[best]) & ~chosen[indices]]] = True
     if spec.point is not None:
-        chosen[indices[np.isin(parts, hanging_parts(scene, indices, parts, meant, size))]] = True
+        chosen[indices[np.isin(parts, detached_parts(scene, indices, parts, meant, size))]] = True
         small &= ~chosen
     nodes = np.flatnonzero(chosen)
     low = FOOTPRINT_HEIGHT * min(size, _diagonal(scene.means[chosen]))
-    cut_off[nodes[cut_off_by(scene.cloud, nodes, spec.clicks, scene.heights[nodes], low)]] = True
+    cut_off[nodes[removed_by_clicks(scene.cloud, nodes, spec.clicks, scene.heights[nodes], low)]] = True
     chosen &= ~cut_off
     # Strays far out, joined by some huge one, would stretch what follows over the whole room.
     chosen &= _within(scene.means, chosen, size)
@@ -235,17 +235,17 @@ def _body(
     if len(shell) and heights.min() < _HANGING * size:
         shell = np.concatenate([shell, shell - 2.0 * (heights[:, None] - foot) * scene.plane.normal])
     chosen |= enclosed(scene.means, shell, 2.0 * size / CELLS) & (scene.heights > foot)
-    chosen |= lying & scene.under(chosen, 0.1 * size, size)
+    chosen |= lying & scene.is_under(chosen, 0.1 * size, size)
     # What was found by its place goes with what is next to it.
     cut_off |= nearer_to(scene.means, scene.means[cut_off], scene.means[chosen & ~cut_off])
     return chosen & ~cut_off, small, cut_off
 
 
-def _first_size(scene: AbovePlane, wanted: np.ndarray, spec: ObjectSpec) -> float:
+def _first_size(scene: SceneAbovePlane, wanted: np.ndarray, spec: ObjectSpec) -> float:
     """First guess of the object's size, scene units: half of the capture's where only a point is known."""
     if spec.box is not None:
         return float(np.linalg.norm(spec.box.high - spec.box.low))
-    standing = wanted & scene.solid & (scene.heights > 0.0)
+    standing = wanted & scene.is_opaque & (scene.heights > 0.0)
     if not standing.any():
         raise UserError(_NOTHING_ABOVE, check=("plane",))
     return _diagonal(scene.means[standing]) * (0.5 if spec.point is not None else 1.0)

@@ -53,7 +53,7 @@ def resting_plane(
     return _lowest(points - middle, up / np.linalg.norm(up), np.tan(np.radians(degrees))).moved(middle)
 
 
-def without_fringe(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> Segmentation:
+def remove_foot_remnants(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> Segmentation:
     """``found``, and with what is buried the shreds of the object's foot, of its shadow and its mirror image that lie
     about it below the ``plane`` or hardly above: no floor is there that they could be part of."""
     means = cloud.means.numpy()

@@ -16,9 +16,9 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.launching import available_threads
 from egs_warp.render.backward import backward
-from egs_warp.render.compositing import BegunImage
+from egs_warp.render.compositing import PendingImage
 from egs_warp.render.projection import project, view_from_camera
-from egs_warp.render.rasteriser import background_of, refusing_what_does_not_fit
+from egs_warp.render.rasteriser import background_of, translate_out_of_memory
 
 
 @dataclass(frozen=True)
@@ -107,10 +107,10 @@ def _votes_of_view(grey: GaussianCloud, masked: MaskedView) -> np.ndarray:
     view = view_from_camera(masked.camera)
     inside = masked.mask.astype(np.float32)
     colour = np.stack([inside, 1.0 - inside, np.zeros_like(inside)], axis=2)
-    with refusing_what_does_not_fit(grey, masked.camera):
+    with translate_out_of_memory(grey, masked.camera):
         projected = project(grey, view, antialiased=False, threads=threads)
         behind = background_of((0.0, 0.0, 0.0), masked.camera, grey.device)
-        begun = BegunImage(projected, view, background=behind, threads=threads).settled()
+        begun = PendingImage(projected, view, background=behind, threads=threads).result()
         gradients = backward(
             *(grey, view, projected, begun.lists, begun.image),
             colour_gradient=wp.array(colour, dtype=wp.vec3, device=grey.device),

@@ -18,7 +18,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.io.arrays import DAMAGES, read_npz
+from egs_warp.io.arrays import READ_ERRORS, read_npz
 from egs_warp.io.atomic import atomic_write
 from egs_warp.version import __version__
 
@@ -57,7 +57,7 @@ class Checkpoint:
             if sorted(state) != facts["arrays"]:
                 raise ValueError("other arrays than were written")
             state |= facts["state"]
-        except (*DAMAGES, RecursionError) as error:
+        except (*READ_ERRORS, RecursionError) as error:
             raise UserError(f"{self.path}: is damaged; begin the training again") from error
         if facts.get("digest") != digest:
             raise UserError(

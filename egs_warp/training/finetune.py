@@ -20,12 +20,12 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.render import render_gaussians
 from egs_warp.render.autograd import render_torch
 from egs_warp.training.checkpoint import Checkpoint, State, digest_of
+from egs_warp.training.exposure import ExposureModel
 from egs_warp.training.growth import Growth
-from egs_warp.training.likeness import ssim
-from egs_warp.training.misfits import Misfits
+from egs_warp.training.metrics import ssim
+from egs_warp.training.outlier_views import OutlierViews
 from egs_warp.training.photo_loss import PhotoLoss, Target
 from egs_warp.training.relocation import Population
-from egs_warp.training.tones import Tones
 
 MIN_LOG_SCALE = -10.0
 """Scales are kept at e^-10 or above, as in the paper."""
@@ -58,7 +58,7 @@ class TrainingView:
 
 
 @dataclass(frozen=True)
-class Rates:
+class LearningRates:
     """Step sizes of Adam by attribute; that of the means is times the scene's extent and decays to a hundredth."""
 
     means: float = 1.6e-4
@@ -74,7 +74,7 @@ class FinetuneOptions:
     """Everything that may be chosen about a training run."""
 
     iterations: int = 1000
-    rates: Rates = field(default_factory=Rates)
+    rates: LearningRates = field(default_factory=LearningRates)
     ssim_weight: float = 0.2
     """Loss = (1 - w) L1 + w (1 - SSIM)."""
     background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
@@ -84,9 +84,9 @@ class FinetuneOptions:
     """The cap that relocation grows to; None grows while the pictures gain by it."""
     sh_steps: int = 0
     """Steps after which the next degree of SH begins; 0 trains all from the start."""
-    tones: bool = False
+    fit_exposure: bool = False
     """Each view has an exposure and white balance of its own, found with the cloud."""
-    leave_out_misfits: bool = False
+    exclude_outliers: bool = False
     """Views that never fit the others are left out on the way."""
     antialiased: bool = False
     seed: int = 0
@@ -157,9 +157,9 @@ def finetune(
     population = Population(_tensors(cloud, device), vars(options.rates), extent=extent, generator=generator)
     frozen = None if trainable is None else torch.as_tensor(~np.asarray(trainable, bool), device=device)
     targets = [_target(view, device) for view in views]
-    tones = Tones(len(views), options.iterations, device) if options.tones else None
+    tones = ExposureModel(len(views), options.iterations, device) if options.fit_exposure else None
     photo_loss = PhotoLoss(options.ssim_weight, device, options.threads)
-    misfits = Misfits(len(views))
+    misfits = OutlierViews(len(views))
     growth = Growth(len(views), options.max_gaussians, device)
     losses = np.zeros(options.iterations)
     pending: list[tuple[int, int, torch.Tensor]] = []
@@ -198,13 +198,13 @@ def finetune(
         if tones is None:
             loss = _loss(target, image.colour, background, options.ssim_weight)
         else:
-            loss = photo_loss(image.colour, image.alpha, tones.of(number), target, background)
+            loss = photo_loss(image.colour, image.alpha, tones.tensor_for(number), target, background)
         pending.append((step, number, loss.detach()))
         if extra_loss is not None:
             loss = loss + extra_loss(tensors)
         loss.backward()
         if relocating:
-            population.pull()
+            population.add_regularization()
         if frozen is not None:
             for tensor in population.tensors.values():
                 if tensor.grad is not None:
@@ -223,15 +223,15 @@ def finetune(
                     raise UserError(
                         f"finetune: the loss is not finite at step {at}; lower the rates or check the views"
                     )
-                misfits.see(seen, value)
+                misfits.update(seen, value)
                 growth.see(value, len(tensors.means))
                 if progress is not None:
                     progress(at, value)
             pending.clear()
-            if options.leave_out_misfits:
-                misfits.judge(step / options.iterations)
+            if options.exclude_outliers:
+                misfits.find(step / options.iterations)
         if relocating:
-            population.evolve(step, options.iterations, growth)
+            population.relocate(step, options.iterations, growth)
         if kept is not None and not pending and kept.due():
             state = {"step": step + 1, "losses": losses[: step + 1], "order": order.bit_generator.state, "queue": queue}
             for name, part in lasting.items():
@@ -254,7 +254,7 @@ def _below(state: State, name: str) -> State:
     return {key.removeprefix(f"{name}/"): value for key, value in state.items() if key.startswith(f"{name}/")}
 
 
-def views_of_capture(
+def render_views(
     cloud: GaussianCloud,
     cameras: Sequence[Camera],
     *,

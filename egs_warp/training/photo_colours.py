@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import shrunk
+from egs_warp.geometry.camera import downscale
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import PosedImage
 from egs_warp.io.photos import read_photo
@@ -43,7 +43,7 @@ def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage])
         except UserError:
             # Whoever wants to know why asks ``train``.
             continue
-        small = shrunk(picture.camera, _PHOTO_SIDE)
+        small = downscale(picture.camera, _PHOTO_SIDE)
         size = (small.width, small.height)
         whole = np.rint(picture.colour * 255.0).astype(np.uint8)
         # Blocks of whole pixels, as the camera has them: stretched to all of the photo it would be off by a pixel.

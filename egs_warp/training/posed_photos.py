@@ -18,7 +18,7 @@ from egs_warp.training.finetune import TrainingView
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class ExcludedPhoto:
     """A photo that is not used."""
 
     name: str
@@ -32,7 +32,7 @@ class PosedPhotos:
 
     views: tuple[TrainingView, ...]
     """Photos that can be used, straightened and upright."""
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[ExcludedPhoto, ...]
     """Those that cannot."""
 
 
@@ -47,7 +47,7 @@ def read_views(posed: Path | str, *, max_side: int | None = None) -> PosedPhotos
         try:
             photo = read_photo(entry, max_side=max_side)
         except UserError as error:
-            left_out.append(LeftOut(entry.name, str(error)))
+            left_out.append(ExcludedPhoto(entry.name, str(error)))
             continue
         weight = None if photo.known is None else photo.known.astype(np.float32)
         views.append(TrainingView(photo.camera, photo.colour, photo.alpha, weight, entry.name))

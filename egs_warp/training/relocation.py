@@ -71,7 +71,7 @@ class Population:
         self._optimiser.zero_grad(set_to_none=True)
 
     @torch.no_grad()
-    def pull(self) -> None:
+    def add_regularization(self) -> None:
         """Add to the gradients a pull on opacities and scales: useless Gaussians fade, and can then be moved."""
         opacities, scales = self.tensors["opacity_logits"], self.tensors["log_scales"]
         assert opacities.grad is not None and scales.grad is not None
@@ -86,7 +86,7 @@ class Population:
             )
 
     @torch.no_grad()
-    def evolve(self, step: int, steps: int, growth: Growth) -> None:
+    def relocate(self, step: int, steps: int, growth: Growth) -> None:
         """Jitter the means; now and then move faint Gaussians onto opaque ones and grow.
 
         A cap that was asked for is reached by half time or before; else the number grows at the least pace, while

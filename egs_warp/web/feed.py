@@ -15,9 +15,9 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.motions.style import LEAST, MOST, PRESETS, Style
-from egs_warp.pipelines.creature import Creature, first_place
-from egs_warp.pipelines.drawn import DrawnCreature
-from egs_warp.pipelines.performance import FILMED_FROM
+from egs_warp.pipelines.creature import Creature, initial_stance
+from egs_warp.pipelines.render_data import RenderData
+from egs_warp.pipelines.simulated_run import FILMED_FROM
 from egs_warp.web.messages import LEAST_SAG, MOST_FRICTION, MOST_SAG, read_message
 from egs_warp.web.packets import Frame
 from egs_warp.web.recording import CURVES, creature_header, curve_facts
@@ -71,27 +71,27 @@ class LiveFeed:
     async def packets(self) -> AsyncGenerator[bytes | str]:
         """Frames and news as they come, until the session is left."""
         loop, some = asyncio.get_running_loop(), asyncio.Event()
-        self.session.watch(lambda: loop.call_soon_threadsafe(some.set))
+        self.session.subscribe(lambda: loop.call_soon_threadsafe(some.set))
         try:
             while True:
                 await some.wait()
                 some.clear()
-                for news in self.session.waiting():
+                for news in self.session.take_news():
                     yield news.packet() if isinstance(news, Frame) else json.dumps(news)
         finally:
-            self.session.unwatch()
+            self.session.unsubscribe()
 
     def receive(self, message: dict[str, object]) -> None:
         """Pass on what the page asks. Raises ``ValueError`` for what makes no sense."""
         body = self.session.creature.body
-        self.session.ask(read_message(message, height=body.height, node_count=len(body.node_mass)))
+        self.session.put_request(read_message(message, height=body.height, node_count=len(body.node_mass)))
 
 
 def live_camera(creature: Creature, *, size: int = 512) -> Camera:
     """Looks at the standing creature as a film does, with room around it to move in."""
     nodes, height = creature.start.positions, creature.body.height
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
-    direction = np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM) @ first_place(creature).ground.axes
+    direction = np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM) @ initial_stance(creature).ground.axes
     fov = 30.0
     distance = _ROOM * height / np.tan(np.radians(0.5 * fov))
     return Camera.look_at(
@@ -105,6 +105,6 @@ def live_camera(creature: Creature, *, size: int = 512) -> Camera:
     )
 
 
-def drawn_creature(creature: Creature, splats: GaussianCloud) -> DrawnCreature:
+def drawn_creature(creature: Creature, splats: GaussianCloud) -> RenderData:
     """``creature`` as the page draws it, of ``splats`` that were split at rest."""
-    return DrawnCreature.of(splats, live_camera(creature), creature.muscles, first_place(creature).feet())
+    return RenderData.of(splats, live_camera(creature), creature.muscles, initial_stance(creature).feet())

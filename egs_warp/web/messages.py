@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
 
 from egs_warp.motions.command import FASTEST, Drive
-from egs_warp.motions.push import LARGEST
+from egs_warp.motions.push import MAX_IMPULSE
 from egs_warp.motions.script import Script, motion
 from egs_warp.motions.style import LEAST, MOST, Style
 
@@ -28,14 +28,14 @@ _MOTIONS = re.compile(r"[A-Za-z0-9_=+\-., ]+")
 
 
 @dataclass(frozen=True)
-class Perform:
+class PlayScript:
     """Do these motions next, in place of what was to come."""
 
     script: Script
 
 
 @dataclass(frozen=True)
-class Go:
+class GoTo:
     """Go to a point of the ground, in place of what was to come."""
 
     point: tuple[float, float]
@@ -64,7 +64,7 @@ class Release:
 
 
 @dataclass(frozen=True)
-class Hit:
+class PushOnce:
     """Push the body in the next step."""
 
     impulse: tuple[float, float, float]
@@ -120,17 +120,17 @@ class Record:
 
 
 @dataclass(frozen=True)
-class TellScript:
+class RequestScript:
     """Say what it has done, as a script."""
 
 
 Message: TypeAlias = (
-    Perform
-    | Go
+    PlayScript
+    | GoTo
     | Steer
     | Pull
     | Release
-    | Hit
+    | PushOnce
     | Change
     | Restyle
     | Pause
@@ -138,7 +138,7 @@ Message: TypeAlias = (
     | Cancel
     | StandUp
     | Record
-    | TellScript
+    | RequestScript
 )
 
 
@@ -164,11 +164,11 @@ def _perform(message: Mapping[str, Any], reach: float, node_count: int) -> Messa
     script = motion(text)
     if any(request.file is not None for request in script.requests):
         raise ValueError("text: motions that need a file are for egs-warp animate")
-    return Perform(script)
+    return PlayScript(script)
 
 
 def _go(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
-    return Go((_number(message, "x", -reach, reach), _number(message, "y", -reach, reach)))
+    return GoTo((_number(message, "x", -reach, reach), _number(message, "y", -reach, reach)))
 
 
 def _steer(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
@@ -185,10 +185,10 @@ def _pull(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
 
 
 def _hit(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
-    x, y, z = (_number(message, name, -LARGEST, LARGEST) for name in "xyz")
-    if math.hypot(x, y, z) > LARGEST:
-        raise ValueError(f"push: give at most {LARGEST:g} m sqrt(g H)")
-    return Hit((x, y, z), _number(message, "height", 0.0, 1.0) if "height" in message else None)
+    x, y, z = (_number(message, name, -MAX_IMPULSE, MAX_IMPULSE) for name in "xyz")
+    if math.hypot(x, y, z) > MAX_IMPULSE:
+        raise ValueError(f"push: give at most {MAX_IMPULSE:g} m sqrt(g H)")
+    return PushOnce((x, y, z), _number(message, "height", 0.0, 1.0) if "height" in message else None)
 
 
 def _change(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
@@ -234,5 +234,5 @@ _READERS: dict[str, tuple[tuple[str, ...], _Reader]] = {
     "cancel": ((), lambda *_: Cancel()),
     "stand": ((), lambda *_: StandUp()),
     "record": (("on",), lambda message, *_: Record(_on(message))),
-    "script": ((), lambda *_: TellScript()),
+    "script": ((), lambda *_: RequestScript()),
 }

@@ -13,8 +13,8 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.pipelines.finished_run import FinishedRun
+from egs_warp.pipelines.render_data import RenderData
 from egs_warp.web.packets import Frame, header, with_length
 
 CURVES = (
@@ -76,7 +76,7 @@ def curve_facts(curves: Sequence[tuple[str, str, str]]) -> list[dict[str, str]]:
 
 def creature_header(
     facts: Mapping[str, Any],
-    made: DrawnCreature,
+    made: RenderData,
     mesh: TetMesh,
     node_mass: np.ndarray,
     planes: np.ndarray,
@@ -135,7 +135,7 @@ def _arms(deformer: Deformer) -> np.ndarray:
     """
     plan = deformer.plan
     rows = plan.mean_tets.numpy() < 0
-    parts = (plan.end_tets.numpy(), plan.shares.numpy(), plan.bulges.numpy())
+    parts = (plan.end_tets.numpy(), plan.inside_fractions.numpy(), plan.smoothing_lengths.numpy())
     return np.concatenate([part[:, rows].T for part in parts], axis=1).astype(np.float32)
 
 

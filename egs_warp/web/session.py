@@ -20,32 +20,32 @@ from egs_warp.fem.body import DEFAULT_SAG, BodyState
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.motions.script import MOST_MOTIONS
-from egs_warp.pipelines.creature import Creature, changed_creature, first_place
-from egs_warp.pipelines.drawn import DrawnCreature
+from egs_warp.pipelines.creature import Creature, changed_creature, initial_stance
+from egs_warp.pipelines.render_data import RenderData
+from egs_warp.web.frame_encoding import encode_frame
+from egs_warp.web.idle import StillnessDetector, tilt_degrees
+from egs_warp.web.mailbox import Mailbox, News
 from egs_warp.web.messages import (
     Cancel,
     Change,
-    Go,
-    Hit,
+    GoTo,
     Message,
     Pause,
-    Perform,
+    PlayScript,
     Pull,
+    PushOnce,
     Record,
     Release,
+    RequestScript,
     Restyle,
     StandUp,
     Steer,
     Step,
-    TellScript,
 )
-from egs_warp.web.moments import frame_of
 from egs_warp.web.packets import Frame
-from egs_warp.web.post import News, Post
-from egs_warp.web.standing import Stillness, tilt_degrees
-from egs_warp.web.steering import FALLEN, Steering
-from egs_warp.web.takes import LONGEST_TAKE, Take, script_text
-from egs_warp.web.touches import Touches
+from egs_warp.web.recordings import LONGEST_TAKE, SessionRecording, script_text
+from egs_warp.web.steering import FALLEN, MotionScheduler
+from egs_warp.web.user_forces import UserForces
 
 
 @dataclass(frozen=True)
@@ -64,22 +64,22 @@ class SessionOptions:
 class Session:
     """One creature, its thread, and what is to be sent of it."""
 
-    def __init__(self, creature: Creature, drawn_as: DrawnCreature, options: SessionOptions | None = None) -> None:
+    def __init__(self, creature: Creature, drawn_as: RenderData, options: SessionOptions | None = None) -> None:
         self.options = options or SessionOptions()
         self.creature, self.drawn_as = creature, drawn_as
         self.sag, self.friction = self.options.sag, creature.geometry.friction
         self.state, self.report = creature.start, None
         self._memory = creature.stepper.initial_memory()
         self._dt, _ = solver_steps(creature.body)
-        self._place = first_place(creature)
-        self._post = Post()
-        self.steering = Steering(self._place, self._post.tell)
-        self._touches = Touches()
-        self._take: Take | None = None
+        self._place = initial_stance(creature)
+        self._post = Mailbox()
+        self.steering = MotionScheduler(self._place, self._post.send_line)
+        self._touches = UserForces()
+        self._take: SessionRecording | None = None
         self._paused, self._single_steps = False, 0
-        self._stillness = Stillness()
+        self._stillness = StillnessDetector()
         self._index = 0
-        self._thread = threading.Thread(target=self._live, name="session", daemon=True)
+        self._thread = threading.Thread(target=self._run_loop, name="session", daemon=True)
         self._due = time.perf_counter()
 
     # Of any thread.
@@ -94,31 +94,31 @@ class Session:
         if self._thread.is_alive():
             self._thread.join()
 
-    def ask(self, message: Message) -> None:
+    def put_request(self, message: Message) -> None:
         """Leave a message; it is obeyed before the next step."""
-        self._post.ask(message)
+        self._post.put_request(message)
 
-    def watch(self, wake: Callable[[], object]) -> None:
+    def subscribe(self, wake: Callable[[], object]) -> None:
         """Live on; ``wake`` is called, from the session's thread, when ``waiting`` has something: first how it is."""
-        self._post.watch(wake, self._frame)
+        self._post.subscribe(wake, self._frame)
 
-    def unwatch(self) -> None:
+    def unsubscribe(self) -> None:
         """Nobody watches: hold still, and let go of what is pulled."""
-        self._post.unwatch()
+        self._post.unsubscribe()
 
-    def waiting(self) -> list[News]:
+    def take_news(self) -> list[News]:
         """Frames and news since the last call."""
-        return self._post.waiting()
+        return self._post.take_news()
 
     # Of the session's own thread.
 
-    def _live(self) -> None:
-        while self._post.await_turn(lambda: self._held, self._begin_time):
-            self.obey()
+    def _run_loop(self) -> None:
+        while self._post.wait_for_work(lambda: self._held, self._begin_time):
+            self.process_requests()
             if not self._held:
                 self.advance()
                 self._keep_time()
-            self._post.tell_state(self.standing())
+            self._post.tell_state(self.state_message())
         if self._take is not None:
             self._end_take()
 
@@ -131,9 +131,9 @@ class Session:
     @property
     def resting(self) -> bool:
         """Whether it stands still with nothing to do; the next thing asked for goes on from there."""
-        if not self.steering.idle or self._take is not None or self._touches.waiting:
+        if not self.steering.idle or self._take is not None or self._touches.has_input:
             return False
-        return self._stillness.lasts(self.state)
+        return self._stillness.is_still(self.state)
 
     def _begin_time(self) -> None:
         """What was waited for is not caught up."""
@@ -141,7 +141,7 @@ class Session:
 
     def _keep_time(self) -> None:
         self._due = max(self._due + self._dt, time.perf_counter() - 2.0 * self._dt)
-        self._post.await_time(lambda: self._due - time.perf_counter())
+        self._post.wait_until(lambda: self._due - time.perf_counter())
 
     def advance(self) -> None:
         """One step of the solver."""
@@ -151,42 +151,42 @@ class Session:
             with one_blas_thread():
                 objectives = self.steering.objectives(before, self.report, self._dt)
             kick = self._touches.kick(self._place, before, self._dt)
-            stepper, start = self.creature.stepper, before.kicked(kick)
+            stepper, start = self.creature.stepper, before.with_velocity_kick(kick)
             self.state, self._memory, reports = stepper.advance(start, self._memory, objectives, self._dt)
             if not np.isfinite(self.state.positions).all():
                 raise FloatingPointError("positions are not finite")
         # A step that goes wrong must not end a session.
         except Exception as error:
             print(f"egs-warp: live: {type(error).__name__}: {error}", file=sys.stderr)
-            self._post.tell("the solver found no way on; the creature stands where it began")
+            self._post.send_line("the solver found no way on; the creature stands where it began")
             self.state = before
             self._stand_up()
             return
         self.report = reports[-1]
-        self._stillness.see(self.creature.body, self.state)
+        self._stillness.update(self.creature.body, self.state)
         if self._take is not None:
             self._take.add(reports, kick=kick)
             if self._take.seconds >= LONGEST_TAKE:
-                self._post.tell(f"a take has at most {LONGEST_TAKE:g} s")
+                self._post.send_line(f"a take has at most {LONGEST_TAKE:g} s")
                 self._end_take()
         self._index += 1
         self._post.send(self._frame())
 
-    def obey(self) -> None:
+    def process_requests(self) -> None:
         """Do what the messages ask that came since."""
-        for message in self._post.asked():
+        for message in self._post.take_requests():
             try:
                 self._do(message)
             # What goes wrong with one message must not end a session.
             except Exception as error:
                 print(f"egs-warp: live: {type(error).__name__}: {error}", file=sys.stderr)
-                self._post.tell(f"that did not work: {str(error)[:200]}")
+                self._post.send_line(f"that did not work: {str(error)[:200]}")
 
     def _do(self, message: Message) -> None:
         match message:
-            case Perform(script):
+            case PlayScript(script):
                 self.steering.perform(script)
-            case Go(point):
+            case GoTo(point):
                 self.steering.go(np.array(point))
             case Steer(command):
                 self.steering.drive(command)
@@ -196,8 +196,8 @@ class Session:
                 self._touches.pull(self.creature.body, message)
             case Release():
                 self._touches.release()
-            case Hit():
-                self._touches.hit(message)
+            case PushOnce():
+                self._touches.push(message)
             case Change():
                 self._change(message)
             case Restyle(style):
@@ -211,14 +211,14 @@ class Session:
                 self._stand_up()
             case Record(on):
                 self._record(on)
-            case TellScript():
+            case RequestScript():
                 requests = self.steering.requests[-MOST_MOTIONS:]
                 self._post.send({"type": "script", "text": script_text(requests), "motions": len(requests)})
 
     def _stand_up(self) -> None:
         self._end_take()
-        self._touches.drop()
-        self._stillness.forget()
+        self._touches.clear()
+        self._stillness.reset()
         stood = self.creature.start.positions.copy()
         self.state = BodyState(stood, np.zeros_like(stood), self.state.time)
         self.report, self._memory = None, self.creature.stepper.initial_memory()
@@ -233,25 +233,25 @@ class Session:
         if (friction, sag) == (self.friction, self.sag):
             return
         self._end_take()
-        with self._post.busy():
+        with self._post.send_busy():
             try:
                 muscles = self.options.muscles_file
                 made = changed_creature(self.creature, friction=friction, sag=sag, muscles_file=muscles)
-                place = first_place(made)
+                place = initial_stance(made)
                 if sag != self.sag and tilt_degrees(self._place, made.start.positions) > FALLEN:
                     raise UserError(f"sag {sag:g}: so soft a body does not stand; choose a smaller one")
             except (UserError, FloatingPointError, np.linalg.LinAlgError) as error:
-                self._post.tell(str(error))
+                self._post.send_line(str(error))
                 return
             self.creature, self.friction, self.sag, self._place = made, friction, sag, place
-            self._stillness.forget()
+            self._stillness.reset()
             # Contacts and activations of the old body are as good a guess as any for the new one.
             self.steering.place = place
             self._begin_time()
 
     def _record(self, on: bool) -> None:
         if on and self._take is None:
-            self._take = Take(self.creature, self.state)
+            self._take = SessionRecording(self.creature, self.state)
         elif not on:
             self._end_take()
 
@@ -260,9 +260,9 @@ class Session:
         if take is None:
             return
         if not take.reports:
-            self._post.tell("nothing has moved since the take began; there is nothing to write")
+            self._post.send_line("nothing has moved since the take began; there is nothing to write")
             return
-        with self._post.busy():
+        with self._post.send_busy():
             try:
                 path = take.write(
                     *(self.options.takes, self.drawn_as, self.steering.begun, self.steering.requests),
@@ -270,16 +270,16 @@ class Session:
                     asked={"live": True, "friction": self.friction, "sag": self.sag},
                     driven=[time for time in self.steering.driven if time >= take.start.time],
                 )
-                self._post.tell(f"wrote {path} ({take.seconds:.1f} s); egs-warp view {path}")
+                self._post.send_line(f"wrote {path} ({take.seconds:.1f} s); egs-warp view {path}")
             except (UserError, OSError) as error:
-                self._post.tell(f"the take could not be written: {error}")
+                self._post.send_line(f"the take could not be written: {error}")
 
     # What is sent.
 
     def _frame(self) -> Frame:
-        return frame_of(self._index, self.state, self.report, self.creature)
+        return encode_frame(self._index, self.state, self.report, self.creature)
 
-    def standing(self) -> Mapping[str, Any]:
+    def state_message(self) -> Mapping[str, Any]:
         """How things stand, beside the frames."""
         steering, goal = self.steering, self.steering.goal
         return {
@@ -292,7 +292,7 @@ class Session:
             "paused": self._paused,
             "resting": self.resting,
             "recording": self._take is not None,
-            "pulled": self._touches.pulled,
+            "pulled": self._touches.is_pulling,
             "friction": self.friction,
             "sag": self.sag,
             "style": vars(steering.style),

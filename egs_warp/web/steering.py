@@ -18,19 +18,19 @@ from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.motions.carriage import carried_on
 from egs_warp.motions.command import Drive
-from egs_warp.motions.drive import Driven
-from egs_warp.motions.feet import Base
+from egs_warp.motions.drive import LiveDrive
+from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.get_up import GetUp
-from egs_warp.motions.repertoire import REPERTOIRE, parts_of
+from egs_warp.motions.repertoire import MOTIONS, parts_of
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script, motion
-from egs_warp.motions.sequence import Done, Part, Place
+from egs_warp.motions.sequence import MotionRecord, MotionTask, Stance
 from egs_warp.motions.stance import sole_shares
 from egs_warp.motions.stand import Stand
 from egs_warp.motions.style import Style
-from egs_warp.web.standing import Lie, tilt_degrees
+from egs_warp.motions.walk_posture import select_posture
+from egs_warp.web.idle import RelaxMuscles, tilt_degrees
 
 ARRIVED = 0.12
 """Body heights from the middle of the feet to the point that it was sent to."""
@@ -54,11 +54,11 @@ _DOWN = 1.0
 class Task:
     """A motion to come, and how a script asks for it."""
 
-    part: Part
+    part: MotionTask
     request: MotionRequest
 
 
-class Posture(Enum):
+class BodyStatus(Enum):
     """What a body is about."""
 
     STANDING = "standing"
@@ -70,7 +70,7 @@ class _Steered(Protocol):
     """A motion, as far as it is steered."""
 
     @property
-    def resting(self) -> bool: ...
+    def is_at_rest(self) -> bool: ...
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]: ...
 
@@ -78,13 +78,13 @@ class _Steered(Protocol):
 
 
 @dataclass(frozen=True)
-class _Act:
+class _ActiveMotion:
     """What it does now."""
 
     name: str
     """As the user reads it."""
     motion: _Steered
-    posture: Posture
+    posture: BodyStatus
 
 
 def tasks_of(script: Script, height: float) -> list[Task]:
@@ -96,7 +96,7 @@ def tasks_of(script: Script, height: float) -> list[Task]:
     return tasks
 
 
-class Journey:
+class PointNavigation:
     """The way to a point: walk there, or turn towards it and jump; each leg is planned from where the last one
     ended."""
 
@@ -106,7 +106,7 @@ class Journey:
         self._walks = walks
         self._nearest, self._fruitless = np.inf, 0
 
-    def leg(self, place: Place) -> Task | None:
+    def next_part(self, place: Stance) -> Task | None:
         """What brings the body that stands at ``place`` nearer; None where it has arrived.
 
         Raises ``UserError`` where several legs did not.
@@ -140,17 +140,17 @@ class Journey:
         return tasks_of(motion(text), height)[0]
 
 
-class Steering:
+class MotionScheduler:
     """Holds the motion of a body and chooses the next; itself a motion."""
 
-    def __init__(self, place: Place, tell: Callable[[str], object]) -> None:
+    def __init__(self, place: Stance, tell: Callable[[str], object]) -> None:
         """``place``: where the body stands at first; ``tell`` is given each line for the user."""
-        self.begun: list[Done] = []
+        self.begun: list[MotionRecord] = []
         self.requests: list[MotionRequest] = []
         """Of ``begun``."""
         self._tell = tell
         self._tasks: deque[Task] = deque()
-        self._journey: Journey | None = None
+        self._journey: PointNavigation | None = None
         self._drive = Drive()
         """How it is to go."""
         self.driven: list[float] = []
@@ -160,12 +160,12 @@ class Steering:
         self.stand(place)
         self.walks = _walks(place)
 
-    def stand(self, place: Place) -> None:
+    def stand(self, place: Stance) -> None:
         """Stand at ``place``, and drop all else."""
         self.cancel()
         self.place = place
-        self._is_ball = place.base() is Base.ROUND
-        self._act: _Act = _Act("stand", Stand(place), Posture.STANDING)
+        self._is_ball = place.base() is SupportKind.ROUND_BASE
+        self._act: _ActiveMotion = _ActiveMotion("stand", Stand(place), BodyStatus.STANDING)
         self._tilted_since: float | None = None
 
     def perform(self, script: Script) -> None:
@@ -176,7 +176,7 @@ class Steering:
     def go(self, goal: np.ndarray) -> None:
         """Go to ``goal`` (2,) next, metres."""
         self.cancel()
-        self._journey = Journey(goal, walks=self.walks)
+        self._journey = PointNavigation(goal, walks=self.walks)
 
     def drive(self, command: Drive) -> None:
         """Go so from now on, once what it does is done; until another command, or anything else that is asked."""
@@ -201,12 +201,12 @@ class Steering:
             return self._tasks[0].part.name
         if self._journey:
             return "go"
-        return None if self._drive.stands or isinstance(self._act.motion, Driven) else "drive"
+        return None if self._drive.is_zero or isinstance(self._act.motion, LiveDrive) else "drive"
 
     @property
     def idle(self) -> bool:
         """Whether it stands or lies, and nothing is to come."""
-        return self._act.posture is not Posture.MOVING and self._act.motion.resting and self.queued is None
+        return self._act.posture is not BodyStatus.MOVING and self._act.motion.is_at_rest and self.queued is None
 
     @property
     def goal(self) -> np.ndarray | None:
@@ -215,7 +215,7 @@ class Steering:
 
     def facing(self, positions: np.ndarray) -> np.ndarray:
         """(2,) unit vector of its way forward, with its nodes at ``positions`` (N, 3)."""
-        place = self.place if self._is_ball else self.place.now(positions)
+        place = self.place if self._is_ball else self.place.moved_to(positions)
         forward = place.ground.axes[0, :2]
         return forward / max(float(np.linalg.norm(forward)), 1e-12)
 
@@ -223,58 +223,58 @@ class Steering:
         """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
         if self._has_fallen(state):
             self._lie(state, report)
-        elif self._act.motion.resting and not (isinstance(self._act.motion, Driven) and not self._drive.stands):
+        elif self._act.motion.is_at_rest and not (isinstance(self._act.motion, LiveDrive) and not self._drive.is_zero):
             self._begin_next(state, report)
-        if isinstance(self._act.motion, Driven):
+        if isinstance(self._act.motion, LiveDrive):
             self._act.motion.command = self._drive
         return self._act.motion.objectives(state, report, dt)
 
     def _lie(self, state: BodyState, report: StepReport | None) -> None:
         """It lies, but for getting up where that is asked."""
-        if isinstance(self._act.motion, GetUp) and not self._act.motion.resting:
+        if isinstance(self._act.motion, GetUp) and not self._act.motion.is_at_rest:
             return
         if self._tasks and self._tasks[0].part.name == "get up":
             self._begin_next(state, report)
             return
-        if self._act.posture is not Posture.LYING:
-            self._act = _Act("fallen", Lie(), Posture.LYING)
+        if self._act.posture is not BodyStatus.LYING:
+            self._act = _ActiveMotion("fallen", RelaxMuscles(), BodyStatus.LYING)
             self._tell("it has fallen; tell it to get up, or Backspace stands it up again")
         self.cancel()
 
     def _begin_next(self, state: BodyState, report: StepReport | None) -> None:
-        place = replace(self.place.after(state.positions, report), style=self.style)
+        place = replace(self.place.next_stance(state.positions, report), style=self.style)
         if self._is_ball:
             self.place = place
         try:
-            task = self._tasks.popleft() if self._tasks else self._journey.leg(place) if self._journey else None
+            task = self._tasks.popleft() if self._tasks else self._journey.next_part(place) if self._journey else None
             begun = task.part.begin(place) if task is not None else None
         except UserError as error:
             self.cancel()
             self._tell(str(error))
             task = begun = None
-        if task is None and not self._drive.stands and self._begin_drive(place, state.time):
+        if task is None and not self._drive.is_zero and self._begin_drive(place, state.time):
             return
         if task is None or begun is None:
             self._journey = None
-            if self._act.posture is not Posture.STANDING:
+            if self._act.posture is not BodyStatus.STANDING:
                 self._say_notes()
-                self._act = _Act("stand", Stand(place), Posture.STANDING)
+                self._act = _ActiveMotion("stand", Stand(place), BodyStatus.STANDING)
             return
         self._say_notes()
-        self._act = _Act(task.part.name, begun, Posture.MOVING)
-        self.begun.append(Done(task.part.name, task.part.asked, begun, state.time))
-        styled = REPERTOIRE[task.request.name].jumps and self.style != Style()
+        self._act = _ActiveMotion(task.part.name, begun, BodyStatus.MOVING)
+        self.begun.append(MotionRecord(task.part.name, task.part.asked, begun, state.time))
+        styled = MOTIONS[task.request.name].jumps and self.style != Style()
         self.requests.append(replace(task.request, style=self.style) if styled else task.request)
 
-    def _begin_drive(self, place: Place, time: float) -> bool:
+    def _begin_drive(self, place: Stance, time: float) -> bool:
         try:
-            driven = Driven(place)
+            driven = LiveDrive(place)
         except UserError as error:
             self.cancel()
             self._tell(str(error))
             return False
         self._say_notes()
-        self._act = _Act("drive", driven, Posture.MOVING)
+        self._act = _ActiveMotion("drive", driven, BodyStatus.MOVING)
         self.driven.append(time)
         return True
 
@@ -294,5 +294,5 @@ class Steering:
         return state.time - self._tilted_since > longest
 
 
-def _walks(place: Place) -> bool:
-    return place.base() in (Base.LONG, Base.ROUND) or len(carried_on(place)[0]) > 0
+def _walks(place: Stance) -> bool:
+    return place.base() in (SupportKind.LYING, SupportKind.ROUND_BASE) or len(select_posture(place)[0]) > 0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from egs_warp.training.likeness import psnr
+from egs_warp.training.metrics import psnr
 from tests.support.scripts import BENCHMARKS, module_of
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from egs_warp.assets import pawn
-from egs_warp.locomotion.admm import Dense
+from egs_warp.locomotion.admm import DenseQp
 from tests.support.scripts import BENCHMARKS, module_of
 
 
@@ -43,11 +43,11 @@ def test_what_is_not_unique_is_compared_by_its_value(benchmark: ModuleType) -> N
     """min (x1 + x2 - 1)^2: every point of a line is an optimum; its rows tell points apart."""
     P, q = 2.0 * np.ones((2, 2)), np.full(2, -2.0)
     bounds = np.array([0.0]), np.array([np.inf])
-    one = benchmark.Recorded("", Dense(P, q, np.array([[1.0, 1.0]])), *bounds, None, False)
+    one = benchmark.Recorded("", DenseQp(P, q, np.array([[1.0, 1.0]])), *bounds, None, False)
     assert one.flat
     assert benchmark.missed(one, np.array([1.0, 0.0]), np.array([0.0, 1.0])) == 0.0
     assert benchmark.missed(one, np.array([1.0, 1.0]), np.array([0.0, 1.0])) == pytest.approx(1.0)
-    sharp = benchmark.Recorded("", Dense(np.eye(2), q, np.eye(2)), *bounds, None, False)
+    sharp = benchmark.Recorded("", DenseQp(np.eye(2), q, np.eye(2)), *bounds, None, False)
     assert not sharp.flat and benchmark.missed(sharp, np.array([1.0, 0.0]), np.array([1.0, 1e-3])) == 1e-3
 
 

@@ -7,7 +7,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from egs_warp.locomotion.contact_pieces import ContactPieces
+from egs_warp.locomotion.contact_modes import CoulombProgram
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import Strategy
 from tests.support.scripts import BENCHMARKS, module_of
@@ -19,9 +19,9 @@ def table2(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return module_of("table2")
 
 
-def assert_coulomb(pieces: ContactPieces, x: np.ndarray) -> None:
+def assert_coulomb(pieces: CoulombProgram, x: np.ndarray) -> None:
     """Eq. (9), with the exact cone."""
-    forces = x[pieces.activations :].reshape(-1, 3)
+    forces = x[pieces.activation_count :].reshape(-1, 3)
     speeds = (pieces.rows @ x + pieces.offset).reshape(-1, 3)
     pull, slip = np.linalg.norm(forces[:, 1:], axis=1), np.linalg.norm(speeds[:, 1:], axis=1)
     assert forces[:, 0].min() >= 0.0 and speeds[:, 0].min() > -1e-4
@@ -40,7 +40,7 @@ def test_every_strategy_finds_a_point_of_every_random_program(table2: ModuleType
     for strategy in Strategy:
         qps, objective, true, _ = figures[strategy].T
         assert qps.min() >= 1 and np.isfinite(objective).all() and np.isfinite(true).all(), strategy
-        if strategy is Strategy.PIECES:
+        if strategy is Strategy.MODES:
             at_rest = [
                 frame.pieces.objective(np.append(f.activations, f.forces)) for frame in frames for f in [frame.foreseen]
             ]
@@ -78,5 +78,5 @@ def test_every_strategy_solves_frames_of_an_animation(table2: ModuleType) -> Non
         ]
     )
     # Those that see every contact state, or the cone, do as well as the activations that made the frames.
-    for strategy in (Strategy.PIECES, Strategy.EXACT):
+    for strategy in (Strategy.MODES, Strategy.EXACT):
         assert (figures[strategy][:, 2] <= made + 1e-6).all(), strategy

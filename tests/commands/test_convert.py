@@ -11,7 +11,7 @@ import pytest
 from egs_warp.cli import main
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io import read_capture, write_ply, write_spz
-from egs_warp.io.losses import losses
+from egs_warp.io.conversion_loss import conversion_loss
 from egs_warp.io.sequence import numbered_captures
 from egs_warp.io.writing import WRITERS
 from tests.support.captures import assert_same_bits, make_cloud
@@ -47,7 +47,7 @@ def test_what_is_said_is_what_was_done(tmp_path: Path) -> None:
     ).subset(rng.permutation(500)[:498])
     write_ply(tmp_path / "a.ply", cloud)
     write_ply(tmp_path / "b.ply", changed)
-    gone, said = losses(read_capture(tmp_path / "a.ply"), read_capture(tmp_path / "b.ply"))
+    gone, said = conversion_loss(read_capture(tmp_path / "a.ply"), read_capture(tmp_path / "b.ply"))
     assert gone == "2 of 500 Gaussians are gone"
     assert "positions 0.003 (at most 0.003) units" in said and "deviations by 2 (at most 2) %" in said
     assert "opacities 0 (at most 0) of 255" in said and "higher bands 0 (at most 0)" in said

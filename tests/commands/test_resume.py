@@ -22,7 +22,7 @@ from egs_warp.errors import UserError
 from egs_warp.io import write_ply
 from egs_warp.io.run_folder import MANIFEST, has_finished
 from tests.support.coarse import coarse_main
-from tests.support.faults import assert_one_line, fail_once
+from tests.support.disk_faults import assert_one_line, fail_once
 
 PATIENCE = 900.0
 """Seconds that a run may take on a busy machine."""

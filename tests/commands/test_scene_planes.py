@@ -8,7 +8,7 @@ import pytest
 from egs_warp.assets import scene
 from egs_warp.commands.scene_input import SceneInput
 from egs_warp.commands.scene_planes import planes_of_scene
-from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture
 from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.scenes import FLOOR
@@ -17,7 +17,7 @@ from tests.support.scenes import FLOOR
 def test_further_planes_are_level_patches_in_colours_of_their_own() -> None:
     """Beside a bedroom's floor only the stool's board and cushion are level; slices of walls and legs are no planes."""
     made = scene("stool")
-    cloud = joined(made.background, made.object)
+    cloud = concatenate(made.background, made.object)
     given = SceneInput(cloud, [], ObjectSpec(point=np.array([0.0, 0.0, 0.68])), None, made.plane, ())
     found = planes_of_scene(given, plane_mask=None, view=None, count=5)
     assert [-one.offset for one in found.planes] == pytest.approx([0.0, 0.52, 0.68], abs=0.01)

@@ -17,10 +17,10 @@ from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
 from egs_warp.inpainting.inpainters import inpainter_by_name
 from egs_warp.io import read_capture, write_ply
 from egs_warp.io.cameras import write_cameras
-from egs_warp.io.planes import KnownPlane, read_planes, write_planes
+from egs_warp.io.planes import PlaneRecord, read_planes, write_planes
 from egs_warp.io.run_folder import MANIFEST
 from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
-from egs_warp.segmentation.clearance import Clearing
+from egs_warp.segmentation.clearance import StraddlingPolicy
 from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.scenes import FLOOR, write_scene
 
@@ -53,7 +53,7 @@ def test_plane_then_segment_take_each_others_files(
         red, green, _ = np.moveaxis(np.asarray(picture, float), -1, 0)
         assert (red - green > 90).mean() > 0.01, "no grid in the picture"
     (found,) = read_planes(tmp_path / "plane" / "plane.json")
-    other = KnownPlane(Plane.from_coefficients(0.0, 0.0, 1.0, -0.8), support=0.1, others={"remark": "a shelf"})
+    other = PlaneRecord(Plane.from_coefficients(0.0, 0.0, 1.0, -0.8), support=0.1, others={"remark": "a shelf"})
     (tmp_path / "parts").mkdir()
     path = tmp_path / "parts" / "plane.json"
     write_planes(path, [found, other])
@@ -151,11 +151,11 @@ def test_inpaint_fills_the_hole_that_animate_fills(folder: Path, tmp_path: Path)
     cloud, spec = read_capture(folder / "scene.ply").cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
     flags = ["--object", "0,-0.5,0.5", "--plane", "0,0,1,0", "--straddling", "split", "--out", str(tmp_path)]
     assert main(["segment", str(folder / "scene.ply"), *flags]) == 0
-    options = SceneOptions(clearing=Clearing.SPLIT, inpaint=False)
+    options = SceneOptions(clearing=StraddlingPolicy.SPLIT, inpaint=False)
     prepared = prepare_scene(cloud, spec, plane=FLOOR, options=options)
     assert prepared.hole is not None
     expected = inpaint(
-        prepared.bare, prepared.hole, inpainter=inpainter_by_name("ns"), options=InpaintOptions(steps=0)
+        prepared.background_with_hole, prepared.hole, inpainter=inpainter_by_name("ns"), options=InpaintOptions(steps=0)
     ).cloud.means.numpy()
     files = [str(tmp_path / "background.ply"), "--plane", str(tmp_path / "plane.json"), "--steps", "0"]
     filled = tmp_path / "filled.ply"

@@ -8,7 +8,7 @@ import torch
 
 from egs_warp.contact.batch_contacts import BatchContacts, BatchDetector
 from egs_warp.contact.detection import ContactDetector, ContactSet
-from egs_warp.contact.points import ContactPoints
+from egs_warp.contact.selection import ContactSelector
 from egs_warp.pipelines.creature import Creature
 from tests.support.creatures import coarse_pawn
 
@@ -22,12 +22,12 @@ def creature() -> Creature:
 
 
 @pytest.fixture(scope="module")
-def points(creature: Creature) -> ContactPoints:
-    return ContactPoints(creature.geometry, near=NEAR, lower=LOWER)
+def points(creature: Creature) -> ContactSelector:
+    return ContactSelector(creature.geometry, near=NEAR, lower=LOWER)
 
 
 @pytest.fixture(scope="module")
-def detector(creature: Creature, points: ContactPoints) -> BatchDetector:
+def detector(creature: Creature, points: ContactSelector) -> BatchDetector:
     return BatchDetector(creature.geometry, points, WORLDS, device=torch.device("cpu"))
 
 
@@ -50,7 +50,7 @@ def alone(creature: Creature, chosen: list[np.ndarray], positions: np.ndarray) -
 
 
 def test_points_are_chosen_step_by_step_as_for_one(
-    creature: Creature, points: ContactPoints, detector: BatchDetector, positions: np.ndarray
+    creature: Creature, points: ContactSelector, detector: BatchDetector, positions: np.ndarray
 ) -> None:
     """Three steps, in which points come, stay for their load and go, and joins of deeper ones."""
     random = np.random.default_rng(1)
@@ -65,18 +65,18 @@ def test_points_are_chosen_step_by_step_as_for_one(
         there = torch.arange(most) < torch.tensor([[len(each)] for each in before])
         for world, (its, load) in enumerate(zip(before, loads, strict=True)):
             previous[world, : len(its)], loaded[world, : len(its)] = torch.from_numpy(its), torch.from_numpy(load > 0.0)
-        contacts = detector.contacts(detector.choose(previous, there, loaded, gaps), gaps, faces)
+        contacts = detector.contacts(detector.select(previous, there, loaded, gaps), gaps, faces)
         for world, place in enumerate(places):
-            expected = points.choose(before[world], loads[world] > 0.0, one.gaps(place)[0])
+            expected = points.select(before[world], loads[world] > 0.0, one.gaps(place)[0])
             assert np.array_equal(taken(contacts, world), expected)
         # Noise, or all points of a cell would be as deep.
         noisy = gaps + 0.01 * torch.from_numpy(random.normal(size=gaps.shape))
-        deep = detector.deeper(contacts, noisy, 0.005)
+        deep = detector.find_deeper(contacts, noisy, 0.005)
         added = detector.contacts(deep, gaps, faces, order=noisy)
-        forces = torch.from_numpy(random.uniform(0.1, 1.0, (*contacts.points.shape, 3))) * contacts.there[:, :, None]
-        joined, wide = detector.joined(contacts, forces, added)
+        forces = torch.from_numpy(random.uniform(0.1, 1.0, (*contacts.points.shape, 3))) * contacts.valid[:, :, None]
+        joined, wide = detector.append_contacts(contacts, forces, added)
         for world in range(WORLDS):
-            new = points.deeper(taken(contacts, world), noisy[world].numpy(), 0.005)
+            new = points.find_deeper(taken(contacts, world), noisy[world].numpy(), 0.005)
             assert np.array_equal(taken(added, world), new)
             joins += len(new)
             assert np.array_equal(taken(joined, world), np.concatenate([taken(contacts, world), new]))
@@ -96,16 +96,23 @@ def test_frames_speeds_and_pushes_are_those_of_one(
     assert sets[3].count == 0 and min(one.count for one in sets[:3]) > 3
     random, nodes = np.random.default_rng(2), positions.shape[1]
     velocities = random.normal(size=(WORLDS, 3 * nodes, 2))
-    forces = random.normal(size=(WORLDS, contacts.most, 3))
-    rows, speeds = contacts.rows(nodes).numpy(), contacts.speeds(torch.from_numpy(velocities)).numpy()
-    pushes = contacts.pushes(torch.from_numpy(forces), nodes).numpy()
+    forces = random.normal(size=(WORLDS, contacts.capacity, 3))
+    rows, speeds = (
+        contacts.jacobian_transposed(nodes).numpy(),
+        contacts.contact_velocities(torch.from_numpy(velocities)).numpy(),
+    )
+    pushes = contacts.nodal_forces(torch.from_numpy(forces), nodes).numpy()
     ends = contacts.end_gaps(0.1, torch.from_numpy(velocities[:, :, 0].reshape(WORLDS, nodes, 3))).numpy()
     for world, one in enumerate(sets):
         count = one.count
-        assert np.array_equal(rows[world, :, : 3 * count], one.frame.T) and not rows[world, :, 3 * count :].any()
-        np.testing.assert_allclose(speeds[world, : 3 * count], one.frame @ velocities[world], rtol=0, atol=1e-13)
+        assert (
+            np.array_equal(rows[world, :, : 3 * count], one.dense_jacobian.T) and not rows[world, :, 3 * count :].any()
+        )
+        np.testing.assert_allclose(
+            speeds[world, : 3 * count], one.dense_jacobian @ velocities[world], rtol=0, atol=1e-13
+        )
         assert not speeds[world, 3 * count :].any()
-        expected = one.frame.T @ forces[world, :count].ravel()
+        expected = one.dense_jacobian.T @ forces[world, :count].ravel()
         np.testing.assert_allclose(pushes[world].ravel(), expected, rtol=0, atol=1e-12)
         lone = one.end_gaps(0.1, velocities[world, :, 0].reshape(nodes, 3))
         np.testing.assert_allclose(ends[world, :count], lone, rtol=0, atol=1e-13)
@@ -116,9 +123,9 @@ def test_forces_go_along_with_their_points(detector: BatchDetector, positions: n
     gaps, faces = detector.gaps(torch.from_numpy(positions))
     now = detector.contacts(gaps < 0.003, gaps, faces)
     then = detector.contacts(gaps < 0.004, gaps, faces)
-    forces = torch.from_numpy(np.random.default_rng(3).normal(size=(WORLDS, then.most, 3)))
-    matched = detector.matched(now, then.points, then.there, forces).numpy()
+    forces = torch.from_numpy(np.random.default_rng(3).normal(size=(WORLDS, then.capacity, 3)))
+    matched = detector.transfer_forces(now, then.points, then.valid, forces).numpy()
     for world in range(WORLDS):
         count, last = int(now.counts[world]), int(then.counts[world])
-        expected = ContactPoints.matched(taken(now, world), taken(then, world), forces[world, :last].numpy())
+        expected = ContactSelector.transfer_forces(taken(now, world), taken(then, world), forces[world, :last].numpy())
         assert np.array_equal(matched[world, :count], expected) and not matched[world, count:].any()

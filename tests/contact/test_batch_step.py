@@ -8,14 +8,14 @@ import torch
 
 from egs_warp.contact.batch_contacts import BatchContacts, BatchDetector
 from egs_warp.contact.batch_step import BatchResult, BatchSolver
-from egs_warp.contact.coupled_step import ContactResponse, CoupledResult, CoupledSolver
+from egs_warp.contact.coupled_step import ContactLinearization, CoupledResult, CoupledSolver
 from egs_warp.contact.detection import push_out_speeds
-from egs_warp.contact.points import ContactPoints
+from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.batch_problem import BatchBody, BatchProblem
 from egs_warp.fem.body import BodyState
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.pipelines.creature import Creature
 from tests.support.creatures import coarse_pawn
 
@@ -56,10 +56,12 @@ def solved_alone(
 ) -> CoupledResult:
     solver = creature.stepper.with_friction(friction).solver
     contacts = solver.detector.contact_set(chosen, problem.state.positions)
-    tangent = problem.tangent(SparseFactors(creature.body.assembly.upper_pattern), problem.start, None)
-    tension = MuscleTension.of(creature.muscles, activations)
+    tangent = problem.tangent(MultifrontalLdl(creature.body.assembly.upper_pattern), problem.rigid_guess, None)
+    tension = MuscleEnergy.of(creature.muscles, activations)
     forces = np.zeros((len(chosen), 3))
-    return solver.solve(ContactResponse.of(tangent, contacts), tension, velocities=problem.start, forces=forces)
+    return solver.solve(
+        ContactLinearization.of(tangent, contacts), tension, velocities=problem.rigid_guess, forces=forces
+    )
 
 
 def solved_together(
@@ -68,7 +70,7 @@ def solved_together(
     """The contacts that are given, those of the end, and the end: from the points that touch as the bodies fly on, or
     from a ``few``, a third of them."""
     one, device, count = creature.stepper.solver, torch.device("cpu"), len(states)
-    points = ContactPoints(creature.geometry, near=one.points.near, lower=one.points.lower)
+    points = ContactSelector(creature.geometry, near=one.points.activation_distance, lower=one.points.hysteresis)
     detector = BatchDetector(creature.geometry, points, count, device=device)
     beside = BatchSolver(
         detector,
@@ -83,16 +85,16 @@ def solved_together(
     problem = BatchProblem.at(common, torch.arange(count), positions, velocities, dt=dt, drag=DRAG)
     begun = detector.gaps(positions)
     ends, _ = detector.gaps(problem.end_positions(velocities + dt * common.gravity))
-    near = detector.deeper(detector.contacts(ends < -1e9, *begun), ends, 0.0)
+    near = detector.find_deeper(detector.contacts(ends < -1e9, *begun), ends, 0.0)
     if few:
         near &= torch.arange(near.shape[1]) % 3 == 0
     contacts = detector.contacts(near, *begun)
-    assert problem.factor(problem.start(), None).all()
+    assert problem.factor(problem.rigid_guess(), None).all()
     touched, made = beside.solve(
-        *(problem, contacts, beside.respond(problem, contacts)),
+        *(problem, contacts, beside.linearize(problem, contacts)),
         *(torch.from_numpy(creature.muscles.stiffness * activations), torch.tensor(FRICTIONS, dtype=torch.float64)),
-        velocities=problem.start(),
-        forces=torch.zeros((count, contacts.most, 3), dtype=torch.float64),
+        velocities=problem.rigid_guess(),
+        forces=torch.zeros((count, contacts.capacity, 3), dtype=torch.float64),
         start_gaps=begun,
     )
     assert torch.equal(contacts.counts, near.sum(dim=1).int())
@@ -115,11 +117,11 @@ def test_ends_are_those_of_each_alone(
         n = int(touched.counts[world])
         assert np.array_equal(touched.points[world, :n].numpy(), alone.contacts.points)
         assert (bool(made.converged[world]), int(made.iterations[world])) == (alone.converged, alone.iterations)
-        assert alone.converged and not made.lost[world]
+        assert alone.converged and not made.is_singular[world]
         np.testing.assert_allclose(made.velocities[world].numpy(), alone.velocities, atol=1e-9 * body.speed_unit)
         forces = made.forces[world, :n].numpy()
         # Redundant points share a load in more than one way.
-        nodal = [alone.contacts.pushes(each) for each in (forces, alone.forces)]
+        nodal = [alone.contacts.nodal_forces(each) for each in (forces, alone.forces)]
         np.testing.assert_allclose(*nodal, rtol=0, atol=1e-6 * body.weight)
         joined += n - len(chosen)
         if world < 4:
@@ -161,20 +163,20 @@ def test_a_world_that_no_tangent_helps_gives_up_at_once(creature: Creature) -> N
     activations = np.zeros((5, creature.muscles.segment_count))
     activations[[1, 3]] = np.nan
     _, _, made = solved_together(creature, states, activations, creature.body.time_unit / 20.0)
-    assert made.converged.tolist() == [True, False, True, False, True] and not made.lost.any()
+    assert made.converged.tolist() == [True, False, True, False, True] and not made.is_singular.any()
     assert made.iterations[[1, 3]].tolist() == [2, 2]
 
 
 def test_shifts_let_nothing_deeper_and_bring_out_what_is_too_deep(creature: Creature, states: list[BodyState]) -> None:
     """As for one, down to where the speed is capped; no shift where there is no contact."""
     one, dt = creature.stepper.solver, 0.01
-    points = ContactPoints(creature.geometry, near=one.points.near, lower=one.points.lower)
+    points = ContactSelector(creature.geometry, near=one.points.activation_distance, lower=one.points.hysteresis)
     detector = BatchDetector(creature.geometry, points, 2, device=torch.device("cpu"))
     beside = BatchSolver(detector, push_out_cap=0.05, penetration_tolerance=0.01, tolerance=1e-8)
     nodes = torch.from_numpy(np.stack([states[0].positions, states[0].positions - np.array([0.0, 0.0, 0.03])]))
     gaps, faces = detector.gaps(nodes)
     contacts = detector.contacts(gaps < 0.003, gaps, faces)
-    made = beside.shift(contacts, dt).numpy()
+    made = beside.normal_bias(contacts, dt).numpy()
     counts = contacts.counts.tolist()
     assert counts[0] < counts[1]
     for world, count in enumerate(counts):

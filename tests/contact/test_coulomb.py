@@ -11,12 +11,12 @@ import pytest
 import torch
 import warp as wp
 
-from egs_warp.contact import coulomb, response
-from egs_warp.contact.batch_contacts import coulomb_forces_of_many
-from egs_warp.contact.coulomb import contacts_of, coulomb_forces
+from egs_warp.contact import coulomb, newton
+from egs_warp.contact.batch_contacts import coulomb_forces_batch
+from egs_warp.contact.coulomb import coulomb_forces, pack_contacts
 from egs_warp.kernels.contact.coulomb import sweeps_kernel
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import coarse_pawn
 
 COUNT = 5
@@ -57,7 +57,7 @@ def test_sweeps_equal_their_twin(friction: float, sweeps: int) -> None:
     for seed in range(60):
         delassus, free, shift, start = problem(seed)
         forces = wp.array(start.ravel(), dtype=wp.float64, device="cpu")
-        given = contacts_of(delassus, free, shift, friction)
+        given = pack_contacts(delassus, free, shift, friction)
         wp.launch(sweeps_kernel, dim=1, inputs=[given, sweeps, forces], device="cpu")
         got = forces.numpy().reshape(-1, 3)
         expected = swept_twin(delassus, free, shift, friction, start, sweeps)
@@ -107,7 +107,7 @@ def test_problems_side_by_side_have_the_bits_of_each_alone() -> None:
         shifts[world, :count], starts[world, :count] = part[2:]
         alone.append(coulomb_forces(*part[:3], frictions[world], part[3]))
     together = (torch.from_numpy(each) for each in (delassus, free, shifts, frictions, starts))
-    forces, missed = coulomb_forces_of_many(torch.tensor(counts, dtype=torch.int32), *together)
+    forces, missed = coulomb_forces_batch(torch.tensor(counts, dtype=torch.int32), *together)
     for world, count in enumerate(counts):
         assert np.array_equal(forces[world, :count].numpy(), alone[world][0])
         assert float(missed[world]) == alone[world][1]
@@ -125,7 +125,7 @@ def test_problems_that_take_all_iterations_have_the_same_bits_side_by_side() -> 
         problems.append((half @ half.T + 1e-7 * np.eye(3 * count), free, shift, start))
     delassus, free, shifts, starts = (torch.from_numpy(np.stack(each)) for each in zip(*problems, strict=True))
     counts, frictions = torch.full((40,), count, dtype=torch.int32), torch.full((40,), friction, dtype=torch.float64)
-    forces, missed = coulomb_forces_of_many(counts, delassus, free, shifts, frictions, starts)
+    forces, missed = coulomb_forces_batch(counts, delassus, free, shifts, frictions, starts)
     alone = [coulomb_forces(matrix, u, shift, friction, start) for matrix, u, shift, start in problems]
     assert np.array_equal(forces.numpy(), np.stack([one for one, _ in alone]))
     assert missed.tolist() == [size for _, size in alone] and 5 < (missed > 1e-9).sum() < 35
@@ -145,8 +145,8 @@ def test_a_block_of_threads_finds_the_forces_of_one(friction: float) -> None:
     frictions = np.full(len(counts), friction)
     given = [torch.from_numpy(each) for each in (delassus, free, shifts, frictions, starts)]
     numbers = torch.tensor(counts, dtype=torch.int32)
-    one, _ = coulomb_forces_of_many(numbers, *given)
-    block, missed = coulomb_forces_of_many(numbers.cuda(), *(each.cuda() for each in given))
+    one, _ = coulomb_forces_batch(numbers, *given)
+    block, missed = coulomb_forces_batch(numbers.cuda(), *(each.cuda() for each in given))
     assert float(missed.max()) < 1e-9
     np.testing.assert_allclose(block.cpu().numpy(), one.numpy(), rtol=0, atol=1e-9 * float(one.abs().max()))
 
@@ -167,8 +167,8 @@ def test_a_block_of_threads_finds_the_forces_of_many_contacts_that_press(frictio
     frictions = np.full(len(counts), friction)
     given = [torch.from_numpy(each) for each in (delassus, free, shifts, frictions, starts)]
     numbers = torch.tensor(counts, dtype=torch.int32)
-    one, _ = coulomb_forces_of_many(numbers, *given)
-    block, missed = coulomb_forces_of_many(numbers.cuda(), *(each.cuda() for each in given))
+    one, _ = coulomb_forces_batch(numbers, *given)
+    block, missed = coulomb_forces_batch(numbers.cuda(), *(each.cuda() for each in given))
     assert float(missed.max()) < 1e-12
     for world, count in enumerate(counts):
         expected, got = one[world, :count].numpy(), block[world, :count].cpu().numpy()
@@ -216,17 +216,17 @@ def test_forces_of_more_points_than_nodes_are_found_where_contacts_give_way(monk
         problems.append(given)
         return coulomb_forces(*given)
 
-    monkeypatch.setattr(response, "coulomb_forces", recorded)
+    monkeypatch.setattr(newton, "coulomb_forces", recorded)
     stepper = creature.stepper
-    _, _, report = stepper.held_step(creature.start, stepper.initial_memory(), first.activations, first.dt)
+    _, _, report = stepper.step_with_activations(creature.start, stepper.initial_memory(), first.activations, first.dt)
     assert report.converged and len(problems) > 1
-    monkeypatch.setattr(coulomb, "SOFT", ())
+    monkeypatch.setattr(coulomb, "REGULARIZATION_STEPS", ())
     alone = [coulomb_forces(*given)[1] for given in problems]
     monkeypatch.undo()
     together = [coulomb_forces(*given) for given in problems]
     assert max(alone) > 1e-5 and max(missed for _, missed in together) < 1e-12
     delassus, free, shift, friction, start = (np.stack(each) for each in zip(*problems, strict=True))
-    many, missed = coulomb_forces_of_many(
+    many, missed = coulomb_forces_batch(
         torch.full((len(start),), start.shape[1], dtype=torch.int32),
         *(torch.from_numpy(each) for each in (delassus, free, shift, friction, start)),
     )

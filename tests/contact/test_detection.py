@@ -43,7 +43,7 @@ def test_hull_points_hold_the_lowest_of_all_points(device: str) -> None:
     cloud = surface_cloud(mesh, 3000, lowest=0.05)
     tilted = (FLOOR, Plane.from_coefficients(0.3, 0.1, 1.0, 0.4))
     geometry = contact_geometry(cloud, mesh, tilted, device=device)
-    assert geometry.left_out == 0
+    assert geometry.excluded_count == 0
     all_points = embed_points(mesh, seven_points(cloud).reshape(-1, 3), device="cpu")
     assert len(geometry.weights) < 0.25 * all_points.count
     detector = ContactDetector(geometry, device=device)
@@ -170,8 +170,8 @@ def test_gaussians_below_the_plane_are_left_out_and_counted() -> None:
         means, np.tile([1.0, 0, 0, 0], (3, 1)), np.full((3, 3), -6.0), logits, np.zeros((3, 1, 3)), device="cpu"
     )
     geometry = contact_geometry(cloud, mesh, (FLOOR,), device="cpu")
-    assert geometry.left_out == 1
-    assert geometry.left_out_opacity == pytest.approx(0.2 / (0.5 + 0.75 + 0.2))
+    assert geometry.excluded_count == 1
+    assert geometry.excluded_opacity == pytest.approx(0.2 / (0.5 + 0.75 + 0.2))
     points = np.einsum("pw,pwi->pi", geometry.weights, mesh.nodes[mesh.tets[geometry.tet_from_point]])
     assert len(points) == 14 and points[:, 2].min() > 0.05
 
@@ -187,17 +187,17 @@ def test_contact_frame_maps_nodes_to_points(device: str) -> None:
     chosen = np.array([3, 17, 5, 40])
     contacts = detector.contact_set(chosen, mesh.nodes)
     v = np.random.default_rng(3).standard_normal(mesh.nodes.shape)
-    local = (contacts.frame @ v.ravel()).reshape(-1, 3)
+    local = (contacts.dense_jacobian @ v.ravel()).reshape(-1, 3)
     for i, point in enumerate(chosen):
         velocity = geometry.weights[point] @ v[mesh.tets[geometry.tet_from_point[point]]]
         assert np.allclose(contacts.axes[i] @ contacts.axes[i].T, np.eye(3), atol=1e-14)
         assert np.allclose(local[i], contacts.axes[i] @ velocity, atol=1e-13)
     many = np.random.default_rng(4).standard_normal((v.size, 5))
-    assert np.allclose(contacts.speeds(many), contacts.frame @ many, atol=1e-13)
+    assert np.allclose(contacts.contact_velocities(many), contacts.dense_jacobian @ many, atol=1e-13)
     forces = many.ravel()[: 3 * contacts.count].reshape(-1, 3)
-    assert np.allclose(contacts.pushes(forces), contacts.frame.T @ forces.ravel(), atol=1e-13)
-    assert np.allclose(contacts.speeds(v.ravel()), local.ravel(), atol=1e-13)
-    assert detector.contact_set(chosen[:0], mesh.nodes).speeds(many).shape == (0, 5)
+    assert np.allclose(contacts.nodal_forces(forces), contacts.dense_jacobian.T @ forces.ravel(), atol=1e-13)
+    assert np.allclose(contacts.contact_velocities(v.ravel()), local.ravel(), atol=1e-13)
+    assert detector.contact_set(chosen[:0], mesh.nodes).contact_velocities(many).shape == (0, 5)
     moved, _ = detector.gaps(mesh.nodes + 0.01 * v)
     assert np.allclose(contacts.end_gaps(0.01, v), moved[chosen], atol=1e-13)
 

@@ -27,7 +27,7 @@ from egs_warp.pipelines.report import AUDIT_LIMITS
 from tests.support.clouds import surface_cloud
 from tests.support.creatures import coarse_creature
 from tests.support.meshes import block_mesh
-from tests.support.places import DT, FLOOR, FORWARD
+from tests.support.stances import DT, FLOOR, FORWARD
 from tests.support.waves import wavy_ground
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -39,14 +39,14 @@ def test_tops_of_a_step_a_ramp_a_wall_and_a_box() -> None:
     wall = Solid((Plane.from_coefficients(0.0, -1.0, 0.0, 1.0),))
     box = Solid((*stair.faces, Plane.from_coefficients(1.0, 0.0, 0.0, -2.0)))
     at = np.array([0.7, 0.3, 0.1])
-    assert stair.top(at, UP) == pytest.approx(0.1)
-    assert stair.top(at - [0.3, 0.0, 0.0], UP) == -np.inf
-    assert ramp.top(at, UP) == pytest.approx(0.7 * np.tan(np.radians(10.0)) - 0.1)
-    assert wall.top(at, UP) == -np.inf
-    assert box.top(at, UP) == pytest.approx(0.1) and box.top(at + [2.0, 0.0, 0.0], UP) == -np.inf
+    assert stair.distance_along(at, UP) == pytest.approx(0.1)
+    assert stair.distance_along(at - [0.3, 0.0, 0.0], UP) == -np.inf
+    assert ramp.distance_along(at, UP) == pytest.approx(0.7 * np.tan(np.radians(10.0)) - 0.1)
+    assert wall.distance_along(at, UP) == -np.inf
+    assert box.distance_along(at, UP) == pytest.approx(0.1) and box.distance_along(at + [2.0, 0.0, 0.0], UP) == -np.inf
     assert surface_above((Solid((FLOOR,)), stair, ramp, wall), at, UP) == pytest.approx(0.1)
     assert surface_above((), at, UP) == -np.inf
-    assert stair.scaled(2.0).top(2.0 * at, UP) == pytest.approx(0.2)
+    assert stair.scaled(2.0).distance_along(2.0 * at, UP) == pytest.approx(0.2)
 
 
 def test_the_top_of_what_hangs_over() -> None:
@@ -55,9 +55,9 @@ def test_the_top_of_what_hangs_over() -> None:
     """
     wedge = Solid((Plane.from_coefficients(0.0, 0.0, 1.0, -1.0), Plane.from_coefficients(2.0, 0.0, -1.0, 0.0)))
     for x, z in ((0.0, 0.0), (0.0, -3.0), (0.4, 0.1), (-2.0, -1.0)):
-        assert wedge.top(np.array([x, 0.0, z]), UP) == pytest.approx(1.0 - z)
+        assert wedge.distance_along(np.array([x, 0.0, z]), UP) == pytest.approx(1.0 - z)
     for x, z in ((0.6, 0.0), (1.0, 0.5), (4.0, -1.0)):
-        assert wedge.top(np.array([x, 0.0, z]), UP) == -np.inf
+        assert wedge.distance_along(np.array([x, 0.0, z]), UP) == -np.inf
 
 
 def test_a_terrain_file(tmp_path: Path) -> None:
@@ -144,7 +144,7 @@ def test_contact_velocities_are_the_gaps_change(device: str) -> None:
     mesh = block_mesh()
     field = wavy_ground()
     x = mesh.nodes.copy()
-    x[:, 2] += field.lift(x)
+    x[:, 2] += field.ground_height(x)
     soles = embed_points(mesh, mesh.nodes[mesh.nodes[:, 2] == 0.0], device="cpu")
     geometry = ContactGeometry(mesh, (FLOOR,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0, field=field)
     detector = ContactDetector(geometry, device=device)
@@ -166,7 +166,7 @@ def test_arms_end_on_the_ground_at_rest_and_bumps_between_them_are_seen() -> Non
     cloud = surface_cloud(mesh, 20000, lowest=0.03)
     geometry = contact_geometry(cloud, mesh, (FLOOR,), field=field, device="cpu")
     flat = contact_geometry(cloud, mesh, (FLOOR,), device="cpu")
-    assert len(geometry.weights) > 1.2 * len(flat.weights) and geometry.left_out == 0
+    assert len(geometry.weights) > 1.2 * len(flat.weights) and geometry.excluded_count == 0
     detector = ContactDetector(geometry, device="cpu")
     assert detector.gaps(mesh.nodes)[0].min() > -1e-6
     means = cloud.means.numpy().astype(np.float64)
@@ -182,7 +182,7 @@ def test_the_highest_of_ground_and_solids_is_stood_on() -> None:
     up = np.array([0.0, 0.0, 1.0])
     assert surface_above((field, block), point, up) == pytest.approx(-0.5)
     assert surface_above((field, block), point - [0.3, 0.0, 0.0], up) == pytest.approx(
-        float(field.lift(point - [0.3, 0.0, 0.0])) - 1.0
+        float(field.ground_height(point - [0.3, 0.0, 0.0])) - 1.0
     )
 
 
@@ -196,13 +196,13 @@ def drop() -> tuple[Trajectory, LocomotionStepper, int]:
     field = wavy_ground(0.03)
     geometry = ContactGeometry(body.mesh, (FLOOR,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0, field=field)
     stepper = LocomotionStepper(body, muscles, geometry, device="cpu")
-    lift = 0.1 + float(field.lift(base).max())
+    lift = 0.1 + float(field.ground_height(base).max())
     start = BodyState(body.mesh.nodes + [0.0, 0.0, lift], np.zeros_like(body.mesh.nodes))
     gaps, _ = stepper.detector.gaps(start.positions)
     recorder = Recorder(body, muscles, geometry, start, float(gaps.min()), drag=0.0)
     state, memory, unconverged = start, stepper.initial_memory(), 0
     for _ in range(210):
-        state, memory, report = stepper.held_step(state, memory, memory.activations, DT)
+        state, memory, report = stepper.step_with_activations(state, memory, memory.activations, DT)
         recorder.add([report])
         unconverged += not report.converged
     return recorder.trajectory(), stepper, unconverged

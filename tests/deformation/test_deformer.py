@@ -19,7 +19,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
 from egs_warp.launching import launch_rows
 from egs_warp.render import render_gaussians
-from tests.support.carrying_scenes import bent, box, covariances, matrices, random_cloud
+from tests.support.deformation_scenes import bent, box, covariances, matrices, random_cloud
 from tests.support.kernels import orders_kernel, rotation_parts_kernel, signed_kernel
 
 
@@ -184,7 +184,9 @@ def test_colour_turns_with_the_mean_of_the_arms(device: str) -> None:
     mesh, cloud = box((4, 4, 4)), random_cloud(400, degree=0, scale=0.15, device=device)
     positions = bent(mesh.nodes, 1.0) + 0.01 * np.random.default_rng(2).normal(size=mesh.nodes.shape)
     embedding = embed_gaussians(cloud, mesh)
-    turns = Rotation.from_quat(deform(cloud, embedding, positions, max_stretch=1e9).turns.numpy(), scalar_first=True)
+    turns = Rotation.from_quat(
+        deform(cloud, embedding, positions, max_stretch=1e9).rotations.numpy(), scalar_first=True
+    )
     through, tets = by_arms(cloud, embedding, positions), tets_of(embedding)
     corners, rest = (x[mesh.tets[tets[:, 0]]] for x in (positions, mesh.nodes))
     edges, rest_edges = ((x[:, 1:] - x[:, :1]).transpose(0, 2, 1) for x in (corners, rest))
@@ -263,10 +265,16 @@ def test_no_spike_and_no_nan_whatever_the_cage_does(seed: int, noise: float, fla
     positions = mesh.nodes * [1.0, 1.0, flatten] + noise * rng.normal(size=mesh.nodes.shape)
     embedding = embed_gaussians(cloud, cage)
     result = deform(cloud, embedding, positions)
-    for values in (result.cloud.means, result.cloud.rotations, result.cloud.log_scales, result.cloud.sh, result.turns):
+    for values in (
+        result.cloud.means,
+        result.cloud.rotations,
+        result.cloud.log_scales,
+        result.cloud.sh,
+        result.rotations,
+    ):
         assert np.isfinite(values.numpy()).all()
     np.testing.assert_allclose(np.linalg.norm(result.cloud.rotations.numpy(), axis=1), 1.0, atol=1e-5)
-    np.testing.assert_allclose(np.linalg.norm(result.turns.numpy(), axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(result.rotations.numpy(), axis=1), 1.0, atol=1e-5)
     corners, rest = positions[mesh.tets], mesh.nodes[mesh.tets]
     edges, rest_edges = ((x[:, 1:] - x[:, :1]).transpose(0, 2, 1) for x in (corners, rest))
     stretch = np.linalg.svd(edges @ np.linalg.inv(rest_edges))[1][:, 0]

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from egs_warp.deformation.rigid import in_body_frame
+from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
-from tests.support.carrying_scenes import covariances
+from tests.support.deformation_scenes import covariances
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -26,7 +26,7 @@ def test_shapes_turn_and_grow_with_the_frame(degree: int) -> None:
     )
     axes = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
     frame = BodyFrame(axes, np.array([0.3, -0.2, 0.5]), 1.7)
-    moved = in_body_frame(cloud, frame)
+    moved = to_body_frame(cloud, frame)
     expected = 1.7**2 * axes @ covariances(cloud) @ axes.T
     np.testing.assert_allclose(covariances(moved), expected, rtol=2e-5, atol=1e-7 * np.abs(expected).max())
     means = cloud.means.numpy().astype(np.float64)

@@ -10,7 +10,7 @@ import pytest
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import GaussianEmbedding, embed_gaussians
 from egs_warp.deformation.splitting import (
-    LEAST_MISFIT,
+    MIN_FIT_ERROR,
     SPLIT_DEGREES,
     SplitRule,
     child_layout,
@@ -22,7 +22,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.capture import read_capture
 from egs_warp.render.rasteriser import render_gaussians
-from tests.support.carrying_scenes import bent, box, covariances, random_cloud
+from tests.support.deformation_scenes import bent, box, covariances, random_cloud
 
 
 def bar_cloud(count: int = 200, *, device: str = "cpu") -> GaussianCloud:
@@ -101,7 +101,7 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
     within, before_within = (e.points.inside.numpy().reshape(-1, 7).all(axis=1) for e in (result.embedding, embedding))
     assert within.mean() > 0.5
     assert after.fit_error[visible & within].max() < 0.6 * before.fit_error[before_within].max()
-    wrong = (after.curl_degrees > SPLIT_DEGREES) & (after.fit_error > LEAST_MISFIT * embedding.cage.extent)
+    wrong = (after.curl_degrees > SPLIT_DEGREES) & (after.fit_error > MIN_FIT_ERROR * embedding.cage.extent)
     assert not (wrong.any(axis=1) & (result.depths < 3) & visible).any()
     capped = split_for_motion(cloud, embedding, frames, max_growth=1.5)
     assert cloud.count < capped.cloud.count <= 1.5 * cloud.count

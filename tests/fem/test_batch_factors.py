@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from egs_warp.fem.batch_factors import BatchFactors
+from egs_warp.fem.batch_factors import BatchCholesky
 
 COUNT, SIZE = 5, 53
 
@@ -26,7 +26,7 @@ def matrices() -> np.ndarray:
 def test_solutions_are_those_of_numpy(matrices: np.ndarray, panel: int, chunk_bytes: int) -> None:
     """In all slots, in some of them, and after some were written anew."""
     right = np.random.default_rng(1).normal(size=(COUNT, SIZE, 3))
-    factors = BatchFactors(COUNT, SIZE, torch.device("cpu"), panel=panel, chunk_bytes=chunk_bytes)
+    factors = BatchCholesky(COUNT, SIZE, torch.device("cpu"), panel=panel, chunk_bytes=chunk_bytes)
     every = torch.arange(COUNT)
     given = torch.from_numpy(np.tril(matrices))
     assert factors.factor(every, given).tolist() == [True, True, False, False, True]

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from egs_warp.fem.batch_problem import BatchBody, BatchProblem, inverse_of
+from egs_warp.fem.batch_problem import BatchBody, BatchProblem, apply_inverse
 from egs_warp.fem.body import BodyState, SoftBody, make_body
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.geometry.plane import Plane
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.muscles.tension import MuscleEnergy
 from tests.support.meshes import block_mesh
 from tests.support.states import bent_state, spinning_state
 
@@ -75,14 +75,16 @@ def same(beside: torch.Tensor, alone: list[np.ndarray], *, rel: float = 1e-12) -
 
 
 def test_what_a_step_starts_from(body: SoftBody, beside: BatchProblem, alone: list[StepProblem]) -> None:
-    assert beside.unit == pytest.approx(alone[0].unit) and beside.inertia_ratio == pytest.approx(1.0 + DT * DRAG)
-    same(beside.turns, [one.turns for one in alone])
+    assert beside.residual_scale == pytest.approx(alone[0].residual_scale) and beside.inertia_ratio == pytest.approx(
+        1.0 + DT * DRAG
+    )
+    same(beside.rotation_modes, [one.rotation_modes for one in alone])
     same(beside.momenta, [one.momenta for one in alone])
-    same(beside.turning_rates, [np.linalg.inv(one.inertia) for one in alone])
-    same(beside.start()[:2], [one.start for one in alone[:2]])
-    assert np.abs(beside.start()[2].numpy()).max() < 1e-12
+    same(beside.inverse_inertia, [np.linalg.inv(one.inertia) for one in alone])
+    same(beside.rigid_guess()[:2], [one.rigid_guess for one in alone[:2]])
+    assert np.abs(beside.rigid_guess()[2].numpy()).max() < 1e-12
     centres = [body.centre_of_mass(one.state.positions) for one in alone]
-    same(beside.common.centre(beside.positions), centres)
+    same(beside.body.centre(beside.positions), centres)
 
 
 @pytest.mark.parametrize("pulling", [False, True])
@@ -97,13 +99,13 @@ def test_residuals(
     """Forces, what the step gives back of a spin, and the whole equation, with muscles and without."""
     given = tried(states)
     velocities, tensions = torch.from_numpy(given), torch.from_numpy(muscles.stiffness * activations)
-    pulls = [MuscleTension.of(muscles, one) if pulling else None for one in activations]
+    pulls = [MuscleEnergy.of(muscles, one) if pulling else None for one in activations]
     internal = beside.internal_gradient(velocities, tensions if pulling else None)
     expected = [one.internal_gradient(v, pull) for one, v, pull in zip(alone, given, pulls, strict=True)]
     same(internal, expected)
-    spins = [one.spin(gradient) for one, gradient in zip(alone, expected, strict=True)]
+    spins = [one.momentum_correction(gradient) for one, gradient in zip(alone, expected, strict=True)]
     assert min(np.linalg.norm(spin) for spin in spins) > 1e-4
-    same(beside.spin(internal), spins, rel=1e-10)
+    same(beside.momentum_correction(internal), spins, rel=1e-10)
     residuals = [one.residual(v, pull) for one, v, pull in zip(alone, given, pulls, strict=True)]
     same(beside.residual(velocities, tensions if pulling else None), residuals)
     same(beside.end_positions(velocities), [one.end_positions(v) for one, v in zip(alone, given, strict=True)])
@@ -114,15 +116,15 @@ def test_a_world_with_an_inverted_element_is_not_feasible(
 ) -> None:
     given = tried(states)
     given[1] -= 2.0 * (states[1].positions - body.centre_of_mass(states[1].positions)) / DT
-    assert beside.feasible(torch.from_numpy(given)).tolist() == [True, False, True]
-    assert [one.feasible(v) for one, v in zip(alone, given, strict=True)] == [True, False, True]
+    assert beside.is_inversion_free(torch.from_numpy(given)).tolist() == [True, False, True]
+    assert [one.is_inversion_free(v) for one, v in zip(alone, given, strict=True)] == [True, False, True]
 
 
 def tangents(
-    body: SoftBody, problems: list[StepProblem], given: np.ndarray, pulls: list[MuscleTension] | list[None]
+    body: SoftBody, problems: list[StepProblem], given: np.ndarray, pulls: list[MuscleEnergy] | list[None]
 ) -> list[Tangent]:
     return [
-        one.tangent(SparseFactors(body.assembly.upper_pattern), v, pull)
+        one.tangent(MultifrontalLdl(body.assembly.upper_pattern), v, pull)
         for one, v, pull in zip(problems, given, pulls, strict=True)
     ]
 
@@ -141,13 +143,13 @@ def test_tangents(
     """What impulses bring about, with and without the stiffness of muscles; a turning that is known is used."""
     beside = problem_of(BatchBody(body, muscles, 4, panel=32, chunk_bytes=chunk_bytes), states)
     given, impulses = tried(states), np.random.default_rng(3).standard_normal((3, given_size(body), 4))
-    pulls = [MuscleTension.of(muscles, one) for one in activations] if pulling else [None] * 3
+    pulls = [MuscleEnergy.of(muscles, one) for one in activations] if pulling else [None] * 3
     tensions = torch.from_numpy(muscles.stiffness * activations) if pulling else None
     assert beside.factor(torch.from_numpy(given), tensions).tolist() == [True] * 3
     expected = [one.solve(b) for one, b in zip(tangents(body, alone, given, pulls), impulses, strict=True)]
-    made, turning = inverse_of(beside, torch.from_numpy(impulses))
+    made, turning = apply_inverse(beside, torch.from_numpy(impulses))
     same(made, expected, rel=1e-9)
-    again, kept = inverse_of(beside, torch.from_numpy(impulses[:, :, :1]), turning)
+    again, kept = apply_inverse(beside, torch.from_numpy(impulses[:, :, :1]), turning)
     assert kept is turning
     same(again, [one[:, :1] for one in expected], rel=1e-9)
 
@@ -161,8 +163,8 @@ def test_tangents_of_muscles_that_are_half_slack(
     beside, given, pulls = problem_of(BatchBody(body, half, 4), states), tried(states), np.abs(activations)
     assert beside.factor(torch.from_numpy(given), torch.from_numpy(half.stiffness * pulls)).all()
     impulses = np.random.default_rng(4).standard_normal((3, given_size(body), 3))
-    made, _ = inverse_of(beside, torch.from_numpy(impulses))
-    pulling = tangents(body, alone, given, [MuscleTension.of(half, one) for one in pulls])
+    made, _ = apply_inverse(beside, torch.from_numpy(impulses))
+    pulling = tangents(body, alone, given, [MuscleEnergy.of(half, one) for one in pulls])
     expected = [one.solve(b) for one, b in zip(pulling, impulses, strict=True)]
     same(made, expected, rel=1e-9)
     for one, plain, b in zip(expected, tangents(body, alone, given, [None] * 3), impulses, strict=True):
@@ -188,7 +190,7 @@ def test_an_indefinite_world_is_projected_and_one_without_numbers_has_no_factors
     alone = [StepProblem(body, state, 1.0) for state in (squashed, rest)]
     impulses = np.random.default_rng(7).standard_normal((given_size(body), 3))
     whole = tangents(body, alone, velocities[[0, 2]], [None, None])
-    made, _ = inverse_of(beside, torch.from_numpy(np.stack([impulses] * 3)))
+    made, _ = apply_inverse(beside, torch.from_numpy(np.stack([impulses] * 3)))
     same(made[[0, 2]], [one.solve(impulses) for one in whole], rel=1e-9)
 
 
@@ -199,5 +201,5 @@ def test_muscles_that_would_make_a_world_indefinite_are_left_out(body: SoftBody,
     pushes = torch.from_numpy(np.stack([-1e3 * muscles.stiffness * muscles.bounds, 0.0 * muscles.bounds]))
     assert beside.factor(torch.zeros((2, *rest.velocities.shape), dtype=torch.float64), pushes).tolist() == [True, True]
     impulses = torch.from_numpy(np.random.default_rng(8).standard_normal((given_size(body), 2))).expand(2, -1, -1)
-    made, _ = inverse_of(beside, impulses)
+    made, _ = apply_inverse(beside, impulses)
     np.testing.assert_allclose(made[0], made[1], rtol=0, atol=1e-12 * float(made.abs().max()))

@@ -9,7 +9,7 @@ import pytest
 import scipy.sparse as sparse
 from scipy.spatial.transform import Rotation
 
-from egs_warp.fem.elastic_maps import Damping, Material
+from egs_warp.fem.assembly_topology import Damping, Material
 from egs_warp.fem.elasticity import ElasticAssembly
 from egs_warp.geometry.tetmesh import TetMesh
 from tests.support.meshes import block_mesh

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sparse
 
-from egs_warp.fem.supernodes import Supernodes, first_of_alike
+from egs_warp.fem.supernodes import Supernodes, first_of_equal_rows
 from tests.support.sparse_patterns import PATTERNS, upper_of
 
 
@@ -15,9 +15,9 @@ def test_blocks_hold_the_factor(name: str) -> None:
     """Of a matrix with that pattern, every entry of L that is not zero lies in a block; blocks tile the columns."""
     matrix = PATTERNS[name]
     blocks, count = Supernodes.of(upper_of(matrix)), len(matrix.indptr) - 1
-    assert np.array_equal(np.sort(blocks.place), np.arange(count))
+    assert np.array_equal(np.sort(blocks.permutation), np.arange(count))
     assert np.array_equal(blocks.first, np.cumsum([0, *blocks.widths[:-1]])) and blocks.widths.sum() == count
-    order = np.argsort(blocks.place)
+    order = np.argsort(blocks.permutation)
     factor = np.linalg.cholesky(matrix.toarray()[np.ix_(order, order)])
     held = np.zeros((count, count), dtype=bool)
     for s in range(blocks.count):
@@ -39,10 +39,10 @@ def test_blocks_of_a_mesh_are_wide_and_nearly_full() -> None:
     matrix = PATTERNS["grid of nodes"]
     full = sparse.csc_matrix(matrix)
     full.sort_indices()
-    assert np.array_equal(np.flatnonzero(first_of_alike(full)), np.arange(0, len(full.indptr) - 1, 3))
+    assert np.array_equal(np.flatnonzero(first_of_equal_rows(full)), np.arange(0, len(full.indptr) - 1, 3))
     blocks = Supernodes.of(upper_of(matrix))
     assert (blocks.widths % 3 == 0).all() and blocks.count < len(full.indptr) / 6
-    order = np.argsort(blocks.place)
+    order = np.argsort(blocks.permutation)
     factor = np.linalg.cholesky(matrix.toarray()[np.ix_(order, order)])
     held = (blocks.widths * (blocks.heights - 0.5 * (blocks.widths - 1.0))).sum()
     assert held < 1.35 * np.count_nonzero(np.abs(factor) > 1e-14)

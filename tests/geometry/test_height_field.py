@@ -35,7 +35,7 @@ def test_it_goes_through_its_nodes_and_follows_waves() -> None:
     nodes = field.nodes()[3:-3, 3:-3]
     assert np.abs(nodes[..., 2] - wave(nodes[..., :2], 1.0)).max() < 2e-4
     points = np.random.default_rng(1).uniform(-2.0, 2.0, (2000, 3))
-    assert np.abs(field.lift(points) - wave(points[:, :2], 1.0)).max() < 5e-3
+    assert np.abs(field.ground_height(points) - wave(points[:, :2], 1.0)).max() < 5e-3
 
 
 def test_normals_are_the_gradient_of_the_gap() -> None:
@@ -87,9 +87,9 @@ def test_it_is_the_same_ground_in_every_frame() -> None:
 def test_levelled_and_raised_are_inverse() -> None:
     field = tilted(wavy_ground())
     points = scattered(field)
-    level = field.levelled(points)
+    level = field.flatten(points)
     assert field.plane.heights(level) == pytest.approx(field.heights(points), abs=1e-12)
-    assert field.raised(level) == pytest.approx(points, abs=1e-12)
+    assert field.unflatten(level) == pytest.approx(points, abs=1e-12)
 
 
 def test_top_is_where_a_plumb_line_meets_it() -> None:
@@ -97,7 +97,7 @@ def test_top_is_where_a_plumb_line_meets_it() -> None:
     field = tilted(wavy_ground())
     up = Rotation.from_rotvec(np.radians(20.0) * field.axes[0]).apply(field.normal)
     point = field.origin + 2.1 * field.axes[0] + 1.7 * field.axes[1] + 0.4 * field.normal
-    way = field.top(point, up)
+    way = field.distance_along(point, up)
     assert way < 0.0 and field.heights(point + way * up) == pytest.approx(0.0, abs=1e-9)
 
 
@@ -107,9 +107,9 @@ def test_coarser_ground_keeps_what_is_wide() -> None:
     coarse = field.coarser(0.05)
     assert coarse.spacing == 0.05 and len(coarse.coefficients) < 0.5 * len(field.coefficients)
     points = np.random.default_rng(1).uniform(-2.0, 2.0, (2000, 3))
-    assert np.abs(coarse.lift(points) - field.lift(points)).max() < 0.03 * 0.03
+    assert np.abs(coarse.ground_height(points) - field.ground_height(points)).max() < 0.03 * 0.03
     narrow = replace(field, coefficients=0.03 * np.cos(np.pi * np.arange(251) * 0.02 / 0.05) * np.ones((251, 1)))
-    assert np.abs(narrow.coarser(0.05).lift(points)).max() < 0.35 * 0.03
+    assert np.abs(narrow.coarser(0.05).ground_height(points)).max() < 0.35 * 0.03
     assert field.coarser(0.01) is field
 
 

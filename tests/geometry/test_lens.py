@@ -10,7 +10,7 @@ import pytest
 
 from egs_warp.assets import pawn
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.lens import Lens, Straightening
+from egs_warp.geometry.lens import Lens, Undistortion
 from egs_warp.render import render_gaussians
 
 POINTS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 2))
@@ -102,7 +102,7 @@ def test_a_photo_through_a_lens_is_straightened(model: str, numbers: dict[str, f
     picture = render_gaussians(cloud, fine).colour.numpy()
     straight = photographed(picture, fine, camera, Lens())
     bent = photographed(picture, fine, camera, lens)
-    way = Straightening.of(camera, lens)
+    way = Undistortion.of(camera, lens)
     back = way.picture(bent)
     inner = way.known & (np.abs(straight - 1).sum(axis=2) > 0.05)
     assert inner.mean() > 0.05
@@ -115,11 +115,11 @@ def test_a_photo_through_a_lens_is_straightened(model: str, numbers: dict[str, f
 def test_pixels_without_a_source_are_known_and_clicks_find_their_way() -> None:
     """A pincushion's pinhole photo has corners that the lens did not see; a barrel's has none."""
     camera = Camera(60, 40, 50.0, 50.0, 30.0, 20.0, np.eye(3), np.zeros(3))
-    wide = Straightening.of(camera, Lens(radial=(0.3, 0.0, 0.0, 0.0)))
+    wide = Undistortion.of(camera, Lens(radial=(0.3, 0.0, 0.0, 0.0)))
     assert not wide.known[[0, 0, -1, -1], [0, -1, 0, -1]].any()
     assert wide.known[20, 30]
     lens = Lens(radial=(-0.1, 0.0, 0.0, 0.0))
-    barrel = Straightening.of(camera, lens)
+    barrel = Undistortion.of(camera, lens)
     assert barrel.known.all()
     ray = np.array([0.3, -0.2])
     u, v = lens.distorted(ray) * 50.0 + [30.0, 20.0]
@@ -129,9 +129,9 @@ def test_pixels_without_a_source_are_known_and_clicks_find_their_way() -> None:
 def test_a_polynomial_that_folds_back_shows_nothing_twice() -> None:
     """Beyond r = 1 / sqrt(1.5) the radius r - 0.5 r^3 falls again: what lies there is not known."""
     lens = Lens(radial=(-0.5, 0.0, 0.0, 0.0))
-    assert lens.reach(3.0) == pytest.approx(1 / np.sqrt(1.5), abs=0.01)
+    assert lens.valid_radius(3.0) == pytest.approx(1 / np.sqrt(1.5), abs=0.01)
     camera = Camera(200, 200, 50.0, 50.0, 100.0, 100.0, np.eye(3), np.zeros(3))
-    known = Straightening.of(camera, lens).known
+    known = Undistortion.of(camera, lens).known
     rows, columns = np.mgrid[:200, :200] + 0.5
     radius = np.hypot(columns - 100, rows - 100) / 50
     assert not known[radius > 0.83].any()
@@ -140,7 +140,7 @@ def test_a_polynomial_that_folds_back_shows_nothing_twice() -> None:
 
 def test_masks_stay_masks() -> None:
     camera = Camera(60, 40, 50.0, 50.0, 30.0, 20.0, np.eye(3), np.zeros(3))
-    way = Straightening.of(camera, Lens(radial=(0.3, 0.0, 0.0, 0.0)))
+    way = Undistortion.of(camera, Lens(radial=(0.3, 0.0, 0.0, 0.0)))
     mask = np.zeros((40, 60), bool)
     mask[:, 30:] = True
     moved = way.mask(mask)

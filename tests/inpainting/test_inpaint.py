@@ -13,19 +13,19 @@ from egs_warp.assets import scene
 from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud, joined
-from egs_warp.geometry.soap_film import soap_film
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
+from egs_warp.geometry.laplace_fill import laplace_fill
 from egs_warp.inpainting.holes import Hole, disc, footprint, unseen
 from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
 from egs_warp.inpainting.inpainters import OpenCvInpainter
 from egs_warp.inpainting.new_floor import rim_heights, with_gloss
-from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, matte, mean_colours, rectify
+from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, diffuse_only, mean_colours, rectify
 from egs_warp.io import read_capture, write_ply
-from egs_warp.io.planes import KnownPlane, write_planes
+from egs_warp.io.planes import PlaneRecord, write_planes
 from egs_warp.render import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
 from egs_warp.segmentation.votes import MaskedView
-from egs_warp.training.likeness import psnr
+from egs_warp.training.metrics import psnr
 from tests.support.floors import PLANE, floor, on_plane, pattern
 
 RADIUS = 0.22
@@ -49,7 +49,7 @@ def holed(truth: GaussianCloud, hole: Hole) -> GaussianCloud:
         np.full((1, truth.sh.shape[1], 3), -1.0) * (np.arange(truth.sh.shape[1]) == 0)[:, None],
         device=str(truth.device),
     )
-    return joined(kept, blob)
+    return concatenate(kept, blob)
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def test_training_comes_nearer_to_what_was_painted() -> None:
 
     def run(steps: int) -> tuple[InpaintResult, float]:
         result = inpaint(damaged, hole, inpainter=OpenCvInpainter(), options=InpaintOptions(steps=steps))
-        image = render_gaussians(matte(result.cloud, PLANE), result.window.camera())
+        image = render_gaussians(diffuse_only(result.cloud, PLANE), result.window.camera())
         return result, float(np.abs(image.colour.numpy() - result.painted)[result.hole].mean())
 
     (start, before), (end, after) = run(0), run(60)
@@ -138,7 +138,7 @@ def test_soap_film_and_rim_heights() -> None:
     rows, columns = (values - 20.0 for values in np.indices((41, 41)).astype(float))
     hole = np.hypot(rows, columns) < 12
     saddle = rows**2 - columns**2 + 3.0 * columns
-    assert soap_film(np.where(hole, 0.0, saddle), hole) == pytest.approx(saddle, abs=1e-8)
+    assert laplace_fill(np.where(hole, 0.0, saddle), hole) == pytest.approx(saddle, abs=1e-8)
     tilted = 0.01 * rows - 0.02 * columns + 0.5
     cracked = np.where(np.abs(columns + rows) < 2, tilted - 3.0, tilted)
     image = RectifiedImage(np.zeros((41, 41, 3)), np.ones((41, 41)), np.where(hole, 0.0, cracked).astype(np.float32))
@@ -220,7 +220,7 @@ def test_what_hangs_over_the_hole_stays() -> None:
     """A shelf at the height of the hole's width is no floor; haze at the foot goes."""
     truth, hole = floor(spacing=0.04), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     shelf = floor(spacing=0.04, half=0.4, height=2.0 * RADIUS)
-    background = joined(holed(truth, hole), shelf)
+    background = concatenate(holed(truth, hole), shelf)
     result, bare = (
         inpaint(cloud, hole, inpainter=OpenCvInpainter(), options=InpaintOptions(steps=0))
         for cloud in (background, holed(truth, hole))
@@ -263,7 +263,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """From files to a filled capture and a picture; the gap is closed."""
     truth, hole = floor(spacing=0.04), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     write_ply(tmp_path / "background.ply", holed(truth, hole))
-    write_planes(tmp_path / "plane.json", [KnownPlane(PLANE)])
+    write_planes(tmp_path / "plane.json", [PlaneRecord(PLANE)])
     x, y, z = on_plane(0.1, 0.05)
     files = [str(tmp_path / "background.ply"), "--plane", str(tmp_path / "plane.json"), "--out"]
     where = [f"--hole={x},{y},{z},{RADIUS}"]

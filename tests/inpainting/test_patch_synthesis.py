@@ -10,8 +10,8 @@ import pytest
 
 from egs_warp.errors import UserError
 from egs_warp.inpainting.offset_labels import _cut, labelled_sources
-from egs_warp.inpainting.patch_synthesis import PatchSynthesis, meld
-from egs_warp.training.likeness import psnr
+from egs_warp.inpainting.patch_synthesis import PatchSynthesis, poisson_blend
+from egs_warp.training.metrics import psnr
 from tests.support.floors import pattern
 
 
@@ -84,11 +84,11 @@ def test_meld_takes_the_gradients_and_drops_the_step() -> None:
     sources = np.stack([rows, np.minimum(columns + 64, 127)], axis=-1)
     wrong = image.copy()
     wrong[hole] += 0.1
-    melded = meld(wrong, hole, np.ones_like(hole), sources)
+    melded = poisson_blend(wrong, hole, np.ones_like(hole), sources)
     assert np.abs(melded - image)[hole].max() < 0.035
     assert np.abs(melded - image)[hole].mean() < 0.3 * 0.1
     same = np.stack([(rows + 32) % 128, columns], axis=-1)
-    assert np.abs(meld(image, hole, np.ones_like(hole), same) - image).max() < 1e-9
+    assert np.abs(poisson_blend(image, hole, np.ones_like(hole), same) - image).max() < 1e-9
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.io.frames import sharp_frames
+from egs_warp.io.frames import select_sharp_frames
 from egs_warp.io.video import VideoWriter
 
 
@@ -22,10 +22,10 @@ def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
         for number in range(40):
             frame = np.roll(texture, number, axis=1)
             video.write(frame if number % 5 == 2 else cv2.GaussianBlur(frame, (0, 0), 3))
-    taken = list(sharp_frames(tmp_path / "v.mp4", 8))
+    taken = list(select_sharp_frames(tmp_path / "v.mp4", 8))
     assert [frame.number for frame in taken] == list(range(2, 40, 5))
     assert taken[0].pixels.shape == (48, 64, 3)
-    assert len(list(sharp_frames(tmp_path / "v.mp4", 100))) == 40
+    assert len(list(select_sharp_frames(tmp_path / "v.mp4", 100))) == 40
 
 
 def test_no_video_is_one_line(tmp_path: Path) -> None:
@@ -33,7 +33,7 @@ def test_no_video_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(
         UserError, match=r"v.mp4: no video that can be read; give an .mp4 or .mov, or a folder of photos"
     ):
-        list(sharp_frames(tmp_path / "v.mp4", 5))
+        list(select_sharp_frames(tmp_path / "v.mp4", 5))
 
 
 @pytest.mark.parametrize(
@@ -49,10 +49,10 @@ def test_no_video_is_one_line(tmp_path: Path) -> None:
 def test_playlists_are_no_videos(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_text(text)
     with pytest.raises(UserError, match=r"a\.mp4: no video that can be read; give an \.mp4 or \.mov"):
-        next(sharp_frames(tmp_path / "a.mp4", 3))
+        next(select_sharp_frames(tmp_path / "a.mp4", 3))
 
 
 def test_a_pipe_is_no_video(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.mp4")
     with pytest.raises(UserError, match=r"a\.mp4: no such file; give a video or a folder of photos"):
-        next(sharp_frames(tmp_path / "a.mp4", 3))
+        next(select_sharp_frames(tmp_path / "a.mp4", 3))

@@ -9,7 +9,7 @@ import pytest
 
 from egs_warp.errors import UserError
 from egs_warp.io.named_files import check_named_files, named_files
-from tests.support.two_runs import told_elsewhere
+from tests.support.concurrent_runs import told_elsewhere
 
 
 def write(*paths: Path, text: str, overwrite: bool = False) -> None:

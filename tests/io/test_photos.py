@@ -13,7 +13,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.cameras import PosedImage
-from egs_warp.io.photos import decoded, orientation, read_photo, turned
+from egs_warp.io.photos import apply_orientation, decoded, orientation, read_photo
 
 # No two corners alike, smooth enough for JPEG.
 ROWS, COLUMNS = np.mgrid[:40, :60]
@@ -37,7 +37,7 @@ def test_turns_are_pillows(turn: int, tmp_path: Path) -> None:
     assert orientation(path) == turn
     with Image.open(path) as opened:
         expected = np.asarray(ImageOps.exif_transpose(opened))
-    np.testing.assert_array_equal(turned(PICTURE, turn), expected)
+    np.testing.assert_array_equal(apply_orientation(PICTURE, turn), expected)
 
 
 @pytest.mark.parametrize("turn", [5, 6, 7, 8])
@@ -46,7 +46,7 @@ def test_pixels_are_turned_only_where_that_fits_the_camera(turn: int, tmp_path: 
     as_stored = read_photo(PosedImage("a.png", camera(60, 40), path))
     np.testing.assert_allclose(as_stored.colour, PICTURE / 255.0, atol=1e-6)
     upright = read_photo(PosedImage("a.png", camera(40, 60), path))
-    np.testing.assert_allclose(upright.colour, turned(PICTURE, turn) / 255.0, atol=1e-6)
+    np.testing.assert_allclose(upright.colour, apply_orientation(PICTURE, turn) / 255.0, atol=1e-6)
     assert (upright.camera.width, upright.camera.height) == (40, 60)
 
 
@@ -78,9 +78,9 @@ def test_masks_of_turned_photos_fit_either_way(drawn_upright: bool, tmp_path: Pa
         (tmp_path / folder).mkdir()
     path = saved(tmp_path / "images" / "a.png", PICTURE, 6)
     mask = np.where(PICTURE[..., 0] > 100, 255, 0).astype(np.uint8)
-    cv2.imwrite(str(tmp_path / "masks" / "a.png.png"), turned(mask, 6) if drawn_upright else mask)
+    cv2.imwrite(str(tmp_path / "masks" / "a.png.png"), apply_orientation(mask, 6) if drawn_upright else mask)
     photo = read_photo(PosedImage("a.png", camera(40, 60), path))
-    np.testing.assert_array_equal(photo.alpha, turned(mask, 6) / 255.0)
+    np.testing.assert_array_equal(photo.alpha, apply_orientation(mask, 6) / 255.0)
 
 
 def test_what_the_lens_did_not_see_stays_unknown_when_reduced(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.plane import Plane
-from egs_warp.io.planes import HoleOutline, KnownPlane, read_planes, write_planes
+from egs_warp.io.planes import HoleOutline, PlaneRecord, read_planes, write_planes
 from tests.support.waves import wavy_ground
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), -0.25)
@@ -19,20 +19,20 @@ HOLE = HoleOutline(np.array([1.0, 2.0, 0.25]), 0.5, (8, 6), (np.array([[1, 1], [
 
 
 def test_all_that_is_known_comes_back(tmp_path: Path) -> None:
-    known = KnownPlane(FLOOR, np.array([1.0, 2.0, 3.0]), 0.7, 0.01, 0.9, 120, 0.3, HOLE, GROUND, {"remark": ["a", 1]})
-    write_planes(tmp_path / "plane.json", [known, KnownPlane(FLOOR)])
+    known = PlaneRecord(FLOOR, np.array([1.0, 2.0, 3.0]), 0.7, 0.01, 0.9, 120, 0.3, HOLE, GROUND, {"remark": ["a", 1]})
+    write_planes(tmp_path / "plane.json", [known, PlaneRecord(FLOOR)])
     full, bare = read_planes(tmp_path / "plane.json")
     assert full.to_json() == known.to_json() and full.pixels == 120 and full.others == {"remark": ["a", 1]}
     assert full.hole is not None and full.hole.texels == (8, 6) and np.array_equal(full.hole.outlines, HOLE.outlines)
-    assert full.ground is not None and full.ground.lift(np.zeros(3)) == pytest.approx(
-        GROUND.lift(np.zeros(3)), abs=1e-4
+    assert full.ground is not None and full.ground.ground_height(np.zeros(3)) == pytest.approx(
+        GROUND.ground_height(np.zeros(3)), abs=1e-4
     )
     assert bare.to_json() == {"normal": [0.0, 0.0, 1.0], "offset": -0.25}
 
 
 def test_what_is_found_anew_takes_the_place_of_what_was_known() -> None:
-    before = KnownPlane(FLOOR, noise=0.01, size=0.7, others={"remark": 1})
-    now = KnownPlane(Plane(np.array([0.0, 0.0, 1.0]), 0.0), size=0.8).over(before)
+    before = PlaneRecord(FLOOR, noise=0.01, size=0.7, others={"remark": 1})
+    now = PlaneRecord(Plane(np.array([0.0, 0.0, 1.0]), 0.0), size=0.8).merged_with(before)
     assert now.plane.offset == 0.0 and (now.noise, now.size, now.others) == (0.01, 0.8, {"remark": 1})
 
 
@@ -63,7 +63,7 @@ def test_damage_is_named(tmp_path: Path, facts: dict[str, object], message: str)
 def test_plane_files_are_checked(tmp_path: Path) -> None:
     path = tmp_path / "plane.json"
     planes = [FLOOR, Plane.from_coefficients(0.0, 1.0, 0.0, 2.0)]
-    write_planes(path, [KnownPlane(planes[0], noise=0.01), KnownPlane(planes[1])])
+    write_planes(path, [PlaneRecord(planes[0], noise=0.01), PlaneRecord(planes[1])])
     for one, other in zip((known.plane for known in read_planes(path)), planes, strict=True):
         np.testing.assert_allclose([*one.normal, one.offset], [*other.normal, other.offset])
     for text, message in (

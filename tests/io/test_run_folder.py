@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.io.run_folder import MANIFEST, check_run_folder, run_folder, tidy
-from tests.support.two_runs import told_elsewhere
+from egs_warp.io.run_folder import MANIFEST, check_run_folder, clean_up, run_folder
+from tests.support.concurrent_runs import told_elsewhere
 
 
 def finished(folder: Path, **files: str) -> None:
@@ -180,10 +180,10 @@ def test_what_a_run_left_that_was_killed_as_it_ended(tmp_path: Path) -> None:
         run.finish()
         (tmp_path / "parts").mkdir()
         (tmp_path / "parts" / "b.npz").write_text("step")
-        tidy(tmp_path, "parts")
+        clean_up(tmp_path, "parts")
         assert (tmp_path / "parts" / "b.npz").exists()
     (tmp_path / ".egs-run.lock").write_text("")
-    tidy(tmp_path, "parts")
+    clean_up(tmp_path, "parts")
     assert sorted(os.listdir(tmp_path)) == ["a.txt", MANIFEST]
 
 

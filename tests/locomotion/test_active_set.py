@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.locomotion.active_set import ReducedRows, optimum_near
+from egs_warp.locomotion.active_set import WhitenedQp, solve_from_guess
 
 
 def random_program(seed: int) -> tuple[np.ndarray, ...]:
@@ -29,15 +29,15 @@ def test_the_conditions_of_the_optimum_hold(guess: str) -> None:
     """P x + q + A^T y = 0, bounds met, multipliers of the sign of the bound that pushes and zero elsewhere."""
     for seed in range(60):
         P, q, A, lower, upper = random_program(seed)
-        reduced = ReducedRows.of(P, q, A)
+        reduced = WhitenedQp.of(P, q, A)
         random = np.random.default_rng(seed)
-        low, high = reduced.free < lower, reduced.free > upper
+        low, high = reduced.values_at_minimum < lower, reduced.values_at_minimum > upper
         if guess == "none":
             low, high = np.zeros_like(low), np.zeros_like(high)
         elif guess == "random":
             low = random.random(len(low)) < 0.3
             high = (random.random(len(low)) < 0.3) & ~low
-        found = optimum_near(reduced, lower, upper, low, high)
+        found = solve_from_guess(reduced, lower, upper, low, high)
         assert found is not None and found.feasible
         y, at = found.multipliers, A @ found.x
         assert np.abs(P @ found.x + q + A.T @ y).max() < 1e-6 * (1.0 + np.abs(y).max())
@@ -55,8 +55,10 @@ def test_bounds_that_no_point_satisfies_are_told_apart() -> None:
         row = len(q) + 1
         A, upper = np.vstack([A, A[row]]), np.r_[upper, np.inf]
         lower = np.r_[lower, upper[row] + 0.1]
-        reduced = ReducedRows.of(P, q, A)
-        found = optimum_near(reduced, lower, upper, reduced.free < lower, reduced.free > upper)
+        reduced = WhitenedQp.of(P, q, A)
+        found = solve_from_guess(
+            reduced, lower, upper, reduced.values_at_minimum < lower, reduced.values_at_minimum > upper
+        )
         assert found is not None and not found.feasible
 
 
@@ -68,8 +70,10 @@ def test_a_sliver_between_two_bounds_has_an_optimum() -> None:
         inside = 0.5 * (lower[row] + upper[row])  # where the point that satisfies all of them is
         A, upper = np.vstack([A, A[row]]), np.r_[upper, np.inf]
         upper[row], lower = inside + 1e-6, np.r_[lower, inside]
-        reduced = ReducedRows.of(P, q, A)
-        found = optimum_near(reduced, lower, upper, reduced.free < lower, reduced.free > upper)
+        reduced = WhitenedQp.of(P, q, A)
+        found = solve_from_guess(
+            reduced, lower, upper, reduced.values_at_minimum < lower, reduced.values_at_minimum > upper
+        )
         assert found is not None and found.feasible
         slack = 1e-7 * max(1.0, np.linalg.norm(A[row]))
         assert -slack < (A @ found.x)[-1] - inside < 1e-6 + slack
@@ -79,17 +83,19 @@ def test_bounds_are_met_where_the_objective_has_nowhere_to_fall_to() -> None:
     """q = 0: whatever they cost, by a search that joins row after row, too."""
     for seed in range(60):
         P, q, A, lower, upper = random_program(seed)
-        reduced = ReducedRows.of(P, 0.0 * q, A)
-        found = optimum_near(reduced, lower, upper, reduced.free < lower, reduced.free > upper)
+        reduced = WhitenedQp.of(P, 0.0 * q, A)
+        found = solve_from_guess(
+            reduced, lower, upper, reduced.values_at_minimum < lower, reduced.values_at_minimum > upper
+        )
         assert found is not None and found.feasible
 
 
 def test_a_minimum_within_its_bounds_is_the_optimum() -> None:
     """Nothing holds it, whatever was guessed."""
     P, q, A, _, _ = random_program(3)
-    reduced = ReducedRows.of(P, q, A)
+    reduced = WhitenedQp.of(P, q, A)
     at = A @ np.linalg.solve(P, -q)
-    found = optimum_near(reduced, at - 1.0, at + 1.0, np.ones(len(at), bool), np.zeros(len(at), bool))
+    found = solve_from_guess(reduced, at - 1.0, at + 1.0, np.ones(len(at), bool), np.zeros(len(at), bool))
     assert found is not None
     assert np.allclose(found.x, np.linalg.solve(P, -q)) and not found.multipliers.any()
 
@@ -102,8 +108,8 @@ def test_what_costs_a_million_times_the_gain_counts_as_no_point(times: float, fe
     side = np.sqrt(2e6 * times / count)
     A = np.eye(count) - np.eye(count, k=-1)
     lower, nothing = np.r_[side, np.zeros(count - 1)], np.zeros(count, bool)
-    found = optimum_near(
-        ReducedRows.of(np.eye(count), np.zeros(count), A), lower, np.full(count, np.inf), nothing, nothing
+    found = solve_from_guess(
+        WhitenedQp.of(np.eye(count), np.zeros(count), A), lower, np.full(count, np.inf), nothing, nothing
     )
     assert found is not None and found.feasible == feasible
     if feasible:
@@ -115,7 +121,7 @@ def test_a_hessian_that_holds_no_number_has_no_optimum() -> None:
     P, q, A, lower, upper = random_program(3)
     P[1, 1] = np.nan
     nothing = np.zeros(len(A), bool)
-    assert optimum_near(ReducedRows.of(P, q, A), lower, upper, nothing, nothing) is None
+    assert solve_from_guess(WhitenedQp.of(P, q, A), lower, upper, nothing, nothing) is None
 
 
 def test_what_was_sought_before_changes_nothing() -> None:
@@ -123,8 +129,10 @@ def test_what_was_sought_before_changes_nothing() -> None:
     programs = [random_program(seed) for seed in (4, 5, 6)]
 
     def found(P: np.ndarray, q: np.ndarray, A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:
-        reduced = ReducedRows.of(P, q, A)
-        best = optimum_near(reduced, lower, upper, reduced.free < lower, reduced.free > upper)
+        reduced = WhitenedQp.of(P, q, A)
+        best = solve_from_guess(
+            reduced, lower, upper, reduced.values_at_minimum < lower, reduced.values_at_minimum > upper
+        )
         assert best is not None and best.feasible
         return [best.x, best.multipliers]
 
@@ -141,27 +149,29 @@ def test_rows_in_coordinates_in_which_distances_are_costs() -> None:
     """z = 0 is the minimum, half its square the cost beside it, and each row's unit and length are those by z."""
     for seed in range(20):
         P, q, A, _, _ = random_program(seed)
-        rows = ReducedRows.of(P, q, A)
+        rows = WhitenedQp.of(P, q, A)
         minimum = np.linalg.solve(P, -q)
-        assert np.allclose(rows.minimum, minimum) and np.allclose(rows.free, A @ minimum)
+        assert np.allclose(rows.minimum, minimum) and np.allclose(rows.values_at_minimum, A @ minimum)
         x = np.random.default_rng(seed).standard_normal(len(q))
-        z = rows.place(x)
+        z = rows.whiten(x)
         cost = 0.5 * x @ P @ x + q @ x - (0.5 * minimum @ P @ minimum + q @ minimum)
         assert 0.5 * z @ z == pytest.approx(cost)
-        assert np.allclose(rows.free + rows.lengths * (rows.units @ z), A @ x)
-        assert np.allclose(np.linalg.norm(rows.units, axis=1), 1.0)
+        assert np.allclose(rows.values_at_minimum + rows.row_norms * (rows.unit_rows @ z), A @ x)
+        assert np.allclose(np.linalg.norm(rows.unit_rows, axis=1), 1.0)
 
 
 def test_rows_of_two_programs_are_not_mixed_up() -> None:
     """Which share their memory; an indefinite Hessian is refused."""
     (P, q, A, *_), (Q, r, _, *_) = random_program(7), random_program(7)
-    first, second = ReducedRows.of(P, q, A), ReducedRows.of(2.0 * Q, r + 1.0, A)
-    units = second.units.copy()
-    assert np.abs(first.units - units).max() < 1e-12 and np.allclose(second.lengths * np.sqrt(2.0), first.lengths)
+    first, second = WhitenedQp.of(P, q, A), WhitenedQp.of(2.0 * Q, r + 1.0, A)
+    units = second.unit_rows.copy()
+    assert np.abs(first.unit_rows - units).max() < 1e-12 and np.allclose(
+        second.row_norms * np.sqrt(2.0), first.row_norms
+    )
     x = np.ones(len(q))
-    assert np.linalg.norm(second.place(second.minimum)) < 1e-9 < np.linalg.norm(second.place(x) - first.place(x))
+    assert np.linalg.norm(second.whiten(second.minimum)) < 1e-9 < np.linalg.norm(second.whiten(x) - first.whiten(x))
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
-        ReducedRows.of(P - 2.0 * np.linalg.eigvalsh(P)[0] * np.eye(len(q)), q, A)
+        WhitenedQp.of(P - 2.0 * np.linalg.eigvalsh(P)[0] * np.eye(len(q)), q, A)
 
 
 def test_as_many_rows_as_unknowns_and_one_that_contradicts_them() -> None:
@@ -174,8 +184,8 @@ def test_as_many_rows_as_unknowns_and_one_that_contradicts_them() -> None:
     corner = rng.standard_normal(count)
     lower = A @ corner
     lower[-1] += 1e-4
-    reduced = ReducedRows.of(np.eye(count), -10.0 * corner - 3.0, A)
+    reduced = WhitenedQp.of(np.eye(count), -10.0 * corner - 3.0, A)
     upper = np.full(len(A), np.inf)
-    for guess in (np.zeros(len(A), bool), reduced.free < lower, np.ones(len(A), bool)):
-        found = optimum_near(reduced, lower, upper, guess, np.zeros(len(A), bool))
+    for guess in (np.zeros(len(A), bool), reduced.values_at_minimum < lower, np.ones(len(A), bool)):
+        found = solve_from_guess(reduced, lower, upper, guess, np.zeros(len(A), bool))
         assert found is not None and not found.feasible

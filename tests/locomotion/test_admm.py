@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.locomotion.admm import AdmmPrograms, Dense, Ending, Iterate
-from egs_warp.locomotion.splitting import AdmmSplitting, OsqpSplitting, Splitting
+from egs_warp.locomotion.admm import AdmmPrograms, AdmmResult, AdmmStatus, DenseQp
+from egs_warp.locomotion.operator_splitting import AdmmSplitting, OperatorSplitting, OsqpSplitting
 
 
-def random_program(seed: int) -> tuple[Dense, np.ndarray, np.ndarray]:
+def random_program(seed: int) -> tuple[DenseQp, np.ndarray, np.ndarray]:
     """Of its own size, with rows from short to long, held, one-sided and free, and bounds that some point satisfies."""
     random = np.random.default_rng(seed)
     n, m = int(random.integers(2, 20)), int(random.integers(1, 50))
@@ -21,18 +21,20 @@ def random_program(seed: int) -> tuple[Dense, np.ndarray, np.ndarray]:
     kind[np.flatnonzero(kind == 0)[n // 2 :]] = 1
     lower = np.where(kind == 0, at, np.where(kind > 2, -np.inf, at - random.exponential(0.3, m)))
     upper = np.where(kind == 0, at, np.where(kind % 2 == 0, np.inf, at + random.exponential(0.3, m)))
-    return Dense(root @ root.T + 0.1 * np.eye(n), 3.0 * random.normal(size=n), A), lower, upper
+    return DenseQp(root @ root.T + 0.1 * np.eye(n), 3.0 * random.normal(size=n), A), lower, upper
 
 
-def by_osqp(program: Dense, lower: np.ndarray, upper: np.ndarray, *, accuracy: float, iterations: int) -> Iterate:
-    return OsqpSplitting(program.P, program.q, accuracy=accuracy).on(program.A, iterations).run(lower, upper, None)
+def by_osqp(program: DenseQp, lower: np.ndarray, upper: np.ndarray, *, accuracy: float, iterations: int) -> AdmmResult:
+    return (
+        OsqpSplitting(program.P, program.q, accuracy=accuracy).full_run(program.A, iterations).run(lower, upper, None)
+    )
 
 
 def by_kernels(
-    program: Dense, lower: np.ndarray, upper: np.ndarray, *, device: str, accuracy: float, iterations: int
-) -> Iterate:
+    program: DenseQp, lower: np.ndarray, upper: np.ndarray, *, device: str, accuracy: float, iterations: int
+) -> AdmmResult:
     splitting = AdmmSplitting(program.P, program.q, accuracy=accuracy, device=device)
-    return splitting.on(program.A, iterations).run(lower, upper, None)
+    return splitting.full_run(program.A, iterations).run(lower, upper, None)
 
 
 def test_programs_of_many_sizes_end_side_by_side_where_osqp_does(device: str) -> None:
@@ -43,7 +45,7 @@ def test_programs_of_many_sizes_end_side_by_side_where_osqp_does(device: str) ->
     ends = together.solve(lowers, uppers, [None] * len(made), accuracy=1e-10, iterations=20000)
     for (program, lower, upper), end in zip(made, ends, strict=True):
         asked = by_osqp(program, lower, upper, accuracy=1e-10, iterations=20000)
-        assert end.ending is asked.ending is Ending.SOLVED
+        assert end.ending is asked.ending is AdmmStatus.SOLVED
         assert np.abs(end.x - asked.x).max() <= 1e-6 * max(1.0, np.abs(asked.x).max())
         assert np.abs(end.multipliers - asked.multipliers).max() <= 1e-5 * max(1.0, np.abs(asked.multipliers).max())
         slope = program.P @ end.x + program.q + program.A.T @ end.multipliers
@@ -69,17 +71,17 @@ def test_a_solved_program_is_where_the_next_begins(device: str) -> None:
     """Where bounds hardly change, a fraction of the iterations; a start of one's own, x with the multipliers kept, as
     OSQP takes it."""
     program, lower, upper = random_program(4)
-    both: list[Splitting] = [
+    both: list[OperatorSplitting] = [
         OsqpSplitting(program.P, program.q, accuracy=1e-8),
         AdmmSplitting(program.P, program.q, accuracy=1e-8, device=device),
     ]
     ran = []
     for splitting in both:
-        iterations = splitting.on(program.A, 20000)
+        iterations = splitting.full_run(program.A, 20000)
         first = iterations.run(lower, upper, None)
         again = iterations.run(lower, upper + 1e-6, None)
         started = iterations.run(lower, upper, first.x)
-        assert first.ending is again.ending is started.ending is Ending.SOLVED
+        assert first.ending is again.ending is started.ending is AdmmStatus.SOLVED
         assert first.iterations > 200 > 2 * max(again.iterations, started.iterations)
         assert np.abs(started.x - first.x).max() < 1e-6
         ran.append([first.iterations, again.iterations, started.iterations])
@@ -90,25 +92,25 @@ def test_bounds_that_no_point_satisfies_are_told_apart_and_forgotten(device: str
     """Two rows that exclude each other: a certificate, from both; the next solve begins anew."""
     for seed in range(10):
         program, lower, upper = random_program(seed)
-        given = Dense(program.P, program.q, np.vstack([program.A, program.A[:1]]))
+        given = DenseQp(program.P, program.q, np.vstack([program.A, program.A[:1]]))
         held = program.A[0] @ np.ones(len(program.q))
         out = np.r_[held, lower[1:], held + 0.5], np.r_[held, upper[1:], np.inf]
         asked = by_osqp(given, *out, accuracy=1e-8, iterations=4000)
         programs = AdmmPrograms([given], device=device)
         (made,) = programs.solve([out[0]], [out[1]], [None], accuracy=1e-8, iterations=4000)
-        assert made.ending is asked.ending is Ending.INFEASIBLE
+        assert made.ending is asked.ending is AdmmStatus.INFEASIBLE
         back = np.r_[lower, -np.inf], np.r_[upper, np.inf]
         (after,) = programs.solve([back[0]], [back[1]], [None], accuracy=1e-10, iterations=20000)
         fresh = by_osqp(program, lower, upper, accuracy=1e-10, iterations=20000)
-        assert after.ending is Ending.SOLVED
+        assert after.ending is AdmmStatus.SOLVED
         assert np.abs(after.x - fresh.x).max() <= 1e-6 * max(1.0, np.abs(fresh.x).max())
 
 
 def test_a_certificate_is_taken_as_osqp_takes_it(device: str) -> None:
     """Rows that nearly repeat each other, whose multipliers grow together for long: a contradiction to OSQP where
     their bounds cross, by however little, and no other."""
-    for crossed, ending in ((-5e-5, Ending.SOLVED), (5e-5, Ending.INFEASIBLE)):
-        program = Dense(np.eye(2), np.array([0.0, 100.0]), np.array([[1.0, 0.0], [1.0, 3e-5]]))
+    for crossed, ending in ((-5e-5, AdmmStatus.SOLVED), (5e-5, AdmmStatus.INFEASIBLE)):
+        program = DenseQp(np.eye(2), np.array([0.0, 100.0]), np.array([[1.0, 0.0], [1.0, 3e-5]]))
         bounds = np.array([-np.inf, 1.0 + crossed]), np.array([1.0, np.inf])
         asked = by_osqp(program, *bounds, accuracy=1e-8, iterations=300)
         made = by_kernels(program, *bounds, device=device, accuracy=1e-8, iterations=300)
@@ -125,15 +127,15 @@ def test_endings_are_those_of_osqp(device: str) -> None:
             made = by_kernels(program, lower, upper, device=device, accuracy=accuracy, iterations=50)
             assert made.ending is asked.ending and made.iterations == asked.iterations
             endings.append(made.ending)
-    assert min(endings.count(one) for one in (Ending.SOLVED, Ending.INEXACT, Ending.LIMIT)) >= 5
+    assert min(endings.count(one) for one in (AdmmStatus.SOLVED, AdmmStatus.INEXACT, AdmmStatus.LIMIT)) >= 5
 
 
 def test_what_is_no_number_is_no_solution(device: str) -> None:
     program, lower, upper = random_program(0)
     q = program.q.copy()
     q[0] = np.nan
-    made = by_kernels(Dense(program.P, q, program.A), lower, upper, device=device, accuracy=1e-8, iterations=100)
-    assert made.ending is Ending.FAILED
+    made = by_kernels(DenseQp(program.P, q, program.A), lower, upper, device=device, accuracy=1e-8, iterations=100)
+    assert made.ending is AdmmStatus.FAILED
 
 
 def test_a_singular_hessian_has_one_value_and_many_points(device: str) -> None:
@@ -141,11 +143,11 @@ def test_a_singular_hessian_has_one_value_and_many_points(device: str) -> None:
     random = np.random.default_rng(5)
     root = random.normal(size=(12, 4))
     A = np.vstack([np.eye(12), random.normal(size=(6, 12))])
-    program = Dense(root @ root.T, random.normal(size=12), A)
+    program = DenseQp(root @ root.T, random.normal(size=12), A)
     lower, upper = np.full(18, -1.0), np.full(18, 1.0)
     made = by_kernels(program, lower, upper, device=device, accuracy=1e-10, iterations=50000)
     asked = by_osqp(program, lower, upper, accuracy=1e-10, iterations=50000)
-    assert made.ending is asked.ending is Ending.SOLVED
+    assert made.ending is asked.ending is AdmmStatus.SOLVED
     values = [0.5 * x @ program.P @ x + program.q @ x for x in (made.x, asked.x)]
     assert values[0] == pytest.approx(values[1], abs=1e-8)
     assert np.abs(root.T @ (made.x - asked.x)).max() < 1e-6

@@ -11,8 +11,8 @@ from egs_warp.locomotion import audit as module
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.trajectory import Trajectory
 from tests.support.flights import rigid_flight
-from tests.support.places import DT
 from tests.support.slides import slide
+from tests.support.stances import DT
 from tests.support.waves import wavy_ground
 
 
@@ -152,6 +152,6 @@ def test_uneven_ground_is_that_of_the_height_field(flight: Trajectory) -> None:
     )
     points = np.random.default_rng(2).uniform(-1.5, 1.5, (200, 3))
     lift, normals = module._ground(t, points)
-    np.testing.assert_allclose(lift, field.lift(points), atol=1e-9)
+    np.testing.assert_allclose(lift, field.ground_height(points), atol=1e-9)
     np.testing.assert_allclose(normals, field.frames(points)[:, 0], atol=1e-6)
     assert np.ptp(normals[:, 0]) > 0.3 and np.ptp(normals[:, 1]) > 0.2

@@ -19,7 +19,7 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.pipelines.creature import Creature
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import coarse_pawn
 
 FRICTIONS = (0.8, 0.3, 1.2)
@@ -53,7 +53,7 @@ def runs_alone(
         stepper = alone(creature, friction)
         memory, reports = stepper.initial_memory(), []
         for given in activations[:, world]:
-            state, memory, done = stepper.advance_held(state, memory, given, dt)
+            state, memory, done = stepper.advance_with_activations(state, memory, given, dt)
             reports.append(done)
         runs.append(reports)
     return runs
@@ -92,7 +92,7 @@ def check(creature: Creature, one: StepReport, other: StepReport) -> None:
     ):
         np.testing.assert_allclose(mine, its, rtol=0, atol=1e-9 * unit)
     # Redundant points share a load in more than one way.
-    nodal = [report.contacts.pushes(report.forces) for report in (one, other)]
+    nodal = [report.contacts.nodal_forces(report.forces) for report in (one, other)]
     np.testing.assert_allclose(*nodal, rtol=0, atol=1e-6 * body.weight)
 
 
@@ -151,10 +151,12 @@ def test_a_world_goes_on_with_what_its_last_step_has_handed_on(creature: Creatur
     steppers, memories, states, expected = [], [], [], []
     for state, friction in zip(begun, FRICTIONS, strict=False):
         steppers.append(alone(creature, friction))
-        state, memory, _ = steppers[-1].advance_held(state, steppers[-1].initial_memory(), jump.activations[FIRST], dt)
+        state, memory, _ = steppers[-1].advance_with_activations(
+            state, steppers[-1].initial_memory(), jump.activations[FIRST], dt
+        )
         states.append(state)
         memories.append(memory)
-        expected.append(steppers[-1].advance_held(state, memory, jump.activations[FIRST + 1], dt)[2])
+        expected.append(steppers[-1].advance_with_activations(state, memory, jump.activations[FIRST + 1], dt)[2])
     beside = BatchStepper(*parts(creature), FRICTIONS[:2])
     state = beside.start(states, memories)
     for world, memory in enumerate(memories):

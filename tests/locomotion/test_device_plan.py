@@ -12,27 +12,27 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("torch")
 
-from egs_warp.contact.device_response import DeviceIterate
-from egs_warp.contact.device_room import ContactRoom
+from egs_warp.contact.device_newton import DeviceNewtonIterate
+from egs_warp.contact.device_newton_workspace import NewtonWorkspace
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion import device_plan, strategies
 from egs_warp.locomotion import stepper as stepping
-from egs_warp.locomotion.contact_pieces import search_pieces, solve_relaxed
-from egs_warp.locomotion.device_plan import DevicePlanner, PlanRoom
-from egs_warp.locomotion.device_search import RelaxedRoom, SearchRoom
-from egs_warp.locomotion.linear_step import Prospect, StepStart
+from egs_warp.locomotion.contact_modes import search_modes, solve_relaxed
+from egs_warp.locomotion.device_plan import DevicePlanner, PlanWorkspace
+from egs_warp.locomotion.device_search import ModeSearchWorkspace, RelaxationWorkspace
+from egs_warp.locomotion.linear_step import PredictedStep, StepInputs
 from egs_warp.locomotion.objectives import (
+    AngularMomentumObjective,
     AnyObjective,
     LoadObjective,
-    SpinObjective,
     centre_of_mass_velocity,
     node_velocities,
 )
 from egs_warp.locomotion.planner import Plan, StageClock
 from egs_warp.locomotion.settings import LocomotionSettings
-from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart
+from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.pipelines.creature import Creature
 from tests.support.creatures import coarse_pawn
 from tests.support.device_steps import on_device
@@ -58,14 +58,14 @@ def asks(creature: Creature, speed: float) -> list[AnyObjective]:
     return [
         centre_of_mass_velocity(body, speed * up, 2.0),
         node_velocities(body, np.tile(speed * up, (len(body.node_mass), 1)), 1.0),
-        SpinObjective(np.zeros(3), 1.0),
+        AngularMomentumObjective(np.zeros(3), 1.0),
         LoadObjective(lifted, 0.1),
     ]
 
 
-def begun(stepper: LocomotionStepper, state: BodyState, memory: StepMemory) -> StepStart:
+def begun(stepper: LocomotionStepper, state: BodyState, memory: WarmStart) -> StepInputs:
     problem = StepProblem(stepper.body, state, DT, stepper.settings.drag)
-    return stepper.start_of(problem, stepper._detect(problem, memory), memory)
+    return stepper.step_inputs(problem, stepper._detect(problem, memory), memory)
 
 
 def on_its_edge(stepper: LocomotionStepper) -> BodyState:
@@ -76,22 +76,22 @@ def on_its_edge(stepper: LocomotionStepper) -> BodyState:
 
 
 def planner_of(stepper: LocomotionStepper) -> DevicePlanner:
-    planner = stepper._at_once
+    planner = stepper._device_planner
     assert isinstance(planner, DevicePlanner)
     return planner
 
 
 def is_the_host_s(
-    stepper: LocomotionStepper, start: StepStart, memory: StepMemory, objectives: Sequence[AnyObjective]
+    stepper: LocomotionStepper, start: StepInputs, memory: WarmStart, objectives: Sequence[AnyObjective]
 ) -> bool:
     """The plan and its response; False if it is left to the host."""
     found = planner_of(stepper).plan(start, objectives)
     if found is None:
         return False
     response, plan = found
-    begun_at = response.at(None, plan.velocities, plan.forces)
+    begun_at = response.iterate_at(None, plan.velocities, plan.forces)
     delassus = response.delassus.copy()
-    prospect = stepper.foresee(start)
+    prospect = stepper.predict(start)
     expected = stepper.planner.plan(prospect, memory.activations, objectives, StageClock())
     height = stepper.body.height
     assert plan.qp_count == expected.qp_count and plan.qp_infeasible == expected.qp_infeasible
@@ -99,9 +99,9 @@ def is_the_host_s(
     np.testing.assert_allclose(plan.velocities, expected.velocities, rtol=0, atol=1e-7 * stepper.body.speed_unit)
     np.testing.assert_allclose(plan.forces, expected.forces, rtol=0, atol=1e-6 * stepper.body.weight)
     scale = np.abs(delassus).max(initial=1e-300)
-    np.testing.assert_allclose(delassus, prospect.response.delassus, rtol=0, atol=1e-9 * scale)
+    np.testing.assert_allclose(delassus, prospect.linearization.delassus, rtol=0, atol=1e-9 * scale)
     # Without muscles it is another place than the one that is at hand.
-    assert isinstance(begun_at, DeviceIterate) and begun_at.tension is None
+    assert isinstance(begun_at, DeviceNewtonIterate) and begun_at.tension is None
     return True
 
 
@@ -132,30 +132,32 @@ def test_the_solve_goes_on_from_the_plan_s_end(
     found = planner_of(stepper).plan(start, asks(creature, 0.1))
     assert found is not None
     response, plan = found
-    tension = MuscleTension.of(stepper.muscles, plan.activations)
+    tension = MuscleEnergy.of(stepper.muscles, plan.activations)
     asked: list[str] = []
-    for name in ("begin", "begin_onward"):
-        real = getattr(ContactRoom, name)
+    for name in ("start_trial", "start_newton"):
+        real = getattr(NewtonWorkspace, name)
         monkeypatch.setattr(
-            ContactRoom, name, lambda *given, name=name, real=real, **named: asked.append(name) or real(*given, **named)
+            NewtonWorkspace,
+            name,
+            lambda *given, name=name, real=real, **named: asked.append(name) or real(*given, **named),
         )
-    course = stepper.solver.course(start.problem)
-    first = response.at(tension, plan.velocities, plan.forces)
-    stretch = first.onward(start.shift, start.friction, course)
-    assert asked == [] and first.size > 0.0 and len(stretch.sizes) > 1
-    second = response.at(tension, plan.velocities.copy(), plan.forces)
-    assert second.size == pytest.approx(first.size, rel=1e-7)
-    np.testing.assert_allclose(second.speeds, first.speeds, rtol=0, atol=1e-10)
-    other = second.onward(start.shift, start.friction, course)
-    ahead, beyond = stretch.end, other.end
-    assert asked == ["begin", "begin_onward"] and stretch.missed < 1e-10
-    np.testing.assert_allclose(other.sizes, stretch.sizes, rtol=1e-3, atol=1e-7)
+    course = stepper.solver.convergence_state(start.problem)
+    first = response.iterate_at(tension, plan.velocities, plan.forces)
+    stretch = first.newton_steps(start.normal_bias, start.friction, course)
+    assert asked == [] and first.residual_norm > 0.0 and len(stretch.accepted_residuals) > 1
+    second = response.iterate_at(tension, plan.velocities.copy(), plan.forces)
+    assert second.residual_norm == pytest.approx(first.residual_norm, rel=1e-7)
+    np.testing.assert_allclose(second.free_contact_velocities, first.free_contact_velocities, rtol=0, atol=1e-10)
+    other = second.newton_steps(start.normal_bias, start.friction, course)
+    ahead, beyond = stretch.trial, other.trial
+    assert asked == ["start_trial", "start_newton"] and stretch.coulomb_violation < 1e-10
+    np.testing.assert_allclose(other.accepted_residuals, stretch.accepted_residuals, rtol=1e-3, atol=1e-7)
     np.testing.assert_allclose(other.forces, stretch.forces, rtol=0, atol=1e-7 * stepper.body.weight)
     np.testing.assert_allclose(beyond.velocities, ahead.velocities, rtol=0, atol=1e-10)
-    assert ahead.seen is not None and beyond.seen is not None
-    assert ahead.seen.sinking == beyond.seen.sinking
-    assert ahead.seen.least_gap == pytest.approx(beyond.seen.least_gap, abs=1e-12)
-    np.testing.assert_allclose(beyond.seen.torque, ahead.seen.torque, rtol=1e-6)
+    assert ahead.penetration is not None and beyond.penetration is not None
+    assert ahead.penetration.is_penetrating == beyond.penetration.is_penetrating
+    assert ahead.penetration.min_gap == pytest.approx(beyond.penetration.min_gap, abs=1e-12)
+    np.testing.assert_allclose(beyond.penetration.internal_torque, ahead.penetration.internal_torque, rtol=1e-6)
 
 
 @pytest.mark.parametrize("last", [False, True])
@@ -167,20 +169,22 @@ def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: Locomoti
     found = planner_of(stepper).plan(start, objectives)
     assert found is not None
     response, plan = found
-    tension = MuscleTension.of(stepper.muscles, plan.activations)
-    course = stepper.solver.course(start.problem)
-    stretch = response.at(tension, plan.velocities, plan.forces).onward(start.shift, start.friction, course)
-    end = stretch.end if last else stretch.base
-    prospect = Prospect(response, start.shift, plan.activations, end.velocities, end.forces)
-    again = planner_of(stepper).plan_again(prospect, memory.activations, objectives, start.friction)
+    tension = MuscleEnergy.of(stepper.muscles, plan.activations)
+    course = stepper.solver.convergence_state(start.problem)
+    stretch = response.iterate_at(tension, plan.velocities, plan.forces).newton_steps(
+        start.normal_bias, start.friction, course
+    )
+    end = stretch.trial if last else stretch.base
+    prospect = PredictedStep(response, start.normal_bias, plan.activations, end.velocities, end.forces)
+    again = planner_of(stepper).replan(prospect, memory.activations, objectives, start.friction)
     assert again is not None
     expected = stepper.planner.plan(prospect, memory.activations, objectives, StageClock())
     assert again.qp_count == expected.qp_count
     np.testing.assert_allclose(again.activations, expected.activations, rtol=0, atol=1e-7 * stepper.body.height)
     np.testing.assert_allclose(again.velocities, expected.velocities, rtol=0, atol=1e-7 * stepper.body.speed_unit)
     np.testing.assert_allclose(again.forces, expected.forces, rtol=0, atol=1e-6 * stepper.body.weight)
-    response.at(None, 0.5 * end.velocities, end.forces)
-    assert planner_of(stepper).plan_again(prospect, memory.activations, objectives, start.friction) is None
+    response.iterate_at(None, 0.5 * end.velocities, end.forces)
+    assert planner_of(stepper).replan(prospect, memory.activations, objectives, start.friction) is None
 
 
 @pytest.mark.parametrize("beside", [False, True])
@@ -192,9 +196,9 @@ def test_a_search_goes_on_as_the_host_s(
     solve begins, whether the second search is ``beside`` the first or after it. Only what is led astray the host
     searches itself."""
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
-    monkeypatch.setattr(device_plan, "LIKELY", 0.0 if beside else np.inf)
+    monkeypatch.setattr(device_plan, "PARALLEL_RESTART_COST", 0.0 if beside else np.inf)
     if what != "astray":
-        monkeypatch.setattr(device_plan, "COSTLY", 0.0)
+        monkeypatch.setattr(device_plan, "RESTART_COST", 0.0)
     planner_of(stepper)._rooms.clear()
     start = begun(stepper, creature.start, memory)
     asked: list[str] = []
@@ -202,36 +206,36 @@ def test_a_search_goes_on_as_the_host_s(
     def noted(module: Any, name: str, given: Callable[..., Any]) -> None:
         monkeypatch.setattr(module, name, wraps(given)(lambda *a, **b: asked.append(name) or given(*a, **b)))
 
-    noted(device_plan, "search_pieces", search_pieces)
+    noted(device_plan, "search_modes", search_modes)
     noted(device_plan, "solve_relaxed", solve_relaxed)
-    noted(PlanRoom, "_enqueue_elsewhere", PlanRoom._enqueue_elsewhere)
-    noted(PlanRoom, "_enqueue_from_point", PlanRoom._enqueue_from_point)
-    noted(PlanRoom, "_end_at", PlanRoom._end_at)
+    noted(PlanWorkspace, "_enqueue_elsewhere", PlanWorkspace._enqueue_elsewhere)
+    noted(PlanWorkspace, "_enqueue_from_point", PlanWorkspace._enqueue_from_point)
+    noted(PlanWorkspace, "_end_at", PlanWorkspace._end_at)
     if what != "astray":
-        monkeypatch.setattr(strategies, "COSTLY", 0.0)
-        monkeypatch.setattr(strategies, "DOUBTFUL", 0.0)
+        monkeypatch.setattr(strategies, "RESTART_COST", 0.0)
+        monkeypatch.setattr(strategies, "RESTART_GAP", 0.0)
     if what not in ("costly", "astray"):
         for module in (strategies, device_plan):
             monkeypatch.setattr(
                 module,
-                "better_elsewhere",
+                "restart_from_relaxation",
                 lambda found, relaxed, search: (search(relaxed[0]), found)[what == "kept"],
             )
     if what == "astray":
         monkeypatch.setattr(device_plan, "FOUND", -1)
-        monkeypatch.setattr(strategies, "search_at_once", lambda *_, **__: None)
+        monkeypatch.setattr(strategies, "search_modes_device", lambda *_, **__: None)
     elif what == "no bound":
-        monkeypatch.setattr(RelaxedRoom, "found", lambda _: None)
+        monkeypatch.setattr(RelaxationWorkspace, "found", lambda _: None)
     elif what == "second astray":
-        monkeypatch.setattr(SearchRoom, "found", lambda *_: None)
+        monkeypatch.setattr(ModeSearchWorkspace, "parse_result", lambda *_: None)
     assert is_the_host_s(stepper, start, memory, objectives)
     expected = {
         "costly": ["_enqueue_elsewhere", "_end_at"],
         "better": ["_enqueue_elsewhere", "_end_at"],
         "kept": ["_enqueue_elsewhere"],
-        "astray": ["search_pieces", "_end_at"],
+        "astray": ["search_modes", "_end_at"],
         "no bound": ["_enqueue_elsewhere", "solve_relaxed", "_enqueue_from_point", "_end_at"],
-        "second astray": ["_enqueue_elsewhere", "search_pieces", "_end_at"],
+        "second astray": ["_enqueue_elsewhere", "search_modes", "_end_at"],
     }
     again = ["_enqueue_elsewhere"] if beside and what in ("astray", "no bound") else []
     assert asked == again + expected[what]
@@ -239,10 +243,14 @@ def test_a_search_goes_on_as_the_host_s(
     assert found is not None
     stretch = (
         found[0]
-        .at(MuscleTension.of(stepper.muscles, found[1].activations), found[1].velocities, found[1].forces)
-        .onward(start.shift, start.friction, stepper.solver.course(start.problem))
+        .iterate_at(MuscleEnergy.of(stepper.muscles, found[1].activations), found[1].velocities, found[1].forces)
+        .newton_steps(start.normal_bias, start.friction, stepper.solver.convergence_state(start.problem))
     )
-    assert stretch.missed < 1e-9 and stretch.end.feasible and stretch.forces.shape == found[1].forces.shape
+    assert (
+        stretch.coulomb_violation < 1e-9
+        and stretch.trial.is_inversion_free
+        and stretch.forces.shape == found[1].forces.shape
+    )
 
 
 @pytest.mark.parametrize("what", ["verdicts", "sizes", "missed", "horizon", "end", "forces"])
@@ -264,7 +272,7 @@ def test_what_is_not_as_usual_is_left_to_the_host(
     monkeypatch.setattr(room, "_parts", told)
     assert planner_of(stepper).plan(start, objectives) is None
     end, _, reports = stepper.advance(creature.start, memory, objectives, DT)
-    stepper._at_once = None
+    stepper._device_planner = None
     expected, _, others = stepper.advance(creature.start, memory, objectives, DT)
     assert reports[0].converged and reports[0].qp_count == others[0].qp_count
     np.testing.assert_array_equal(end.velocities, expected.velocities)
@@ -280,20 +288,20 @@ def test_a_step_that_goes_amiss_is_planned_again_on_the_device(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every step is asked for again: what comes of it is the host's."""
-    monkeypatch.setattr(stepping, "_AMISS", 0.0)
-    monkeypatch.setattr(stepping, "_LITTLE", -1.0)
+    monkeypatch.setattr(stepping, "_REPLAN_FACTOR", 0.0)
+    monkeypatch.setattr(stepping, "_REPLAN_MARGIN", -1.0)
     planned: list[bool] = []
-    again = DevicePlanner.plan_again
+    again = DevicePlanner.replan
 
     def counted(*given: Any) -> Plan | None:
         planned.append((found := again(*given)) is not None)
         return found
 
-    monkeypatch.setattr(DevicePlanner, "plan_again", counted)
+    monkeypatch.setattr(DevicePlanner, "replan", counted)
     memory, objectives, state = stepper.initial_memory(), asks(creature, 0.1), on_its_edge(stepper)
     end, _, (report,) = stepper.advance(state, memory, objectives, DT)
     assert planned == [True] and report.converged
-    stepper._at_once = None
+    stepper._device_planner = None
     expected, _, (other,) = stepper.advance(state, memory, objectives, DT)
     assert report.qp_count == other.qp_count
     np.testing.assert_allclose(end.positions, expected.positions, rtol=0, atol=1e-8 * stepper.body.height)
@@ -304,7 +312,7 @@ def test_the_same_body_on_other_ground_shares_what_it_works_with(
 ) -> None:
     """Steps by turns on two frictions are those of each alone."""
     slippery = stepper.with_friction(0.1)
-    assert slippery._at_once is stepper._at_once and slippery.respond is stepper.respond
+    assert slippery._device_planner is stepper._device_planner and slippery.linearizer is stepper.linearizer
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     one, other = ((creature.start, memory), (creature.start, memory))
     turns: list[np.ndarray] = []
@@ -326,13 +334,13 @@ def test_a_step_is_begun_when_the_one_before_has_ended(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Once; whatever else is done there meanwhile, it is begun again, and ends alike."""
-    counted: list[StepStart] = []
-    begin = DevicePlanner.begin
-    monkeypatch.setattr(DevicePlanner, "begin", lambda self, start: counted.append(start) or begin(self, start))
+    counted: list[StepInputs] = []
+    begin = DevicePlanner.start
+    monkeypatch.setattr(DevicePlanner, "start", lambda self, start: counted.append(start) or begin(self, start))
     objectives, slippery = asks(creature, 0.1), stepper.with_friction(0.2)
     first = on_its_edge(stepper), stepper.initial_memory()
 
-    def end_after(meanwhile: Callable[[BodyState, StepMemory], object]) -> np.ndarray:
+    def end_after(meanwhile: Callable[[BodyState, WarmStart], object]) -> np.ndarray:
         state, memory, _ = stepper.advance(*first, objectives, DT)
         meanwhile(state, memory)
         counted.clear()
@@ -340,12 +348,12 @@ def test_a_step_is_begun_when_the_one_before_has_ended(
         assert report.converged
         return end.positions
 
-    expected = end_after(lambda state, memory: setattr(stepper, "_ahead", None))
+    expected = end_after(lambda state, memory: setattr(stepper, "_prefetched", None))
     assert len(counted) == 2
     for times, meanwhile in [
         (1, lambda state, memory: None),
         (2, lambda state, memory: slippery.advance(state, memory, objectives, DT)),
-        (2, lambda state, memory: slippery.advance_held(state, memory, memory.activations, DT)),
+        (2, lambda state, memory: slippery.advance_with_activations(state, memory, memory.activations, DT)),
         (2, lambda state, memory: slippery.advance(*first, objectives, DT)),
         (2, lambda state, memory: stepper.passive_step(first[0], memory, DT)),
     ]:

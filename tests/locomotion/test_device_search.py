@@ -9,25 +9,25 @@ import pytest
 import warp as wp
 
 from egs_warp.contact.coulomb import coulomb_forces
-from egs_warp.kernels.locomotion import block_active_set, block_pieces, piece_search, pieces
+from egs_warp.kernels.locomotion import block_active_set, block_mode_region, mode_region, mode_search
 from egs_warp.kernels.locomotion.active_set import FOUND, INFEASIBLE
-from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows
+from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints
 from egs_warp.kernels.locomotion.block_splitting import Splitting
 from egs_warp.locomotion import active_set, solvers, strategies
-from egs_warp.locomotion.active_set import ReducedRows, optimum_near
-from egs_warp.locomotion.contact_pieces import (
+from egs_warp.locomotion.active_set import WhitenedQp, solve_from_guess
+from egs_warp.locomotion.contact_modes import (
     SLIDE,
     STICK,
     ContactModes,
-    ContactPieces,
-    PieceSearch,
-    search_pieces,
+    CoulombProgram,
+    ModeSearchResult,
+    search_modes,
     solve_relaxed,
 )
-from egs_warp.locomotion.device_search import RelaxedRoom, SearchRoom, search_at_once
+from egs_warp.locomotion.device_search import ModeSearchWorkspace, RelaxationWorkspace, search_modes_device
+from egs_warp.locomotion.operator_splitting import OsqpSplitting
 from egs_warp.locomotion.solvers import QpSolver
-from egs_warp.locomotion.splitting import OsqpSplitting
-from egs_warp.locomotion.strategies import Foreseen, Strategy, search_program
+from egs_warp.locomotion.strategies import PredictedContact, Strategy, search_program
 from egs_warp.precision import real
 from tests.support.kernels import algebra_kernel, iterate_kernel
 
@@ -35,7 +35,7 @@ DEVICES = [str(device) for device in wp.get_devices()]
 FRICTION = 0.6
 
 
-def body_program(seed: int, activations: int, contacts: int, *, bias: float = 0.0) -> ContactPieces:
+def body_program(seed: int, activations: int, contacts: int, *, bias: float = 0.0) -> CoulombProgram:
     """Activations and contacts of a random body, which ask for some of its velocities; ``bias`` presses it down."""
     rng = np.random.default_rng(seed)
     freedoms = activations + 2 * contacts + 6
@@ -48,24 +48,24 @@ def body_program(seed: int, activations: int, contacts: int, *, bias: float = 0.
     goals = rng.standard_normal((max(3, activations // 2), freedoms))
     rows, gap = goals @ columns, goals @ base - rng.standard_normal(len(goals))
     weights = np.concatenate([np.full(activations, 0.05), np.zeros(3 * contacts)])
-    return ContactPieces(
+    return CoulombProgram(
         *(2.0 * rows.T @ rows + np.diag(weights), 2.0 * rows.T @ gap, float(gap @ gap)),
         *(frame @ columns, frame @ base, FRICTION, -np.ones(activations), np.ones(activations)),
     )
 
 
-def entered(program: ContactPieces) -> tuple[np.ndarray, ContactModes]:
+def entered(program: CoulombProgram) -> tuple[np.ndarray, ContactModes]:
     """Without activations: a point, and how each contact moves there."""
-    m, n = program.activations, program.contacts
+    m, n = program.activation_count, program.contact_count
     forces, _ = coulomb_forces(program.rows[:, m:], program.offset, np.zeros(n), FRICTION, np.zeros((n, 3)))
     return np.concatenate([np.zeros(m), forces.ravel()]), ContactModes.of(forces, FRICTION)
 
 
-def both(program: ContactPieces, device: str, limit: int = 12) -> tuple[PieceSearch | None, PieceSearch]:
+def both(program: CoulombProgram, device: str, limit: int = 12) -> tuple[ModeSearchResult | None, ModeSearchResult]:
     start, modes = entered(program)
     given: dict[str, Any] = {"qp_limit": limit}
-    here = search_pieces(program, start, modes, solver=QpSolver.OSQP, **given)
-    return search_at_once(program, start, modes, device=wp.get_device(device), **given), here
+    here = search_modes(program, start, modes, solver=QpSolver.OSQP, **given)
+    return search_modes_device(program, start, modes, device=wp.get_device(device), **given), here
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -129,18 +129,18 @@ def test_the_default_strategy_goes_by_it_and_by_the_host_where_it_is_led_astray(
     forces = start[5:].reshape(-1, 3)
     asked: list[int] = []
 
-    def counted(*given: Any, **named: Any) -> PieceSearch | None:
+    def counted(*given: Any, **named: Any) -> ModeSearchResult | None:
         asked.append(named["qp_limit"])
-        return search_at_once(*given, **named) if len(asked) == 1 else None
+        return search_modes_device(*given, **named) if len(asked) == 1 else None
 
-    monkeypatch.setattr(strategies, "search_at_once", counted)
+    monkeypatch.setattr(strategies, "search_modes_device", counted)
     given: dict[str, Any] = {"directions": 4, "qp_limit": 9, "device": "cpu"}
-    foreseen = Foreseen(np.zeros(5), forces, np.zeros((3, 3)))
-    found = [search_program(program, Strategy.PIECES, foreseen, solver="admm", **given) for _ in range(2)]
+    foreseen = PredictedContact(np.zeros(5), forces, np.zeros((3, 3)))
+    found = [search_program(program, Strategy.MODES, foreseen, solver="admm", **given) for _ in range(2)]
     assert asked[:2] == [9, 9]
     assert found[0].x is not None and found[1].x is not None
     np.testing.assert_allclose(found[0].x, found[1].x, atol=1e-6)
-    search_program(program, Strategy.PIECES, foreseen, solver="osqp", **given)
+    search_program(program, Strategy.MODES, foreseen, solver="osqp", **given)
     assert len(asked) == 2 and modes.kind.max() >= STICK
 
 
@@ -153,14 +153,14 @@ def test_contacts_without_a_pivot_are_left_to_the_host(own: float, device: str) 
     speeds = program.rows[:, 3:]
     speeds[3, :] = 0.0
     # What is added to the diagonal is taken off again.
-    speeds[3, 3] = own or -pieces.SINGULAR * np.abs(np.delete(np.diag(speeds), 3)).sum() / 6.0
+    speeds[3, 3] = own or -mode_region.DELASSUS_REGULARIZATION * np.abs(np.delete(np.diag(speeds), 3)).sum() / 6.0
     start = np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
     modes = ContactModes(np.full(2, STICK), np.tile([1.0, 0.0], (2, 1)))
-    there = search_at_once(program, start, modes, qp_limit=3, device=wp.get_device(device))
+    there = search_modes_device(program, start, modes, qp_limit=3, device=wp.get_device(device))
     if own == 0.0:
         assert there is None
         return
-    here = search_pieces(program, start, modes, qp_limit=3, solver=QpSolver.OSQP)
+    here = search_modes(program, start, modes, qp_limit=3, solver=QpSolver.OSQP)
     assert there is not None and there.qp_count == here.qp_count and there.infeasible == here.infeasible
     assert there.objective == pytest.approx(here.objective, rel=1e-7)
 
@@ -169,8 +169,8 @@ def test_contacts_without_a_pivot_are_left_to_the_host(own: float, device: str) 
 @pytest.mark.parametrize(("activations", "contacts"), [(1, 1), (5, 3), (9, 8), (23, 11)])
 def test_one_launch_finds_the_optimum_without_complementarity(activations: int, contacts: int, device: str) -> None:
     """What the host finds, of the program that the search was told, in a room for more; no search ends lower."""
-    search = SearchRoom(activations, contacts + 2, device)
-    room = RelaxedRoom(activations, contacts + 2, search)
+    search = ModeSearchWorkspace(activations, contacts + 2, device)
+    room = RelaxationWorkspace(activations, contacts + 2, search)
     alike = apart = 0
     for seed in range(12):
         program = body_program(seed, activations, contacts, bias=0.5 * (seed % 3))
@@ -207,10 +207,10 @@ def test_a_block_does_the_algebra(count: int, device: str) -> None:
     lengths, across = (wp.zeros(count, dtype=real, device=device) for _ in range(2))
     wp.launch(
         algebra_kernel,
-        1 if device == "cpu" else piece_search.BLOCK,
+        1 if device == "cpu" else mode_search.BLOCK,
         inputs=[count, count + right, *given, *made, *numbers, *parts, lengths, across],
         device=device,
-        block_dim=piece_search.BLOCK,
+        block_dim=mode_search.BLOCK,
     )
     root, product, turned = (each.numpy() for each in made)
     np.testing.assert_allclose(product, matrix[:, :count] @ symmetric, atol=1e-10 * count)
@@ -233,15 +233,20 @@ def test_a_block_does_the_algebra(count: int, device: str) -> None:
 
 def test_bounds_give_way_by_as_much_as_on_the_host() -> None:
     """These numbers stand in the kernels, which know nothing of the host's modules."""
-    there = block_pieces.LEFT, block_pieces.ROOM, piece_search.HOPELESS, block_active_set.PIVOTS
-    here = active_set._BROKEN, solvers._ROOM * 3e-5, active_set._HOPELESS, active_set._PIVOTS
+    there = (
+        block_mode_region.ROW_TOLERANCE,
+        block_mode_region.BOUND_PADDING,
+        mode_search.INFEASIBLE_COST,
+        block_active_set.PIVOTS,
+    )
+    here = active_set._BROKEN, solvers._BOUND_PADDING * 3e-5, active_set._HOPELESS, active_set._PIVOTS
     assert [float(each) for each in there] == pytest.approx(here, rel=1e-12)
 
 
 def filled(made: Any, device: str, **shapes: Any) -> Any:
     """The struct ``made`` with zeros of these shapes, or with the numbers of arrays."""
     for name, given in shapes.items():
-        kind = int if name in ("side", "active", "settled", "parts") else real
+        kind = int if name in ("side", "active", "cancelled", "base_rows") else real
         array = given if isinstance(given, np.ndarray) else np.zeros(given)
         setattr(made, name, wp.array(np.ascontiguousarray(array), dtype=kind, device=device))
     return made
@@ -262,7 +267,7 @@ def test_a_block_iterates_as_osqp_does_and_ends_at_the_optimum(seed: int, device
     chosen = np.flatnonzero(broken)[:n]
     side = np.zeros(m, np.int32)
     side[chosen] = np.where(free[chosen] < lower[chosen], 1, -1)
-    near = OsqpSplitting(np.eye(n), np.zeros(n), accuracy=3e-5).near(
+    near = OsqpSplitting(np.eye(n), np.zeros(n), accuracy=3e-5).warm_start(
         units[chosen], (lower - free)[chosen], (upper - free)[chosen], start
     )
     pushes = np.zeros(m)
@@ -270,37 +275,40 @@ def test_a_block_iterates_as_osqp_does_and_ends_at_the_optimum(seed: int, device
     at = free + units @ near.x
     expected = np.where(at - lower < -pushes, 1, np.where(upper - at < pushes, -1, 0))
     rows = filled(
-        UnitRows(), device, units=units, free=free, lower=lower, upper=upper, slack=np.full(m, 1e-8),
-        settled=1, seen=m, parts=np.arange(m)[:, None].repeat(3, 1), shares=np.eye(1, 3).repeat(m, 0),
+        UnitConstraints(), device, units=units, values_at_origin=free, lower=lower, upper=upper,
+        slack=np.full(m, 1e-8),
+        cancelled=1, base_values=m, base_rows=np.arange(m)[:, None].repeat(3, 1),
+        coefficients=np.eye(1, 3).repeat(m, 0),
     )  # fmt: skip
-    rows.unknowns, rows.count, rows.made_of, rows.most = n, m, m, 1e6
+    rows.unknowns, rows.count, rows.base_count, rows.cost_limit = n, m, m, 1e6
     holding = filled(
-        Holding(), device, side=side, active=n, at=m, **dict.fromkeys(("pulls", "place", "ways", "beside"), n),
-        **dict.fromkeys(("between", "joins", "outside"), n),
-        **dict.fromkeys(("held", "held_across", "products", "root", "inverse"), (n, n)),
+        ActiveSet(), device, side=side, active=n, values=m,
+        **dict.fromkeys(("multipliers", "z", "dual_direction", "scratch_a"), n),
+        **dict.fromkeys(("scratch_b", "entering_row", "orthogonal_part"), n),
+        **dict.fromkeys(("active_rows", "active_columns", "products", "root", "inverse"), (n, n)),
     )  # fmt: skip
     splitting = filled(
-        Splitting(), device, begun=units @ start, held_by=m,
-        **dict.fromkeys(("rows", "near", "pushes", "sums", "right", "between", "step"), n),
+        Splitting(), device, initial_values=units @ start, all_multipliers=m,
+        **dict.fromkeys(("rows", "projected", "multipliers", "sums", "right", "between", "step"), n),
     )  # fmt: skip
     guessed, ended = (wp.zeros(count, dtype=int, device=device) for count in (m, 1))
     wp.launch(
         iterate_kernel,
-        1 if device == "cpu" else piece_search.BLOCK,
+        1 if device == "cpu" else mode_search.BLOCK,
         inputs=[rows, holding, splitting, guessed, ended],
         device=device,
-        block_dim=piece_search.BLOCK,
+        block_dim=mode_search.BLOCK,
     )
     # A row that is at its bound to rounding is on either side of it.
     sure = np.minimum(np.abs(at - lower + pushes), np.abs(upper - at - pushes)) > 1e-9
     np.testing.assert_array_equal(guessed.numpy()[sure], expected[sure])
     assert sure.sum() > m - 3 and np.count_nonzero(expected) > 2
-    np.testing.assert_allclose(splitting.pushes.numpy()[: len(chosen)], near.multipliers, atol=1e-8)
+    np.testing.assert_allclose(splitting.multipliers.numpy()[: len(chosen)], near.multipliers, atol=1e-8)
     np.testing.assert_allclose(splitting.rows.numpy()[: len(chosen)], units[chosen] @ near.x, atol=1e-8)
-    exact = optimum_near(
-        ReducedRows.of(np.eye(n), np.zeros(n), units), lower - free, upper - free, free < lower, free > upper
+    exact = solve_from_guess(
+        WhitenedQp.of(np.eye(n), np.zeros(n), units), lower - free, upper - free, free < lower, free > upper
     )
     assert exact is not None
     assert ended.numpy()[0] == (FOUND if exact.feasible else INFEASIBLE)
     if exact.feasible:
-        np.testing.assert_allclose(holding.place.numpy(), exact.x, atol=1e-6)
+        np.testing.assert_allclose(holding.z.numpy(), exact.x, atol=1e-6)

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from egs_warp.fem.body import BodyState
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion import ledger as module
-from egs_warp.locomotion.ledger import FLOWS, STORED, EnergySums, Ledger, ledger
+from egs_warp.locomotion.ledger import FLOWS, STORED, EnergyBalance, EnergyTotals, energy_balance
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.muscles.tension import MuscleTension, shares_of_tension
-from tests.support.places import DT
+from egs_warp.muscles.tension import MuscleEnergy, force_length_factor
 from tests.support.slides import slide
+from tests.support.stances import DT
 
 CLOSES = 1e-6
 """Of m g H, in every step."""
@@ -31,24 +31,24 @@ def trajectory() -> Trajectory:
 
 
 @pytest.fixture(scope="module")
-def books(trajectory: Trajectory) -> Ledger:
-    return ledger(trajectory)
+def books(trajectory: Trajectory) -> EnergyBalance:
+    return energy_balance(trajectory)
 
 
-def worst(books: Ledger) -> float:
+def worst(books: EnergyBalance) -> float:
     return float(np.abs(books.residual).max())
 
 
-def test_every_step_closes(books: Ledger) -> None:
+def test_every_step_closes(books: EnergyBalance) -> None:
     assert len(books.residual) >= 24 and worst(books) < 1e-9
 
 
-def test_each_flow_counts(books: Ledger) -> None:
+def test_each_flow_counts(books: EnergyBalance) -> None:
     """A tenth more of any of them is beyond the bound; those that the slide does not have are nothing."""
     for flow in FLOWS:
         values = getattr(books, flow)
         if flow in IDLE:
-            assert np.abs(values).max() < 1e-8 * books.unit, flow
+            assert np.abs(values).max() < 1e-8 * books.energy_unit, flow
         else:
             assert worst(replace(books, **{flow: 1.1 * values})) > CLOSES, flow
 
@@ -59,9 +59,9 @@ class PartlyInside(StepProblem):
 
     share: float = 0.0
 
-    def spin(self, internal_gradient: np.ndarray) -> np.ndarray:
+    def momentum_correction(self, internal_gradient: np.ndarray) -> np.ndarray:
         """(3,) rad/s."""
-        return self.share * super().spin(internal_gradient)
+        return self.share * super().momentum_correction(internal_gradient)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.6])
@@ -70,20 +70,20 @@ def test_spin_that_is_added_after_a_step_counts(trajectory: Trajectory, share: f
     body, positions = slide().stepper.body, trajectory.positions[0]
     state = BodyState(positions, np.cross([3.0, -2.0, 5.0], positions - body.centre_of_mass(positions)))
     problem = PartlyInside(body, state, DT, trajectory.drag, share)
-    velocities, factors = problem.start, SparseFactors(body.assembly.upper_pattern)
+    velocities, factors = problem.rigid_guess, MultifrontalLdl(body.assembly.upper_pattern)
     for _ in range(40):
         change = problem.tangent(factors, velocities, None).solve(problem.residual(velocities, None).ravel())
         velocities = velocities - change.reshape(velocities.shape)
-    assert np.linalg.norm(problem.residual(velocities, None)) < 1e-11 * problem.unit
+    assert np.linalg.norm(problem.residual(velocities, None)) < 1e-11 * problem.residual_scale
     end = problem.end_positions(velocities)
-    whole = StepProblem.spin(problem, problem.internal_gradient(velocities, None))
+    whole = StepProblem.momentum_correction(problem, problem.internal_gradient(velocities, None))
     added = np.linalg.solve(body.inertia(end), (1.0 - share) * problem.inertia @ whole)
     after = velocities + np.cross(added, end - body.centre_of_mass(end))
     step = one_step(trajectory, [positions, end], [state.velocities, after])
-    books = ledger(step)
+    books = energy_balance(step)
     assert worst(books) < 1e-9
     assert worst(replace(books, spin_after=1.1 * books.spin_after)) > CLOSES
-    assert (np.abs(books.spin_inside).max() < 1e-9 * books.unit) == (share == 0.0)
+    assert (np.abs(books.spin_inside).max() < 1e-9 * books.energy_unit) == (share == 0.0)
 
 
 def one_step(
@@ -110,23 +110,23 @@ def test_muscles_that_lose_their_tension_count(trajectory: Trajectory, height: f
     body, muscles = stepper.body, stepper.muscles
     positions = body.mesh.nodes * [1.0, 1.0, height] + [0.0, 0.0, 1.0]
     state = BodyState(positions, np.array([0.2, 0.1, 1.5 * (1.0 - height)]) * -body.mesh.nodes)
-    tension = MuscleTension.of(muscles, np.full(muscles.segment_count, 0.02))
+    tension = MuscleEnergy.of(muscles, np.full(muscles.segment_count, 0.02))
     problem = StepProblem(body, state, DT, trajectory.drag)
-    velocities, factors = problem.start, SparseFactors(body.assembly.upper_pattern)
+    velocities, factors = problem.rigid_guess, MultifrontalLdl(body.assembly.upper_pattern)
     for _ in range(40):
         change = problem.tangent(factors, velocities, tension).solve(problem.residual(velocities, tension).ravel())
         velocities = velocities - change.reshape(velocities.shape)
-    assert np.linalg.norm(problem.residual(velocities, tension)) < 1e-10 * problem.unit
+    assert np.linalg.norm(problem.residual(velocities, tension)) < 1e-10 * problem.residual_scale
     end = problem.end_positions(velocities)
     lengths = np.stack([muscles.lengths(positions), muscles.lengths(end)]) / muscles.rest_lengths
     assert (((lengths > 0.3) & (lengths < 0.7)).any(axis=0) & (np.ptp(lengths, axis=0) > 0.01)).any()
-    books = ledger(one_step(trajectory, [positions, end], [state.velocities, velocities], 0.02))
+    books = energy_balance(one_step(trajectory, [positions, end], [state.velocities, velocities], 0.02))
     assert worst(books) < 1e-9
     for flow in ("muscles", "lost_muscle"):
         assert worst(replace(books, **{flow: 1.1 * getattr(books, flow)})) > CLOSES, flow
 
 
-def test_the_work_of_a_push_is_the_kinetic_energy_that_it_gives(trajectory: Trajectory, books: Ledger) -> None:
+def test_the_work_of_a_push_is_the_kinetic_energy_that_it_gives(trajectory: Trajectory, books: EnergyBalance) -> None:
     """m |v0 + k|^2 / 2 - m |v0|^2 / 2 over the nodes, of a blow on one side and a wind at once."""
     assert trajectory.kick_step.tolist() == list(range(8, 24)) and (books.pushes[:8] == 0.0).all()
     mass, before = trajectory.node_mass, trajectory.velocities[8]
@@ -135,22 +135,22 @@ def test_the_work_of_a_push_is_the_kinetic_energy_that_it_gives(trajectory: Traj
     assert books.pushes[8] == pytest.approx(gained, rel=1e-10)
 
 
-def test_the_sums_of_a_run_close_and_have_its_peaks(books: Ledger) -> None:
+def test_the_sums_of_a_run_close_and_have_its_peaks(books: EnergyBalance) -> None:
     """Over m g H: what is gained is what all flows bring; the peaks are those of a state, found by looking at each."""
-    sums = EnergySums.of(books)
-    assert sums.unit_joules == books.unit and set(sums.flows) == set(FLOWS)
-    assert sums.gained == pytest.approx(sum(sums.flows.values()), abs=1e-8)
-    assert abs(sums.gained) > 1e-3
+    sums = EnergyTotals.of(books)
+    assert sums.unit_joules == books.energy_unit and set(sums.flows) == set(FLOWS)
+    assert sums.change == pytest.approx(sum(sums.flows.values()), abs=1e-8)
+    assert abs(sums.change) > 1e-3
     for peak, energies in (
         (sums.peak_elastic, books.elastic),
         (sums.peak_deformation, books.kinetic_deformation),
         (sums.muscle_work, [books.muscle_work.sum()]),
     ):
-        assert peak * books.unit == pytest.approx(max(energies)) and peak > 1e-6
-    assert sums.worst_residual == books.worst < 1e-9
+        assert peak * books.energy_unit == pytest.approx(max(energies)) and peak > 1e-6
+    assert sums.worst_residual == books.max_residual < 1e-9
 
 
-def test_each_stored_energy_counts(books: Ledger) -> None:
+def test_each_stored_energy_counts(books: EnergyBalance) -> None:
     for energy in STORED:
         assert worst(replace(books, **{energy: 1.01 * getattr(books, energy)})) > CLOSES, energy
 
@@ -174,7 +174,7 @@ def test_each_stored_energy_counts(books: Ledger) -> None:
 def test_the_file_s_numbers_are_those_of_the_run(trajectory: Trajectory, number: str) -> None:
     """Each 1 % too large."""
     wrong = replace(trajectory, **{number: 1.01 * getattr(trajectory, number)})
-    assert worst(ledger(wrong)) > CLOSES
+    assert worst(energy_balance(wrong)) > CLOSES
 
 
 def test_velocities_that_belong_to_no_step_are_seen(trajectory: Trajectory) -> None:
@@ -182,18 +182,18 @@ def test_velocities_that_belong_to_no_step_are_seen(trajectory: Trajectory) -> N
     velocities = trajectory.velocities.copy()
     middle = trajectory.positions[10] - trajectory.node_mass @ trajectory.positions[10] / trajectory.node_mass.sum()
     velocities[10] += 0.1 * middle
-    assert worst(ledger(replace(trajectory, velocities=velocities))) > CLOSES
+    assert worst(energy_balance(replace(trajectory, velocities=velocities))) > CLOSES
 
 
-def test_signs_are_those_of_physics(books: Ledger) -> None:
+def test_signs_are_those_of_physics(books: EnergyBalance) -> None:
     """Damping, drag, friction and what implicit Euler takes of the inertia never give energy, but for what the contact
     solver leaves."""
     for flow in ("damping", "drag", "friction", "contact", "lost_inertia"):
-        assert (getattr(books, flow) <= 1e-8 * books.unit).all(), flow
-    assert (books.push_out >= 0.0).all() and (books.muscle_work >= books.muscles - 1e-12 * books.unit).all()
+        assert (getattr(books, flow) <= 1e-8 * books.energy_unit).all(), flow
+    assert (books.push_out >= 0.0).all() and (books.muscle_work >= books.muscles - 1e-12 * books.energy_unit).all()
 
 
-def test_stored_energies_are_those_of_the_body(trajectory: Trajectory, books: Ledger) -> None:
+def test_stored_energies_are_those_of_the_body(trajectory: Trajectory, books: EnergyBalance) -> None:
     """Against the solver's own sum, which the ledger never sees."""
     body = slide().stepper.body
     theirs = [body.mechanical_energy(x, v) for x, v in zip(trajectory.positions, trajectory.velocities, strict=True)]
@@ -244,6 +244,6 @@ def test_what_a_shortened_muscle_has_pulled_is_the_integral_of_its_share() -> No
     count, rest = 4800, 0.5
     lengths = 1.2 * rest * np.arange(count + 1) / count
     middles = 0.5 * (lengths[1:] + lengths[:-1]) / rest
-    summed = np.append(0.0, np.cumsum(shares_of_tension(middles)[0] * np.diff(lengths)))
+    summed = np.append(0.0, np.cumsum(force_length_factor(middles)[0] * np.diff(lengths)))
     muscles = module._Muscles(*[np.zeros(0)] * 5, rest_lengths=np.full(count + 1, rest))
     np.testing.assert_allclose(muscles._pulled(lengths), summed, atol=1e-7)

@@ -8,10 +8,10 @@ import scipy.sparse as sparse
 
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.linear_step import LinearStep, Prospect
+from egs_warp.locomotion.linear_step import LinearStep, PredictedStep
 from egs_warp.locomotion.objectives import Objective
 from egs_warp.locomotion.stepper import LocomotionStepper
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.pipelines.creature import Creature
 from tests.support.creatures import coarse_pawn
 from tests.support.device_steps import on_device
@@ -22,17 +22,17 @@ def creature() -> Creature:
     return coarse_pawn()
 
 
-def about_a_fall(stepper: LocomotionStepper, creature: Creature, seed: int = 0) -> tuple[Prospect, LinearStep]:
+def about_a_fall(stepper: LocomotionStepper, creature: Creature, seed: int = 0) -> tuple[PredictedStep, LinearStep]:
     """A prospect of a body that falls and trembles on seven contacts, and the step about it."""
     nodes, random = creature.start.positions, np.random.default_rng(seed)
     state = BodyState(nodes, np.array([0.1, 0.0, -0.3]) + 0.02 * random.standard_normal(nodes.shape))
     problem = StepProblem(stepper.body, state, 0.01, 0.1)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(0, 49, 7), nodes)
-    response = stepper.respond(problem.tangent(stepper.factors, problem.start, None), contacts)
+    response = stepper.linearizer(problem.tangent(stepper.factors, problem.rigid_guess, None), contacts)
     forces = random.standard_normal((contacts.count, 3))
-    velocities = problem.start + 0.01 * random.standard_normal(nodes.shape)
-    prospect = Prospect(response, np.zeros(7), np.zeros(creature.muscles.segment_count), velocities, forces)
-    linear, other = stepper.planner.linear_steps.about(prospect, lambda: "meanwhile")
+    velocities = problem.rigid_guess + 0.01 * random.standard_normal(nodes.shape)
+    prospect = PredictedStep(response, np.zeros(7), np.zeros(creature.muscles.segment_count), velocities, forces)
+    linear, other = stepper.planner.linear_steps.linearize(prospect, lambda: "meanwhile")
     assert other == "meanwhile"
     return prospect, linear
 
@@ -41,19 +41,19 @@ def test_its_end_is_the_newton_step_s(creature: Creature) -> None:
     """Activations and contact forces push the nodes, and the tangent says how these move (Eq. 7, 8)."""
     stepper = creature.stepper
     prospect, linear = about_a_fall(stepper, creature)
-    problem, contacts = prospect.response.tangent.problem, prospect.response.contacts
+    problem, contacts = prospect.linearization.tangent.problem, prospect.linearization.contacts
     x = np.random.default_rng(1).standard_normal(linear.count)
     m = stepper.planner.synergies.count
     activations = (stepper.planner.synergies.members @ x[:m]) * creature.muscles.bounds
-    tension = MuscleTension.of(creature.muscles, activations)
+    tension = MuscleEnergy.of(creature.muscles, activations)
     missing = problem.residual(prospect.velocities, None).ravel()
     ends = problem.end_positions(prospect.velocities)
     missing += problem.dt * tension.gradient(ends).ravel()
-    missing -= problem.dt * contacts.pushes(creature.body.weight * x[m:].reshape(-1, 3))
-    expected = prospect.velocities.ravel() - prospect.response.tangent.solve(missing)
-    np.testing.assert_allclose(linear.end(x), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
-    speeds = linear.speeds(contacts)
-    np.testing.assert_allclose(speeds @ np.append(x, 1.0), contacts.frame @ expected, rtol=0, atol=1e-9)
+    missing -= problem.dt * contacts.nodal_forces(creature.body.weight * x[m:].reshape(-1, 3))
+    expected = prospect.velocities.ravel() - prospect.linearization.tangent.solve(missing)
+    np.testing.assert_allclose(linear.end_velocities(x), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+    speeds = linear.contact_velocities(contacts)
+    np.testing.assert_allclose(speeds @ np.append(x, 1.0), contacts.dense_jacobian @ expected, rtol=0, atol=1e-9)
 
 
 def objectives_of(count: int) -> list[Objective]:
@@ -73,9 +73,9 @@ def test_squares_are_what_is_missed(creature: Creature) -> None:
     _, linear = about_a_fall(creature.stepper, creature)
     asked = objectives_of(creature.start.positions.size)
     x = np.append(np.random.default_rng(4).standard_normal(linear.count), 1.0)
-    missed = [each.weight * np.sum((each.rows @ linear.end(x[:-1]) - each.target) ** 2) for each in asked]
-    assert 0.5 * x @ linear.squares(asked)() @ x == pytest.approx(sum(missed), rel=1e-11)
-    assert np.array_equal(linear.squares([])(), np.zeros((len(x), len(x))))
+    missed = [each.weight * np.sum((each.rows @ linear.end_velocities(x[:-1]) - each.target) ** 2) for each in asked]
+    assert 0.5 * x @ linear.objective_quadratic(asked)() @ x == pytest.approx(sum(missed), rel=1e-11)
+    assert np.array_equal(linear.objective_quadratic([])(), np.zeros((len(x), len(x))))
 
 
 def test_a_device_has_the_host_s_step(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,12 +87,12 @@ def test_a_device_has_the_host_s_step(creature: Creature, device: str, monkeypat
     for seed, host in enumerate(expected):
         prospect, linear = about_a_fall(stepper, creature, seed)
         x = np.random.default_rng(seed).standard_normal(host.count)
-        contacts = prospect.response.contacts
+        contacts = prospect.linearization.contacts
         np.testing.assert_allclose(linear.torques, host.torques, rtol=0, atol=1e-14)
         for got, wanted in (
-            (linear.end(x), host.end(x)),
-            (linear.speeds(contacts), host.speeds(contacts)),
-            (linear.squares(asked)(), host.squares(asked)()),
+            (linear.end_velocities(x), host.end_velocities(x)),
+            (linear.contact_velocities(contacts), host.contact_velocities(contacts)),
+            (linear.objective_quadratic(asked)(), host.objective_quadratic(asked)()),
             (linear.velocities.cpu().numpy(), host.velocities),
         ):
             np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())

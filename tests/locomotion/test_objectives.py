@@ -20,15 +20,15 @@ from egs_warp.locomotion.objectives import (
     Coordinates,
     base_area,
     centre_of_mass_velocity,
-    held_contacts,
+    deformation_velocities,
+    no_slip_contacts,
     node_velocities,
     part_acceleration,
     part_angular_momentum,
+    part_angular_velocity,
     part_nodes,
     part_position,
-    part_turning,
     part_velocity,
-    straining_velocities,
 )
 from tests.support.meshes import block_mesh
 
@@ -86,7 +86,7 @@ def test_straining_rows_see_uniform_strain_alone_and_all_of_it() -> None:
     rng = np.random.default_rng(4)
     state = shaken_state()
     target = rng.standard_normal(state.positions.shape)
-    objective = straining_velocities(BODY, state.positions, target, 0.3)
+    objective = deformation_velocities(BODY, state.positions, target, 0.3)
     assert objective.target.shape == (6,) and objective.weight == 0.3
     arms = state.positions - BODY.centre_of_mass(state.positions)
     mass = BODY.node_mass[:, None] / BODY.mass
@@ -154,7 +154,7 @@ def test_momentum_rows_measure_the_angular_momentum_in_metres_a_second(part: Bod
     if not frame.relative:
         turn = np.array([0.4, -0.2, 0.7])
         rigid = np.cross(turn, state.positions) + [1.0, 2.0, 3.0]
-        asked = part_angular_momentum(BODY, part, state, frame.axes @ part.spread(state.positions) @ turn, 1.0, frame)
+        asked = part_angular_momentum(BODY, part, state, frame.axes @ part.inertia(state.positions) @ turn, 1.0, frame)
         assert np.allclose(asked.rows @ rigid.ravel(), asked.target, atol=1e-10)
 
 
@@ -169,7 +169,7 @@ def test_turning_rows_are_the_rate_of_the_best_fit_rotation_of_a_rigid_part(part
         arms, rest = (x[part.nodes] - part.centre(x) for x in (positions, state.positions))
         return Rotation.align_vectors(arms, rest, weights=part.masses)[0].as_rotvec()
 
-    objective = part_turning(BODY, part, state, TURNED @ turn, 1.0, Coordinates(TURNED, False))
+    objective = part_angular_velocity(BODY, part, state, TURNED @ turn, 1.0, Coordinates(TURNED, False))
     assert np.allclose(rate_of(rotation, state, rigid), turn, atol=1e-6)
     assert np.allclose(objective.rows @ rigid.ravel(), objective.target, atol=1e-10)
 
@@ -201,7 +201,7 @@ def test_what_is_held_costs_the_squared_slip_of_each_contact_by_its_load() -> No
     geometry = ContactGeometry(BODY.mesh, (floor,), 0.8, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
     contacts = ContactDetector(geometry, device="cpu").contact_set(np.arange(4), nodes)
     loads = np.array([0.5, 0.2, 0.0, 0.3])
-    objective = held_contacts(contacts, loads, 7.0)
+    objective = no_slip_contacts(contacts, loads, 7.0)
     assert objective.weight == 7.0 and not objective.target.any()
     v = np.random.default_rng(9).standard_normal(nodes.shape)
     moved = np.einsum("cw,cwi->ci", contacts.weights, v[contacts.nodes])

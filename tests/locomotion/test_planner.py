@@ -8,12 +8,12 @@ import pytest
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion import planner
-from egs_warp.locomotion.contact_pieces import ContactPieces
-from egs_warp.locomotion.objectives import AnyObjective, SpinObjective, centre_of_mass_velocity
-from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory, StepReport
+from egs_warp.locomotion.contact_modes import CoulombProgram
+from egs_warp.locomotion.objectives import AngularMomentumObjective, AnyObjective, centre_of_mass_velocity
+from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
 from tests.support.creatures import coarse_creature
 from tests.support.meshes import block_mesh
-from tests.support.places import DT
+from tests.support.stances import DT
 
 
 def asked(stepper: LocomotionStepper, step: int) -> list[AnyObjective]:
@@ -21,7 +21,7 @@ def asked(stepper: LocomotionStepper, step: int) -> list[AnyObjective]:
     up = -0.3 if step < 5 else min(0.3 * (step - 4), 0.9)
     return [
         centre_of_mass_velocity(stepper.body, np.array([0.0, 0.0, up]), 600.0),
-        SpinObjective(np.zeros(3), 600.0),
+        AngularMomentumObjective(np.zeros(3), 600.0),
     ]
 
 
@@ -49,16 +49,16 @@ def test_activations_cost_the_squares_of_what_their_muscles_give_or_take(monkeyp
     """Beside it nothing changes: not the slope, not the cost of no activation, not that of contact forces."""
     stepper, states, reports = thrust(7)
     muscles, start = stepper.muscles, states[-1]
-    memory = StepMemory.after(reports[-1])
+    memory = WarmStart.from_report(reports[-1])
     problem = StepProblem(stepper.body, start, DT, stepper.settings.drag)
-    prospect = stepper.foresee(stepper.start_of(problem, reports[-1].contacts, memory))
+    prospect = stepper.predict(stepper.step_inputs(problem, reports[-1].contacts, memory))
 
-    def pieces() -> ContactPieces:
-        return stepper.planner.program(prospect, memory.activations, asked(stepper, 7)).pieces
+    def pieces() -> CoulombProgram:
+        return stepper.planner.program(prospect, memory.activations, asked(stepper, 7)).program
 
     with_work = pieces()
     P, q, constant = with_work.P.copy(), with_work.q.copy(), with_work.constant
-    monkeypatch.setattr(planner, "WORK", 0.0)
+    monkeypatch.setattr(planner, "WORK_WEIGHT", 0.0)
     without = pieces()
     np.testing.assert_allclose(q, without.q, rtol=1e-12)
     assert constant == pytest.approx(without.constant, rel=1e-12)
@@ -84,7 +84,7 @@ def test_a_thrust_works_less(monkeypatch: pytest.MonkeyPatch) -> None:
         return float(np.sum(np.maximum(given, 0.0))), float(up)
 
     work, speed = worked()
-    monkeypatch.setattr(planner, "WORK", 0.0)
+    monkeypatch.setattr(planner, "WORK_WEIGHT", 0.0)
     more, same = worked()
     assert work < 0.95 * more
     assert speed == pytest.approx(same, rel=0.02)

@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.locomotion.objectives import LoadObjective, SpinObjective, held_contacts, node_velocities
+from egs_warp.locomotion.objectives import AngularMomentumObjective, LoadObjective, no_slip_contacts, node_velocities
 from egs_warp.locomotion.replay import Replay, digest
-from egs_warp.locomotion.rollout import Simulation, roll_out
+from egs_warp.locomotion.rollout import RolloutResult, roll_out
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.meshes import box_mesh, coarse_stool
-from tests.support.places import FORWARD
 from tests.support.slides import slide
+from tests.support.stances import FORWARD
 
 FRAMES, CUT = 36, 28
 """The block is in its thrust where the run is cut off."""
@@ -44,7 +44,7 @@ def walker() -> CoarseCreature:
     return coarse_creature(coarse_stool(), forward=np.array([1.0, 0.0, 0.0]))
 
 
-def run(made: CoarseCreature, script: str = "jump", *, killed_at: int | None = None, **given: Any) -> Simulation:
+def run(made: CoarseCreature, script: str = "jump", *, killed_at: int | None = None, **given: Any) -> RolloutResult:
     def progress(frame: int) -> None:
         if frame == killed_at:
             raise KilledError
@@ -55,7 +55,7 @@ def run(made: CoarseCreature, script: str = "jump", *, killed_at: int | None = N
 
 
 @cache
-def uninterrupted() -> Simulation:
+def uninterrupted() -> RolloutResult:
     return run(block())
 
 
@@ -225,14 +225,14 @@ def test_a_digest_tells_objectives_apart() -> None:
     still = np.zeros((len(body.node_mass), 3))
     many = [
         [],
-        [SpinObjective(np.zeros(3), 1.0)],
-        [SpinObjective(np.array([0.0, 0.0, 1e-300]), 1.0)],
-        [SpinObjective(np.zeros(3), 1.0 + 1e-15)],
+        [AngularMomentumObjective(np.zeros(3), 1.0)],
+        [AngularMomentumObjective(np.array([0.0, 0.0, 1e-300]), 1.0)],
+        [AngularMomentumObjective(np.zeros(3), 1.0 + 1e-15)],
         [node_velocities(body, still, 1.0)],
         [LoadObjective(np.array([1, 2]), 1.0)],
         [LoadObjective(np.array([1, 3]), 1.0)],
-        [held_contacts(contacts, np.ones(contacts.count), 1.0)],
-        [held_contacts(contacts, np.arange(contacts.count), 1.0)],
+        [no_slip_contacts(contacts, np.ones(contacts.count), 1.0)],
+        [no_slip_contacts(contacts, np.arange(contacts.count), 1.0)],
     ]
     assert len({digest(objectives) for objectives in many}) == len(many)
     assert digest(many[4]) == digest([node_velocities(body, still.copy(), 1.0)])

@@ -10,16 +10,16 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import UnsolvableStepError
-from egs_warp.locomotion.rollout import REST_FRAMES, Simulation, roll_out, settle
-from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory
+from egs_warp.locomotion.rollout import REST_FRAMES, RolloutResult, roll_out, settle
+from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.meshes import box_mesh
-from tests.support.places import FORWARD
+from tests.support.stances import FORWARD
 
 
-def run(made: CoarseCreature, start: BodyState) -> Simulation:
+def run(made: CoarseCreature, start: BodyState) -> RolloutResult:
     sequence = MotionSequence(made.place, motion("jump").parts(made.place.body.height))
     return roll_out(made.stepper, made.stepper.geometry, start, sequence, frames=8)
 
@@ -55,7 +55,7 @@ def test_a_step_in_parts_hands_on_its_last(made: CoarseCreature, monkeypatch: py
     """The second step begins where the second part of the first has ended, with what that did."""
     advance, given, parts = LocomotionStepper.advance, [], []
 
-    def halved(stepper: LocomotionStepper, state: BodyState, memory: StepMemory, *rest: Any) -> Any:
+    def halved(stepper: LocomotionStepper, state: BodyState, memory: WarmStart, *rest: Any) -> Any:
         given.append((state, memory))
         end, after, done = advance(stepper, state, memory, *rest)
         if len(given) == 1:
@@ -69,7 +69,7 @@ def test_a_step_in_parts_hands_on_its_last(made: CoarseCreature, monkeypatch: py
     state, memory = given[1]
     assert len(parts) == 2 and state is parts[1].state
     for name in ("points", "forces", "activations"):
-        expected = getattr(StepMemory.after(parts[1]), name)
+        expected = getattr(WarmStart.from_report(parts[1]), name)
         np.testing.assert_array_equal(getattr(memory, name), expected)
     assert not np.array_equal(memory.activations, parts[0].activations)
 

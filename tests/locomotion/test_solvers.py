@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.locomotion import splitting
-from egs_warp.locomotion.active_set import Optimum, ReducedRows, optimum_near
-from egs_warp.locomotion.admm import Ending, Iterate
+from egs_warp.locomotion import operator_splitting
+from egs_warp.locomotion.active_set import Optimum, WhitenedQp, solve_from_guess
+from egs_warp.locomotion.admm import AdmmResult, AdmmStatus
+from egs_warp.locomotion.operator_splitting import SplittingRun
 from egs_warp.locomotion.solvers import QpSolver, QpStatus, SplittingProgram, quadratic_program
-from egs_warp.locomotion.splitting import Iterations
 
 SOLVERS = pytest.mark.parametrize(
     ("solver", "accuracy"), [(QpSolver.OSQP, 1e-4), (QpSolver.ADMM, 1e-4), (QpSolver.DAQP, 1e-6)]
@@ -73,7 +73,7 @@ def test_a_program_beside_one_that_is_solved_needs_no_iterations(monkeypatch: py
         lower, upper = np.full(30, -0.1), np.full(30, 0.2)
         asked = quadratic_program(P, q, A).solve(lower, upper)
         with monkeypatch.context() as patch:
-            patch.setattr(splitting, "_answer", None)
+            patch.setattr(operator_splitting, "_answer", None)
             beside = quadratic_program(P, q, A).solve(lower, upper, beside=True)
             rows, below = np.vstack([A, A[:1]]), np.append(lower, 0.3)
             none = quadratic_program(P, q, rows).solve(below, np.append(upper, 1.0), beside=True)
@@ -88,7 +88,7 @@ def test_each_splitting_is_that_of_its_name(monkeypatch: pytest.MonkeyPatch) -> 
     P, q, A = random_program(0)
     lower, upper = np.r_[0.0, np.full(29, -0.1)], np.r_[0.0, np.full(29, 0.2)]
     expected = quadratic_program(P, q, A, solver="osqp").solve(lower, upper)
-    monkeypatch.setattr(splitting, "_answer", None)
+    monkeypatch.setattr(operator_splitting, "_answer", None)
     found = quadratic_program(P, q, A, solver="admm").solve(lower, upper)
     assert found.status is QpStatus.SOLVED and np.abs(found.x - expected.x).max() < 1e-3
     with pytest.raises(TypeError):
@@ -98,10 +98,12 @@ def test_each_splitting_is_that_of_its_name(monkeypatch: pytest.MonkeyPatch) -> 
 class Doubting:
     """A splitting whose iterations end with a loose certificate, as OSQP leaves them."""
 
-    def near(self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
-        return Iterate(Ending.DOUBTFUL, np.full(20, 2.143e9), np.zeros(len(lower)), 15)
+    def warm_start(
+        self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None
+    ) -> AdmmResult:
+        return AdmmResult(AdmmStatus.DOUBTFUL, np.full(20, 2.143e9), np.zeros(len(lower)), 15)
 
-    def on(self, A: np.ndarray, iterations: int) -> Iterations:
+    def full_run(self, A: np.ndarray, iterations: int) -> SplittingRun:
         raise AssertionError("nothing is left to iterate on")
 
 
@@ -111,12 +113,12 @@ def test_what_iterations_leave_in_doubt_is_no_guess(monkeypatch: pytest.MonkeyPa
     lower, upper = np.full(30, -0.1), np.full(30, 0.2)
     guesses = []
 
-    def noted(rows: ReducedRows, *rest: np.ndarray) -> Optimum | None:
+    def noted(rows: WhitenedQp, *rest: np.ndarray) -> Optimum | None:
         guesses.append(rest[2:])
-        return optimum_near(rows, *rest)
+        return solve_from_guess(rows, *rest)
 
     asked = quadratic_program(P, q, A).solve(lower, upper)
-    monkeypatch.setattr("egs_warp.locomotion.solvers.optimum_near", noted)
+    monkeypatch.setattr("egs_warp.locomotion.solvers.solve_from_guess", noted)
     doubted = SplittingProgram(P, q, A, Doubting()).solve(lower, upper)
     ((low, high),) = guesses
     free = A @ np.linalg.solve(P, -q)
@@ -161,7 +163,7 @@ def test_an_iteration_limit_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> No
     near = program.solve(np.zeros(30), np.r_[0.0, np.full(29, np.inf)])
     assert near.status is QpStatus.ITERATION_LIMIT and near.usable
     assert near.status.value == "the iteration limit was reached near the bounds; the last point is used"
-    monkeypatch.setattr("egs_warp.locomotion.solvers.LARGEST_BREACH", 0.0)
+    monkeypatch.setattr("egs_warp.locomotion.solvers.MAX_VIOLATION", 0.0)
     far = program.solve(np.zeros(30), np.r_[0.0, np.full(29, np.inf)])
     assert far.status is QpStatus.FAILED and not far.usable and far.objective == np.inf
 

@@ -8,12 +8,12 @@ import pytest
 from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, make_body
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.linear_step import LinearStep
-from egs_warp.locomotion.objectives import LoadObjective, SpinObjective, centre_of_mass_velocity
-from egs_warp.locomotion.step_cost import Horizon, QuadraticCost, effort_cost, objectives_cost
+from egs_warp.locomotion.objectives import AngularMomentumObjective, LoadObjective, centre_of_mass_velocity
+from egs_warp.locomotion.step_cost import EffortModel, QuadraticCost, effort_cost, objectives_cost
 from tests.support.meshes import block_mesh
 
 BODY = make_body(block_mesh(), Plane(np.array([0.0, 0.0, 1.0]), 0.0), device="cpu")
@@ -47,7 +47,7 @@ def test_objectives_are_weighted_squares_of_what_is_missed() -> None:
     x, target, momentum = rng.standard_normal(7), rng.standard_normal(3), rng.standard_normal(3)
     contacts = two_contacts()
     lifted = LoadObjective(contacts.nodes[1, [int(np.argmax(contacts.weights[1]))]], 7.0)
-    objectives = [centre_of_mass_velocity(BODY, target, 2.0), SpinObjective(momentum, 5.0), lifted]
+    objectives = [centre_of_mass_velocity(BODY, target, 2.0), AngularMomentumObjective(momentum, 5.0), lifted]
     speed = float(np.sqrt(9.81 * BODY.height))
     velocities = (linear.base + linear.columns @ x).reshape(-1, 3)
     missed = (BODY.centre_of_mass(velocities) - target) / speed
@@ -77,17 +77,17 @@ def test_effort_is_the_energy_ahead_and_convex() -> None:
     problem, linear, foreseen = example()
     horizon = 0.16
     time = horizon * np.sqrt(BODY.height / 9.81)
-    factors = SparseFactors(BODY.assembly.upper_pattern)
+    factors = MultifrontalLdl(BODY.assembly.upper_pattern)
     damping = BODY.assembly.damping(problem.state.positions, time)
     unit = 0.1 / (BODY.weight * BODY.height)
-    ahead = Horizon.of(problem, foreseen.reshape(-1, 3), factors, horizon=horizon)
+    ahead = EffortModel.of(problem, foreseen.reshape(-1, 3), factors, horizon=horizon)
     cost = effort_cost(problem, linear, foreseen, ahead, weight=0.1)
     assert np.linalg.eigvalsh(cost.P).min() >= -1e-12 * np.abs(cost.P).max()
     # About the end that is foreseen the model is the energy, to second order.
     assert np.linalg.norm(cost.P) > 0.0
     still = LinearStep(np.column_stack([1e-2 * linear.columns, 0.0 * foreseen]), linear.torques)
     rest = np.zeros_like(foreseen)
-    ahead = Horizon.of(problem, rest.reshape(-1, 3), factors, horizon=horizon)
+    ahead = EffortModel.of(problem, rest.reshape(-1, 3), factors, horizon=horizon)
     modelled = effort_cost(problem, still, rest, ahead, weight=0.1)
 
     def energy(x: np.ndarray) -> float:
@@ -110,9 +110,9 @@ def test_what_lets_go_is_foreseen_slack_not_strained_the_other_way() -> None:
     problem = StepProblem(BODY, BodyState(nodes + stretch, np.zeros_like(nodes)), DT)
     back = (-stretch / DT).ravel()
     linear = LinearStep(np.column_stack([np.zeros(back.size), back]), np.zeros((3, 1)))
-    factors = SparseFactors(BODY.assembly.upper_pattern)
+    factors = MultifrontalLdl(BODY.assembly.upper_pattern)
     horizon = 3.0 * DT / np.sqrt(BODY.height / 9.81)
-    ahead = Horizon.of(problem, back.reshape(-1, 3), factors, horizon=horizon)
+    ahead = EffortModel.of(problem, back.reshape(-1, 3), factors, horizon=horizon)
     effort = effort_cost(problem, linear, back, ahead, weight=1.0).constant
     carried_on = nodes - 2.0 * stretch
     assert effort < 0.5 * BODY.assembly.energy(carried_on) / (BODY.weight * BODY.height)

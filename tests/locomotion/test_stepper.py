@@ -15,19 +15,19 @@ import warp as wp
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, SoftBody, make_body
-from egs_warp.fem.element_kernels import ElementKernels
 from egs_warp.fem.step_problem import StepProblem
+from egs_warp.fem.warp_elasticity import WarpElasticity
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import (
+    AngularMomentumObjective,
     AnyObjective,
-    SpinObjective,
     centre_of_mass_velocity,
     node_velocities,
 )
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolver
-from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory, StepReport
-from egs_warp.locomotion.strategies import PATIENCE, Strategy
+from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
+from egs_warp.locomotion.strategies import RESTART_BUDGET, Strategy
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import attach_fibres
@@ -69,7 +69,7 @@ def hop(body: SoftBody, step: int) -> list[AnyObjective]:
     pose = np.tile(velocity, (len(body.mesh.nodes), 1))
     return [
         centre_of_mass_velocity(body, velocity, 1.0),
-        SpinObjective(np.zeros(3), 1.0),
+        AngularMomentumObjective(np.zeros(3), 1.0),
         node_velocities(body, pose, 0.02),
     ]
 
@@ -132,11 +132,11 @@ def test_what_a_program_foresees_is_in_its_units() -> None:
     stepper = muscular_block()
     body = stepper.body
     states, reports = run_hop(stepper, 3)
-    memory = StepMemory.after(reports[-1])
+    memory = WarmStart.from_report(reports[-1])
     problem = StepProblem(body, states[-1], DT, stepper.settings.drag)
-    prospect = stepper.foresee(stepper.start_of(problem, reports[-1].contacts, memory))
-    foreseen = stepper.planner.program(prospect, memory.activations, hop(body, 3)).foreseen
-    speeds = prospect.response.contacts.speeds(prospect.velocities.ravel()).reshape(-1, 3)
+    prospect = stepper.predict(stepper.step_inputs(problem, reports[-1].contacts, memory))
+    foreseen = stepper.planner.program(prospect, memory.activations, hop(body, 3)).predicted
+    speeds = prospect.linearization.contacts.contact_velocities(prospect.velocities.ravel()).reshape(-1, 3)
     assert np.abs(speeds).max() > 1e-3 and prospect.forces[:, 0].sum() > 0.5 * body.weight
     np.testing.assert_allclose(foreseen.velocities, speeds / body.speed_unit, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(foreseen.forces, prospect.forces / body.weight, rtol=1e-12)
@@ -155,7 +155,7 @@ def test_a_body_bobs_as_asked() -> None:
         spread = np.tile(wanted, (len(state.positions), 1))
         objectives = [
             centre_of_mass_velocity(body, wanted, 1000.0),
-            SpinObjective(np.zeros(3), 1000.0),
+            AngularMomentumObjective(np.zeros(3), 1000.0),
             node_velocities(body, spread, 0.1),
         ]
         state, memory, reports = stepper.advance(state, memory, objectives, DT)
@@ -176,17 +176,17 @@ def test_a_gpu_s_factors_make_the_same_hop(device: str, monkeypatch: pytest.Monk
     a GPU's kernels on a GPU: within 1e-8 H of sparse factors. On four feet: of more, rounding chooses which press.
     """
     steps, corners = 10 if device == "cpu" else 30, GRID[[0, 4, 20, 24]]
-    dense_factors = pytest.importorskip("egs_warp.fem.dense_factors")
+    dense_factors = pytest.importorskip("egs_warp.fem.dense_cholesky")
     expected, _ = run_hop(muscular_block(feet=corners), steps)
     made: list[object] = []
 
     def dense(_: wp.Device, pattern: sparse.csc_matrix) -> object:
-        made.append(dense_factors.DenseFactors(pattern, device=device))
+        made.append(dense_factors.DenseCholesky(pattern, device=device))
         return made[-1]
 
-    monkeypatch.setattr("egs_warp.locomotion.stepper.factors_on", dense)
+    monkeypatch.setattr("egs_warp.locomotion.stepper.linear_solver_on", dense)
     # A GPU's kernels on a CPU, too.
-    monkeypatch.setattr("egs_warp.fem.elasticity.ElementVectors", ElementKernels)
+    monkeypatch.setattr("egs_warp.fem.elasticity.SimdElasticity", WarpElasticity)
     got, reports = run_hop(muscular_block(device, feet=corners), steps)
     assert len(made) == 2 and len(got) == len(expected) and max(len(one.forces) for one in reports) > 3
     for one, other in zip(got, expected, strict=True):
@@ -237,7 +237,7 @@ def test_every_strategy_drives_the_stepper(strategy: Strategy) -> None:
     assert all(report.converged for report in reports)
     assert max(np.abs(report.activations).max() for report in reports) > 0.0
     assert strategy is not Strategy.STATIC or max(report.qp_count for report in reports) <= 2
-    assert max(report.qp_count for report in reports) <= (1 if strategy is Strategy.PIECES else PATIENCE) * 6
+    assert max(report.qp_count for report in reports) <= (1 if strategy is Strategy.MODES else RESTART_BUDGET) * 6
 
 
 class LateStepper(LocomotionStepper):
@@ -246,18 +246,16 @@ class LateStepper(LocomotionStepper):
     longest = 0.0
 
     def step(
-        self, state: BodyState, memory: StepMemory, objectives: Sequence[AnyObjective], dt: float
-    ) -> tuple[BodyState, StepMemory, StepReport]:
+        self, state: BodyState, memory: WarmStart, objectives: Sequence[AnyObjective], dt: float
+    ) -> tuple[BodyState, WarmStart, StepReport]:
         return self._judged(*super().step(state, memory, objectives, dt))
 
-    def held_step(
-        self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float
-    ) -> tuple[BodyState, StepMemory, StepReport]:
-        return self._judged(*super().held_step(state, memory, activations, dt))
+    def step_with_activations(
+        self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float
+    ) -> tuple[BodyState, WarmStart, StepReport]:
+        return self._judged(*super().step_with_activations(state, memory, activations, dt))
 
-    def _judged(
-        self, end: BodyState, after: StepMemory, report: StepReport
-    ) -> tuple[BodyState, StepMemory, StepReport]:
+    def _judged(self, end: BodyState, after: WarmStart, report: StepReport) -> tuple[BodyState, WarmStart, StepReport]:
         return end, after, replace(report, converged=report.dt <= self.longest)
 
 
@@ -293,8 +291,8 @@ def test_halves_are_made_under_the_activations_that_serve_better(planned_well: b
         longest = 0.6 * DT
 
         def step(
-            self, state: BodyState, memory: StepMemory, objectives: Sequence[AnyObjective], dt: float
-        ) -> tuple[BodyState, StepMemory, StepReport]:
+            self, state: BodyState, memory: WarmStart, objectives: Sequence[AnyObjective], dt: float
+        ) -> tuple[BodyState, WarmStart, StepReport]:
             end, after, report = super().step(state, memory, objectives, dt)
             return end, after, replace(report, activations=planned)
 

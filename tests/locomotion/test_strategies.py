@@ -13,23 +13,23 @@ import warp as wp
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.errors import UserError
 from egs_warp.locomotion.complementarity import STATIC
-from egs_warp.locomotion.contact_pieces import ContactModes, search_pieces
+from egs_warp.locomotion.contact_modes import ContactModes, search_modes
 from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import (
-    COSTLY,
-    PATIENCE,
-    Foreseen,
+    RESTART_BUDGET,
+    RESTART_COST,
+    PredictedContact,
     SearchResult,
     Strategy,
-    contact_under,
+    contact_response,
     find_states,
     search_program,
 )
 from tests.support.contact_programs import FRICTION, optimum_of_each, small_problem
 
-PAIRED = [strategy for strategy in Strategy if strategy is not Strategy.PIECES]
+PAIRED = [strategy for strategy in Strategy if strategy is not Strategy.MODES]
 """Those that choose states of complementary pairs."""
 
 
@@ -94,7 +94,7 @@ def test_the_limit_is_kept_and_more_qps_are_never_worse() -> None:
         last = np.inf
         for limit in (2, 3, 4, 8):
             found = search(program, Strategy.RELAXED, limit=limit)
-            assert found.qp_count <= PATIENCE * limit and found.objective <= last + 1e-9
+            assert found.qp_count <= RESTART_BUDGET * limit and found.objective <= last + 1e-9
             last = found.objective
 
 
@@ -109,7 +109,7 @@ def test_contact_under_given_activations_obeys_every_pair() -> None:
     for seed in range(10):
         program = small_problem(seed, contacts=4).program
         activations = np.random.default_rng(seed).uniform(-1, 1, 3)
-        y = contact_under(program, activations)
+        y = contact_response(program, activations)
         assert y is not None and np.array_equal(y[:3], activations)
         assert is_complementary(program, y, 1e-9)
 
@@ -176,19 +176,19 @@ def test_every_strategy_solves_the_same_program() -> None:
         delassus = pieces.rows[:, 3:]
         forces, _ = coulomb_forces(delassus, pieces.offset, np.zeros(3), FRICTION, np.zeros((3, 3)))
         velocities = (delassus @ forces.ravel() + pieces.offset).reshape(-1, 3)
-        foreseen = Foreseen(np.zeros(3), forces, velocities)
+        foreseen = PredictedContact(np.zeros(3), forces, velocities)
         for strategy in Strategy:
             found = search_program(pieces, strategy, foreseen, directions=8, qp_limit=8, solver=QpSolver.DAQP)
             assert found.x is not None and found.qp_count > 0
             forces = found.x[3:].reshape(-1, 3)
             slack = FRICTION * forces[:, 0] - np.linalg.norm(forces[:, 1:], axis=1)
             # The pieces hold the cone by a pyramid around their start, which may break a face by 0.02 and its load too.
-            broken = 0.03 if strategy is Strategy.PIECES else 1e-5
+            broken = 0.03 if strategy is Strategy.MODES else 1e-5
             assert np.abs(found.x[:3]).max() <= 1.0 + 1e-6 and slack.min() > -broken
             assert found.objective == pytest.approx(pieces.objective(found.x), rel=1e-4, abs=1e-4)
             reached[strategy].append(found.objective)
     means = {strategy: float(np.mean(values)) for strategy, values in reached.items()}
-    assert means[Strategy.PIECES] < means[Strategy.PAPER] < means[Strategy.STATIC]
+    assert means[Strategy.MODES] < means[Strategy.PAPER] < means[Strategy.STATIC]
     assert means[Strategy.QPCC_OUR_MOVES] < 0.9 * means[Strategy.QPCC]
 
 
@@ -232,12 +232,12 @@ def test_pieces_are_searched_again_only_in_doubt(bound: float | None, monkeypatc
     else there is a second search."""
     pieces = small_problem(3, contacts=3, directions=8, freedoms=14).pieces
     forces = np.zeros((3, 3))
-    foreseen = Foreseen(np.zeros(3), forces, forces)
+    foreseen = PredictedContact(np.zeros(3), forces, forces)
     start = np.zeros(12)
-    once = search_pieces(pieces, start, ContactModes.of(forces, FRICTION), qp_limit=8, solver=QpSolver.DAQP)
-    assert once.objective > COSTLY
+    once = search_modes(pieces, start, ContactModes.of(forces, FRICTION), qp_limit=8, solver=QpSolver.DAQP)
+    assert once.objective > RESTART_COST
     relaxed = None if bound is None else (np.zeros(3), bound * once.objective)
     monkeypatch.setattr("egs_warp.locomotion.strategies.solve_relaxed", lambda *given, **options: relaxed)
-    found = search_program(pieces, Strategy.PIECES, foreseen, directions=8, qp_limit=8, solver=QpSolver.DAQP)
+    found = search_program(pieces, Strategy.MODES, foreseen, directions=8, qp_limit=8, solver=QpSolver.DAQP)
     assert found.objective <= once.objective
     assert (found.qp_count > once.qp_count + 1) == (bound == 0.5)

@@ -13,10 +13,10 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion import stepper as module
 from egs_warp.locomotion.synergies import find_synergies
 from egs_warp.muscles.muscle_set import automatic_muscles
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.muscles.tension import MuscleEnergy
 from tests.support.creatures import coarse_creature
 from tests.support.meshes import block_mesh
-from tests.support.places import FORWARD
+from tests.support.stances import FORWARD
 
 
 def test_alike_are_grouped_and_few_are_left_alone() -> None:
@@ -60,6 +60,6 @@ def test_muscles_are_grouped_by_what_they_do_in_a_step(monkeypatch: pytest.Monke
         along = effects[:, k].reshape(still.shape) * (1e-4 * body.speed_unit / np.abs(effects[:, k]).max())
         impulse = problem.residual(along, None) - problem.residual(-along, None)
         pull = np.eye(muscles.segment_count)[k] * muscles.bounds
-        pulled = alone - problem.residual(still, MuscleTension.of(muscles, pull))
+        pulled = alone - problem.residual(still, MuscleEnergy.of(muscles, pull))
         cosine = (impulse * pulled).sum() / np.linalg.norm(impulse) / np.linalg.norm(pulled)
         assert cosine == pytest.approx(1.0, abs=1e-5)

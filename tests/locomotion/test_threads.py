@@ -8,7 +8,7 @@ import pytest
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from egs_warp.locomotion.stepper import LocomotionStepper
-from tests.support.lives import coarse_pawn
+from tests.support.live_sessions import coarse_pawn
 
 
 def _threads() -> set[int]:

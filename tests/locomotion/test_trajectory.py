@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.locomotion.trajectory import Trajectory, measure
 from tests.support.flights import rigid_flight
-from tests.support.places import DT
+from tests.support.stances import DT
 
 
 @pytest.fixture

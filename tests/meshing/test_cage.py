@@ -23,7 +23,7 @@ from egs_warp.io import read_capture
 from egs_warp.kernels.meshing.occupancy import enclosed_kernel
 from egs_warp.meshing.cage import Cage, CageMethod, build_cage
 from egs_warp.meshing.occupancy import solid_from_gaussians
-from egs_warp.meshing.stuffing import stuff
+from egs_warp.meshing.stuffing import isosurface_stuffing
 from egs_warp.segmentation.base_plane import find_base_plane
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -239,7 +239,7 @@ def test_stuffing_quality(seed: int, cell: float) -> None:
         return (np.linalg.norm((x - centre) / axes, axis=1) - 1.0) * axes.min() + 0.03 * np.sin(x @ wave)
 
     low, high = np.array([-0.7, -0.7, 0.0]), np.array([0.7, 0.7, 1.0])
-    mesh = TetMesh.oriented(*stuff(field, low, high, cell))
+    mesh = TetMesh.oriented(*isosurface_stuffing(field, low, high, cell))
     faces = mesh.boundary_faces()
     _, uses = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
     assert np.all(uses % 2 == 0)
@@ -259,7 +259,7 @@ def test_stuffing_converges() -> None:
     """The volume of a half ball converges at second order in the cell."""
     errors = []
     for cell in (0.2, 0.1, 0.05):
-        nodes, tets = stuff(
+        nodes, tets = isosurface_stuffing(
             lambda x: np.linalg.norm(x, axis=1) - 1.0, np.array([-1.1, -1.1, 0.0]), np.array([1.1, 1.1, 1.1]), cell
         )
         errors.append(abs(TetMesh.oriented(nodes, tets).volumes().sum() - 2.0 * np.pi / 3.0))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from egs_warp.motions.sequence import Place
-from tests.support.places import block_place
+from egs_warp.motions.sequence import Stance
 from tests.support.runs import Run, coarse_block_run
+from tests.support.stances import block_place
 
 
 @pytest.fixture
-def place() -> Place:
+def place() -> Stance:
     """A block of 0.4 x 0.4 x 1 metres that stands on z = 0 and faces +x."""
     return block_place()
 

@@ -15,12 +15,12 @@ from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory, measure
 from egs_warp.motions.crawl import STRAIN, Crawl
-from egs_warp.motions.feet import Base
-from egs_warp.motions.going import going, going_round
-from egs_warp.motions.route import Route, along, straight
+from egs_warp.motions.feet import SupportKind
+from egs_warp.motions.gait_selection import move_along, turn_in_place
+from egs_warp.motions.route import Route, path_route, straight_route
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.meshes import worm_mesh
-from tests.support.places import DT, FORWARD
+from tests.support.stances import DT, FORWARD
 
 
 @cache
@@ -59,13 +59,15 @@ def crawled(route: Route) -> Crawled:
 
 def test_what_lies_along_the_ground_crawls() -> None:
     place = worm().place
-    assert place.base() is Base.LONG
-    assert isinstance(going(place, straight(1.0), 0.1), Crawl) and isinstance(going_round(place, 1.0, 0.1), Crawl)
+    assert place.base() is SupportKind.LYING
+    assert isinstance(move_along(place, straight_route(1.0), 0.1), Crawl) and isinstance(
+        turn_in_place(place, 1.0, 0.1), Crawl
+    )
 
 
 def test_a_stride_strains_it_by_no_more_than_it_may() -> None:
     """The wave at its steepest; and every slice ends where the body is to be."""
-    crawl = Crawl(worm().place, straight(5.0))
+    crawl = Crawl(worm().place, straight_route(5.0))
     crawl._to = np.array([crawl.pace.length, 0.0, 0.0])
     along_it, most = crawl._standing[:, 0], 0.0
     for elapsed in np.linspace(0.0, crawl._round, 60):
@@ -82,7 +84,7 @@ def test_a_stride_strains_it_by_no_more_than_it_may() -> None:
 def test_what_is_carried_is_unloaded_from_the_front_on() -> None:
     """A quarter into a round the front is carried and the back stands, at three quarters the other way round."""
     made = worm()
-    crawl = Crawl(made.place, straight(1.0))
+    crawl = Crawl(made.place, straight_route(1.0))
     crawl.objectives(made.start, None, DT)
     middles = []
     for part in (0.2, 0.8):
@@ -96,7 +98,7 @@ def test_what_is_carried_is_unloaded_from_the_front_on() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("route", "goal"),
-    [(straight(0.5), [0.5, 0.0]), (along(np.array([[0.2, 0.2]])), [0.2, 0.2])],
+    [(straight_route(0.5), [0.5, 0.0]), (path_route(np.array([[0.2, 0.2]])), [0.2, 0.2])],
     ids=["ahead", "aside"],
 )
 def test_a_worm_comes_where_it_is_told(route: Route, goal: list[float]) -> None:

@@ -15,10 +15,10 @@ from egs_warp.motions.dance import HIGHEST, IN_TIME, LOWEST, Dance
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget, height_of_flight, level_flight
 from egs_warp.motions.script import motion
-from egs_warp.motions.sequence import Place
-from egs_warp.pipelines.performance import simulate
+from egs_warp.motions.sequence import Stance
 from egs_warp.pipelines.report import verdict
-from tests.support.lives import coarse_pawn
+from egs_warp.pipelines.simulated_run import simulate
+from tests.support.live_sessions import coarse_pawn
 from tests.support.runs import Run, coarse_block_run
 
 
@@ -43,7 +43,7 @@ def flights(trajectory: Trajectory, least: float) -> list[tuple[float, float]]:
 
 def check_that_it_keeps_time(dance: Dance, trajectory: Trajectory) -> None:
     """Every flight of the trajectory begins and ends within 40 ms of what was asked, and none is left out."""
-    reached = dance.reached(trajectory, 0, -1)
+    reached = dance.outcome_record(trajectory, 0, -1)
     asked = np.array([event.asked for event in reached.events]).reshape(-1, 2)
     found = np.array(flights(trajectory, level_flight(0.5 * LOWEST, 1.0, 9.81)))
     assert len(found) == len(asked) > 1
@@ -59,13 +59,18 @@ def test_a_dance_keeps_time(danced: Run) -> None:
     dance = danced.sequence.done[0].motion
     assert isinstance(dance, Dance) and dance.resting
     check_that_it_keeps_time(dance, danced.trajectory)
-    assert {round(event.asked, 9) for event in dance.reached(danced.trajectory, 0, -1).events} == {0.5, 1.1, 2.3, 2.9}
+    assert {round(event.asked, 9) for event in dance.outcome_record(danced.trajectory, 0, -1).events} == {
+        0.5,
+        1.1,
+        2.3,
+        2.9,
+    }
 
 
 def test_what_was_skipped_is_told(danced: Run) -> None:
     dance = danced.sequence.done[0].motion
     assert isinstance(dance, Dance)
-    np.testing.assert_allclose(dance.reached(danced.trajectory, 0, -1).skipped, [1.7])
+    np.testing.assert_allclose(dance.outcome_record(danced.trajectory, 0, -1).skipped, [1.7])
     assert "1 of 5 beats skipped, too near to the others or the last: 1.70 s" in dance.notes()
     assert any(note.startswith("4 take-offs and touch-downs, the worst ") for note in dance.notes())
 
@@ -92,7 +97,7 @@ def test_a_flight_and_its_height_are_told_from_each_other() -> None:
     assert level_flight(0.5, 1.0, 9.81) == pytest.approx(np.sqrt(8.0 * 0.46 / 9.81))
 
 
-def test_a_jump_says_when_it_takes_off(place: Place) -> None:
+def test_a_jump_says_when_it_takes_off(place: Stance) -> None:
     """As the flight does, the lead follows from the plan that the jump itself has."""
     jump = Jump(place, JumpTarget(0.0, 0.4), settled=True)
     assert jump.plan.flight_time == pytest.approx(level_flight(0.4, place.body.height, 9.81))

@@ -15,15 +15,15 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.fem.body import DEFAULT_SAG
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.command import Drive, DrivePlan, read_drive
-from egs_warp.motions.drive import Driven, DrivenBy, DrivenWalk, onward
-from egs_warp.motions.route import Pace
+from egs_warp.motions.drive import DrivenWalk, LiveDrive, ScriptedDrive, integrate_command
+from egs_warp.motions.route import StepLimits
 from egs_warp.motions.stand import Stand
 from egs_warp.motions.walk_plan import WalkPhase
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.meshes import ball_mesh, coarse_stool, worm_mesh
-from tests.support.places import DT, FORWARD
+from tests.support.stances import DT, FORWARD
 
-PACE = Pace(0.2, 0.25, sideways=0.5)
+PACE = StepLimits(0.2, 0.25, side_fraction=0.5)
 _SPEED = st.floats(-2.0, 2.0)
 
 
@@ -36,11 +36,11 @@ def stool() -> CoarseCreature:
 def test_no_pace_is_longer_than_may_be(forward: float, sideways: float, turn: float, time: float) -> None:
     """What is asked goes as far as it may, in the mix that was asked."""
     command, start = Drive(forward, sideways, turn), np.array([0.3, -0.2, 0.7])
-    change = onward(start, command, time, PACE, unit=0.5, height=0.8) - start
+    change = integrate_command(start, command, time, PACE, unit=0.5, height=0.8) - start
     middle = start[2] + 0.5 * change[2]
     ahead = np.cos(middle) * change[0] + np.sin(middle) * change[1]
     left = np.cos(middle) * change[1] - np.sin(middle) * change[0]
-    effort = np.hypot(ahead, left / PACE.sideways) / PACE.length + abs(change[2]) / PACE.turn
+    effort = np.hypot(ahead, left / PACE.side_fraction) / PACE.length + abs(change[2]) / PACE.turn
     assert effort <= 1.0 + 1e-9
     asked = time / 0.5 * np.array([0.8 * forward, 0.8 * sideways, turn])
     share = min(1.0, 1.0 / max(np.hypot(asked[0], asked[1] / 0.5) / 0.2 + abs(asked[2]) / 0.25, 1e-12))
@@ -48,7 +48,7 @@ def test_no_pace_is_longer_than_may_be(forward: float, sideways: float, turn: fl
 
 
 def test_a_base_goes_to_no_side() -> None:
-    change = onward(np.zeros(3), Drive(0.1, 0.1, 0.0), 1.0, Pace(1.0, 1.0), unit=1.0, height=1.0)
+    change = integrate_command(np.zeros(3), Drive(0.1, 0.1, 0.0), 1.0, StepLimits(1.0, 1.0), unit=1.0, height=1.0)
     assert change == pytest.approx([0.1, 0.0, 0.0])
 
 
@@ -63,7 +63,7 @@ def test_a_file_of_speeds_is_read(tmp_path: Path) -> None:
     file.write_text("time,forward,sideways,turn\n# ahead\n0,0.1,0,0\n1.5, 0.1,0,0.2\n3,0,0,0\n")
     plan = read_drive(file)
     assert plan.seconds == 3.0 and plan.at(0.0) == plan.at(1.4) == Drive(0.1)
-    assert plan.at(2.0) == Drive(0.1, 0.0, 0.2) and plan.at(9.0).stands
+    assert plan.at(2.0) == Drive(0.1, 0.0, 0.2) and plan.at(9.0).is_zero
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,9 @@ def test_the_way_is_made_from_the_command_of_the_moment() -> None:
     """What has been gone stays, what is to come turns with the command, and told to stand it closes its feet."""
     walk = DrivenWalk(stool().place, Drive(0.1))
     before = walk.places.copy()
-    assert walk.gait.paces == len(before) - 1 > 2 and np.all(np.diff(before[:, 0]) > 0.0) and not before[:, 2].any()
+    assert (
+        walk.gait.step_count == len(before) - 1 > 2 and np.all(np.diff(before[:, 0]) > 0.0) and not before[:, 2].any()
+    )
     walk.command = Drive(0.1, 0.0, 0.1)
     walk._lay_places(2)
     assert walk.places[:3] == pytest.approx(before[:3]) and walk.places[3, 2] > 0.0
@@ -106,7 +108,7 @@ def test_it_goes_on_from_where_slipping_feet_have_left_it() -> None:
     place = stool().place
     walk, standing = DrivenWalk(place, Drive(0.1)), place.ground.local(place.standing)
     before, length = walk.places.copy(), walk.places[1, 0]
-    walk._come = [2] * len(walk.feet)
+    walk._arrived_footholds = [2] * len(walk.feet)
     walk._plan_swing(2, standing + [before[2, 0], 0.0, 0.0])
     assert walk.places[:5] == pytest.approx(before)
     walk._plan_swing(2, standing + [before[1, 0], 0.0, 0.0])
@@ -115,7 +117,7 @@ def test_it_goes_on_from_where_slipping_feet_have_left_it() -> None:
     walk.command = Drive()
     walk._lay_places(3)
     walk.gait = replace(walk.gait, groups=((0,), (1, 2), (3,)))
-    walk._come, last = [3, 2, 2, 3], walk.places[3, 0]
+    walk._arrived_footholds, last = [3, 2, 2, 3], walk.places[3, 0]
     walk._plan_swing(4, standing)
     assert len(walk.places) == 4 and walk.places[3, 0] < last
 
@@ -133,7 +135,7 @@ def test_a_stool_is_driven_and_stands_again() -> None:
     says, within a pace, and stands."""
     made, speed = stool(), 0.06
     plan = DrivePlan((0.0, 1.5), (Drive(speed), Drive()))
-    driven = DrivenBy(made.place, plan)
+    driven = ScriptedDrive(made.place, plan)
     state, memory, reports = made.start, made.stepper.initial_memory(), list[StepReport]()
     body = made.place.body
     for _ in range(420):
@@ -154,12 +156,12 @@ def test_every_kind_of_body_can_be_driven() -> None:
     ball = coarse_creature(ball_mesh(), forward=FORWARD, all_round=True)
     worm = coarse_creature(worm_mesh(), forward=FORWARD)
     for made in (stool(), ball, worm):
-        driven = Driven(made.place)
+        driven = LiveDrive(made.place)
         assert driven.resting and isinstance(driven._motion, Stand)
         driven.command = Drive(0.1)
         assert not driven.resting
         assert driven.objectives(made.start, None, DT) and not isinstance(driven._motion, Stand)
-    walk = Driven(stool().place)
+    walk = LiveDrive(stool().place)
     walk.command = Drive(0.1)
     walk.objectives(stool().start, None, DT)
     assert isinstance(walk._motion, DrivenWalk) and walk._motion.phase is WalkPhase.SHIFT

@@ -10,7 +10,7 @@ import pytest
 
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import around, find_feet, foot_of_node, halves
+from egs_warp.motions.feet import find_feet, foot_of_node, order_counterclockwise, split_base
 from egs_warp.motions.footfalls import footfalls
 from tests.support.meshes import block_mesh, figure, stool
 
@@ -34,7 +34,7 @@ def test_a_stool_has_four_feet_with_their_legs() -> None:
 
 def test_feet_are_named_around_the_body() -> None:
     """Anticlockwise from above, so that every other one is opposite."""
-    order = around(np.array([STOOL.nodes[foot.sole, :2].mean(axis=0) for foot in FEET]))
+    order = order_counterclockwise(np.array([STOOL.nodes[foot.sole, :2].mean(axis=0) for foot in FEET]))
     centres = [STOOL.nodes[FEET[index].sole, :2].mean(axis=0) for index in order]
     turns = [np.cross([*a, 0.0], [*b, 0.0])[2] for a, b in zip(centres, [*centres[1:], centres[0]], strict=True)]
     assert min(turns) > 0.0
@@ -50,7 +50,7 @@ def test_a_base_has_a_left_and_a_right_side() -> None:
     """Apart from each other by what is near the middle; what goes with them falls off sideways and up."""
     mesh = block_mesh(5, 5, 5)
     heights, sole = mesh.nodes[:, 2], np.flatnonzero(mesh.nodes[:, 2] == 0.0)
-    left, right = halves(mesh.nodes[:, :2], heights, sole, 1.0)
+    left, right = split_base(mesh.nodes[:, :2], heights, sole, 1.0)
     assert mesh.nodes[left.sole, 1].min() > 0.02 and mesh.nodes[right.sole, 1].max() < -0.02
     assert len(left.sole) == len(right.sole) and set(left.sole) | set(right.sole) <= set(sole)
     assert np.all(left.leg[left.sole] > 0.5) and np.all(left.leg[right.sole] < 0.5)

@@ -12,11 +12,11 @@ from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState, make_body
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
 from egs_warp.motions.follow import Follow, FollowPhase, FollowPlan
 from egs_warp.motions.keyframes import Key, Quantity
-from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import Ground
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.stance import GroundFrame
 from tests.support.meshes import block_mesh, figure, stool
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
@@ -24,15 +24,15 @@ DT = 1 / 60
 
 
 @pytest.fixture
-def place() -> Place:
+def place() -> Stance:
     return stood(block_mesh())
 
 
-def stood(mesh: TetMesh) -> Place:
+def stood(mesh: TetMesh) -> Stance:
     """A body of ``mesh`` at rest; forward is +y."""
     body = make_body(mesh, FLOOR, device="cpu")
-    ground = Ground.on(FLOOR, np.array([0.0, 1.0, 0.0]), body.centre_of_mass(mesh.nodes))
-    return Place(body, ground, mesh.nodes, mesh.nodes[mesh.nodes[:, 2] < 1e-9], DT)
+    ground = GroundFrame.on_plane(FLOOR, np.array([0.0, 1.0, 0.0]), body.centre_of_mass(mesh.nodes))
+    return Stance(body, ground, mesh.nodes, mesh.nodes[mesh.nodes[:, 2] < 1e-9], DT)
 
 
 def key(time: float, part: str, quantity: Quantity, value: tuple[float, float, float]) -> Key:
@@ -40,7 +40,7 @@ def key(time: float, part: str, quantity: Quantity, value: tuple[float, float, f
 
 
 @pytest.mark.parametrize("part", ["body", "base", "head", "foot"])
-def test_each_quantity_is_measured_in_its_unit_along_forward_left_up(place: Place, part: str) -> None:
+def test_each_quantity_is_measured_in_its_unit_along_forward_left_up(place: Stance, part: str) -> None:
     """A rigid motion: forward is +y, left is -x; lengths over H, spin over m H^2."""
     body, height = place.body, place.body.height
     follow = Follow(place, [key(1.0, part, Quantity.POSITION, (0.1, 0.0, 0.0))])
@@ -59,7 +59,7 @@ def test_each_quantity_is_measured_in_its_unit_along_forward_left_up(place: Plac
     assert np.allclose(follow._measured(part, Quantity.ANGULAR_MOMENTUM, state), [spin[1], -spin[0], spin[2]])
 
 
-def test_a_position_key_asks_for_the_speed_of_its_curve(place: Place) -> None:
+def test_a_position_key_asks_for_the_speed_of_its_curve(place: Stance) -> None:
     """On the curve the head is asked for the curve's own speed; behind it for more."""
     follow = Follow(place, [key(1.0, "head", Quantity.POSITION, (0.2, 0.0, 0.0))])
     (channel,) = follow.channels
@@ -78,7 +78,7 @@ def test_a_position_key_asks_for_the_speed_of_its_curve(place: Place) -> None:
     assert np.allclose(asked[0], [speed, 0.0, 0.0]) and asked[1][0] > 1.5 * speed
 
 
-def test_each_key_has_its_own_weight(place: Place) -> None:
+def test_each_key_has_its_own_weight(place: Stance) -> None:
     """Of 1 and 9, the first key's holds until it is reached, the second's from then on."""
     value = (0.1, 0.0, 0.0)
     keys = [Key(time, "head", Quantity.POSITION, value, weight) for time, weight in ((6 * DT, 1.0), (12 * DT, 9.0))]
@@ -89,16 +89,16 @@ def test_each_key_has_its_own_weight(place: Place) -> None:
     assert found == [follow.weights.com] * 6 + [9.0 * follow.weights.com] * 8
 
 
-def test_keys_of_the_whole_body_replace_its_own_balance_or_spin(place: Place) -> None:
+def test_keys_of_the_whole_body_replace_its_own_balance_or_spin(place: Stance) -> None:
     state = BodyState(place.standing, 0 * place.standing)
     moving = Follow(place, [key(1.0, "body", Quantity.VELOCITY, (0.3, 0.0, 0.0))]).objectives(state, None, DT)
     assert [o.name for o in moving if isinstance(o, Objective)] == ["pose", "body velocity"]
-    assert sum(isinstance(o, SpinObjective) for o in moving) == 1
+    assert sum(isinstance(o, AngularMomentumObjective) for o in moving) == 1
     spinning = Follow(place, [key(DT, "body", Quantity.ANGULAR_MOMENTUM, (0.0, 0.0, 0.02))]).objectives(state, None, DT)
-    (spin,) = [o for o in spinning if isinstance(o, SpinObjective)]
+    (spin,) = [o for o in spinning if isinstance(o, AngularMomentumObjective)]
     assert np.allclose(spin.target, [0.0, 0.0, 0.02 * place.body.mass * place.body.height**2])
     turning = Follow(place, [key(DT, "body", Quantity.ORIENTATION, (0.0, 0.0, 3.0))]).objectives(state, None, DT)
-    (turn,) = [o for o in turning if isinstance(o, SpinObjective)]
+    (turn,) = [o for o in turning if isinstance(o, AngularMomentumObjective)]
     rate = np.linalg.solve(place.body.inertia(state.positions), turn.target)
     assert rate[2] > 0.0 and np.abs(rate[:2]).max() < 1e-6 * rate[2]
 
@@ -123,7 +123,7 @@ def test_feet_are_numbered_anticlockwise_from_straight_ahead() -> None:
         assert np.allclose(lift.target[:2], 0.0) and lift.target[2] > 0.0
 
 
-def test_a_part_that_the_body_does_not_have_is_refused_with_those_that_it_has(place: Place) -> None:
+def test_a_part_that_the_body_does_not_have_is_refused_with_those_that_it_has(place: Stance) -> None:
     """The one foot of a block is its base."""
     parts = Follow(place, [key(0.5, "foot", Quantity.POSITION, (0.0, 0.0, 0.1))]).parts
     assert np.array_equal(parts["foot"].nodes, parts["base"].nodes)
@@ -134,7 +134,7 @@ def test_a_part_that_the_body_does_not_have_is_refused_with_those_that_it_has(pl
         Follow(stood(figure()), [key(0.5, "foot", Quantity.POSITION, (0.0, 0.0, 0.1))])
 
 
-def test_missed_keys_are_told_and_reached_ones_are_not(place: Place) -> None:
+def test_missed_keys_are_told_and_reached_ones_are_not(place: Stance) -> None:
     keys = [
         key(0.1, "head", Quantity.POSITION, (0.1, 0.0, 0.0)),
         Key(0.2, "head", Quantity.POSITION, (0.2, 0.0, 0.0), where="k.json, key 2"),
@@ -145,7 +145,7 @@ def test_missed_keys_are_told_and_reached_ones_are_not(place: Place) -> None:
         positions = place.standing + forward * place.body.height * place.ground.axes[0]
         follow.objectives(BodyState(positions, 0 * positions, time), None, DT)
     assert follow.phase is FollowPhase.FOLLOW
-    planned = follow.planned()
+    planned = follow.plan_record()
     assert planned == FollowPlan(3.0, 0.3, planned.worst_miss) and planned.worst_miss == pytest.approx(0.08)
     assert follow.notes()[0].startswith("k.json, key 2: head position at 0.2 s: reached (0.12, ")
     assert follow.notes()[1] == "k.json, key 3: head position at 0.3 s was not reached in time"
@@ -153,13 +153,13 @@ def test_missed_keys_are_told_and_reached_ones_are_not(place: Place) -> None:
     assert follow.phase is FollowPhase.HOLD and len(follow.notes()) == 1
 
 
-def drifting(place: Place, speed: float, time: float) -> BodyState:
+def drifting(place: Stance, speed: float, time: float) -> BodyState:
     """The body standing at its place with ``speed`` forward, in sqrt(g H)."""
     velocity = speed * np.sqrt(9.81 * place.body.height) * place.ground.axes[0]
     return BodyState(place.standing, np.tile(velocity, (len(place.standing), 1)), time)
 
 
-def test_a_trajectory_rests_once_the_body_is_slow_and_at_last_in_any_case(place: Place) -> None:
+def test_a_trajectory_rests_once_the_body_is_slow_and_at_last_in_any_case(place: Stance) -> None:
     """Slow from some time on, it rests 0.3 sqrt(H / g) later;
     never slow, 9 sqrt(H / g) after the last key, which is noted.
     """
@@ -175,7 +175,7 @@ def test_a_trajectory_rests_once_the_body_is_slow_and_at_last_in_any_case(place:
         assert len(follow.notes()) == (slow_from == np.inf)
 
 
-def test_places_are_held_after_their_last_key_and_speeds_are_not(place: Place) -> None:
+def test_places_are_held_after_their_last_key_and_speeds_are_not(place: Stance) -> None:
     """After a body velocity the balance rules again; a head position stays asked for."""
     keys = [key(0.1, "body", Quantity.VELOCITY, (0.3, 0.0, 0.0)), key(0.2, "head", Quantity.POSITION, (0.1, 0.0, 0.0))]
     follow = Follow(place, keys)
@@ -186,7 +186,7 @@ def test_places_are_held_after_their_last_key_and_speeds_are_not(place: Place) -
     assert names == [{"pose", "body velocity", "head velocity"}] * 2 + [{"pose", "com", "head velocity"}] * 2
 
 
-def spun(place: Place, degrees: float, time: float) -> BodyState:
+def spun(place: Stance, degrees: float, time: float) -> BodyState:
     """The block turned about up where it stands."""
     centre = place.body.centre_of_mass(place.standing)
     turn = Rotation.from_rotvec([0.0, 0.0, degrees], degrees=True)
@@ -195,18 +195,18 @@ def spun(place: Place, degrees: float, time: float) -> BodyState:
 
 @pytest.mark.parametrize("part", ["body", "head"])
 @pytest.mark.parametrize("asked", [170.0, 180.0, 270.0, 360.0, -360.0])
-def test_a_turn_is_reached_the_way_round_that_was_asked(place: Place, part: str, asked: float) -> None:
+def test_a_turn_is_reached_the_way_round_that_was_asked(place: Stance, part: str, asked: float) -> None:
     """A body that turns all the way misses nothing; by 10 degrees less, 10; one that does not turn, all of it."""
     for share, miss in ((1.0, 0.0), (1.0 - 10.0 / abs(asked), 10.0), (0.0, abs(asked))):
         follow = Follow(place, [key(1.0, part, Quantity.ORIENTATION, (0.0, 0.0, asked))])
         for time in np.linspace(0.0, 1.0, 61):
             follow.objectives(spun(place, share * time * asked, time), None, DT)
-        assert follow.planned().worst_miss == pytest.approx(miss, abs=1e-6)
+        assert follow.plan_record().worst_miss == pytest.approx(miss, abs=1e-6)
         assert len(follow.notes()) == (miss > 36.0)
 
 
 @pytest.mark.parametrize("behind", [0.0, 20.0, 190.0])
-def test_a_turn_over_half_is_steered_the_way_round_that_was_asked(place: Place, behind: float) -> None:
+def test_a_turn_over_half_is_steered_the_way_round_that_was_asked(place: Stance, behind: float) -> None:
     """Late in a turn by 350 degrees the asked rate is that of the curve, and more for what the body is behind,
     however far.
     """
@@ -217,7 +217,7 @@ def test_a_turn_over_half_is_steered_the_way_round_that_was_asked(place: Place, 
     for time in np.arange(1, 109) * DT:
         value, rate = channel.at(time + DT)
         state = spun(place, max((value - DT * rate)[2] - behind, 0.0), time)
-        (spin,) = [o for o in follow.objectives(state, None, DT) if isinstance(o, SpinObjective)]
+        (spin,) = [o for o in follow.objectives(state, None, DT) if isinstance(o, AngularMomentumObjective)]
         rates.append(np.linalg.solve(body.inertia(state.positions), spin.target))
     gain = 6.0 * np.sqrt(9.81 / body.height)
     assert np.allclose(rates[-1], [0.0, 0.0, np.radians(rate[2] + gain * behind)], atol=1e-4)

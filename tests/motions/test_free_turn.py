@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from egs_warp.motions.free_turn import free_turn, spin_that_turns
+from egs_warp.motions.free_turn import integrate_rotation, spin_for_rotation
 
 
 def leaning(inertia: list[float], lean: float) -> np.ndarray:
@@ -24,12 +24,12 @@ def test_the_axis_of_a_symmetric_top_goes_round_its_angular_momentum(seconds: fl
     spin = np.array([0.3, -0.2, 1.4])
     momentum = inertia @ spin
     wanted = Rotation.from_rotvec(seconds / across * momentum).apply(axis)
-    assert np.allclose(free_turn(inertia, spin, seconds).apply(axis), wanted, atol=5e-3)
+    assert np.allclose(integrate_rotation(inertia, spin, seconds).apply(axis), wanted, atol=5e-3)
 
 
 def test_about_a_principal_axis_a_body_does_not_wobble() -> None:
     inertia = np.diag([0.4, 0.9, 0.6])
-    turned = free_turn(inertia, np.array([0.0, 0.0, 2.0]), 1.3)
+    turned = integrate_rotation(inertia, np.array([0.0, 0.0, 2.0]), 1.3)
     assert np.allclose(turned.as_matrix(), Rotation.from_rotvec([0.0, 0.0, 2.6]).as_matrix(), atol=1e-12)
 
 
@@ -40,7 +40,7 @@ def test_a_body_off_its_axes_comes_to_the_turn_that_is_asked(turn: float) -> Non
     goal = Rotation.from_rotvec(asked) * Rotation.from_rotvec(upright)
 
     def missed(spin: np.ndarray) -> float:
-        return float(np.degrees((goal * free_turn(inertia, spin, 1.2).inv()).magnitude()))
+        return float(np.degrees((goal * integrate_rotation(inertia, spin, 1.2).inv()).magnitude()))
 
     assert missed((upright + asked) / 1.2) > 0.5
-    assert missed(spin_that_turns(inertia, upright, asked, 1.2)) < 0.02
+    assert missed(spin_for_rotation(inertia, upright, asked, 1.2)) < 0.02

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egs_warp.motions.carriage import ON_LEGS
 from egs_warp.motions.gait import Gait, feet_in_turn
+from egs_warp.motions.walk_posture import LEGGED_TIMING
 
-GAIT = Gait.of(4, 4, 0.03, ON_LEGS, time_unit=0.32)
+GAIT = Gait.of(4, 4, 0.03, LEGGED_TIMING, time_unit=0.32)
 
 
 @given(st.integers(2, 9))
@@ -28,11 +28,11 @@ def test_every_foot_swings_once_in_a_round_and_none_beside_its_neighbour(count: 
 @given(st.integers(2, 7), st.integers(1, 12))
 def test_footprints_follow_each_other_and_close(feet: int, paces: int) -> None:
     """Each swing comes one pace ahead of the last, and at the end all feet are at the last place."""
-    gait = Gait.of(feet, paces, 0.03, ON_LEGS, time_unit=0.3)
+    gait = Gait.of(feet, paces, 0.03, LEGGED_TIMING, time_unit=0.3)
     at = np.zeros(feet)
     for swing in range(gait.swings):
-        for foot in gait.group(swing):
-            at[foot] = gait.landing(swing)
+        for foot in gait.swing_feet(swing):
+            at[foot] = gait.target_step(swing)
         assert at.max() == min(swing + 1, paces)
     assert np.all(at == paces)
 
@@ -41,10 +41,10 @@ def test_footprints_follow_each_other_and_close(feet: int, paces: int) -> None:
 def test_the_body_is_as_far_as_its_feet(feet: int) -> None:
     """Far from both ends: in the middle of a swing as far as the groups of feet are in the mean of before and after;
     and evenly."""
-    gait = Gait.of(feet, 40, 0.03, ON_LEGS, time_unit=0.3)
+    gait = Gait.of(feet, 40, 0.03, LEGGED_TIMING, time_unit=0.3)
     swing, rounds = 20, len(gait.groups)
-    before = np.mean([gait.landing(swing - 1 - k) for k in range(rounds)])
-    after = np.mean([gait.landing(swing - k) for k in range(rounds)])
+    before = np.mean([gait.target_step(swing - 1 - k) for k in range(rounds)])
+    after = np.mean([gait.target_step(swing - k) for k in range(rounds)])
     assert gait.progress(swing, 0.5 * gait.swing_time) == pytest.approx(0.5 * (before + after))
     period = gait.swing_time + gait.double_time
     assert gait.progress(swing, period) == pytest.approx(gait.progress(swing + 1, 0.0))
@@ -58,11 +58,11 @@ def test_a_swinging_foot_leaves_and_lands_at_rest() -> None:
     near = 1e-4
     for end in (0.0, 1.0):
         inside = end + near * (1.0 - 2.0 * end)
-        assert GAIT.lifted(end) == pytest.approx(0.0, abs=1e-12) and GAIT.lifted(inside) < 1e-5
-        assert GAIT.carried(inside) == pytest.approx(end, abs=1e-12)
+        assert GAIT.foot_height(end) == pytest.approx(0.0, abs=1e-12) and GAIT.foot_height(inside) < 1e-5
+        assert GAIT.transfer_progress(inside) == pytest.approx(end, abs=1e-12)
     progress = np.linspace(0.0, 1.0, 101)
-    heights = np.array([GAIT.lifted(s) for s in progress])
-    ways = np.array([GAIT.carried(s) for s in progress])
+    heights = np.array([GAIT.foot_height(s) for s in progress])
+    ways = np.array([GAIT.transfer_progress(s) for s in progress])
     assert heights.max() == pytest.approx(GAIT.lift, rel=1e-3) and heights.min() >= 0.0
     assert np.all(np.diff(ways) >= 0.0)
     moving = (ways > 0.02) & (ways < 0.98)
@@ -72,8 +72,8 @@ def test_a_swinging_foot_leaves_and_lands_at_rest() -> None:
 def test_a_foot_is_steered_bit_by_bit_and_goes_ahead_only_when_it_is_up() -> None:
     """Not at all where the swing begins, wholly before it is carried far; carried between the two times that are
     told."""
-    steered = [GAIT.eased(s) for s in (0.0, 0.1, 0.2, 0.3, 1.0)]
+    steered = [GAIT.steering_progress(s) for s in (0.0, 0.1, 0.2, 0.3, 1.0)]
     assert steered[0] == 0.0 and steered[3:] == [1.0, 1.0] and np.all(np.diff(steered[:4]) > 0.0)
-    assert GAIT.carried(GAIT.carried_from / GAIT.swing_time) == 0.0
-    assert GAIT.carried(GAIT.carried_until / GAIT.swing_time) == pytest.approx(1.0)
-    assert 0.0 < GAIT.carried(0.5 * (GAIT.carried_from + GAIT.carried_until) / GAIT.swing_time) < 1.0
+    assert GAIT.transfer_progress(GAIT.carried_from / GAIT.swing_time) == 0.0
+    assert GAIT.transfer_progress(GAIT.carried_until / GAIT.swing_time) == pytest.approx(1.0)
+    assert 0.0 < GAIT.transfer_progress(0.5 * (GAIT.carried_from + GAIT.carried_until) / GAIT.swing_time) < 1.0

@@ -11,17 +11,17 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState
 from egs_warp.locomotion.audit import audit
-from egs_warp.locomotion.ledger import ledger
-from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.ledger import energy_balance
+from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.motions.fall import FallWatch
+from egs_warp.motions.fall_monitor import FallMonitor
 from egs_warp.motions.get_up import _TRIES, GetUp, GetUpPhase, lie_down
-from egs_warp.motions.sequence import MotionSequence, Part
+from egs_warp.motions.sequence import MotionSequence, MotionTask
 from egs_warp.motions.stand import Stand, StandFor
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.meshes import ball_mesh, box_mesh
-from tests.support.places import DT, FORWARD
+from tests.support.stances import DT, FORWARD
 
 LEFT = np.array([0.0, 1.0, 0.0])
 
@@ -66,7 +66,7 @@ def test_it_turns_as_a_whole_about_the_edge_of_its_base() -> None:
     get_up, state = GetUp(block().place), lying(90.0)
     get_up.phase, get_up._entered, get_up._push = GetUpPhase.ROLL, 0.0, 50.0
     com, spin, _ = get_up.objectives(replace(state, time=0.05), None, DT)
-    assert isinstance(com, Objective) and isinstance(spin, SpinObjective)
+    assert isinstance(com, Objective) and isinstance(spin, AngularMomentumObjective)
     body = get_up.body
     rate = np.linalg.solve(body.inertia(state.positions), spin.target)
     assert rate[1] < 0.0 and abs(rate[0]) + abs(rate[2]) < 1e-3 * abs(rate[1])
@@ -74,7 +74,7 @@ def test_it_turns_as_a_whole_about_the_edge_of_its_base() -> None:
     arm = (body.centre_of_mass(state.positions) - edge) * [1.0, 0.0, 1.0]
     assert com.target == pytest.approx(np.cross(rate, arm), rel=0.02, abs=1e-6)
     _, spin, _ = get_up.objectives(replace(state, time=0.2), None, DT)
-    assert isinstance(spin, SpinObjective)
+    assert isinstance(spin, AngularMomentumObjective)
     about = body.inertia(state.positions)[1, 1] + body.mass * arm @ arm
     falls = DT * body.weight * arm[0] / about
     assert np.linalg.solve(body.inertia(state.positions), spin.target)[1] == pytest.approx(falls, rel=0.01)
@@ -124,21 +124,21 @@ def test_it_gives_up_after_its_tries() -> None:
 
 
 @cache
-def risen(degrees: float, sideways: bool) -> tuple[FallWatch, list[StepReport], BodyState, BodyState]:
+def risen(degrees: float, sideways: bool) -> tuple[FallMonitor, list[StepReport], BodyState, BodyState]:
     """Laid on its side while it was to stand for a second, and then to stand for another."""
     made, start = block(), lying(degrees, FORWARD if sideways else LEFT)
     parts = [
-        Part("stand", {}, lambda place: StandFor(place, 1.0)),
-        Part("stand", {}, lambda place: StandFor(place, 0.2)),
+        MotionTask("stand", {}, lambda place: StandFor(place, 1.0)),
+        MotionTask("stand", {}, lambda place: StandFor(place, 0.2)),
     ]
-    watch = FallWatch(MotionSequence(made.place, parts), made.place, gets_up=True)
+    watch = FallMonitor(MotionSequence(made.place, parts), made.place, gets_up=True)
     state, memory, reports = start, made.stepper.initial_memory(), []
     # Time for all of its tries.
     for _ in range(1800):
         wishes = watch.objectives(state, reports[-1] if reports else None, DT)
         state, memory, fresh = made.stepper.advance(state, memory, wishes, DT)
         reports += fresh
-        if watch.finished:
+        if watch.is_finished:
             break
     return watch, reports, start, state
 
@@ -148,7 +148,7 @@ def risen(degrees: float, sideways: bool) -> tuple[FallWatch, list[StepReport], 
 def test_a_block_gets_up_and_goes_on(degrees: float, sideways: bool) -> None:
     """The motion that fell is over, the next one is done from where it has come to stand."""
     watch, _, _, end = risen(degrees, sideways)
-    assert watch.fallen is None and watch.finished
+    assert watch.fallen is None and watch.is_finished
     assert [entry.name for entry in watch.sequence.done] == ["stand", "get up", "stand"]
     fell, get_up, last = watch.sequence.done
     assert fell.fell is not None and fell.fell.startswith("tilted by") and fell.got_up and last.fell is None
@@ -164,9 +164,9 @@ def test_it_gets_up_calmly() -> None:
     _, entry, last = watch.sequence.done
     assert isinstance(entry.motion, GetUp)
     found = _recorded().trajectory()
-    books, starts = ledger(found), found.time[:-1] + 1e-9
+    books, starts = energy_balance(found), found.time[:-1] + 1e-9
     rising = (starts >= entry.start_time) & (starts < last.start_time)
-    assert 0.0 < books.muscle_work[rising].sum() < 20.0 * books.unit * entry.motion.tries
+    assert 0.0 < books.muscle_work[rising].sum() < 20.0 * books.energy_unit * entry.motion.tries
 
 
 def _recorded() -> Recorder:

@@ -6,29 +6,29 @@ import numpy as np
 import pytest
 
 from egs_warp.contact.terrain import Solid, step
-from egs_warp.motions.hop import Hop, Squares
-from egs_warp.motions.sequence import Place
+from egs_warp.motions.hop import Hop, HopTargets
+from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import sole_shares
-from tests.support.places import DT, FLOOR, FORWARD, moved
+from tests.support.stances import DT, FLOOR, FORWARD, moved
 
 
-def test_hops_aim_at_squares_from_where_the_feet_are(place: Place) -> None:
+def test_hops_aim_at_squares_from_where_the_feet_are(place: Stance) -> None:
     """A hop that fell short and went aside is made up by the next; a square on a step is jumped up to."""
     height = place.body.height
-    row = Squares(0.7, 0.2, 3, {"distance": 0.7})
+    row = HopTargets(0.7, 0.2, 3, {"distance": 0.7})
     begin = [part.begin for part in row.parts()]
     first = begin[0](place)
     assert isinstance(first, Hop) and first.jump.target.distance == pytest.approx(0.7)
     feet = sole_shares(place.body, place.ground, place.standing) @ place.standing
     assert np.allclose(first.square, feet + [0.7, 0.0, 0.0])
-    again = begin[1](place.now(moved(place, 0.0, np.array([0.6, 0.1, 0.0]))))
+    again = begin[1](place.moved_to(moved(place, 0.0, np.array([0.6, 0.1, 0.0]))))
     assert isinstance(again, Hop) and again.jump.target.distance == pytest.approx(np.hypot(0.8, 0.1))
     assert np.allclose(again.jump.ground.axes[0] * np.hypot(0.8, 0.1), [0.8, -0.1, 0.0])
     assert again.miss(moved(place, 0.0, np.array([1.43, 0.04, 0.2]))) == pytest.approx(0.05)
 
     stair = step(FLOOR, np.array([0.4, 0.0, 0.0]), FORWARD, 0.2 * height)
-    stairs = Place(place.body, place.ground, place.standing, place.touching, DT, (Solid((FLOOR,)), stair))
-    up = Squares(0.7, 0.2, 1, {}).parts()[0].begin(stairs)
+    stairs = Stance(place.body, place.ground, place.standing, place.contact_points, DT, (Solid((FLOOR,)), stair))
+    up = HopTargets(0.7, 0.2, 1, {}).parts()[0].begin(stairs)
     assert isinstance(up, Hop) and up.jump.target.rise == pytest.approx(0.2 * height)
     assert up.jump.target.height == pytest.approx(0.2 + 0.2 * height)
     assert up.jump.plan.flight_time < first.jump.plan.flight_time + np.sqrt(2 * 0.2 * height / 9.81)

@@ -9,24 +9,24 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.locomotion.objectives import Objective, SpinObjective
-from egs_warp.motions.jump import BASE_SWING, FOOTHOLD, Jump
+from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
+from egs_warp.motions.jump import BASE_SWING, MAX_FOOTHOLD_OFFSET, Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget, stopping_time
-from egs_warp.motions.sequence import Place
-from egs_warp.motions.twist import Turning
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.twist import TurnHeading
 from tests.support.meshes import coarse_stool
-from tests.support.places import DT, block_place, moved
+from tests.support.stances import DT, block_place, moved
 
 
-def test_a_landing_frame_holds_the_landed_body(place: Place) -> None:
+def test_a_landing_frame_holds_the_landed_body(place: Stance) -> None:
     """From take-off on, a body that stands turned at the target has the coordinates of the start."""
     target = JumpTarget(0.5, 0.3, 0.1)
-    jump = Jump(place, target, facing=Turning(place, 0.8))
+    jump = Jump(place, target, facing=TurnHeading(place, 0.8))
     start = place.ground.local(place.standing)
     jump.phase = JumpPhase.THRUST
     flying = place.standing + [0.2, 0.0, 0.3]
     jump.objectives(BodyState(flying, np.tile([1.0, 0.0, 2.5], (len(flying), 1)), 0.01), None, DT)
-    assert jump.phase is JumpPhase.FLIGHT and jump.left_ground
+    assert jump.phase is JumpPhase.FLIGHT and jump.is_airborne
     landed = moved(place, 0.8, np.array([0.5, 0.0, 0.1]))
     assert np.allclose(jump.ground.local(landed), start)
     assert jump.pose.measure(BodyState(landed, 0 * landed), None).heading == pytest.approx(0.0, abs=1e-9)
@@ -34,7 +34,7 @@ def test_a_landing_frame_holds_the_landed_body(place: Place) -> None:
 
 @pytest.mark.parametrize(("distance", "lean"), [(0.0, 0.0), (0.3, 0.045), (2.0, 0.07)])
 def test_the_weight_goes_ahead_with_the_distance_and_stays_well_behind_the_toes(
-    place: Place, distance: float, lean: float
+    place: Stance, distance: float, lean: float
 ) -> None:
     """0.15 of the distance, at most 0.35 of the 0.2 metres to the front of the feet."""
     assert Jump(place, JumpTarget(distance, 0.3)).plan.lean == pytest.approx(lean)
@@ -64,7 +64,7 @@ def test_a_landing_that_may_fail_is_balanced_in_full() -> None:
         jump.phase = JumpPhase.LAND
         moving = np.tile([speed, 0.0, 0.0], (len(place.standing), 1))
         asked = jump.objectives(BodyState(place.standing, moving, time), None, DT)
-        weights.append(next(objective.weight for objective in asked if isinstance(objective, SpinObjective)))
+        weights.append(next(objective.weight for objective in asked if isinstance(objective, AngularMomentumObjective)))
     assert weights[:2] == pytest.approx([jump.weights.landing * jump.weights.spin, jump.weights.spin])
     assert 0.0 < weights[2] < 0.05 * jump.weights.spin
 
@@ -95,7 +95,7 @@ def test_what_comes_up_to_its_feet_turns_until_they_are_flat(com_speed: float, f
     jump.phase = JumpPhase.LAND
     moving = np.tile([0.4 * com_speed, 0.0, 0.0], (len(sheared), 1))
     asked = jump.objectives(BodyState(sheared, moving, 1.0), None, DT)
-    spin = next(objective for objective in asked if isinstance(objective, SpinObjective))
+    spin = next(objective for objective in asked if isinstance(objective, AngularMomentumObjective))
     rate = np.linalg.solve(place.body.inertia(sheared), spin.target)
     assert abs(rate[1]) < 0.03 if flat else rate[1] > 0.1, rate
 
@@ -105,8 +105,8 @@ def test_feet_come_down_so_far_ahead_that_the_body_stops_over_them(toes: float) 
     """Where the target lies too near to stop, the capture point is ahead of the middle of the feet by no more than its
     share of what they reach ahead, however far they reach behind."""
     place = block_place()
-    touching = place.touching[place.touching[:, 0] < toes + 1e-9]
-    place = replace(place, touching=np.vstack([touching, [toes, 0.0, 0.0]]))
+    touching = place.contact_points[place.contact_points[:, 0] < toes + 1e-9]
+    place = replace(place, contact_points=np.vstack([touching, [toes, 0.0, 0.0]]))
     jump, speed = Jump(place, JumpTarget(0.0, 0.3)), 1.0
     jump.phase = JumpPhase.THRUST
     state = BodyState(place.standing + [0.0, 0.0, 0.3], np.tile([speed, 0.0, -1.0], (len(place.standing), 1)), 0.01)
@@ -118,4 +118,4 @@ def test_feet_come_down_so_far_ahead_that_the_body_stops_over_them(toes: float) 
     stop = stopping_time(jump.pose.standing_height, left * 9.81 + 1.0, 9.81)
     placed = jump._foothold(state, seen, down, left)  # pyright: ignore[reportPrivateUsage]
     ahead = down[0] + stop * speed + jump.pose.base_offset[0] - placed[0]
-    assert ahead == pytest.approx(FOOTHOLD * toes)
+    assert ahead == pytest.approx(MAX_FOOTHOLD_OFFSET * toes)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from egs_warp.motions.jump_plan import LEAN, JumpPlan, JumpTarget, plan_jump, stopping_time
+from egs_warp.motions.jump_plan import LEAN_FRACTION, JumpPlan, JumpTarget, plan_jump, stopping_time
 
 GRAVITY, STEP = 9.81, 1 / 60
 
@@ -27,7 +27,7 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
         support_ahead=ahead,
         gravity=GRAVITY,
         step=STEP,
-        lean=LEAN * target.distance,
+        lean=LEAN_FRACTION * target.distance,
     )
 
     # Thrust: from rest at the bottom of the crouch, a push that grows and then stays, to take-off stretched by the
@@ -69,7 +69,7 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
     # of the body. What the crouch has left of speed ahead is not counted: the plan's own path is a little longer.
     way = plan.lean + plan.speed_forward * (0.5 * plan.thrust_time + plan.flight_time)
     assert way + plan.landing_lag == pytest.approx(target.distance, rel=1e-9)
-    assert plan.lean == pytest.approx(LEAN * target.distance)
+    assert plan.lean == pytest.approx(LEAN_FRACTION * target.distance)
     path = moves[-1][0][0] + plan.speed_forward * plan.flight_time + plan.landing_lag
     assert target.distance - 1e-9 <= path <= 1.05 * target.distance
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.meshing.occupancy import LatticeSolid
-from egs_warp.motions.feet import Base, around, base_of, find_feet
+from egs_warp.motions.feet import SupportKind, find_feet, order_counterclockwise, support_kind_of
 from egs_warp.motions.limbs import Sections, find_limbs
 from tests.support.meshes import carved, coarse_stool, column, figure, stool
 
@@ -44,25 +44,25 @@ def mesh_of(shape: Shape, size: tuple[float, float, float] = SIZE, cell: float =
     return carved(size, cell, shape)
 
 
-def feet_of(mesh: TetMesh, heights: np.ndarray | None = None) -> tuple[int, Base]:
+def feet_of(mesh: TetMesh, heights: np.ndarray | None = None) -> tuple[int, SupportKind]:
     heights = mesh.nodes[:, 2] if heights is None else heights
     feet = find_feet(mesh, heights, float(np.ptp(heights)))
-    return len(feet), base_of(mesh, heights, len(feet))
+    return len(feet), support_kind_of(mesh, heights, len(feet))
 
 
 SNAKE = carved((2.4, 0.3, 0.2), 0.05, lambda p: np.abs(p[:, 1] - 0.06 * np.sin(6.0 * p[:, 0])) < 0.09)
 BODIES = {
-    "stool": (stool(), 4, Base.FEET),
-    "coarse stool": (coarse_stool(), 4, Base.FEET),
-    "figure": (figure(), 2, Base.FEET),
-    "column": (column(), 1, Base.ONE),
-    "tripod": (mesh_of(legged(3)), 3, Base.FEET),
-    "six legs": (mesh_of(legged(6)), 6, Base.FEET),
-    "eight legs": (mesh_of(legged(8), cell=0.04), 8, Base.FEET),
-    "snake": (SNAKE, 0, Base.LONG),
-    "ball": (mesh_of(ball), 1, Base.ROUND),
-    "pawn": (mesh_of(pawn), 1, Base.ONE),
-    "block": (mesh_of(lambda p: np.ones(len(p), bool), (0.6, 0.5, 1.0), 0.1), 1, Base.ONE),
+    "stool": (stool(), 4, SupportKind.FEET),
+    "coarse stool": (coarse_stool(), 4, SupportKind.FEET),
+    "figure": (figure(), 2, SupportKind.FEET),
+    "column": (column(), 1, SupportKind.SINGLE_BASE),
+    "tripod": (mesh_of(legged(3)), 3, SupportKind.FEET),
+    "six legs": (mesh_of(legged(6)), 6, SupportKind.FEET),
+    "eight legs": (mesh_of(legged(8), cell=0.04), 8, SupportKind.FEET),
+    "snake": (SNAKE, 0, SupportKind.LYING),
+    "ball": (mesh_of(ball), 1, SupportKind.ROUND_BASE),
+    "pawn": (mesh_of(pawn), 1, SupportKind.SINGLE_BASE),
+    "block": (mesh_of(lambda p: np.ones(len(p), bool), (0.6, 0.5, 1.0), 0.1), 1, SupportKind.SINGLE_BASE),
 }
 
 
@@ -91,13 +91,13 @@ def test_a_table_with_one_short_leg_has_four_feet() -> None:
     short = [foot for foot in feet if foot.height > 0.0]
     assert [foot.height for foot in short] == [pytest.approx(0.05)]
     assert np.all(mesh.nodes[short[0].sole, :2] > 0.0) and np.all(mesh.nodes[short[0].sole, 2] == pytest.approx(0.05))
-    assert not any(foot.joined for foot in feet)
+    assert not any(foot.is_joined for foot in feet)
 
 
 def test_what_hangs_is_no_foot() -> None:
     """A fifth leg that ends a quarter of the height above the ground."""
     mesh = mesh_of(lambda p: short_legged(p) | ((np.abs(p[:, :2]).max(axis=1) < 0.1) & (p[:, 2] > 0.25)))
-    assert feet_of(mesh) == (4, Base.FEET)
+    assert feet_of(mesh) == (4, SupportKind.FEET)
 
 
 def melted(thickness: float) -> TetMesh:
@@ -110,7 +110,7 @@ def test_legs_that_melt_together_at_the_base_are_told_apart() -> None:
     """Each sole is a quarter of the slab, and each foot knows that it is joined."""
     mesh = melted(0.05)
     feet = find_feet(mesh, mesh.nodes[:, 2], 1.0)
-    assert len(feet) == 4 and all(foot.joined for foot in feet)
+    assert len(feet) == 4 and all(foot.is_joined for foot in feet)
     corners = {tuple(np.sign(mesh.nodes[foot.sole, :2].mean(axis=0)).astype(int)) for foot in feet}
     assert corners == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
     for foot in feet:
@@ -120,7 +120,7 @@ def test_legs_that_melt_together_at_the_base_are_told_apart() -> None:
 
 
 def test_legs_on_a_thick_slab_stand_on_one_base() -> None:
-    assert feet_of(melted(0.25)) == (1, Base.ONE)
+    assert feet_of(melted(0.25)) == (1, SupportKind.SINGLE_BASE)
 
 
 @pytest.mark.parametrize(("length", "count"), [(1.4, 2), (0.8, 4)])
@@ -134,7 +134,7 @@ def test_legs_on_runners_stand_on_these(length: float, count: int) -> None:
         return posts | runners | ((p[:, 2] > 0.7) & (np.abs(p[:, 0]) < 0.5 * length))
 
     mesh = mesh_of(sledge, (1.4, 1.0, 1.0), 0.04)
-    assert feet_of(mesh) == (count, Base.FEET)
+    assert feet_of(mesh) == (count, SupportKind.FEET)
     spacing = 1.0 / 32.0
     places = np.stack(np.meshgrid(*[np.arange(n) for n in (47, 35, 33)], indexing="ij"), axis=-1)
     inside = sledge((spacing * (places - [23, 17, 0])).reshape(-1, 3)).reshape(places.shape[:3])
@@ -151,7 +151,7 @@ def test_a_tail_held_up_from_the_base_carries_nothing() -> None:
             | ((np.linalg.norm(p[:, :2] + [0.35, 0.0], axis=1) < 0.1) & (p[:, 2] < 0.8))
         )
     )
-    assert feet_of(mesh) == (1, Base.ONE)
+    assert feet_of(mesh) == (1, SupportKind.SINGLE_BASE)
 
 
 def test_gaps_finer_than_the_cage_are_seen_in_the_solid() -> None:
@@ -166,7 +166,7 @@ def test_gaps_finer_than_the_cage_are_seen_in_the_solid() -> None:
     limbs = find_limbs(Sections.of_solid(solid, cage), cage.nodes)
     feet = find_feet(cage, cage.nodes[:, 2], 1.0, limbs)
     assert limbs.tops == (pytest.approx(0.4, abs=0.03),) * 2
-    assert [foot.joined for foot in feet] == [True, True]
+    assert [foot.is_joined for foot in feet] == [True, True]
     sides = sorted(float(cage.nodes[foot.sole, 0].mean()) for foot in feet)
     assert sides[0] < -0.1 and sides[1] > 0.1
 
@@ -177,5 +177,5 @@ def test_feet_are_numbered_anticlockwise_from_straight_ahead() -> None:
     def at(*degrees: float) -> np.ndarray:
         return np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], axis=1)
 
-    assert around(at(170.0, 80.0, -10.0, -100.0)).tolist() == [2, 1, 0, 3]
-    assert around(at(160.0, 70.0, -20.0, -110.0)).tolist() == [1, 0, 3, 2]
+    assert order_counterclockwise(at(170.0, 80.0, -10.0, -100.0)).tolist() == [2, 1, 0, 3]
+    assert order_counterclockwise(at(160.0, 70.0, -20.0, -110.0)).tolist() == [1, 0, 3, 2]

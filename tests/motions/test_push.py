@@ -11,21 +11,21 @@ import pytest
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.locomotion.audit import audit
-from egs_warp.locomotion.rollout import Simulation, roll_out
+from egs_warp.locomotion.rollout import RolloutResult, roll_out
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.fall import FallWatch
-from egs_warp.motions.push import WAYS, Kicks, Push, kick_of, read_pushes
+from egs_warp.motions.fall_monitor import FallMonitor
+from egs_warp.motions.push import DIRECTIONS, Push, PushKicks, kick_of, read_pushes
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from egs_warp.motions.stand import StandFor
-from egs_warp.pipelines.performance import simulate
 from egs_warp.pipelines.report import AUDIT_LIMITS
+from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import CoarseCreature, coarse_creature
-from tests.support.lives import coarse_pawn
+from tests.support.live_sessions import coarse_pawn
 from tests.support.meshes import box_mesh
-from tests.support.places import DT, FORWARD, block_place
+from tests.support.stances import DT, FORWARD, block_place
 
-LEFT = np.array(WAYS["left"])
+LEFT = np.array(DIRECTIONS["left"])
 
 
 def block() -> CoarseCreature:
@@ -37,15 +37,15 @@ def made() -> CoarseCreature:
     return block()
 
 
-def stood(made: CoarseCreature, pushes: str, frames: int = 40, **given: Path) -> tuple[Simulation, str | None]:
+def stood(made: CoarseCreature, pushes: str, frames: int = 40, **given: Path) -> tuple[RolloutResult, str | None]:
     """A block that is told to stand, and how it fell, if it did."""
     place = made.place
-    watch = FallWatch(MotionSequence(place, motion("stand 0.5").parts(place.body.height)), place)
+    watch = FallMonitor(MotionSequence(place, motion("stand 0.5").parts(place.body.height)), place)
     simulation = roll_out(
         *(made.stepper, made.stepper.geometry, made.start, watch),
         frames=frames,
-        kicks=Kicks(place, read_pushes(pushes)),
-        finished=lambda: watch.finished,
+        kicks=PushKicks(place, read_pushes(pushes)),
+        finished=lambda: watch.is_finished,
         parts=(lambda: given["parts"]) if "parts" in given else None,
         resume=given.get("resume"),
     )
@@ -60,11 +60,11 @@ def pushed(made: CoarseCreature) -> Trajectory:
 
 
 @pytest.mark.parametrize("dt", [1 / 60, 0.013, 0.2])
-@pytest.mark.parametrize("push", [Push(0.25, LEFT), Push(0.25, LEFT, lasts=0.31), Push(0.0, LEFT, lasts=0.001)])
+@pytest.mark.parametrize("push", [Push(0.25, LEFT), Push(0.25, LEFT, duration=0.31), Push(0.0, LEFT, duration=0.001)])
 def test_steps_share_out_all_of_a_push(push: Push, dt: float) -> None:
     shares = [push.share(step * dt, dt) for step in range(int(np.ceil(1.0 / dt)))]
     assert sum(shares) == pytest.approx(1.0) and min(shares) >= 0.0
-    if push.lasts == 0.0:
+    if push.duration == 0.0:
         assert sorted(shares)[-2:] == [0.0, 1.0]
 
 
@@ -73,7 +73,7 @@ def test_a_push_has_its_momentum_and_its_arm(made: CoarseCreature) -> None:
     does not."""
     place, body = made.place, made.place.body
     for height in (None, 0.9, 0.1):
-        kick = Kicks(place, [Push(0.0, 0.3 * LEFT, height)])(0.0, DT)
+        kick = PushKicks(place, [Push(0.0, 0.3 * LEFT, height)])(0.0, DT)
         assert kick is not None
         momentum = body.node_mass @ kick
         np.testing.assert_allclose(momentum, 0.3 * body.mass * body.speed_unit * place.ground.axes[1], atol=1e-12)
@@ -81,7 +81,7 @@ def test_a_push_has_its_momentum_and_its_arm(made: CoarseCreature) -> None:
         sign = {None: 0.0, 0.9: -1.0, 0.1: 1.0}[height]
         unit = body.mass * body.speed_unit * body.height
         assert abs(turning[0]) < 1e-12 * unit if height is None else sign * turning[0] > 0.05 * unit
-    assert Kicks(place, [Push(0.5, LEFT)])(0.0, DT) is None
+    assert PushKicks(place, [Push(0.5, LEFT)])(0.0, DT) is None
 
 
 def test_what_is_hit_is_around_the_height(made: CoarseCreature) -> None:
@@ -117,7 +117,7 @@ def test_who_is_pushed_goes_along_and_keeps_its_feet(made: CoarseCreature, pushe
     com = np.array([place.body.centre_of_mass(place.ground.local(x)) for x in pushed.positions])
     after = int(np.searchsorted(pushed.time, 0.2))
     assert com[after, 1] > 0.005 > com[0, 1] + 0.001
-    reached = StandFor(place, 0.5).reached(pushed, 0, len(pushed.dt))
+    reached = StandFor(place, 0.5).outcome_record(pushed, 0, len(pushed.dt))
     lean = np.linalg.norm((com - com[0])[:, :2], axis=1).max() / place.body.height
     assert reached.lean == pytest.approx(lean) and reached.sole_shift < 0.3 * lean
     assert np.linalg.norm(pushed.node_mass @ pushed.velocities[-1]) < 0.05 * place.body.mass * place.body.speed_unit
@@ -129,7 +129,7 @@ def test_a_hard_push_throws_it_over(made: CoarseCreature) -> None:
     assert fallen is not None and fallen.startswith("tilted by")
     assert audit(simulation.trajectory).energy_residual < 1e-6
     t = simulation.trajectory
-    reached = StandFor(made.place, 0.5).reached(t, 0, len(t.dt))
+    reached = StandFor(made.place, 0.5).outcome_record(t, 0, len(t.dt))
     sole = made.place.ground.local(made.place.standing)[:, 2] < 0.01
     middle = np.array([made.place.ground.local(x)[sole, :2].mean(axis=0) for x in t.positions])
     shift = np.linalg.norm(middle - middle[0], axis=1).max() / made.place.body.height
@@ -148,12 +148,12 @@ def test_a_pushed_run_goes_on_to_the_same_bits(pushed: Trajectory, tmp_path: Pat
 
 def test_what_the_run_was_over_before_is_told() -> None:
     pushes = read_pushes("0.5 0.1 left, 1-3 0.1 back, 2 0.1 left")
-    assert [push.missed(2.0) for push in pushes] == [
+    assert [push.unapplied_note(2.0) for push in pushes] == [
         None,
         "the gust until 3 s was not over when the run was",
         "the push at 2 s never came: the run was over before",
     ]
-    assert [push.missed(3.0) for push in pushes] == [None] * 3
+    assert [push.unapplied_note(3.0) for push in pushes] == [None] * 3
 
 
 @pytest.mark.slow

@@ -16,16 +16,16 @@ from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory, measure
-from egs_warp.motions.fall import FallWatch
-from egs_warp.motions.feet import Base
-from egs_warp.motions.going import going, going_round
+from egs_warp.motions.fall_monitor import FallMonitor
+from egs_warp.motions.feet import SupportKind
+from egs_warp.motions.gait_selection import move_along, turn_in_place
 from egs_warp.motions.roll import Roll
-from egs_warp.motions.route import along, straight
-from egs_warp.motions.sequence import MotionSequence, Part, Place
+from egs_warp.motions.route import path_route, straight_route
+from egs_warp.motions.sequence import MotionSequence, MotionTask, Stance
 from egs_warp.motions.turn import Turn
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.meshes import UP, ball_mesh
-from tests.support.places import DT, FORWARD
+from tests.support.stances import DT, FORWARD
 
 WAY = np.array([[0.3, 0.2]])
 
@@ -50,14 +50,16 @@ class Rolled:
 def rolled() -> Rolled:
     """Past a point ahead and to the left."""
     made = ball()
-    sequence = MotionSequence(made.place, [Part("walk to", {}, lambda place: going(place, along(WAY), 0.1))])
-    watch = FallWatch(sequence, made.place)
+    sequence = MotionSequence(
+        made.place, [MotionTask("walk to", {}, lambda place: move_along(place, path_route(WAY), 0.1))]
+    )
+    watch = FallMonitor(sequence, made.place)
     state, memory, reports = made.start, made.stepper.initial_memory(), []
     for _ in range(260):
         wishes = watch.objectives(state, reports[-1] if reports else None, DT)
         state, memory, fresh = made.stepper.advance(state, memory, wishes, DT)
         reports += fresh
-        if watch.finished:
+        if watch.is_finished:
             break
     recorder = Recorder(made.stepper.body, made.stepper.muscles, made.stepper.geometry, made.start, 0.0, drag=0.0)
     recorder.add(reports)
@@ -68,8 +70,10 @@ def rolled() -> Rolled:
 
 def test_a_ball_is_told_from_what_stands() -> None:
     place = ball().place
-    assert place.base() is Base.ROUND
-    assert isinstance(going(place, straight(1.0), 0.1), Roll) and isinstance(going_round(place, 1.0, 0.1), Turn)
+    assert place.base() is SupportKind.ROUND_BASE
+    assert isinstance(move_along(place, straight_route(1.0), 0.1), Roll) and isinstance(
+        turn_in_place(place, 1.0, 0.1), Turn
+    )
 
 
 def test_a_ball_that_has_turned_over_is_still_one() -> None:
@@ -78,15 +82,15 @@ def test_a_ball_that_has_turned_over_is_still_one() -> None:
     turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     com = made.place.body.centre_of_mass(made.place.standing)
     report = _report(made)
-    over = made.place.after(com + (made.place.standing - com) @ turn.T, report)
-    assert over.base() is Base.ROUND and over.ground.axes == pytest.approx(made.place.ground.axes)
+    over = made.place.next_stance(com + (made.place.standing - com) @ turn.T, report)
+    assert over.base() is SupportKind.ROUND_BASE and over.ground.axes == pytest.approx(made.place.ground.axes)
 
 
 def test_a_ball_that_has_turned_about_up_faces_elsewhere() -> None:
     made = ball()
     com = made.place.body.centre_of_mass(made.place.standing)
-    turned = com + (made.place.standing - com) @ made.place.ground.turn(0.6).T
-    ahead = made.place.after(turned, _report(made)).ground.axes[0]
+    turned = com + (made.place.standing - com) @ made.place.ground.rotation_about_up(0.6).T
+    ahead = made.place.next_stance(turned, _report(made)).ground.axes[0]
     assert ahead == pytest.approx([np.cos(0.6), np.sin(0.6), 0.0], abs=1e-6)
 
 
@@ -98,9 +102,9 @@ def _report(made: CoarseCreature) -> StepReport:
 def test_a_step_in_its_way_is_refused() -> None:
     place = ball().place
     wall = (step(Plane(UP, 0.0), 0.5 * FORWARD, FORWARD, 0.2),)
-    blocked = Place(place.body, place.ground, place.standing, place.touching, DT, wall)
+    blocked = Stance(place.body, place.ground, place.standing, place.contact_points, DT, wall)
     with pytest.raises(UserError, match="the way leads over a step"):
-        going(blocked, straight(1.0), 0.1)
+        move_along(blocked, straight_route(1.0), 0.1)
 
 
 @pytest.mark.slow
@@ -111,7 +115,7 @@ def test_a_ball_rolls_to_its_point_without_slipping() -> None:
     com = done.roll.body.centre_of_mass(local)
     assert com[:2] == pytest.approx(WAY[0], abs=0.03) and done.fallen is None
     way = float(np.linalg.norm(WAY))
-    assert np.radians(done.roll.reached(done.trajectory, 0, -1).rolled_degrees) == pytest.approx(
+    assert np.radians(done.roll.outcome_record(done.trajectory, 0, -1).rolled_degrees) == pytest.approx(
         way / float(com[2]), rel=0.1
     )
     assert measure(done.trajectory).airborne_frames == 0.0

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from egs_warp.errors import UserError
-from egs_warp.motions.route import Pace, along, read_path, straight, turning
+from egs_warp.motions.route import StepLimits, path_route, read_path, straight_route, turn_route
 
-PACE = Pace(0.1, 0.25)
+PACE = StepLimits(0.1, 0.25)
 
 
 @given(st.floats(-3.0, 3.0))
 def test_straight_on_in_even_paces(distance: float) -> None:
-    places = straight(distance)(PACE)
+    places = straight_route(distance)(PACE)
     assert places[-1] == pytest.approx([distance, 0.0, 0.0]) and places[0] == pytest.approx(np.zeros(3))
     steps = np.diff(places[:, 0])
     assert np.ptp(steps) < 1e-12 and abs(steps).max() <= PACE.length + 1e-12
@@ -26,7 +26,7 @@ def test_straight_on_in_even_paces(distance: float) -> None:
 
 @given(st.floats(-7.0, 7.0))
 def test_turns_on_the_spot_in_even_paces(angle: float) -> None:
-    places = turning(angle)(PACE)
+    places = turn_route(angle)(PACE)
     assert np.all(places[:, :2] == 0.0) and places[-1, 2] == pytest.approx(angle)
     assert abs(np.diff(places[:, 2])).max() <= PACE.turn + 1e-12
 
@@ -35,7 +35,7 @@ def test_turns_on_the_spot_in_even_paces(angle: float) -> None:
 def test_a_point_is_reached_however_it_lies(ahead: float, left: float) -> None:
     """It ends there, goes the way it is turned but for the last pace, and no pace is longer or turns more than one may;
     what turns leaves less for the way."""
-    places = along(np.array([[ahead, left]]))(PACE)
+    places = path_route(np.array([[ahead, left]]))(PACE)
     assert places[-1, :2] == pytest.approx([ahead, left], abs=1e-8)
     steps = np.diff(places, axis=0)
     lengths = np.linalg.norm(steps[:, :2], axis=1)
@@ -48,7 +48,7 @@ def test_a_point_is_reached_however_it_lies(ahead: float, left: float) -> None:
 def test_a_path_is_followed_past_its_points() -> None:
     """Within a pace of each; the way is hardly longer than the path."""
     points = np.array([[0.5, 0.0], [0.9, 0.3], [0.9, 0.8]])
-    places = along(points)(PACE)
+    places = path_route(points)(PACE)
     for point in points:
         assert np.linalg.norm(places[:, :2] - point, axis=1).min() <= PACE.length
     assert places[-1, :2] == pytest.approx(points[-1])
@@ -57,7 +57,7 @@ def test_a_path_is_followed_past_its_points() -> None:
 
 def test_a_way_of_too_many_paces_is_refused() -> None:
     with pytest.raises(UserError, match="walk: the way takes more than 400 paces; choose a shorter one"):
-        along(np.array([[9.0, 0.0]]))(Pace(0.01, 0.25))
+        path_route(np.array([[9.0, 0.0]]))(StepLimits(0.01, 0.25))
 
 
 def test_paths_are_read_with_their_lines(tmp_path: Path) -> None:

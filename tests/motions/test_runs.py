@@ -15,14 +15,14 @@ from egs_warp.fem.body import BodyState
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import Reached, Trajectory, measure
+from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory, measure
 from egs_warp.motions.follow import Follow
 from egs_warp.motions.hop import Hop
 from egs_warp.motions.keyframes import Quantity
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from egs_warp.pipelines.creature import make_creature
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.simulated_run import simulate
 from tests.support.runs import Run, coarse_block_run
 from tests.support.waves import wavy_ground
 
@@ -58,7 +58,7 @@ def test_a_coarse_block_hops_onto_its_square_and_twists_there(coarse_run: Run) -
 
 
 def test_a_coarse_run_ends_at_rest_with_all_motions_done(coarse_run: Run) -> None:
-    assert coarse_run.sequence.finished and coarse_run.sequence.cut_short() == []
+    assert coarse_run.sequence.is_finished and coarse_run.sequence.unfinished_note() == []
     assert [done.motion.notes() for done in coarse_run.sequence.done] == [[], []]
     speed = coarse_run.body.centre_of_mass(coarse_run.reports[-1].state.velocities)
     assert np.linalg.norm(speed) < 0.05 * np.sqrt(9.81 * coarse_run.body.height)
@@ -68,17 +68,17 @@ def test_a_coarse_block_jumps_on_waves() -> None:
     """It begins and lands on folds 1.5 % of its height high either way; the audit recomputes the ground."""
     field = wavy_ground(0.015)
     base = np.stack(np.meshgrid(*[np.linspace(-0.25, 0.25, 11)] * 2, [0.0]), axis=-1)
-    run = coarse_block_run("jump 0.4 0.2", field.moved(np.array([0.0, 0.0, -float(field.lift(base).max())])))
+    run = coarse_block_run("jump 0.4 0.2", field.moved(np.array([0.0, 0.0, -float(field.ground_height(base).max())])))
     assert run.trajectory.ground_coefficients.size > 0
     assert_audit(run.trajectory, run.reports)
     jumped = measure(run.trajectory)
-    assert run.sequence.finished and jumped.tilt_degrees < 10.0 and jumped.airborne_frames > 10.0
+    assert run.sequence.is_finished and jumped.tilt_degrees < 10.0 and jumped.airborne_frames > 10.0
     assert jumped.distance == pytest.approx(0.4, abs=0.06) and jumped.height == pytest.approx(0.2, abs=0.04)
     last = run.trajectory.contact_step == len(run.trajectory.dt) - 1
     assert np.ptp(run.trajectory.contact_normal[last], axis=0).max() > 0.02
 
 
-def run(script: str, **ground: Any) -> tuple[MotionSequence, list[Reached], np.ndarray]:
+def run(script: str, **ground: Any) -> tuple[MotionSequence, list[MotionOutcome], np.ndarray]:
     """Simulate ``script``; returns the sequence, what each motion reached, and the nodes at its end.
 
     Asserts the audit.
@@ -133,8 +133,8 @@ def test_the_head_follows_its_key_and_the_body_comes_to_rest(tmp_path: Path) -> 
     file.write_text("time,part,quantity,x,y,z\n0.5,head,position,0.05,0,0\n")
     sequence, (reached,), (end,) = run(f"trajectory {file}")
     follow = sequence.done[0].motion
-    assert isinstance(follow, Follow) and sequence.finished and follow.notes() == []
-    assert follow.planned().worst_miss < 0.002
+    assert isinstance(follow, Follow) and sequence.is_finished and follow.notes() == []
+    assert follow.plan_record().worst_miss < 0.002
     held = follow._measured("head", Quantity.POSITION, BodyState(end, 0 * end))
     assert np.allclose(held, [0.05, 0.0, 0.0], atol=0.002)
     assert reached.tilt_degrees < 2.0 and reached.airborne_frames == 0.0

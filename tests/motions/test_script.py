@@ -8,8 +8,8 @@ import pytest
 
 from egs_warp.errors import UserError
 from egs_warp.motions.command import Drive
-from egs_warp.motions.script import driving, motion
-from egs_warp.motions.sequence import Place
+from egs_warp.motions.script import drive_script, motion
+from egs_warp.motions.sequence import Stance
 from egs_warp.motions.walk import Walk
 
 KNOWN = "jump, hop, twist, walk, walk to, walk along, run, turn, drive, stand, get up, dance, trajectory"
@@ -42,12 +42,12 @@ def test_a_json_script_is_the_same_as_its_line(tmp_path: Path) -> None:
     assert motion(str(path)) == motion(f"hop 0.5 x2, twist 90, trajectory {tmp_path / 'keys.csv'}")
 
 
-def test_a_run_is_the_quickest_walk_by_the_longest_paces(place: Place) -> None:
+def test_a_run_is_the_quickest_walk_by_the_longest_paces(place: Stance) -> None:
     (run,), (walk,) = (motion(text).parts(1.0) for text in ("run 0.5", "walk 0.5"))
     fast, usual = run.begin(place), walk.begin(place)
     assert isinstance(fast, Walk) and isinstance(usual, Walk)
     assert fast.gait.swing_time == pytest.approx(usual.gait.swing_time / 1.6)
-    assert fast.gait.paces <= usual.gait.paces and fast.places[-1] == pytest.approx(usual.places[-1])
+    assert fast.gait.step_count <= usual.gait.step_count and fast.places[-1] == pytest.approx(usual.places[-1])
 
 
 def test_what_takes_no_numbers_says_so() -> None:
@@ -55,9 +55,9 @@ def test_what_takes_no_numbers_says_so() -> None:
         motion("get up 2")
 
 
-def test_speeds_come_from_a_file_or_from_commands(place: Place, tmp_path: Path) -> None:
+def test_speeds_come_from_a_file_or_from_commands(place: Stance, tmp_path: Path) -> None:
     (tmp_path / "speeds.csv").write_text("0,0.1,0,0\n1,0,0,0\n")
-    read, given = motion(f"drive {tmp_path / 'speeds.csv'}"), driving((0.0, Drive(0.1)), (1.0, Drive()))
+    read, given = motion(f"drive {tmp_path / 'speeds.csv'}"), drive_script((0.0, Drive(0.1)), (1.0, Drive()))
     assert read.name == given.name == "drive" and read.frames() == given.frames() == 360
     (part,), (other,) = read.parts(1.0), given.parts(1.0)
     assert part.asked == other.asked == {"commands": 2.0, "duration": 1.0}

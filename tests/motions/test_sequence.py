@@ -17,34 +17,34 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.script import motion
-from egs_warp.motions.sequence import MotionSequence, Part, Place
+from egs_warp.motions.sequence import MotionSequence, MotionTask, Stance
 from egs_warp.motions.turn import Turn
 from egs_warp.motions.twist import twist
-from tests.support.places import DT, moved
+from tests.support.stances import DT, moved
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.7, -2.5, np.pi])
-def test_a_place_follows_the_feet(place: Place, angle: float) -> None:
+def test_a_place_follows_the_feet(place: Stance, angle: float) -> None:
     """Turned and moved, to another level too, the stance is the body's own again and forward turns with it."""
     shift = np.array([0.4, -1.2, 0.25])
-    now = place.now(moved(place, angle, shift))
+    now = place.moved_to(moved(place, angle, shift))
     assert np.abs(now.standing - moved(place, angle, shift)).max() < 1e-12
     assert np.allclose(now.ground.axes[0], [np.cos(angle), np.sin(angle), 0.0])
     assert np.allclose(now.ground.local(now.standing), place.ground.local(place.standing))
     leaning = moved(place, angle, shift)
     leaning[:, 0] += 0.3 * (leaning[:, 2] - leaning[:, 2].min())
-    feet = place.now(leaning).standing
+    feet = place.moved_to(leaning).standing
     assert np.ptp(feet[:, 2]) == pytest.approx(np.ptp(place.standing[:, 2]))
 
 
-def test_facing_turns_the_way_and_not_the_body(place: Place) -> None:
-    other = place.facing(np.array([0.0, 2.0, 5.0]))
+def test_facing_turns_the_way_and_not_the_body(place: Stance) -> None:
+    other = place.with_forward(np.array([0.0, 2.0, 5.0]))
     assert np.allclose(other.ground.axes, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     assert other.standing is place.standing
 
 
 @pytest.mark.parametrize(("slope", "rise", "height"), [(0.1, 0.05, 0.2), (-0.1, -0.05, 0.2), (0.4, 0.2, 0.3)])
-def test_a_jump_is_to_land_on_what_is_ahead(place: Place, slope: float, rise: float, height: float) -> None:
+def test_a_jump_is_to_land_on_what_is_ahead(place: Stance, slope: float, rise: float, height: float) -> None:
     """Half a metre up or down a slope; over what is high by half of the asked 0.2 at least."""
     normal = np.array([-slope, 0.0, 1.0]) / np.hypot(1.0, slope)
     target = replace(place, solids=(Solid((Plane(normal, 0.0),)),)).landing(JumpTarget(0.5, 0.2))
@@ -52,7 +52,7 @@ def test_a_jump_is_to_land_on_what_is_ahead(place: Place, slope: float, rise: fl
     assert place.landing(JumpTarget(0.5, 0.2)) == JumpTarget(0.5, 0.2)
 
 
-def test_a_jump_is_level_before_a_wall_and_over_an_edge(place: Place) -> None:
+def test_a_jump_is_level_before_a_wall_and_over_an_edge(place: Stance) -> None:
     """And under what is overhead."""
     ground, asked = Solid((Plane(np.array([0.0, 0.0, 1.0]), 0.0),)), JumpTarget(0.5, 0.2)
     block = (Plane(np.array([0.0, 0.0, 1.0]), -2.5), Plane(np.array([-1.0, 0.0, 0.0]), 0.3))
@@ -63,7 +63,7 @@ def test_a_jump_is_level_before_a_wall_and_over_an_edge(place: Place) -> None:
 
 
 @pytest.mark.parametrize("name", ["jump", "twist"])
-def test_motions_jump_onto_what_is_ahead(place: Place, name: str) -> None:
+def test_motions_jump_onto_what_is_ahead(place: Stance, name: str) -> None:
     step = Solid((Plane(np.array([0.0, 0.0, 1.0]), -0.1), Plane(np.array([-1.0, 0.0, 0.0]), 0.3)))
     ground = Solid((Plane(np.array([0.0, 0.0, 1.0]), 0.0),))
     target, stepped = JumpTarget(0.5, 0.2), replace(place, solids=(ground, step))
@@ -74,11 +74,11 @@ def test_motions_jump_onto_what_is_ahead(place: Place, name: str) -> None:
 class Waits:
     """Rests after three steps."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: Stance) -> None:
         self.place, self.steps = place, 0
 
     @property
-    def resting(self) -> bool:
+    def is_at_rest(self) -> bool:
         return self.steps >= 3
 
     @property
@@ -89,10 +89,10 @@ class Waits:
         self.steps += 1
         return []
 
-    def planned(self) -> JumpTarget:
+    def plan_record(self) -> JumpTarget:
         return JumpTarget(0.0, 0.0)
 
-    def reached(self, trajectory: Trajectory, first: int, last: int) -> None:
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> None:
         return None
 
     def planned_com(self, elapsed: float) -> None:
@@ -102,11 +102,11 @@ class Waits:
         return []
 
 
-def test_motions_follow_each_other_from_where_the_body_is(place: Place) -> None:
-    sequence = MotionSequence(place, [Part("a", {}, Waits), Part("b", {}, Waits)])
+def test_motions_follow_each_other_from_where_the_body_is(place: Stance) -> None:
+    sequence = MotionSequence(place, [MotionTask("a", {}, Waits), MotionTask("b", {}, Waits)])
     times = [0.0]
     for k in range(8):
-        assert sequence.finished == (k >= 6)
+        assert sequence.is_finished == (k >= 6)
         positions = moved(place, 0.1 * k, np.array([0.1 * k, 0.0, 0.0]))
         sequence.objectives(BodyState(positions, 0 * positions, times[-1]), None, DT)
         times.append(times[-1] + DT)
@@ -117,13 +117,15 @@ def test_motions_follow_each_other_from_where_the_body_is(place: Place) -> None:
     assert sequence.spans(np.array(times)) == [(0, 3), (3, 8)]
 
 
-def test_what_the_last_frame_cut_off_is_told(place: Place) -> None:
-    sequence = MotionSequence(place, [Part("a", {}, Waits), Part("b", {}, Waits), Part("c", {}, Waits)])
+def test_what_the_last_frame_cut_off_is_told(place: Stance) -> None:
+    sequence = MotionSequence(
+        place, [MotionTask("a", {}, Waits), MotionTask("b", {}, Waits), MotionTask("c", {}, Waits)]
+    )
     positions = moved(place, 0.0, np.zeros(3))
     told = []
     for k in range(9):
         sequence.objectives(BodyState(positions, 0 * positions, k * DT), None, DT)
-        told.append(sequence.cut_short())
+        told.append(sequence.unfinished_note())
     assert told[3] == [
         "b was cut off before it came to rest; give more frames",
         "1 of 3 motions did not begin: c",
@@ -132,19 +134,19 @@ def test_what_the_last_frame_cut_off_is_told(place: Place) -> None:
     assert told[8] == []
 
 
-def test_a_motion_that_cannot_be_is_refused_before_the_first(place: Place) -> None:
+def test_a_motion_that_cannot_be_is_refused_before_the_first(place: Stance) -> None:
     with pytest.raises(UserError, match="walk: the way takes more than 400 paces"):
         motion("hop x2, jump, walk to 9,9 0.01").check(place)
     motion("hop x2, jump").check(place)
 
 
-def test_a_script_becomes_parts(place: Place) -> None:
+def test_a_script_becomes_parts(place: Stance) -> None:
     script = motion("hop 0.6 x3, twist 90, jump x2")
     parts = script.parts(place.body.height)
     assert [part.name for part in parts] == ["hop", "hop", "hop", "twist", "jump", "jump"]
     assert [part.asked.get("square") for part in parts[:3]] == [1.0, 2.0, 3.0]
     turn = parts[3].begin(place)
-    assert isinstance(turn, Turn) and turn.jumps[0].facing.turn == pytest.approx(np.pi / 2)
+    assert isinstance(turn, Turn) and turn.jumps[0].facing.target_heading == pytest.approx(np.pi / 2)
     jump = parts[4].begin(place)
     assert isinstance(jump, Jump) and jump.target.distance == pytest.approx(0.5 * place.body.height)
     assert script.frames() == 3 * motion("hop").frames() + motion("twist, jump x2").frames()

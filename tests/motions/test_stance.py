@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 
 from egs_warp.fem.body import BodyState
-from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import MARGIN, SOLE, Measurement, PoseFamily, _share_in_cone
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.stance import SOLE_HEIGHT, SUPPORT_MARGIN, BalanceController, Measurement, _share_in_cone
 
 GRAVITY, EDGE, DT = 9.81, 0.2, 1 / 60
 
 
 def stood(
-    place: Place, friction: float, moved: tuple[float, float, float]
-) -> tuple[PoseFamily, BodyState, Measurement]:
+    place: Stance, friction: float, moved: tuple[float, float, float]
+) -> tuple[BalanceController, BodyState, Measurement]:
     """The body with all above its soles ``moved``, at rest."""
-    pose = PoseFamily(place.body, place.ground, place.standing, place.touching, friction)
+    pose = BalanceController(place.body, place.ground, place.standing, place.contact_points, friction)
     positions = place.standing + np.array(moved) * (place.standing[:, 2:] > 1e-9)
     state = BodyState(positions, np.zeros_like(positions))
     return pose, state, pose.measure(state, None)
 
 
-def swing(place: Place, state: BodyState, seen: Measurement, spin: np.ndarray) -> np.ndarray:
+def swing(place: Stance, state: BodyState, seen: Measurement, spin: np.ndarray) -> np.ndarray:
     """(2,) m/s that a ``spin`` (3,) adds to the speed in the momentum about the feet."""
     momentum = place.ground.axes @ place.body.inertia(state.positions) @ spin / (place.body.mass * seen.com[2])
     return np.array([momentum[1], -momentum[0]])
@@ -32,21 +32,21 @@ def swing(place: Place, state: BodyState, seen: Measurement, spin: np.ndarray) -
 @pytest.mark.parametrize("turning", [(0.0, 0.0, 0.3), (0.4, -2.0, 0.0)])
 @pytest.mark.parametrize("up", [0.0, 0.1, -0.08])
 def test_the_nearest_end_of_a_step_that_does_not_tip(
-    place: Place, wanted: tuple[float, float], turning: tuple[float, float, float], up: float
+    place: Stance, wanted: tuple[float, float], turning: tuple[float, float, float], up: float
 ) -> None:
     """About the point where the ground pushes, within the footprint, m h (v + swing) changes by its distance from the
     centre of mass times the load; of all ends that do, the one whose velocity and spin miss least."""
     pose, state, seen = stood(place, 1e3, (0.05, -0.03, 0.1))
     asked, spin = np.array([*wanted, up]), np.array(turning)
-    velocity, turned = pose.balanced(seen, asked, spin, DT)
+    velocity, turned = pose.balance_targets(seen, asked, spin, DT)
     load, height = GRAVITY + up / DT, seen.com[2]
-    middle = place.ground.local(place.touching)[:, :2].mean(axis=0)
+    middle = place.ground.local(place.contact_points)[:, :2].mean(axis=0)
 
     def pressure(change: np.ndarray) -> np.ndarray:
         return seen.com[:2] - height / load * change / DT
 
     change = velocity[:2] + swing(place, state, seen, turned)
-    assert np.abs(pressure(change) - middle).max() <= MARGIN * EDGE + 1e-9
+    assert np.abs(pressure(change) - middle).max() <= SUPPORT_MARGIN * EDGE + 1e-9
     assert velocity[2] == up
     axis = place.ground.axes[2]
     inertia = place.body.inertia(state.positions)
@@ -56,7 +56,7 @@ def test_the_nearest_end_of_a_step_that_does_not_tip(
     line = np.linspace(-1.0, 1.0, 2001)
     for k in (0, 1):
         level, turn = np.meshgrid(line, line, indexing="ij")
-        stands = np.abs(seen.com[k] - height / load * (level + turn) / DT - middle[k]) <= MARGIN * EDGE
+        stands = np.abs(seen.com[k] - height / load * (level + turn) / DT - middle[k]) <= SUPPORT_MARGIN * EDGE
         target = swing(place, state, seen, spin)[k]
         missed = (level - wanted[k]) ** 2 + (turn - target) ** 2 / gyration
         got = (velocity[k] - wanted[k]) ** 2 + (swing(place, state, seen, turned)[k] - target) ** 2 / gyration
@@ -64,27 +64,27 @@ def test_the_nearest_end_of_a_step_that_does_not_tip(
         assert np.sqrt(got) >= np.sqrt(missed[stands].min()) - 5e-3
 
 
-def test_what_feet_can_give_is_asked_for_as_it_is_and_a_falling_body_may_be_pushed_either_way(place: Place) -> None:
+def test_what_feet_can_give_is_asked_for_as_it_is_and_a_falling_body_may_be_pushed_either_way(place: Stance) -> None:
     pose, _, seen = stood(place, 1e3, (0.0, 0.0, 0.0))
     asked, spin = np.array([0.01, -0.005, 0.02]), np.array([0.01, 0.02, 0.5])
-    velocity, turned = pose.balanced(seen, asked, spin, DT)
+    velocity, turned = pose.balance_targets(seen, asked, spin, DT)
     np.testing.assert_allclose(velocity, asked, atol=1e-12)
     np.testing.assert_allclose(turned, spin, atol=1e-12)
     pose, _, seen = stood(place, 1e3, (0.5, 0.0, 0.0))
-    ways = [pose.balanced(seen, np.array([x, 0.0, 0.0]), np.zeros(3), DT)[0][0] for x in (-2.0, 2.0)]
+    ways = [pose.balance_targets(seen, np.array([x, 0.0, 0.0]), np.zeros(3), DT)[0][0] for x in (-2.0, 2.0)]
     assert ways[0] < -0.5 * DT and ways[1] > 0.5 * DT
 
 
 @pytest.mark.parametrize("up", [0.0, 0.25])
-def test_no_more_is_asked_than_friction_gives(place: Place, up: float) -> None:
+def test_no_more_is_asked_than_friction_gives(place: Stance, up: float) -> None:
     """Coulomb: what is asked keeps its way and is 0.95 of what the ground's friction could do; less is asked as it
     is."""
     pose, _, seen = stood(place, 0.05, (0.0, 0.0, 0.0))
     wanted = np.array([0.009, -0.012])
     most = 0.95 * 0.05 * (GRAVITY + up / DT) * DT
-    got, _ = pose.balanced(seen, np.array([*(10.0 * wanted), up]), np.zeros(3), DT)
+    got, _ = pose.balance_targets(seen, np.array([*(10.0 * wanted), up]), np.zeros(3), DT)
     assert got[:2] == pytest.approx(most * wanted / 0.015)
-    little, _ = pose.balanced(seen, np.array([*(0.1 * wanted), up]), np.zeros(3), DT)
+    little, _ = pose.balance_targets(seen, np.array([*(0.1 * wanted), up]), np.zeros(3), DT)
     assert little[:2] == pytest.approx(0.1 * wanted)
 
 
@@ -106,45 +106,45 @@ def test_on_a_slope_friction_gives_less_uphill(way: tuple[float, float]) -> None
 
 
 @pytest.mark.parametrize("spin", [(0.0, -2.0, 0.0), (1.5, 1.0, 0.2)])
-def test_what_friction_denies_the_speed_the_spin_takes(place: Place, spin: tuple[float, float, float]) -> None:
+def test_what_friction_denies_the_speed_the_spin_takes(place: Stance, spin: tuple[float, float, float]) -> None:
     """On a slippery ground, too, the centre of pressure asked for is within the footprint."""
     pose, state, seen = stood(place, 0.3, (0.05, -0.03, 0.1))
-    velocity, turned = pose.balanced(seen, np.array([0.3, 0.01, 0.0]), np.array(spin), DT)
+    velocity, turned = pose.balance_targets(seen, np.array([0.3, 0.01, 0.0]), np.array(spin), DT)
     change = velocity[:2] + swing(place, state, seen, turned)
-    middle = place.ground.local(place.touching)[:, :2].mean(axis=0)
+    middle = place.ground.local(place.contact_points)[:, :2].mean(axis=0)
     pressure = seen.com[:2] - seen.com[2] / GRAVITY * change / DT
     assert np.linalg.norm(velocity[:2]) <= 0.3 * GRAVITY * DT
-    assert np.abs(pressure - middle).max() <= MARGIN * EDGE + 1e-9
+    assert np.abs(pressure - middle).max() <= SUPPORT_MARGIN * EDGE + 1e-9
 
 
-def test_a_body_that_turns_forward_is_caught_further_ahead(place: Place) -> None:
+def test_a_body_that_turns_forward_is_caught_further_ahead(place: Stance) -> None:
     """The capture point is that of the momentum about the feet: at rest over its place nothing is asked, and spin
     counts as the speed that has the same momentum."""
     pose, state, seen = stood(place, 1.0, (0.0, 0.0, 0.0))
-    np.testing.assert_allclose(pose.caught(seen, seen.com[:2]), 0.0, atol=1e-12)
+    np.testing.assert_allclose(pose.capture_acceleration(seen, seen.com[:2]), 0.0, atol=1e-12)
     ahead = BodyState(state.positions, np.broadcast_to(0.1 * place.ground.axes[0], state.positions.shape))
-    forward = pose.caught(pose.measure(ahead, None), seen.com[:2])
+    forward = pose.capture_acceleration(pose.measure(ahead, None), seen.com[:2])
     assert forward[0] == pytest.approx(-0.2 * np.sqrt(GRAVITY / seen.com[2]), rel=1e-9)
     arms = state.positions - place.body.centre_of_mass(state.positions)
     turning = BodyState(state.positions, np.cross(0.5 * place.ground.axes[1], arms))
-    caught = pose.caught(pose.measure(turning, None), seen.com[:2])
+    caught = pose.capture_acceleration(pose.measure(turning, None), seen.com[:2])
     same = swing(place, state, seen, 0.5 * place.ground.axes[1])
     np.testing.assert_allclose(caught, -2.0 * np.sqrt(GRAVITY / seen.com[2]) * same, atol=1e-9)
 
 
 @pytest.mark.parametrize(("ahead", "urgency"), [(0.0, 0.0), (0.05, 0.25), (-0.1, 0.5), (0.3, 1.5)])
 def test_balance_is_urgent_by_how_near_the_capture_point_is_to_the_edge(
-    place: Place, ahead: float, urgency: float
+    place: Stance, ahead: float, urgency: float
 ) -> None:
     """Over a base of 0.2 metres either way, by the speed alone."""
-    pose = PoseFamily(place.body, place.ground, place.standing, place.touching, place.friction)
+    pose = BalanceController(place.body, place.ground, place.standing, place.contact_points, place.friction)
     height = place.body.centre_of_mass(place.standing)[2]
     speed = np.array([ahead * np.sqrt(GRAVITY / height), 0.0, 0.0])
     seen = pose.measure(BodyState(place.standing, np.tile(speed, (len(place.standing), 1))), None)
-    assert pose.urgency(seen) == pytest.approx(urgency, abs=0.02)
+    assert pose.capture_margin(seen) == pytest.approx(urgency, abs=0.02)
 
 
-def test_a_body_that_leans_turns_as_far_as_strains_it_least(place: Place) -> None:
+def test_a_body_that_leans_turns_as_far_as_strains_it_least(place: Stance) -> None:
     """The static bend under a pull along the ground, its sole taken out of a dense system: the pose is the affine map
     nearest to it by mass, found by least squares."""
     pose, _, seen = stood(place, 0.8, (0.0, 0.0, 0.0))
@@ -152,7 +152,7 @@ def test_a_body_that_leans_turns_as_far_as_strains_it_least(place: Place) -> Non
     upper = assembly.matrix(assembly.hessian_entries(place.standing, projected=True)).toarray()
     stiffness = upper + np.triu(upper, 1).T
     heights = place.standing @ place.ground.surface_normal
-    free = np.repeat(heights >= heights.min() + SOLE * body.height, 3)
+    free = np.repeat(heights >= heights.min() + SOLE_HEIGHT * body.height, 3)
     bend = np.zeros(len(free))
     ahead = place.ground.axes[0]
     bend[free] = np.linalg.solve(stiffness[np.ix_(free, free)], np.kron(body.node_mass, ahead)[free])
@@ -163,9 +163,9 @@ def test_a_body_that_leans_turns_as_far_as_strains_it_least(place: Place) -> Non
     ends = arms + moved - body.centre_of_mass(moved)
     nearest = np.linalg.lstsq(weights * arms, weights * ends, rcond=None)[0].T
     goal = seen.com + lean * pose.standing_height * np.array([1.0, 0.0, 0.0])
-    assert np.allclose(pose.bent_over_base(goal, seen.base), nearest, atol=1e-5)
+    assert np.allclose(pose.bent_over_base(goal, seen.foot_centre), nearest, atol=1e-5)
     left = place.ground.axes[1]
     sheared, bent = (
-        left @ pose.turn_towards(seen, of(goal, seen.base)) for of in (pose.over_base, pose.bent_over_base)
+        left @ pose.turn_towards(seen, of(goal, seen.foot_centre)) for of in (pose.over_base, pose.bent_over_base)
     )
     assert 1.1 * sheared < bent

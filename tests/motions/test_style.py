@@ -16,12 +16,12 @@ from egs_warp.motions.dance import Dance
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPlan, JumpTarget, plan_jump
 from egs_warp.motions.script import motion
-from egs_warp.motions.sequence import MotionSequence, Place
+from egs_warp.motions.sequence import MotionSequence, Stance
 from egs_warp.motions.style import PRESETS, Style, read_style
 from egs_warp.pipelines.report import verdict
 from tests.support.creatures import coarse_creature
 from tests.support.meshes import box_mesh
-from tests.support.places import FORWARD
+from tests.support.stances import FORWARD
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ def jumped(style: str | None) -> Jumped:
     place = made.place if style is None else replace(made.place, style=read_style(style))
     sequence = MotionSequence(place, motion("jump 0 0.2").parts(place.body.height))
     t = roll_out(
-        *(made.stepper, made.stepper.geometry, made.start, sequence), frames=120, finished=lambda: sequence.finished
+        *(made.stepper, made.stepper.geometry, made.start, sequence), frames=120, finished=lambda: sequence.is_finished
     ).trajectory
-    assert sequence.finished and verdict(audit(t)).startswith("audit: passed")
+    assert sequence.is_finished and verdict(audit(t)).startswith("audit: passed")
     height = np.array([place.body.centre_of_mass(x)[2] for x in t.positions])
     rise = height - height[0]
     borne = np.unique(t.contact_step[t.contact_force[:, 2] > 1e-3]) + 1
@@ -112,15 +112,15 @@ def planned(style: Style) -> JumpPlan:
     )
 
 
-def test_a_dance_knows_how_long_the_crouches_of_its_style_are(place: Place) -> None:
+def test_a_dance_knows_how_long_the_crouches_of_its_style_are(place: Stance) -> None:
     usual, quick = (Dance(replace(place, style=style), (1.0, 1.5)) for style in (Style(), Style(timing=0.5)))
     assert quick.expected_time == usual.expected_time
     with pytest.raises(UserError, match="before the first jump it takes"):
         Dance(place, (0.35, 0.8))
-    assert Dance(replace(place, style=Style(timing=0.5)), (0.35, 0.8)).planned().beats == 2.0
+    assert Dance(replace(place, style=Style(timing=0.5)), (0.35, 0.8)).plan_record().beats == 2.0
 
 
-def test_a_jump_of_a_script_may_have_a_style_of_its_own(place: Place, tmp_path: Path) -> None:
+def test_a_jump_of_a_script_may_have_a_style_of_its_own(place: Stance, tmp_path: Path) -> None:
     """It goes before the style of the run, which the others have."""
     (tmp_path / "s.json").write_text(
         '[{"motion": "jump", "repeat": 2, "style": "squash=2"}, {"motion": "jump"},'

@@ -10,10 +10,10 @@ import pytest
 from egs_warp.fem.body import BodyState
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
-from egs_warp.motions.sequence import Place
+from egs_warp.motions.sequence import Stance
 from egs_warp.motions.turn import Turn, largest_turn
 from egs_warp.motions.twist import twist
-from tests.support.places import DT, moved
+from tests.support.stances import DT, moved
 
 
 def land(jump: Jump, state: BodyState) -> None:
@@ -22,7 +22,7 @@ def land(jump: Jump, state: BodyState) -> None:
     jump.pose = jump._landing
 
 
-def test_a_turn_that_falls_short_is_made_up_where_it_began(place: Place) -> None:
+def test_a_turn_that_falls_short_is_made_up_where_it_began(place: Stance) -> None:
     """25 degrees short and 0.1 aside: the next jump turns by the rest and goes back; 5 degrees short is let be."""
     turn = Turn(place, JumpTarget(0.0, 0.2), np.radians(60.0))
     short = moved(place, np.radians(35.0), np.array([0.1, 0.0, 0.0]))
@@ -31,32 +31,34 @@ def test_a_turn_that_falls_short_is_made_up_where_it_began(place: Place) -> None
     turn.objectives(state, None, DT)
     assert len(turn.jumps) == 2
     second = turn.jumps[1]
-    assert np.degrees(second.facing.turn) == pytest.approx(25.0) and second.target.distance == pytest.approx(0.1)
+    assert np.degrees(second.facing.target_heading) == pytest.approx(25.0) and second.target.distance == pytest.approx(
+        0.1
+    )
     assert np.allclose(second.ground.axes[0], [-1.0, 0.0, 0.0])
-    assert turn.notes() == ["turned in 2 jumps"] and turn.planned().jumps == 2.0
+    assert turn.notes() == ["turned in 2 jumps"] and turn.plan_record().jumps == 2.0
     there = moved(place, np.radians(55.0), np.zeros(3))
     land(second, BodyState(there, 0 * there, 20.0))
     turn.objectives(BodyState(there, 0 * there, 20.0), None, DT)
     assert len(turn.jumps) == 2 and turn.resting
 
 
-def test_a_slippery_floor_takes_more_jumps(place: Place) -> None:
+def test_a_slippery_floor_takes_more_jumps(place: Stance) -> None:
     """The largest turn is proportional to friction; a turn beyond it is shared out evenly."""
     target = JumpTarget(0.0, 0.2)
     rough, smooth = (Turn(replace(place, friction=mu), target, np.pi) for mu in (0.8, 0.2))
     assert smooth.most_in_a_jump == pytest.approx(rough.most_in_a_jump / 4.0)
     count = np.ceil(np.pi / smooth.most_in_a_jump)
-    assert count >= 2.0 and smooth.jumps[0].facing.turn == pytest.approx(np.pi / count)
-    landed = moved(place, smooth.jumps[0].facing.turn, np.zeros(3))
+    assert count >= 2.0 and smooth.jumps[0].facing.target_heading == pytest.approx(np.pi / count)
+    landed = moved(place, smooth.jumps[0].facing.target_heading, np.zeros(3))
     state = BodyState(landed, 0 * landed, 10.0)
     land(smooth.jumps[0], state)
     smooth.objectives(state, None, DT)
-    assert smooth.jumps[1].facing.turn == pytest.approx(np.pi / count)
+    assert smooth.jumps[1].facing.target_heading == pytest.approx(np.pi / count)
     assert smooth.notes()[0] == f"friction gives a turn of {np.degrees(smooth.most_in_a_jump):.0f} degrees a jump"
 
 
 @pytest.mark.parametrize("points", ["disc", "rim"])
-def test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground(place: Place, points: str) -> None:
+def test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground(place: Stance, points: str) -> None:
     """docs/concepts/motions.md: a disc pressed down by N resists twisting by 2/3 mu N R; its impulse while thrusting
     turns the flying body.
 
@@ -67,7 +69,7 @@ def test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground(place: P
     angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
     circle = np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
     shares = np.sqrt((np.arange(40) + 0.5) / 40) if points == "disc" else np.ones(1)
-    feet = replace(place, friction=mu, touching=np.concatenate([radius * share * circle for share in shares]))
+    feet = replace(place, friction=mu, contact_points=np.concatenate([radius * share * circle for share in shares]))
     jump = twist(feet, JumpTarget(0.0, 0.2), 1.0)
     plan, body = jump.plan, place.body
     thrust = (np.arange(1000) + 0.5) / 1000 * plan.thrust_time

@@ -8,23 +8,23 @@ import numpy as np
 import pytest
 
 from egs_warp.fem.body import BodyState
-from egs_warp.locomotion.objectives import Objective, SpinObjective
-from egs_warp.motions.jump import THRUST_LEAD, Jump
+from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
+from egs_warp.motions.jump import FORWARD_TIME_FRACTION, Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
-from egs_warp.motions.sequence import Place
+from egs_warp.motions.sequence import Stance
 from egs_warp.motions.twist import AIRBORNE_SHARE, SLIDE, SPARE_SPIN, twist
 from tests.support.meshes import box_mesh
-from tests.support.places import DT, block_place, moved
+from tests.support.stances import DT, block_place, moved
 
 
 def yaw_asked(jump: Jump, state: BodyState) -> float:
     """Angular momentum about up, kg m^2/s, that the step from ``state`` asks for."""
     asked = jump.objectives(state, None, DT)[1]
-    assert isinstance(asked, SpinObjective)
+    assert isinstance(asked, AngularMomentumObjective)
     return float(asked.target[2])
 
 
-def inertia_about_up(place: Place, positions: np.ndarray) -> float:
+def inertia_about_up(place: Stance, positions: np.ndarray) -> float:
     flat = positions[:, :2] - place.body.centre_of_mass(positions)[:2]
     return float(place.body.node_mass @ (flat**2).sum(axis=1))
 
@@ -57,10 +57,10 @@ def test_a_twist_asks_friction_for_the_spin_that_is_left(turn: float) -> None:
     assert sign * yaw_asked(jump, BodyState(crouched, rising, 0.0)) == pytest.approx(asked[-1], rel=1e-6)
     for angle in np.linspace(0.6, abs(turn), 12) * sign:
         jump.objectives(BodyState(moved(place, angle, np.zeros(3)), rising, 0.0), None, DT)
-    assert jump.facing.turned == pytest.approx(turn)
+    assert jump.facing.heading == pytest.approx(turn)
 
 
-def test_a_twist_gathers_its_spin_as_the_speed_up_is_gathered(place: Place) -> None:
+def test_a_twist_gathers_its_spin_as_the_speed_up_is_gathered(place: Stance) -> None:
     """What friction can give follows the load: a body that is still is asked for the share of the whole spin that a
     step is of the thrust, one that rises at half the speed for twice that."""
     shares = []
@@ -74,11 +74,11 @@ def test_a_twist_gathers_its_spin_as_the_speed_up_is_gathered(place: Place) -> N
         whole = inertia_about_up(place, place.standing) * (1.0 - SLIDE) * SPARE_SPIN
         whole /= AIRBORNE_SHARE * jump.plan.flight_time + 0.5 * left
         shares.append(asked / whole)
-        assert shares[-1] == pytest.approx(DT / (THRUST_LEAD * left), rel=5e-3)
+        assert shares[-1] == pytest.approx(DT / (FORWARD_TIME_FRACTION * left), rel=5e-3)
     assert shares[1] == pytest.approx(2.0 * shares[0], rel=5e-3)
 
 
-def test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn(place: Place) -> None:
+def test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn(place: Stance) -> None:
     """Angular momentum L is kept: the inertia I (arms in or out) that turns by the angle left in the time left is L t /
     angle.
 

@@ -19,18 +19,18 @@ from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory, measure
-from egs_warp.motions.carriage import OnLegs
 from egs_warp.motions.footfalls import Footfalls
 from egs_warp.motions.pendulum import nearest_in_hull
-from egs_warp.motions.route import Route, along, straight, turning
+from egs_warp.motions.route import Route, path_route, straight_route, turn_route
 from egs_warp.motions.script import motion
 from egs_warp.motions.walk import Walk
+from egs_warp.motions.walk_posture import LeggedPosture
 from egs_warp.pipelines.creature import make_creature
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.simulated_run import simulate
 from egs_warp.segmentation.base_plane import find_base_plane
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.meshes import UP, block_mesh, carved, coarse_stool, figure, stool
-from tests.support.places import DT, block_place
+from tests.support.stances import DT, block_place
 
 AHEAD = np.array([1.0, 0.0, 0.0])
 
@@ -78,7 +78,7 @@ def walked(creature: CoarseCreature, route: Route, pace_length: float, *, speed:
     recorder.add(reports)
     trajectory = recorder.trajectory()
     unconverged = sum(not report.converged for report in reports)
-    return Walked(creature, walk, trajectory, walk.reached(trajectory, 0, -1), air, unconverged)
+    return Walked(creature, walk, trajectory, walk.outcome_record(trajectory, 0, -1), air, unconverged)
 
 
 def check_audit(done: Walked) -> None:
@@ -99,7 +99,7 @@ def test_a_coarse_stool_takes_a_step(slope: float) -> None:
     """One step, up a slope too, and the closing one: each foot lands once, none slips 2 % of the stride, the distance
     is met, the audit holds."""
     tilt = np.radians(slope)
-    done = walked(strong(coarse_stool(), np.array([np.sin(tilt), 0.0, np.cos(tilt)])), straight(0.06), 0.06)
+    done = walked(strong(coarse_stool(), np.array([np.sin(tilt), 0.0, np.cos(tilt)])), straight_route(0.06), 0.06)
     reached = measure(done.trajectory)
     assert done.fell.landings == 4 and done.fell.slip < 0.02 and done.fell.sole_shift < 0.05
     assert done.air > 0.3 * done.walk.gait.lift
@@ -109,18 +109,18 @@ def test_a_coarse_stool_takes_a_step(slope: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("route", [straight(0.12), turning(np.radians(20.0))], ids=["ahead", "turn"])
+@pytest.mark.parametrize("route", [straight_route(0.12), turn_route(np.radians(20.0))], ids=["ahead", "turn"])
 def test_a_body_on_two_legs_keeps_its_balance(route: Route) -> None:
     """Two paces ahead, and on the spot: it comes to its place, upright."""
     done = walked(strong(biped()), route, 0.06)
-    assert isinstance(done.walk._carriage, OnLegs) and len(done.walk.feet) == 2
+    assert isinstance(done.walk._carriage, LeggedPosture) and len(done.walk.feet) == 2
     reached, place = measure(done.trajectory), done.walk.places[-1]
     assert reached.distance * done.creature.place.body.height == pytest.approx(place[0], abs=0.012)
     assert reached.heading_degrees == pytest.approx(np.degrees(place[2]), abs=3.0) and reached.tilt_degrees < 4.0
     check_audit(done)
 
 
-@pytest.mark.parametrize("route", [straight(0.04), pytest.param(turning(0.2), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("route", [straight_route(0.04), pytest.param(turn_route(0.2), marks=pytest.mark.slow)])
 def test_a_block_waddles(route: Route) -> None:
     """It lifts one side of its base, turns about the other, and so on: it comes to its place, upright."""
     done = walked(strong(block_mesh()), route, 0.04)
@@ -147,31 +147,31 @@ def test_a_pace_that_slipping_feet_have_lost_is_made_again() -> None:
     """Feet that are where they came to go on; half a pace behind, they go to the same place once more, told in one
     line, and the way still ends where it did."""
     place = coarse_creature(block_mesh(), forward=AHEAD, settled=False).place
-    walk = Walk(place, straight(0.12), 0.04)
-    standing, before, paces = place.ground.local(place.standing), walk.places.copy(), walk.gait.paces
-    walk._come = [1, 1]
+    walk = Walk(place, straight_route(0.12), 0.04)
+    standing, before, paces = place.ground.local(place.standing), walk.places.copy(), walk.gait.step_count
+    walk._arrived_footholds = [1, 1]
     pace = before[1, 0]
-    assert walk._behind(standing + [pace, 0.0, 0.0]) == pytest.approx(0.0, abs=1e-9)
-    assert walk._behind(standing) == pytest.approx(1.0)
+    assert walk._mean_lag(standing + [pace, 0.0, 0.0]) == pytest.approx(0.0, abs=1e-9)
+    assert walk._mean_lag(standing) == pytest.approx(1.0)
     walk._plan_swing(1, standing + [0.8 * pace, 0.0, 0.0])
     assert np.array_equal(walk.places, before) and not walk.notes()
     walk._plan_swing(1, standing + [0.2 * pace, 0.0, 0.0])
-    assert walk.gait.paces == paces + 1 and np.array_equal(np.delete(walk.places, 2, axis=0), before)
+    assert walk.gait.step_count == paces + 1 and np.array_equal(np.delete(walk.places, 2, axis=0), before)
     assert np.array_equal(walk.places[2], before[1]) and "1 pace" in walk.notes()[-1]
 
 
 def test_the_plan_tells_what_the_legs_can_do() -> None:
     place = coarse_creature(stool(), forward=AHEAD, settled=False).place
-    walk = Walk(place, straight(0.24), 0.08)
-    planned = walk.planned()
+    walk = Walk(place, straight_route(0.24), 0.08)
+    planned = walk.plan_record()
     assert planned.paces == 3.0 and planned.pace_length == pytest.approx(0.08)
     assert planned.stride == pytest.approx(0.16) and walk.notes() == []
-    fast = Walk(place, straight(0.24), 0.08, speed=1.5).planned()
+    fast = Walk(place, straight_route(0.24), 0.08, speed=1.5).plan_record()
     assert fast.swing_time == pytest.approx(planned.swing_time / 1.5)
-    strides_out = Walk(place, straight(1.6), 0.8)
-    assert strides_out.planned().pace_length <= 0.5 * min(foot.length for foot in strides_out.feet)
+    strides_out = Walk(place, straight_route(1.6), 0.8)
+    assert strides_out.plan_record().pace_length <= 0.5 * min(foot.length for foot in strides_out.feet)
     assert strides_out.notes()[0].startswith("steps of 1.00 body heights were asked; the body goes by 0.3")
-    turned = Walk(place, turning(0.5), 0.08).planned()
+    turned = Walk(place, turn_route(0.5), 0.08).plan_record()
     far = max(np.linalg.norm(place.ground.local(place.standing)[f.sole, :2].mean(axis=0)) for f in place.feet())
     assert turned.stride == pytest.approx(2.0 * 2.0 * np.sin(0.125) * far, rel=0.05) and turned.paces == 2.0
 
@@ -179,13 +179,13 @@ def test_the_plan_tells_what_the_legs_can_do() -> None:
 def test_feet_go_to_where_they_belong_when_the_body_turns() -> None:
     """Told by turning the whole standing body to each place of the way, about where its centre of mass was."""
     place = coarse_creature(stool(), forward=AHEAD, settled=False).place
-    walk = Walk(place, along(np.array([[0.2, 0.3]])), 0.1)
+    walk = Walk(place, path_route(np.array([[0.2, 0.3]])), 0.1)
     standing, com = place.ground.local(place.standing), place.body.centre_of_mass(place.ground.local(place.standing))
     for x, y, heading in walk.places:
         turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
         moved = (standing[:, :2] - com[:2]) @ turn.T + com[:2] + [x, y]
         for index, foot in enumerate(walk.feet):
-            home = walk._footing.home(np.array([x, y, heading]), index)
+            home = walk._footing.nominal_foothold(np.array([x, y, heading]), index)
             assert home[:2] == pytest.approx(moved[foot.sole].mean(axis=0), abs=1e-12) and home[3] == heading
 
 
@@ -193,11 +193,11 @@ def test_feet_go_to_where_they_belong_when_the_body_turns() -> None:
 def test_it_is_planned_to_press_where_its_feet_are(mesh: Callable[[], TetMesh]) -> None:
     """The centre of pressure of the first swing lies under the feet that stand then; all of the plan is bounded."""
     place = coarse_creature(mesh(), forward=AHEAD, settled=False).place
-    walk = Walk(place, straight(0.3), 0.06)
+    walk = Walk(place, straight_route(0.3), 0.06)
     walk._advance_phase(place.ground.local(place.standing), None, 0.0)
     plan = walk._plan
     swing = plan.pressure[round(walk._duration(walk.phase) / plan.step)]
-    lifted = walk.gait.group(0)
+    lifted = walk.gait.swing_feet(0)
     stands = [index for index in range(len(walk.feet)) if index not in lifted]
     assert stands and len(stands) < len(walk.feet)
     under = np.concatenate([walk._footing.soles[index, :2] + walk._footing.grips[index] for index in stands])
@@ -212,26 +212,26 @@ def test_it_is_planned_to_press_where_its_feet_are(mesh: Callable[[], TetMesh]) 
 def test_a_foot_that_has_turned_all_the_way_round_is_told_so() -> None:
     """A heading is told as near to the planned one as whole turns let it."""
     place = coarse_creature(stool(), forward=AHEAD, settled=False).place
-    walk = Walk(place, turning(np.radians(420.0)), 0.08)
+    walk = Walk(place, turn_route(np.radians(420.0)), 0.08)
     walk.swing = walk.gait.swings - 1
     local = place.ground.local(place.standing)
     com = place.body.centre_of_mass(local)
     turn = np.eye(3)
     turn[:2, :2] = [[0.5, -np.sqrt(0.75)], [np.sqrt(0.75), 0.5]]
-    walk._stands(0, com + (local - com) @ turn.T)
+    walk._has_landed(0, com + (local - com) @ turn.T)
     assert walk._footprints[0, 3] == pytest.approx(np.radians(420.0))
 
 
 def test_a_base_on_ice_is_told_that_it_cannot_turn() -> None:
     place = replace(coarse_creature(block_mesh(), forward=AHEAD, settled=False).place, friction=0.001)
     with pytest.raises(UserError, match=r"walk: friction 0\.001 cannot turn the body about a side of its base"):
-        Walk(place, straight(0.2), 0.1)
+        Walk(place, straight_route(0.2), 0.1)
 
 
 def test_what_has_no_feet_and_what_stands_in_the_way_is_told() -> None:
     bar = block_mesh(12, 3, 3, (2.0, 0.3, 0.3))
     with pytest.raises(UserError, match="walk: the body has no feet, and no flat base of which it could lift a side"):
-        Walk(block_place(bar), straight(0.2), 0.1)
+        Walk(block_place(bar), straight_route(0.2), 0.1)
     place = coarse_creature(stool(), forward=AHEAD, settled=False).place
     wall = Solid(
         tuple(
@@ -242,8 +242,8 @@ def test_what_has_no_feet_and_what_stands_in_the_way_is_told() -> None:
         )
     )  # fmt: skip
     walled = replace(place, solids=(*place.solids, wall))
-    Walk(walled, straight(0.5), 0.1)
+    Walk(walled, straight_route(0.5), 0.1)
     with pytest.raises(
         UserError, match=r"the way leads over a step, .* ahead and 0.00 to the left: .* higher; walk round"
     ):
-        Walk(walled, straight(1.2), 0.1)
+        Walk(walled, straight_route(1.2), 0.1)

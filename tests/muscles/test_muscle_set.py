@@ -16,7 +16,7 @@ from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 from egs_warp.muscles.attachments import attachment_rows
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres, automatic_muscles
-from egs_warp.muscles.tension import muscle_columns
+from egs_warp.muscles.tension import activation_jacobian
 from tests.support.meshes import box_mesh
 
 COLUMN = box_mesh((4, 4, 10), (0.4, 0.4, 1.0))
@@ -37,7 +37,7 @@ def test_columns_make_no_net_force_or_torque(seed: int) -> None:
     rng = np.random.default_rng(seed)
     muscles = random_muscles(rng)
     positions = COLUMN.nodes + rng.normal(0.0, 0.05, COLUMN.nodes.shape) + rng.normal(0.0, 1.0, 3)
-    forces = muscle_columns(muscles, positions).toarray().reshape(-1, 3, muscles.segment_count)
+    forces = activation_jacobian(muscles, positions).toarray().reshape(-1, 3, muscles.segment_count)
     scale = np.abs(forces).sum(axis=(0, 1))
     assert np.all(np.abs(forces.sum(axis=0)) <= 1e-14 * scale)
     torques = np.cross(positions[:, :, None], forces, axis=1).sum(axis=0)
@@ -49,7 +49,7 @@ def test_columns_are_equation_7() -> None:
     rng = np.random.default_rng(1)
     muscles = random_muscles(rng)
     positions = COLUMN.nodes + rng.normal(0.0, 0.05, COLUMN.nodes.shape)
-    dense = muscle_columns(muscles, positions).toarray()
+    dense = activation_jacobian(muscles, positions).toarray()
     rows = muscles.end_rows.toarray()
     expected = np.zeros_like(dense)
     for j, (i, k) in enumerate(muscles.segments):
@@ -57,7 +57,7 @@ def test_columns_are_equation_7() -> None:
         u /= np.linalg.norm(u)
         expected[:, j] = muscles.stiffness[j] * np.outer(rows[i] - rows[k], u).ravel()
     np.testing.assert_allclose(dense, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
-    assert not muscle_columns(muscles, np.zeros_like(positions)).toarray().any()
+    assert not activation_jacobian(muscles, np.zeros_like(positions)).toarray().any()
 
 
 def test_positive_activation_contracts() -> None:
@@ -69,7 +69,7 @@ def test_positive_activation_contracts() -> None:
     rate = (muscles.lengths(COLUMN.nodes + step * velocity) - muscles.lengths(COLUMN.nodes - step * velocity)) / (
         2 * step
     )
-    power = muscle_columns(muscles, COLUMN.nodes).T @ velocity.ravel()
+    power = activation_jacobian(muscles, COLUMN.nodes).T @ velocity.ravel()
     np.testing.assert_allclose(power, -muscles.stiffness * rate, rtol=1e-6, atol=1e-9 * np.abs(power).max())
 
 
@@ -155,7 +155,7 @@ def static_response(
     stiffness = (upper + sparse.triu(upper, 1).T).tocsc()
     activation = np.zeros(muscles.segment_count)
     activation[segments] = share * muscles.rest_lengths[segments]
-    force = muscle_columns(muscles, COLUMN.nodes) @ activation
+    force = activation_jacobian(muscles, COLUMN.nodes) @ activation
     free = np.flatnonzero(~np.broadcast_to(held, COLUMN.nodes.shape).ravel())
     moved = np.zeros(force.shape)
     moved[free] = np.asarray(spsolve(stiffness[free][:, free], force[free]))
@@ -263,7 +263,7 @@ def test_hoops_make_no_axial_torque_between_halves(column_muscles: MuscleSet) ->
     """A planar hoop's forces turn neither half of the body about the axis,
     whatever its activations (erratum, docs/concepts/muscles.md).
     """
-    columns = muscle_columns(column_muscles, COLUMN.nodes).toarray().reshape(-1, 3, column_muscles.segment_count)
+    columns = activation_jacobian(column_muscles, COLUMN.nodes).toarray().reshape(-1, 3, column_muscles.segment_count)
     x = COLUMN.nodes
     torque = x[:, 0, None] * columns[:, 1] - x[:, 1, None] * columns[:, 0]
     crossing = np.abs(torque[x[:, 2] > 0.5].sum(axis=0)) / column_muscles.stiffness

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
-from egs_warp.muscles.ascent import ascent_field, base_nodes
 from egs_warp.muscles.fibres import FibreKind
+from egs_warp.muscles.geodesic_height import base_nodes, geodesic_height
 from egs_warp.muscles.muscle_set import automatic_muscles
 from egs_warp.muscles.skeleton import skeleton
 from tests.support.meshes import UP, carved, column, figure, stool
@@ -18,7 +18,7 @@ from tests.support.meshes import UP, carved, column, figure, stool
 def test_ascent_is_height_on_a_column() -> None:
     """The drainage field of an upright prism depends on height alone, so phi is the height itself."""
     mesh = column()
-    np.testing.assert_allclose(ascent_field(mesh, UP), mesh.nodes[:, 2], atol=0.04)
+    np.testing.assert_allclose(geodesic_height(mesh, UP), mesh.nodes[:, 2], atol=0.04)
     assert set(base_nodes(mesh, UP)) == set(np.flatnonzero(mesh.nodes[:, 2] < 1e-9))
 
 

@@ -10,13 +10,13 @@ import scipy.sparse as sparse
 from scipy.optimize import minimize
 
 from egs_warp.fem.body import BodyState, SoftBody, make_body
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres
-from egs_warp.muscles.tension import GroupImpulses, MuscleTension, muscle_columns, shortenings
+from egs_warp.muscles.tension import MuscleEnergy, SynergyColumns, activation_jacobian, shortening
 from tests.support.creatures import coarse_pawn
 from tests.support.meshes import box_mesh
 from tests.support.passive import passive_body
@@ -35,14 +35,14 @@ def tendon(count: int) -> MuscleSet:
     return attach_fibres(ROD, [Fibre("spine", FibreKind.LONGITUDINAL, points, 1.0)])
 
 
-def scattered(rng: np.random.Generator) -> MuscleTension:
+def scattered(rng: np.random.Generator) -> MuscleEnergy:
     """Segments across the rod, some that pull and some that push."""
     points = rng.uniform([-0.03, -0.03, 0.1], [0.03, 0.03, 0.9], (6, 4, 3))
     muscles = attach_fibres(ROD, [Fibre(f"f{i}", FibreKind.USER, p, 5.0 + i) for i, p in enumerate(points)])
-    return MuscleTension.of(muscles, rng.uniform(-1.0, 1.0, muscles.segment_count) * muscles.bounds)
+    return MuscleEnergy.of(muscles, rng.uniform(-1.0, 1.0, muscles.segment_count) * muscles.bounds)
 
 
-def dense(tension: MuscleTension, x: np.ndarray) -> np.ndarray:
+def dense(tension: MuscleEnergy, x: np.ndarray) -> np.ndarray:
     """(3N, 3N) stiffness of all segments."""
     across, rates = tension.hessian(x).factors(least=0.0)
     return (across * rates) @ across.T
@@ -52,8 +52,8 @@ def test_segments_of_a_rod_that_is_pressed_are_shorter() -> None:
     """By a tenth of their rest length each, at whatever place and turn it ends."""
     muscles, turned = tendon(3), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     pressed = (ROD.nodes * [1.0, 1.0, 0.9]) @ turned.T + [1.0, 2.0, 3.0]
-    np.testing.assert_allclose(shortenings(muscles, ROD.nodes, pressed), 0.1 * muscles.rest_lengths, rtol=1e-9)
-    np.testing.assert_allclose(shortenings(muscles, pressed, ROD.nodes), -0.1 * muscles.rest_lengths, rtol=1e-9)
+    np.testing.assert_allclose(shortening(muscles, ROD.nodes, pressed), 0.1 * muscles.rest_lengths, rtol=1e-9)
+    np.testing.assert_allclose(shortening(muscles, pressed, ROD.nodes), -0.1 * muscles.rest_lengths, rtol=1e-9)
 
 
 @pytest.mark.parametrize("shortened", [1.0, 0.55, 0.2], ids=["long", "short", "slack"])
@@ -83,9 +83,9 @@ def test_the_kernel_adds_the_force_to_that_of_the_elements(rod: SoftBody, shorte
     """Eq. (7): to rounding that of ``gradient``, of one set of muscles after another."""
     rng = np.random.default_rng(3)
     x = ROD.nodes + rng.normal(0.0, 0.002, ROD.nodes.shape)
-    for tension in (scattered(rng), MuscleTension.of(tendon(5), rng.normal(size=5)), scattered(rng)):
+    for tension in (scattered(rng), MuscleEnergy.of(tendon(5), rng.normal(size=5)), scattered(rng)):
         # As if the segments were that much shorter than at rest.
-        held = MuscleTension(tension.rows, tension.tensions, tension.rest_lengths / max(shortened, 1e-9))
+        held = MuscleEnergy(tension.rows, tension.tensions, tension.rest_lengths / max(shortened, 1e-9))
         forces = rod.assembly.gradient(x, None, held) - rod.assembly.gradient(x)
         expected = held.gradient(x)
         assert np.abs(forces - expected).max() <= 1e-12 * max(
@@ -99,7 +99,7 @@ def test_full_tension_has_the_energy_of_its_length() -> None:
     """
     muscles = tendon(5)
     activations = np.linspace(0.1, 0.3, 5) * muscles.bounds
-    tension = MuscleTension.of(muscles, activations)
+    tension = MuscleEnergy.of(muscles, activations)
 
     def energy(scale: float) -> float:
         return tension.energy(scale * ROD.nodes)
@@ -117,8 +117,8 @@ def test_force_is_equation_7_and_makes_no_net_force_or_torque() -> None:
     muscles = tendon(5)
     activations = rng.uniform(-1.0, 1.0, 5) * muscles.bounds
     x = ROD.nodes + rng.normal(0.0, 0.004, ROD.nodes.shape)
-    forces = -MuscleTension.of(muscles, activations).gradient(x)
-    np.testing.assert_allclose(forces.ravel(), muscle_columns(muscles, x) @ activations, rtol=0, atol=1e-14)
+    forces = -MuscleEnergy.of(muscles, activations).gradient(x)
+    np.testing.assert_allclose(forces.ravel(), activation_jacobian(muscles, x) @ activations, rtol=0, atol=1e-14)
     scale = np.abs(forces).sum()
     assert np.abs(forces.sum(axis=0)).max() < 1e-14 * scale
     assert np.abs(np.cross(x, forces).sum(axis=0)).max() < 1e-14 * scale
@@ -131,14 +131,14 @@ def test_a_step_balances_momentum_under_tension(rod: SoftBody) -> None:
     state, tension = BodyState(x, rng.normal(0.0, 0.3, x.shape)), scattered(rng)
     problem, result = passive_body(rod, state=state).advance(1 / 60, tension)
     assert result.converged
-    assert np.linalg.norm(problem.residual(result.velocities, tension)) <= 1e-8 * problem.unit
+    assert np.linalg.norm(problem.residual(result.velocities, tension)) <= 1e-8 * problem.residual_scale
     gained = rod.mass * rod.centre_of_mass(result.velocities - state.velocities)
     np.testing.assert_allclose(gained, rod.mass * rod.gravity / 60, rtol=0, atol=1e-8 * rod.weight / 60)
     spins = [
         rod.angular_momentum(state.positions, state.velocities),
         rod.angular_momentum(problem.end_positions(result.velocities), result.velocities),
     ]
-    np.testing.assert_allclose(*spins, rtol=0, atol=1e-8 * problem.unit * rod.height)
+    np.testing.assert_allclose(*spins, rtol=0, atol=1e-8 * problem.residual_scale * rod.height)
     _, slack = passive_body(rod, state=state).advance(1 / 60)
     assert np.abs(result.velocities - slack.velocities).max() > 1e-2
 
@@ -173,7 +173,7 @@ def equilibrium(
 def press(rod: SoftBody, load: float, *, follows: bool) -> np.ndarray:
     """(N, 3) the rod on its held foot, nudged sideways, under its tendon's pull of ``load`` newtons."""
     assembly, muscles = rod.assembly, tendon(6)
-    tension = MuscleTension(muscles.difference_rows, np.full(6, load), muscles.rest_lengths)
+    tension = MuscleEnergy(muscles.difference_rows, np.full(6, load), muscles.rest_lengths)
     x = ROD.nodes + 0.01 * ROD.nodes[:, 2:] ** 2 * [1.0, 0.0, 0.0]
 
     def elastic(positions: np.ndarray) -> np.ndarray:
@@ -220,7 +220,7 @@ def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
 ) -> None:
     """A free rod pressed by its tendon with ``share`` of Euler's load, below and above it; against dense matrices."""
     euler = np.pi**2 * rod.young_modulus * 0.08**4 / 12 / 0.9**2
-    tension = MuscleTension(tendon(6).difference_rows, np.full(6, share * euler), tendon(6).rest_lengths)
+    tension = MuscleEnergy(tendon(6).difference_rows, np.full(6, share * euler), tendon(6).rest_lengths)
     still = np.zeros_like(ROD.nodes)
     pressed = passive_body(rod)
     for _ in range(4):
@@ -236,14 +236,14 @@ def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
     assert (np.linalg.eigvalsh(elastic).min() > 0.0) == (share < 1.0)
     assert np.linalg.eigvalsh(whole).min() > 0.0
     right = np.random.default_rng(3).standard_normal((whole.shape[0], 4))
-    tangent = problem.tangent(SparseFactors(rod.assembly.upper_pattern), still, tension)
+    tangent = problem.tangent(MultifrontalLdl(rod.assembly.upper_pattern), still, tension)
     found = tangent.solve(right)
     # But for so much of a turn as keeps the angular momentum.
     turned = problem.momenta.T
     missing = right - whole @ found
     missing = missing - turned @ np.linalg.lstsq(turned, missing, rcond=None)[0]
     np.testing.assert_allclose(missing, 0.0, rtol=0, atol=1e-6 * np.abs(right).max())
-    np.testing.assert_allclose(problem.momenta @ found, problem.turns.T @ right, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(problem.momenta @ found, problem.rotation_modes.T @ right, rtol=0, atol=1e-9)
 
 
 def test_impulses_of_groups_are_the_columns_of_their_muscles() -> None:
@@ -255,10 +255,10 @@ def test_impulses_of_groups_are_the_columns_of_their_muscles() -> None:
     other = np.arange(3.0 * len(rest))
     for most in (muscles.segment_count, 7):
         synergies = Synergies((np.arange(muscles.segment_count) % most).astype(np.int32))
-        impulses = GroupImpulses(muscles, synergies.group_from_muscle)
+        impulses = SynergyColumns(muscles, synergies.group_from_muscle)
         for positions in (rest, bent):
-            found = impulses.beside(other, positions, 0.02)
-            each = muscle_columns(muscles, positions).toarray() * muscles.bounds
+            found = impulses.with_base(other, positions, 0.02)
+            each = activation_jacobian(muscles, positions).toarray() * muscles.bounds
             expected = 0.02 * (each @ synergies.members.toarray())
             assert found.shape == (3 * len(rest), most + 1)
             np.testing.assert_allclose(found[:, :-1], expected, atol=1e-12 * np.abs(expected).max())

@@ -22,9 +22,9 @@ from egs_warp.motions.script import motion
 from egs_warp.pipelines.animate import AnimateOptions, animate
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.finished_run import PARTS, read_trajectory
-from egs_warp.pipelines.performance import Performance, simulate
 from egs_warp.pipelines.report import Report, verdict
-from tests.support.faults import fail_once
+from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
+from tests.support.disk_faults import fail_once
 from tests.support.slides import slide
 
 FILES = ["cage.vtu", "creature.npz", "jump.mp4", MANIFEST, "plots.png", "report.json", "sheet.png", "trajectory.npz"]
@@ -38,14 +38,14 @@ def thing() -> BuiltInObject:
 
 
 @pytest.fixture(scope="module")
-def performance() -> Performance:
+def performance() -> SimulatedRun:
     """Two pictures of a coarse pawn."""
     creature = make_creature(thing().cloud, plane=thing().plane, friction=0.6, nodes=120)
     return simulate(creature, motion("jump"), frames=2)
 
 
 @pytest.fixture
-def run(performance: Performance, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Report]:
+def run(performance: SimulatedRun, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Report]:
     """``animate`` without the seconds before its first file."""
     monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", lambda *_, **__: performance.creature)
     monkeypatch.setattr("egs_warp.pipelines.animate.simulate", lambda *_, **__: performance)
@@ -112,7 +112,7 @@ def test_a_run_that_is_cut_off_leaves_its_steps(
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_a_film_from_straight_above_or_below(performance: Performance, side: float) -> None:
+def test_a_film_from_straight_above_or_below(performance: SimulatedRun, side: float) -> None:
     """The way the body faces is up in the picture."""
     up = thing().plane.normal
     camera = performance.camera(64, side * up)
@@ -120,7 +120,7 @@ def test_a_film_from_straight_above_or_below(performance: Performance, side: flo
     assert performance.place.ground.axes[0] @ -camera.rotation[1] > 0.999
 
 
-def test_of_several_sides_a_film_is_taken_from_the_one_nearest_to_the_usual(performance: Performance) -> None:
+def test_of_several_sides_a_film_is_taken_from_the_one_nearest_to_the_usual(performance: SimulatedRun) -> None:
     """The usual one shows the face and the way."""
     first, second = thing().plane.tangents()
     around = 2.0 * np.pi * (np.arange(7)[:, None] + 0.3) / 7

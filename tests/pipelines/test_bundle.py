@@ -43,7 +43,7 @@ def test_the_reader_agrees_with_the_deformer(run: FinishedRun, tmp_path: Path) -
         expected = factors @ factors.transpose(0, 2, 1)
         size = np.linalg.norm(expected, axis=(1, 2))
         assert (np.linalg.norm(covariances - expected, axis=(1, 2)) / size).max() < 1e-4
-        made = Rotation.from_quat(deformed.turns.numpy()[:, [1, 2, 3, 0]]).as_matrix()
+        made = Rotation.from_quat(deformed.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
         assert np.abs(turns - made).max() < 1e-3
 
 

@@ -13,26 +13,28 @@ from egs_warp.assets.object import BuiltInObject
 from egs_warp.cli import main
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io import write_ply
-from egs_warp.motions.feet import Base
-from egs_warp.motions.repertoire import REPERTOIRE
-from egs_warp.pipelines.info import BodyInfo, draw_info, look_into
+from egs_warp.motions.feet import SupportKind
+from egs_warp.motions.repertoire import MOTIONS
+from egs_warp.pipelines.info import BodyInfo, draw_info, inspect_capture
 
 COLOURS = {1: (0xD6, 0x27, 0x28), 2: (0x1F, 0x77, 0xB4), 3: (0x2C, 0xA0, 0x2C), 4: (0xFF, 0x7F, 0x0E)}
 """Of the feet, as they are drawn."""
 
 
 def seen(thing: BuiltInObject) -> BodyInfo:
-    return look_into(thing.cloud, source=thing.name, plane=thing.plane, nodes=200)
+    return inspect_capture(thing.cloud, source=thing.name, plane=thing.plane, nodes=200)
 
 
 @pytest.fixture(scope="module")
 def chair() -> BodyInfo:
-    return look_into(stool(gaussian_count=5000).cloud, source="chair.ply", up=np.array([0.0, 0.0, 1.0]), notes=("so",))
+    return inspect_capture(
+        stool(gaussian_count=5000).cloud, source="chair.ply", up=np.array([0.0, 0.0, 1.0]), notes=("so",)
+    )
 
 
 def test_a_chair_is_told_by_what_can_be_measured(chair: BodyInfo) -> None:
     """Front right and left, back right and left, in the order of the numbers; lengths in body heights."""
-    assert chair.base is Base.FEET and len(chair.feet) == 4
+    assert chair.base is SupportKind.FEET and len(chair.feet) == 4
     soles = chair.soles() / chair.body.height
     assert np.sign(soles[:, :2]).astype(int).tolist() == [[1, 1], [-1, 1], [-1, -1], [1, -1]]
     lines = chair.lines()
@@ -49,10 +51,10 @@ def test_a_chair_is_told_by_what_can_be_measured(chair: BodyInfo) -> None:
 
 
 def test_all_motions_are_told_with_what_is_in_their_way(chair: BodyInfo) -> None:
-    assert chair.motions() == dict.fromkeys(REPERTOIRE)
+    assert chair.motions() == dict.fromkeys(MOTIONS)
     round_one = seen(pawn(gaussian_count=3000))
     assert len(round_one.feet) == 1 and "stands   on one base" in round_one.lines()
-    assert round_one.motions() == dict.fromkeys(REPERTOIRE), "it waddles"
+    assert round_one.motions() == dict.fromkeys(MOTIONS), "it waddles"
     assert "jump       yes" in round_one.lines()
 
 
@@ -79,8 +81,8 @@ def snake() -> GaussianCloud:
 
 
 def test_what_lies_has_no_feet_and_is_drawn(tmp_path: Path) -> None:
-    info = look_into(snake(), up=np.array([0.0, 0.0, 1.0]), nodes=300)
-    assert info.feet == () and info.base is Base.LONG
+    info = inspect_capture(snake(), up=np.array([0.0, 0.0, 1.0]), nodes=300)
+    assert info.feet == () and info.base is SupportKind.LYING
     assert "stands   on its length: it crawls" in info.lines()
     assert info.motions()["walk"] is None and info.motions()["turn"] is None
     assert abs(info.front.direction[0]) > 0.99 and "the body lies along it" in str(info.front.reason)

@@ -17,12 +17,12 @@ from egs_warp.fem.body import BodyState
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.io import read_capture
-from egs_warp.locomotion.rollout import Simulation
+from egs_warp.locomotion.rollout import RolloutResult
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import Creature, first_place, make_creature
-from egs_warp.pipelines.performance import FILMED_FROM, simulate
+from egs_warp.pipelines.creature import Creature, initial_stance, make_creature
+from egs_warp.pipelines.simulated_run import FILMED_FROM, simulate
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.base_plane import find_base_plane
 from tests.support.frames import TURN, Lying
@@ -31,7 +31,7 @@ WHERE_IT_LIES = {"body_axes", "body_origin", "metres_per_unit"}
 """Of a trajectory: what says how the file lies."""
 
 
-def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, Simulation]:
+def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, RolloutResult]:
     """The first ``frames`` pictures of a jump, or all of it; the plane is given, or found from up alone."""
     if by_up:
         creature = make_creature(lying.cloud, up=lying.up)
@@ -59,12 +59,12 @@ def thing() -> Lying:
 
 
 @pytest.fixture(scope="module")
-def first_steps(thing: Lying) -> tuple[Creature, Simulation]:
+def first_steps(thing: Lying) -> tuple[Creature, RolloutResult]:
     return jump(thing, frames=3, by_up=True)
 
 
 @pytest.fixture(scope="module")
-def elsewhere(thing: Lying) -> tuple[Lying, Creature, Simulation]:
+def elsewhere(thing: Lying) -> tuple[Lying, Creature, RolloutResult]:
     """The same, moved, turned and in another unit, with its plane."""
     lying = thing.moved((3.0, 1.0, -2.0)).turned().scaled(0.37)
     return lying, *jump(lying, frames=3)
@@ -81,7 +81,7 @@ def elsewhere(thing: Lying) -> tuple[Lying, Creature, Simulation]:
     ids=["all", "shuffled", "x4", "moved"],
 )
 def test_same_bits_however_the_file_lies(
-    thing: Lying, first_steps: tuple[Creature, Simulation], other: Callable[[Lying], Lying]
+    thing: Lying, first_steps: tuple[Creature, RolloutResult], other: Callable[[Lying], Lying]
 ) -> None:
     creature, simulation = first_steps
     again, simulated = jump(other(thing), frames=3, by_up=True)
@@ -99,14 +99,14 @@ def test_same_bits_however_the_file_lies(
                 assert np.array_equal(a, b), name
 
 
-def assert_same_pictures(one: tuple[Creature, Simulation], other: tuple[Creature, Simulation]) -> None:
+def assert_same_pictures(one: tuple[Creature, RolloutResult], other: tuple[Creature, RolloutResult]) -> None:
     truth, again = (pictures(creature, done.trajectory.positions[-1]) for creature, done in (one, other))
     assert truth.std() > 0.05
     assert np.abs(again - truth).mean() < 1e-3
 
 
 def test_same_pictures_elsewhere(
-    first_steps: tuple[Creature, Simulation], elsewhere: tuple[Lying, Creature, Simulation]
+    first_steps: tuple[Creature, RolloutResult], elsewhere: tuple[Lying, Creature, RolloutResult]
 ) -> None:
     assert_same_pictures(first_steps, elsewhere[1:])
 
@@ -116,12 +116,12 @@ def test_same_pictures_elsewhere(
     "other", [lambda thing: thing.scaled(0.37), lambda thing: thing.turned()], ids=["x0.37", "turned"]
 )
 def test_same_pictures_from_up_alone(
-    thing: Lying, first_steps: tuple[Creature, Simulation], other: Callable[[Lying], Lying]
+    thing: Lying, first_steps: tuple[Creature, RolloutResult], other: Callable[[Lying], Lying]
 ) -> None:
     assert_same_pictures(first_steps, jump(other(thing), frames=3, by_up=True))
 
 
-def test_trajectory_leads_back_to_the_capture(elsewhere: tuple[Lying, Creature, Simulation]) -> None:
+def test_trajectory_leads_back_to_the_capture(elsewhere: tuple[Lying, Creature, RolloutResult]) -> None:
     """The nodes at the start stand where the Gaussians are, on the capture's plane."""
     turned, _, simulation = elsewhere
     trajectory = simulation.trajectory
@@ -185,6 +185,6 @@ def test_front_is_where_the_face_is(monkeypatch: pytest.MonkeyPatch) -> None:
     creature = make_creature(turned.cloud, plane=turned.plane)
     face = creature.frame.axes @ TURN @ [0.0, -1.0, 0.0]
     assert creature.front.direction @ face > 0.98
-    ground = first_place(creature).ground
+    ground = initial_stance(creature).ground
     assert ground.axes[0] @ face > 0.98, "it moves the way it faces"
     assert (FILMED_FROM @ ground.axes) @ face > 0.5

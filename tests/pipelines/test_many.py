@@ -19,10 +19,10 @@ from egs_warp.motions.push import read_pushes
 from egs_warp.motions.script import motion
 from egs_warp.motions.style import read_style
 from egs_warp.pipelines.creature import Creature
-from egs_warp.pipelines.ending import State
+from egs_warp.pipelines.end_state import State
 from egs_warp.pipelines.job import Job
-from egs_warp.pipelines.many import Outcome, simulate_many
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.many import JobResult, simulate_many
+from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import coarse_pawn
 
 FRAMES, FEW = 31, 11
@@ -57,7 +57,7 @@ def told() -> list[tuple[int, int]]:
 
 
 @pytest.fixture(scope="module")
-def outcomes(creature: Creature, jobs: list[Job], told: list[tuple[int, int]]) -> tuple[Outcome, ...]:
+def outcomes(creature: Creature, jobs: list[Job], told: list[tuple[int, int]]) -> tuple[JobResult, ...]:
     return simulate_many(creature, jobs, workers=2, progress=lambda done, expected: told.append((done, expected)))
 
 
@@ -68,7 +68,9 @@ def same(one: Trajectory, other: Trajectory) -> bool:
     )
 
 
-def test_each_has_the_bits_of_its_run_alone(creature: Creature, jobs: list[Job], outcomes: tuple[Outcome, ...]) -> None:
+def test_each_has_the_bits_of_its_run_alone(
+    creature: Creature, jobs: list[Job], outcomes: tuple[JobResult, ...]
+) -> None:
     alone = {
         0: simulate(creature, jobs[0].motion, frames=FRAMES),
         1: simulate(creature, jobs[1].motion, frames=FEW),
@@ -79,7 +81,7 @@ def test_each_has_the_bits_of_its_run_alone(creature: Creature, jobs: list[Job],
     }
     for number, performance in alone.items():
         outcome = outcomes[number]
-        assert outcome.job is jobs[number] and outcome.error is None and outcome.runs == 1
+        assert outcome.job is jobs[number] and outcome.error is None and outcome.attempts == 1
         assert len(outcome.trajectory.dt) >= (30 if number in (0, 2) else 10)
         assert same(outcome.trajectory, performance.trajectory), number
         assert np.array_equal(outcome.frames, performance.simulation.frames)
@@ -90,16 +92,16 @@ def test_each_has_the_bits_of_its_run_alone(creature: Creature, jobs: list[Job],
     assert outcomes[2].trajectory.friction == 0.3 and outcomes[0].trajectory.friction == 0.8
 
 
-def test_the_error_of_one_does_not_end_the_others(outcomes: tuple[Outcome, ...]) -> None:
+def test_the_error_of_one_does_not_end_the_others(outcomes: tuple[JobResult, ...]) -> None:
     assert outcomes[6].error == "friction -1.0: give a Coulomb coefficient of at least 0"
     assert outcomes[7].error is not None and outcomes[7].error.startswith("activations: of shape (10, ")
     for outcome in outcomes[6:]:
-        assert outcome.state is None and outcome.report is None and outcome.runs == 1
+        assert outcome.state is None and outcome.report is None and outcome.attempts == 1
         with pytest.raises(UserError, match="job: it has no trajectory"):
             _ = outcome.trajectory
 
 
-def test_reports_tell_how_they_ended(creature: Creature, outcomes: tuple[Outcome, ...]) -> None:
+def test_reports_tell_how_they_ended(creature: Creature, outcomes: tuple[JobResult, ...]) -> None:
     for outcome in outcomes[:6]:
         assert outcome.report is not None
         assert outcome.state is outcome.report.state is not State.DONE
@@ -109,7 +111,7 @@ def test_reports_tell_how_they_ended(creature: Creature, outcomes: tuple[Outcome
     assert outcomes[2].report is not None and outcomes[2].report.asked["friction"] == 0.3
 
 
-def test_progress_ends_where_all_is_done(told: list[tuple[int, int]], outcomes: tuple[Outcome, ...]) -> None:
+def test_progress_ends_where_all_is_done(told: list[tuple[int, int]], outcomes: tuple[JobResult, ...]) -> None:
     frames = sum(len(outcome.frames) - 1 for outcome in outcomes if outcome.report is not None)
     done = [one for one, _ in told]
     assert told[-1] == (frames, frames) and done == sorted(done) and all(one <= of for one, of in told)
@@ -146,7 +148,7 @@ def test_side_by_side_each_is_as_alone(creature: Creature, tmp_path: Path) -> No
     assert made[6].error is not None and made[6].error.startswith("activations: of shape (6, ")
     steps = []
     for job, outcome in zip(jobs[:5], made, strict=False):
-        alone = job.perform(creature)
+        alone = job.run(creature)
         one, other = outcome.trajectory, alone.trajectory
         steps.append(len(one.dt))
         assert outcome.job is job and one.friction == other.friction == (job.friction or 0.8)
@@ -194,18 +196,18 @@ def test_over_ray_it_has_the_same_bits(creature: Creature, monkeypatch: pytest.M
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     job = Job(motion("jump 0.2 0.1"), friction=0.5, frames=FEW)
     (outcome,) = simulate_many(creature, [job], workers="ray")
-    assert outcome.error is None and same(outcome.trajectory, job.perform(creature).trajectory)
+    assert outcome.error is None and same(outcome.trajectory, job.run(creature).trajectory)
 
 
 def test_trajectories_may_lie_in_a_folder(creature: Creature, tmp_path: Path) -> None:
     """As they end they are told, by their numbers."""
-    ended: dict[int, Outcome] = {}
+    ended: dict[int, JobResult] = {}
     jobs = [Job(motion("stand 1"), frames=count) for count in (4, 3)]
     made = simulate_many(
         creature, jobs, workers=1, out=tmp_path / "runs", ended=lambda number, one: ended.update({number: one})
     )
     assert [one.file for one in made] == [tmp_path / "runs" / f"job-000{number}.npz" for number in (0, 1)]
-    assert [one.held for one in made] == [None, None] and [ended[0], ended[1]] == list(made)
+    assert [one.in_memory_trajectory for one in made] == [None, None] and [ended[0], ended[1]] == list(made)
     assert [len(one.trajectory.dt) for one in made] == [3, 2]
 
 
@@ -248,4 +250,4 @@ def test_activations_that_no_muscle_has_are_refused(creature: Creature) -> None:
     for given in (np.tile(1.01 * bounds, (5, 1)), np.full((5, count), np.nan)):
         with pytest.raises(ArgumentError, match=r"^activations: beyond what a muscle can do; keep each within"):
             simulate(creature, motion("jump"), activations=given)
-    assert replace(Job(motion("jump")), frames=2).perform(creature).frames.shape[0] == 2
+    assert replace(Job(motion("jump")), frames=2).run(creature).frames.shape[0] == 2

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from egs_warp.locomotion.ledger import ledger
+from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.pipelines.plots import draw_plots
 from tests.support.flights import rigid_flight
 from tests.support.slides import slide
@@ -20,7 +20,7 @@ def picture(path: Path) -> np.ndarray:
 
 def test_the_same_run_gives_the_same_bytes_and_another_another_picture(tmp_path: Path) -> None:
     t = slide().trajectory()
-    books = ledger(t)
+    books = energy_balance(t)
     planned = np.full((len(t.time), 3), np.nan)
     planned[3:9] = [0.1, 0.0, 0.9]
     runs = {
@@ -44,5 +44,5 @@ def test_the_same_run_gives_the_same_bytes_and_another_another_picture(tmp_path:
 
 def test_a_flight_without_contact_or_pull_is_drawn(tmp_path: Path) -> None:
     t = rigid_flight()
-    draw_plots(tmp_path / "plots.png", t, ledger(t))
+    draw_plots(tmp_path / "plots.png", t, energy_balance(t))
     assert picture(tmp_path / "plots.png").std() > 10.0

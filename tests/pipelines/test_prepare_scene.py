@@ -17,7 +17,7 @@ from egs_warp.io import read_capture, write_ply
 from egs_warp.io.planes import read_planes
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene, viewing_directions
-from egs_warp.segmentation.clearance import Clearing
+from egs_warp.segmentation.clearance import StraddlingPolicy
 from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.grounds import on_folds
 from tests.support.scenes import FLOOR, ball_on_floor
@@ -34,7 +34,7 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def prepared() -> PreparedScene:
     """The ball taken off its floor, whose hole is left."""
-    options = SceneOptions(clearing=Clearing.SPLIT, inpaint=False)
+    options = SceneOptions(clearing=StraddlingPolicy.SPLIT, inpaint=False)
     return prepare_scene(ball_on_floor()[0], ObjectSpec(point=np.array([0.0, -0.5, 0.5])), options=options)
 
 
@@ -109,7 +109,7 @@ def test_animate_passes_on_how_the_scene_is_taken_apart(
     flags = ["--object", "0,0,0.5", "--inpainter", "ns", "--straddling", "remove", "--out", str(tmp_path / "out")]
     assert main(["animate", str(scene_file), *flags]) == 2
     assert told["options"].inpainter == OpenCvInpainter(OpenCvMethod.NAVIER_STOKES)
-    assert told["options"].clearing is Clearing.REMOVE
+    assert told["options"].clearing is StraddlingPolicy.REMOVE
 
 
 def test_the_parts_of_earlier_steps_are_animated(
@@ -131,7 +131,7 @@ def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monke
     """
     cloud, truth = on_folds(0.04, length=0.9)
     click = ObjectSpec(point=np.array([0.0, 0.0, 0.5]))
-    options = SceneOptions(clearing=Clearing.SPLIT, inpaint=False)
+    options = SceneOptions(clearing=StraddlingPolicy.SPLIT, inpaint=False)
     prepared = prepare_scene(cloud, click, up=FLOOR.normal, options=options)
     ground = prepared.ground
     assert ground is not None and any(note.startswith("the ground is not flat") for note in prepared.notes)
@@ -203,7 +203,7 @@ def test_an_animation_that_fails_loses_none_of_the_parts(
 def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
     cloud, _ = ball_on_floor()
     told: list[tuple[str, float]] = []
-    options = SceneOptions(clearing=Clearing.SPLIT, inpaint=False)
+    options = SceneOptions(clearing=StraddlingPolicy.SPLIT, inpaint=False)
     prepared = prepare_scene(
         cloud,
         ObjectSpec(point=np.array([0.0, -0.5, 0.5])),
@@ -212,7 +212,7 @@ def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
     )
     assert told == [(stage, 0.0) for stage in options.stages]
     assert options.stages == {"plane": True, "ground": True, "segment": False}
-    assert prepared.background is prepared.bare
+    assert prepared.background is prepared.background_with_hole
     assert any("straddled the plane: split at it" in note for note in prepared.notes)
     cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=12, elevations=(20.0, 40.0, 60.0))
     found = viewing_directions(prepared, cameras)
@@ -227,8 +227,8 @@ def test_what_hangs_above_the_ground_leaves_no_hole(tmp_path: Path) -> None:
     """A ball a fifth of its size above the floor comes down; nothing is painted, ``plane.json`` tells of no hole."""
     cloud, truth = ball_on_floor(lift=0.33)
     spec = ObjectSpec(point=np.array([0.0, -0.5, 0.83]))
-    scene = prepare_scene(cloud, spec, options=SceneOptions(clearing=Clearing.SPLIT))
-    assert scene.hole is None and scene.filled is None and scene.background is scene.bare
+    scene = prepare_scene(cloud, spec, options=SceneOptions(clearing=StraddlingPolicy.SPLIT))
+    assert scene.hole is None and scene.filled is None and scene.background is scene.background_with_hole
     assert "the object hangs above the ground, which is whole under it" in scene.notes
     assert scene.object.count >= 0.99 * truth.sum()
     heights = scene.plane.heights(scene.object.means.numpy())

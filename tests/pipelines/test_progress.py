@@ -9,7 +9,7 @@ import pytest
 
 from egs_warp.pipelines.prepare_scene import SceneOptions
 from egs_warp.pipelines.progress import conversion_bar, info_bar, preparation_bar, scene_bar
-from egs_warp.segmentation.clearance import Clearing
+from egs_warp.segmentation.clearance import StraddlingPolicy
 
 
 def drawn(options: SceneOptions, monkeypatch: pytest.MonkeyPatch, told: list[tuple[float, str, float]]) -> list[str]:
@@ -29,7 +29,7 @@ def drawn(options: SceneOptions, monkeypatch: pytest.MonkeyPatch, told: list[tup
 def test_a_scene_tells_its_stages_and_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """In the middle of its longest stage half of the time is over, to a few percent."""
     told = [(0.0, "plane", 0.0), (12.0, "ground", 0.0), (27.0, "segment", 0.0), (50.0, "segment", 0.5)]
-    assert drawn(SceneOptions(clearing=Clearing.FINETUNE), monkeypatch, told) == [
+    assert drawn(SceneOptions(clearing=StraddlingPolicy.FINETUNE), monkeypatch, told) == [
         "scene: plane, 00:00<?",
         "scene: ground, 00:12<01:28",
         "scene: segment, 00:27<01:13",
@@ -39,7 +39,7 @@ def test_a_scene_tells_its_stages_and_what_is_left(monkeypatch: pytest.MonkeyPat
 
 def test_what_is_not_done_is_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without ground, training and floor there is little behind the plane."""
-    options = SceneOptions(clearing=Clearing.SPLIT, flat=True, inpaint=False)
+    options = SceneOptions(clearing=StraddlingPolicy.SPLIT, flat=True, inpaint=False)
     lines = drawn(options, monkeypatch, [(0.0, "plane", 0.0), (12.0, "segment", 0.0)])
     assert lines[1] == "scene: segment, 00:12<00:02"
 

@@ -14,16 +14,16 @@ from PIL import Image
 from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.io import read_capture
-from egs_warp.io.photos import turned
+from egs_warp.io.photos import apply_orientation
 from tests.support.posed import posed_folder
 from tests.support.training_views import ring
 
 pytest.importorskip("torch")
 from egs_warp.pipelines.train_capture import train
 from egs_warp.training.finetune import TrainingView
-from egs_warp.training.likeness import psnr
+from egs_warp.training.initial_cloud import initial_cloud, middle_of
+from egs_warp.training.metrics import psnr
 from egs_warp.training.posed_photos import backdrop_colour, laid_over, read_views
-from egs_warp.training.rough_cloud import middle_of, rough_cloud
 
 
 def run(folder: Path, out: Path, *flags: str) -> int:
@@ -124,7 +124,7 @@ def test_portrait_and_landscape_through_a_lens(tmp_path: Path) -> None:
             upright = np.ascontiguousarray(pixels[:, 8:-8, ::-1])
             exif = Image.Exif()
             exif[0x0112] = 6
-            Image.fromarray(turned(upright, 8)).save(posed / f"t_{number}.png", exif=exif)
+            Image.fromarray(apply_orientation(upright, 8)).save(posed / f"t_{number}.png", exif=exif)
             frame.update(file_path=f"t_{number}.png", w=32, h=48, cx=16.0, cy=24.0)
     (posed / "transforms.json").write_text(json.dumps(tree))
     assert run(posed, tmp_path / "ball.ply", "--iterations", "200") == 0
@@ -204,7 +204,7 @@ def test_the_first_cloud_fills_the_silhouettes_and_nothing_else() -> None:
         off = np.linalg.norm(to_centre - (rays @ to_centre)[..., None] * rays, axis=-1)
         image = np.broadcast_to([0.8, 0.3, 0.1], (64, 64, 3)).astype(np.float32)
         views.append(TrainingView(camera, image, alpha=(off < radius).astype(np.float32)))
-    cloud = rough_cloud(views, count=500, sh_degree=1, device="cpu")
+    cloud = initial_cloud(views, count=500, sh_degree=1, device="cpu")
     means = cloud.means.numpy()
     assert len(means) == 500
     for view in views[::3]:
@@ -227,7 +227,7 @@ def test_cameras_that_see_nothing_in_common_are_refused() -> None:
     away = replace(camera, rotation=camera.rotation, near=1e9)
     view = TrainingView(away, np.zeros((camera.height, camera.width, 3), np.float32))
     with pytest.raises(UserError, match="train: the cameras do not look at a place in common; check the poses"):
-        rough_cloud([view], count=100, sh_degree=0, device="cpu")
+        initial_cloud([view], count=100, sh_degree=0, device="cpu")
 
 
 @pytest.mark.data

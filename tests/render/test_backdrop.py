@@ -13,7 +13,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.render.backdrop import captured_scene, grid_floor, plain_colour
 from egs_warp.render.compositing import RenderedImage
-from egs_warp.render.shadow import ContactShadow, grain_of
+from egs_warp.render.shadow import ContactShadow, shadow_blur_radius
 from tests.support.scenes import FLOOR, ball_on_floor
 
 SIDE = 120
@@ -37,7 +37,7 @@ def parts() -> tuple[GaussianCloud, GaussianCloud]:
 
 def over_scene(scene: GaussianCloud, body: GaussianCloud, *, shadow: bool) -> np.ndarray:
     behind = captured_scene(
-        scene, camera(), FLOOR, centre=np.zeros(3), reach=2.0, grain=grain_of(body), height=1.0, shadow=shadow
+        scene, camera(), FLOOR, centre=np.zeros(3), reach=2.0, grain=shadow_blur_radius(body), height=1.0, shadow=shadow
     )
     return behind.background(body).numpy()
 
@@ -46,7 +46,7 @@ def on_ground(
     body: GaussianCloud, plane: Plane = FLOOR, centre: np.ndarray | None = None, *, height: float = 1.0
 ) -> ContactShadow:
     where = {"centre": np.zeros(3) if centre is None else centre, "reach": 2.0}
-    return ContactShadow(camera(), plane, **where, device=body.device, grain=grain_of(body), height=height)
+    return ContactShadow(camera(), plane, **where, device=body.device, grain=shadow_blur_radius(body), height=height)
 
 
 def square(values: Any) -> np.ndarray:
@@ -63,8 +63,8 @@ def test_the_shadow_falls_where_the_floor_is_seen() -> None:
     assert dark[under].mean() < 0.75 * bare[under].mean()
     np.testing.assert_array_equal(dark[far], bare[far])
     behind = plain_colour(ground, (1.0, 1.0, 1.0))
-    lifted = behind.cover(placed(body, body.means.numpy() + [0.0, 0.0, 0.4])).numpy()
-    assert 0.0 < lifted.max() < behind.cover(body).numpy().max() <= 0.5
+    lifted = behind.shadow_opacity(placed(body, body.means.numpy() + [0.0, 0.0, 0.4])).numpy()
+    assert 0.0 < lifted.max() < behind.shadow_opacity(body).numpy().max() <= 0.5
     # A wall in front of the floor takes no shadow.
     wall = placed(floor, floor.means.numpy()[:, [0, 2, 1]] + [0.0, -1.2, 1.0])
     plain, shaded = (over_scene(wall, body, shadow=shadow) for shadow in (False, True))

@@ -14,14 +14,14 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.clearance import (
-    Clearing,
-    ClearingOptions,
-    Reach,
+    ExtentMeasure,
+    StraddlingOptions,
+    StraddlingPolicy,
     _subdivided,
     clear_plane,
     foot_ring,
     half_space,
-    reach_across,
+    plane_extents,
     views_above,
 )
 from tests.support.scenes import FLOOR, round_ones, shell
@@ -55,10 +55,10 @@ def test_reach_is_that_of_the_six_tips_or_of_the_whole_ellipsoid(device: str) ->
     turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
     arms = turns * np.exp(cloud.log_scales.numpy())[:, None, :]
     tips = 3.0 * np.abs(np.einsum("nij,i->nj", arms, PLANE.normal)).max(axis=1)
-    heights, reach = reach_across(cloud, PLANE, Reach.AXIS_TIPS)
+    heights, reach = plane_extents(cloud, PLANE, ExtentMeasure.AXIS_TIPS)
     np.testing.assert_allclose(heights, PLANE.heights(cloud.means.numpy()), atol=1e-5)
     np.testing.assert_allclose(reach, tips, rtol=1e-4)
-    _, whole = reach_across(cloud, PLANE)
+    _, whole = plane_extents(cloud, PLANE)
     expected = 3.0 * np.sqrt(np.einsum("i,nij,j->n", PLANE.normal, covariances(cloud), PLANE.normal))
     np.testing.assert_allclose(whole, expected, rtol=1e-4)
     assert ((whole > reach * 0.9999) & (whole < np.sqrt(3.0) * reach * 1.0001)).all()
@@ -136,8 +136,8 @@ def test_what_straddles_is_split_in_three_across_the_plane(device: str) -> None:
         device=device,
     )
     # Both reach across by three tenths.
-    assert _subdivided(cloud, PLANE, Reach.ELLIPSOID, 0.31) is cloud
-    split = _subdivided(cloud, PLANE, Reach.ELLIPSOID, 0.29)
+    assert _subdivided(cloud, PLANE, ExtentMeasure.ELLIPSOID, 0.31) is cloud
+    split = _subdivided(cloud, PLANE, ExtentMeasure.ELLIPSOID, 0.29)
     np.testing.assert_allclose(PLANE.heights(split.means.numpy()), [0.5, 0.05, 0.15, 0.25, 0.05, 0.15], atol=1e-5)
     np.testing.assert_allclose(covariances(split)[0], covariances(cloud)[2], atol=1e-8)
     arms = split.means.numpy()[1:4].astype(np.float64) - cloud.means.numpy()[0]
@@ -200,9 +200,9 @@ def test_flat_splats_survive_the_cut() -> None:
 
 def test_removing_leaves_nothing_across_the_plane() -> None:
     cloud = cloud_near(PLANE, "cpu")
-    heights, reach = reach_across(clear_plane(cloud, PLANE, Clearing.REMOVE), PLANE)
+    heights, reach = plane_extents(clear_plane(cloud, PLANE, StraddlingPolicy.REMOVE), PLANE)
     assert (np.abs(heights) >= reach).all()
-    assert clear_plane(cloud, PLANE, Clearing.NONE) is cloud
+    assert clear_plane(cloud, PLANE, StraddlingPolicy.NONE) is cloud
 
 
 def test_loss_is_the_sum_over_straddling_gaussians() -> None:
@@ -221,8 +221,8 @@ def test_loss_is_the_sum_over_straddling_gaussians() -> None:
     }
     rest = {"sh_band_0": torch.zeros(20, 1, 3), "sh_rest": torch.zeros(20, 0, 3)}
     normal, near = torch.tensor(PLANE.normal), torch.arange(20)
-    for reach in Reach:
-        heights, eta = reach_across(cloud, PLANE, reach)
+    for reach in ExtentMeasure:
+        heights, eta = plane_extents(cloud, PLANE, reach)
         expected = np.maximum(eta - np.abs(heights), 0.0).sum()
         loss = straddling_loss(GaussianTensors(**leaves, **rest), near, normal, PLANE.offset, reach)
         assert float(loss.detach()) == pytest.approx(expected, rel=1e-4)
@@ -230,7 +230,7 @@ def test_loss_is_the_sum_over_straddling_gaussians() -> None:
         assert (straddling & (heights > 0.0)).any() and (straddling & (heights < 0.0)).any()
         inputs = [leaves[name] for name in ("means", "rotations", "log_scales")]
 
-        def value(means: Any, rotations: Any, log_scales: Any, reach: Reach = reach) -> Any:
+        def value(means: Any, rotations: Any, log_scales: Any, reach: ExtentMeasure = reach) -> Any:
             tensors = GaussianTensors(means, rotations, log_scales, leaves["opacity_logits"], **rest)
             return straddling_loss(tensors, near, normal, PLANE.offset, reach)
 
@@ -242,7 +242,7 @@ def test_finetuning_clears_the_plane_and_keeps_the_looks() -> None:
     pytest.importorskip("torch")
     from egs_warp.geometry.camera import Camera
     from egs_warp.render import render_gaussians
-    from egs_warp.training.likeness import psnr
+    from egs_warp.training.metrics import psnr
 
     random = np.random.default_rng(2)
     floor = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
@@ -256,21 +256,21 @@ def test_finetuning_clears_the_plane_and_keeps_the_looks() -> None:
         np.full(len(points), 3.0),
         random.uniform(-0.8, 0.8, (len(points), 1, 3)),
     )
-    before, eta = reach_across(ball, floor)
+    before, eta = plane_extents(ball, floor)
     crossing = float(np.maximum(eta - np.abs(before), 0.0).sum())
     assert (np.abs(before) < eta).sum() > 20
     cameras = foot_ring(ball, floor, size=72)[::3]
-    options = ClearingOptions(iterations=120, subdivisions=0, weight=3.0)
-    tuned = clear_plane(ball, floor, Clearing.FINETUNE, cameras=cameras, options=options)
+    options = StraddlingOptions(iterations=120, subdivisions=0, weight=3.0)
+    tuned = clear_plane(ball, floor, StraddlingPolicy.FINETUNE, cameras=cameras, options=options)
     hasty = replace(options, iterations=3)
     cut, left = (
-        clear_plane(ball, floor, Clearing.FINETUNE, cameras=cameras, options=replace(hasty, cut_rest=cut_rest))
+        clear_plane(ball, floor, StraddlingPolicy.FINETUNE, cameras=cameras, options=replace(hasty, cut_rest=cut_rest))
         for cut_rest in (True, False)
     )
     straddles = np.abs(before) < eta
     assert np.array_equal(cut.means.numpy()[~straddles], left.means.numpy()[~straddles])
     assert (floor.heights(cut.means.numpy())[straddles] > floor.heights(left.means.numpy())[straddles]).mean() > 0.9
-    after, eta = reach_across(tuned, floor)
+    after, eta = plane_extents(tuned, floor)
     assert float(np.maximum(eta - np.abs(after), 0.0).sum()) < 0.35 * crossing
     assert (after > 0.0).all()
     camera = Camera.look_at(np.array([0.3, -3.0, 1.0]), np.array([0.0, 0.0, 0.5]), floor.normal, width=96, height=96)

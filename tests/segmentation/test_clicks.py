@@ -11,11 +11,11 @@ from egs_warp.commands.object_flag import read_object
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
-from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.io import read_cameras
 from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
-from egs_warp.segmentation.above_plane import AbovePlane, clicked_parts, hanging_parts
+from egs_warp.segmentation.above_plane import SceneAbovePlane, clicked_parts, detached_parts
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -81,7 +81,7 @@ def test_a_click_that_just_misses_means_the_nearest_part() -> None:
     """Within a tenth of the object's size; one further off means none, one that hits what it hits most of."""
     parts = np.repeat([0, 1, 2], [1500, 1500, 100])
     places = [shell() - [0.7, 0.0, 0.0], shell() + [0.7, 0.0, 0.0], 0.1 * shell(100) + [0.0, 0.9, 0.0]]
-    scene, indices = AbovePlane.of(round_ones(np.concatenate(places), 0.02), FLOOR), np.arange(3100)
+    scene, indices = SceneAbovePlane.of(round_ones(np.concatenate(places), 0.02), FLOOR), np.arange(3100)
 
     def meant(point: tuple[float, float, float], hits: list[int]) -> list[int]:
         at = Click(np.array(point), np.array(hits, int))
@@ -150,7 +150,7 @@ def test_leaves_that_hang_in_the_air_go_along_and_what_stands_beside_does_not() 
     gap = 0.045
     hanging, standing = leaf + [0.56 + gap, 0.0, 0.5], leaf * [1, 1, 1.5] + [0.0, 0.62, 0.09]
     things = round_ones(np.concatenate([shell(), hanging, standing]), 0.012)
-    cloud = joined(things, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05)))
+    cloud = concatenate(things, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05)))
     found = segment(cloud, FLOOR, ObjectSpec.of_clicks([click(cloud, (0.0, -0.5, 0.5))]))
     assert found.object_mask[1500:1560].all()
     assert not found.object_mask[1560:1620].any()
@@ -164,9 +164,9 @@ def test_what_hangs_in_the_air_is_held_by_what_is_near() -> None:
     size = 1.7
     near, far = (leaf + [0.5 + gap * size, 0.0, 0.5] for gap in (1.6 / 64.0, 2.6 / 64.0))
     low = leaf + thing[np.argmin(np.abs(thing[:, 2] - 0.05))] * [1.08, 1.08, 1.0]
-    scene = AbovePlane.of(round_ones(np.concatenate([thing, near, far + [0, 0, 0.3], low]), 0.01), FLOOR)
+    scene = SceneAbovePlane.of(round_ones(np.concatenate([thing, near, far + [0, 0, 0.3], low]), 0.01), FLOOR)
     parts = np.repeat([0, 1, 2, 3], [800, 2, 2, 2])
-    assert hanging_parts(scene, np.arange(806), parts, np.array([0]), size).tolist() == [1]
+    assert detached_parts(scene, np.arange(806), parts, np.array([0]), size).tolist() == [1]
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ def test_a_hand_that_hangs_apart_is_held_by_the_nearest(count: int, post: float 
             np.column_stack([post + 0.05 * np.cos(angle.ravel()), 0.05 * np.sin(angle.ravel()), height.ravel()])
         )
     things = round_ones(np.concatenate(parts), 0.02)
-    cloud = joined(things, lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.05)))
+    cloud = concatenate(things, lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.05)))
     found = segment(cloud, FLOOR, ObjectSpec.of_clicks([click(cloud, (0.0, -0.5, 0.5))]), size=1.7)
     assert found.object_mask[1500 : 1500 + count].mean() == float(goes_along)
     assert not found.object_mask[1500 + count : things.count].any()
@@ -198,7 +198,7 @@ def test_the_plane_lies_below_the_lowest_click() -> None:
     side = np.column_stack([np.full(across.size, 0.9), across.ravel(), up_to.ravel()])
     slab = [level((-0.9, -0.9), (0.9, 0.9), 0.4, 0.04), *(side * [sign, 1, 1] for sign in (-1, 1))]
     slab += [one[:, [1, 0, 2]] for one in slab[1:]]
-    cloud = joined(
+    cloud = concatenate(
         round_ones(np.concatenate([shell() + [0.0, 0.0, 0.4], *slab]), 0.025),
         lying(level((-3.0, -3.0), (3.0, 3.0), 0.0, 0.06)),
     )
@@ -242,7 +242,7 @@ def test_a_click_on_a_shadow_takes_no_leg_along() -> None:
     across, out = np.meshgrid(np.linspace(-0.12, 0.12, 9), np.linspace(-0.72, -0.2, 19))
     tongue = [np.column_stack([across.ravel(), out.ravel(), np.full(across.size, z)]) for z in (0.03, 0.05)]
     things = round_ones(np.concatenate([shell(), *tongue]), 0.025)
-    cloud = joined(things, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05)))
+    cloud = concatenate(things, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05)))
     top, tip = click(cloud, (0.0, -0.35, 0.85)), click(cloud, (0.0, -0.7, 0.06), inside=False)
     along = segment(cloud, FLOOR, ObjectSpec.of_clicks([top]))
     found = segment(cloud, FLOOR, ObjectSpec.of_clicks([top, tip]))
@@ -263,7 +263,7 @@ def test_a_click_on_a_shadow_at_the_foot_of_a_thin_leg_leaves_the_leg() -> None:
     shadow = [np.column_stack([across.ravel(), out.ravel(), np.full(across.size, z)]) for z in (0.03, 0.05)]
     head = 0.6 * shell() + [0.0, 0.0, 0.68]
     things = round_ones(np.concatenate([head, leg, *shadow]), 0.025)
-    cloud = joined(things, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05)))
+    cloud = concatenate(things, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05)))
     top, beside = click(cloud, (0.0, -0.28, 1.05)), click(cloud, (0.0, -0.3, 0.06), inside=False)
     found = segment(cloud, FLOOR, ObjectSpec.of_clicks([top, beside]))
     means = things.means.numpy()

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.capture import read_capture
-from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
+from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, with_measured_ground
 from egs_warp.segmentation import ground as module
 from egs_warp.segmentation.ground import MeasuredGround, measure_ground
 from egs_warp.segmentation.object_mask import segment
@@ -36,7 +36,7 @@ def folds() -> tuple[GaussianCloud, np.ndarray]:
 @pytest.fixture(scope="module")
 def located(folds: tuple[GaussianCloud, np.ndarray]) -> LocatedPlane:
     cloud, _ = folds
-    return on_its_ground(cloud, locate_plane(cloud, BALL, up=UP), BALL)
+    return with_measured_ground(cloud, locate_plane(cloud, BALL, up=UP), BALL)
 
 
 def test_the_plane_of_folds_is_level(located: LocatedPlane) -> None:
@@ -93,7 +93,7 @@ def on_flat(flat: tuple[GaussianCloud, np.ndarray]) -> tuple[LocatedPlane, Locat
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("egs_warp.pipelines.locate_plane.measure_ground", noted)
-        same = on_its_ground(cloud, located, BALL)
+        same = with_measured_ground(cloud, located, BALL)
     (measured,) = seen
     return located, same, measured
 
@@ -126,7 +126,7 @@ def test_real_grounds_that_are_flat_stay_planes(data_dir: Path, file: str, click
     but views of them differ by 1.1 %.
     """
     cloud, spec = read_capture(data_dir / "scenes" / file).cloud, ObjectSpec(point=np.array(click))
-    located = on_its_ground(cloud, locate_plane(cloud, spec), spec)
+    located = with_measured_ground(cloud, locate_plane(cloud, spec), spec)
     assert located.ground is None
     assert any("taken as flat" in note for note in located.notes) == (file == "koala.ply")
 
@@ -142,7 +142,7 @@ def test_ground_reaches_up_to_what_stands_on_it() -> None:
     beside = sheet(np.array([[0.0, 1.5, -0.1]]), np.array([[0.0, 0.0, 1.0]]), 0.035, (0.8, 0.3, 0.2))
     size = np.sqrt(3.0)
     # Something that hangs down beside the field is not what stands on it.
-    raised = measured.touched_by(joined(thing, beside), size)
+    raised = measured.touched_by(concatenate(thing, beside), size)
     means = thing.means.numpy().astype(np.float64)
     assert field.heights(means).min() > 0.035 and abs(raised.heights(means).min()) < 0.002
     lifted = raised.nodes()[..., 2]
@@ -164,10 +164,10 @@ def test_what_the_object_hid_is_not_taken_for_ground(scale: float) -> None:
         sheet(part, np.repeat(up, len(part), axis=0), gap, (0.5, 0.5, 0.5))
         for part, gap in ((top, 0.04), (below, 0.08))
     ]
-    bare = joined(*floors)
+    bare = concatenate(*floors)
     eye = scale * np.array([0.3, -0.3, 4.0])
     camera = Camera.look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]), width=64, height=64, near=0.01 * scale)
-    seen = module._seen_points(joined(bare, ball()).scaled(scale), bare.scaled(scale), camera, LEVEL)
+    seen = module._seen_points(concatenate(bare, ball()).scaled(scale), bare.scaled(scale), camera, LEVEL)
     assert len(seen) > 1000 and np.abs(seen[:, 2]).max() < 0.05 * scale
 
 

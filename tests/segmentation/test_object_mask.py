@@ -13,11 +13,11 @@ from egs_warp.commands.object_flag import read_mask, read_object
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
-from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
-from egs_warp.segmentation import floor_shreds
+from egs_warp.segmentation import floor_remnants
 from egs_warp.segmentation import object_mask as module
 from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import Box, ObjectSpec
@@ -68,15 +68,17 @@ def test_fine_specks_in_the_floor_s_colour_are_no_shreds_of_it() -> None:
     thing, floor = shell(), level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.05)
     angles = np.linspace(0.0, 5.0, 6)
     specks = np.column_stack([0.3 * np.cos(angles), 0.3 * np.sin(angles), np.full(6, 0.09)])
-    whole = joined(joined(round_ones(thing, 0.004), round_ones(specks[:3], 0.012)), round_ones(specks[3:], 0.06))
-    whole = joined(whole, lying(floor))
+    whole = concatenate(
+        concatenate(round_ones(thing, 0.004), round_ones(specks[:3], 0.012)), round_ones(specks[3:], 0.06)
+    )
+    whole = concatenate(whole, lying(floor))
     tones = np.where(np.arange(whole.count) < 1500, -1.0, 0.0)
     whole = GaussianCloud.from_numpy(
         *(each.numpy() for each in (whole.means, whole.rotations, whole.log_scales, whole.opacity_logits)),
         tones[:, None, None] + np.zeros((1, 1, 3)),
     )
     mine = np.arange(whole.count) < 1506
-    found = floor_shreds.wisps(module.AbovePlane.of(whole, FLOOR), mine, np.sqrt(3.0))
+    found = floor_remnants.floor_remnants(module.SceneAbovePlane.of(whole, FLOOR), mine, np.sqrt(3.0))
     assert np.flatnonzero(found).tolist() == [1503, 1504, 1505]
 
 
@@ -219,7 +221,7 @@ def test_real_captures_from_one_click(
 def test_a_click_finds_what_is_small_in_a_large_room(width: float) -> None:
     """A ball of one unit between walls that are far apart: guesses of its size are halved until it is found."""
     cloud, truth = ball_on_floor()
-    whole = joined(cloud, walls(width, cloud.sh.shape[1]))
+    whole = concatenate(cloud, walls(width, cloud.sh.shape[1]))
     check(whole, np.arange(whole.count) < truth.sum(), ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
 
 
@@ -235,7 +237,7 @@ def test_a_click_finds_what_is_flat_in_a_room() -> None:
     overlooks it, and half of that is about right.
     """
     lens = round_ones(shell() * [1.0, 1.0, 0.1], 0.02)
-    whole = joined(joined(lens, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05))), walls(11.3, 1))
+    whole = concatenate(concatenate(lens, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05))), walls(11.3, 1))
     found = segment(whole, FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 0.1])))
     assert found.object_mask[: lens.count].mean() > 0.9 and not found.object_mask[lens.count :].any()
 
@@ -248,7 +250,7 @@ def test_the_unit_of_length_changes_nothing() -> None:
     angles = np.arange(6)
     shreds = np.column_stack([0.3 * np.cos(angles), 0.3 * np.sin(angles), np.full(6, 0.09)])
     under = np.random.default_rng(0).normal(0.0, 0.05, (30, 3)) - [0.0, 0.0, 0.2]
-    whole = joined(joined(cloud, round_ones(shreds, 0.1)), round_ones(under, 0.02))
+    whole = concatenate(concatenate(cloud, round_ones(shreds, 0.1)), round_ones(under, 0.02))
     tone = np.where(np.arange(whole.count) < truth.sum(), -1.0, 1.0)
     whole = GaussianCloud.from_numpy(
         whole.means.numpy(),
@@ -273,7 +275,7 @@ def test_what_hangs_beside_is_a_floater_only_where_it_is_small() -> None:
     mine = shell()
     other = mine + [1.13, 0.0, 0.0]
     floater = np.array([[0.0, -0.62, 0.5]])
-    whole = joined(
+    whole = concatenate(
         round_ones(np.concatenate([mine, other, floater]), 0.01), lying(level((-1.0, -1.0), (2.2, 1.0), 0.0, 0.05))
     )
     found = segment(whole, FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 1.0])), size=np.sqrt(3.0))
@@ -290,7 +292,9 @@ def test_loose_matter_behind_a_hole_is_the_bodys() -> None:
     away = np.linalg.norm(skin - [0.5, 0.0, 0.5], axis=1)
     skin = skin[away > 0.085]
     inside = np.random.default_rng(0).normal(0.0, 0.05, (30, 3)) + [0.0, 0.0, 0.5]
-    whole = joined(round_ones(np.concatenate([skin, inside]), 0.02), lying(level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.05)))
+    whole = concatenate(
+        round_ones(np.concatenate([skin, inside]), 0.02), lying(level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.05))
+    )
     found = segment(whole, FLOOR, ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
     assert found.object_mask[len(skin) : len(skin) + 30].all()
 
@@ -300,7 +304,9 @@ def test_the_floor_closes_a_bell_from_below() -> None:
     skin = shell(3000)
     dome = skin[skin[:, 2] > 0.5] - [0.0, 0.0, 0.5]
     inside = np.random.default_rng(0).normal(0.0, 0.03, (30, 3)) + [0.0, 0.0, 0.25]
-    whole = joined(round_ones(np.concatenate([dome, inside]), 0.02), lying(level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.05)))
+    whole = concatenate(
+        round_ones(np.concatenate([dome, inside]), 0.02), lying(level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.05))
+    )
     found = segment(whole, FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 0.5])))
     assert found.object_mask[len(dome) : len(dome) + 30].all()
 
@@ -316,9 +322,9 @@ def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
     beside[:, 2] = random.normal(0.0, 0.001, len(beside))
     away = np.concatenate([level((-8.0, -8.0), (0.0, 8.0), 0.04, 0.1), level((4.0, -8.0), (8.0, 8.0), 0.04, 0.1)])
     under = level((1.6, -1.4), (2.4, -0.6), 0.04, 0.01)
-    whole = joined(round_ones(thing, 0.02), lying(np.concatenate([beside, away, under])))
-    scene_ = module.AbovePlane.of(whole, FLOOR)
-    top = floor_shreds.floor_top(scene_, np.arange(whole.count) < len(thing), np.sqrt(2.0))
+    whole = concatenate(round_ones(thing, 0.02), lying(np.concatenate([beside, away, under])))
+    scene_ = module.SceneAbovePlane.of(whole, FLOOR)
+    top = floor_remnants.floor_scatter_height(scene_, np.arange(whole.count) < len(thing), np.sqrt(2.0))
     assert top == pytest.approx(0.003, rel=0.15)
 
 
@@ -327,8 +333,10 @@ def test_hardly_any_floor_says_nothing_of_its_roughness() -> None:
     for count, rough in ((19, False), (20, True)):
         place = np.linspace(0.7, 1.2, count)
         floor = np.column_stack([place, np.zeros(count), np.full(count, 0.01)])
-        whole = joined(round_ones(shell(), 0.02), lying(floor))
-        top = floor_shreds.floor_top(module.AbovePlane.of(whole, FLOOR), np.arange(whole.count) < 1500, np.sqrt(3.0))
+        whole = concatenate(round_ones(shell(), 0.02), lying(floor))
+        top = floor_remnants.floor_scatter_height(
+            module.SceneAbovePlane.of(whole, FLOOR), np.arange(whole.count) < 1500, np.sqrt(3.0)
+        )
         assert top == pytest.approx(0.01 if rough else 0.0, abs=1e-6)
 
 

@@ -10,11 +10,11 @@ import warp as wp
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera_ring import ring_cameras
-from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
-from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
+from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, with_measured_ground
 from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
-from egs_warp.segmentation.clearance import Clearing
+from egs_warp.segmentation.clearance import StraddlingPolicy
 from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.segmentation.resting_plane import resting_plane
@@ -45,7 +45,9 @@ def box_on_haze(degrees: float) -> GaussianCloud:
     normal = leaning(degrees)
     haze = level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.1)
     haze[:, 2] = 0.05 - haze[:, 0] * normal[0] / normal[2]
-    return joined(round_ones(skin_of_box(), 0.008), sheet(haze, np.tile(normal, (len(haze), 1)), 0.06, (0.9, 0.9, 0.9)))
+    return concatenate(
+        round_ones(skin_of_box(), 0.008), sheet(haze, np.tile(normal, (len(haze), 1)), 0.06, (0.9, 0.9, 0.9))
+    )
 
 
 def degrees_between(one: np.ndarray, other: np.ndarray) -> float:
@@ -113,7 +115,7 @@ def test_haze_alone_carries_nothing() -> None:
 def found_on(cloud: GaussianCloud) -> LocatedPlane:
     cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.25]), 0.9, count=8, elevations=(20.0, 50.0), size=200)
     spec = ObjectSpec(point=np.array([0.0, 0.0, 0.45]))
-    return on_its_ground(cloud, locate_plane(cloud, spec, cameras=cameras), spec, cameras)
+    return with_measured_ground(cloud, locate_plane(cloud, spec, cameras=cameras), spec, cameras)
 
 
 def test_where_what_is_seen_is_not_level_the_plane_is_laid_under_the_object() -> None:
@@ -132,7 +134,7 @@ def test_shreds_about_a_foot_on_haze_are_dropped_and_haze_stays() -> None:
     at = np.array([[0.54, 0.1, 0.04], [0.52, -0.1, 0.03], [1.6, 0.9, 0.0]])
     shreds = round_ones(at, 0.01)
     for degrees, dropped in ((8.0, [True, True, False]), (3.0, [False, False, False])):
-        cloud = joined(box_on_haze(degrees), shreds)
+        cloud = concatenate(box_on_haze(degrees), shreds)
         found = found_on(cloud)
         assert found.in_sight is not any(dropped)
         segmentation = found.segmentation
@@ -147,7 +149,7 @@ def test_haze_is_not_filled() -> None:
     cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.25]), 0.9, count=8, elevations=(20.0, 50.0), size=200)
     spec = ObjectSpec(point=np.array([0.0, 0.0, 0.45]))
     scene = prepare_scene(
-        box_on_haze(8.0), spec, cameras=cameras, options=SceneOptions(clearing=Clearing.SPLIT), plane=None
+        box_on_haze(8.0), spec, cameras=cameras, options=SceneOptions(clearing=StraddlingPolicy.SPLIT), plane=None
     )
     assert scene.filled is None and not scene.located.in_sight
     assert "was not filled, as no view tells" in scene.notes[-1]
@@ -159,7 +161,7 @@ def test_haze_within_an_object_is_dropped_with_it() -> None:
     where = np.array([[0.0, 0.1, 0.6], [0.1, 0.0, 0.4]])
     haze = round_ones(where, 0.2)
     haze = replace(haze, opacity_logits=wp.array(np.full(2, -1.5, np.float32)))
-    found = segment(joined(cloud, haze), FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 0.5])))
+    found = segment(concatenate(cloud, haze), FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 0.5])))
     assert found.floater_mask[-2:].all()
     assert found.object_mask[: cloud.count][truth].mean() > 0.95
 
@@ -175,7 +177,7 @@ def test_haze_at_an_object_in_its_colour_is_dropped_with_it() -> None:
         opacity_logits=wp.array(np.full(3, -1.5, np.float32)),
         sh=wp.array(np.array([grey, bright, grey])[:, None, None] * np.ones((3, 1, 3)), dtype=wp.vec3),
     )
-    found = segment(joined(cloud, haze), FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 0.5])))
+    found = segment(concatenate(cloud, haze), FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 0.5])))
     assert found.floater_mask[-3:].tolist() == [True, False, False]
     assert not found.object_mask[-3:].any()
 
@@ -188,7 +190,7 @@ def test_haze_about_an_object_is_not_taken_along() -> None:
     for opacity, taken in ((0.2, False), (0.9, True)):
         haze = round_ones(where, 0.2)
         logits = np.full(30, np.log(opacity / (1.0 - opacity)), np.float32)
-        both = joined(
+        both = concatenate(
             cloud,
             GaussianCloud.from_numpy(where, haze.rotations.numpy(), haze.log_scales.numpy(), logits, haze.sh.numpy()),
         )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
 from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.segmentation import table_top as module
@@ -82,7 +82,7 @@ def test_dust_far_away_changes_no_candidate(room: GaussianCloud, candidates: lis
         np.full(4000, -3.0),
         np.zeros((4000, *room.sh.shape[1:], 3)),
     )
-    found = planes_below(joined(room, dust), UP, MIDDLE)
+    found = planes_below(concatenate(room, dust), UP, MIDDLE)
     assert [plane.offset for plane in found] == [plane.offset for plane in candidates]
 
 
@@ -94,7 +94,7 @@ def on_surface(points: np.ndarray, spacing: float, cover: float) -> float:
     flat = sheet(points, np.tile(UP, (len(points), 1)), spacing, (0.5, 0.5, 0.5))
     # A Gaussian's opacity adds up to 2 pi s1 s2 times its peak.
     full = 2.0 * np.pi * flat.opacities()[0] * np.exp(2.0 * float(flat.log_scales.numpy()[0, 0])) / spacing**2
-    whole = joined(
+    whole = concatenate(
         thing, sheet(points, np.tile(UP, (len(points), 1)), spacing * np.sqrt(cover / full), (0.5, 0.5, 0.5))
     )
     whole = GaussianCloud.from_numpy(

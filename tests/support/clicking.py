@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.segmentation.clicks import Click, click_at
 from tests.support.grounds import level
 from tests.support.scenes import lying, round_ones, shell
@@ -18,7 +18,9 @@ def balls(tones: tuple[float, float], between: float = SPAN) -> GaussianCloud:
     """Two balls of one unit on a floor, in greys of their own; each has 1500 Gaussians, the left one first."""
     skin = shell()
     left, right = skin - [0.5 * between, 0.0, 0.0], skin + [0.5 * between, 0.0, 0.0]
-    cloud = joined(round_ones(np.concatenate([left, right]), 0.025), lying(level((-2.0, -1.5), (2.0, 1.5), 0.0, 0.05)))
+    cloud = concatenate(
+        round_ones(np.concatenate([left, right]), 0.025), lying(level((-2.0, -1.5), (2.0, 1.5), 0.0, 0.05))
+    )
     sh = cloud.sh.numpy()
     sh[:1500], sh[1500:3000] = tones
     return GaussianCloud.from_numpy(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from egs_warp.locomotion.complementarity import SEPARATE, ContactLayout
-from egs_warp.locomotion.contact_pieces import ContactPieces
+from egs_warp.locomotion.contact_modes import CoulombProgram
 from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
 
@@ -19,7 +19,7 @@ FRICTION = 0.8
 class SmallProblem:
     """A program and the mechanics behind it; units of weight and speed are 1."""
 
-    pieces: ContactPieces
+    pieces: CoulombProgram
     program: ContactProgram
     shift: np.ndarray
 
@@ -58,7 +58,7 @@ def small_problem(
     P[m, m] += 1e-3
     offset = frame @ base
     offset[::3] += shift
-    pieces = ContactPieces(
+    pieces = CoulombProgram(
         *(P, 2.0 * rows.T @ gap, float(gap @ gap), frame @ response, offset, FRICTION),
         *(-np.ones(activations), np.ones(activations)),
     )

@@ -14,12 +14,12 @@ from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.rollout import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
-from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import Ground
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.stance import GroundFrame
 from egs_warp.muscles.muscle_set import automatic_muscles
 from egs_warp.pipelines.creature import Creature, make_creature
 from tests.support.meshes import UP
-from tests.support.places import DT, FLOOR
+from tests.support.stances import DT, FLOOR
 
 
 def coarse_pawn(*, friction: float = 0.8, device: str = "cpu") -> Creature:
@@ -33,7 +33,7 @@ class CoarseCreature:
     """A stepper, the place where its body stands, and its state there."""
 
     stepper: LocomotionStepper
-    place: Place
+    place: Stance
     start: BodyState
 
 
@@ -64,6 +64,6 @@ def coarse_creature(
     geometry = ContactGeometry(mesh, (FLOOR,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0, field=field)
     stepper = LocomotionStepper(body, muscles, geometry, device="cpu")
     start = settle(stepper) if settled else BodyState(mesh.nodes, np.zeros_like(mesh.nodes))
-    ground = Ground.on(FLOOR, forward, body.centre_of_mass(start.positions), up=up)
+    ground = GroundFrame.on_plane(FLOOR, forward, body.centre_of_mass(start.positions), up=up)
     touching = stepper.detector.points_within(start.positions, 0.01)
-    return CoarseCreature(stepper, Place(body, ground, start.positions, touching, DT), start)
+    return CoarseCreature(stepper, Stance(body, ground, start.positions, touching, DT), start)

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from egs_warp.fem.dense_factors import DenseFactors
+from egs_warp.fem.dense_cholesky import DenseCholesky
 from egs_warp.fem.elasticity import ElasticAssembly
-from egs_warp.fem.element_kernels import ElementKernels
+from egs_warp.fem.warp_elasticity import WarpElasticity
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.pipelines.creature import Creature
@@ -18,8 +18,10 @@ def on_device(
     creature: Creature, device: str, patch: pytest.MonkeyPatch, settings: LocomotionSettings | None = None
 ) -> LocomotionStepper:
     """A stepper of the ``creature``'s body and muscles on ``device``."""
-    patch.setattr("egs_warp.locomotion.stepper.factors_on", lambda _, pattern: DenseFactors(pattern, device=device))
-    patch.setattr("egs_warp.fem.elasticity.ElementVectors", ElementKernels)
+    patch.setattr(
+        "egs_warp.locomotion.stepper.linear_solver_on", lambda _, pattern: DenseCholesky(pattern, device=device)
+    )
+    patch.setattr("egs_warp.fem.elasticity.SimdElasticity", WarpElasticity)
     mesh, material = creature.body.mesh, creature.body.assembly.material
     body = replace(creature.body, assembly=ElasticAssembly(mesh, material, device=device))
     return LocomotionStepper(body, creature.muscles, creature.geometry, settings=settings, device=device)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from egs_warp.geometry.camera import Camera
-from egs_warp.pipelines.drawn import FILE, DrawnCreature
+from egs_warp.pipelines.render_data import FILE, RenderData
 from egs_warp.web.recording import Recording
 from tests.support.captures import small_cloud
 from tests.support.slides import slide
@@ -26,7 +26,7 @@ def finished_run() -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         slid.trajectory().save(folder / "trajectory.npz")
-        DrawnCreature.of(small_cloud(), camera, slid.stepper.muscles).save(folder / FILE)
+        RenderData.of(small_cloud(), camera, slid.stepper.muscles).save(folder / FILE)
         (folder / "report.json").write_text(json.dumps({"source": "block", "motion": [{"name": "jump"}], "notes": []}))
         return {path.name: path.read_bytes() for path in folder.iterdir()}
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.locomotion.trajectory import Trajectory
 from tests.support.meshes import block_mesh
-from tests.support.places import DT
+from tests.support.stances import DT
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 

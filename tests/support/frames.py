@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from egs_warp.deformation.rigid import in_body_frame
+from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
@@ -42,7 +42,7 @@ class Lying:
 
     def turned(self, turn: np.ndarray = TURN) -> Lying:
         frame = BodyFrame(turn, np.zeros(3), 1.0)
-        return Lying(in_body_frame(self.cloud, frame), frame.plane(self.plane))
+        return Lying(to_body_frame(self.cloud, frame), frame.plane(self.plane))
 
     def _with(self, means: np.ndarray) -> GaussianCloud:
         return replace(self.cloud, means=wp.array(means.astype(np.float32), dtype=wp.vec3, device=self.cloud.device))

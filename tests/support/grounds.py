@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from egs_warp.assets.surface import quaternions_from_normals
-from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from tests.support.waves import wave
 
 RADIUS = 0.5
@@ -56,7 +56,7 @@ def furnished_room() -> GaussianCloud:
     parts.append(sheet(wall, np.tile([0.0, -1.0, 0.0], (len(wall), 1)), 0.1, (0.8, 0.8, 0.75)))
     whole = parts[0]
     for part in parts[1:]:
-        whole = joined(whole, part)
+        whole = concatenate(whole, part)
     return whole
 
 
@@ -76,4 +76,4 @@ def on_folds(amplitude: float, *, length: float = 0.8, reach: float = 2.2) -> tu
     shell = ball().means.numpy().astype(np.float64)
     rest = float((wave(shell[:, :2], amplitude, length) - shell[:, 2]).max())
     thing = ball(rest)
-    return joined(thing, cloth), np.arange(thing.count + cloth.count) < thing.count
+    return concatenate(thing, cloth), np.arange(thing.count + cloth.count) < thing.count

@@ -2,13 +2,13 @@
 
 import warp as wp
 
-from egs_warp.kernels.block import wait_for_block
-from egs_warp.kernels.deformation.decomposition import column, matched_order, rotation_part, signed_as
+from egs_warp.kernels.block import sync_block
+from egs_warp.kernels.deformation.decomposition import align_signs, column, match_columns, rotation_part
 from egs_warp.kernels.locomotion import block_algebra as algebra
-from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows, find_optimum
-from egs_warp.kernels.locomotion.block_elimination import eliminate, invert_root
+from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints, find_optimum
+from egs_warp.kernels.locomotion.block_elimination import eliminate, inverse_cholesky
 from egs_warp.kernels.locomotion.block_splitting import Splitting, iterate
-from egs_warp.kernels.locomotion.piece_search import BLOCK
+from egs_warp.kernels.locomotion.mode_search import BLOCK
 from egs_warp.precision import real
 
 
@@ -20,7 +20,7 @@ def rotation_parts_kernel(maps: wp.array[wp.mat33], rotations_out: wp.array[wp.m
 
 @wp.kernel
 def orders_kernel(frames: wp.array[wp.mat33], carried: wp.array[wp.mat33], out: wp.array[wp.vec3i]):
-    out[wp.tid()] = matched_order(frames[wp.tid()], carried[wp.tid()])
+    out[wp.tid()] = match_columns(frames[wp.tid()], carried[wp.tid()])
 
 
 @wp.kernel
@@ -28,7 +28,7 @@ def signed_kernel(
     frames: wp.array[wp.mat33], orders: wp.array[wp.vec3i], carried: wp.array[wp.mat33], out: wp.array[wp.mat33]
 ):
     i = wp.tid()
-    out[i] = signed_as(frames[i], orders[i], carried[i])
+    out[i] = align_signs(frames[i], orders[i], carried[i])
 
 
 @wp.kernel(launch_bounds=BLOCK)
@@ -52,25 +52,25 @@ def algebra_kernel(
     for e in range(algebra.lane_of_block(), unknowns * unknowns, wp.block_dim()):
         product[e / unknowns, e % unknowns] = real(0.0)
         turned[e / unknowns, e % unknowns] = real(0.0)
-    wait_for_block()
-    algebra.add_product(product, matrix, symmetric, unknowns, unknowns, unknowns, 0)
-    algebra.add_product(turned, matrix, symmetric, unknowns, unknowns, unknowns, 1)
-    told[0] = invert_root(symmetric, unknowns, root)
+    sync_block()
+    algebra.gemm_add(product, matrix, symmetric, unknowns, unknowns, unknowns, 0)
+    algebra.gemm_add(turned, matrix, symmetric, unknowns, unknowns, unknowns, 1)
+    told[0] = inverse_cholesky(symmetric, unknowns, root)
     told[1] = eliminate(matrix, unknowns, columns, real(1e-12))
-    told[2] = algebra.list_marked(marks, columns, unknowns, found)
+    told[2] = algebra.compact_indices(marks, columns, unknowns, found)
     mine = real(algebra.lane_of_block() % 7)
-    told[3] = int(algebra.largest_and_place(mine, algebra.lane_of_block())[1])
-    algebra.normalise(matrix, columns, parts, shares, unknowns, lengths)
-    algebra.multiply_across(product, unknowns, unknowns, lengths, across)
+    told[3] = int(algebra.argmax_of_block(mine, algebra.lane_of_block())[1])
+    algebra.normalize_rows(matrix, columns, parts, shares, unknowns, lengths)
+    algebra.multiply_transposed(product, unknowns, unknowns, lengths, across)
 
 
 @wp.kernel(launch_bounds=BLOCK)
 def iterate_kernel(
-    rows: UnitRows, holding: Holding, splitting: Splitting, guessed: wp.array[int], ended: wp.array[int]
+    rows: UnitConstraints, holding: ActiveSet, splitting: Splitting, guessed: wp.array[int], ended: wp.array[int]
 ):
     """OSQP's iterations from the sides, which are ``guessed`` then, and the optimum from there."""
     iterate(rows, holding, splitting)
     for row in range(algebra.lane_of_block(), rows.count, wp.block_dim()):
         guessed[row] = holding.side[row]
-    wait_for_block()
+    sync_block()
     ended[0] = find_optimum(rows, holding)

@@ -1,6 +1,6 @@
-"""Small changes of the code of a room, found by the operators of cosmic-ray, and the tests that ought to notice.
+"""Small changes of the code of a package, found by the operators of cosmic-ray, and the tests that ought to notice.
 
-A place is a token that an operator would change; a room's sample is a seeded choice of places, with one change each.
+A place is a token that an operator would change; a package's sample is a seeded choice of places, with one change each.
 Places are ranked by a digest of the seed and of the line they stand on, so that an edit elsewhere leaves the sample as
 it is.
 """
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[2]
-ROOMS = ("contact", "locomotion", "fem", "deformation", "segmentation")
+PACKAGES = ("contact", "locomotion", "fem", "deformation", "segmentation")
 _ARITHMETIC = frozenset(["Add", "Sub", "Mul", "Div", "FloorDiv", "Mod", "Pow"])
 _BITS = frozenset(["BitOr", "BitAnd", "BitXor"])
 _ORDER = frozenset(["Eq", "NotEq", "Lt", "LtE", "Gt", "GtE"])
@@ -47,7 +47,7 @@ class Change:
 class Mutant:
     """One change."""
 
-    room: str
+    package: str
     file: str
     """Below the tree's root."""
     digest: str
@@ -79,9 +79,9 @@ class Mutant:
         return changed
 
 
-def files_of(room: str) -> list[Path]:
-    """Of the room and of its kernels; fast tests see nothing of what runs on a GPU alone."""
-    folders = (ROOT / "egs_warp" / room, ROOT / "egs_warp" / "kernels" / room)
+def files_of(package: str) -> list[Path]:
+    """Of the package and of its kernels; fast tests see nothing of what runs on a GPU alone."""
+    folders = (ROOT / "egs_warp" / package, ROOT / "egs_warp" / "kernels" / package)
     return sorted(
         path
         for folder in folders
@@ -90,10 +90,10 @@ def files_of(room: str) -> list[Path]:
     )
 
 
-def sample(room: str, count: int, seed: int) -> list[Mutant]:
-    """At most ``count`` mutants of a room, at as many places, in the order of their ranks."""
+def sample(package: str, count: int, seed: int) -> list[Mutant]:
+    """At most ``count`` mutants of a package, at as many places, in the order of their ranks."""
     ranked = []
-    for path in files_of(room):
+    for path in files_of(package):
         source = path.read_text()
         lines = source.splitlines()
         seen: dict[tuple[str, int], int] = defaultdict(int)
@@ -107,24 +107,24 @@ def sample(room: str, count: int, seed: int) -> list[Mutant]:
     for rank, path, source, changes in ranked:
         if len(found) == count:
             break
-        mutant = _first_that_compiles(room, path, source, changes, rank)
+        mutant = _first_that_compiles(package, path, source, changes, rank)
         if mutant is not None:
             found.append(mutant)
     return found
 
 
-def tests_of(room: str, file: str) -> list[str]:
-    """The room's test files: those whose imports reach the changed module by the shortest way first, of these the one
-    that bears its name.
+def tests_of(package: str, file: str) -> list[str]:
+    """The package's test files, ordered by their import distance to the changed module; the file named after it comes
+    first.
     """
     module = file.removesuffix(".py").replace("/", ".")
     own = f"test_{Path(file).stem}"
-    tests = (ROOT / "tests" / room).glob("test_*.py")
+    tests = (ROOT / "tests" / package).glob("test_*.py")
     nearest = sorted(tests, key=lambda path: (_distance(path, module), path.stem != own, path))
     return [path.relative_to(ROOT).as_posix() for path in nearest]
 
 
-def _first_that_compiles(room: str, path: Path, source: str, changes: list[Change], rank: str) -> Mutant | None:
+def _first_that_compiles(package: str, path: Path, source: str, changes: list[Change], rank: str) -> Mutant | None:
     """The change of a place whose turn it is by ``rank``, or the next that is Python and not the same program."""
     start = int(rank[:8], 16) % len(changes)
     for change in changes[start:] + changes[:start]:
@@ -139,7 +139,7 @@ def _first_that_compiles(room: str, path: Path, source: str, changes: list[Chang
             number, before, after = next((n, a, b) for n, (a, b) in pairs if a != b)
         place = path.relative_to(ROOT).as_posix()
         return Mutant(
-            room, place, _digest(source), change.operator, change.occurrence, number, before.strip(), after.strip()
+            package, place, _digest(source), change.operator, change.occurrence, number, before.strip(), after.strip()
         )
     return None
 

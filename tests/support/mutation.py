@@ -1,9 +1,9 @@
-"""``make mutation``: small changes of the code, one by one, that the fast tests of a room must notice.
+"""``make mutation``: small changes of the code, one by one, that the fast tests of a package must notice.
 
 ``python -m tests.mutation --help``. Each process has its own copy of the package and of the tests, and its own cache of
 kernels. What is found is kept in a session as it comes, so that a run that was cut off goes on where it stopped; a
 result holds as long as the changed file stays as it is. Survivors that are no gap are listed with reasons in
-``tests/support/survivors/``. Nothing is fetched: cosmic-ray's operators and pytest are all that it takes.
+``tests/support/surviving_mutants/``. Nothing is fetched: cosmic-ray's operators and pytest are all that it takes.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.support.mutants import ROOMS, ROOT, Mutant, sample, tests_of
-from tests.support.survivors import reason_for
+from tests.support.mutants import PACKAGES, ROOT, Mutant, sample, tests_of
+from tests.support.surviving_mutants import reason_for
 
 OUT = Path("out/mutation")
 _SEED = 20_261_123
 _FAST = "not (slow or data or example or cuda)"
 _LEAST_KILLED = 0.8
-"""Share of a room's mutants, without those that are no gap."""
+"""Share of a package's mutants, without those that are no gap."""
 _PATIENCE = 4.0
-"""Times what a room's tests take unchanged; a mutant that takes longer is killed by time."""
+"""Times what a package's tests take unchanged; a mutant that takes longer is killed by time."""
 _HEAD_START = 60.0
 """s beside that, for kernels that are compiled anew."""
 _KINDS = ("assertion", "exception", "time", "survived")
@@ -53,7 +53,7 @@ class Outcome:
 
 
 class Session:
-    """The results so far: lines of JSON, one a mutant, and the time that a room's tests take unchanged."""
+    """The results so far: lines of JSON, one a mutant, and the time that a package's tests take unchanged."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -127,7 +127,7 @@ class Copy:
         place = self.folder / mutant.file
         try:
             place.write_text(mutant.text())
-            return self.run(tests_of(mutant.room, mutant.file), limit)
+            return self.run(tests_of(mutant.package, mutant.file), limit)
         finally:
             shutil.copy2(ROOT / mutant.file, place)
 
@@ -160,8 +160,8 @@ def main() -> int:
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rooms", default=",".join(ROOMS), help="with commas between; all unless told")
-    parser.add_argument("--count", type=int, default=200, help="mutants a room (%(default)s)")
+    parser.add_argument("--packages", default=",".join(PACKAGES), help="with commas between; all unless told")
+    parser.add_argument("--count", type=int, default=200, help="mutants a package (%(default)s)")
     parser.add_argument("--seed", type=int, default=_SEED, help="of the sample (%(default)s)")
     parser.add_argument("--processes", type=int, default=1, help="at once, each with its own copy (%(default)s)")
     parser.add_argument("--minutes", type=float, default=1e6, help="no mutant begins later; those that run are ended")
@@ -169,18 +169,18 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--json", type=Path, default=OUT / "survivors.json", help="survivors (%(default)s)")
     parser.add_argument("--again", action="store_true", help="try those that survived once more")
     chosen = parser.parse_args()
-    chosen.rooms = chosen.rooms.split(",")
-    unknown = sorted(set(chosen.rooms) - set(ROOMS))
+    chosen.packages = chosen.packages.split(",")
+    unknown = sorted(set(chosen.packages) - set(PACKAGES))
     if unknown:
-        parser.error(f"no such room: {', '.join(unknown)}; there are {', '.join(ROOMS)}")
+        parser.error(f"no such package: {', '.join(unknown)}; there are {', '.join(PACKAGES)}")
     return chosen
 
 
 def _samples(chosen: argparse.Namespace) -> list[Mutant]:
-    """Of all rooms in turn, so that a run that is cut off has seen of each."""
-    with ProcessPoolExecutor(min(chosen.processes, len(chosen.rooms))) as pool:
-        rooms = len(chosen.rooms)
-        samples = list(pool.map(sample, chosen.rooms, [chosen.count] * rooms, [chosen.seed] * rooms))
+    """Of all packages in turn, so that a run that is cut off has seen of each."""
+    with ProcessPoolExecutor(min(chosen.processes, len(chosen.packages))) as pool:
+        count = len(chosen.packages)
+        samples = list(pool.map(sample, chosen.packages, [chosen.count] * count, [chosen.seed] * count))
     longest = max(map(len, samples))
     return [found[i] for i in range(longest) for found in samples if i < len(found)]
 
@@ -191,28 +191,30 @@ def _is_open(mutant: Mutant, session: Session, again: bool) -> bool:
 
 
 def _baselines(chosen: argparse.Namespace, session: Session, place: Path) -> bool:
-    """Each room's tests on the code as it is: whether they pass, how long they take, and their kernels."""
+    """Each package's tests on the code as it is: whether they pass, how long they take, and their kernels."""
     state = _digest(ROOT.joinpath(name) for name in ("egs_warp", "tests"))
     kernels = OUT / "kernels"
-    rooms = [room for room in chosen.rooms if f"{room}:{state}" not in session.baselines or not kernels.is_dir()]
+    packages = [
+        package for package in chosen.packages if f"{package}:{state}" not in session.baselines or not kernels.is_dir()
+    ]
 
-    def one(room: str) -> tuple[str, Outcome]:
-        copy = Copy(place / f"right-{room}", kernels)
-        outcome = copy.run(tests_of(room, ""), 1800.0)
-        copy.keep_kernels(place / "kernels" / room)
-        return room, outcome
+    def one(package: str) -> tuple[str, Outcome]:
+        copy = Copy(place / f"right-{package}", kernels)
+        outcome = copy.run(tests_of(package, ""), 1800.0)
+        copy.keep_kernels(place / "kernels" / package)
+        return package, outcome
 
     with ThreadPoolExecutor(chosen.processes) as pool:
-        found = list(pool.map(one, rooms))
-    for room, outcome in found:
+        found = list(pool.map(one, packages))
+    for package, outcome in found:
         if outcome.kind != "survived":
-            print(f"{room}: a test fails on the code as it is: {outcome.test or outcome.kind}")
+            print(f"{package}: a test fails on the code as it is: {outcome.test or outcome.kind}")
             return False
-        shutil.copytree(place / "kernels" / room, kernels, dirs_exist_ok=True)
-        session.add({"baseline": f"{room}:{state}", "seconds": round(outcome.seconds, 1)})
-    for room in chosen.rooms:
-        session.baselines[room] = session.baselines[f"{room}:{state}"]
-        print(f"{room}: its tests take {session.baselines[room]:.0f} s", flush=True)
+        shutil.copytree(place / "kernels" / package, kernels, dirs_exist_ok=True)
+        session.add({"baseline": f"{package}:{state}", "seconds": round(outcome.seconds, 1)})
+    for package in chosen.packages:
+        session.baselines[package] = session.baselines[f"{package}:{state}"]
+        print(f"{package}: its tests take {session.baselines[package]:.0f} s", flush=True)
     return True
 
 
@@ -227,7 +229,7 @@ def _try_all(
         except queue.Empty:
             copy = Copy(Path(tempfile.mkdtemp(dir=place)) / "tree", OUT / "kernels")
         try:
-            limit = _HEAD_START + _PATIENCE * session.baselines[mutant.room]
+            limit = _HEAD_START + _PATIENCE * session.baselines[mutant.package]
             left = deadline - time.monotonic()
             if left <= 0.0 or mutant.is_stale:
                 return
@@ -247,12 +249,14 @@ def _try_all(
 
 
 def _tell(mutants: list[Mutant], session: Session, path: Path) -> int:
-    """A table of the rooms, and the survivors as a file."""
-    print("| room | tried | by assertion | by exception | by time | survived | of these no gap | killed | s a mutant |")
+    """A table of the packages, and the survivors as a file."""
+    print(
+        "| package | tried | by assertion | by exception | by time | survived | of these no gap | killed | s a mutant |"
+    )
     print("|---|---|---|---|---|---|---|---|---|")
     survivors, short = [], False
-    for room in dict.fromkeys(mutant.room for mutant in mutants):
-        known = [mutant for mutant in mutants if mutant.room == room and mutant.key in session.results]
+    for package in dict.fromkeys(mutant.package for mutant in mutants):
+        known = [mutant for mutant in mutants if mutant.package == package and mutant.key in session.results]
         if not known:
             continue
         results = [session.results[mutant.key] for mutant in known]
@@ -264,7 +268,7 @@ def _tell(mutants: list[Mutant], session: Session, path: Path) -> int:
         share = killed / max(len(known) - no_gap, 1)
         mean = sum(result["seconds"] for result in results) / len(results)
         short |= share < _LEAST_KILLED
-        cells = (room, len(known), *count.values(), no_gap, f"{100 * share:.0f} %", f"{mean:.1f}")
+        cells = (package, len(known), *count.values(), no_gap, f"{100 * share:.0f} %", f"{mean:.1f}")
         print("| " + " | ".join(map(str, cells)) + " |")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(survivors, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""Deliberately wrong formulas, each with the test that must notice: what ``tests/test_teeth.py`` tries one by one.
+"""Deliberately wrong formulas, each with the test that must notice; ``tests/test_formula_mutations.py`` tries them.
 
 A formula of the package that is rewritten has its line rewritten here too: the mutation must still be the formula,
 wrong.
@@ -47,7 +47,7 @@ EQUATIONS: dict[int, Mutation] = {
             "contact/test_detection.py::test_endpoints_are_shortened_to_the_plane_at_rest",
         ),
         (
-            *(4, "the weight's factor dt", "contact/newton_room.py"),
+            *(4, "the weight's factor dt", "contact/host_newton.py"),
             *("state.velocities + problem.dt * problem", "state.velocities + 1.01 * problem.dt * problem"),
             "fem/test_step_problem.py::test_free_fall_follows_the_discrete_parabola",
         ),
@@ -80,7 +80,7 @@ EQUATIONS: dict[int, Mutation] = {
             "contact/test_detection.py::test_coulomb_forces_on_random_problems",
         ),
         (
-            *(10, "the normal measure of the foreseen contact", "contact/response.py"),
+            *(10, "the normal measure of the foreseen contact", "contact/newton.py"),
             *(
                 "(self._regular, speeds, shift, friction, start)",
                 "(self._regular, speeds, shift + 0.1, friction, start)",
@@ -110,8 +110,8 @@ EQUATIONS: dict[int, Mutation] = {
         (
             *(15, "the turn of the colour", "kernels/deformation/deformer.py"),
             *(
-                "result.turn = quaternion_of(turned * wp.transpose(axes))",
-                "result.turn = quaternion_of(axes * wp.transpose(turned))",
+                "result.turn = quaternion_from_rotation(turned * wp.transpose(axes))",
+                "result.turn = quaternion_from_rotation(axes * wp.transpose(turned))",
             ),
             "deformation/test_deformer.py::test_a_turned_cage_turns_shape_and_colour_exactly",
         ),
@@ -156,11 +156,11 @@ BESIDE_THE_PAPER: list[Mutation] = [
     Mutation(what, f"egs_warp/{file}", right, wrong, f"tests/{test}")
     for what, file, right, wrong, test in [
         (
-            *("SSIM's window", "training/likeness.py", "(2 * 1.5**2)", "(2 * 1.6**2)"),
+            *("SSIM's window", "training/metrics.py", "(2 * 1.5**2)", "(2 * 1.6**2)"),
             "training/test_finetune.py::test_ssim_equals_scikit_images",
         ),
         (
-            *("SSIM's constants", "training/likeness.py", "0.01**2, 0.03**2", "0.01**2, 0.01**2"),
+            *("SSIM's constants", "training/metrics.py", "0.01**2, 0.03**2", "0.01**2, 0.01**2"),
             "training/test_finetune.py::test_ssim_equals_scikit_images",
         ),
         (
@@ -263,7 +263,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("balance: the margin of the footprint", "motions/stance.py"),
-            *("0.5 * MARGIN * (seen.support[1]", "0.5 * (seen.support[1]"),
+            *("0.5 * SUPPORT_MARGIN * (seen.support[1]", "0.5 * (seen.support[1]"),
             "motions/test_stance.py::test_the_nearest_end_of_a_step_that_does_not_tip",
         ),
         (
@@ -283,7 +283,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("twist: the spin of the standing body, not of the crouched one", "motions/twist.py"),
-            *("return inertia @ spin_that_turns(", "return seen.inertia @ spin_that_turns("),
+            *("return inertia @ spin_for_rotation(", "return seen.inertia @ spin_for_rotation("),
             "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
         ),
         (
@@ -307,12 +307,12 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "muscles/test_muscle_set.py::test_radial_fibres_lengthen_by_poissons_ratio",
         ),
         (
-            *("radial fibres: how far out they end", "muscles/tube.py"),
+            *("radial fibres: how far out they end", "muscles/branch_cylinder.py"),
             *("_RADIUS_FRACTION * reach * outwards", "0.5 * reach * outwards"),
             "muscles/test_muscle_set.py::test_radial_fibres_are_diameters_spread_over_length_and_directions",
         ),
         (
-            *("radial fibres: spread over the directions", "muscles/tube.py"),
+            *("radial fibres: spread over the directions", "muscles/branch_cylinder.py"),
             *("diameter * count // (2 * self.detail.diameters)", "0"),
             "muscles/test_muscle_set.py::test_radial_fibres_are_diameters_spread_over_length_and_directions",
         ),

@@ -8,14 +8,14 @@ import numpy as np
 
 from egs_warp.contact.coupled_step import CoupledResult, CoupledSolver
 from egs_warp.contact.detection import ContactDetector, ContactGeometry
-from egs_warp.contact.points import ContactPoints
-from egs_warp.contact.response import ContactResponse
+from egs_warp.contact.newton import ContactLinearization
+from egs_warp.contact.selection import ContactSelector
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.muscles.tension import MuscleEnergy
 
 ABYSS = Plane(np.array([0.0, 0.0, 1.0]), 1e9)
 """A ground that nothing reaches."""
@@ -27,7 +27,7 @@ class PassiveBody:
 
     body: SoftBody
     solver: CoupledSolver
-    factors: SparseFactors
+    factors: MultifrontalLdl
     state: BodyState
     points: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     """(n,) of the last step."""
@@ -35,18 +35,18 @@ class PassiveBody:
     """(n, 3) newtons."""
 
     def advance(
-        self, dt: float, tension: MuscleTension | None = None, *, drag: float = 0.0
+        self, dt: float, tension: MuscleEnergy | None = None, *, drag: float = 0.0
     ) -> tuple[StepProblem, CoupledResult]:
         """One step of ``dt`` seconds."""
         body, state, solver = self.body, self.state, self.solver
         problem = StepProblem(body, state, dt, drag)
         gaps, _ = solver.detector.gaps(problem.end_positions(state.velocities + dt * body.gravity))
-        chosen = solver.points.choose(self.points, self.forces[:, 0] > 0.0, gaps)
+        chosen = solver.points.select(self.points, self.forces[:, 0] > 0.0, gaps)
         contacts = solver.detector.contact_set(chosen, state.positions)
-        tangent = problem.tangent(self.factors, problem.start, tension)
-        start = solver.points.matched(chosen, self.points, self.forces)
-        response = ContactResponse.of(tangent, contacts)
-        result = solver.solve(response, tension, velocities=problem.start, forces=start)
+        tangent = problem.tangent(self.factors, problem.rigid_guess, tension)
+        start = solver.points.transfer_forces(chosen, self.points, self.forces)
+        response = ContactLinearization.of(tangent, contacts)
+        result = solver.solve(response, tension, velocities=problem.rigid_guess, forces=start)
         self.state = BodyState(problem.end_positions(result.velocities), result.velocities, state.time + dt)
         self.points, self.forces = result.contacts.points, result.forces
         return problem, result
@@ -72,12 +72,12 @@ def passive_body(
     height = body.height
     solver = CoupledSolver(
         ContactDetector(geometry, device=device),
-        ContactPoints(geometry, near=0.01 * height, lower=1e-3 * height),
+        ContactSelector(geometry, near=0.01 * height, lower=1e-3 * height),
         push_out_cap=0.05 * float(np.sqrt(np.linalg.norm(body.gravity) * height)),
         penetration_tolerance=5e-3 * height,
         tolerance=tolerance,
     )
-    factors = SparseFactors(body.assembly.upper_pattern)
+    factors = MultifrontalLdl(body.assembly.upper_pattern)
     return PassiveBody(body, solver, factors, state or BodyState(nodes, np.zeros_like(nodes)))
 
 

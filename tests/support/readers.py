@@ -1,6 +1,6 @@
 """Every reader of strangers' files, with good files to begin from and what a file that is read must fulfil.
 
-``tests/support/damage.py`` makes inputs of them.
+``tests/support/corruption.py`` makes inputs of them.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from tests.support.creatures import coarse_creature
 from tests.support.meshes import box_mesh
-from tests.support.places import FORWARD
+from tests.support.stances import FORWARD
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,6 @@ def coarse_block_run(script: str, field: HeightField | None = None) -> Run:
         made.start,
         sequence,
         frames=asked.frames(),
-        finished=lambda: sequence.finished,
+        finished=lambda: sequence.is_finished,
     )
     return Run(made.place.body, sequence, done.trajectory, done.reports)

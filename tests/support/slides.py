@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from egs_warp.fem.body import BodyState
-from egs_warp.locomotion.objectives import SpinObjective, centre_of_mass_velocity, node_velocities
+from egs_warp.locomotion.objectives import AngularMomentumObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from tests.support.creatures import coarse_creature
 from tests.support.meshes import block_mesh
-from tests.support.places import DT, FORWARD
+from tests.support.stances import DT, FORWARD
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,10 @@ def slide(*, struck: bool = False) -> Slide:
         wanted = np.array([0.0, 0.0, -0.12 * np.sin(6.0 * DT * (step + 1))])
         objectives = [
             centre_of_mass_velocity(body, wanted, 2.0),
-            SpinObjective(np.zeros(3), 5.0),
+            AngularMomentumObjective(np.zeros(3), 5.0),
             node_velocities(body, np.tile(wanted, (len(positions), 1)), 0.01),
         ]
-        state, memory, done = stepper.advance(state.kicked(kick), memory, objectives, DT)
+        state, memory, done = stepper.advance(state.with_velocity_kick(kick), memory, objectives, DT)
         assert len(done) == 1, "a kick is of one step"
         reports += done
     return Slide(stepper, start, tuple(reports), tuple(kicks))

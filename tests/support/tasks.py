@@ -12,10 +12,10 @@ from threadpoolctl import threadpool_info
 
 from egs_warp.errors import ArgumentError
 from egs_warp.launching import available_threads
-from egs_warp.pipelines.crew import Tell
+from egs_warp.pipelines.worker_pool import ProgressCallback
 
 
-def square(task: int, tell: Tell) -> int:
+def square(task: int, tell: ProgressCallback) -> int:
     """Told on the way; refuses 3, cannot send what it makes of 4."""
     tell(task, 2 * task)
     if task == 3:
@@ -33,7 +33,7 @@ class Dying:
     def __init__(self, folder: Path, deaths: dict[int, int]) -> None:
         self.folder, self.deaths = folder, deaths
 
-    def __call__(self, task: int, tell: Tell) -> int:
+    def __call__(self, task: int, tell: ProgressCallback) -> int:
         with (self.folder / f"{task}").open("a") as file:
             file.write("x")
         if len((self.folder / f"{task}").read_text()) <= self.deaths.get(task, 0):
@@ -41,7 +41,7 @@ class Dying:
         return task
 
 
-def threads(task: Any, tell: Tell) -> dict[str, Any]:
+def threads(task: Any, tell: ProgressCallback) -> dict[str, Any]:
     """How many threads a worker has."""
     import numpy
 
@@ -51,7 +51,7 @@ def threads(task: Any, tell: Tell) -> dict[str, Any]:
     return {"blas": blas, "available": available_threads(), "process": os.getpid()}
 
 
-def sleeping(folder: str, tell: Tell) -> None:
+def sleeping(folder: str, tell: ProgressCallback) -> None:
     """Writes its process's number down, then sleeps for minutes."""
     (Path(folder) / str(os.getpid())).touch()
     time.sleep(300)

@@ -18,7 +18,7 @@ from egs_warp.training.finetune import (  # noqa: E402
     FinetuneResult,
     TrainingView,
     finetune,
-    views_of_capture,
+    render_views,
 )
 
 OPTIONS = FinetuneOptions(
@@ -27,8 +27,8 @@ OPTIONS = FinetuneOptions(
     densification=Densification.RELOCATION,
     max_gaussians=90,
     sh_steps=60,
-    tones=True,
-    leave_out_misfits=True,
+    fit_exposure=True,
+    exclude_outliers=True,
     seed=3,
 )
 CUTS = (17, 104, 209)
@@ -40,8 +40,8 @@ def one_thread(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("egs_warp.training.checkpoint.SECONDS", 0.0)
     monkeypatch.setattr("egs_warp.training.checkpoint._SHARE", 1e9)
     # One view in ten is left out early, whichever it is.
-    monkeypatch.setattr("egs_warp.training.misfits._TIMES_MEDIAN", 1.0)
-    monkeypatch.setattr("egs_warp.training.misfits._SPREADS", 0.1)
+    monkeypatch.setattr("egs_warp.training.outlier_views._TIMES_MEDIAN", 1.0)
+    monkeypatch.setattr("egs_warp.training.outlier_views._SPREADS", 0.1)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -51,7 +51,7 @@ def one_thread(monkeypatch: pytest.MonkeyPatch):
 @pytest.fixture(scope="module")
 def views() -> list[TrainingView]:
     """Ten of a ball."""
-    return views_of_capture(GaussianCloud.from_numpy(**ball(60), device="cpu"), ring(10, 24))
+    return render_views(GaussianCloud.from_numpy(**ball(60), device="cpu"), ring(10, 24))
 
 
 def start() -> GaussianCloud:

@@ -21,10 +21,10 @@ from egs_warp.training.finetune import (  # noqa: E402
     FinetuneOptions,
     TrainingView,
     finetune,
-    views_of_capture,
+    render_views,
 )
 from egs_warp.training.growth import Growth  # noqa: E402
-from egs_warp.training.likeness import psnr, ssim  # noqa: E402
+from egs_warp.training.metrics import psnr, ssim  # noqa: E402
 from egs_warp.training.relocation import Population  # noqa: E402
 
 
@@ -36,7 +36,7 @@ def mean_psnr(cloud: GaussianCloud, views: list[TrainingView]) -> float:
 
 def test_a_disturbed_capture_is_restored_from_its_own_renders() -> None:
     values = ball()
-    views = views_of_capture(GaussianCloud.from_numpy(**values, device="cpu"), ring())
+    views = render_views(GaussianCloud.from_numpy(**values, device="cpu"), ring())
     random = np.random.default_rng(1)
     disturbed = values | {
         "sh": values["sh"] + random.normal(0, 0.4, values["sh"].shape),
@@ -51,7 +51,7 @@ def test_a_disturbed_capture_is_restored_from_its_own_renders() -> None:
 
 def test_training_repeats_to_the_bit() -> None:
     values = ball(60)
-    views = views_of_capture(GaussianCloud.from_numpy(**values, device="cpu"), ring(3, 32))
+    views = render_views(GaussianCloud.from_numpy(**values, device="cpu"), ring(3, 32))
     options = FinetuneOptions(iterations=130, densification=Densification.RELOCATION, max_gaussians=80, seed=3)
     start = GaussianCloud.from_numpy(**ball(60, seed=5), device="cpu")
     threads = torch.get_num_threads()
@@ -69,7 +69,7 @@ def test_only_the_trainable_change_and_scales_stay_above_their_floor() -> None:
     values = ball(50)
     values["log_scales"][:, 2] = -14.0
     cloud = GaussianCloud.from_numpy(**values, device="cpu")
-    views = views_of_capture(GaussianCloud.from_numpy(**ball(50, seed=2), device="cpu"), ring(2))
+    views = render_views(GaussianCloud.from_numpy(**ball(50, seed=2), device="cpu"), ring(2))
     trainable = np.arange(50) < 20
     result = finetune(cloud, views, options=FinetuneOptions(iterations=10), trainable=trainable).cloud
     moved = np.any(result.means.numpy() != cloud.means.numpy(), axis=1)
@@ -157,7 +157,7 @@ def test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared() -> None:
     population = Population(
         tensors, dict.fromkeys(tensors, rate), extent=1.0, generator=torch.Generator().manual_seed(1)
     )
-    population.evolve(0, 1000, Growth(1, 3 * count, "cpu"))
+    population.relocate(0, 1000, Growth(1, 3 * count, "cpu"))
     axes = rotation_matrices(turn[None])[0]
     shape = axes @ np.diag(scales**2) @ axes.T
     for moved, opacity in zip(tensors["means"].numpy().astype(float).reshape(3, count, 3), opacities, strict=True):

@@ -13,7 +13,7 @@ from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import write_cameras
 from egs_warp.render import render_gaussians
-from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane, reach_across
+from egs_warp.segmentation.clearance import StraddlingOptions, StraddlingPolicy, clear_plane, plane_extents
 from tests.support.scenes import FLOOR, ball_on_floor
 
 
@@ -48,14 +48,14 @@ def test_photographs_beside_the_cameras_clear_the_plane(tmp_path: Path) -> None:
     tuned = clear_plane(
         thing,
         FLOOR,
-        Clearing.FINETUNE,
+        StraddlingPolicy.FINETUNE,
         views=photographs,
         surroundings=cloud.subset(~truth),
-        options=ClearingOptions(iterations=60, subdivisions=0, weight=3.0),
+        options=StraddlingOptions(iterations=60, subdivisions=0, weight=3.0),
     )
 
     def crossing(one: GaussianCloud) -> float:
-        heights, reach = reach_across(one, FLOOR)
+        heights, reach = plane_extents(one, FLOOR)
         return float(np.maximum(reach - np.abs(heights), 0.0).sum())
 
     assert thing.count - 10 <= tuned.count <= thing.count

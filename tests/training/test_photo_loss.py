@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 torch = pytest.importorskip("torch")
-from egs_warp.training.likeness import ssim  # noqa: E402
+from egs_warp.training.metrics import ssim  # noqa: E402
 from egs_warp.training.photo_loss import PhotoLoss, Target  # noqa: E402
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from egs_warp.web.session import Session
 from tests.support.chromium import started
-from tests.support.lives import coarse_pawn, session_of
+from tests.support.live_sessions import coarse_pawn, session_of
 
 
 @pytest.fixture(scope="session")

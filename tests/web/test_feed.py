@@ -18,8 +18,8 @@ from egs_warp.launching import THREADS, available_threads
 from egs_warp.web.feed import live_camera
 from egs_warp.web.server import LARGEST_MESSAGE, PageServer
 from egs_warp.web.session import Session
-from tests.support.lives import coarse_pawn, session_of
-from tests.support.living import living, needs_page
+from tests.support.live_pages import living, needs_page
+from tests.support.live_sessions import coarse_pawn, session_of
 
 
 def _socket(server: PageServer, token: str | None = None) -> ClientConnection:

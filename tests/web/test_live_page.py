@@ -14,7 +14,7 @@ from egs_warp.motions.style import Style
 from egs_warp.web.feed import LiveFeed
 from egs_warp.web.session import Session
 from tests.support.chromium import opened, wait_until
-from tests.support.living import in_browser, living, watched
+from tests.support.live_pages import in_browser, living, watched
 from tests.support.pages import served
 
 

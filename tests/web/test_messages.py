@@ -11,19 +11,19 @@ from egs_warp.motions.style import Style
 from egs_warp.web.messages import (
     Cancel,
     Change,
-    Go,
-    Hit,
+    GoTo,
     Message,
     Pause,
-    Perform,
+    PlayScript,
     Pull,
+    PushOnce,
     Record,
     Release,
+    RequestScript,
     Restyle,
     StandUp,
     Steer,
     Step,
-    TellScript,
     read_message,
 )
 
@@ -35,11 +35,11 @@ def _read(**message: Any) -> Message:
 @pytest.mark.parametrize(
     ("message", "expected"),
     [
-        ({"type": "go", "x": 1, "y": -0.5}, Go((1.0, -0.5))),
+        ({"type": "go", "x": 1, "y": -0.5}, GoTo((1.0, -0.5))),
         ({"type": "pull", "node": 9, "x": 0, "y": 1, "z": 2.5}, Pull(9, (0.0, 1.0, 2.5))),
         ({"type": "release"}, Release()),
-        ({"type": "push", "x": 0.2, "y": 0, "z": -0.1}, Hit((0.2, 0.0, -0.1))),
-        ({"type": "push", "x": 0, "y": 1, "z": 0, "height": 0.9}, Hit((0.0, 1.0, 0.0), 0.9)),
+        ({"type": "push", "x": 0.2, "y": 0, "z": -0.1}, PushOnce((0.2, 0.0, -0.1))),
+        ({"type": "push", "x": 0, "y": 1, "z": 0, "height": 0.9}, PushOnce((0.0, 1.0, 0.0), 0.9)),
         ({"type": "set", "friction": 0.3}, Change(friction=0.3)),
         ({"type": "set", "sag": 0.02, "friction": 0}, Change(friction=0.0, sag=0.02)),
         ({"type": "style", "squash": 1.5}, Restyle(Style(squash=1.5))),
@@ -51,7 +51,7 @@ def _read(**message: Any) -> Message:
         ({"type": "cancel"}, Cancel()),
         ({"type": "stand"}, StandUp()),
         ({"type": "record", "on": False}, Record(False)),
-        ({"type": "script"}, TellScript()),
+        ({"type": "script"}, RequestScript()),
     ],
 )
 def test_each_message_is_read(message: dict[str, Any], expected: Message):
@@ -60,7 +60,7 @@ def test_each_message_is_read(message: dict[str, Any], expected: Message):
 
 def test_motions_are_those_of_scripts():
     asked = _read(type="motion", text="hop x2, jump 0.5 height=0.3")
-    assert isinstance(asked, Perform)
+    assert isinstance(asked, PlayScript)
     assert [(request.name, request.repeat) for request in asked.script.requests] == [("hop", 2), ("jump", 1)]
     assert asked.script.requests[1].asked["height"] == 0.3
 

@@ -14,10 +14,10 @@ import pytest
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.creature import changed_creature
 from egs_warp.pipelines.report import AUDIT_LIMITS
-from egs_warp.web.messages import Pause, Perform, Step, read_message
+from egs_warp.web.messages import Pause, PlayScript, Step, read_message
 from egs_warp.web.packets import Frame
 from egs_warp.web.session import Session
-from tests.support.lives import Played, coarse_pawn, session_of
+from tests.support.live_sessions import SteppedSession, coarse_pawn, session_of
 
 
 def _wait(session: Session, woken: threading.Event, seen: list, done: Callable[[], bool]) -> None:
@@ -27,7 +27,7 @@ def _wait(session: Session, woken: threading.Event, seen: list, done: Callable[[
         assert time.monotonic() < end, [one for one in seen if not isinstance(one, Frame)]
         woken.wait(0.2)
         woken.clear()
-        seen += session.waiting()
+        seen += session.take_news()
 
 
 @pytest.mark.slow
@@ -36,20 +36,20 @@ def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
     woken, seen = threading.Event(), []
     session.start()
     time.sleep(0.1)
-    assert session.waiting() == [] and session.state.time == 0.0
+    assert session.take_news() == [] and session.state.time == 0.0
     try:
-        session.watch(woken.set)
+        session.subscribe(woken.set)
         _wait(session, woken, seen, lambda: any(isinstance(one, dict) for one in seen))
         assert isinstance(seen[0], Frame)
         message = read_message({"type": "motion", "text": "jump 0 0.1"}, height=1.0, node_count=1)
-        assert isinstance(message, Perform)
-        session.ask(message)
+        assert isinstance(message, PlayScript)
+        session.put_request(message)
         _wait(session, woken, seen, lambda: any(isinstance(one, dict) and one.get("doing") == "jump" for one in seen))
         # Nobody watches: it waits where it is, and goes on from there.
-        session.unwatch()
+        session.unsubscribe()
         held = _held(session)
-        session.watch(woken.set)
-        seen = session.waiting()
+        session.subscribe(woken.set)
+        seen = session.take_news()
         assert isinstance(seen[0], Frame) and seen[0].time == held
         rested = lambda: any(isinstance(one, dict) and one.get("resting") for one in seen)  # noqa: E731
         _wait(session, woken, seen, rested)
@@ -78,14 +78,14 @@ def _held(session: Session) -> float:
 def test_a_pause_holds_it_and_a_step_is_one_step(tmp_path: Path):
     session = session_of(coarse_pawn(), tmp_path)
     woken, seen = threading.Event(), []
-    session.ask(Pause(True))
+    session.put_request(Pause(True))
     session.start()
     try:
-        session.watch(woken.set)
+        session.subscribe(woken.set)
         _wait(session, woken, seen, lambda: any(isinstance(one, dict) and one.get("paused") for one in seen))
         assert session.state.time == 0.0
         for count in (1, 2, 3):
-            session.ask(Step())
+            session.put_request(Step())
             _wait(session, woken, seen, lambda: session.state.time > (count - 0.5) / 60.0)  # noqa: B023
         time.sleep(0.2)
         assert session.state.time == pytest.approx(3.0 / 60.0)
@@ -95,7 +95,7 @@ def test_a_pause_holds_it_and_a_step_is_one_step(tmp_path: Path):
 
 def test_it_is_no_faster_than_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     session = session_of(coarse_pawn(), tmp_path)
-    made = Played(coarse_pawn(), tmp_path)
+    made = SteppedSession(coarse_pawn(), tmp_path)
     made.step()
     result = (made.session.state, made.session._memory, [made.session.report])
     monkeypatch.setattr(type(session.creature.stepper), "advance", lambda *_: result)
@@ -104,7 +104,7 @@ def test_it_is_no_faster_than_the_clock(tmp_path: Path, monkeypatch: pytest.Monk
     session.start()
     try:
         began = time.monotonic()
-        session.watch(woken.set)
+        session.subscribe(woken.set)
         _wait(session, woken, seen, lambda: len([one for one in seen if isinstance(one, Frame)]) > 32)
         # It may catch up what two steps were late.
         assert time.monotonic() - began > 27 / 60.0
@@ -113,7 +113,7 @@ def test_it_is_no_faster_than_the_clock(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_frames_tell_what_the_solver_did(tmp_path: Path):
-    played = Played(coarse_pawn(), tmp_path)
+    played = SteppedSession(coarse_pawn(), tmp_path)
     played.step(3)
     frame, session = played.frames[-1], played.session
     report = session.report
@@ -129,7 +129,7 @@ def test_frames_tell_what_the_solver_did(tmp_path: Path):
 
 
 def test_friction_and_stiffness_change_under_it(tmp_path: Path):
-    played = Played(coarse_pawn(), tmp_path)
+    played = SteppedSession(coarse_pawn(), tmp_path)
     played.step(2)
     before = played.session.state
     young = played.session.creature.body.young_modulus
@@ -148,7 +148,7 @@ def test_friction_and_stiffness_change_under_it(tmp_path: Path):
         played.step()
         assert played.session.report is not None and played.session.report.converged
     assert played.session.steering.doing == "jump"
-    assert played.session.standing()["friction"] == 0.3 and played.session.standing()["sag"] == 0.025
+    assert played.session.state_message()["friction"] == 0.3 and played.session.state_message()["sag"] == 0.025
     # What is asked again changes nothing.
     made = played.session.creature
     played.ask("set", sag=0.025)
@@ -165,7 +165,7 @@ def test_a_changed_creature_is_that_which_would_have_been_made():
 def test_a_solver_that_fails_does_not_end_the_session(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    played = Played(coarse_pawn(), tmp_path)
+    played = SteppedSession(coarse_pawn(), tmp_path)
     played.step(2)
 
     def fail(*_: object) -> None:
@@ -182,19 +182,19 @@ def test_a_solver_that_fails_does_not_end_the_session(
 
 
 def test_a_page_that_takes_nothing_loses_the_oldest_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("egs_warp.web.post._MOST_WAITING", 5)
+    monkeypatch.setattr("egs_warp.web.mailbox._MOST_WAITING", 5)
     session = session_of(coarse_pawn(), tmp_path)
-    session.watch(lambda: None)
+    session.subscribe(lambda: None)
     for _ in range(8):
         session.advance()
-    times = [round(60.0 * one.time) for one in session.waiting() if isinstance(one, Frame)]
+    times = [round(60.0 * one.time) for one in session.take_news() if isinstance(one, Frame)]
     assert times == [4, 5, 6, 7, 8]
 
 
 @pytest.mark.slow
 def test_a_push_strikes_it_in_the_next_step_and_its_take_passes_the_audit(tmp_path: Path):
     """What is told moves the centre of mass, the head turns it; whoever is at rest wakes, and keeps its feet."""
-    played = Played(coarse_pawn(), tmp_path)
+    played = SteppedSession(coarse_pawn(), tmp_path)
     session, body = played.session, played.session.creature.body
     played.until(lambda: session.resting)
     played.ask("push", x=0.05, y=-0.1, z=0.0)
@@ -224,7 +224,7 @@ def test_a_push_strikes_it_in_the_next_step_and_its_take_passes_the_audit(tmp_pa
 
 
 def test_a_push_that_waits_is_dropped_where_the_creature_stands_up_anew(tmp_path: Path):
-    played = Played(coarse_pawn(), tmp_path)
+    played = SteppedSession(coarse_pawn(), tmp_path)
     played.ask("push", x=0.3, y=0.0, z=0.0)
     played.ask("stand")
     played.step()

@@ -7,7 +7,7 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.web.spring import STIFFNESS, STRONGEST, Spring
-from tests.support.lives import coarse_pawn
+from tests.support.live_sessions import coarse_pawn
 
 
 def test_force_is_that_of_a_spring_up_to_its_strongest():
@@ -45,7 +45,9 @@ def test_a_step_under_a_pull_has_its_impulse_and_its_torque():
     high = BodyState(body.mesh.nodes + [0.0, 0.0, 3.0], np.zeros_like(body.mesh.nodes))
     spring.target = high.positions[spring.node] + [0.2, 0.1, 0.0]
     dt = 1.0 / 60.0
-    after, _, reports = stepper.advance(high.kicked(spring.kick(high, dt)), stepper.initial_memory(), [], dt)
+    after, _, reports = stepper.advance(
+        high.with_velocity_kick(spring.kick(high, dt)), stepper.initial_memory(), [], dt
+    )
     assert reports[-1].contacts.count == 0 and len(reports) == 1
     force = spring.force(high)
     momentum = body.mass * body.centre_of_mass(after.velocities)

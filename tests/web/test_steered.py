@@ -14,7 +14,7 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.stance import sole_shares
 from egs_warp.web.session import Session
 from tests.support.chromium import wait_until
-from tests.support.living import KEEP_SENT, in_browser, watched
+from tests.support.live_pages import KEEP_SENT, in_browser, watched
 
 _FAR = "Math.hypot(...egs.stages[0].middle.toArray().map((x, k) => x - {}[k])) > 0.01"
 """The centre of mass is no longer there."""

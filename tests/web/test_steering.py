@@ -9,20 +9,20 @@ import pytest
 
 from egs_warp.errors import UserError
 from egs_warp.motions.command import Drive
-from egs_warp.motions.drive import Driven
+from egs_warp.motions.drive import LiveDrive
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.script import motion
 from egs_warp.motions.stance import sole_shares
 from egs_warp.motions.style import PRESETS, Style
-from egs_warp.pipelines.creature import first_place
-from egs_warp.web.steering import ARRIVED, ASIDE, Journey, Steering
+from egs_warp.pipelines.creature import initial_stance
+from egs_warp.web.steering import ARRIVED, ASIDE, MotionScheduler, PointNavigation
 from tests.support.creatures import coarse_creature
-from tests.support.lives import Played, coarse_pawn
+from tests.support.live_sessions import SteppedSession, coarse_pawn
 from tests.support.meshes import stool
 
 
 def test_what_is_asked_meanwhile_takes_the_place_of_what_was_to_come(tmp_path: Path):
-    played = Played(coarse_pawn(), tmp_path)
+    played = SteppedSession(coarse_pawn(), tmp_path)
     played.ask("motion", text="jump 0 0.1, hop")
     played.step()
     assert (played.session.steering.doing, played.session.steering.queued) == ("jump", "hop")
@@ -40,25 +40,25 @@ def test_what_is_asked_meanwhile_takes_the_place_of_what_was_to_come(tmp_path: P
 
 def test_it_is_driven_until_something_else_is_asked(tmp_path: Path):
     """A command waits for the motion that goes on; the next command, or motion, takes its place."""
-    played = Played(coarse_pawn(), tmp_path)
+    played = SteppedSession(coarse_pawn(), tmp_path)
     steering = played.session.steering
     played.ask("drive", forward=0.1)
     assert steering.queued == "drive" and not steering.idle
     played.step(2)
     driven = steering._act.motion
-    assert steering.doing == "drive" and steering.queued is None and isinstance(driven, Driven)
+    assert steering.doing == "drive" and steering.queued is None and isinstance(driven, LiveDrive)
     assert driven.command == Drive(0.1) and steering.driven == [0.0] and steering.begun == []
     played.ask("drive", turn=0.1)
     played.step()
     assert driven.command == Drive(turn=0.1) and steering._act.motion is driven
     played.ask("motion", text="jump 0 0.1")
     played.step()
-    assert driven.command.stands and (steering.doing, steering.queued) == ("drive", "jump")
+    assert driven.command.is_zero and (steering.doing, steering.queued) == ("drive", "jump")
 
 
 @pytest.mark.slow
 def test_what_was_driven_stands_once_it_is_told_to(tmp_path: Path):
-    played = Played(coarse_pawn(), tmp_path)
+    played = SteppedSession(coarse_pawn(), tmp_path)
     played.ask("drive", forward=0.1)
     played.step(60)
     played.ask("drive")
@@ -68,7 +68,7 @@ def test_what_was_driven_stands_once_it_is_told_to(tmp_path: Path):
 
 def test_a_style_is_of_the_motions_that_begin_after_it(tmp_path: Path):
     """A jump that goes on keeps its own; what stands up anew, or is made anew, keeps the style."""
-    played = Played(coarse_pawn(), tmp_path)
+    played = SteppedSession(coarse_pawn(), tmp_path)
     session = played.session
     played.ask("motion", text="jump 0 0.1, jump 0 0.1")
     played.step()
@@ -76,7 +76,7 @@ def test_a_style_is_of_the_motions_that_begin_after_it(tmp_path: Path):
     assert isinstance(usual, Jump)
     played.ask("style", **PRESETS["heavy"])
     played.step()
-    assert session.steering._act.motion is usual and session.standing()["style"] == PRESETS["heavy"]
+    assert session.steering._act.motion is usual and session.state_message()["style"] == PRESETS["heavy"]
     played.ask("stand")
     played.ask("set", friction=0.5)
     played.ask("motion", text="jump 0 0.1, walk 0.1")
@@ -90,7 +90,7 @@ def test_a_style_is_of_the_motions_that_begin_after_it(tmp_path: Path):
 
 
 def test_a_motion_that_the_body_cannot_do_is_told(tmp_path: Path):
-    played = Played(coarse_pawn(), tmp_path)
+    played = SteppedSession(coarse_pawn(), tmp_path)
     played.ask("motion", text="walk to 9,9 0.01, jump")
     played.step()
     assert played.told == ["walk: the way takes more than 400 paces; choose a shorter one"]
@@ -100,12 +100,12 @@ def test_a_motion_that_the_body_cannot_do_is_told(tmp_path: Path):
 
 def test_a_journey_turns_first_and_then_jumps_straight_at_its_goal():
     creature = coarse_pawn()
-    place = first_place(creature)
+    place = initial_stance(creature)
     feet = sole_shares(place.body, place.ground, place.standing) @ place.standing
     ahead, left = place.ground.axes[:2]
 
     def leg(way: np.ndarray):
-        return Journey((feet + way)[:2], walks=False).leg(place)
+        return PointNavigation((feet + way)[:2], walks=False).next_part(place)
 
     aside = leg(1.0 * left)
     assert aside is not None and aside.request.name == "twist"
@@ -121,33 +121,33 @@ def test_a_journey_turns_first_and_then_jumps_straight_at_its_goal():
 
 
 def test_a_journey_that_comes_no_nearer_is_given_up():
-    place = first_place(coarse_pawn())
-    journey = Journey(np.array([3.0, 0.0]), walks=False)
+    place = initial_stance(coarse_pawn())
+    journey = PointNavigation(np.array([3.0, 0.0]), walks=False)
     with pytest.raises(UserError, match="go: it comes no nearer than"):
         for _ in range(10):
-            journey.leg(place)
+            journey.next_part(place)
 
 
 def test_a_body_with_feet_walks_there():
     """To where it lies, ahead and aside as it is, at most a leg's length at once."""
     place = coarse_creature(stool(), forward=np.array([0.9, 0.3, 0.0]), sag=0.01, strength=20.0, settled=False).place
-    steering = Steering(place, print)
+    steering = MotionScheduler(place, print)
     assert steering.walks
     feet, height = sole_shares(place.body, place.ground, place.standing) @ place.standing, place.body.height
     way = height * (0.3 * place.ground.axes[0] - 0.4 * place.ground.axes[1])
-    leg = Journey((feet + way)[:2], walks=True).leg(place)
+    leg = PointNavigation((feet + way)[:2], walks=True).next_part(place)
     assert leg is not None and leg.request.name == "walk to"
     assert (leg.request.asked["ahead"], leg.request.asked["left"]) == (pytest.approx(0.3), pytest.approx(-0.4))
-    leg = Journey((feet + 4.0 * way)[:2], walks=True).leg(place)
+    leg = PointNavigation((feet + 4.0 * way)[:2], walks=True).next_part(place)
     assert leg is not None and leg.request.asked["ahead"] == pytest.approx(0.8 * 0.6)
-    assert Journey((feet + 0.2 * way)[:2], walks=True).leg(place) is None
+    assert PointNavigation((feet + 0.2 * way)[:2], walks=True).next_part(place) is None
     steering.perform(motion("walk 0.1"))
     assert steering.queued == "walk"
 
 
 @pytest.mark.slow
 def test_a_click_sends_it_there(tmp_path: Path):
-    played = Played(coarse_pawn(), tmp_path)
+    played = SteppedSession(coarse_pawn(), tmp_path)
     body = played.session.creature.body
     place = played.session.steering.place
     feet = sole_shares(place.body, place.ground, place.standing)

@@ -8,7 +8,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def contact_rows_kernel(
+def contact_jacobian_kernel(
     # In:
     counts: wp.array[int],
     nodes: wp.array2d[wp.vec4i],
@@ -28,7 +28,7 @@ def contact_rows_kernel(
 
 
 @wp.kernel
-def contact_speeds_kernel(
+def contact_velocities_kernel(
     # In:
     counts: wp.array[int],
     nodes: wp.array2d[wp.vec4i],
@@ -53,7 +53,7 @@ def contact_speeds_kernel(
 
 
 @wp.kernel
-def contact_pushes_kernel(
+def nodal_forces_kernel(
     # In:
     counts: wp.array[int],
     nodes: wp.array2d[wp.vec4i],

@@ -6,13 +6,13 @@ Each problem has a block of threads to itself on a GPU, one thread on a CPU; wha
 
 import warp as wp
 
-from egs_warp.kernels.block import wait_for_block
+from egs_warp.kernels.block import sync_block
 from egs_warp.kernels.contact.coulomb_block import (
     BLOCK,
-    SWEPT,
-    in_block,
-    missed_by_block,
-    shared_room,
+    MAX_SWEPT_CONTACTS,
+    is_gpu,
+    residual_by_block,
+    shared_memory,
     speeds_by_block,
     sweep_by_block,
 )
@@ -35,7 +35,7 @@ rate leaves it."""
 _BOLD = wp.constant(12)
 """Whole steps of each attempt but the first."""
 _HALVINGS = wp.constant(10)
-_SWEPT = wp.constant(SWEPT)
+_SWEPT = wp.constant(MAX_SWEPT_CONTACTS)
 _LEAST = wp.constant(real(1e-5))
 """Pivots on the diagonal of the equations, whose entries are about 1, that are larger are taken without exchange."""
 _LESS = wp.constant(real(1e-4))
@@ -101,7 +101,7 @@ def speeds_of(contacts: Contacts, i: int, forces: wp.array[real]):
 
 
 @wp.func
-def asked_of(contacts: Contacts, i: int, forces: wp.array[real], velocity: Vec3):
+def projected_force(contacts: Contacts, i: int, forces: wp.array[real], velocity: Vec3):
     """The force that contact ``i``'s own normal and tangents ask for at its ``velocity``, m/s, shifted (Eq. 8, 9)."""
     n = 3 * i
     normal = wp.max(forces[n] - velocity[0] / contacts.delassus[n, n], real(0.0))
@@ -123,47 +123,49 @@ def sweep(contacts: Contacts, sweeps: int, forces: wp.array[real]):
         for i in range(contacts.count):
             n = 3 * i
             speeds = speeds_of(contacts, i, forces)
-            normal_speed = speeds[0] + contacts.free[n]
+            normal_speed = speeds[0] + contacts.free_velocity[n]
             velocity = Vec3(
-                normal_speed + contacts.shifts[i], speeds[1] + contacts.free[n + 1], speeds[2] + contacts.free[n + 2]
+                normal_speed + contacts.normal_bias[i],
+                speeds[1] + contacts.free_velocity[n + 1],
+                speeds[2] + contacts.free_velocity[n + 2],
             )
-            asked = asked_of(contacts, i, forces, velocity)
+            asked = projected_force(contacts, i, forces, velocity)
             for t in range(3):
                 forces[n + t] = asked[t]
 
 
 @wp.func
-def missed(contacts: Contacts, forces: wp.array[real], scale: real, length: real, newton: Newton):
+def projection_residual(contacts: Contacts, forces: wp.array[real], scale: real, length: real, newton: Newton):
     """Value f - projection of f - rate u at ``length`` of the step from ``forces``; its largest part and its norm, both
     in m/s."""
-    if in_block() == 1:
-        return missed_by_block(
+    if is_gpu() == 1:
+        return residual_by_block(
             contacts.delassus, contacts.friction, contacts.count, forces, newton.velocities, newton.step,
-            newton.change, scale, length, newton.values,
+            newton.velocity_change, scale, length, newton.residual,
         )  # fmt: skip
     for i in range(contacts.count):
         n = 3 * i
         rate = rate_of(contacts, i, scale)
         normal = forces[n] + length * newton.step[n]
-        trial = normal - rate * (newton.velocities[n] + length * newton.change[n])
-        newton.values[n] = normal - wp.max(trial, real(0.0))
+        trial = normal - rate * (newton.velocities[n] + length * newton.velocity_change[n])
+        newton.residual[n] = normal - wp.max(trial, real(0.0))
         radius = contacts.friction * wp.max(normal, real(0.0))
         f1 = forces[n + 1] + length * newton.step[n + 1]
         f2 = forces[n + 2] + length * newton.step[n + 2]
-        first = f1 - rate * (newton.velocities[n + 1] + length * newton.change[n + 1])
-        second = f2 - rate * (newton.velocities[n + 2] + length * newton.change[n + 2])
+        first = f1 - rate * (newton.velocities[n + 1] + length * newton.velocity_change[n + 1])
+        second = f2 - rate * (newton.velocities[n + 2] + length * newton.velocity_change[n + 2])
         pull = wp.sqrt(first * first + second * second)
         share = real(1.0)
         if pull > radius:
             share = radius / pull
-        newton.values[n + 1] = f1 - share * first
-        newton.values[n + 2] = f2 - share * second
+        newton.residual[n + 1] = f1 - share * first
+        newton.residual[n + 2] = f2 - share * second
     most = real(0.0)
     square = real(0.0)
     for i in range(contacts.count):
         rate = rate_of(contacts, i, scale)
         for t in range(3):
-            speed = newton.values[3 * i + t] / rate
+            speed = newton.residual[3 * i + t] / rate
             most = wp.max(most, wp.abs(speed))
             square += speed * speed
     # A maximum passes over what is no number, a sum does not.
@@ -176,60 +178,60 @@ def missed(contacts: Contacts, forces: wp.array[real], scale: real, length: real
 def find_step(contacts: Contacts, forces: wp.array[real], scale: real, short: real, newton: Newton):
     """A Newton step from the values at ``forces``, and what it changes of the velocities."""
     solved = int(0)
-    if in_block() == 1:
+    if is_gpu() == 1:
         solved = step_by_block(
-            shared_room(), contacts.delassus, contacts.friction, contacts.count, forces, newton.velocities,
-            newton.values, scale, short, _LEAST, newton.step, newton.change,
+            shared_memory(), contacts.delassus, contacts.friction, contacts.count, forces, newton.velocities,
+            newton.residual, scale, short, _LEAST, newton.step, newton.velocity_change,
         )  # fmt: skip
         if solved == 0:
             solved = wide_step_by_block(
-                shared_room(), contacts.delassus, contacts.friction, contacts.count, forces, newton.velocities,
-                newton.values, scale, short, _LEAST, newton.step, newton.change, newton.matrix,
+                shared_memory(), contacts.delassus, contacts.friction, contacts.count, forces, newton.velocities,
+                newton.residual, scale, short, _LEAST, newton.step, newton.velocity_change, newton.matrix,
             )  # fmt: skip
     if solved == 0:
         unknowns = write_equations(contacts, forces, scale, short, newton)
         solve_equations(unknowns, newton)
-    if in_block() == 1:
-        speeds_by_block(contacts.delassus, 3 * contacts.count, newton.step, newton.change)
+    if is_gpu() == 1:
+        speeds_by_block(contacts.delassus, 3 * contacts.count, newton.step, newton.velocity_change)
         return
     for i in range(contacts.count):
         speeds = speeds_of(contacts, i, newton.step)
         for t in range(3):
-            newton.change[3 * i + t] = speeds[t]
+            newton.velocity_change[3 * i + t] = speeds[t]
 
 
 @wp.func
 def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
     """Those at ``forces``; no step is left."""
-    if in_block() == 1:
+    if is_gpu() == 1:
         speeds_by_block(contacts.delassus, 3 * contacts.count, forces, newton.velocities)
     for i in range(newton.lane, contacts.count, wp.block_dim()):
         n = 3 * i
-        if in_block() == 1:
+        if is_gpu() == 1:
             speeds = Vec3(newton.velocities[n], newton.velocities[n + 1], newton.velocities[n + 2])
         else:
             speeds = speeds_of(contacts, i, forces)
         for t in range(3):
-            newton.velocities[n + t] = speeds[t] + contacts.free[n + t]
+            newton.velocities[n + t] = speeds[t] + contacts.free_velocity[n + t]
             newton.step[n + t] = real(0.0)
-            newton.change[n + t] = real(0.0)
-        newton.velocities[n] = newton.velocities[n] + contacts.shifts[i]
-    wait_for_block()
+            newton.velocity_change[n + t] = real(0.0)
+        newton.velocities[n] = newton.velocities[n] + contacts.normal_bias[i]
+    sync_block()
 
 
 @wp.func
-def sweep_together(contacts: Contacts, sweeps: int, forces: wp.array[real], newton: Newton):
+def sweep_cooperative(contacts: Contacts, sweeps: int, forces: wp.array[real], newton: Newton):
     """``sweep`` by a block of threads. Of more contacts than ``sweep_by_block`` takes each is every lane's to work out,
     and each lane keeps the velocities of some rows up with it."""
-    if in_block() == 0:
+    if is_gpu() == 0:
         sweep(contacts, sweeps, forces)
         return
     if contacts.count == 0:
         return
     if contacts.count <= _SWEPT:
         sweep_by_block(
-            shared_room(), contacts.delassus, contacts.free, contacts.shifts, contacts.friction, contacts.count, sweeps,
-            forces,
+            shared_memory(), contacts.delassus, contacts.free_velocity, contacts.normal_bias, contacts.friction,
+            contacts.count, sweeps, forces,
         )  # fmt: skip
         return
     find_velocities(contacts, forces, newton)
@@ -238,10 +240,10 @@ def sweep_together(contacts: Contacts, sweeps: int, forces: wp.array[real], newt
         for i in range(contacts.count):
             n = 3 * i
             velocity = Vec3(newton.velocities[n], newton.velocities[n + 1], newton.velocities[n + 2])
-            asked = asked_of(contacts, i, forces, velocity)
+            asked = projected_force(contacts, i, forces, velocity)
             change = asked - Vec3(forces[n], forces[n + 1], forces[n + 2])
             # All lanes have read what they change now.
-            wait_for_block()
+            sync_block()
             for row in range(newton.lane, size, wp.block_dim()):
                 newton.velocities[row] = newton.velocities[row] + (
                     contacts.delassus[row, n] * change[0]
@@ -251,45 +253,45 @@ def sweep_together(contacts: Contacts, sweeps: int, forces: wp.array[real], newt
             if newton.lane == 0:
                 for t in range(3):
                     forces[n + t] = asked[t]
-            wait_for_block()
+            sync_block()
 
 
 @wp.func
-def move(contacts: Contacts, forces: wp.array[real], length: real, newton: Newton):
+def advance(contacts: Contacts, forces: wp.array[real], length: real, newton: Newton):
     """Go ``length`` of the step; no step is left."""
     for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
         forces[k] = forces[k] + length * newton.step[k]
-        newton.velocities[k] = newton.velocities[k] + length * newton.change[k]
+        newton.velocities[k] = newton.velocities[k] + length * newton.velocity_change[k]
         newton.step[k] = real(0.0)
-        newton.change[k] = real(0.0)
-    wait_for_block()
+        newton.velocity_change[k] = real(0.0)
+    sync_block()
 
 
 @wp.func
-def keep(contacts: Contacts, source: wp.array[real], target: wp.array[real], newton: Newton):
+def copy_vector(contacts: Contacts, source: wp.array[real], target: wp.array[real], newton: Newton):
     """``target`` is ``source`` (3n,) then."""
     for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
         target[k] = source[k]
-    wait_for_block()
+    sync_block()
 
 
 @wp.func
 def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp.array[real], newton: Newton):
     """Of one problem, see ``coulomb_kernel``; its residual."""
     least = real(wp.inf)
-    keep(contacts, forces, newton.best, newton)
+    copy_vector(contacts, forces, newton.best_forces, newton)
     for attempt in range(_ATTEMPTS + 1):
         # The last one begins at the best, once they are near enough, and takes them to rounding: in the same loop, so
         # that a GPU has the code of a step once.
         polishes = least < tolerance
         if attempt == _ATTEMPTS and not polishes:
-            keep(contacts, newton.best, forces, newton)
+            copy_vector(contacts, newton.best_forces, forces, newton)
             break
         scale = real(1.0)
         short = _FINEST
         steps = _POLISHES
         if polishes:
-            keep(contacts, newton.best, forces, newton)
+            copy_vector(contacts, newton.best_forces, forces, newton)
         else:
             scale = _RATES[attempt]
             sweeps = _MORE_SWEEPS
@@ -297,7 +299,7 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
             if attempt == 0:
                 sweeps = _FEW_SWEEPS
                 steps = iterations
-            sweep_together(contacts, sweeps, forces, newton)
+            sweep_cooperative(contacts, sweeps, forces, newton)
         find_velocities(contacts, forces, newton)
         for number in range(steps):
             if not polishes:
@@ -306,14 +308,14 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
                     short = _SHORTER
                 if attempt % 2 == 1:
                     scale = _RATES[(attempt + number) % _ATTEMPTS]
-            size = missed(contacts, forces, scale, real(0.0), newton)
+            size = projection_residual(contacts, forces, scale, real(0.0), newton)
             near = tolerance
             if polishes:
                 near = _POLISHED * tolerance
                 least = size[0]
             elif size[0] < least:
                 least = size[0]
-                keep(contacts, forces, newton.best, newton)
+                copy_vector(contacts, forces, newton.best_forces, newton)
             if size[0] < near:
                 break
             find_step(contacts, forces, scale, short, newton)
@@ -322,7 +324,7 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
                 found = int(0)
                 halvings = int(0)
                 while found == 0 and halvings < _HALVINGS:
-                    trial = missed(contacts, forces, scale, length, newton)
+                    trial = projection_residual(contacts, forces, scale, length, newton)
                     halvings += 1
                     if polishes:
                         halvings = _HALVINGS
@@ -335,7 +337,7 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
                         length *= real(0.5)
                 if found == 0:
                     break
-            move(contacts, forces, length, newton)
+            advance(contacts, forces, length, newton)
         if polishes:
             break
     for i in range(newton.lane, contacts.count, wp.block_dim()):
@@ -378,16 +380,16 @@ def coulomb_kernel(
     contacts = Contacts()
     contacts.count = counts[problem]
     contacts.delassus = delassus[problem]
-    contacts.free = free[problem]
-    contacts.shifts = shifts[problem]
+    contacts.free_velocity = free[problem]
+    contacts.normal_bias = shifts[problem]
     contacts.friction = frictions[problem]
     newton = Newton()
     newton.lane = lane
     newton.velocities = vectors[problem, 0]
-    newton.values = vectors[problem, 1]
+    newton.residual = vectors[problem, 1]
     newton.step = vectors[problem, 2]
-    newton.change = vectors[problem, 3]
-    newton.best = vectors[problem, 4]
+    newton.velocity_change = vectors[problem, 3]
+    newton.best_forces = vectors[problem, 4]
     newton.unknowns = indices[problem, 0]
     newton.pivots = indices[problem, 1]
     newton.matrix = matrices[problem]

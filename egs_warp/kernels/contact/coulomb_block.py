@@ -13,9 +13,9 @@ wp.set_module_options({"enable_backward": False})
 
 BLOCK = 256
 """Threads for each problem on a GPU."""
-SWEPT = 128
+MAX_SWEPT_CONTACTS = 128
 """Contacts at most that ``sweep_by_block`` sweeps."""
-ROOM = 5264
+SHARED_MEMORY_DOUBLES = 5264
 """Numbers in the memory that a block shares: all that it may have, which one after the other has to itself."""
 
 _RECIPROCALS = """
@@ -36,9 +36,10 @@ _RECIPROCALS = """
 """
 
 
-def on_gpu(body: str, *, otherwise: str = "") -> str:
+def gpu_or_cpu(body: str, *, otherwise: str = "") -> str:
     """``body`` by a block on a GPU, ``otherwise`` on a CPU, which never comes there."""
-    given = f"{_RECIPROCALS}    constexpr int WARPS = {BLOCK // 32}, SWEPT = {SWEPT}, ROOM = {ROOM};\n"
+    sizes = f"SWEPT = {MAX_SWEPT_CONTACTS}, ROOM = {SHARED_MEMORY_DOUBLES}"
+    given = f"{_RECIPROCALS}    constexpr int WARPS = {BLOCK // 32}, {sizes};\n"
     given += "    (void)WARPS, (void)SWEPT, (void)ROOM;\n"
     return by_block(f"#if defined(__CUDA_ARCH__)\n{given}{body}\n#else\n{otherwise}\n#endif\n")
 
@@ -50,13 +51,13 @@ def on_gpu(body: str, *, otherwise: str = "") -> str:
     return 0;
 #endif
 """)
-def in_block() -> int:
+def is_gpu() -> int:
     """Whether this is a GPU, known while it is compiled: what is another's way is left out."""
     ...
 
 
 @wp.func_native(
-    on_gpu(
+    gpu_or_cpu(
         """
     __shared__ __align__(16) double room[ROOM];
     return static_cast<unsigned>(__cvta_generic_to_shared(room));
@@ -64,13 +65,13 @@ def in_block() -> int:
         otherwise="    return 0;",
     )
 )
-def shared_room() -> wp.uint32:
+def shared_memory() -> wp.uint32:
     """Where ``ROOM`` numbers lie that the threads of a block share."""
     ...
 
 
 @wp.func_native(
-    on_gpu("""
+    gpu_or_cpu("""
     // Eight threads take turns in a row, so that a warp has four rows.
     const double *const G = delassus.data, *const x = given.data;
     const int stride = delassus.strides[0] / 8, place = own & 7, part = own >> 3;
@@ -106,7 +107,7 @@ def speeds_by_block(delassus: wp.array2d[real], size: int, given: wp.array[real]
 
 
 @wp.func_native(
-    on_gpu("""
+    gpu_or_cpu("""
     // The first warp finds the forces of a group of contacts one after the other, while the others work out the speeds
     // at the next group, to which the first adds what its own change of them, and lay out what it needs there.
     constexpr int GROUP = 5, ROWS = 3 * GROUP, PITCH = 17;
@@ -212,7 +213,7 @@ def sweep_by_block(
 
 
 @wp.func_native(
-    on_gpu(
+    gpu_or_cpu(
         """
     __shared__ double parts[2][WARPS];
     const double *const G = delassus.data, *const f = forces.data, *const u = velocities.data;
@@ -267,7 +268,7 @@ def sweep_by_block(
         otherwise="    return wp::vec_t<2, double>(0.0, 0.0);",
     )
 )
-def missed_by_block(
+def residual_by_block(
     delassus: wp.array2d[real],
     friction: real,
     count: int,

@@ -5,7 +5,7 @@ A problem has a block of threads to itself, see ``kernels.contact.coulomb``; a t
 
 import warp as wp
 
-from egs_warp.kernels.block import wait_for_block
+from egs_warp.kernels.block import sync_block
 from egs_warp.kernels.vectors import ROW_ELIMINATION, on_cpu
 from egs_warp.precision import Vec3, Vec4, real
 
@@ -25,9 +25,9 @@ class Contacts:
     """n."""
     delassus: wp.array2d[real]
     """(3n, 3n) m/(N s)."""
-    free: wp.array[real]
+    free_velocity: wp.array[real]
     """(3n,) m/s without forces."""
-    shifts: wp.array[real]
+    normal_bias: wp.array[real]
     """(n,) m/s, added to the normal velocities."""
     friction: real
 
@@ -38,12 +38,12 @@ class Newton:
 
     lane: int
     velocities: wp.array[real]
-    values: wp.array[real]
+    residual: wp.array[real]
     """(3n,) what the projection equations miss."""
     step: wp.array[real]
-    change: wp.array[real]
+    velocity_change: wp.array[real]
     """(3n,) of the velocities by a whole step."""
-    best: wp.array[real]
+    best_forces: wp.array[real]
     unknowns: wp.array[int]
     """(3n,) rows that the equations do not give at once."""
     pivots: wp.array[int]
@@ -149,19 +149,19 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, sho
             newton.unknowns[unknowns] = n
             unknowns += 1
         else:
-            newton.step[n] = -newton.values[n]
+            newton.step[n] = -newton.residual[n]
         first = forces[n + 1] - rate * newton.velocities[n + 1]
         second = forces[n + 2] - rate * newton.velocities[n + 2]
         if forces[n] <= real(0.0) and first * first + second * second > real(0.0):
-            newton.step[n + 1] = -newton.values[n + 1]
-            newton.step[n + 2] = -newton.values[n + 2]
+            newton.step[n + 1] = -newton.residual[n + 1]
+            newton.step[n + 2] = -newton.residual[n + 2]
         else:
             newton.step[n + 1] = real(0.0)
             newton.step[n + 2] = real(0.0)
             newton.unknowns[unknowns] = n + 1
             newton.unknowns[unknowns + 1] = n + 2
             unknowns += 2
-    wait_for_block()
+    sync_block()
     across = wp.min(wp.block_dim(), _ACROSS)
     for a in range(newton.lane / across, unknowns, wp.block_dim() / across):
         row = newton.unknowns[a]
@@ -188,10 +188,10 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, sho
                 own = Vec3(-contacts.friction * mine, -along[0], -along[1])
                 own[row - n] = own[row - n] + real(1.0)
         write_row(
-            contacts.delassus, newton.step, newton.values, newton.unknowns, 3 * contacts.count, unknowns, a, row,
+            contacts.delassus, newton.step, newton.residual, newton.unknowns, 3 * contacts.count, unknowns, a, row,
             weights, own, newton.lane % across, across, newton.matrix,
         )  # fmt: skip
-    wait_for_block()
+    sync_block()
     return unknowns
 
 
@@ -240,7 +240,7 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
         if 4 * panel + part < unknowns:
             pivot = pivot_row(newton.matrix, 4 * panel + part, pivots.rank, unknowns, newton.lane)
             size = wp.abs(newton.matrix[pivot, panel][part])
-            wait_for_block()
+            sync_block()
             if size > _SINGULAR * pivots.largest:
                 pivots.largest = wp.max(pivots.largest, size)
                 if pivot != pivots.rank:
@@ -248,7 +248,7 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
                         kept = newton.matrix[pivots.rank, quad]
                         newton.matrix[pivots.rank, quad] = newton.matrix[pivot, quad]
                         newton.matrix[pivot, quad] = kept
-                wait_for_block()
+                sync_block()
                 top = newton.matrix[pivots.rank, panel]
                 for a in range(pivots.rank + 1 + newton.lane, unknowns, lanes):
                     row = newton.matrix[a, panel]
@@ -257,7 +257,7 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
                     for k in range(part + 1, 4):
                         row[k] = row[k] - factor * top[k]
                     newton.matrix[a, panel] = row
-                wait_for_block()
+                sync_block()
                 newton.pivots[pivots.rank] = 4 * panel + part
                 pivots.parts[pivots.found] = part
                 pivots.found += 1
@@ -311,7 +311,7 @@ def eliminate(unknowns: int, newton: Newton):
                 for s in range(t):
                     left -= newton.matrix[first + t, panel][pivots.parts[s]] * newton.matrix[first + s, quad]
                 newton.matrix[first + t, quad] = left
-        wait_for_block()
+        sync_block()
         for a in range(pivots.rank + newton.lane / across, unknowns, lanes / across):
             shares = newton.matrix[a, panel]
             if pivots.found == 4:
@@ -327,7 +327,7 @@ def eliminate(unknowns: int, newton: Newton):
                     share = shares[pivots.parts[s]]
                     for quad in range(panel + 1 + newton.lane % across, quads, across):
                         newton.matrix[a, quad] = newton.matrix[a, quad] - share * newton.matrix[first + s, quad]
-        wait_for_block()
+        sync_block()
     return pivots
 
 

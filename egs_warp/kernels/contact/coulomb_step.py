@@ -3,7 +3,7 @@ equations of its own, eliminated eight unknowns at a time."""
 
 import warp as wp
 
-from egs_warp.kernels.contact.coulomb_block import on_gpu
+from egs_warp.kernels.contact.coulomb_block import gpu_or_cpu
 from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
@@ -300,7 +300,7 @@ _ELIMINATE = """
 
 
 @wp.func_native(
-    on_gpu(
+    gpu_or_cpu(
         f"#if __CUDA_ARCH__ < 800\n    return 0;\n#else\n{_TILES}{LIST}{_WRITE}{PRODUCTS}{_ELIMINATE}#endif\n",
         otherwise="    return 0;",
     )

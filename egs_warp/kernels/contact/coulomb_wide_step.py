@@ -3,7 +3,7 @@ equations at a time."""
 
 import warp as wp
 
-from egs_warp.kernels.contact.coulomb_block import on_gpu
+from egs_warp.kernels.contact.coulomb_block import gpu_or_cpu
 from egs_warp.kernels.contact.coulomb_step import LIST, PRODUCTS
 from egs_warp.kernels.contact.coulomb_step import TILES as FEWER
 from egs_warp.precision import Vec4, real
@@ -207,7 +207,7 @@ _PASSES = """
 
 
 @wp.func_native(
-    on_gpu(
+    gpu_or_cpu(
         f"#if __CUDA_ARCH__ < 800\n    return 0;\n#else\n{_TILES}{LIST}{_PREPARE}{PRODUCTS}{_PASSES}#endif\n",
         otherwise="    return 0;",
     )

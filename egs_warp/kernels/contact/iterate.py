@@ -8,7 +8,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def base_kernel(
+def select_base_kernel(
     # In:
     told: wp.array[real],
     trial: wp.array[real],
@@ -25,7 +25,7 @@ def base_kernel(
 
 
 @wp.kernel
-def holding_kernel(
+def invert_momentum_matrix_kernel(
     # In:
     ratio: real,
     momenta: wp.array[Mat33],
@@ -118,7 +118,7 @@ def residual_kernel(
 
 
 @wp.kernel
-def loose_kernel(
+def free_velocity_kernel(
     # Model:
     turned: wp.array2d[real],
     # In:

@@ -3,8 +3,8 @@
 
 import warp as wp
 
-from egs_warp.kernels.fem.elasticity_cpu import Elements, Lines, written_gradient
-from egs_warp.kernels.fem.supernodal import Fronts, Kept, solved_one
+from egs_warp.kernels.fem.elasticity_cpu import Elements, MuscleSegments, gradient_native
+from egs_warp.kernels.fem.supernodal import Fronts, MomentumProjection, solve_vector_native
 from egs_warp.kernels.vectors import on_cpu
 from egs_warp.precision import real
 
@@ -17,11 +17,11 @@ class Step:
 
     positions: wp.array[real]
     """(3N,) metres at the start."""
-    known: wp.array[real]
+    ballistic_velocities: wp.array[real]
     """(3N,) m/s, the velocities at the start after gravity alone."""
     arms: wp.array[real]
     """(3N,) metres from the centre of mass."""
-    rates: wp.array[real]
+    inverse_inertia: wp.array[real]
     """(9,) 1/(kg m^2), the inverse of the inertia."""
     masses: wp.array[real]
     """(N,) kg."""
@@ -50,7 +50,7 @@ class Step:
     }
 """)
 )
-def gone(
+def advance_trial(
     starts: wp.array[real],
     dt: real,
     base: wp.uint64,
@@ -77,7 +77,8 @@ def gone(
     const double *const v = (const double*)velocities, *const f = (const double*)forces, *const in = gradient.data;
     const int* const node = (const int*)contact_nodes;
     const double *const weight = (const double*)contact_weights, *const axis = (const double*)contact_axes;
-    const double *const r = step.arms.data, *const known = step.known.data, *const rate = step.rates.data;
+    const double *const r = step.arms.data, *const known = step.ballistic_velocities.data;
+    const double* const rate = step.inverse_inertia.data;
     double *const free = (double*)free_out, *const missed = (double*)rest.data;
     double torque[3] = {0.0, 0.0, 0.0}, spin[3];
     for (int i = 0; i < 3 * nodes_count; i += 3) {
@@ -109,7 +110,7 @@ def gone(
         elsewhere="return 0.0;",
     )
 )
-def missed_by(
+def step_residual(
     step: Step,
     dt: real,
     ratio: real,
@@ -146,21 +147,21 @@ def missed_by(
         for (int j = 0; j < k; ++j) away += z[(long long)i * k + j] * by[j];
         x[i] -= away;
         for (int t = 0; t < 3; ++t)
-            missing[t] += kept.turns.data[3 * i + t] * given[i]
-                - kept.ratio.data[0] * kept.momenta.data[3 * i + t] * x[i];
+            missing[t] += kept.rotation_modes.data[3 * i + t] * given[i]
+                - kept.inertia_ratio.data[0] * kept.mode_momenta.data[3 * i + t] * x[i];
     }
     for (int t = 0; t < 9; ++t) turn[t / 3] += kept.inverse.data[t] * missing[t % 3];
     for (int i = 0; i < unknowns; ++i)
-        for (int t = 0; t < 3; ++t) x[i] += kept.turned.data[3 * i + t] * turn[t];
+        for (int t = 0; t < 3; ++t) x[i] += kept.rotation_response.data[3 * i + t] * turn[t];
 """)
 )
-def add_sum(
+def add_low_rank(
     unknowns: wp.int32,
     directions: wp.int32,
     across: wp.uint64,
     through: wp.uint64,
     inverse: wp.uint64,
-    kept: Kept,
+    kept: MomentumProjection,
     right: wp.uint64,
     room: wp.array[real],
     solved: wp.uint64,
@@ -187,7 +188,7 @@ def add_sum(
     }
 """)
 )
-def let_go(
+def apply_update(
     unknowns: wp.int32,
     contacts: wp.int32,
     contact_nodes: wp.uint64,
@@ -205,7 +206,7 @@ def let_go(
 def trial_kernel(
     # Model:
     elements: Elements,
-    lines: Lines,
+    lines: MuscleSegments,
     step: Step,
     starts: wp.array[real],
     dt: real,
@@ -231,11 +232,11 @@ def trial_kernel(
     size_out: wp.array[real],
 ):
     """See ``gone``, then ``missed_by``; no ``loose`` and no ``columns`` where the ``length`` is 0."""
-    gone(
+    advance_trial(
         step.positions, dt, base, loose, columns, 3 * contacts, forces, wanted, length, velocities_out, ends, forces_out
     )  # fmt: skip
-    written_gradient(elements, lines, ends, starts, dt, gradient)
-    size_out[0] = missed_by(
+    gradient_native(elements, lines, ends, starts, dt, gradient)
+    size_out[0] = step_residual(
         step, dt, ratio, contacts, contact_nodes, contact_weights, contact_axes, gradient, velocities_out, forces_out,
         free_out, rest_out,
     )  # fmt: skip
@@ -250,7 +251,7 @@ def newton_kernel(
     factor: wp.array[real],
     inverses: wp.array[real],
     reciprocals: wp.array[real],
-    kept: Kept,
+    kept: MomentumProjection,
     directions: wp.int32,
     across: wp.uint64,
     through: wp.uint64,
@@ -269,8 +270,10 @@ def newton_kernel(
 ):
     """(3N,) m/s after the step that takes off the ``right`` side (3N,), N s, and the contacts' speeds (3n,) then."""
     if directions == 0:
-        solved_one(fronts, blocks, unknowns, factor, inverses, reciprocals, right, 1, kept, room, loose_out)
+        solve_vector_native(fronts, blocks, unknowns, factor, inverses, reciprocals, right, 1, kept, room, loose_out)
     else:
-        solved_one(fronts, blocks, unknowns, factor, inverses, reciprocals, right, 1, Kept(), room, loose_out)
-        add_sum(unknowns, directions, across, through, inverse, kept, right, room, loose_out)
-    let_go(unknowns, contacts, contact_nodes, contact_weights, contact_axes, velocities, loose_out, speeds_out)
+        solve_vector_native(
+            fronts, blocks, unknowns, factor, inverses, reciprocals, right, 1, MomentumProjection(), room, loose_out
+        )
+        add_low_rank(unknowns, directions, across, through, inverse, kept, right, room, loose_out)
+    apply_update(unknowns, contacts, contact_nodes, contact_weights, contact_axes, velocities, loose_out, speeds_out)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from egs_warp.kernels.block import sum_of_block, wait_for_block
+from egs_warp.kernels.block import sum_of_block, sync_block
 from egs_warp.precision import Mat33, Vec3, real
 
 wp.set_module_options({"enable_backward": False})
@@ -15,11 +15,11 @@ BLOCK = 256
 def sums_of_block(value: Vec3):
     """Of the threads' vectors."""
     first = sum_of_block(value[0])
-    wait_for_block()
+    sync_block()
     second = sum_of_block(value[1])
-    wait_for_block()
+    sync_block()
     third = sum_of_block(value[2])
-    wait_for_block()
+    sync_block()
     return Vec3(first, second, third)
 
 
@@ -63,7 +63,7 @@ def step_start_kernel(
         place += masses[node] * positions[node]
         momentum += masses[node] * velocities[node]
     mass = sum_of_block(mass)
-    wait_for_block()
+    sync_block()
     centre = sums_of_block(place) / mass
     speed = sums_of_block(momentum) / mass
     squares = Vec3()

@@ -10,13 +10,13 @@ REGULAR = wp.constant(wp.float32(1.0e-3))
 
 
 @wp.func
-def turn_of(q: wp.vec4) -> wp.mat33:
+def rotation_from_quaternion(q: wp.vec4) -> wp.mat33:
     """Rotation matrix [r1 r2 r3] of a w, x, y, z quaternion."""
     return wp.quat_to_matrix(wp.normalize(wp.quat(q[1], q[2], q[3], q[0])))
 
 
 @wp.func
-def quaternion_of(m: wp.mat33) -> wp.vec4:
+def quaternion_from_rotation(m: wp.mat33) -> wp.vec4:
     """w, x, y, z of a rotation matrix, from the largest of the four; without an index, which would cost memory."""
     xx = m[0, 0]
     yy = m[1, 1]
@@ -176,7 +176,7 @@ def rotation_part(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.mat33:
 
 
 @wp.func
-def matched_order(frame: wp.mat33, carried: wp.mat33) -> wp.vec3i:
+def match_columns(frame: wp.mat33, carried: wp.mat33) -> wp.vec3i:
     """Which column of ``frame`` belongs to each column of ``carried``: the permutation of greatest total alignment."""
     d = wp.transpose(carried) * frame
     best = wp.vec3i(0, 1, 2)
@@ -238,17 +238,17 @@ def rotation_of(m: wp.mat33) -> wp.mat33:
 
 
 @wp.func
-def chosen(m: wp.mat33, k: wp.int32) -> wp.vec3:
+def select_column(m: wp.mat33, k: wp.int32) -> wp.vec3:
     """Column k, by comparison: an index that is not known in advance would put the matrix into memory."""
     return wp.where(k == 0, column(m, 0), wp.where(k == 1, column(m, 1), column(m, 2)))
 
 
 @wp.func
-def signed_as(frame: wp.mat33, order: wp.vec3i, carried: wp.mat33) -> wp.mat33:
+def align_signs(frame: wp.mat33, order: wp.vec3i, carried: wp.mat33) -> wp.mat33:
     """Columns of ``frame`` in that order, turned to the side of ``carried``; the least aligned one makes det = +1."""
-    a = chosen(frame, order[0])
-    b = chosen(frame, order[1])
-    c = chosen(frame, order[2])
+    a = select_column(frame, order[0])
+    b = select_column(frame, order[1])
+    c = select_column(frame, order[2])
     da = wp.dot(a, column(carried, 0))
     db = wp.dot(b, column(carried, 1))
     dc = wp.dot(c, column(carried, 2))

@@ -2,12 +2,12 @@
 
 import warp as wp
 
-from egs_warp.kernels.deformation.carried_cage import (
+from egs_warp.kernels.deformation.cage_maps import (
     RIGID,
     ArmPlan,
-    CarriedCage,
+    CageMaps,
     affine_of,
-    carried_arms,
+    deform_arms,
     exponential,
     load_row,
     reach_of,
@@ -15,17 +15,17 @@ from egs_warp.kernels.deformation.carried_cage import (
     turn_of_tet,
 )
 from egs_warp.kernels.deformation.decomposition import (
-    chosen,
+    align_signs,
     column,
-    matched_order,
+    match_columns,
     orthogonal_columns,
     proper_frame,
-    quaternion_of,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
     rotation_of,
     rotation_part,
     scaled_columns,
-    signed_as,
-    turn_of,
+    select_column,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -34,25 +34,25 @@ LEAST_SCALE = wp.constant(wp.float32(1.0e-12))
 
 
 @wp.struct
-class CarriedShape:
+class DeformedShape:
     rotation: wp.vec4
     log_scales: wp.vec3
 
 
 @wp.func
-def carried_shape(stretched: wp.mat33, scales: wp.vec3, carried: wp.mat33) -> CarriedShape:
+def deform_shape(stretched: wp.mat33, scales: wp.vec3, carried: wp.mat33) -> DeformedShape:
     """Eq. (15) for ``stretched`` = F R: the SVD of F R S, its axes matched in order and sign to R_polar r_i."""
     factor = scaled_columns(stretched, scales)
     m = orthogonal_columns(column(factor, 0), column(factor, 1), column(factor, 2))
     frame = proper_frame(m.a, m.b, m.c)
     columns = wp.matrix_from_cols(m.a, m.b, m.c)
-    order = matched_order(frame, carried)
-    result = CarriedShape()
-    result.rotation = quaternion_of(signed_as(frame, order, carried))
+    order = match_columns(frame, carried)
+    result = DeformedShape()
+    result.rotation = quaternion_from_rotation(align_signs(frame, order, carried))
     result.log_scales = wp.vec3(
-        wp.log(wp.max(wp.length(chosen(columns, order[0])), LEAST_SCALE)),
-        wp.log(wp.max(wp.length(chosen(columns, order[1])), LEAST_SCALE)),
-        wp.log(wp.max(wp.length(chosen(columns, order[2])), LEAST_SCALE)),
+        wp.log(wp.max(wp.length(select_column(columns, order[0])), LEAST_SCALE)),
+        wp.log(wp.max(wp.length(select_column(columns, order[1])), LEAST_SCALE)),
+        wp.log(wp.max(wp.length(select_column(columns, order[2])), LEAST_SCALE)),
     )
     return result
 
@@ -69,14 +69,14 @@ def write_gaussian(
 ):
     """Shape and turn of Eq. (15) for ``stretched`` = F R."""
     carried = rotation_part(column(stretched, 0), column(stretched, 1), column(stretched, 2))
-    shape = carried_shape(stretched, scales, carried)
+    shape = deform_shape(stretched, scales, carried)
     rotations_out[row] = shape.rotation
     log_scales_out[row] = shape.log_scales
-    turns_out[row] = quaternion_of(carried * wp.transpose(axes))
+    turns_out[row] = quaternion_from_rotation(carried * wp.transpose(axes))
 
 
 @wp.struct
-class CarriedGaussian:
+class DeformedGaussian:
     mean: wp.vec3
     rotation: wp.vec4
     log_scales: wp.vec3
@@ -84,24 +84,24 @@ class CarriedGaussian:
 
 
 @wp.func
-def carried_gaussian(
+def deform_gaussian(
     row: wp.int32,
     mean: wp.vec3,
     rotation: wp.vec4,
     log_scales: wp.vec3,
     max_stretch: wp.float32,
-    cage: CarriedCage,
+    cage: CageMaps,
     plan: ArmPlan,
-) -> CarriedGaussian:
+) -> DeformedGaussian:
     """F = (F+ + F-)/2 (Eq. 14), or the F of the mean's tetrahedron where det F <= 0, then Eq. (15).
 
     The mean goes where the Gaussian's mass goes, to second order (beyond the paper, which carries the mean as a point):
     E[x(m + sum z_k s_k r_k)] = x(m) + sum s_k^2 x_kk / 2, and x_kk is seen from the difference of the two arms.
     """
-    axes = turn_of(rotation)
+    axes = rotation_from_quaternion(rotation)
     scales = exponential(log_scales)
-    both = carried_arms(row, mean, axes, max_stretch, cage, plan)
-    result = CarriedGaussian()
+    both = deform_arms(row, mean, axes, max_stretch, cage, plan)
+    result = DeformedGaussian()
     result.mean = both.mean
     stretched = both.through
     # Alone in one tetrahedron, far outside, or where F is turned inside out: the rotation of that tetrahedron, found
@@ -110,7 +110,7 @@ def carried_gaussian(
     if both.straddles:
         bulge = wp.vec3(0.0)
         for k in range(3):
-            bulge += plan.bulges[k, row] * (column(both.plus, k) - column(both.minus, k))
+            bulge += plan.smoothing_lengths[k, row] * (column(both.plus, k) - column(both.minus, k))
         result.mean += bulge
         average = 0.5 * (both.plus + both.minus)
         if wp.determinant(average) > 0.0:
@@ -119,11 +119,11 @@ def carried_gaussian(
     turned = wp.mat33()
     if own:
         result.turn = turn_of_tet(cage, both.tet)
-        turned = turn_of(result.turn) * axes
+        turned = rotation_from_quaternion(result.turn) * axes
     else:
         turned = rotation_of(stretched)
-        result.turn = quaternion_of(turned * wp.transpose(axes))
-    shape = carried_shape(stretched, scales, turned)
+        result.turn = quaternion_from_rotation(turned * wp.transpose(axes))
+    shape = deform_shape(stretched, scales, turned)
     result.rotation = shape.rotation
     result.log_scales = shape.log_scales
     return result
@@ -137,7 +137,7 @@ def deform_kernel(
     rotations: wp.array[wp.vec4],
     log_scales: wp.array[wp.vec3],
     max_stretch: wp.float32,
-    cage: CarriedCage,
+    cage: CageMaps,
     plan: ArmPlan,
     # Out:
     means_out: wp.array[wp.vec3],
@@ -147,7 +147,7 @@ def deform_kernel(
 ):
     """Each Gaussian as the cage has carried it (Eq. 14, 15)."""
     row = first_row + wp.tid()
-    result = carried_gaussian(
+    result = deform_gaussian(
         row,
         means[row],
         load_row(rotations, row),
@@ -188,7 +188,7 @@ def measure_bend_kernel(
     rotations: wp.array[wp.vec4],
     log_scales: wp.array[wp.vec3],
     max_stretch: wp.float32,
-    cage: CarriedCage,
+    cage: CageMaps,
     plan: ArmPlan,
     arms: wp.array2d[wp.float32],
     # In and out:
@@ -203,11 +203,11 @@ def measure_bend_kernel(
     the displacement that F leaves out at one standard deviation along both axes.
     """
     row = first_row + wp.tid()
-    if plan.mean_tets[row] < 0 and plan.shares[0, row] == RIGID:
+    if plan.mean_tets[row] < 0 and plan.inside_fractions[0, row] == RIGID:
         return
     scales = exponential(log_scales[row])
-    axes = turn_of(rotations[row])
-    both = carried_arms(row, means[row], axes, max_stretch, cage, plan)
+    axes = rotation_from_quaternion(rotations[row])
+    both = deform_arms(row, means[row], axes, max_stretch, cage, plan)
     between = wp.transpose(bend_frame(both.plus, scales)) * bend_frame(both.minus, scales)
     twice_sine = wp.length(
         wp.vec3(between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1])

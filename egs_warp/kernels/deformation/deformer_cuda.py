@@ -6,9 +6,9 @@ read row by row, every load would touch 32 cache lines. CUDA C++ only for that; 
 
 import warp as wp
 
-from egs_warp.kernels.deformation.carried_cage import ArmPlan, CarriedCage, load_row, store_row
-from egs_warp.kernels.deformation.deformer import carried_gaussian
-from egs_warp.kernels.deformation.spherical_harmonics import Colour, turned_colour
+from egs_warp.kernels.deformation.cage_maps import ArmPlan, CageMaps, load_row, store_row
+from egs_warp.kernels.deformation.deformer import deform_gaussian
+from egs_warp.kernels.deformation.spherical_harmonics import Colour, rotate_sh
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -106,7 +106,7 @@ def deform_with_colour_kernel(
     rotations: wp.array[wp.vec4],
     log_scales: wp.array[wp.vec3],
     max_stretch: wp.float32,
-    cage: CarriedCage,
+    cage: CageMaps,
     plan: ArmPlan,
     sh: wp.array2d[wp.vec3],
     # Out:
@@ -121,7 +121,7 @@ def deform_with_colour_kernel(
     space = warp_space()
     fetch_colour(space, sh, row, count)
     mine = wp.min(row, count - 1)
-    result = carried_gaussian(
+    result = deform_gaussian(
         mine,
         means[mine],
         load_row(rotations, mine),
@@ -135,7 +135,7 @@ def deform_with_colour_kernel(
         store_row(rotations_out, row, result.rotation)
         log_scales_out[row] = result.log_scales
         store_row(turns_out, row, result.turn)
-    colour = turned_colour(load_colour(space), result.turn, 3)
+    colour = rotate_sh(load_colour(space), result.turn, 3)
     store_colour(space, sh_out, row, count, colour)
 
 

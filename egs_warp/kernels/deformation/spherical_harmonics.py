@@ -23,7 +23,7 @@ S1516 = wp.constant(wp.float32(np.sqrt(15 / 16)))
 
 
 @wp.func
-def turned_band_1(c: wp.mat33, turn: wp.mat33) -> wp.mat33:
+def rotate_band_1(c: wp.mat33, turn: wp.mat33) -> wp.mat33:
     """Coefficients 1 to 3, a row each, after the rotation ``turn``: the linear function w.d with w = (-c3, -c1, c2)."""
     w = wp.mat33(-c[2, 0], -c[2, 1], -c[2, 2], -c[0, 0], -c[0, 1], -c[0, 2], c[1, 0], c[1, 1], c[1, 2])
     w = turn * w
@@ -31,7 +31,7 @@ def turned_band_1(c: wp.mat33, turn: wp.mat33) -> wp.mat33:
 
 
 @wp.struct
-class Turns:
+class EulerAngles:
     """A rotation as three, about z, y and z, in the order in which they are made: cosine and sine of each."""
 
     first: wp.vec2
@@ -40,7 +40,7 @@ class Turns:
 
 
 @wp.func
-def turns_of(q: wp.vec4) -> Turns:
+def euler_from_quaternion(q: wp.vec4) -> EulerAngles:
     """Euler angles of the unit quaternion w, x, y, z. Where one is arbitrary, every choice is right to rounding."""
     along = wp.sqrt(q[0] * q[0] + q[3] * q[3])
     across = wp.sqrt(q[1] * q[1] + q[2] * q[2])
@@ -54,7 +54,7 @@ def turns_of(q: wp.vec4) -> Turns:
     ii = half_sum[1] * half_difference[1]
     ri = half_sum[0] * half_difference[1]
     ir = half_sum[1] * half_difference[0]
-    result = Turns()
+    result = EulerAngles()
     result.first = wp.vec2(rr + ii, ir - ri)
     result.tilt = wp.vec2(along * along - across * across, 2.0 * along * across)
     result.last = wp.vec2(rr - ii, ir + ri)
@@ -85,7 +85,7 @@ def band_2_about_z(c: Mat53, t: wp.vec2) -> Mat53:
 
 
 @wp.func
-def turned_band_2(c: Mat53, turns: Turns) -> Mat53:
+def rotate_band_2(c: Mat53, turns: EulerAngles) -> Mat53:
     """Coefficients 4 to 8, a row each, after the rotation.
     That about y is one about z between quarter turns about x.
     """
@@ -122,7 +122,7 @@ def band_3_about_z(c: Mat73, t: wp.vec2) -> Mat73:
 
 
 @wp.func
-def turned_band_3(c: Mat73, turns: Turns) -> Mat73:
+def rotate_band_3(c: Mat73, turns: EulerAngles) -> Mat73:
     """Coefficients 9 to 15, a row each, after the rotation; as ``turned_band_2``."""
     f = band_3_about_z(c, turns.first)
     g = Mat73()
@@ -145,29 +145,29 @@ def turned_band_3(c: Mat73, turns: Turns) -> Mat73:
 
 
 @wp.func
-def turned_colour(c: Colour, q: wp.vec4, degree: wp.int32) -> Colour:
+def rotate_sh(c: Colour, q: wp.vec4, degree: wp.int32) -> Colour:
     """Coefficients up to that degree after the rotation ``q`` (w, x, y, z); band 0 stays."""
     result = c
-    turns = turns_of(q)
+    turns = euler_from_quaternion(q)
     if degree >= 1:
         first = wp.mat33()
         for j in range(3):
             first[j] = c[1 + j]
-        first = turned_band_1(first, wp.quat_to_matrix(wp.quat(q[1], q[2], q[3], q[0])))
+        first = rotate_band_1(first, wp.quat_to_matrix(wp.quat(q[1], q[2], q[3], q[0])))
         for j in range(3):
             result[1 + j] = first[j]
     if degree >= 2:
         second = Mat53()
         for j in range(5):
             second[j] = c[4 + j]
-        second = turned_band_2(second, turns)
+        second = rotate_band_2(second, turns)
         for j in range(5):
             result[4 + j] = second[j]
     if degree >= 3:
         third = Mat73()
         for j in range(7):
             third[j] = c[9 + j]
-        third = turned_band_3(third, turns)
+        third = rotate_band_3(third, turns)
         for j in range(7):
             result[9 + j] = third[j]
     return result
@@ -191,7 +191,7 @@ def rotate_sh_kernel(
     for j in range(1, 16):
         if j < count:
             colour[j] = sh[row, j]
-    colour = turned_colour(colour, turns[row], degree)
+    colour = rotate_sh(colour, turns[row], degree)
     for j in range(1, 16):
         if j < count:
             sh_out[row, j] = colour[j]

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from egs_warp.kernels.block import lanes, sum_of_lanes
+from egs_warp.kernels.block import warp_size, warp_sum
 from egs_warp.precision import Mat33, Vec3, real
 
 wp.set_module_options({"enable_backward": False})
@@ -177,13 +177,13 @@ def element_gradients_kernel(
 
 
 @wp.func
-def of_all_lanes(part: Vec3) -> Vec3:
+def sum_lanes(part: Vec3) -> Vec3:
     """Sum of the lanes' parts."""
-    return Vec3(sum_of_lanes(part[0]), sum_of_lanes(part[1]), sum_of_lanes(part[2]))
+    return Vec3(warp_sum(part[0]), warp_sum(part[1]), warp_sum(part[2]))
 
 
 @wp.kernel
-def segment_pulls_kernel(
+def segment_forces_kernel(
     # Model:
     offsets: wp.array[int],
     nodes: wp.array[int],
@@ -200,9 +200,9 @@ def segment_pulls_kernel(
     """T phi u of each segment (Eq. 7), with the shares of tension of ``muscles.tension``."""
     segment, lane = wp.tid()
     line = Vec3(real(0.0))
-    for slot in range(offsets[segment] + lane, offsets[segment + 1], lanes()):
+    for slot in range(offsets[segment] + lane, offsets[segment + 1], warp_size()):
         line += shares[slot] * positions[nodes[slot]]
-    line = of_all_lanes(line)
+    line = sum_lanes(line)
     length = wp.max(wp.length(line), real(1e-300))
     along = wp.clamp((length / rest_lengths[segment] - slack) / (full - slack), real(0.0), real(1.0))
     share = along * along * (real(3.0) - real(2.0) * along)
@@ -227,13 +227,13 @@ def gather_forces_kernel(
     """Of each node's corners and, where there are ends of muscles, of those."""
     node, lane = wp.tid()
     total = Vec3(real(0.0))
-    for slot in range(corner_offsets[node] + lane, corner_offsets[node + 1], lanes()):
+    for slot in range(corner_offsets[node] + lane, corner_offsets[node + 1], warp_size()):
         corner = corner_from_slot[slot]
         total += corner_values[corner // 4, corner % 4]
     if end_offsets.shape[0] > 0:
-        for slot in range(end_offsets[node] + lane, end_offsets[node + 1], lanes()):
+        for slot in range(end_offsets[node] + lane, end_offsets[node + 1], warp_size()):
             total += end_shares[slot] * pulls[segment_from_end[slot]]
-    total = of_all_lanes(total)
+    total = sum_lanes(total)
     if lane == 0:
         node_values_out[node] = total
 

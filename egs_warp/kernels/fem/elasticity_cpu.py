@@ -88,16 +88,16 @@ class Elements:
 
 
 @wp.struct
-class Lines:
+class MuscleSegments:
     """Muscles' segments, see ``segment_pulls_kernel``; there may be none."""
 
     offsets: wp.array[wp.int32]
     nodes: wp.array[wp.int32]
-    shares: wp.array[real]
+    weights: wp.array[real]
     rest_lengths: wp.array[real]
     tensions: wp.array[real]
-    slack: real
-    full: real
+    length_zero_force: real
+    length_full_force: real
 
 
 @wp.func_native(
@@ -114,7 +114,7 @@ class Lines:
 """
     )
 )
-def written_starts(elements: Elements, positions: wp.array2d[real], starts: wp.array[real]):
+def starts_native(elements: Elements, positions: wp.array2d[real], starts: wp.array[real]):
     """See ``starts_kernel``."""
     ...
 
@@ -192,22 +192,23 @@ def energy_of(
         const int from = lines.offsets.data[s], to = lines.offsets.data[s + 1];
         double line[3] = {0.0, 0.0, 0.0};
         for (int slot = from; slot < to; ++slot)
-            for (int i = 0; i < 3; ++i) line[i] += lines.shares.data[slot] * x[3 * lines.nodes.data[slot] + i];
+            for (int i = 0; i < 3; ++i) line[i] += lines.weights.data[slot] * x[3 * lines.nodes.data[slot] + i];
         double length = __builtin_sqrt(line[0] * line[0] + line[1] * line[1] + line[2] * line[2]);
         length = length > 1e-300 ? length : 1e-300;
-        double along = (length / lines.rest_lengths.data[s] - lines.slack) / (lines.full - lines.slack);
+        const double range = lines.length_full_force - lines.length_zero_force;
+        double along = (length / lines.rest_lengths.data[s] - lines.length_zero_force) / range;
         along = along > 0.0 ? (along < 1.0 ? along : 1.0) : 0.0;
         const double pull = lines.tensions.data[s] * along * along * (3.0 - 2.0 * along) / length;
         for (int slot = from; slot < to; ++slot)
             for (int i = 0; i < 3; ++i)
-                out[3 * lines.nodes.data[slot] + i] += lines.shares.data[slot] * pull * line[i];
+                out[3 * lines.nodes.data[slot] + i] += lines.weights.data[slot] * pull * line[i];
     }
 """
     )
 )
-def written_gradient(
+def gradient_native(
     elements: Elements,
-    lines: Lines,
+    lines: MuscleSegments,
     positions: wp.array2d[real],
     starts: wp.array[real],
     dt: real,
@@ -303,7 +304,7 @@ _HESSIANS = """
 """
     )
 )
-def written_hessian(
+def hessian_native(
     elements: Elements,
     positions: wp.array2d[real],
     starts: wp.array[real],
@@ -415,7 +416,7 @@ def written_hessian(
 """
     )
 )
-def written_projected_hessian(
+def projected_hessian_native(
     elements: Elements,
     positions: wp.array2d[real],
     starts: wp.array[real],
@@ -432,7 +433,7 @@ def written_projected_hessian(
 @wp.kernel
 def starts_kernel(elements: Elements, positions: wp.array2d[real], starts_out: wp.array[real]) -> None:
     """(T / 4, 6, 4) F^T F at ``positions`` (N, 3), which damping needs of a step's start: its upper triangle."""
-    written_starts(elements, positions, starts_out)
+    starts_native(elements, positions, starts_out)
 
 
 @wp.kernel
@@ -455,7 +456,7 @@ def energy_kernel(
 def gradient_kernel(
     # Model:
     elements: Elements,
-    lines: Lines,
+    lines: MuscleSegments,
     # In:
     positions: wp.array2d[real],
     starts: wp.array[real],
@@ -464,7 +465,7 @@ def gradient_kernel(
     gradient_out: wp.array2d[real],
 ) -> None:
     """(N, 3) sums over ``element_gradients_kernel`` and ``segment_pulls_kernel``."""
-    written_gradient(elements, lines, positions, starts, dt, gradient_out)
+    gradient_native(elements, lines, positions, starts, dt, gradient_out)
 
 
 @wp.kernel
@@ -485,6 +486,6 @@ def hessian_kernel(
     """``factor`` times the upper entries of the sum over ``element_hessians_kernel``, or, ``projected``, over
     ``element_projected_hessians_kernel``, of whose rotations ``off`` and ``sweeps`` are."""
     if projected != 0:
-        written_projected_hessian(elements, positions, starts, dt, factor, off, sweeps, entries_out)
+        projected_hessian_native(elements, positions, starts, dt, factor, off, sweeps, entries_out)
     else:
-        written_hessian(elements, positions, starts, dt, factor, entries_out)
+        hessian_native(elements, positions, starts, dt, factor, entries_out)

@@ -1,6 +1,6 @@
 """Factors L D L^T of a sparse matrix by fronts, and solutions with them: dense arithmetic in vectors of four, on a CPU.
 
-See ``egs_warp/fem/sparse_factors.py``.
+See ``egs_warp/fem/multifrontal.py``.
 """
 
 import warp as wp
@@ -55,15 +55,15 @@ class Fronts:
 
 
 @wp.struct
-class Kept:
-    """Angular momentum that a solution keeps, see ``fem.factors.Kept``; nothing where it is not ``there``."""
+class MomentumProjection:
+    """Angular momentum that a solution keeps, see ``fem.linear_solver.Kept``; nothing where it is not ``there``."""
 
-    there: wp.int32
-    ratio: wp.array[real]
+    enabled: wp.int32
+    inertia_ratio: wp.array[real]
     """(1,)."""
-    turns: wp.array[real]
-    momenta: wp.array[real]
-    turned: wp.array[real]
+    rotation_modes: wp.array[real]
+    mode_momenta: wp.array[real]
+    rotation_response: wp.array[real]
     """(3n,), three numbers for each unknown."""
     inverse: wp.array[real]
     """(9,)."""
@@ -108,7 +108,7 @@ class Kept:
         elsewhere="return 0;",
     )
 )
-def factored(
+def factor_native(
     fronts: Fronts,
     count: wp.int32,
     matrix: wp.array[real],
@@ -221,13 +221,13 @@ def factored(
         }
     }
     double missing[3][PANEL] = {{0.0}}, by[3][PANEL] = {{0.0}};
-    if (kept.there) {
+    if (kept.enabled) {
         for (int i = 0; i < unknowns; ++i) {
             const double* const row = x + fronts.place.data[i] * PANEL;
             const double* const g = given + i * row_stride + from * column_stride;
             for (int t = 0; t < 3; ++t) {
-                const double turn = kept.turns.data[3 * i + t];
-                const double momentum = kept.ratio.data[0] * kept.momenta.data[3 * i + t];
+                const double turn = kept.rotation_modes.data[3 * i + t];
+                const double momentum = kept.inertia_ratio.data[0] * kept.mode_momenta.data[3 * i + t];
                 for (int q = 0; q < columns; ++q) missing[t][q] += turn * g[q * column_stride] - momentum * row[q];
             }
         }
@@ -241,8 +241,8 @@ def factored(
         const double* g = given + i * row_stride + from * column_stride;
         if (weights) {
             for (int q = 0; q < columns; ++q) to[q] = near_share * g[q * column_stride] + far_share * row[q];
-        } else if (kept.there) {
-            const double* const turned = kept.turned.data + 3 * i;
+        } else if (kept.enabled) {
+            const double* const turned = kept.rotation_response.data + 3 * i;
             for (int q = 0; q < columns; ++q)
                 to[q] = row[q] + (turned[0] * by[0][q] + turned[1] * by[1][q] + turned[2] * by[2][q]);
         } else {
@@ -252,7 +252,7 @@ def factored(
 """
     )
 )
-def solved_panel(
+def solve_panel_native(
     fronts: Fronts,
     blocks: wp.int32,
     unknowns: wp.int32,
@@ -266,7 +266,7 @@ def solved_panel(
     weights: wp.uint64,
     near_share: real,
     far_share: real,
-    kept: Kept,
+    kept: MomentumProjection,
     panel: wp.int32,
     room: wp.array[real],
     solution: wp.uint64,
@@ -340,17 +340,17 @@ def solved_panel(
     double missing[3] = {0.0, 0.0, 0.0}, by[3] = {0.0, 0.0, 0.0};
     for (int i = 0; i < unknowns; ++i) {
         found[i] = x[fronts.place.data[i]];
-        for (int t = 0; t < 3 && kept.there; ++t)
-            missing[t] += kept.turns.data[3 * i + t] * given[i * row_stride]
-                - kept.ratio.data[0] * kept.momenta.data[3 * i + t] * found[i];
+        for (int t = 0; t < 3 && kept.enabled; ++t)
+            missing[t] += kept.rotation_modes.data[3 * i + t] * given[i * row_stride]
+                - kept.inertia_ratio.data[0] * kept.mode_momenta.data[3 * i + t] * found[i];
     }
-    for (int t = 0; t < 9 && kept.there; ++t) by[t / 3] += kept.inverse.data[t] * missing[t % 3];
-    for (int i = 0; i < unknowns && kept.there; ++i)
-        for (int t = 0; t < 3; ++t) found[i] += kept.turned.data[3 * i + t] * by[t];
+    for (int t = 0; t < 9 && kept.enabled; ++t) by[t / 3] += kept.inverse.data[t] * missing[t % 3];
+    for (int i = 0; i < unknowns && kept.enabled; ++i)
+        for (int t = 0; t < 3; ++t) found[i] += kept.rotation_response.data[3 * i + t] * by[t];
 """
     )
 )
-def solved_one(
+def solve_vector_native(
     fronts: Fronts,
     blocks: wp.int32,
     unknowns: wp.int32,
@@ -359,7 +359,7 @@ def solved_one(
     reciprocals: wp.array[real],
     right: wp.uint64,
     row_stride: wp.int32,
-    kept: Kept,
+    kept: MomentumProjection,
     room: wp.array[real],
     solution: wp.uint64,
 ) -> None:
@@ -382,7 +382,7 @@ def factor_kernel(
     negative: wp.array[wp.int32],
 ) -> None:
     """See ``factored``."""
-    negative[0] = factored(fronts, count, matrix, least, front, front_size, stack, factor, inverses, reciprocals)
+    negative[0] = factor_native(fronts, count, matrix, least, front, front_size, stack, factor, inverses, reciprocals)
 
 
 @wp.kernel
@@ -398,17 +398,19 @@ def solve_kernel(
     row_stride: wp.int32,
     column_stride: wp.int32,
     count: wp.int32,
-    kept: Kept,
+    kept: MomentumProjection,
     room: wp.array[real],
     solution: wp.uint64,
 ) -> None:
     """Panel after panel as ``counters`` (1,) give them out, see ``solved_panel``."""
     if count == 1:
-        solved_one(fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, kept, room, solution)
+        solve_vector_native(
+            fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, kept, room, solution
+        )
         return
     panel = claimed(counters, 0)
     while PANEL * panel < count:
-        solved_panel(
+        solve_panel_native(
             fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count,
             wp.uint64(0), real(0.0), real(1.0), kept, panel, room, solution + wp.uint64(8 * PANEL * panel), count,
         )  # fmt: skip
@@ -416,7 +418,7 @@ def solve_kernel(
 
 
 @wp.kernel
-def strain_kernel(
+def effort_panel_kernel(
     counters: wp.array[wp.int32],
     fronts: Fronts,
     blocks: wp.int32,
@@ -449,9 +451,9 @@ def strain_kernel(
     panel = claimed(counters, 0)
     while panel < panels:
         mine = address_of(moves[panel])
-        solved_panel(
+        solve_panel_native(
             fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count, weights,
-            near_share, far_share, Kept(), panel, room, mine, PANEL,
+            near_share, far_share, MomentumProjection(), panel, room, mine, PANEL,
         )  # fmt: skip
         finish_moves(count - PANEL * panel, away, slope, moves[panel], along[panel])
         for strip in range(PANEL // STRIP):

@@ -6,26 +6,26 @@ in the direction of its side s, z = R^T (s p), so all that is needed of R are it
 
 import warp as wp
 
-from egs_warp.kernels.locomotion.reduced_rows import Reduced, know_products, write_point
+from egs_warp.kernels.locomotion.whitened_constraints import WhitenedConstraints, fetch_products, write_point
 from egs_warp.kernels.vectors import on_cpu
 from egs_warp.precision import Vec4, real
 
 wp.set_module_options({"enable_backward": False})
 
-FOUND, INFEASIBLE, ASTRAY = wp.constant(0), wp.constant(1), wp.constant(2)
+FOUND, INFEASIBLE, NUMERICAL_FAILURE = wp.constant(0), wp.constant(1), wp.constant(2)
 """How a search ends: at the optimum, where no point satisfies the bounds, or led by rounding to neither."""
 
 _ROUNDS = wp.constant(3)
 """In which rows are let go and held by all that is wrong at once, before one at a time."""
-REVISIONS = wp.constant(4)
+REFINEMENTS = wp.constant(4)
 """In which multipliers that were carried along are found anew."""
-PULLS = wp.constant(real(1e-9))
+WRONG_SIGN_TOLERANCE = wp.constant(real(1e-9))
 """Of the largest multiplier: sign of one that holds its row from the wrong side."""
-REDUNDANT = wp.constant(real(1e-12))
+REDUNDANCY_TOLERANCE = wp.constant(real(1e-12))
 """Rows that repeat each other leave the matrix of their products singular."""
-MISSED = wp.constant(real(1e-7))
+BOUND_TOLERANCE = wp.constant(real(1e-7))
 """From its bound: a row that the others keep from there."""
-DEPENDENT = wp.constant(real(1e-9))
+DEPENDENCE_TOLERANCE = wp.constant(real(1e-9))
 """Of a row's square: what of it lies outside of the rows that hold, if it follows from them."""
 
 
@@ -34,42 +34,42 @@ class Program:
     """What is given. Columns of matrices lie by fours, which a processor takes at once, zeros after the last. Rows of
     zeros without bounds may follow."""
 
-    reduced: Reduced
+    constraints: WhitenedConstraints
     """The rows R, n unknowns wide, and their products with each other."""
-    free: wp.array[Vec4]
+    values_at_origin: wp.array[Vec4]
     """(m,) by fours, the rows at z = 0."""
     lower: wp.array[real]
     upper: wp.array[real]
     slack: wp.array[real]
     """(m,) by how much a row may break its bounds."""
-    most: wp.array[real]
+    cost_limit: wp.array[real]
     """(1,) cost z^T z / 2 beyond which no point is looked for."""
 
 
 @wp.struct
-class Search:
+class ActiveSetState:
     """Where the search is."""
 
     side: wp.array[int]
     """(m,) of rows that hold: 1 at the lower bound, -1 at the upper; else 0."""
     active: wp.array[int]
     """(n,) those rows, in the order in which they have joined."""
-    pulls: wp.array[real]
+    multipliers: wp.array[real]
     """(n,) their multipliers."""
     factor: wp.array2d[real]
     """(n, n) lower triangle L of their products, each in the direction of its side."""
-    at: wp.array[Vec4]
+    values: wp.array[Vec4]
     """(m,) all rows, by fours."""
     rates: wp.array[real]
     """(n,) by how much each multiplier falls for one of the row that joins."""
-    across: wp.array[real]
+    solved_products: wp.array[real]
     """(n,) L^-1 of the products of the row that joins."""
-    outside: wp.array[Vec4]
+    orthogonal_part: wp.array[Vec4]
     """(n,) by fours: what of the row that joins lies outside of those that hold."""
 
 
 @wp.func
-def bound_of(program: Program, search: Search, row: int):
+def bound_of(program: Program, search: ActiveSetState, row: int):
     """The bound that ``row`` is held at."""
     if search.side[row] > 0:
         return program.lower[row]
@@ -77,15 +77,15 @@ def bound_of(program: Program, search: Search, row: int):
 
 
 @wp.func
-def place_of(search: Search, row: int):
+def value_of(search: ActiveSetState, row: int):
     """Where ``row`` is."""
-    return search.at[row / 4][row % 4]
+    return search.values[row / 4][row % 4]
 
 
 @wp.func
 def product_of(program: Program, row: int, other: int):
     """Of two rows."""
-    return program.reduced.products[row, other / 4][other % 4]
+    return program.constraints.products[row, other / 4][other % 4]
 
 
 @wp.func_native(
@@ -177,12 +177,12 @@ def solve_upper(factor: wp.array2d[real], count: wp.int32, x: wp.array[real]):
 
 
 @wp.func
-def know(program: Program, search: Search, count: int, row: int):
+def fetch_active_products(program: Program, search: ActiveSetState, count: int, row: int):
     """The products of the active rows and of ``row``."""
-    reduced = program.reduced
-    know_products(
+    reduced = program.constraints
+    fetch_products(
         reduced.minimum.shape[0], search.active, count, row, reduced.rows, reduced.columns, reduced.products,
-        reduced.known, reduced.scratch,
+        reduced.has_products, reduced.scratch,
     )  # fmt: skip
 
 
@@ -196,15 +196,15 @@ def know(program: Program, search: Search, count: int, row: int):
 """
     )
 )
-def move_by(products: wp.array2d[Vec4], row: wp.int32, by: real, at: wp.array[Vec4]):
+def axpy_values(products: wp.array2d[Vec4], row: wp.int32, by: real, at: wp.array[Vec4]):
     """See ``move_rows``."""
     ...
 
 
 @wp.func
-def move_rows(program: Program, search: Search, row: int, by: real):
+def move_rows_by(program: Program, search: ActiveSetState, row: int, by: real):
     """All rows where the multiplier of ``row`` is greater ``by``."""
-    move_by(program.reduced.products, row, by, search.at)
+    axpy_values(program.constraints.products, row, by, search.values)
 
 
 @wp.func_native(
@@ -226,7 +226,7 @@ def move_rows(program: Program, search: Search, row: int, by: real):
         elsewhere="return 0.0;",
     )
 )
-def square_outside(
+def orthogonal_norm2(
     rows: wp.array2d[Vec4],
     row: wp.int32,
     towards: real,
@@ -260,7 +260,7 @@ def square_outside(
         elsewhere="return -1;",
     )
 )
-def most_broken(
+def most_violated(
     lower: wp.array[real], upper: wp.array[real], slack: wp.array[real], side: wp.array[wp.int32], at: wp.array[Vec4]
 ) -> wp.int32:
     """Of the rows without a side the one that breaks its bounds most, -1 where none does."""
@@ -268,148 +268,158 @@ def most_broken(
 
 
 @wp.func
-def hold(program: Program, search: Search):
+def solve_active(program: Program, search: ActiveSetState):
     """How many rows have a side, held at their bounds; -1 where that has no numbers."""
     count = int(0)
-    for quad in range(search.at.shape[0]):
-        search.at[quad] = program.free[quad]
+    for quad in range(search.values.shape[0]):
+        search.values[quad] = program.values_at_origin[quad]
     for row in range(search.side.shape[0]):
         if search.side[row] != 0:
             if count == search.active.shape[0]:
                 return -1
             search.active[count] = row
             count += 1
-    know(program, search, count, -1)
-    if factored(program.reduced.products, search.active, search.side, count, REDUNDANT, search.factor) == 0:
+    fetch_active_products(program, search, count, -1)
+    if (
+        factored(program.constraints.products, search.active, search.side, count, REDUNDANCY_TOLERANCE, search.factor)
+        == 0
+    ):
         return -1
     for i in range(count):
         row = search.active[i]
         sign = real(search.side[row])
-        search.pulls[i] = sign * (bound_of(program, search, row) - program.free[row / 4][row % 4])
-    solve_lower(search.factor, count, search.pulls)
-    solve_upper(search.factor, count, search.pulls)
+        search.multipliers[i] = sign * (bound_of(program, search, row) - program.values_at_origin[row / 4][row % 4])
+    solve_lower(search.factor, count, search.multipliers)
+    solve_upper(search.factor, count, search.multipliers)
     for i in range(count):
         row = search.active[i]
-        move_rows(program, search, row, real(search.side[row]) * search.pulls[i])
+        move_rows_by(program, search, row, real(search.side[row]) * search.multipliers[i])
     return count
 
 
 @wp.func
-def let_go_of_wrong(program: Program, search: Search, count: int):
+def drop_wrong_sign(program: Program, search: ActiveSetState, count: int):
     """How many rows lose their side: those that pull the wrong way, or that the others keep from their bounds."""
     most = real(0.0)
     for i in range(count):
-        most = wp.max(most, wp.abs(search.pulls[i]))
+        most = wp.max(most, wp.abs(search.multipliers[i]))
     wrong = int(0)
     for i in range(count):
         row = search.active[i]
-        missed = wp.abs(place_of(search, row) - bound_of(program, search, row))
-        if search.pulls[i] < -PULLS * most or missed > MISSED + program.slack[row]:
+        missed = wp.abs(value_of(search, row) - bound_of(program, search, row))
+        if search.multipliers[i] < -WRONG_SIGN_TOLERANCE * most or missed > BOUND_TOLERANCE + program.slack[row]:
             search.side[row] = 0
             wrong += 1
     return wrong
 
 
 @wp.func
-def breach_of(program: Program, search: Search, row: int):
+def violation_of(program: Program, search: ActiveSetState, row: int):
     """By how much more than it may ``row`` breaks its bounds, negative where it does not."""
-    at = place_of(search, row)
+    at = value_of(search, row)
     return wp.max(program.lower[row] - at, at - program.upper[row]) - program.slack[row]
 
 
 @wp.func
-def hold_broken(program: Program, search: Search):
+def add_violated(program: Program, search: ActiveSetState):
     """How many rows without a side break their bounds; they are given one."""
     broken = int(0)
     for row in range(search.side.shape[0]):
-        if search.side[row] == 0 and breach_of(program, search, row) > real(0.0):
-            search.side[row] = wp.where(place_of(search, row) < program.lower[row], 1, -1)
+        if search.side[row] == 0 and violation_of(program, search, row) > real(0.0):
+            search.side[row] = wp.where(value_of(search, row) < program.lower[row], 1, -1)
             broken += 1
     return broken
 
 
 @wp.func
-def hold_those_that_pull(program: Program, search: Search):
+def crash_start(program: Program, search: ActiveSetState):
     """How many rows are held, all of which pull the right way."""
-    count = hold(program, search)
+    count = solve_active(program, search)
     if count < 0:
         # From where nothing holds there always is a way.
         for row in range(search.side.shape[0]):
             search.side[row] = 0
-        return hold(program, search)
-    while let_go_of_wrong(program, search, count) > 0:
-        count = hold(program, search)
+        return solve_active(program, search)
+    while drop_wrong_sign(program, search, count) > 0:
+        count = solve_active(program, search)
         if count < 0:
             for row in range(search.side.shape[0]):
                 search.side[row] = 0
-            count = hold(program, search)
+            count = solve_active(program, search)
     return count
 
 
 @wp.func
-def leave(search: Search, count: int, place: int):
+def drop_constraint(search: ActiveSetState, count: int, place: int):
     """Let go of the active row at ``place``; Givens rotations bring its column of the factor into the others."""
     search.side[search.active[place]] = 0
     left = count - 1
     for i in range(place, left):
         search.active[i] = search.active[i + 1]
-        search.pulls[i] = search.pulls[i + 1]
-        search.across[i] = search.factor[i + 1, place]
+        search.multipliers[i] = search.multipliers[i + 1]
+        search.solved_products[i] = search.factor[i + 1, place]
         for k in range(place):
             search.factor[i, k] = search.factor[i + 1, k]
     for j in range(place, left):
         a = search.factor[j + 1, j + 1]
-        b = search.across[j]
+        b = search.solved_products[j]
         length = wp.sqrt(a * a + b * b)
         c = a / length
         s = b / length
         search.factor[j, j] = length
         for i in range(j + 1, left):
             below = search.factor[i + 1, j + 1]
-            beside = search.across[i]
+            beside = search.solved_products[i]
             search.factor[i, j] = c * below + s * beside
-            search.across[i] = c * beside - s * below
+            search.solved_products[i] = c * beside - s * below
 
 
 @wp.func
-def join(program: Program, search: Search, active: int, row: int):
+def add_constraint(program: Program, search: ActiveSetState, active: int, row: int):
     """How many rows are active when ``row`` is held beside them, less those whose pull ends on the way; -1 where no
     point satisfies it beside those, -2 where rounding leaves no way."""
     count = int(active)
     sign = int(-1)
     bound = program.upper[row]
-    if place_of(search, row) < program.lower[row]:
+    if value_of(search, row) < program.lower[row]:
         sign = 1
         bound = program.lower[row]
     towards = real(sign)
-    know(program, search, 0, row)
+    fetch_active_products(program, search, 0, row)
     square = product_of(program, row, row)
     pull = real(0.0)
     while True:
         for i in range(count):
             other = search.active[i]
             value = towards * real(search.side[other]) * product_of(program, row, other)
-            search.across[i] = value
-        solve_lower(search.factor, count, search.across)
+            search.solved_products[i] = value
+        solve_lower(search.factor, count, search.solved_products)
         for i in range(count):
-            search.rates[i] = search.across[i]
+            search.rates[i] = search.solved_products[i]
         solve_upper(search.factor, count, search.rates)
-        apart = square_outside(
-            program.reduced.rows, row, towards, search.active, search.side, search.rates, count, search.outside
+        apart = orthogonal_norm2(
+            program.constraints.rows,
+            row,
+            towards,
+            search.active,
+            search.side,
+            search.rates,
+            count,
+            search.orthogonal_part,
         )
         part = real(wp.inf)
         first = int(-1)
         for i in range(count):
             rate = search.rates[i]
             if rate > real(0.0):
-                ends = wp.max(search.pulls[i], real(0.0)) / rate
+                ends = wp.max(search.multipliers[i], real(0.0)) / rate
                 if ends < part:
                     part = ends
                     first = i
         whole = real(wp.inf)
         # As many rows as unknowns leave nothing outside, whatever rounding says.
-        if apart > DEPENDENT * square and count < search.active.shape[0]:
-            whole = towards * (bound - place_of(search, row)) / apart
+        if apart > DEPENDENCE_TOLERANCE * square and count < search.active.shape[0]:
+            whole = towards * (bound - value_of(search, row)) / apart
         step = wp.min(whole, part)
         if not apart < real(wp.inf):
             return -2
@@ -417,27 +427,27 @@ def join(program: Program, search: Search, active: int, row: int):
             return -1
         pull += step
         if whole < real(wp.inf):
-            move_rows(program, search, row, towards * step)
+            move_rows_by(program, search, row, towards * step)
             for i in range(count):
                 other = search.active[i]
-                move_rows(program, search, other, -real(search.side[other]) * search.rates[i] * step)
+                move_rows_by(program, search, other, -real(search.side[other]) * search.rates[i] * step)
         for i in range(count):
-            search.pulls[i] = search.pulls[i] - step * search.rates[i]
+            search.multipliers[i] = search.multipliers[i] - step * search.rates[i]
         if whole <= part:
             for i in range(count):
-                search.factor[count, i] = search.across[i]
-            search.factor[count, count] = wp.sqrt(apart + REDUNDANT)
+                search.factor[count, i] = search.solved_products[i]
+            search.factor[count, count] = wp.sqrt(apart + REDUNDANCY_TOLERANCE)
             search.active[count] = row
-            search.pulls[count] = pull
+            search.multipliers[count] = pull
             search.side[row] = sign
             return count + 1
-        leave(search, count, first)
+        drop_constraint(search, count, first)
         count -= 1
     return count
 
 
 @wp.func
-def cost_of(program: Program, search: Search, count: int):
+def cost_of(program: Program, search: ActiveSetState, count: int):
     """z^T z / 2."""
     cost = real(0.0)
     for i in range(count):
@@ -445,51 +455,51 @@ def cost_of(program: Program, search: Search, count: int):
         cost += (
             real(0.5)
             * real(search.side[row])
-            * search.pulls[i]
-            * (place_of(search, row) - program.free[row / 4][row % 4])
+            * search.multipliers[i]
+            * (value_of(search, row) - program.values_at_origin[row / 4][row % 4])
         )
     return cost
 
 
 @wp.func
-def descend(program: Program, search: Search, active: int, pivots: int):
+def dual_iterations(program: Program, search: ActiveSetState, active: int, pivots: int):
     """From rows that all pull the right way; how the search ends. What is broken most joins first."""
     count = int(active)
     for _ in range(pivots):
-        row = most_broken(program.lower, program.upper, program.slack, search.side, search.at)
+        row = most_violated(program.lower, program.upper, program.slack, search.side, search.values)
         if row < 0:
             return FOUND
-        count = join(program, search, count, row)
+        count = add_constraint(program, search, count, row)
         if count == -2:
-            return ASTRAY
+            return NUMERICAL_FAILURE
         if count < 0:
             return INFEASIBLE
-        if cost_of(program, search, count) > program.most[0]:
+        if cost_of(program, search, count) > program.cost_limit[0]:
             return INFEASIBLE
-    return ASTRAY
+    return NUMERICAL_FAILURE
 
 
 @wp.func
-def find_optimum(program: Program, pivots: int, search: Search):
+def find_optimum(program: Program, pivots: int, search: ActiveSetState):
     """See ``optimum_kernel``."""
     for _ in range(_ROUNDS):
-        count = hold(program, search)
+        count = solve_active(program, search)
         if count < 0:
             break
-        if let_go_of_wrong(program, search, count) + hold_broken(program, search) == 0:
+        if drop_wrong_sign(program, search, count) + add_violated(program, search) == 0:
             return FOUND
-    for _ in range(REVISIONS):
-        count = hold_those_that_pull(program, search)
-        ended = descend(program, search, count, pivots)
+    for _ in range(REFINEMENTS):
+        count = crash_start(program, search)
+        ended = dual_iterations(program, search, count, pivots)
         if ended != FOUND:
             return ended
         # Once more without what rounding has carried along.
-        count = hold(program, search)
+        count = solve_active(program, search)
         if count < 0:
             continue
-        if let_go_of_wrong(program, search, count) + hold_broken(program, search) == 0:
+        if drop_wrong_sign(program, search, count) + add_violated(program, search) == 0:
             return FOUND
-    return ASTRAY
+    return NUMERICAL_FAILURE
 
 
 @wp.kernel
@@ -497,7 +507,7 @@ def optimum_kernel(
     program: Program,
     pivots: int,
     # In and out:
-    search: Search,
+    search: ActiveSetState,
     # Out:
     ended: wp.array[int],
     point: wp.uint64,
@@ -519,8 +529,9 @@ def optimum_kernel(
         if search.side[row] != 0:
             count += 1
     ended[1] = count
-    reduced = program.reduced
+    reduced = program.constraints
     write_point(
-        reduced.lower, reduced.roots, reduced.minimum, reduced.rows, search.active, search.side, search.pulls, count,
+        reduced.lower, reduced.roots, reduced.minimum, reduced.rows, search.active, search.side,
+        search.multipliers, count,
         point,
     )  # fmt: skip

@@ -9,10 +9,10 @@ factor would have them wait for each unknown. Constants are the defaults that OS
 
 import warp as wp
 
-from egs_warp.kernels.block import largest_of_block, sum_of_block, wait_for_block
+from egs_warp.kernels.block import block_max, sum_of_block, sync_block
 from egs_warp.kernels.locomotion.scaled_programs import (
+    AdmmWorkspace,
     Iterates,
-    Memory,
     Programs,
     Scaled,
     equilibrate,
@@ -88,7 +88,7 @@ def invert(lane: int, rho: real, own: Scaled):
         elif own.lower[i] == real(-wp.inf) and own.upper[i] == real(wp.inf):
             row_rho = _LEAST_RHO
         own.rho[i] = row_rho
-    wait_for_block()
+    sync_block()
     for entry in range(lane, n * n, wp.block_dim()):
         i = entry / n
         j = entry - i * n
@@ -99,10 +99,10 @@ def invert(lane: int, rho: real, own: Scaled):
             value += own.rho[row] * own.rows[row, i] * own.rows[row, j]
         own.inverse[i, j] = value
     for pivot in range(n):
-        wait_for_block()
+        sync_block()
         for j in range(lane, n, wp.block_dim()):
             own.slope[j] = own.inverse[pivot, j]
-        wait_for_block()
+        sync_block()
         scale = real(1.0) / own.slope[pivot]
         for entry in range(lane, n * n, wp.block_dim()):
             i = entry / n
@@ -115,7 +115,7 @@ def invert(lane: int, rho: real, own: Scaled):
                 own.inverse[i, j] = scale * own.slope[i]
             else:
                 own.inverse[i, j] = own.inverse[i, j] - scale * own.slope[i] * own.slope[j]
-    wait_for_block()
+    sync_block()
 
 
 @wp.func
@@ -126,13 +126,13 @@ def iterate(lane: int, own: Scaled):
     m = own.row_count
     for i in range(lane, m, wp.block_dim()):
         own.push[i] = own.y[i] + own.rho[i] * (own.at[i] - own.z[i])
-    wait_for_block()
+    sync_block()
     for j in range(lane, n, wp.block_dim()):
         own.slope[j] = own.q[j] + product(own.P, own.P, j, own.x, n) + product(own.columns, own.rows, j, own.push, m)
-    wait_for_block()
+    sync_block()
     for j in range(lane, n, wp.block_dim()):
         own.step[j] = product(own.inverse, own.inverse, j, own.slope, n)
-    wait_for_block()
+    sync_block()
     for j in range(lane, n, wp.block_dim()):
         own.x[j] = own.x[j] + _OVER * own.step[j]
     for i in range(lane, m, wp.block_dim()):
@@ -143,7 +143,7 @@ def iterate(lane: int, own: Scaled):
         pull = own.rho[i] * (wish - own.z[i])
         own.change[i] = pull - own.y[i]
         own.y[i] = pull
-    wait_for_block()
+    sync_block()
 
 
 @wp.func
@@ -189,17 +189,17 @@ def residuals(lane: int, cost: real, own: Scaled):
         dual = wp.max(dual, missed / own.stretch[j])
         dual_size = wp.max(dual_size, size / own.stretch[j])
     found = Residuals()
-    found.primal = largest_of_block(primal)
-    found.primal_size = largest_of_block(primal_size)
-    found.dual = largest_of_block(dual) / cost
-    found.dual_size = largest_of_block(dual_size) / cost
+    found.primal = block_max(primal)
+    found.primal_size = block_max(primal_size)
+    found.dual = block_max(dual) / cost
+    found.dual_size = block_max(dual_size) / cost
     square = sum_of_block(square)
     linear = sum_of_block(linear)
     support = sum_of_block(support)
     found.gap = wp.abs(square + linear + support) / cost
     found.gap_size = wp.max(wp.max(wp.abs(square), wp.abs(linear)), wp.abs(support)) / cost
-    primal_part = largest_of_block(scaled_primal) / (largest_of_block(scaled_primal_size) + _NOTHING)
-    dual_part = largest_of_block(scaled_dual) / (largest_of_block(scaled_dual_size) + _NOTHING)
+    primal_part = block_max(scaled_primal) / (block_max(scaled_primal_size) + _NOTHING)
+    dual_part = block_max(scaled_dual) / (block_max(scaled_dual_size) + _NOTHING)
     found.ratio = primal_part / (dual_part + _NOTHING)
     return found
 
@@ -215,7 +215,7 @@ def within(found: Residuals, accuracy: real):
 
 
 @wp.func
-def contradicted(lane: int, accuracy: real, own: Scaled):
+def is_infeasible(lane: int, accuracy: real, own: Scaled):
     """Whether the last change d of the multipliers certifies that no point satisfies the bounds: A^T d = 0, while
     u^T d+ + l^T d- < 0."""
     norm = real(0.0)
@@ -233,12 +233,12 @@ def contradicted(lane: int, accuracy: real, own: Scaled):
             support += own.upper[i] * change
         elif change < real(0.0):
             support += own.lower[i] * change
-    norm = largest_of_block(norm)
+    norm = block_max(norm)
     support = sum_of_block(support)
     left = real(0.0)
     for j in range(lane, own.variables, wp.block_dim()):
         left = wp.max(left, wp.abs(product(own.columns, own.rows, j, own.push, own.row_count)) / own.stretch[j])
-    left = largest_of_block(left)
+    left = block_max(left)
     return norm > _NOTHING and support < real(0.0) and left <= accuracy * norm
 
 
@@ -249,7 +249,7 @@ def admm_kernel(
     iterations: int,
     passes: int,
     adapt: int,
-    memory: Memory,
+    memory: AdmmWorkspace,
     # In and out:
     iterates: Iterates,
     # Out:
@@ -268,7 +268,7 @@ def admm_kernel(
     write_scaled(lane, programs.P[program], programs.q[program], programs.A[program], cost, own)
     for j in range(lane, n, wp.block_dim()):
         own.x[j] = iterates.x[program, j] / own.stretch[j]
-    wait_for_block()
+    sync_block()
     for i in range(lane, m, wp.block_dim()):
         own.lower[i] = own.weight[i] * programs.lower[program, i]
         own.upper[i] = own.weight[i] * programs.upper[program, i]
@@ -287,13 +287,13 @@ def admm_kernel(
             if within(found, accuracy):
                 end = SOLVED
                 break
-            if contradicted(lane, _CERTAIN, own):
+            if is_infeasible(lane, _CERTAIN, own):
                 end = INFEASIBLE
                 break
             if last == iterations:
                 if within(found, _LOOSE * accuracy):
                     end = INEXACT
-                elif contradicted(lane, _LOOSE * _CERTAIN, own):
+                elif is_infeasible(lane, _LOOSE * _CERTAIN, own):
                     end = DOUBTFUL
             elif last % adapt == 0:
                 better = wp.min(wp.max(rho * wp.sqrt(found.ratio), _LEAST_RHO), _MOST_RHO)

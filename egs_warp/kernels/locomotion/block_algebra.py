@@ -117,7 +117,7 @@ def lane_of_block() -> int:
     WAIT;
 """)
 )
-def add_product(
+def gemm_add(
     to: wp.array2d[real],
     one: wp.array2d[real],
     other: wp.array2d[real],
@@ -159,7 +159,7 @@ def add_product(
     return total;
 """)
 )
-def list_marked(marks: wp.array[int], count: int, room: int, found: wp.array[int]) -> int:
+def compact_indices(marks: wp.array[int], count: int, room: int, found: wp.array[int]) -> int:
     """How many of ``count`` marks are not zero; where they are, in their order, as many as there is ``room`` for."""
     ...
 
@@ -188,7 +188,7 @@ def list_marked(marks: wp.array[int], count: int, room: int, found: wp.array[int
     return wp::vec_t<2, double>(value, double(place));
 """)
 )
-def largest_and_place(value: real, place: int) -> wp.vec2d:
+def argmax_of_block(value: real, place: int) -> wp.vec2d:
     """The largest of the threads' values, and its place, the first of those where several are as large."""
     ...
 
@@ -283,7 +283,7 @@ def multiply_at(
     WAIT;
 """)
 )
-def multiply_across(
+def multiply_transposed(
     matrix: wp.array2d[real], rows: int, columns: int, given: wp.array[real], made: wp.array[real]
 ) -> None:
     """``made`` (columns,) = the transpose of ``matrix`` (rows, columns) times ``given`` (rows,)."""
@@ -320,7 +320,7 @@ def multiply_across(
     WAIT;
 """)
 )
-def normalise(
+def normalize_rows(
     matrix: wp.array2d[real],
     columns: int,
     parts: wp.array2d[int],
@@ -334,9 +334,9 @@ def normalise(
 
 
 @wp.func
-def apply_root(
+def apply_factor(
     root: wp.array2d[real], count: int, given: wp.array[real], between: wp.array[real], made: wp.array[real]
 ):
     """``made`` (count,) = U U^T ``given`` (count,), U^T of it ``between``."""
-    multiply_across(root, count, count, given, between)
+    multiply_transposed(root, count, count, given, between)
     multiply(root, count, count, between, made)

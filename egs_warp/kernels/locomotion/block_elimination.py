@@ -286,7 +286,7 @@ def eliminate(matrix: wp.array2d[real], unknowns: int, columns: int, singular: r
 """
     )
 )
-def invert_root(matrix: wp.array2d[real], count: int, root: wp.array2d[real]) -> int:
+def inverse_cholesky(matrix: wp.array2d[real], count: int, root: wp.array2d[real]) -> int:
     """``root`` U, an upper triangle (count, count), of A^-1 = U U^T for a symmetric ``matrix`` A (count, count), whose
     upper triangle is read and lost; 0 where that is not definite."""
     ...

@@ -7,22 +7,22 @@ looked at: z = share z_0 + R^T sums.
 
 import warp as wp
 
-from egs_warp.kernels.block import wait_for_block
-from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows, gather, see
+from egs_warp.kernels.block import sync_block
+from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints, evaluate, gather_active
 from egs_warp.kernels.locomotion.block_algebra import (
-    apply_root,
+    apply_factor,
+    compact_indices,
     lane_of_block,
-    list_marked,
-    multiply_across,
+    multiply_transposed,
 )
-from egs_warp.kernels.locomotion.block_elimination import invert_root
+from egs_warp.kernels.locomotion.block_elimination import inverse_cholesky
 from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
 
 _ITERATIONS = wp.constant(15)
 _RHO = wp.constant(real(1.0))
-"""Both as in ``egs_warp/locomotion/splitting.py``."""
+"""Both as in ``egs_warp/locomotion/operator_splitting.py``."""
 _SIGMA = wp.constant(real(1e-6))
 _OVER = wp.constant(real(1.6))
 """alpha, relaxation beyond a whole step. OSQP's defaults."""
@@ -34,9 +34,9 @@ class Splitting:
 
     rows: wp.array[real]
     """(k,) R z."""
-    near: wp.array[real]
+    projected: wp.array[real]
     """(k,) what of that is within the bounds."""
-    pushes: wp.array[real]
+    multipliers: wp.array[real]
     """(k,) multipliers."""
     sums: wp.array[real]
     """(k,)."""
@@ -44,28 +44,28 @@ class Splitting:
     between: wp.array[real]
     step: wp.array[real]
     """(k,) scratch."""
-    begun: wp.array[real]
+    initial_values: wp.array[real]
     """(m,) R z_0 of all rows."""
-    held_by: wp.array[real]
+    all_multipliers: wp.array[real]
     """(m,) multipliers of all rows."""
 
 
 @wp.func
-def iterate(rows: UnitRows, holding: Holding, splitting: Splitting):
+def iterate(rows: UnitConstraints, holding: ActiveSet, splitting: Splitting):
     """From rows with a side, those that are looked at, to a guess of the rows that hold the optimum; the guess that
     there is stays where they are more than there are unknowns, or have no factors."""
     lane = lane_of_block()
     one = real(1.0)
-    count = list_marked(holding.side, rows.count, rows.unknowns, holding.active)
+    count = compact_indices(holding.side, rows.count, rows.unknowns, holding.active)
     if count > rows.unknowns:
         return
-    gather(rows, holding, count, (one + _SIGMA) / _RHO)
-    if invert_root(holding.products, count, holding.root) == 0:
+    gather_active(rows, holding, count, (one + _SIGMA) / _RHO)
+    if inverse_cholesky(holding.products, count, holding.root) == 0:
         return
     for i in range(lane, count, wp.block_dim()):
-        splitting.rows[i] = splitting.begun[holding.active[i]]
-        splitting.near[i] = splitting.begun[holding.active[i]]
-        splitting.pushes[i] = real(0.0)
+        splitting.rows[i] = splitting.initial_values[holding.active[i]]
+        splitting.projected[i] = splitting.initial_values[holding.active[i]]
+        splitting.multipliers[i] = real(0.0)
         splitting.sums[i] = real(0.0)
     share = real(1.0)
     # Not a range, which would be written out.
@@ -74,42 +74,42 @@ def iterate(rows: UnitRows, holding: Holding, splitting: Splitting):
         done += 1
         for i in range(lane, count, wp.block_dim()):
             splitting.right[i] = _SIGMA * splitting.rows[i] + (one + _SIGMA) * (
-                splitting.pushes[i] / _RHO - splitting.near[i]
+                splitting.multipliers[i] / _RHO - splitting.projected[i]
             )
-        wait_for_block()
-        apply_root(holding.root, count, splitting.right, splitting.between, splitting.step)
+        sync_block()
+        apply_factor(holding.root, count, splitting.right, splitting.between, splitting.step)
         for i in range(lane, count, wp.block_dim()):
             row = holding.active[i]
             nu = splitting.step[i]
-            near = splitting.near[i]
-            push = splitting.pushes[i]
+            near = splitting.projected[i]
+            push = splitting.multipliers[i]
             ahead = near + (nu - push) / _RHO
             splitting.rows[i] = _OVER * ahead + (one - _OVER) * splitting.rows[i]
             splitting.sums[i] = (
                 _OVER * (_SIGMA * splitting.sums[i] - nu) / (one + _SIGMA) + (one - _OVER) * (splitting.sums[i])
             )
             relaxed = _OVER * ahead + (one - _OVER) * near
-            free = rows.free[row]
+            free = rows.values_at_origin[row]
             within = wp.clamp(relaxed + push / _RHO, rows.lower[row] - free, rows.upper[row] - free)
-            splitting.near[i] = within
-            splitting.pushes[i] = push + _RHO * (relaxed - within)
+            splitting.projected[i] = within
+            splitting.multipliers[i] = push + _RHO * (relaxed - within)
         share = _OVER * _SIGMA * share / (one + _SIGMA) + (one - _OVER) * share
-    wait_for_block()
-    multiply_across(holding.held, count, rows.unknowns, splitting.sums, holding.place)
-    see(rows, holding)
+    sync_block()
+    multiply_transposed(holding.active_rows, count, rows.unknowns, splitting.sums, holding.z)
+    evaluate(rows, holding)
     for row in range(lane, rows.count, wp.block_dim()):
-        splitting.held_by[row] = real(0.0)
-    wait_for_block()
+        splitting.all_multipliers[row] = real(0.0)
+    sync_block()
     for i in range(lane, count, wp.block_dim()):
-        splitting.held_by[holding.active[i]] = splitting.pushes[i]
-    wait_for_block()
+        splitting.all_multipliers[holding.active[i]] = splitting.multipliers[i]
+    sync_block()
     for row in range(lane, rows.count, wp.block_dim()):
-        at = holding.at[row] + share * splitting.begun[row]
-        push = splitting.held_by[row]
+        at = holding.values[row] + share * splitting.initial_values[row]
+        push = splitting.all_multipliers[row]
         side = int(0)
         if at - rows.lower[row] < -push:
             side = 1
         elif rows.upper[row] - at < push:
             side = -1
         holding.side[row] = side
-    wait_for_block()
+    sync_block()

@@ -5,29 +5,29 @@ What ``contact_pieces.solve_relaxed`` does on a host: see there, and docs/concep
 
 import warp as wp
 
-from egs_warp.kernels.block import sum_of_block, wait_for_block
-from egs_warp.kernels.locomotion.active_set import ASTRAY, FOUND
-from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows, find_optimum, is_settled
+from egs_warp.kernels.block import sum_of_block, sync_block
+from egs_warp.kernels.locomotion.active_set import FOUND, NUMERICAL_FAILURE
+from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints, find_optimum, is_cancelled
 from egs_warp.kernels.locomotion.block_algebra import (
-    add_product,
-    apply_root,
+    apply_factor,
+    gemm_add,
     lane_of_block,
     multiply,
     multiply_at,
-    normalise,
+    normalize_rows,
 )
-from egs_warp.kernels.locomotion.block_elimination import invert_root
-from egs_warp.kernels.locomotion.block_pieces import COSINES, LEFT, ROOM, SINES, Program
+from egs_warp.kernels.locomotion.block_elimination import inverse_cholesky
+from egs_warp.kernels.locomotion.block_mode_region import BOUND_PADDING, COSINES, ROW_TOLERANCE, SINES, Program
 from egs_warp.kernels.locomotion.block_splitting import Splitting, iterate
-from egs_warp.kernels.locomotion.piece_search import BLOCK, HEADER, HOPELESS, guess, program_in
-from egs_warp.kernels.locomotion.pieces import FACES, SINGULAR
-from egs_warp.kernels.locomotion.step_program import tell_contact
+from egs_warp.kernels.locomotion.mode_region import CONE_FACES, DELASSUS_REGULARIZATION
+from egs_warp.kernels.locomotion.mode_search import BLOCK, HEADER_SIZE, INFEASIBLE_COST, crash_start, unpack_program
+from egs_warp.kernels.locomotion.step_program import assemble_contact
 from egs_warp.precision import Vec3, real
 
 wp.set_module_options({"enable_backward": False})
 
-_HEADER, _OF_FORCES = wp.constant(HEADER), wp.constant(1 + FACES)
-_SINGULAR = wp.constant(real(SINGULAR))
+_HEADER, _OF_FORCES = wp.constant(HEADER_SIZE), wp.constant(1 + CONE_FACES)
+_SINGULAR = wp.constant(real(DELASSUS_REGULARIZATION))
 
 
 @wp.struct
@@ -55,7 +55,7 @@ class Relaxed:
 
 
 @wp.func
-def share_of(friction: real, part: int):
+def cone_component(friction: real, part: int):
     """Of a force, what is not negative: the normal one, or what a face around the cone leaves."""
     if part == 0:
         return wp.vec3d(real(1.0), real(0.0), real(0.0))
@@ -63,13 +63,13 @@ def share_of(friction: real, part: int):
 
 
 @wp.func
-def regular(program: Program):
+def diagonal_shift(program: Program):
     """What is added to the diagonal of the cost."""
     mean = real(0.0)
     for i in range(lane_of_block(), program.size, wp.block_dim()):
-        mean += program.told[program.cost + i * (program.size + 1)] / real(program.size)
+        mean += program.packed[program.cost + i * (program.size + 1)] / real(program.size)
     mean = sum_of_block(mean)
-    wait_for_block()
+    sync_block()
     return _SINGULAR * mean
 
 
@@ -80,33 +80,33 @@ def write_root(program: Program, relaxed: Relaxed, added: real):
     lane = lane_of_block()
     size = program.size
     for e in range(lane, size * size, wp.block_dim()):
-        value = program.told[program.cost + e]
+        value = program.packed[program.cost + e]
         if e % (size + 1) == 0:
             value += added
         relaxed.cost[e / size, e % size] = value
     for i in range(lane, size, wp.block_dim()):
-        relaxed.slope[i] = program.told[program.slope + i]
-    wait_for_block()
-    if invert_root(relaxed.cost, size, relaxed.root) == 0:
+        relaxed.slope[i] = program.packed[program.slope + i]
+    sync_block()
+    if inverse_cholesky(relaxed.cost, size, relaxed.root) == 0:
         return real(-1.0)
-    apply_root(relaxed.root, size, relaxed.slope, relaxed.values, relaxed.minimum)
+    apply_factor(relaxed.root, size, relaxed.slope, relaxed.values, relaxed.minimum)
     worth = real(0.0)
     for i in range(lane, size, wp.block_dim()):
         relaxed.minimum[i] = -relaxed.minimum[i]
         worth -= real(0.5) * relaxed.slope[i] * relaxed.minimum[i]
     worth = wp.max(sum_of_block(worth), real(1.0))
-    wait_for_block()
+    sync_block()
     return worth
 
 
 @wp.func
-def see_speeds(program: Program, relaxed: Relaxed, point: wp.array[real]):
+def normal_velocities(program: Program, relaxed: Relaxed, point: wp.array[real]):
     """How fast contacts leave the ground at the ``point``, but for the program's ``offset``."""
     multiply(relaxed.leaving, program.n, program.size, point, relaxed.speeds)
 
 
 @wp.func
-def at_row(program: Program, relaxed: Relaxed, row: int, point: wp.array[real]):
+def row_value(program: Program, relaxed: Relaxed, row: int, point: wp.array[real]):
     """What a row is at the ``point``, whose speeds were seen last."""
     if row < program.n:
         return relaxed.speeds[row]
@@ -114,7 +114,7 @@ def at_row(program: Program, relaxed: Relaxed, row: int, point: wp.array[real]):
     if k < program.m:
         return point[k]
     k -= program.m
-    share = share_of(program.friction, k % _OF_FORCES)
+    share = cone_component(program.friction, k % _OF_FORCES)
     value = real(0.0)
     for t in range(3):
         value += share[t] * point[program.m + 3 * (k / _OF_FORCES) + t]
@@ -122,17 +122,17 @@ def at_row(program: Program, relaxed: Relaxed, row: int, point: wp.array[real]):
 
 
 @wp.func
-def write_rows(program: Program, relaxed: Relaxed, rows: UnitRows, begun: wp.array[real]):
+def write_rows(program: Program, relaxed: Relaxed, rows: UnitConstraints, begun: wp.array[real]):
     """In coordinates whose squares are costs, from whose origin the search begins."""
     lane = lane_of_block()
     m = program.m
     n = program.n
     size = program.size
     for e in range(lane, n * size, wp.block_dim()):
-        relaxed.leaving[e / size, e % size] = program.told[program.rows + 3 * (e / size) * size + e % size]
+        relaxed.leaving[e / size, e % size] = program.packed[program.rows + 3 * (e / size) * size + e % size]
         rows.units[e / size, e % size] = real(0.0)
-    wait_for_block()
-    add_product(rows.units, relaxed.leaving, relaxed.root, n, size, size, 0)
+    sync_block()
+    gemm_add(rows.units, relaxed.leaving, relaxed.root, n, size, size, 0)
     for e in range(lane, size * size, wp.block_dim()):
         rows.units[n + e / size, e % size] = relaxed.root[e / size, e % size]
     for row in range(lane, rows.count, wp.block_dim()):
@@ -141,44 +141,44 @@ def write_rows(program: Program, relaxed: Relaxed, rows: UnitRows, begun: wp.arr
         k = row - n - m
         if k >= 0:
             part = n + m + 3 * (k / _OF_FORCES)
-            share = share_of(program.friction, k % _OF_FORCES)
+            share = cone_component(program.friction, k % _OF_FORCES)
         for t in range(3):
-            rows.parts[row, t] = wp.where(k >= 0, part + t, part)
-            rows.shares[row, t] = share[t]
-    wait_for_block()
-    normalise(rows.units, size, rows.parts, rows.shares, rows.count, relaxed.lengths)
-    see_speeds(program, relaxed, relaxed.minimum)
+            rows.base_rows[row, t] = wp.where(k >= 0, part + t, part)
+            rows.coefficients[row, t] = share[t]
+    sync_block()
+    normalize_rows(rows.units, size, rows.base_rows, rows.coefficients, rows.count, relaxed.lengths)
+    normal_velocities(program, relaxed, relaxed.minimum)
     for row in range(lane, rows.count, wp.block_dim()):
         least = real(0.0)
         most = real(wp.inf)
         if row < n:
-            least = -program.told[program.offset + 3 * row]
+            least = -program.packed[program.offset + 3 * row]
         elif row < n + m:
-            least = program.told[program.lower + row - n]
-            most = program.told[program.upper + row - n]
-        relaxed.bounds[0, row] = least - ROOM
-        relaxed.bounds[1, row] = most + ROOM
+            least = program.packed[program.lower + row - n]
+            most = program.packed[program.upper + row - n]
+        relaxed.bounds[0, row] = least - BOUND_PADDING
+        relaxed.bounds[1, row] = most + BOUND_PADDING
         length = relaxed.lengths[row]
-        rows.free[row] = at_row(program, relaxed, row, relaxed.minimum) / length
+        rows.values_at_origin[row] = row_value(program, relaxed, row, relaxed.minimum) / length
         rows.lower[row] = relaxed.bounds[0, row] / length
         rows.upper[row] = relaxed.bounds[1, row] / length
-        rows.slack[row] = LEFT * wp.max(real(1.0), length) / length
+        rows.slack[row] = ROW_TOLERANCE * wp.max(real(1.0), length) / length
         begun[row] = real(0.0)
-    wait_for_block()
+    sync_block()
 
 
 @wp.func
-def misses(program: Program, relaxed: Relaxed, count: int):
+def count_violations(program: Program, relaxed: Relaxed, count: int):
     """How many rows the point that was found breaks."""
-    see_speeds(program, relaxed, relaxed.found)
+    normal_velocities(program, relaxed, relaxed.found)
     missed = real(0.0)
     for row in range(lane_of_block(), count, wp.block_dim()):
-        at = at_row(program, relaxed, row, relaxed.found)
-        slack = real(10.0) * LEFT * wp.max(real(1.0), relaxed.lengths[row])
+        at = row_value(program, relaxed, row, relaxed.found)
+        slack = real(10.0) * ROW_TOLERANCE * wp.max(real(1.0), relaxed.lengths[row])
         if not (at > relaxed.bounds[0, row] - slack and at < relaxed.bounds[1, row] + slack):
             missed += real(1.0)
     missed = sum_of_block(missed)
-    wait_for_block()
+    sync_block()
     return int(missed)
 
 
@@ -186,24 +186,24 @@ def misses(program: Program, relaxed: Relaxed, count: int):
 def objective_at(program: Program, relaxed: Relaxed, added: real):
     """What the point that was found costs."""
     size = program.size
-    multiply_at(program.told, program.cost, size, size, size, relaxed.found, relaxed.values)
+    multiply_at(program.packed, program.cost, size, size, size, relaxed.found, relaxed.values)
     total = real(0.0)
     for k in range(lane_of_block(), size, wp.block_dim()):
         at = relaxed.found[k]
         total += at * (real(0.5) * (relaxed.values[k] + added * at) + relaxed.slope[k])
     total = sum_of_block(total)
-    wait_for_block()
+    sync_block()
     return total + program.constant
 
 
 @wp.kernel(launch_bounds=BLOCK)
-def relax_kernel(
+def relaxed_qp_kernel(
     # In:
     told: wp.array[real],
     # Scratch:
     relaxed: Relaxed,
-    rows: UnitRows,
-    holding: Holding,
+    rows: UnitConstraints,
+    holding: ActiveSet,
     splitting: Splitting,
     # Out:
     answer: wp.array[real],
@@ -211,31 +211,31 @@ def relax_kernel(
     """``solve_relaxed`` of what is ``told``, as ``search_kernel`` reads it. ``answer``: how it ended, the objective;
     from ``HEADER`` on the activations (m,)."""
     lane = lane_of_block()
-    program = program_in(told)
+    program = unpack_program(told)
     size = program.size
-    added = regular(program)
+    added = diagonal_shift(program)
     worth = write_root(program, relaxed, added)
-    ended = ASTRAY
-    if worth > real(0.0) and not is_settled(rows):
+    ended = NUMERICAL_FAILURE
+    if worth > real(0.0) and not is_cancelled(rows):
         rows.unknowns = size
         rows.count = program.m + (1 + _OF_FORCES) * program.n
-        rows.made_of = program.n + size
-        rows.most = HOPELESS * worth
-        write_rows(program, relaxed, rows, splitting.begun)
+        rows.base_count = program.n + size
+        rows.cost_limit = INFEASIBLE_COST * worth
+        write_rows(program, relaxed, rows, splitting.initial_values)
         ended = FOUND
         for k in range(lane, size, wp.block_dim()):
             relaxed.found[k] = real(0.0)
-        wait_for_block()
-        if guess(rows, holding) > 0:
+        sync_block()
+        if crash_start(rows, holding) > 0:
             iterate(rows, holding, splitting)
             ended = find_optimum(rows, holding)
-            multiply(relaxed.root, size, size, holding.place, relaxed.found)
+            multiply(relaxed.root, size, size, holding.z, relaxed.found)
         for k in range(lane, size, wp.block_dim()):
             relaxed.found[k] = relaxed.found[k] + relaxed.minimum[k]
-        wait_for_block()
+        sync_block()
     if ended == FOUND:
-        if misses(program, relaxed, rows.count) > 0:
-            ended = ASTRAY
+        if count_violations(program, relaxed, rows.count) > 0:
+            ended = NUMERICAL_FAILURE
         objective = objective_at(program, relaxed, added)
         for k in range(lane, program.m, wp.block_dim()):
             answer[_HEADER + k] = wp.clamp(relaxed.found[k], told[program.lower + k], told[program.upper + k])
@@ -246,7 +246,7 @@ def relax_kernel(
 
 
 @wp.kernel
-def start_kernel(
+def pack_search_kernel(
     # Model:
     weight: real,
     # In:
@@ -261,10 +261,10 @@ def start_kernel(
     k = wp.tid()
     if k == 0 and settled[0] != 0:
         told_out[4] = real(0.0)
-    program = program_in(told_out)
+    program = unpack_program(told_out)
     begin = program.upper + program.m
     kinds = begin + program.m
     if k < program.m:
         told_out[begin + k] = activations[k]
     if k < program.n:
-        tell_contact(told_out, kinds, kinds + program.n, k, forces[k] / weight, program.friction)
+        assemble_contact(told_out, kinds, kinds + program.n, k, forces[k] / weight, program.friction)

@@ -5,7 +5,7 @@ See ``kernels.locomotion.admm``.
 
 import warp as wp
 
-from egs_warp.kernels.block import largest_of_block, sum_of_block, wait_for_block
+from egs_warp.kernels.block import block_max, sum_of_block, sync_block
 from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
@@ -48,7 +48,7 @@ class Iterates:
 
 
 @wp.struct
-class Memory:
+class AdmmWorkspace:
     """Of all programs, scaled: x = D x', y = E y' / c, P' = c D P D, A' = E A D."""
 
     P: wp.array3d[real]
@@ -98,7 +98,7 @@ class Scaled:
 
 
 @wp.func
-def memory_of(program: int, programs: Programs, memory: Memory):
+def memory_of(program: int, programs: Programs, memory: AdmmWorkspace):
     """What belongs to ``program``."""
     own = Scaled()
     own.variables = programs.variables[program]
@@ -153,7 +153,7 @@ def equilibrate(lane: int, P: wp.array2d[real], q: wp.array[real], A: wp.array2d
     for i in range(lane, m, wp.block_dim()):
         own.weight[i] = real(1.0)
     cost = real(1.0)
-    wait_for_block()
+    sync_block()
     for _ in range(passes):
         for j in range(lane, n, wp.block_dim()):
             most = cost * largest_across(P, j, own.stretch, j + 1)
@@ -164,19 +164,19 @@ def equilibrate(lane: int, P: wp.array2d[real], q: wp.array[real], A: wp.array2d
             for j in range(n):
                 most = wp.max(most, wp.abs(A[i, j]) * own.stretch[j])
             own.push[i] = own.weight[i] / wp.sqrt(length_of(own.weight[i] * most))
-        wait_for_block()
+        sync_block()
         for j in range(lane, n, wp.block_dim()):
             own.stretch[j] = own.slope[j]
         for i in range(lane, m, wp.block_dim()):
             own.weight[i] = own.push[i]
-        wait_for_block()
+        sync_block()
         norms = real(0.0)
         most = real(0.0)
         for j in range(lane, n, wp.block_dim()):
             norms += own.stretch[j] * largest_across(P, j, own.stretch, j + 1)
             most = wp.max(most, own.stretch[j] * wp.abs(q[j]))
         mean = sum_of_block(norms) / real(n)
-        most = length_of(cost * largest_of_block(most))
+        most = length_of(cost * block_max(most))
         cost = cost / length_of(wp.max(cost * mean, most))
     return cost
 

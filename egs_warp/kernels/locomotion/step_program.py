@@ -6,19 +6,19 @@ See ``egs_warp/locomotion/device_plan.py``; numbers are told as ``search_kernel`
 import warp as wp
 
 from egs_warp.kernels.locomotion.active_set import FOUND
-from egs_warp.kernels.locomotion.piece_search import HEADER, unit_of
-from egs_warp.kernels.locomotion.pieces import FREE, NEARLY, NOTHING, SLIDE, STICK
+from egs_warp.kernels.locomotion.mode_region import CONE_FRACTION, FREE, SLIDE, STICK, ZERO_FORCE
+from egs_warp.kernels.locomotion.mode_search import HEADER_SIZE, normalized
 from egs_warp.precision import Vec3, real
 
 wp.set_module_options({"enable_backward": False})
 
-_HEADER, _FOUND = wp.constant(HEADER), wp.constant(int(FOUND))
+_HEADER, _FOUND = wp.constant(HEADER_SIZE), wp.constant(int(FOUND))
 _FREE, _STICK, _SLIDE = wp.constant(FREE), wp.constant(STICK), wp.constant(SLIDE)
-_NOTHING, _NEARLY = wp.constant(real(NOTHING)), wp.constant(real(NEARLY))
+_NOTHING, _NEARLY = wp.constant(real(ZERO_FORCE)), wp.constant(real(CONE_FRACTION))
 
 
 @wp.func
-def tell_contact(told: wp.array[real], kinds: int, slips: int, i: int, force: Vec3, friction: real):
+def assemble_contact(told: wp.array[real], kinds: int, slips: int, i: int, force: Vec3, friction: real):
     """How contact ``i`` moves under its ``force``, body weights, which obeys Coulomb's law."""
     pull = wp.sqrt(force[1] * force[1] + force[2] * force[2])
     kind = _FREE
@@ -26,14 +26,14 @@ def tell_contact(told: wp.array[real], kinds: int, slips: int, i: int, force: Ve
         kind = _STICK
         if pull >= _NEARLY * friction * force[0]:
             kind = _SLIDE
-    way = unit_of(-force[1], -force[2])
+    way = normalized(-force[1], -force[2])
     told[kinds + i] = real(kind)
     told[slips + 2 * i] = way[0]
     told[slips + 2 * i + 1] = way[1]
 
 
 @wp.kernel
-def tell_kernel(
+def assemble_qp_kernel(
     # Model:
     limit: int,
     speed: real,
@@ -83,7 +83,7 @@ def tell_kernel(
                 told_out[begin + part * m + column] = bounds[part, column]
         kinds = begin + 3 * m
         if column < n:
-            tell_contact(told_out, kinds, kinds + n, column, forces[column] / weight, frictions[0])
+            assemble_contact(told_out, kinds, kinds + n, column, forces[column] / weight, frictions[0])
         if column == last:
             told_out[0] = real(m)
             told_out[1] = real(n)
@@ -93,7 +93,7 @@ def tell_kernel(
 
 
 @wp.kernel
-def take_kernel(
+def scatter_solution_kernel(
     # In:
     counts: wp.array[int],
     answer: wp.array[real],
@@ -114,7 +114,7 @@ def take_kernel(
 
 
 @wp.kernel
-def settled_kernel(
+def accept_search_kernel(
     # In:
     counts: wp.array[int],
     answer: wp.array[real],

@@ -11,7 +11,7 @@ from egs_warp.kernels.render.ellipse import TILE, tile_columns, tile_rows
 wp.set_module_options({"enable_backward": False})
 
 
-NO_PAIR = wp.constant(wp.uint32(0xFFFFFFFF))
+EMPTY_KEY = wp.constant(wp.uint32(0xFFFFFFFF))
 """Sort key of room that no pair fills: behind every tile."""
 
 
@@ -24,7 +24,7 @@ def first_slot_of(slot_end: wp.array[wp.int64], g: wp.int32) -> wp.int32:
     return slot
 
 
-AHEAD = wp.constant(12)
+PREFETCH_DISTANCE = wp.constant(12)
 """Gaussians in depth order lie anywhere in memory: so many are asked for before their turn."""
 
 
@@ -35,7 +35,7 @@ AHEAD = wp.constant(12)
     __builtin_prefetch(falloff.data + g);
 #endif
 """)
-def ask_for_ellipse(slot_end: wp.array[wp.int64], ellipse: wp.array[wp.vec4], falloff: wp.array[wp.vec2], g: wp.int32):
+def prefetch_ellipse(slot_end: wp.array[wp.int64], ellipse: wp.array[wp.vec4], falloff: wp.array[wp.vec2], g: wp.int32):
     """Have what ``count_tiles_kernel`` reads of Gaussian ``g`` brought to the CPU's cache."""
     ...
 
@@ -45,7 +45,7 @@ def ask_for_ellipse(slot_end: wp.array[wp.int64], ellipse: wp.array[wp.vec4], fa
     __builtin_prefetch(slot_end.data + g);
 #endif
 """)
-def ask_for_slots(slot_end: wp.array[wp.int64], g: wp.int32):
+def prefetch_slots(slot_end: wp.array[wp.int64], g: wp.int32):
     """Have what ``fill_tiles_kernel`` reads of Gaussian ``g`` brought to the CPU's cache."""
     ...
 
@@ -70,7 +70,7 @@ def count_tiles_kernel(
     columns = (width + TILE - 1) / TILE
     last = chunk_start[chunk + 1] - 1
     for rank in range(chunk_start[chunk], last + 1):
-        ask_for_ellipse(slot_end, ellipse, falloff, gaussian_from_rank[wp.min(rank + AHEAD, last)])
+        prefetch_ellipse(slot_end, ellipse, falloff, gaussian_from_rank[wp.min(rank + PREFETCH_DISTANCE, last)])
         g = gaussian_from_rank[rank]
         slot = first_slot_of(slot_end, g)
         e = ellipse[g]
@@ -102,7 +102,7 @@ def fill_tiles_kernel(
     chunk = wp.tid() + first_chunk
     last = chunk_start[chunk + 1] - 1
     for rank in range(chunk_start[chunk], last + 1):
-        ask_for_slots(slot_end, gaussian_from_rank[wp.min(rank + AHEAD, last)])
+        prefetch_slots(slot_end, gaussian_from_rank[wp.min(rank + PREFETCH_DISTANCE, last)])
         g = gaussian_from_rank[rank]
         slot = first_slot_of(slot_end, g)
         end = wp.int32(slot_end[g])
@@ -143,7 +143,7 @@ def emit_tiles_kernel(
     for i in range(g, room, slot_end.shape[0]):
         slot_and_gaussian_out[i] = i
         if not fits or wp.int64(i) >= pair_count:
-            key_out[i] = NO_PAIR
+            key_out[i] = EMPTY_KEY
     if not fits:
         return
     slot = first_slot_of(slot_end, g)
@@ -167,7 +167,7 @@ def emit_tiles_kernel(
 def tile_of_key(key: wp.uint32, kept_bits: wp.int32, tiles: wp.int32) -> wp.int32:
     """Number of the tile; ``tiles`` for room that no pair fills."""
     tile = tiles
-    if key != NO_PAIR:
+    if key != EMPTY_KEY:
         tile = wp.int32(key >> wp.uint32(kept_bits))
     return tile
 

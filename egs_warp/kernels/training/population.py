@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from egs_warp.kernels.deformation.decomposition import turn_of
+from egs_warp.kernels.deformation.decomposition import rotation_from_quaternion
 
 wp.set_module_options({"enable_backward": False})
 
@@ -49,7 +49,7 @@ def jitter_kernel(
     gate = sigmoid(-STEEPNESS * (sigmoid(opacity_logits[n]) - faint))
     # Above this the gate moves nothing that can be seen.
     if gate > 1.0e-6:
-        turn = turn_of(rotations[n])
+        turn = rotation_from_quaternion(rotations[n])
         local = wp.transpose(turn) * noise[n]
         s = log_scales[n]
         local = wp.vec3(wp.exp(2.0 * s[0]) * local[0], wp.exp(2.0 * s[1]) * local[1], wp.exp(2.0 * s[2]) * local[2])

@@ -1,0 +1,94 @@
+"""Objects and ground of real scenes as a person drew them: ``tests/data/rooms``.
+
+Each scene has eight views, of a ring about the object or photos of it. In each the object's outline was drawn by hand
+on the picture (polygons, then moved by at most five pixels to the picture's own edges by GrabCut, and looked at),
+before any method had been run on them; and six places were marked on what it stands on.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.lens import Undistortion
+from egs_warp.io import read_cameras
+from harness import data_folder
+
+FOLDER = Path(__file__).resolve().parents[1] / "tests" / "data" / "rooms"
+NAMES = ("koala", "fox", "narcissus", "playbot", "bonsai")
+
+
+@dataclass(frozen=True)
+class DrawnView:
+    """One picture with what was drawn on it, straightened where its lens bends lines."""
+
+    camera: Camera
+    mask: np.ndarray
+    """(H, W) bool, True on the object."""
+    ground: np.ndarray
+    """(k, 2) pixels that show what it stands on."""
+
+
+@dataclass(frozen=True)
+class DrawnScene:
+    """A scene with its views."""
+
+    name: str
+    capture: Path | None
+    """None where photos are to be trained first."""
+    photos: Path | None
+    views: tuple[DrawnView, ...]
+
+    @property
+    def is_here(self) -> bool:
+        """Whether the data are."""
+        place = self.capture or self.photos
+        return place is not None and place.exists()
+
+
+def read_drawn(name: str) -> DrawnScene:
+    """What was drawn of the scene ``name``."""
+    tree = json.loads((FOLDER / f"{name}.json").read_text())
+    capture, photos = (None if tree[key] is None else data_folder() / tree[key] for key in ("capture", "photos"))
+    scene = DrawnScene(name, capture, photos, ())
+    if not scene.is_here:
+        return scene
+    posed = {Path(one.name).name: one for one in read_cameras(photos)} if photos else {}
+    views = []
+    for view in tree["views"]:
+        mask, ground = _mask(view), np.array(view["ground"], float)
+        if photos is None:
+            views.append(DrawnView(_camera(view), mask, ground))
+            continue
+        one = posed[view["name"]]
+        if one.lens is not None:
+            straight = Undistortion.of(one.camera, one.lens)
+            mask = straight.mask(mask)
+            ground = np.array([straight.pixel(u, v) for u, v in ground])
+        views.append(DrawnView(one.camera, mask, ground))
+    return DrawnScene(name, capture, photos, tuple(views))
+
+
+def _mask(view: dict[str, Any]) -> np.ndarray:
+    """(H, W) bool: outlines within outlines are holes."""
+    mask = np.zeros((view["height"], view["width"]), np.uint8)
+    cv2.fillPoly(mask, [np.array(outline, np.int32).reshape(-1, 2) for outline in view["outline"]], 1)
+    return mask > 0
+
+
+def _camera(view: dict[str, Any]) -> Camera:
+    width, height, rotation = view["width"], view["height"], np.array(view["rotation"], float)
+    centre = np.array(view["centre"], float)
+    away = float(np.linalg.norm(centre))
+    return Camera(
+        *(width, height, view["focal"], view["focal"], width / 2.0, height / 2.0),
+        rotation=rotation,
+        translation=-rotation @ centre,
+        near=0.01 * away,
+    )

@@ -1,0 +1,122 @@
+"""What a picture of a film costs by its stages: the creature carried by its cage, its shadow on the floor, the splats
+drawn over that, and bytes for a video on the host.
+
+python benchmarks/frame_time.py [--quick] [--device cuda:0] [--seed 0] [--json PATH] [--plot PATH]
+
+The pawn in a cage of about 1,000 nodes, which bends to and fro. Stages are timed one by one, the whole without waiting
+between them. Aim: ``picture_60hz`` (1,000,000 Gaussians at 1920 x 1080 within 16.7 ms; null on a CPU). Encoding and the
+step are not in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from egs_warp.assets import pawn
+from egs_warp.deformation.deformer import Deformer
+from egs_warp.deformation.embedding import embed_gaussians
+from egs_warp.geometry.body_frame import GROUND
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.render.backdrop import grid_floor
+from egs_warp.render.compositing import PendingImage
+from egs_warp.render.rasteriser import enqueue_image, render_gaussians
+from egs_warp.render.shadow import ContactShadow, shadow_blur_radius
+from harness import Row, Table, flags, median_ms, report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+NODES = 800
+"""--nodes that give the pawn a cage of about 1,000."""
+SIZES = ((512, 512), (1920, 1080))
+FRAME = 1e3 / 60.0
+
+
+class Studio:
+    """What draws a creature from one place over a floor with its shadow."""
+
+    def __init__(self, creature: Creature, size: tuple[int, int]) -> None:
+        height = creature.body.height
+        self._deformer = Deformer(creature.cloud, embed_gaussians(creature.cloud, creature.cage.mesh))
+        eye, middle = height * np.array([1.6, -2.4, 1.1]), height * np.array([0.0, 0.0, 0.45])
+        self.camera = Camera.look_at(eye, middle, np.eye(3)[2], width=size[0], height=size[1])
+        where = {"centre": np.zeros(3), "reach": 3.5 * height, "device": creature.cloud.device}
+        ground = ContactShadow(self.camera, GROUND, grain=shadow_blur_radius(creature.cloud), height=height, **where)
+        self.behind = grid_floor(ground, cell=0.25 * height)
+
+    def carried(self, nodes: np.ndarray) -> GaussianCloud:
+        """The Gaussians where the cage has ``nodes`` (N, 3)."""
+        return self._deformer.deform(nodes).cloud
+
+    def begun(self, cloud: GaussianCloud) -> PendingImage:
+        """The picture of that."""
+        return enqueue_image(cloud, self.camera, background=self.behind.background(cloud))
+
+
+def measure(creature: Creature, size: tuple[int, int], *, repeats: int) -> Row:
+    """A row of pictures of ``size`` across and down."""
+    nodes, height = creature.cage.mesh.nodes, creature.body.height
+    studio, device, turn = Studio(creature, size), creature.cloud.device, iter(range(1_000_000))
+
+    def bent() -> np.ndarray:
+        lean = 0.2 * np.sin(0.3 * next(turn)) * (nodes[:, 2] / height) ** 2
+        return nodes + np.outer(height * lean, [1.0, 0.0, 0.0])
+
+    cloud = studio.carried(bent())
+    floor, image = studio.behind.background(cloud), studio.begun(cloud).result().image
+    stages = {
+        "carry": lambda: studio.carried(bent()),
+        "shadow": lambda: studio.behind.background(cloud),
+        "draw": lambda: render_gaussians(cloud, studio.camera, background=floor),
+        "bytes": image.colour_srgb8,
+        "whole": lambda: studio.begun(studio.carried(bent())).result().image.colour_srgb8(),
+    }
+    times = median_ms(stages, repeats=repeats, synchronise=lambda: wp.synchronize_device(device))
+    return {"gaussians": cloud.count, "width": size[0], "height": size[1], **times}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmark."""
+    options = flags(__doc__, quick="22,000 Gaussians", seed="of the Gaussians").parse_args(arguments)
+    counts = (22_000,) if options.quick else (22_000, 180_000, 1_000_000)
+    table = Table(
+        **{"Gaussians": "9d", "width": "5d", "height": "6d"},
+        **dict.fromkeys(("carry", "shadow", "draw", "bytes", "whole"), "8.2f"),
+    )
+    rows: list[Row] = []
+    for count in counts:
+        made = pawn(gaussian_count=count, seed=options.seed, device=options.device)
+        creature = make_creature(made.cloud, plane=made.plane, nodes=NODES)
+        for size in SIZES:
+            rows.append(measure(creature, size, repeats=5 if options.quick else 15))
+            table.row(*rows[-1].values())
+    largest = rows[-1]["whole"] if rows[-1]["gaussians"] > 500_000 else None
+    on_gpu = wp.get_device(options.device).is_cuda and largest is not None
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        left = np.zeros(len(rows))
+        for stage in ("carry", "shadow", "draw", "bytes"):
+            taken = np.array([row[stage] for row in rows])
+            axes.barh([f"{row['gaussians']}, {row['width']} x {row['height']}" for row in rows], taken, left=left)
+            left += taken
+        axes.axvline(FRAME, color="0.5")
+        axes.set_xlabel("milliseconds a picture: carry, shadow, draw, bytes")
+
+    report(
+        options,
+        rows,
+        aims={"picture_60hz": largest <= FRAME if on_gpu and largest is not None else None},
+        why_null={} if on_gpu else {"picture_60hz": "told of a GPU and of 1,000,000 Gaussians"},
+        draw=draw,
+    )
+
+
+if __name__ == "__main__":
+    main()

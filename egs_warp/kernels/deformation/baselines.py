@@ -1,0 +1,159 @@
+"""Other ways to carry Gaussians with a cage, to compare with: surface-bound, one gradient, a small tetrahedron each."""
+
+import warp as wp
+
+from egs_warp.kernels.deformation.cage_maps import CageMaps, affine_of, exponential, single, single_matrix
+from egs_warp.kernels.deformation.decomposition import rotation_from_quaternion
+from egs_warp.kernels.deformation.deformer import write_gaussian
+from egs_warp.kernels.deformation.embedding import axes_from_quaternion
+from egs_warp.precision import Mat33, Vec3, Vec4, real
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def interpolated(corners: wp.vec4i, weights: Vec4, positions: wp.array[Vec3]) -> Vec3:
+    """Eq. (2) read backwards: the point with these weights."""
+    return (
+        weights[0] * positions[corners[0]]
+        + weights[1] * positions[corners[1]]
+        + weights[2] * positions[corners[2]]
+        + weights[3] * positions[corners[3]]
+    )
+
+
+@wp.func
+def double(v: wp.vec3) -> Vec3:
+    return Vec3(real(v[0]), real(v[1]), real(v[2]))
+
+
+@wp.func
+def local_corner(j: wp.int32) -> Vec3:
+    """Corner j of a regular tetrahedron around the origin: alternate corners of the cube of side 2."""
+    one = real(1.0)
+    if j == 0:
+        return Vec3(one, one, one)
+    if j == 1:
+        return Vec3(one, -one, -one)
+    if j == 2:
+        return Vec3(-one, one, -one)
+    return Vec3(-one, -one, one)
+
+
+@wp.func
+def local_lengths(log_scales: wp.vec3, reach: real, least: real) -> Vec3:
+    s = exponential(log_scales)
+    return Vec3(wp.max(reach * real(s[0]), least), wp.max(reach * real(s[1]), least), wp.max(reach * real(s[2]), least))
+
+
+@wp.kernel
+def local_tetrahedron_kernel(
+    first_row: wp.int32,
+    # In:
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    reach: real,
+    least: real,
+    # Out:
+    corners_out: wp.array[Vec3],
+):
+    """Corners of each Gaussian's own tetrahedron, rows 4 i .. 4 i + 3."""
+    row = first_row + wp.tid()
+    lengths = local_lengths(log_scales[row], reach, least)
+    for j in range(4):
+        corner = wp.cw_mul(local_corner(j), lengths)
+        corners_out[4 * row + j] = double(means[row]) + axes_from_quaternion(rotations[row]) * corner
+
+
+@wp.kernel
+def carry_local_tetrahedron_kernel(
+    first_row: wp.int32,
+    # In:
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    corners: wp.array[Vec3],
+    reach: real,
+    least: real,
+    # Out:
+    means_out: wp.array[wp.vec3],
+    rotations_out: wp.array[wp.vec4],
+    log_scales_out: wp.array[wp.vec3],
+    turns_out: wp.array[wp.vec4],
+):
+    """F from the corners of each Gaussian's own tetrahedron,
+    which the cage has carried (VR-GS, two-level embedding).
+    """
+    row = first_row + wp.tid()
+    lengths = local_lengths(log_scales[row], reach, least)
+    centre = Vec3()
+    moments = Mat33()
+    for j in range(4):
+        centre += real(0.25) * corners[4 * row + j]
+    for j in range(4):
+        moments += wp.outer(real(0.25) * (corners[4 * row + j] - centre), local_corner(j))
+    one = real(1.0)
+    stretched = single_matrix(moments * wp.diag(Vec3(one / lengths[0], one / lengths[1], one / lengths[2])))
+    axes = rotation_from_quaternion(rotations[row])
+    means_out[row] = single(centre)
+    write_gaussian(row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, turns_out)
+
+
+@wp.kernel
+def carry_gradient_kernel(
+    first_row: wp.int32,
+    # In:
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    positions: wp.array[Vec3],
+    nodes: wp.array[wp.vec4i],
+    weights: wp.array[Vec4],
+    tet_from_mean: wp.array[wp.int32],
+    cage: CageMaps,
+    # Out:
+    means_out: wp.array[wp.vec3],
+    rotations_out: wp.array[wp.vec4],
+    log_scales_out: wp.array[wp.vec3],
+    turns_out: wp.array[wp.vec4],
+):
+    """One F, that of the tetrahedron which holds the mean (PhysGaussian)."""
+    row = first_row + wp.tid()
+    axes = rotation_from_quaternion(rotations[row])
+    means_out[row] = single(interpolated(nodes[row], weights[row], positions))
+    stretched = affine_of(cage, tet_from_mean[row]).gradient * axes
+    write_gaussian(row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, turns_out)
+
+
+@wp.func
+def triangle_frame(a: Vec3, b: Vec3, c: Vec3) -> Mat33:
+    """Two edges and the unit normal."""
+    return wp.matrix_from_cols(b - a, c - a, wp.normalize(wp.cross(b - a, c - a)))
+
+
+@wp.kernel
+def carry_surface_kernel(
+    first_row: wp.int32,
+    # In:
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    rest: wp.array[Vec3],
+    positions: wp.array[Vec3],
+    faces: wp.array[wp.vec3i],
+    face_from_gaussian: wp.array[wp.int32],
+    # Out:
+    means_out: wp.array[wp.vec3],
+    rotations_out: wp.array[wp.vec4],
+    log_scales_out: wp.array[wp.vec3],
+    turns_out: wp.array[wp.vec4],
+):
+    """F of the nearest surface triangle, whose thickness does not change (SuGaR: Gaussians bound to triangles)."""
+    row = first_row + wp.tid()
+    f = faces[face_from_gaussian[row]]
+    before = triangle_frame(rest[f[0]], rest[f[1]], rest[f[2]])
+    after = triangle_frame(positions[f[0]], positions[f[1]], positions[f[2]])
+    gradient = after * wp.inverse(before)
+    axes = rotation_from_quaternion(rotations[row])
+    means_out[row] = single(positions[f[0]] + gradient * (double(means[row]) - rest[f[0]]))
+    stretched = single_matrix(gradient) * axes
+    write_gaussian(row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, turns_out)

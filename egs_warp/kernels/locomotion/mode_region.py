@@ -1,0 +1,272 @@
+"""The program of a piece of contact over activations alone, in vectors of four, on a CPU.
+
+See ``egs_warp/locomotion/contact_modes.py``.
+"""
+
+import math
+
+import warp as wp
+
+from egs_warp.kernels.vectors import ROW_ELIMINATION, on_cpu
+from egs_warp.precision import real
+
+wp.set_module_options({"enable_backward": False})
+
+FREE, STICK, SLIDE = 0, 1, 2
+"""How a contact moves."""
+TO_FREE, TO_SLIDE, TO_OTHER_DIRECTION, TO_TOUCHING = 0, 1, 2, 3
+"""What it does beyond a row that says where a piece ends."""
+CONE_FACES = 8
+"""Of the pyramid that stands in for the friction cone of a contact that sticks."""
+SLIDE_SECTOR = math.radians(30.0)
+"""How far a contact that slides may turn from the way that its friction is taken against. Friction that stays where it
+was while a foot slides elsewhere pushes a body along that no ground would."""
+DELASSUS_REGULARIZATION = 1e-7
+"""Of the mean of the operator's diagonal: more points than the cage can resolve leave it singular."""
+ZERO_FORCE = 1e-9
+"""Body weights: what rounding leaves of the force of a contact that is open."""
+CONE_FRACTION = 1.0 - 1e-6
+"""Of the cone's radius: a contact whose friction comes so near to it slides."""
+ZERO_SPEED = 1e-9
+"""Of sqrt(g H): tangential velocity without a direction."""
+ACTIVE = 1e-3
+"""Multiplier, of the objective's value for a unit of the row, from which a bound is worth leaving."""
+GAIN = 5e-3
+"""Share of the objective by which a further piece has to lower it."""
+BROKEN = 0.02
+"""By which a start may break a row that its piece does not quite hold."""
+ROUNDING = 1e-6
+"""Of a start that is the only point of its piece, as where contacts repeat each other."""
+_NO_PIVOT = 1e-14
+_ANGLES = [2.0 * math.pi * face / CONE_FACES for face in range(CONE_FACES)]
+_NORMALS = ", ".join(f"{math.cos(math.pi / CONE_FACES)}, {-math.cos(angle)}, {-math.sin(angle)}" for angle in _ANGLES)
+
+
+def padded(count: int) -> int:
+    """Columns of a matrix by eights."""
+    return -(-count // 8) * 8
+
+
+def scratch_size(activations: int, contacts: int) -> int:
+    """Numbers of scratch memory that a piece takes at most."""
+    wide, touches = padded(activations + 1), 3 * contacts
+    met = activations + touches
+    return (touches + 5) * wide + max(
+        (touches + 1) * (padded(touches) + wide), met * wide + (met + activations) * (touches + 1)
+    )
+
+
+@wp.func_native(
+    on_cpu(
+        ROW_ELIMINATION
+        + f"""
+    constexpr int FREE = {FREE}, STICK = {STICK}, SLIDE = {SLIDE}, FACES = {CONE_FACES};
+    constexpr double SINGULAR = {DELASSUS_REGULARIZATION}, NO_PIVOT = {_NO_PIVOT};
+    constexpr double WEDGE_SINE = {math.sin(SLIDE_SECTOR)}, WEDGE_COSINE = {math.cos(SLIDE_SECTOR)};
+    // What each face leaves of the normal force over the friction, and of the tangents.
+    const double sides[3 * FACES] = {{{_NORMALS}}};
+"""
+        + """
+    const int m = activations, n = contacts, N = m + 3 * n, wide = (m + 8) & ~7, plain = (m + 7) & ~7;
+    const double *const P = (const double*)cost, *const q = (const double*)slope_of_cost;
+    const double *const W = (const double*)rows, *const w = (const double*)offset;
+    const int* const kinds = (const int*)kind;
+    const double* const slips = (const double*)slip;
+    double* room = scratch.data;
+    auto take = [&](int count) { double* const taken = room; room += count; return taken; };
+    int *const held = numbers.data, *const touching = held + 3 * n, *const pivots = touching + 3 * n;
+    int *const place = pivots + 3 * n, holds = 0, touches = 0;
+    for (int i = 0; i < n; ++i) {
+        place[i] = touches;
+        for (int t = 0; t < 3 && kinds[i] != FREE; ++t) touching[touches++] = 3 * i + t;
+        for (int t = 0; t < 3 && (kinds[i] == STICK || (kinds[i] == SLIDE && t == 0)); ++t) held[holds++] = 3 * i + t;
+    }
+    // Forces: (what is held) (f) = -(what goes on without), the last column that of no activation.
+    double* const S = take((touches + 1) * wide);
+    {
+        const int right = (holds + 7) & ~7, stride = right + wide;
+        double* const M = take((holds + 1) * stride);
+        double mean = 0.0;
+        for (int a = 0; a < holds; ++a) {
+            double *const row = M + a * stride;
+            const double* const from = W + held[a] * N;
+            for (int b = 0; b < holds; ++b) {
+                const int f = held[b], i = f / 3;
+                row[b] = from[m + f];
+                if (kinds[i] == SLIDE)
+                    row[b] -= friction * (from[m + f + 1] * slips[2 * i] + from[m + f + 2] * slips[2 * i + 1]);
+            }
+            for (int b = holds; b < right; ++b) row[b] = 0.0;
+            for (int c = 0; c < m; ++c) row[right + c] = -from[c];
+            row[right + m] = -w[held[a]];
+            for (int c = m + 1; c < wide; ++c) row[right + c] = 0.0;
+            mean += __builtin_fabs(row[a]) / holds;
+        }
+        for (int a = 0; a < holds; ++a) M[a * stride + a] += SINGULAR * mean;
+        if (eliminate_rows(M, stride, holds, stride, NO_PIVOT, pivots) < holds) return 0;
+        for (int i = (holds - 1) & ~3; holds > 0 && i >= 0; i -= 4) {
+            const int some = holds - i < 4 ? holds - i : 4;
+            double* const x = M + i * stride + right;
+            if (some == 4)
+                take_off_all(x, stride, 4, M + i * stride + i + 4, stride, x + 4 * stride, stride, wide, holds - i - 4);
+            for (int p = some - 1; p >= 0; p -= 1) {
+                const double* const row = M + (i + p) * stride + i;
+                for (int o = p + 1; o < some; ++o)
+                    for (int c = 0; c < wide; c += 4)
+                        *(v4*)(x + p * stride + c) -= row[o] * *(const v4*)(x + o * stride + c);
+                const double by = 1.0 / row[p];
+                for (int c = 0; c < wide; c += 4) *(v4*)(x + p * stride + c) *= by;
+            }
+        }
+        for (int a = 0; a < holds; ++a) {
+            const int i = held[a] / 3, t = held[a] % 3;
+            double* const to = S + (place[i] + t) * wide;
+            const double* const from = M + a * stride + right;
+            for (int c = 0; c < wide; ++c) to[c] = from[c];
+            for (int s = 0; s < 2 && kinds[i] == SLIDE; ++s)
+                for (int c = 0; c < wide; ++c) to[(s + 1) * wide + c] = -friction * slips[2 * i + s] * from[c];
+        }
+        room = M;
+    }
+    double *const f = (double*)forces, *const f0 = (double*)forces_offset;
+    for (int k = 0; k < 3 * n; ++k) {
+        f0[k] = 0.0;
+        for (int c = 0; c < plain; ++c) f[k * plain + c] = 0.0;
+    }
+    for (int g = 0; g < touches; ++g) {
+        f0[touching[g]] = S[g * wide + m];
+        for (int c = 0; c < m; ++c) f[touching[g] * plain + c] = S[g * wide + c];
+    }
+    // x = (0, offset) + (1, S) a: of P x the parts that meet it again, then its square.
+    double* const X = take((m + touches) * wide);
+    {
+        double *const L = take((m + touches) * (touches + 1)), *const down = take(m * (touches + 1));
+        for (int i = 0; i < m + touches; ++i) {
+            const double* const from = P + (i < m ? i : m + touching[i - m]) * N;
+            for (int c = 0; c < m; ++c) X[i * wide + c] = from[c];
+            for (int c = m; c < wide; ++c) X[i * wide + c] = 0.0;
+            for (int g = 0; g < touches; ++g) L[i * touches + g] = -from[m + touching[g]];
+        }
+        take_off_all(X, wide, m + touches, L, touches, S, wide, wide, touches);
+        for (int i = 0; i < m; ++i)
+            for (int g = 0; g < touches; ++g) down[i * touches + g] = -S[g * wide + i];
+        take_off_all(X, wide, m, down, touches, X + m * wide, wide, wide, touches);
+        room = L;
+    }
+    double *const Q = (double*)piece_cost, *const s = (double*)piece_slope;
+    for (int i = 0; i < m; ++i) {
+        s[i] = q[i] + X[i * wide + m];
+        for (int k = 0; k <= i; ++k) Q[i * plain + k] = Q[k * plain + i] = 0.5 * (X[i * wide + k] + X[k * wide + i]);
+        for (int k = m; k < plain; ++k) Q[i * plain + k] = 0.0;
+    }
+    for (int g = 0; g < touches; ++g)
+        for (int i = 0; i < m; ++i) s[i] += S[g * wide + i] * q[m + touching[g]];
+    // Where it ends: sign of forces, faces, ways of what slides, speeds of what is free.
+    double *A = (double*)bounds, *b = (double*)bounds_offset;
+    auto write = [&](double by, const double* from) {
+        for (int c = 0; c < m; ++c) A[c] += by * from[c];
+        *b += by * from[m];
+    };
+    auto next = [&]() { A += plain; ++b; };
+    for (int k = 0; k < total * plain; ++k) A[k] = 0.0;
+    for (int k = 0; k < total; ++k) b[k] = 0.0;
+    for (int i = 0; i < m; ++i, next()) A[i] = 1.0;
+    for (int kept = STICK; kept <= SLIDE; ++kept)
+        for (int i = 0; i < n; ++i)
+            if (kinds[i] == kept) { write(1.0, S + place[i] * wide); next(); }
+    for (int face = 0; face < FACES; ++face)
+        for (int i = 0; i < n; ++i)
+            if (kinds[i] == STICK) {
+                const double* const from = S + place[i] * wide;
+                const double* const side = sides + 3 * face;
+                write(friction * side[0], from);
+                write(side[1], from + wide);
+                write(side[2], from + 2 * wide);
+                next();
+            }
+    double *const V = X, *const L = V + 4 * wide;
+    auto speeds = [&](int first, int count) {
+        for (int t = 0; t < count; ++t) {
+            const double* const from = W + (first + t) * N;
+            for (int c = 0; c < m; ++c) V[t * wide + c] = from[c];
+            V[t * wide + m] = w[first + t];
+            for (int c = m + 1; c < wide; ++c) V[t * wide + c] = 0.0;
+            for (int g = 0; g < touches; ++g) L[t * touches + g] = -from[m + touching[g]];
+        }
+        take_off_all(V, wide, count, L, touches, S, wide, wide, touches);
+    };
+    for (int side = 1; side >= -1; side -= 2)
+        for (int i = 0; i < n; ++i)
+            if (kinds[i] == SLIDE) {
+                const double d0 = slips[2 * i], d1 = slips[2 * i + 1];
+                speeds(3 * i + 1, 2);
+                write(WEDGE_SINE * d0 - side * WEDGE_COSINE * d1, V);
+                write(WEDGE_SINE * d1 + side * WEDGE_COSINE * d0, V + wide);
+                next();
+            }
+    for (int i = 0; i < n; ++i)
+        if (kinds[i] == FREE) { speeds(3 * i, 1); write(1.0, V); next(); }
+    return 1;
+""",
+        elsewhere="return 0;",
+    )
+)
+def mode_region_native(
+    activations: wp.int32,
+    contacts: wp.int32,
+    friction: real,
+    cost: wp.uint64,
+    slope_of_cost: wp.uint64,
+    rows: wp.uint64,
+    offset: wp.uint64,
+    kind: wp.uint64,
+    slip: wp.uint64,
+    numbers: wp.array[wp.int32],
+    scratch: wp.array[real],
+    total: wp.int32,
+    forces: wp.uint64,
+    forces_offset: wp.uint64,
+    piece_cost: wp.uint64,
+    piece_slope: wp.uint64,
+    bounds: wp.uint64,
+    bounds_offset: wp.uint64,
+) -> wp.int32:
+    """See ``piece_kernel``; whether there are forces."""
+    ...
+
+
+@wp.kernel
+def mode_region_kernel(
+    # In:
+    activations: wp.int32,
+    contacts: wp.int32,
+    friction: real,
+    cost: wp.uint64,
+    slope_of_cost: wp.uint64,
+    rows: wp.uint64,
+    offset: wp.uint64,
+    kind: wp.uint64,
+    slip: wp.uint64,
+    numbers: wp.array[wp.int32],
+    scratch: wp.array[real],
+    total: wp.int32,
+    # Out:
+    forces: wp.uint64,
+    forces_offset: wp.uint64,
+    piece_cost: wp.uint64,
+    piece_slope: wp.uint64,
+    bounds: wp.uint64,
+    bounds_offset: wp.uint64,
+    there: wp.array[wp.int32],
+) -> None:
+    """Of ``ContactPieces`` (``cost`` P, ``slope_of_cost`` q, ``rows``, ``offset``) with m ``activations`` and n
+    ``contacts``, the piece in which each moves as its ``kind`` (n,) of 32 bits says, along its ``slip`` (n, 2): what
+    contact answers, ``forces`` (3n, m) and ``forces_offset`` (3n,); ``piece_cost`` (m, m) and ``piece_slope`` (m,) of
+    activations alone; ``bounds`` (total, m) and ``bounds_offset`` (total,): the activations, then what is not negative
+    where the piece holds. Those that stick or slide leave, those that stick slip at each face, those that slide turn to
+    one side, and to the other, those that are free land. All are addresses, rows of m numbers ``padded``. ``numbers``
+    are 10 n, ``scratch`` is ``room_of``. One thread."""
+    there[0] = mode_region_native(
+        activations, contacts, friction, cost, slope_of_cost, rows, offset, kind, slip, numbers, scratch, total, forces,
+        forces_offset, piece_cost, piece_slope, bounds, bounds_offset,
+    )  # fmt: skip

@@ -1,0 +1,45 @@
+"""A height-like function that grows along every limb of a body away from the ground.
+
+First a drainage field u (the body is heated evenly and cooled only at its base, so that heat flows down every limb to
+the ground: -lap u = 1, u = 0 at the base; u has no minimum but the base and no maximum but the tips), then the ascent,
+with the direction of u's gradient and unit slope, as in the heat method of Crane, Weischedel and Wardetzky (2013).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from egs_warp.geometry.tetmesh import TetMesh, edge_graph
+
+_BASE_FRACTION = 0.02
+"""Nodes lower than this part of the body's height above its lowest point are its base (or half an edge, if more)."""
+
+
+def base_nodes(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
+    """Indices of the nodes on which the body stands."""
+    heights = mesh.nodes @ up
+    edge = edge_graph(mesh).data.mean()
+    return np.flatnonzero(heights <= heights.min() + max(_BASE_FRACTION * np.ptp(heights), 0.4 * edge))
+
+
+def geodesic_height(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
+    """(N,) metres: zero at the base, growing with about unit slope along every limb away from it (module docstring)."""
+    volumes = mesh.volumes()
+    corners = mesh.nodes[mesh.tets]
+    inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])
+    gradients = np.concatenate([-inverse.sum(axis=2, keepdims=True), inverse], axis=2).transpose(0, 2, 1)
+    stiffness = np.einsum("t,tai,tbi->tab", volumes, gradients, gradients)
+    rows, columns = np.repeat(mesh.tets, 4, axis=1).ravel(), np.tile(mesh.tets, (1, 4)).ravel()
+    laplacian = sp.csc_matrix((stiffness.ravel(), (rows, columns)), shape=(len(mesh.nodes),) * 2)
+    free = np.setdiff1d(np.arange(len(mesh.nodes)), base_nodes(mesh, up))
+    solver = splu(laplacian[free][:, free].tocsc())
+    drainage, ascent = np.zeros(len(mesh.nodes)), np.zeros(len(mesh.nodes))
+    drainage[free] = solver.solve(mesh.lumped_masses(1.0)[free])
+    slopes = np.einsum("tai,ta->ti", gradients, drainage[mesh.tets])
+    slopes /= np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-300)
+    divergence = np.zeros(len(mesh.nodes))
+    np.add.at(divergence, mesh.tets, np.einsum("t,tai,ti->ta", volumes, gradients, slopes))
+    ascent[free] = solver.solve(divergence[free])
+    return ascent

@@ -1,0 +1,142 @@
+"""``creature.npz``: what the pictures of a run were drawn from, so that a page can draw them again from any side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io.arrays import READ_ERRORS, read_npz
+from egs_warp.io.atomic import atomic_write
+from egs_warp.io.limits import FURTHEST, check_pixels
+from egs_warp.motions.feet import Foot
+from egs_warp.muscles.muscle_set import MuscleSet
+
+FILE = "creature.npz"
+_SPLATS = ("means", "rotations", "log_scales", "opacity_logits", "sh")
+_CAMERA = ("rotation", "translation", "width", "height", "fx", "fy", "cx", "cy", "near", "far")
+
+
+@dataclass(frozen=True)
+class RenderData:
+    """Splats, muscles and camera of a run; metres, all in the frame of the body. P end points, M segments, F fibres."""
+
+    splats: GaussianCloud
+    """At rest, after splitting: embedded in the rest cage of the trajectory they are drawn as the film draws them."""
+    camera: Camera
+    """Of the film."""
+    muscle_ends: sp.csr_matrix
+    """(P, N) end points are this times the node positions."""
+    muscle_segments: np.ndarray
+    """(M, 2) int32, end points of each segment."""
+    muscle_bounds: np.ndarray
+    """(M,) metres: the most that ``activations`` of the trajectory can be."""
+    fibre_from_segment: np.ndarray
+    """(M,) int32."""
+    fibre_names: tuple[str, ...]
+    """(F,)"""
+    fibre_kinds: tuple[str, ...]
+    """(F,)"""
+    foot_from_node: np.ndarray
+    """(N,) int32: the foot whose sole a node belongs to, -1 for the rest."""
+
+    @classmethod
+    def of(cls, splats: GaussianCloud, camera: Camera, muscles: MuscleSet, feet: Sequence[Foot] = ()) -> RenderData:
+        """From what a film was drawn with, and what the body stands on."""
+        foot_from_node = np.full(muscles.node_count, -1, np.int32)
+        for index, foot in enumerate(feet):
+            foot_from_node[foot.sole] = index
+        return cls(
+            splats,
+            camera,
+            muscles.end_rows,
+            muscles.segments,
+            muscles.bounds,
+            muscles.fibre_from_segment,
+            muscles.fibre_names,
+            tuple(kind.value for kind in muscles.fibre_kinds),
+            foot_from_node,
+        )
+
+    def save(self, path: Path) -> None:
+        """Write ``creature.npz`` (docs/guide/report.md); the same creature gives the same bytes."""
+        arrays: dict[str, Any] = {name: getattr(self.splats, name).numpy() for name in _SPLATS}
+        arrays |= {f"camera_{name}": np.asarray(getattr(self.camera, name)) for name in _CAMERA}
+        arrays |= {
+            "muscle_end_starts": self.muscle_ends.indptr.astype(np.int32),
+            "muscle_end_nodes": self.muscle_ends.indices.astype(np.int32),
+            "muscle_end_weights": self.muscle_ends.data,
+            "muscle_segments": self.muscle_segments,
+            "muscle_bounds": self.muscle_bounds,
+            "fibre_from_segment": self.fibre_from_segment,
+            "fibre_names": np.array(self.fibre_names, dtype=np.str_),
+            "fibre_kinds": np.array(self.fibre_kinds, dtype=np.str_),
+            "foot_from_node": self.foot_from_node,
+        }
+        with atomic_write(path) as temporary, temporary.open("wb") as stream:
+            np.savez(stream, **arrays)
+
+    @classmethod
+    def load(cls, path: Path, *, node_count: int, device: str | None = None) -> RenderData:
+        """Read what ``save`` wrote for a cage of ``node_count`` nodes. Raises ``UserError`` for any other file."""
+        try:
+            arrays = read_npz(path)
+            camera: dict[str, Any] = {name: arrays[f"camera_{name}"] for name in _CAMERA}
+            whole: dict[str, Any] = {name: int(camera[name]) for name in ("width", "height")}
+            real: dict[str, Any] = {name: float(camera[name]) for name in ("fx", "fy", "cx", "cy", "near", "far")}
+            starts = arrays["muscle_end_starts"]
+            rows = (arrays["muscle_end_weights"], arrays["muscle_end_nodes"], starts)
+            found = cls(
+                GaussianCloud.from_numpy(*(arrays[name] for name in _SPLATS), device=device),
+                Camera(**whole, **real, rotation=camera["rotation"], translation=camera["translation"]),
+                sp.csr_matrix(rows, shape=(len(starts) - 1, node_count)),
+                arrays["muscle_segments"],
+                arrays["muscle_bounds"],
+                arrays["fibre_from_segment"],
+                tuple(map(str, arrays["fibre_names"])),
+                tuple(map(str, arrays["fibre_kinds"])),
+                arrays["foot_from_node"],
+            )
+            found._check(node_count)
+        except FileNotFoundError as error:
+            raise UserError(f"{path}: is missing; run egs-warp animate again, which writes it") from error
+        except READ_ERRORS as error:
+            raise UserError(f"{path}: cannot be read ({error}); run egs-warp animate again, which writes it") from error
+        return found
+
+    def _check(self, node_count: int) -> None:
+        """Raise ``ValueError`` for what cannot be drawn."""
+        camera, ends = self.camera, self.muscle_ends
+        ends.check_format()
+        check_pixels(camera.width, camera.height, "its camera")
+        numbers = np.concatenate([camera.rotation.ravel(), camera.translation, [camera.cx, camera.cy, camera.far]])
+        if (camera.rotation.shape, camera.translation.shape) != ((3, 3), (3,)) or not (abs(numbers) <= FURTHEST).all():
+            raise ValueError("its camera stands nowhere")
+        lengths = np.array([camera.fx, camera.fy, camera.near, camera.far - camera.near])
+        if not (lengths > 0.0).all() or lengths.max() > FURTHEST or min(camera.width, camera.height) < 1:
+            raise ValueError("its camera sees nothing")
+        count = len(self.muscle_bounds)
+        _check_rows("muscle_segments", self.muscle_segments, (count, 2), 0, len(ends.indptr) - 1)
+        _check_rows("fibre_from_segment", self.fibre_from_segment, (count,), 0, len(self.fibre_names))
+        _check_rows("foot_from_node", self.foot_from_node, (node_count,), -1, node_count)
+        if len(self.fibre_names) != len(self.fibre_kinds):
+            raise ValueError("fibre_names and fibre_kinds are not alike")
+        if self.muscle_bounds.shape != (count,) or not np.isfinite(self.muscle_bounds).all():
+            raise ValueError("muscle_bounds are no bounds")
+        if not (np.abs(ends.data) <= FURTHEST).all():
+            raise ValueError("muscle_end_weights are no weights")
+
+
+def _check_rows(name: str, values: np.ndarray, shape: tuple[int, ...], least: int, below: int) -> None:
+    """Raise ``ValueError`` for what are not whole numbers of this ``shape`` from ``least`` to ``below``, left out."""
+    if values.shape != shape or values.dtype.kind not in "iu":
+        raise ValueError(f"{name} has shape {values.shape} of {values.dtype}")
+    if values.size and not least <= values.min() <= values.max() < below:
+        raise ValueError(f"{name} points at what is not there")

@@ -1,0 +1,64 @@
+"""Exposure and white balance of each photo, found together with what the photos show."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from egs_warp.training.checkpoint import State
+
+_RATE, _LAST_RATE = 1e-2, 1e-4
+"""Step of Adam at the start and at the end."""
+_PULL = 1e-2
+"""Weight of the squared distance from the mean tone: what all photos share belongs to the cloud."""
+
+
+class ExposureModel:
+    """One affine map of colours (3, 4) for each view, their mean held at the identity.
+
+    Without that gauge a darker cloud under brighter tones would be as good. The views are stepped by Adam one by one:
+    one that is not seen does not drift.
+    """
+
+    def __init__(self, count: int, steps: int, device: str) -> None:
+        self._offsets = torch.zeros((count, 3, 4), device=device)
+        self._first, self._second = torch.zeros_like(self._offsets), torch.zeros_like(self._offsets)
+        self._visits = [0] * count
+        self._leaf = torch.zeros((3, 4), device=device)
+        self._steps = steps
+        self._identity = torch.eye(3, 4, device=device)
+
+    def tensor_for(self, number: int) -> torch.Tensor:
+        """(3, 4) the tone of view ``number``, a leaf whose gradient ``step`` takes."""
+        self._leaf = leaf = (self._identity + self._offsets[number]).requires_grad_()
+        return leaf
+
+    @torch.no_grad()
+    def step(self, number: int, step: int) -> None:
+        """Move the tone of view ``number`` along its gradient, and all such that their mean stays."""
+        gradient = self._leaf.grad
+        assert gradient is not None
+        gradient = gradient + 2 * _PULL * self._offsets[number]
+        self._visits[number] += 1
+        visits = self._visits[number]
+        first = self._first[number].lerp_(gradient, 0.1)
+        second = self._second[number].lerp_(gradient.square(), 0.01)
+        rate = _RATE * (_LAST_RATE / _RATE) ** (step / max(self._steps, 1))
+        size = (second / (1 - 0.99**visits)).sqrt() + 1e-12
+        self._offsets[number] -= rate / (1 - 0.9**visits) * first / size
+        self._offsets -= self._offsets.mean(dim=0)
+
+    def state(self) -> State:
+        """All that lasts from step to step."""
+        arrays = {"offsets": self._offsets, "first": self._first, "second": self._second}
+        return {name: tensor.cpu().numpy().copy() for name, tensor in arrays.items()} | {"visits": self._visits}
+
+    def restore(self, state: State) -> None:
+        """Go on from ``state``."""
+        for name, tensor in (("offsets", self._offsets), ("first", self._first), ("second", self._second)):
+            tensor.copy_(torch.from_numpy(state[name]))
+        self._visits = list(state["visits"])
+
+    def matrices(self) -> np.ndarray:
+        """(views, 3, 4) float64."""
+        return (self._identity + self._offsets).double().cpu().numpy()

@@ -1,0 +1,142 @@
+"""What training from photos begins with: Gaussians where the photos agree.
+
+Imports torch through ``egs_warp.training.finetune``, so import it only where something is trained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.io.colmap import SparsePoints
+from egs_warp.training.finetune import TrainingView
+
+LEAST_POINTS = 500
+"""Fewer triangulated points are not a scene to begin with."""
+_SIZE_OF_POINT, _OPACITY_OF_POINT = 1.0, 0.1
+"""Standard deviation over the spacing, and opacity, that a triangulated point begins with."""
+
+
+def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
+    """(3,) the point nearest to all optical axes, in the least-squares sense."""
+    centres = np.array([camera.centre for camera in cameras])
+    axes = np.array([camera.rotation[2] for camera in cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    return np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None)[0]
+
+
+def initial_cloud(
+    views: Sequence[TrainingView], *, count: int, sh_degree: int, seed: int = 0, device: str | None = None
+) -> GaussianCloud:
+    """``count`` round Gaussians, spread evenly over the region that most cameras see, in the colours they see there.
+
+    Of many random points those are kept on whose colour the views agree best, and where all views have alpha only those
+    inside of all silhouettes: a rough visual and photometric hull.
+    """
+    centres = np.array([view.camera.centre for view in views])
+    focus = middle_of([view.camera for view in views])
+    distance = float(np.median(np.linalg.norm(centres - focus, axis=1)))
+    reach = np.median([0.5 * max(v.camera.width / v.camera.fx, v.camera.height / v.camera.fy) for v in views])
+    random = np.random.default_rng(seed)
+    low, high = focus - distance * min(float(reach), 1.0), focus + distance * min(float(reach), 1.0)
+    points = random.uniform(low, high, (8 * count, 3))
+    sight = _Visibility.of(points, views)
+    if sight.solid.any():
+        # The object may fill little of what the cameras see: look again, around it alone.
+        margin = 0.05 * (high - low)
+        low, high = points[sight.solid].min(axis=0) - margin, points[sight.solid].max(axis=0) + margin
+        points = random.uniform(low, high, (8 * count, 3))
+        sight = _Visibility.of(points, views)
+    kept = np.flatnonzero(sight.solid if sight.solid.any() else sight.often)
+    if len(kept) == 0:
+        raise UserError("train: the cameras do not look at a place in common; check the poses")
+    # Empty space before a plain backdrop agrees as well as a surface does; half of the points are kept at random.
+    best = kept[np.argsort(sight.spread[kept], kind="stable")][: count // 2]
+    rest = random.permutation(np.setdiff1d(kept, best))[: count - len(best)]
+    chosen = np.concatenate([best, rest])
+    means = points[chosen]
+    volume = float(np.prod(high - low)) * len(kept) / len(points)
+    spacing = 0.5 * (volume / len(means)) ** (1 / 3)
+    sh = np.zeros((len(means), (sh_degree + 1) ** 2, 3))
+    sh[:, 0] = (sight.colour[chosen] - 0.5) / SH_BAND_0
+    return GaussianCloud.from_numpy(
+        means,
+        np.tile([1.0, 0, 0, 0], (len(means), 1)),
+        np.full((len(means), 3), np.log(spacing)),
+        np.full(len(means), np.log(0.1 / 0.9)),
+        sh,
+        device=device,
+    )
+
+
+def cloud_from_points(
+    points: SparsePoints, *, count: int | None, sh_degree: int, seed: int = 0, device: str | None = None
+) -> GaussianCloud:
+    """Round Gaussians at ``points``, at most ``count`` of them, each as large as its three nearest are far."""
+    positions, colours = points.positions, points.colours
+    if count is not None and len(positions) > count:
+        chosen = np.sort(np.random.default_rng(seed).permutation(len(positions))[:count])
+        positions, colours = positions[chosen], colours[chosen]
+    near = KDTree(positions).query(positions, k=4)[0][:, 1:]
+    spacing = np.sqrt(np.mean(near**2, axis=1))
+    # Points on one spot have no room at all.
+    spacing = np.maximum(spacing, 1e-3 * np.median(spacing))
+    sh = np.zeros((len(positions), (sh_degree + 1) ** 2, 3))
+    sh[:, 0] = (colours - 0.5) / SH_BAND_0
+    return GaussianCloud.from_numpy(
+        positions,
+        np.tile([1.0, 0, 0, 0], (len(positions), 1)),
+        np.repeat(np.log(_SIZE_OF_POINT * spacing)[:, None], 3, axis=1),
+        np.full(len(positions), np.log(_OPACITY_OF_POINT / (1 - _OPACITY_OF_POINT))),
+        sh,
+        device=device,
+    )
+
+
+@dataclass(frozen=True)
+class _Visibility:
+    """How all views together see each of n points."""
+
+    colour: np.ndarray
+    """(n, 3) mean over the views that see it."""
+    spread: np.ndarray
+    """(n,) standard deviation of the colour."""
+    often: np.ndarray
+    """(n,) bool: seen by at least half as many views as any other point."""
+    solid: np.ndarray
+    """(n,) bool: seen often, and inside of the silhouettes; nowhere, unless all views have alpha."""
+
+    @classmethod
+    def of(cls, points: np.ndarray, views: Sequence[TrainingView]) -> _Visibility:
+        sums, squares = np.zeros((len(points), 3)), np.zeros((len(points), 3))
+        seen, alpha = np.zeros(len(points)), np.zeros(len(points))
+        for view in views:
+            camera = view.camera
+            p = points @ camera.rotation.T + camera.translation
+            ahead = p[:, 2] > camera.near
+            z = np.where(ahead, p[:, 2], 1.0)
+            column = np.floor(camera.fx * p[:, 0] / z + camera.cx)
+            row = np.floor(camera.fy * p[:, 1] / z + camera.cy)
+            inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+            pixel = row[inside].astype(int), column[inside].astype(int)
+            sums[inside] += view.image[pixel]
+            squares[inside] += view.image[pixel] ** 2
+            seen[inside] += 1
+            if view.alpha is not None:
+                alpha[inside] += view.alpha[pixel]
+        known = np.maximum(seen, 1)
+        mean = sums / known[:, None]
+        often = seen >= max(0.5 * seen.max(), 1)
+        return cls(
+            colour=mean,
+            spread=np.sqrt(np.maximum(squares / known[:, None] - mean**2, 0).sum(axis=1)),
+            often=often,
+            # One mask in ten may cut a little off.
+            solid=often & (alpha > 0.9 * known),
+        )

@@ -1,0 +1,39 @@
+"""One moment of a live creature as the page is sent it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.pipelines.creature import Creature
+from egs_warp.web.packets import Frame
+
+
+def encode_frame(index: int, state: BodyState, report: StepReport | None, creature: Creature) -> Frame:
+    """What the page is sent of ``state``, to which the step of ``report`` led; curves as those of a recording."""
+    body, muscles = creature.body, creature.muscles
+    height = float(-body.gravity @ body.centre_of_mass(state.positions)) / float(np.linalg.norm(body.gravity))
+    if report is None:
+        curves = np.array([height / body.height, 0.0, 0.0, 0.0])
+        return Frame(index, state.time, state.positions, np.zeros(muscles.segment_count), np.zeros((0, 9)), curves)
+    contacts = report.contacts
+    points = np.einsum("nw,nwi->ni", contacts.weights, state.positions[contacts.nodes])
+    forces = np.einsum("na,nai->ni", report.forces, contacts.axes)
+    rubbed = float(np.linalg.norm(report.forces[:, 1:], axis=1).sum())
+    pressed = creature.geometry.friction * float(report.forces[:, 0].sum())
+    return Frame(
+        index,
+        state.time,
+        state.positions,
+        report.activations / np.maximum(muscles.bounds, 1e-12),
+        np.concatenate([points, contacts.axes[:, 0], forces], axis=1),
+        np.array(
+            [
+                height / body.height,
+                float(np.linalg.norm(forces.sum(axis=0))) / body.weight,
+                rubbed / max(pressed, 1e-9 * body.weight),
+                report.min_gap / body.height,
+            ]
+        ),
+    )

@@ -1,0 +1,224 @@
+"""Responses and iterates that stay on the device are those of the host, on every device."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+from egs_warp.contact.device_newton import DeviceContactLinearizer
+from egs_warp.contact.newton import ContactLinearization, NewtonIterate
+from egs_warp.contact.newton_convergence import ConvergenceState
+from egs_warp.fem import dense_cholesky
+from egs_warp.fem.body import BodyState
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.muscles.tension import MuscleEnergy
+from egs_warp.pipelines.creature import Creature
+from tests.support.creatures import coarse_pawn
+from tests.support.device_steps import on_device
+
+
+@pytest.fixture(scope="module")
+def creature() -> Creature:
+    return coarse_pawn()
+
+
+def pulled(creature: Creature, seed: int, strength: float = 0.3) -> MuscleEnergy:
+    muscles = creature.muscles
+    shares = np.random.default_rng(seed).standard_normal(muscles.segment_count)
+    return MuscleEnergy.of(muscles, strength * muscles.bounds * shares)
+
+
+def problems(stepper: LocomotionStepper, creature: Creature) -> list[StepProblem]:
+    """Of a body that falls and trembles, without drag and with it, in steps of two lengths."""
+    nodes, random = creature.start.positions, np.random.default_rng(0)
+    state = BodyState(nodes, np.array([0.1, 0.0, -0.3]) + 0.02 * random.standard_normal(nodes.shape))
+    return [StepProblem(stepper.body, state, dt, drag) for dt, drag in ((0.01, 0.0), (0.005, 0.3), (0.01, 0.0))]
+
+
+def assert_alike(one: NewtonIterate, other: NewtonIterate) -> None:
+    assert (
+        other.residual_norm == pytest.approx(one.residual_norm, rel=1e-9)
+        and one.is_inversion_free == other.is_inversion_free
+    )
+    for got, expected in zip(
+        (other.free_contact_velocities, other.velocities), (one.free_contact_velocities, one.velocities), strict=True
+    ):
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(other.forces, one.forces, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("points", [np.array([0, 7, 13, 24]), np.zeros(0, int), np.arange(11)])
+def test_iterates_go_the_host_s_way(
+    creature: Creature, points: np.ndarray, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Begun, tried in whole and in part, from there on, by another tangent with the muscles' stiffness in it, and on:
+    twice, for what a GPU has recorded the first time it plays the second."""
+    stepper = on_device(creature, device, monkeypatch)
+    respond, factors = stepper.linearizer, stepper.factors
+    assert isinstance(respond, DeviceContactLinearizer)
+    for number, problem in enumerate(problems(stepper, creature)):
+        contacts = creature.stepper.solver.detector.contact_set(points, problem.state.positions)
+        tension, random = pulled(creature, number), np.random.default_rng(number)
+        first, second, third = random.standard_normal((3, len(points), 3))
+        tangent = problem.tangent(factors, problem.rigid_guess, None)
+        host, there = ContactLinearization.of(tangent, contacts), respond(tangent, contacts)
+        columns = there.columns.cpu().numpy()
+        np.testing.assert_allclose(columns, host.columns, rtol=0, atol=1e-13 * np.abs(host.columns).max(initial=1e-300))
+        np.testing.assert_allclose(there.delassus, host.delassus, rtol=1e-10, atol=1e-16)
+        one, other = (
+            host.iterate_at(tension, problem.rigid_guess, first),
+            there.iterate_at(tension, problem.rigid_guess, first),
+        )
+        assert_alike(one, other)
+        assert_alike(one.line_search_point(second), other.line_search_point(second))
+        one, other = one.line_search_point(third, 0.5), other.line_search_point(third, 0.5)
+        assert_alike(one, other)
+        one, other = one.line_search_point(second), other.line_search_point(second)
+        assert_alike(one, other)
+        one, moved = one.with_new_tangent(), other.with_new_tangent()
+        assert_alike(one, moved)
+        assert_alike(one.line_search_point(first), moved.line_search_point(first))
+        host, there = one.linearization, moved.linearization
+        np.testing.assert_allclose(there.delassus, host.delassus, rtol=1e-9, atol=1e-15)
+        assert_alike(
+            host.iterate_at(None, problem.rigid_guess, third), there.iterate_at(None, problem.rigid_guess, third)
+        )
+
+
+def test_what_inverts_an_element_is_no_number(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the place before it is still there to go on from."""
+    stepper = on_device(creature, device, monkeypatch)
+    respond, (problem, *_) = stepper.linearizer, problems(stepper, creature)
+    contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
+    tangent = problem.tangent(stepper.factors, problem.rigid_guess, None)
+    forces = np.zeros((6, 3))
+    assert respond.predict_velocities(tangent, contacts, pulled(creature, 1, 1e4), problem.rigid_guess, forces) is None
+    there, crushed = respond(tangent, contacts), np.full((6, 3), 1e4 * creature.body.weight)
+    place = there.iterate_at(None, problem.rigid_guess, forces)
+    assert place.is_inversion_free and not place.line_search_point(crushed).is_inversion_free
+    host = ContactLinearization.of(tangent, contacts).iterate_at(None, problem.rigid_guess, forces)
+    near = place.line_search_point(crushed, 1e-6)
+    assert near.is_inversion_free and near.residual_norm == pytest.approx(
+        host.line_search_point(crushed, 1e-6).residual_norm, rel=1e-6
+    )
+
+
+def test_what_was_no_number_is_left_behind(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step is begun alike after another whose matrix had no factor, or whose end was no number."""
+    stepper = on_device(creature, device, monkeypatch)
+    respond, (problem, *_) = stepper.linearizer, problems(stepper, creature)
+    assert isinstance(respond, DeviceContactLinearizer)
+    contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
+    tangent = problem.tangent(stepper.factors, problem.rigid_guess, None)
+    tension, forces = pulled(creature, 3, 0.02), np.ones((6, 3))
+    host = ContactLinearization.of(tangent, contacts)
+    expected = creature.stepper.linearizer.predict_velocities(tangent, contacts, tension, problem.rigid_guess, forces)
+    assert expected is not None
+    room = respond.workspace_for(contacts)
+    for _ in range(3):
+        for part in (
+            room.columns,
+            room.delassus,
+            room.ends,
+            room._base,
+            room._trial,
+            room._pushed,
+            respond.momentum_projection,
+        ):
+            part.fill_(np.nan)
+        found = respond.predict_velocities(tangent, contacts, tension, problem.rigid_guess, forces)
+        assert found is not None
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+        room._trial.fill_(np.nan)
+        assert_alike(
+            host.iterate_at(tension, problem.rigid_guess, forces),
+            respond(tangent, contacts).iterate_at(tension, problem.rigid_guess, forces),
+        )
+
+
+def test_what_is_at_hand_no_more_is_told_again(
+    creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Memory is there for two places: from others a step goes on as it did the first time. And it is there for one
+    response: another fails, in place of going on from what is not its own."""
+    stepper = on_device(creature, device, monkeypatch)
+    respond, (problem, *_) = stepper.linearizer, problems(stepper, creature)
+    contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
+    tangent = problem.tangent(stepper.factors, problem.rigid_guess, None)
+    old, forces = respond(tangent, contacts), np.zeros((6, 3))
+    first = old.iterate_at(None, problem.rigid_guess, forces)
+    second = first.line_search_point(forces)
+    second.line_search_point(forces)
+    assert_alike(first.line_search_point(forces), second)
+    shift = np.zeros(6)
+    begun = first.newton_steps(shift, 0.8)
+    # The device goes on past what it has told first.
+    again = first.newton_steps(shift, 0.8, ConvergenceState(1e-12, 0.0, np.inf))
+    assert len(again.accepted_residuals) > 1
+    for one, other in (
+        (first.newton_steps(shift, 0.8), begun),
+        (again.trial.newton_steps(shift, 0.8), again.trial.newton_steps(shift, 0.8)),
+        (begun.trial.newton_steps(shift, 0.8), begun.trial.newton_steps(shift, 0.8)),
+    ):
+        np.testing.assert_allclose(one.forces, other.forces, rtol=0, atol=1e-10)
+        assert_alike(one.trial, other.trial)
+    respond(tangent, contacts)
+    for left in (first, second):
+        with pytest.raises(AssertionError):
+            left.line_search_point(forces)
+        with pytest.raises(AssertionError):
+            left.newton_steps(shift, 0.8)
+    with pytest.raises(AssertionError):
+        old.iterate_at(None, problem.rigid_guess, forces)
+
+
+def test_a_step_has_the_same_contacts_whatever_was_looked_ahead_for(
+    creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That very step, one from another state, of another length, or after other points."""
+    stepper = on_device(creature, device, monkeypatch)
+    first, second, _ = problems(stepper, creature)
+    lifted = BodyState(creature.start.positions + [0.0, 0.0, 0.004], first.state.velocities)
+    steps = [
+        (first, np.array([3, 8])),
+        (StepProblem(stepper.body, lifted, 0.01), np.arange(20)),
+        (second, np.arange(5)),
+    ]
+    seen = set()
+    for problem, before in steps:
+        ballistic = problem.end_positions(problem.state.velocities + problem.dt * stepper.body.gravity)
+        loaded, (gaps, _) = np.ones(len(before), bool), stepper.detector.gaps(ballistic)
+        expected = stepper.points.select(before, loaded, gaps)
+        for ahead, points in [*steps, (problem, np.arange(2))]:
+            stepper.linearizer.prefetch_contacts(ahead.state, ahead.dt, points)
+            found = stepper.linearizer.select_contacts(problem, before, loaded)
+            assert found is not None and np.array_equal(found.points, expected)
+        seen.add(tuple(expected))
+    assert len(seen) == 3
+
+
+def test_a_tangent_whose_sum_fails_is_the_host_s(
+    creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where what the muscles add is not definite by itself: factored as a whole, from the same place on."""
+    stepper = on_device(creature, device, monkeypatch)
+    problem, *_ = problems(stepper, creature)
+    contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
+    tension, forces = pulled(creature, 2), np.ones((6, 3))
+    tangent = problem.tangent(stepper.factors, problem.rigid_guess, None)
+    place = (
+        stepper.linearizer(tangent, contacts)
+        .iterate_at(tension, problem.rigid_guess, forces)
+        .line_search_point(2.0 * forces)
+    )
+    monkeypatch.setattr(dense_cholesky._InverseFactor, "add", lambda root, directions, sign: 0.0 * directions[0, 0])
+    found = place.with_new_tangent()
+    # Nobody has waited for the sum so far.
+    assert len(found.free_contact_velocities) == 18
+    whole = problem.tangent(stepper.factors, place.velocities, tension)
+    expected = ContactLinearization.of(whole, contacts).iterate_at(tension, place.velocities, place.forces)
+    assert_alike(expected, found)
+    assert_alike(expected.line_search_point(forces), found.line_search_point(forces))

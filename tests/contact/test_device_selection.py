@@ -1,0 +1,108 @@
+"""Contact points that are chosen on the device are those of the host, on every kind of ground."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+import torch
+import warp as wp
+
+from egs_warp.contact.coupled_step import ACTIVATION_DEPTH, MAX_CREEP, MAX_SINK
+from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
+from egs_warp.contact.device_selection import DeviceContactSelector
+from egs_warp.contact.selection import ContactSelector
+from egs_warp.deformation.embedding import embed_points
+from egs_warp.fem.cuda_graphs import GraphStream
+from egs_warp.geometry.plane import Plane
+from egs_warp.precision import Vec3
+from tests.support.meshes import block_mesh
+from tests.support.waves import wavy_ground
+
+NEAR, TOLERANCE = 0.01, 2e-3
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+WALL = Plane(np.array([-1.0, 0.0, 0.0]), 0.205)
+
+
+def ground(kind: str) -> ContactGeometry:
+    """A block with many points under its base and on its sides, on ``kind`` of ground."""
+    mesh = block_mesh()
+    half = mesh.nodes[:, 0].max()
+    side = np.linspace(-half, half, 15)
+    points = np.array([[x, y, z] for x in side for y in side for z in (0.0, 0.004 * (1 + x), 0.3)])
+    embedding = embed_points(mesh, points, device="cpu")
+    flat = ContactGeometry(mesh, (FLOOR,), 0.8, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
+    if kind == "corner":
+        return replace(flat, planes=(FLOOR, WALL))
+    return replace(flat, field=wavy_ground(0.004)) if kind == "waves" else flat
+
+
+def assert_alike(there: ContactSet, here: ContactSet) -> None:
+    for name in ("points", "nodes", "faces"):
+        np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
+    for name in ("weights", "axes", "gaps"):
+        np.testing.assert_allclose(getattr(there, name), getattr(here, name), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["flat", "corner", "waves"])
+def test_the_points_of_a_step_are_the_host_s(kind: str, device: str) -> None:
+    """Of a body that comes down, leans, slides to the wall and leaves: each after the points of the look before, of
+    which some press; and what sinks, but for points that are in contact."""
+    geometry = ground(kind)
+    nodes, random = geometry.mesh.nodes, np.random.default_rng(0)
+    detector, points = ContactDetector(geometry, device=device), ContactSelector(geometry, near=NEAR, lower=1e-3)
+    sight = DeviceContactSelector(detector, points, GraphStream(torch.device(device)), TOLERANCE)
+    start, ends = (wp.zeros(len(nodes), dtype=Vec3, device=device) for _ in range(2))
+    before, changed, sunk = np.zeros(0, int), 0, 0
+    for lean, lift in ((0.0, 0.004), (0.0, 0.0), (0.03, -0.003), (-0.02, -0.004), (0.0, 0.05), (0.01, 0.0)):
+        at = nodes + [lean, 0.0, lift] + 0.002 * random.standard_normal(nodes.shape)
+        then = at + np.column_stack([np.zeros((len(nodes), 2)), lean * nodes[:, 0] - 0.002])
+        start.assign(at)
+        ends.assign(then)
+        loaded = random.random(len(before)) < 0.5
+        gaps, _ = detector.gaps(then)
+        here = detector.contact_set(points.select(before, loaded, gaps), at)
+        sight.start_prefetch(start, ends, before)
+        there = sight.select(before, loaded, at)
+        assert_alike(there, here)
+        changed += len(before) > 0 and here.count > 0 and not np.array_equal(before, here.points)
+        taken = there.points[::2]
+        seen, least = torch.zeros((2, 1), dtype=torch.float64, device=device)
+        told = torch.as_tensor(taken.astype(np.int32), device=device)
+        sight.enqueue_penetration(ends, told, torch.tensor([len(taken)], dtype=torch.int32, device=device), seen)
+        allowed = np.where(gaps < -TOLERANCE, MAX_CREEP, MAX_SINK) * TOLERANCE
+        sinks = (gaps < -ACTIVATION_DEPTH * TOLERANCE) & (gaps < detector.gaps(at)[0] - allowed)
+        sinks[taken] = False
+        sight.enqueue_min_gap(least[0])
+        assert seen.item() == sinks.sum() and least.item() == pytest.approx(gaps.min(), abs=1e-12)
+        sunk += sinks.any()
+        before_it, joining = (
+            detector.gaps(at),
+            points.find_deeper(taken, np.where(sinks, gaps, 0.0), ACTIVATION_DEPTH * TOLERANCE),
+        )
+        # Where it ends the next step begins.
+        after = then + 0.002 * random.standard_normal(nodes.shape)
+        next_ends = wp.array(after, dtype=Vec3, device=device)
+        places = torch.as_tensor(np.append(taken, [0] * 5).astype(np.int32), device=device)
+        sight.enqueue_prefetch(next_ends, places)
+        sight.advance_prefetch()
+        found = sight.deepest(len(places))
+        found = found[points.order_by_gap(found[:, 0], found[:, 1])]
+        assert np.array_equal(found[:, 0], joining)
+        np.testing.assert_allclose(found[:, 1], gaps[joining], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found[:, 2], before_it[0][joining], rtol=0, atol=1e-12)
+        assert np.array_equal(found[:, 3], before_it[1][joining])
+        loaded = random.random(len(taken)) < 0.5
+        expected = points.select(taken, loaded, detector.gaps(after)[0])
+        assert_alike(sight.select(taken, loaded, then, places=len(places)), detector.contact_set(expected, then))
+        sight.enqueue_penetration(next_ends, told, torch.tensor([len(taken)], dtype=torch.int32, device=device), seen)
+        later = detector.gaps(after)[0]
+        allowed = np.where(later < -TOLERANCE, MAX_CREEP, MAX_SINK) * TOLERANCE
+        sinks = (later < -ACTIVATION_DEPTH * TOLERANCE) & (later < gaps - allowed)
+        sinks[taken] = False
+        assert seen.item() == sinks.sum()
+        before = here.points
+    assert changed > 1 and sunk > 1

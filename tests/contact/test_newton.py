@@ -1,0 +1,142 @@
+"""Newton steps with contact on the host: what they say of the step's equation is what the equation says (Eq. 4, 8)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.contact.newton import ContactLinearization, HostContactLinearizer, NumpyNewtonIterate
+from egs_warp.fem.body import BodyState
+from egs_warp.fem.multifrontal import MultifrontalLdl
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.muscles.tension import MuscleEnergy
+from egs_warp.pipelines.creature import Creature
+from tests.support.creatures import coarse_pawn
+
+DT = 0.01
+
+
+@pytest.fixture(scope="module")
+def creature() -> Creature:
+    return coarse_pawn()
+
+
+def falling(creature: Creature) -> tuple[StepProblem, MuscleEnergy, np.random.Generator]:
+    """A step of a body that falls and trembles, and muscles that pull."""
+    random = np.random.default_rng(0)
+    nodes, muscles = creature.start.positions, creature.muscles
+    state = BodyState(nodes, np.array([0.1, 0.0, -0.3]) + 0.02 * random.standard_normal(nodes.shape))
+    return (
+        StepProblem(creature.body, state, DT, 0.2),
+        MuscleEnergy.of(muscles, 0.3 * muscles.bounds * random.standard_normal(muscles.segment_count)),
+        random,
+    )
+
+
+def test_a_newton_step_solves_the_linear_equation(creature: Creature) -> None:
+    """A body that the tangent speaks true of (the residual is linear where it is looked at so near) has nothing left
+    to miss after a whole step, and half as much after half of one; the contacts' speeds are of the step without
+    forces."""
+    problem, tension, random = falling(creature)
+    factors, solver = MultifrontalLdl(creature.body.assembly.upper_pattern), creature.stepper.solver
+    contacts = solver.detector.contact_set(np.arange(0, 40, 7), problem.state.positions)
+    velocities = problem.rigid_guess
+    for _ in range(12):
+        tangent = problem.tangent(factors, velocities, tension)
+        velocities = velocities - tangent.solve(problem.residual(velocities, tension).ravel()).reshape(velocities.shape)
+    response = ContactLinearization.of(problem.tangent(factors, velocities, tension), contacts)
+    small = 1e-5 * creature.body.weight * random.standard_normal((contacts.count, 3))
+    still = response.iterate_at(tension, velocities, np.zeros_like(small))
+    whole, half = still.line_search_point(small), still.line_search_point(small, 0.5)
+    assert still.residual_norm < 1e-10 and whole.residual_norm < 1e-9 and half.residual_norm < 1e-9
+    assert np.array_equal(whole.forces, small) and np.array_equal(half.forces, 0.5 * small)
+    moved = problem.dt * response.tangent.solve(contacts.dense_jacobian.T @ small.ravel())
+    np.testing.assert_allclose((whole.velocities - velocities).ravel(), moved, atol=1e-9 * np.abs(moved).max())
+    expected = contacts.contact_velocities(velocities.ravel())
+    np.testing.assert_allclose(still.free_contact_velocities, expected, atol=1e-9 * np.abs(expected).max())
+    missing = response.iterate_at(tension, velocities, small)
+    push = np.linalg.norm(problem.dt * contacts.nodal_forces(small)) / problem.residual_scale
+    assert missing.residual_norm == pytest.approx(push, rel=1e-6)
+
+
+def test_another_tangent_changes_the_newton_step_alone(creature: Creature) -> None:
+    """Made where the iterate is, with the muscles' stiffness in it."""
+    problem, tension, random = falling(creature)
+    contacts = creature.stepper.solver.detector.contact_set(np.arange(5), problem.state.positions)
+    first, second = (
+        ContactLinearization.of(
+            problem.tangent(MultifrontalLdl(creature.body.assembly.upper_pattern), problem.rigid_guess, stiff), contacts
+        )
+        for stiff in (None, tension)
+    )
+    forces = random.standard_normal((5, 3))
+    place = first.iterate_at(tension, problem.rigid_guess, forces)
+    fresh = second.iterate_at(tension, problem.rigid_guess, forces)
+    speeds = place.free_contact_velocities.copy()
+    other = place.with_new_tangent()
+    assert np.array_equal(place.free_contact_velocities, speeds)
+    assert other.residual_norm == place.residual_norm == fresh.residual_norm and np.array_equal(
+        other.free_contact_velocities, fresh.free_contact_velocities
+    )
+    assert np.abs(other.free_contact_velocities - place.free_contact_velocities).max() > 1e-6
+    assert np.array_equal(other.line_search_point(forces).velocities, fresh.line_search_point(forces).velocities)
+
+
+def test_a_wider_response_is_that_of_all_its_contacts(creature: Creature) -> None:
+    problem, _, _ = falling(creature)
+    detector = creature.stepper.solver.detector
+    tangent = problem.tangent(MultifrontalLdl(creature.body.assembly.upper_pattern), problem.rigid_guess, None)
+    few, many = (detector.contact_set(np.arange(count), problem.state.positions) for count in (3, 8))
+    wide, whole = (
+        ContactLinearization.of(tangent, few).with_added_contacts(many),
+        ContactLinearization.of(tangent, many),
+    )
+    np.testing.assert_allclose(wide.columns, whole.columns, rtol=0, atol=1e-13 * np.abs(whole.columns).max())
+    np.testing.assert_allclose(wide.delassus, whole.delassus, rtol=0, atol=1e-13 * np.abs(whole.delassus).max())
+
+
+def test_a_step_ahead_is_newton_s_with_forces_as_they_are(creature: Creature) -> None:
+    """And none where it would invert an element."""
+    problem, tension, random = falling(creature)
+    respond = HostContactLinearizer()
+    contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
+    tangent = problem.tangent(MultifrontalLdl(creature.body.assembly.upper_pattern), problem.rigid_guess, None)
+    forces = random.standard_normal((6, 3))
+    ahead = respond.predict_velocities(tangent, contacts, tension, problem.rigid_guess, forces)
+    whole = respond(tangent, contacts).iterate_at(tension, problem.rigid_guess, forces).line_search_point(forces)
+    assert ahead is not None and whole.is_inversion_free
+    np.testing.assert_allclose(ahead, whole.velocities, atol=1e-12)
+    torn = MuscleEnergy(tension.rows, 1e4 * tension.tensions, tension.rest_lengths)
+    assert respond.predict_velocities(tangent, contacts, torn, problem.rigid_guess, forces) is None
+    assert (
+        not respond(tangent, contacts)
+        .iterate_at(torn, problem.rigid_guess, forces)
+        .line_search_point(forces)
+        .is_inversion_free
+    )
+
+
+@pytest.mark.parametrize("pulled", [True, False])
+def test_kernels_say_what_arrays_say(creature: Creature, pulled: bool) -> None:
+    """Sizes, contact speeds and Newton steps, whole and in part; with the muscles' stiffness in the tangent, too."""
+    problem, tension, random = falling(creature)
+    contacts = creature.stepper.solver.detector.contact_set(np.arange(0, 36, 5), problem.state.positions)
+    stiff = tension if pulled else None
+    tangent = problem.tangent(MultifrontalLdl(creature.body.assembly.upper_pattern), problem.rigid_guess, stiff)
+    response = ContactLinearization.of(tangent, contacts)
+    first, wanted = 0.1 * creature.body.weight * random.standard_normal((2, contacts.count, 3))
+    arrays = NumpyNewtonIterate(response, tension, problem.rigid_guess, first)
+    vectors = response.iterate_at(tension, problem.rigid_guess, first)
+    assert type(vectors) is not NumpyNewtonIterate
+    for length in (1.0, 0.3, None):
+        assert vectors.is_inversion_free and vectors.residual_norm == pytest.approx(arrays.residual_norm, rel=1e-11)
+        np.testing.assert_allclose(
+            vectors.free_contact_velocities,
+            arrays.free_contact_velocities,
+            rtol=0,
+            atol=1e-12 * np.abs(arrays.free_contact_velocities).max(),
+        )
+        np.testing.assert_allclose(vectors.velocities, arrays.velocities, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(vectors.forces, arrays.forces, rtol=1e-14)
+        if length is not None:
+            vectors, arrays = vectors.line_search_point(wanted, length), arrays.line_search_point(wanted, length)

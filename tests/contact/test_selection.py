@@ -1,0 +1,103 @@
+"""Contact points: one a cell, the lowest, and the same ones from step to step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egs_warp.contact.detection import ContactGeometry
+from egs_warp.contact.selection import MOST_AT_REST, ContactSelector
+from egs_warp.deformation.embedding import embed_points
+from egs_warp.geometry.plane import Plane
+from tests.support.meshes import block_mesh
+
+NEAR = 0.01
+
+
+@pytest.fixture(scope="module")
+def geometry() -> ContactGeometry:
+    """A block with a fine grid of points under its base and some on its sides."""
+    mesh = block_mesh()
+    half = mesh.nodes[:, 0].max()
+    side = np.linspace(-half, half, 15)
+    points = np.array([[x, y, z] for x in side for y in side for z in (0.0, 0.004 * (1 + x))])
+    embedding = embed_points(mesh, points, device="cpu")
+    floor = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+    return ContactGeometry(mesh, (floor,), 0.8, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
+
+
+def gaps_of(geometry: ContactGeometry, tilt: float = 0.0) -> np.ndarray:
+    corners = geometry.mesh.nodes[geometry.mesh.tets[geometry.tet_from_point]]
+    places = np.einsum("pw,pwi->pi", geometry.weights, corners)
+    return places[:, 2] + tilt * places[:, 0]
+
+
+def test_few_points_one_a_cell(geometry: ContactGeometry) -> None:
+    points = ContactSelector(geometry, near=NEAR, lower=1e-3)
+    gaps = gaps_of(geometry)
+    chosen = points.select(np.zeros(0, int), np.zeros(0, bool), gaps)
+    assert 4 <= len(chosen) <= MOST_AT_REST
+    cells = points.cell_from_point[chosen]
+    assert len(np.unique(cells)) == len(cells)
+    for point, cell in zip(chosen, cells, strict=True):
+        assert gaps[point] == gaps[points.cell_from_point == cell].min()
+
+
+def test_what_presses_stays_and_the_rest_follows_the_lowest(geometry: ContactGeometry) -> None:
+    points = ContactSelector(geometry, near=NEAR, lower=1e-3)
+    first = points.select(np.zeros(0, int), np.zeros(0, bool), gaps_of(geometry))
+    tilted = gaps_of(geometry, 0.02)
+    again = points.select(first, np.ones(len(first), bool), tilted)
+    assert np.isin(first[tilted[first] < 2.0 * NEAR], again).all()
+    loose = points.select(first, np.zeros(len(first), bool), tilted)
+    lowest = {cell: tilted[points.cell_from_point == cell].min() for cell in points.cell_from_point[loose]}
+    assert all(tilted[p] <= lowest[points.cell_from_point[p]] + 1e-3 for p in loose)
+    lifted = points.select(first, np.ones(len(first), bool), gaps_of(geometry) + 3.0 * NEAR)
+    assert len(lifted) == 0
+
+
+def test_forces_go_with_their_points_and_the_deep_join(geometry: ContactGeometry) -> None:
+    points = ContactSelector(geometry, near=NEAR, lower=1e-3)
+    before, forces = np.array([7, 3, 11]), np.arange(9.0).reshape(3, 3)
+    matched = points.transfer_forces(np.array([3, 5, 7]), before, forces)
+    assert np.array_equal(matched, [[3, 4, 5], [0, 0, 0], [0, 1, 2]])
+    gaps = gaps_of(geometry) - 0.006
+    deep = points.find_deeper(np.array([int(np.argmin(gaps))]), gaps, 0.005)
+    assert len(deep) and (gaps[deep] < -0.005).all() and int(np.argmin(gaps)) not in deep
+
+
+def test_cells_are_as_few_wherever_the_ground_is() -> None:
+    """A wide body that begins above the ground has the cells under it that it has where it stands."""
+    mesh = block_mesh(7, 7, 3, (1.2, 1.2, 0.4))
+    side = np.linspace(-0.6, 0.6, 30)
+    embedding = embed_points(mesh, np.array([[x, y, 0.0] for x in side for y in side]), device="cpu")
+    points = [
+        ContactSelector(
+            ContactGeometry(mesh, (floor,), 0.8, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0),
+            near=NEAR,
+            lower=1e-3,
+        )
+        for floor in (Plane(np.array([0.0, 0.0, 1.0]), 0.0), Plane(np.array([0.0, 0.0, 1.0]), 0.3))
+    ]
+    assert 0.5 * MOST_AT_REST < len(np.unique(points[0].cell_from_point)) <= MOST_AT_REST
+    assert np.array_equal(points[0].cell_from_point, points[1].cell_from_point)
+
+
+def test_rounding_chooses_neither_cells_nor_points(geometry: ContactGeometry) -> None:
+    """The last bits of weights and gaps are others on every machine: of what lies alike on the ground the one
+    next to the middle of its cell is taken."""
+    random = np.random.default_rng(0)
+    weights = geometry.weights + 1e-15 * random.standard_normal(geometry.weights.shape)
+    other = ContactSelector(replace(geometry, weights=weights), near=NEAR, lower=1e-3)
+    points, gaps = ContactSelector(geometry, near=NEAR, lower=1e-3), gaps_of(geometry)
+    assert np.array_equal(points.cell_from_point, other.cell_from_point)
+    none = np.zeros(0, int), np.zeros(0, bool)
+    chosen = points.select(*none, gaps)
+    for _ in range(5):
+        shaken = gaps + 1e-15 * random.standard_normal(gaps.shape)
+        assert np.array_equal(other.select(*none, shaken), chosen)
+        assert np.array_equal(
+            points.find_deeper(chosen, shaken - 0.02, 0.01), points.find_deeper(chosen, gaps - 0.02, 0.01)
+        )

@@ -1,0 +1,194 @@
+"""Dense factors solve as sparse ones do, and tell definiteness alike."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sparse
+import warp as wp
+
+from egs_warp.fem.dissection import Dissection
+from egs_warp.fem.linear_solver import linear_solver_on
+from egs_warp.fem.multifrontal import MultifrontalLdl
+
+pytest.importorskip("torch")
+
+import torch
+
+from egs_warp.fem.dense_cholesky import DenseCholesky
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
+
+
+def entries_of(upper: sparse.csc_matrix, seed: int, diagonal: float) -> np.ndarray:
+    """(nnz,) of a random symmetric matrix with the pattern of ``upper``."""
+    entries = np.random.default_rng(seed).normal(size=upper.nnz)
+    entries[upper.indptr[1:] - 1] += diagonal
+    return entries
+
+
+def pattern(count: int) -> sparse.csc_matrix:
+    """Upper triangle, a tenth of it filled, with the diagonal."""
+    filled = np.triu(np.random.default_rng(3).random((count, count)) < 0.1) | np.eye(count, dtype=bool)
+    upper = sparse.csc_matrix(filled.astype(float))
+    upper.sort_indices()
+    return upper
+
+
+def band(count: int) -> sparse.csc_matrix:
+    """Upper triangle of a long body: all that is at most four places away."""
+    return sparse.csc_matrix(np.triu(np.tri(count, k=4).T.astype(float)) * (np.tri(count, k=4) > 0))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("count", [1, 7, 64, 65, 130, 259])
+def test_matrices_of_every_size_are_inverted_by_halves(count: int, device: str) -> None:
+    """With what is added to their diagonals, by dense factors as by sparse ones; no number is no matrix."""
+    upper = pattern(count)
+    dense, thin = DenseCholesky(upper, device=device), MultifrontalLdl(upper)
+    random = np.random.default_rng(count)
+    right = random.normal(size=(count, 3))
+    for seed in range(3):
+        entries, diagonal = entries_of(upper, seed, 1.0), 40.0 + random.random(count)
+        assert dense.update(entries, diagonal) and thin.update(entries, diagonal)
+        half = sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray()
+        matrix = half + np.triu(half, 1).T + np.diag(diagonal)
+        for factors in (dense, thin):
+            assert np.abs(matrix @ factors.solve(right) - right).max() < 1e-11
+    entries[-1] = np.nan
+    assert not dense.update(entries, diagonal) and not dense.is_ready and not thin.update(entries, diagonal)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_slabs_of_a_long_body_are_factored_at_once(device: str) -> None:
+    """As recorded work, too, and with a sum between two matrices; what is indefinite in a slab, or between them alone,
+    has no factors."""
+    count = 150
+    upper = band(count)
+    slabs = Dissection.of(upper)
+    assert len(slabs.parts) > 2
+    factors = DenseCholesky(upper, device=device)
+    random = np.random.default_rng(0)
+    right, across, rates = random.normal(size=(count, 5)), random.normal(size=(count, 3)), np.array([2.0, -0.01, 1.0])
+    for seed in range(4):
+        entries = entries_of(upper, seed, 12.0)
+        half = sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray()
+        matrix = half + np.triu(half, 1).T
+        assert factors.update(entries)
+        assert np.abs(matrix @ factors.solve(right) - right).max() < 1e-12
+        root = factors.inverse.cpu().numpy()
+        np.testing.assert_allclose(root.T @ root, np.linalg.inv(matrix), rtol=0, atol=1e-13)
+        assert factors.add_low_rank(across, rates)
+        both = matrix + across * rates @ across.T
+        assert np.abs(both @ factors.solve(right) - right).max() < 1e-11
+    for wrong in (slabs.parts[0][0], slabs.parts[-1][-1], slabs.separator[0]):
+        lower = np.zeros(count)
+        lower[wrong] = -40.0
+        assert not factors.update(entries, lower) and factors.update(entries)
+        assert np.abs(matrix @ factors.solve(right) - right).max() < 1e-12
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("diagonal", [30.0, 1.0])
+def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
+    """Solutions and strains of moves to rounding, with a sum and without; an indefinite matrix has no dense factors,
+    but a sum with it may have.
+    """
+    upper = pattern(60)
+    dense, thin = DenseCholesky(upper, device=device), MultifrontalLdl(upper)
+    random = np.random.default_rng(7)
+    right = random.normal(size=(60, 40))
+    across, rates = random.normal(size=(60, 8)), 0.1 * random.normal(size=8)
+    for seed in range(5):
+        entries = entries_of(upper, seed, diagonal)
+        definite = thin.update(entries)
+        assert dense.update(entries) == dense.is_ready == definite == (diagonal == 30.0)
+        half = sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray()
+        matrix = half + np.triu(half, 1).T
+        if definite:
+            slope, weights, away = random.normal(size=(3, 60))
+            for found, expected in zip(
+                *(
+                    one.effort_quadratic(entries, slope, weights, right, dt_now=0.2, dt_ahead=0.5, reference=away)
+                    for one in (dense, thin)
+                ),
+                strict=True,
+            ):
+                assert np.abs(found - expected).max() < 1e-11 * np.abs(expected).max()
+        if definite:
+            assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
+            assert np.abs(dense.solve(right[:, 0]) - thin.solve(right[:, 0])).max() < 1e-12
+        assert dense.add_low_rank(across, rates) == thin.add_low_rank(across, rates) == definite
+        if definite:
+            assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
+        # What is refused changes nothing.
+        assert not dense.add_low_rank(across, np.full(8, -1e3)) and not thin.add_low_rank(across, np.full(8, -1e3))
+        assert dense.update(entries) == thin.update(entries) == definite
+        if definite:
+            assert not dense.add_low_rank(across, np.full(8, -1e3)) and not thin.add_low_rank(across, np.full(8, -1e3))
+            assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
+        # As much along every axis as makes the sum definite.
+        assert (
+            dense.add_low_rank(np.eye(60), np.full(60, 40.0))
+            and thin.add_low_rank(np.eye(60), np.full(60, 40.0))
+            and dense.is_ready
+        )
+        assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-10
+        assert np.abs((matrix + 40.0 * np.eye(60)) @ dense.solve(right) - right).max() < 1e-10
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("count", [1, 70])
+def test_directions_are_added_without_another_factor(count: int, device: str) -> None:
+    """What pulls, then what pushes; where they take too much away the sum is not definite, until the next matrix."""
+    upper, random = pattern(60), np.random.default_rng(5)
+    factors, right = DenseCholesky(upper, device=device), random.normal(size=(60, 4))
+    directions = np.vstack([random.normal(size=(count, 60)), np.zeros((3, 60))])
+    for seed, strengths, definite in [(0, (3.0, 0.1), True), (1, (1e3, 0.0), True), (2, (0.1, 90.0), False)]:
+        entries = entries_of(upper, seed, 30.0)
+        half = sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray()
+        matrix = half + np.triu(half, 1).T
+        with factors.stream:
+            factors.enqueue(torch.from_numpy(entries).to(device))
+            for sign, strength in zip((1.0, -1.0), strengths, strict=True):
+                told = np.sqrt(strength / count) * directions
+                matrix = matrix + sign * told.T @ told
+                factors.enqueue_low_rank(torch.from_numpy(told).to(device), sign)
+        factors.mark_started()
+        assert factors.is_ready == definite == (np.linalg.eigvalsh(matrix).min() > 0.0)
+        if definite:
+            found = factors.solve(right)
+            assert np.abs(matrix @ found - right).max() < 1e-11
+            np.testing.assert_allclose(found, np.linalg.solve(matrix, right), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_what_is_not_finite_has_no_factors(device: str) -> None:
+    upper = pattern(20)
+    factors = DenseCholesky(upper, device=device)
+    for value in (np.nan, np.inf):
+        assert not factors.update(np.full(upper.nnz, value)) and not factors.is_ready
+        assert not factors.add_low_rank(np.eye(20), np.ones(20)) and not factors.is_ready
+    assert factors.update(entries_of(upper, 0, 30.0)) and factors.is_ready
+    assert not factors.add_low_rank(np.full((20, 1), np.nan), np.ones(1))
+
+
+@pytest.mark.cuda
+def test_a_gpu_gets_dense_factors() -> None:
+    assert isinstance(linear_solver_on(wp.get_device("cuda:0"), pattern(20)), DenseCholesky)
+
+
+def test_a_cpu_gets_sparse_factors() -> None:
+    assert isinstance(linear_solver_on(wp.get_device("cpu"), pattern(20)), MultifrontalLdl)
+
+
+@pytest.mark.cuda
+def test_factors_leave_what_warp_holds_for_its_stream() -> None:
+    """Memory for sorts, which would go while a graph is recorded."""
+    upper = band(150)
+    factors, count = DenseCholesky(upper, device="cuda:0"), 1000
+    for seed in range(3):
+        keys, values = (wp.array(np.arange(2 * count)[::-1].astype(np.int32), dtype=int, device="cuda:0") for _ in "kv")
+        wp.utils.radix_sort_pairs(keys, values, count)
+        assert factors.update(entries_of(upper, seed, 12.0))
+        assert np.array_equal(keys.numpy()[:count], np.arange(count, 2 * count))

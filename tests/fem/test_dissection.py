@@ -1,0 +1,55 @@
+"""Slabs of a body: what lies between them holds all that joins them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sparse
+
+from egs_warp.fem.dissection import Dissection
+
+
+def upper_of(joined: np.ndarray) -> sparse.csc_matrix:
+    """Upper triangle, with the diagonal, of a pattern (n, n)."""
+    return sparse.csc_matrix(np.triu(joined | joined.T | np.eye(len(joined), dtype=bool)).astype(float))
+
+
+def band(count: int, reach: int, seed: int) -> np.ndarray:
+    """(n, n) of a long body: each of ``count`` is joined to those up to ``reach`` from it, in a random order."""
+    places = np.random.default_rng(seed).permutation(count)
+    return abs(places[:, None] - places) <= reach
+
+
+@pytest.mark.parametrize("count", [20, 60, 200])
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_joins_two_slabs(count: int, seed: int) -> None:
+    joined = band(count, 3, seed)
+    slabs = Dissection.of(upper_of(joined))
+    assert np.array_equal(np.sort(slabs.order), np.arange(count))
+    assert len(slabs.parts) > 1 and min(map(len, slabs.parts)) > 0
+    for number, part in enumerate(slabs.parts):
+        for other in slabs.parts[number + 1 :]:
+            assert not joined[np.ix_(part, other)].any()
+    # A quarter each, and three cuts as wide as a band is thick, is as little as can be.
+    assert max(map(len, slabs.parts)) + len(slabs.separator) < 0.3 * count + 12
+
+
+def test_what_no_cut_divides_is_whole() -> None:
+    for joined in (np.ones((30, 30), bool), np.ones((1, 1), bool)):
+        slabs = Dissection.of(upper_of(joined))
+        assert (
+            len(slabs.parts) == 1 and np.array_equal(slabs.order, np.arange(len(joined))) and not len(slabs.separator)
+        )
+
+
+def test_bodies_that_do_not_meet_have_slabs_too() -> None:
+    """All of those that the first one does not reach are one level of it."""
+    joined = sparse.block_diag([band(60, 2, 0), band(20, 2, 1)]).toarray().astype(bool)
+    slabs = Dissection.of(upper_of(joined))
+    assert np.array_equal(np.sort(slabs.order), np.arange(80)) and len(slabs.parts) > 1
+    parts = np.full(80, -1)
+    for number, part in enumerate(slabs.parts):
+        parts[part] = number
+    rows, columns = np.nonzero(joined)
+    one, other = parts[rows], parts[columns]
+    assert ((one == other) | (one < 0) | (other < 0)).all()

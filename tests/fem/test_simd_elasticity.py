@@ -1,0 +1,97 @@
+"""Eq. (5), elements by fours against one at a time: the same numbers, whatever way they are added up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sparse
+import warp as wp
+
+from egs_warp.fem.assembly_topology import AssemblyTopology, Damping, Material
+from egs_warp.fem.simd_elasticity import SimdElasticity
+from egs_warp.fem.warp_elasticity import WarpElasticity
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.muscles.tension import MuscleEnergy
+from tests.support.meshes import block_mesh
+
+MATERIAL = Material(young_modulus=3.0e4, poisson_ratio=0.4, density=1000.0, damping_time=0.01)
+Pair = tuple[WarpElasticity, SimdElasticity]
+
+
+def both(mesh: TetMesh) -> Pair:
+    maps, device = AssemblyTopology.of(mesh), wp.get_device("cpu")
+    return WarpElasticity(maps, MATERIAL, device), SimdElasticity(maps, MATERIAL, device)
+
+
+def part(count: int) -> TetMesh:
+    """The first tetrahedra of a block, whose nodes are put in another order: of a group of four some are missing."""
+    mesh = block_mesh()
+    used, corners = np.unique(mesh.tets[:count], return_inverse=True)
+    order = np.random.default_rng(count).permutation(len(used))
+    nodes = np.empty((len(used), 3))
+    nodes[order] = mesh.nodes[used]
+    return TetMesh(nodes, order[corners.reshape(-1, 4)].astype(np.int32))
+
+
+def strings(mesh: TetMesh) -> MuscleEnergy:
+    """Three segments between a few nodes each; one is slack, one shorter than what pulls fully."""
+    rng = np.random.default_rng(2)
+    rows = sparse.csr_matrix(rng.standard_normal((3, len(mesh.nodes))) * (rng.random((3, len(mesh.nodes))) < 0.6))
+    lengths = np.linalg.norm(rows @ mesh.nodes, axis=1)
+    return MuscleEnergy(rows, np.array([30.0, -4.0, 11.0]), lengths / [1.1, 0.5, 0.2])
+
+
+@pytest.mark.parametrize("count", [1, 4, 7, 40, None])
+@pytest.mark.parametrize("dt", [None, 1 / 60])
+def test_they_are_those_of_one_at_a_time(count: int | None, dt: float | None) -> None:
+    """Eq. (5): energy, determinants, gradients with muscles and without, both Hessians."""
+    mesh = block_mesh() if count is None else part(count)
+    one, four = both(mesh)
+    rng = np.random.default_rng(3)
+    start, end = (mesh.nodes + 0.008 * rng.standard_normal(mesh.nodes.shape) for _ in range(2))
+    damping = [None if dt is None else Damping(dt, each.start(start)) for each in (one, four)]
+    (energy, determinants), (found, others) = (
+        each.energy(end, damped) for each, damped in zip((one, four), damping, strict=True)
+    )
+    assert found == pytest.approx(energy, rel=1e-13) and energy > 0.0
+    np.testing.assert_allclose(others, determinants, rtol=1e-13)
+    tension = strings(mesh)
+    for muscles in (None, tension):
+        expected, given = (
+            each.gradient(end, damped, muscles) for each, damped in zip((one, four), damping, strict=True)
+        )
+        np.testing.assert_allclose(given, expected, atol=1e-13 * np.abs(expected).max())
+    for projected in (False, True):
+        expected, given = (
+            each.hessian_entries(end, damped, factor=0.3, projected=projected)
+            for each, damped in zip((one, four), damping, strict=True)
+        )
+        np.testing.assert_allclose(given, expected, atol=1e-13 * np.abs(expected).max())
+    pulled = four.gradient(end, damping[1], tension) - four.gradient(end, damping[1], None)
+    np.testing.assert_allclose(pulled, tension.gradient(end), atol=1e-9)
+
+
+def test_shapes_whose_axes_are_not_told_apart() -> None:
+    """At rest, stretched along one axis, and pulled alike everywhere: rotations that have nothing to turn."""
+    mesh = block_mesh()
+    one, four = both(mesh)
+    for shape in (np.ones(3), np.array([1.0, 1.0, 1.3]), 0.8 * np.ones(3)):
+        expected, found = (
+            each.hessian_entries(mesh.nodes * shape, None, factor=1.0, projected=True) for each in (one, four)
+        )
+        assert np.isfinite(found).all()
+        np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
+
+
+def test_an_inverted_element_among_four() -> None:
+    """The energy is infinite, the gradient no number, as for one at a time; those of others stay what they are."""
+    mesh = block_mesh()
+    one, four = both(mesh)
+    turned = mesh.nodes.copy()
+    corner = mesh.tets[5, 0]
+    turned[corner] = 2.0 * turned[mesh.tets[5, 1:]].mean(axis=0) - turned[corner]
+    for each in (one, four):
+        energy, determinants = each.energy(turned, None)
+        assert energy == np.inf and determinants[5] < 0.0
+        assert not np.isfinite(each.gradient(turned, None, None)).all()
+        assert np.abs(each.gradient(mesh.nodes, None, None)).max() < 1e-9

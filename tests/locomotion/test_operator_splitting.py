@@ -1,0 +1,82 @@
+"""Operator splitting's few iterations among squares: on a solver that is kept, as on a new one, as kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+import osqp
+import scipy.sparse as sparse
+
+from egs_warp.locomotion.operator_splitting import (
+    RHO,
+    WARM_START_ITERATIONS,
+    AdmmSplitting,
+    OsqpSplitting,
+    OsqpWarmStart,
+)
+
+SIZES = (3, 8, 9, 30)
+
+
+def program(seed: int, rows: int, unknowns: int = 12) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of length 1, bounds that the minimum breaks and another point does not, and a start."""
+    rng = np.random.default_rng(seed)
+    units = rng.standard_normal((rows, unknowns))
+    units /= np.linalg.norm(units, axis=1)[:, None]
+    at = units @ rng.standard_normal(unknowns)
+    sides = at > 0.0
+    return units, np.where(sides, 0.9 * at, -np.inf), np.where(sides, np.inf, 0.9 * at), rng.standard_normal(unknowns)
+
+
+def by_osqp(units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, ...]:
+    """OSQP as its users call it."""
+    solver = osqp.OSQP(algebra="builtin")
+    given = {"P": sparse.identity(len(start), format="csc"), "q": np.zeros(len(start)), "A": sparse.csc_matrix(units)}
+    solver.setup(
+        **given,
+        l=lower,
+        u=upper,
+        rho=RHO,
+        scaling=0,
+        max_iter=WARM_START_ITERATIONS,
+        adaptive_rho=False,
+        polishing=False,
+        verbose=False,
+    )
+    solver.warm_start(x=start, y=np.zeros(len(lower)))
+    result = solver.solve(raise_error=False)
+    return result.x, result.y
+
+
+def test_they_are_those_of_osqp_whatever_was_asked_before() -> None:
+    """A solver that is kept, with rows to spare, and that was asked other things."""
+    kept = OsqpWarmStart(32, 12)
+    for seed in range(6):
+        for rows in SIZES:
+            units, lower, upper, start = program(seed, rows)
+            x, y = by_osqp(units, lower, upper, start)
+            made = kept.run(units, lower, upper, start)
+            np.testing.assert_allclose(made.x, x, atol=1e-9)
+            np.testing.assert_allclose(made.multipliers, y, atol=1e-9)
+            again = OsqpSplitting(np.eye(12), np.zeros(12), accuracy=1e-5).warm_start(units, lower, upper, start)
+            np.testing.assert_allclose(again.multipliers, y, atol=1e-9)
+
+
+def test_without_a_start_they_begin_at_the_minimum() -> None:
+    units, lower, upper, _ = program(0, 8)
+    x, _ = by_osqp(units, lower, upper, np.zeros(12))
+    np.testing.assert_allclose(OsqpWarmStart(8, 12).run(units, lower, upper, None).x, x, atol=1e-12)
+
+
+def test_kernels_end_where_osqp_does() -> None:
+    for seed in range(6):
+        for rows in SIZES:
+            given = program(seed, rows)
+            host, device = (
+                kind.warm_start(*given)
+                for kind in (
+                    OsqpSplitting(np.eye(12), np.zeros(12), accuracy=1e-5),
+                    AdmmSplitting(np.eye(12), np.zeros(12), accuracy=1e-5, device="cpu"),
+                )
+            )
+            np.testing.assert_allclose(device.x, host.x, atol=1e-9)
+            np.testing.assert_allclose(device.multipliers, host.multipliers, atol=1e-9)

@@ -1,0 +1,129 @@
+"""A fall ends a motion: by tilt, by what the body lies on; flights, landings and what the user asks for are none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from egs_warp.contact.detection import ContactGeometry
+from egs_warp.deformation.embedding import embed_points
+from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.objectives import AngularMomentumObjective
+from egs_warp.locomotion.rollout import REST_FRAMES, roll_out
+from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.motions.fall_monitor import FALLEN_TILT, FALLEN_TIME, FallMonitor
+from egs_warp.motions.follow import Follow
+from egs_warp.motions.get_up import GetUpPhase
+from egs_warp.motions.keyframes import Key, Quantity
+from egs_warp.motions.script import motion
+from egs_warp.motions.sequence import MotionSequence, MotionTask
+from tests.support.creatures import CoarseCreature, coarse_creature
+from tests.support.meshes import box_mesh
+from tests.support.stances import DT, FLOOR, FORWARD
+
+
+@pytest.fixture(scope="module")
+def made() -> CoarseCreature:
+    return coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
+
+
+class Stands:
+    """A motion that asks for something and never rests."""
+
+    resting = False
+
+    def __init__(self, _: object) -> None:
+        pass
+
+    def objectives(self, *_: object) -> list[AngularMomentumObjective]:
+        return [AngularMomentumObjective(np.zeros(3), 1.0)]
+
+
+def watched(made: CoarseCreature, begin: Any = Stands) -> FallMonitor:
+    return FallMonitor(MotionSequence(made.place, [MotionTask("stand", {}, begin)]), made.place)
+
+
+def seen(
+    made: CoarseCreature, watch: FallMonitor, *, degrees: float, load: float, seconds: float, on: str = "base"
+) -> None:
+    """Show it a body turned by so much, which the ground bears by ``load`` of its weight at its base or top."""
+    body, start = made.place.body, made.start
+    turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+    state = BodyState(start.positions @ turn.T, start.velocities)
+    height = made.place.standing[:, 2]
+    node = int(np.argmin(height) if on == "base" else np.argmax(height))
+    contacts = SimpleNamespace(nodes=np.array([[node] * 4]), count=0)
+    report = SimpleNamespace(forces=np.array([[load * body.weight, 0.0, 0.0]]), contacts=contacts, min_gap=0.0)
+    watch.objectives(state, None, DT)
+    for step in range(1, int(np.ceil(seconds / DT)) + 1):
+        watch.objectives(replace(state, time=step * DT), cast(Any, report), DT)
+
+
+def test_tilt_and_what_a_body_lies_on(made: CoarseCreature) -> None:
+    long = FALLEN_TIME * np.sqrt(made.place.body.height / 9.81)
+    cases: list[tuple[dict[str, Any], str | None]] = [
+        ({"degrees": FALLEN_TILT + 1, "load": 1.0, "seconds": long}, "tilted by 61 degrees at 0.17 s"),
+        ({"degrees": -170.0, "load": 0.2, "seconds": long}, "tilted by 170 degrees at 0.17 s"),
+        ({"degrees": FALLEN_TILT - 1, "load": 1.0, "seconds": 1.0}, None),
+        ({"degrees": FALLEN_TILT + 1, "load": 1.0, "seconds": long - 2 * DT}, None),
+        ({"degrees": 90.0, "load": 0.0, "seconds": 1.0}, None),
+        ({"degrees": 0.0, "load": 0.6, "seconds": long, "on": "top"}, "its base off the ground at 0.17 s"),
+        ({"degrees": 0.0, "load": 0.4, "seconds": 1.0, "on": "top"}, None),
+    ]
+    for given, said in cases:
+        watch = watched(made)
+        seen(made, watch, **given)
+        assert watch.fallen == said and watch.is_finished == (said is not None)
+
+
+def test_a_fallen_body_is_asked_for_nothing(made: CoarseCreature) -> None:
+    watch = watched(made)
+    assert len(watch.objectives(made.start, None, DT)) == 1
+    seen(made, watch, degrees=90.0, load=1.0, seconds=1.0)
+    assert watch.objectives(made.start, None, DT) == []
+
+
+def test_a_body_that_gets_up_is_not_watched_meanwhile(made: CoarseCreature) -> None:
+    """The motion that fell is marked, getting up takes its place, and only its giving up is a fall."""
+    sequence = MotionSequence(made.place, [MotionTask("stand", {}, cast(Any, Stands))])
+    watch = FallMonitor(sequence, made.place, gets_up=True)
+    seen(made, watch, degrees=90.0, load=1.0, seconds=1.0)
+    assert watch.fallen is None and not watch.is_finished
+    fell, get_up = sequence.done
+    assert fell.fell == "tilted by 90 degrees at 0.17 s" and not fell.got_up and get_up.name == "get up"
+    assert sequence.time_left(1.0, [5.0]) > 0.0 and sequence.unstarted_note() == []
+    get_up.motion.phase = GetUpPhase.GIVEN_UP  # type: ignore[attr-defined]
+    watch.objectives(replace(made.start, time=1.1), cast(Any, SimpleNamespace()), DT)
+    assert watch.fallen == fell.fell and watch.is_finished
+
+
+def test_keys_may_tip_the_body(made: CoarseCreature) -> None:
+    key = Key(0.5, "body", Quantity.ORIENTATION, (90.0, 0.0, 0.0))
+    for keys, falls in (([key], False), ([replace(key, quantity=Quantity.POSITION)], True)):
+        watch = watched(made, lambda place, keys=keys: Follow(place, keys))
+        seen(made, watch, degrees=90.0, load=1.0, seconds=0.4)
+        assert (watch.fallen is not None) == falls
+
+
+def test_a_body_on_its_side_has_fallen() -> None:
+    """With the whole stepper, but weak: its muscles let go, and the run ends a little later."""
+    made = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD, strength=0.2)
+    turn = Rotation.from_euler("x", 90.0, degrees=True).as_matrix()
+    positions = made.start.positions @ turn.T
+    start = BodyState(positions - [0.0, 0.0, positions[:, 2].min()], made.start.velocities)
+    watch = FallMonitor(MotionSequence(made.place, motion("jump").parts(1.0)), made.place)
+    body, muscles = made.place.body, made.stepper.muscles
+    everywhere = embed_points(body.mesh, body.mesh.nodes, device="cpu")
+    geometry = ContactGeometry(body.mesh, (FLOOR,), 0.8, everywhere.tets.numpy(), everywhere.weights.numpy(), 0, 0.0)
+    stepper = LocomotionStepper(body, muscles, geometry, device="cpu")
+    done = roll_out(stepper, geometry, start, watch, frames=60, finished=lambda: watch.is_finished)
+    assert watch.fallen is not None and watch.fallen.startswith("tilted by ") and watch.is_finished
+    first = round(60.0 * float(watch.fallen.split()[-2]))
+    assert len(done.frames) == first + 1 + REST_FRAMES
+    asked = np.abs([report.activations for report in done.reports]).max(axis=1)
+    assert asked[-1] < 0.75 * asked[first - 1]

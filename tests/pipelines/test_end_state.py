@@ -1,0 +1,110 @@
+"""How a run ended is in its report, its summary and its exit status, whatever the state; its files are all there."""
+
+from __future__ import annotations
+
+import json
+import os
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from egs_warp import cli
+from egs_warp.assets import pawn
+from egs_warp.fem.step_problem import UnsolvableStepError
+from egs_warp.io import write_ply
+from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.locomotion.trajectory import MotionOutcome
+from egs_warp.motions.fall_monitor import FallMonitor
+from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.end_state import EndCause, State
+from egs_warp.pipelines.finished_run import FinishedRun
+from tests.support.coarse import NODES
+
+
+def reached(distance: float = 0.0, turn: float = 0.0) -> MotionOutcome:
+    return MotionOutcome(distance, 0.1, turn, 0.0, 0.0)
+
+
+def entry(*, resting: bool = True, fell: str | None = None, got_up: bool = False, **asked: float) -> Any:
+    motion = SimpleNamespace(is_at_rest=resting)
+    return cast(Any, SimpleNamespace(asked=asked, motion=motion, fell=fell, got_up=got_up))
+
+
+@pytest.mark.parametrize(
+    ("ending", "of", "result", "last", "state", "why"),
+    [
+        (EndCause(), entry(distance=0.5), reached(0.4), True, State.DONE, []),
+        (EndCause(), entry(distance=0.5, resting=False), reached(), True, State.CUT_OFF, []),
+        (
+            *(EndCause(), entry(distance=0.5), reached(0.049), False, State.FALLEN),
+            ["fallen: no progress, distance 0.049 of 0.5 body heights"],
+        ),
+        (
+            *(EndCause(), entry(heading_degrees=-90.0, distance=0.0), reached(0.0, 8.0), True, State.FALLEN),
+            ["fallen: no progress, heading 8 of -90 degrees"],
+        ),
+        (EndCause(), entry(heading_degrees=-90.0, distance=0.0), reached(0.0, -9.1), True, State.DONE, []),
+        (
+            *(EndCause(), entry(resting=False, fell="tilted", got_up=True), reached(), False, State.GOT_UP),
+            ["fallen: tilted; it got up again"],
+        ),
+        (
+            *(EndCause("tilted"), entry(resting=False, fell="tilted"), reached(), False, State.FALLEN),
+            ["fallen: tilted; it did not get up"],
+        ),
+        (EndCause("tilted"), entry(resting=False), reached(), True, State.FALLEN, ["fallen: tilted"]),
+        (EndCause("tilted"), entry(), reached(), False, State.DONE, []),
+        (
+            *(EndCause("tilted", True), entry(resting=False), reached(), True, State.STOPPED),
+            ["stopped: the next step could not be solved, however short; this is all before it"],
+        ),
+    ],
+)
+def test_each_motion_has_a_state(
+    ending: EndCause, of: Any, result: MotionOutcome, last: bool, state: State, why: list[str]
+) -> None:
+    assert ending.of(of, result, last=last) == (state, why)
+
+
+def test_a_run_ends_in_the_worst_state_of_its_motions() -> None:
+    assert State.worst(()) is State.DONE
+    assert State.worst((State.FALLEN, State.DONE)) is State.FALLEN
+    assert State.worst((State.FALLEN, State.STOPPED, State.CUT_OFF)) is State.STOPPED
+    assert [state.is_failure for state in State] == [False, False, False, True, True]
+
+
+@pytest.mark.parametrize("after", [0, 3, "fall"])
+def test_a_run_that_stops_or_falls_writes_all_of_its_files(
+    after: int | str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", partial(make_creature, nodes=NODES))
+    advance, calls = LocomotionStepper.advance, iter(range(1000))
+
+    def failing(*given: Any) -> Any:
+        if next(calls) == after:
+            raise UnsolvableStepError("singular")
+        return advance(*given)
+
+    monkeypatch.setattr(LocomotionStepper, "advance", failing)
+    if after == "fall":
+        monkeypatch.setattr(FallMonitor, "_lying_note", lambda *_: "tilted by 90 degrees")
+    write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=1000, device="cpu").cloud)
+    out = tmp_path / "out"
+    flags = ["--up", "z", "--size", "32", "--motion", "jump, twist", "--no-get-up", "--out", str(out)]
+    assert cli.main(["animate", str(tmp_path / "pawn.ply"), *flags]) == 3
+    said = capsys.readouterr().out
+    state = "fallen" if after == "fall" else "stopped"
+    assert f"note: {state}: " in said and "1 of 2 motions did not begin: twist" in said
+    assert "cut off" not in said
+    report = json.loads((out / "report.json").read_text())
+    assert report["state"] == state and [motion["state"] for motion in report["motion"]] == [state]
+    assert json.loads((out / "manifest.json").read_text())["finished"]
+    assert {"motions.mp4", "sheet.png", "plots.png", "trajectory.npz", "creature.npz"} <= set(os.listdir(out))
+    run = FinishedRun.read(out)
+    if isinstance(after, int):
+        assert len(run.trajectory.dt) == after and len(run.steps) == after + 1
+    assert cli.main(["resume", str(out)]) == 3
+    assert capsys.readouterr().out == f"{out}: this run has finished\n"

@@ -1,0 +1,115 @@
+"""Which way bodies face: by their mirror plane, and by what is before and behind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from egs_warp.assets import figurine, stool
+from egs_warp.assets.object import BuiltInObject
+from egs_warp.errors import ArgumentError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.pipelines.creature import PlacedCage, choose_front, make_creature, place_cage
+from egs_warp.pipelines.facing_direction import Front, mean_view
+from tests.support.frames import Lying
+
+DOWN = np.array([0.0, -1.0, 0.0])
+"""The way that the built-in figures face."""
+
+
+def front_of(
+    standing: PlacedCage, front: np.ndarray | None = None, seen_from: np.ndarray | None = None
+) -> tuple[Front, np.ndarray]:
+    """The front, and its direction in the capture."""
+    found = choose_front(standing, front, seen_from=seen_from)
+    return found, standing.frame.axes.T @ found.direction
+
+
+def degrees(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1.0, 1.0))))
+
+
+@pytest.fixture(scope="module", params=[figurine, stool], ids=["figurine", "stool"])
+def thing(request: pytest.FixtureRequest) -> BuiltInObject:
+    return request.param(gaussian_count=6000)
+
+
+@pytest.fixture(scope="module")
+def standing(thing: BuiltInObject) -> PlacedCage:
+    """As its file lies."""
+    return place_cage(thing.cloud, plane=thing.plane, nodes=200)
+
+
+@pytest.mark.parametrize("turn", [None, [0.7, -1.1, 0.4]])
+def test_a_bear_looks_where_its_face_is_and_a_stool_away_from_its_back(
+    thing: BuiltInObject, standing: PlacedCage, turn: list[float] | None
+) -> None:
+    """However the file lies; the line tells the direction in the file, and why."""
+    way = DOWN
+    if turn is not None:
+        axes = Rotation.from_rotvec(turn).as_matrix()
+        lying, way = Lying(thing.cloud, thing.plane).turned(axes), axes @ DOWN
+        standing = place_cage(lying.cloud, plane=lying.plane, nodes=200)
+    found = choose_front(standing)
+    assert degrees(standing.frame.axes.T @ found.direction, way) < 8.0
+    told = found.told(standing.frame)
+    x, y, z = standing.frame.axes.T @ found.direction
+    assert told.startswith(f"front is taken to be {x:.2f},{y:.2f},{z:.2f} (guessed: the body is ")
+    assert "times the detail of behind" in told and told.endswith("if not, say which way is front)")
+
+
+def plain_box(width: float, depth: float) -> Lying:
+    """A grey box, alike on all sides."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (6000, 3))
+    face_of = rng.integers(0, 3, len(points))
+    points[np.arange(len(points)), face_of] = np.where(rng.uniform(size=len(points)) < 0.5, -0.5, 0.5)
+    points = (points + [0.0, 0.0, 0.5]) * [width, depth, 1.0]
+    count = len(points)
+    cloud = GaussianCloud.from_numpy(
+        points,
+        np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        np.full((count, 3), np.log(0.02)),
+        np.full(count, 4.0),
+        np.zeros((count, 1, 3)),
+        device="cpu",
+    )
+    return Lying(cloud, Plane(np.array([0.0, 0.0, 1.0]), 0.0))
+
+
+def test_what_was_photographed_from_one_side_shows_its_front_there() -> None:
+    """A box that says nothing itself."""
+    box = plain_box(0.9, 0.5)
+    standing = place_cage(box.cloud, plane=box.plane, nodes=200)
+    for side in (1.0, -1.0):
+        way = side * np.array([0.0, 1.0, 0.0])
+        cameras = [
+            Camera.look_at(5.0 * (way + [x, 0.0, 0.3]), np.zeros(3), np.array([0.0, 0.0, 1.0]), width=8, height=8)
+            for x in (-0.6, 0.0, 0.6)
+        ]
+        found, front = front_of(standing, seen_from=mean_view(cameras, np.zeros(3)))
+        assert degrees(front, way) < 15.0
+        assert "was photographed from there" in str(found.reason)
+
+
+def test_cameras_all_around_say_nothing() -> None:
+    angles = np.arange(12) * np.pi / 6.0
+    eyes = np.stack([np.cos(angles), np.sin(angles), np.full(12, 0.4)], axis=1)
+    up = np.array([0.0, 0.0, 1.0])
+    seen = mean_view([Camera.look_at(eye, np.zeros(3), up, width=8, height=8) for eye in eyes], np.zeros(3))
+    assert seen is not None and np.abs(seen[:2]).max() < 1e-12
+    assert mean_view([], np.zeros(3)) is None
+
+
+def test_front_is_as_given_along_the_ground(standing: PlacedCage) -> None:
+    found, front = front_of(standing, np.array([1.0, 1.0, 3.0]))
+    np.testing.assert_allclose(front, np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0), atol=1e-12)
+    assert found.reason is None
+
+
+def test_a_front_that_points_up_is_refused_before_any_work(thing: BuiltInObject) -> None:
+    with pytest.raises(ArgumentError, match="front 0,0,-2: points up or down; give a way along the ground"):
+        make_creature(thing.cloud, plane=thing.plane, front=np.array([0.0, 0.0, -2.0]))

@@ -1,0 +1,58 @@
+"""A body that ends beyond the edge of what was captured of its ground is told of."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.contact.terrain import Solid
+from egs_warp.geometry.body_frame import GROUND
+from egs_warp.geometry.height_field import HeightField
+from egs_warp.pipelines.ground_coverage import ground_coverage_warning, share_over_ground
+from tests.support.grounds import level
+from tests.support.scenes import lying
+
+FLAT = Solid((GROUND,))
+TABLE = lying(np.concatenate([level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.03), level((1.0, -1.0), (4.0, 1.0), -0.6, 0.03)]))
+
+
+def box(x: float, lift: float = 0.0) -> np.ndarray:
+    """(n, 3) nodes of a box of one unit that stands about ``x``."""
+    corners = np.stack(np.meshgrid(*[np.linspace(-0.2, 0.2, 5)] * 2, np.linspace(0.0, 1.0, 6)), axis=-1)
+    return corners.reshape(-1, 3) + [x, 0.0, lift]
+
+
+@pytest.mark.parametrize(("x", "share"), [(0.0, 1.0), (0.99, 0.6), (1.6, 0.0)])
+def test_how_much_of_it_stands_on_ground(x: float, share: float) -> None:
+    """On the table, over its edge (three of five columns of nodes), and beyond it, over a floor far below."""
+    assert share_over_ground(box(x), TABLE, FLAT, 1.0) == pytest.approx(share)
+
+
+def test_what_is_told() -> None:
+    assert (
+        ground_coverage_warning(box(0.0), TABLE, FLAT, 1.0)
+        == ground_coverage_warning(box(0.99), TABLE, FLAT, 1.0)
+        == ()
+    )
+    (line,) = ground_coverage_warning(box(1.6), TABLE, FLAT, 1.0)
+    assert line.startswith("it ends beyond the edge of the captured ground, in the air; ask for less distance")
+    # In the air at the end, or without a scene, nothing is said; a scene without ground is all edge.
+    assert (
+        ground_coverage_warning(box(1.6, 0.3), TABLE, FLAT, 1.0)
+        == ground_coverage_warning(box(1.6), None, FLAT, 1.0)
+        == ()
+    )
+    above = lying(level((-1.0, -1.0), (1.0, 1.0), 0.5, 0.03))
+    assert len(ground_coverage_warning(box(0.0), above, FLAT, 1.0)) == 1
+
+
+def test_ground_that_is_not_flat_is_where_it_is() -> None:
+    """A slope, on which both body and splats stand higher to the right."""
+    heights = np.tile(0.2 * np.linspace(-2.0, 2.0, 41), (41, 1))
+    field = HeightField.through(np.eye(3), np.array([-2.0, -2.0, 0.0]), 0.1, heights)
+    points = level((-2.0, -1.0), (1.0, 1.0), 0.0, 0.03)
+    points[:, 2] = 0.2 * points[:, 0]
+    for x, share in ((0.5, 1.0), (1.6, 0.0)):
+        nodes = box(x)
+        nodes[:, 2] += 0.2 * nodes[:, 0]
+        assert share_over_ground(nodes, lying(points), field, 1.0) == pytest.approx(share)

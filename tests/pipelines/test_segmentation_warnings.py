@@ -1,0 +1,73 @@
+"""What looks wrong about an object is said in words, and nothing where nothing does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egs_warp.geometry.camera_ring import ring_cameras
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
+from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane
+from egs_warp.pipelines.pictures import segmentation_picture
+from egs_warp.pipelines.segmentation_warnings import segmentation_warnings
+from egs_warp.segmentation.object_spec import ObjectSpec
+from tests.support.grounds import level
+from tests.support.scenes import FLOOR, lying, round_ones, shell
+
+CAMERAS = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 1.0, count=4, elevations=(20.0,), size=120)
+
+
+@pytest.fixture(scope="module")
+def found() -> tuple[GaussianCloud, LocatedPlane]:
+    """A ball on a floor, by a point."""
+    cloud = concatenate(round_ones(shell(), 0.03), lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05)))
+    return cloud, locate_plane(cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5])), plane=FLOOR)
+
+
+def changed(located: LocatedPlane, object_mask: np.ndarray) -> LocatedPlane:
+    return replace(located, segmentation=replace(located.segmentation, object_mask=object_mask))
+
+
+def test_nothing_is_said_of_a_whole_object(found: tuple[GaussianCloud, LocatedPlane]) -> None:
+    cloud, located = found
+    assert segmentation_warnings(cloud, located, cloud.subset(located.segmentation.object_mask), CAMERAS) == []
+
+
+def test_an_object_at_the_edge_of_pictures(found: tuple[GaussianCloud, LocatedPlane]) -> None:
+    cloud, located = found
+    thing = cloud.subset(located.segmentation.object_mask)
+    near = [replace(CAMERAS[0], cx=CAMERAS[0].cx + 50.0), *CAMERAS[1:]]
+    assert segmentation_warnings(cloud, located, thing, near) == [
+        "touches the picture's edge in 1 of 4 views: is it whole?"
+    ]
+
+
+def test_an_object_without_its_foot(found: tuple[GaussianCloud, LocatedPlane]) -> None:
+    """A ball of one unit that begins at 0.17: a tenth of its size, the diagonal of its box."""
+    cloud, located = found
+    kept = located.segmentation.object_mask & (cloud.means.numpy()[:, 2] > 0.17)
+    (line,) = segmentation_warnings(cloud, changed(located, kept), cloud.subset(kept), CAMERAS)
+    assert line == "rests on nothing: its lowest part is 10 % of its size above the ground"
+
+
+def test_a_floor_that_came_along(found: tuple[GaussianCloud, LocatedPlane]) -> None:
+    """All of the floor that lies on one side: half of it, within the object's size."""
+    cloud, located = found
+    means = cloud.means.numpy()
+    kept = located.segmentation.object_mask | ((np.arange(cloud.count) >= 1500) & (means[:, 0] > 0.0))
+    (line,) = segmentation_warnings(
+        cloud, changed(located, kept), cloud.subset(located.segmentation.object_mask), CAMERAS
+    )
+    assert line.startswith("taken along: ") and line.endswith(" % of the floor about it")
+    assert 45 <= int(line.split()[2]) <= 55
+
+
+def test_the_words_are_in_the_picture(found: tuple[GaussianCloud, LocatedPlane]) -> None:
+    cloud, located = found
+    thing = cloud.subset(located.segmentation.object_mask)
+    plain, told = (segmentation_picture(cloud, thing, cloud, CAMERAS[:2], words) for words in ((), ("taken along",)))
+    np.testing.assert_array_equal(told[: len(plain)], plain)
+    strip = told[len(plain) :]
+    assert strip.shape[0] < 40 and (strip < 60).any() and strip[:, -20:].min() == 255

@@ -1,0 +1,50 @@
+"""From where a film is taken: from before the face, unless something stands there that hides it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
+from egs_warp.pipelines.simulated_run import FILMED_FROM, SimulatedRun
+from tests.support.grounds import level, sheet
+from tests.support.scenes import lying, round_ones
+
+MIDDLE = np.array([0.0, 0.0, 0.5])
+USUAL = np.array(FILMED_FROM[:2]) / np.hypot(*FILMED_FROM[:2])
+
+
+def side(scene: GaussianCloud) -> np.ndarray:
+    """(2,) along the ground, for a body of one unit that faces x."""
+    ground = SimpleNamespace(local=lambda points: points)
+    body = SimpleNamespace(height=1.0)
+    stub: Any = SimpleNamespace(creature=SimpleNamespace(body=body), place=SimpleNamespace(ground=ground))
+    way = SimulatedRun._clear_side(stub, scene, MIDDLE, 4.0)
+    return way[:2] / np.hypot(*way[:2])
+
+
+def wall(way: np.ndarray, away: float) -> GaussianCloud:
+    """A screen of two by one and a half units that stands across ``way`` (2,)."""
+    along = np.array([-way[1], way[0]])
+    grid = level((-1.0, 0.0), (1.0, 1.5), 0.0, 0.05)
+    points = np.column_stack([away * way + grid[:, :1] * along, grid[:, 1]])
+    return sheet(points, np.tile([*-way, 0.0], (len(points), 1)), 0.05, (0.5, 0.5, 0.5))
+
+
+FLOOR = lying(level((-3.0, -3.0), (3.0, 3.0), 0.0, 0.05))
+
+
+def test_floaters_do_not_turn_the_camera_away_from_the_face() -> None:
+    random = np.random.default_rng(0)
+    near = 1.5 * np.array([*USUAL, 0.3]) + random.normal(0.0, 0.2, (12, 3))
+    assert side(FLOOR) == pytest.approx(USUAL)
+    assert side(concatenate(FLOOR, round_ones(near, 0.02))) == pytest.approx(USUAL)
+
+
+def test_what_hides_it_does_and_what_stands_behind_the_camera_does_not() -> None:
+    turned = side(concatenate(FLOOR, wall(USUAL, 1.5)))
+    assert -0.1 < turned @ USUAL < 0.8, "the nearest side that is clear"
+    assert side(concatenate(FLOOR, wall(USUAL, 4.5))) == pytest.approx(USUAL)

@@ -1,0 +1,42 @@
+"""The time left that a progress bar tells is the time that is left, within a factor of two."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.locomotion.rollout import REST_FRAMES
+from egs_warp.motions.script import motion
+from egs_warp.pipelines.simulated_run import simulate
+from tests.support.live_sessions import coarse_pawn
+
+NEAR = 20
+"""Frames: what is left then is told in any case."""
+
+
+def _told(text: str, frames: int | None = None) -> np.ndarray:
+    """(n, 2) frames done and expected, after each."""
+    told: list[tuple[int, int]] = []
+    simulate(coarse_pawn(), motion(text), frames=frames, progress=lambda done, expected: told.append((done, expected)))
+    assert [done for done, _ in told] == list(range(1, len(told) + 1))
+    return np.array(told)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", ["jump", "hop x2 0.4 0.2", "twist 60", "twist 180", "walk 0.2", "jump 0 0.1, turn 30"])
+def test_what_is_left_is_told_within_a_factor_of_two(text: str) -> None:
+    """Of all frames but the last ones; a twist finds out in the air whether it takes another jump."""
+    done, expected = _told(text).T
+    count = len(done)
+    far = done < count - NEAR
+    ratio = (expected - done)[far] / (count - done)[far]
+    assert ratio.min() >= 0.5 and ratio.max() <= 2.0
+    # The frames that are shown at rest are counted down.
+    assert (expected[-REST_FRAMES:] == count).all()
+    # The teeth: where the motion is cut off tells less.
+    assert motion(text).frames() > 1.2 * count
+
+
+def test_asked_frames_are_all_there_are() -> None:
+    """The first one is the body at rest."""
+    np.testing.assert_array_equal(_told("jump", frames=4)[:, 1], 3)

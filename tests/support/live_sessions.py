@@ -1,0 +1,76 @@
+"""A coarse creature that lives, step by step or in its thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from egs_warp.assets.pawn import pawn
+from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.web.feed import drawn_creature
+from egs_warp.web.messages import read_message
+from egs_warp.web.packets import Frame
+from egs_warp.web.session import Session, SessionOptions
+
+
+@cache
+def coarse_pawn() -> Creature:
+    """About a hundred nodes."""
+    made = pawn(gaussian_count=2000)
+    return make_creature(made.cloud, plane=made.plane, nodes=50)
+
+
+def session_of(creature: Creature, takes: Path) -> Session:
+    """Of ``creature``, not started; what it records goes to ``takes``."""
+    return Session(creature, drawn_creature(creature, creature.cloud), SessionOptions(source="pawn", takes=takes))
+
+
+class SteppedSession:
+    """A session that is stepped by the test, in the test's own thread."""
+
+    def __init__(self, creature: Creature, takes: Path) -> None:
+        self.session = session_of(creature, takes)
+        self.session.subscribe(lambda: None)
+        self.frames: list[Frame] = []
+        self.news: list[dict[str, Any]] = []
+
+    def ask(self, kind: str, **fields: Any) -> None:
+        """What the page would send."""
+        body = self.session.creature.body
+        message = read_message({"type": kind, **fields}, height=body.height, node_count=len(body.node_mass))
+        self.session.put_request(message)
+        self.session.process_requests()
+        self._hear()
+
+    def step(self, count: int = 1) -> None:
+        """So many steps."""
+        for _ in range(count):
+            self.session.advance()
+            self._hear()
+
+    def until(self, condition: Callable[[], bool], *, most: int = 400) -> int:
+        """Steps until ``condition`` holds."""
+        for count in range(most):
+            if condition():
+                return count
+            self.step()
+        raise AssertionError(f"not within {most} steps")
+
+    def until_idle(self, *, most: int = 400) -> int:
+        """Steps until it stands with nothing to come; at least one."""
+        self.step()
+        return self.until(lambda: self.session.steering.idle, most=most)
+
+    @property
+    def told(self) -> list[str]:
+        """Lines for the user."""
+        return [str(news["text"]) for news in self.news if news["type"] == "told"]
+
+    def _hear(self) -> None:
+        for news in self.session.take_news():
+            if isinstance(news, Frame):
+                self.frames.append(news)
+            else:
+                self.news.append(news)

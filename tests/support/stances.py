@@ -1,0 +1,32 @@
+"""A block that stands where a motion begins, and the same block posed by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from egs_warp.contact.terrain import Solid
+from egs_warp.fem.body import make_body
+from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.motions.sequence import Stance
+from egs_warp.motions.stance import GroundFrame
+from tests.support.meshes import block_mesh
+
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+FORWARD = np.array([1.0, 0.0, 0.0])
+DT = 1 / 60
+
+
+def block_place(mesh: TetMesh | None = None) -> Stance:
+    """A block of 0.4 x 0.4 x 1 metres, irregular inside, or another ``mesh`` that stands on z = 0 and faces +x."""
+    mesh = mesh or block_mesh()
+    body = make_body(mesh, FLOOR, device="cpu")
+    standing = mesh.nodes - [0.0, 0.0, mesh.nodes[:, 2].min()]
+    ground = GroundFrame.on_plane(FLOOR, FORWARD, body.centre_of_mass(standing))
+    return Stance(body, ground, standing, standing[standing[:, 2] < 1e-9], DT, (Solid((FLOOR,)),))
+
+
+def moved(place: Stance, angle: float, shift: np.ndarray) -> np.ndarray:
+    """(N, 3) nodes of the standing block turned by ``angle`` radians about up and moved by ``shift`` (3,)."""
+    com = place.body.centre_of_mass(place.standing)
+    return com + (place.standing - com) @ place.ground.rotation_about_up(angle).T + shift

@@ -1,0 +1,92 @@
+"""Of ``fem`` and its kernels."""
+
+from __future__ import annotations
+
+from tests.support.surviving_mutants.survivor import Survivor
+
+FEM = [
+    Survivor(
+        "fem/warp_elasticity.py",
+        "self._no_gradients, self._no_pulls = empty(0, Mat33, device), empty(0, Vec3, device)",
+        "self._no_gradients, self._no_pulls = empty( 1, Mat33, device), empty(0, Vec3, device)",
+        "it stands in for an array that no kernel reads without damping",
+    ),
+    Survivor(
+        "fem/body.py",
+        "column = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)",
+        "column = ElasticAssembly(mesh, Material(young, poisson_ratio, density, -1.0), device=device)",
+        "the column is loaded at rest, where nothing is damped",
+    ),
+    Survivor(
+        "fem/assembly_topology.py",
+        "offsets = np.searchsorted(inverse[order], np.arange(len(blocks) + 1))",
+        "offsets = np.searchsorted(inverse[order], np.arange(len(blocks) + 2))",
+        "one offset more, the last one again, which bounds nothing",
+    ),
+    Survivor(
+        "fem/linear_solver.py",
+        "@property",
+        "",
+        "of a Protocol, which nothing runs",
+    ),
+    Survivor(
+        "kernels/fem/elasticity.py",
+        "along = wp.clamp((length / rest_lengths[segment] - slack) / (full - slack), real(0.0), real(1.0))",
+        "along = wp.clamp((length / rest_lengths[segment] - slack) / (full % slack), real(0.0), real(1.0))",
+        "tests/muscles/test_tension.py notices, which the room does not run",
+    ),
+    Survivor(
+        "kernels/fem/elasticity.py",
+        "if end_offsets.shape[0] > 0:",
+        "if end_offsets.shape[0] != 0:",
+        "a count is never less than nothing",
+    ),
+    Survivor(
+        "fem/batch_factors.py",
+        "self.chunk = max(1, chunk_bytes // (8 * size * size))",
+        "self.chunk = max(1, chunk_bytes - (8 * size * size))",
+        "how many worlds share one pass: results are the same",
+    ),
+    Survivor(
+        "kernels/fem/elasticity.py",
+        "OFF, SWEEPS = 1e-31, 12",
+        "OFF, SWEEPS = 1e-31,  13",
+        "sweeps after which a matrix of three has long been diagonal: one more",
+    ),
+    Survivor(
+        "fem/batch_elasticity.py",
+        "self._no_ends = self._copies(rows.T.tocsr(), 0, 0)",
+        "self._no_ends = self._copies(rows.T.tocsr(), 0, -1)",
+        "how far apart copies of nothing are",
+    ),
+    Survivor(
+        "kernels/fem/elasticity.py",
+        "share = along * along * (real(3.0) - real(2.0) * along)",
+        "share = along * along // (real(3.0) - real(2.0) * along)",
+        "tests/muscles/test_tension.py, another room's, kills it",
+    ),
+    Survivor(
+        "fem/multifrontal.py",
+        "positive = int((factors.diagonal()[pivots > 0] > 0.0).sum()) + int((pivots < 0).sum()) // 2",
+        "positive = int((factors.diagonal()[pivots >= 0] > 0.0).sum()) + int((pivots < 0).sum()) // 2",
+        "pivots count from one: none is nothing",
+    ),
+    Survivor(
+        "kernels/fem/elasticity.py",
+        "if between != real(0.0):",
+        "if between != real( 1.0):",
+        "where it is nothing the turn is by nothing",
+    ),
+    Survivor(
+        "kernels/fem/elasticity.py",
+        "while sweep < _SWEEPS and m[0, 1] * m[0, 1] + m[0, 2] * m[0, 2] + m[1, 2] * m[1, 2] > least:",
+        "while sweep < _SWEEPS and m[0, 1] * m[0, 1] + m[0, 2] * m[0, 2] + m[1, 2] * m[1, 2] >= least:",
+        "no sum of squares is the bound to the bit",
+    ),
+    Survivor(
+        "kernels/fem/elasticity.py",
+        "for k in range(3):",
+        "for k in range( 4):",
+        "entries of a fourth column are written over by the next row's, or lie beyond the matrix: no sum reads them",
+    ),
+]

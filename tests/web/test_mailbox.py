@@ -1,0 +1,95 @@
+"""What lies between a session and its page: nothing is told twice, nothing but old frames is lost."""
+
+from __future__ import annotations
+
+import threading
+import time
+from unittest.mock import patch
+
+import numpy as np
+
+from egs_warp.web.mailbox import Mailbox
+from egs_warp.web.messages import Pause, Release
+from egs_warp.web.packets import Frame
+
+
+def _frame(index: int) -> Frame:
+    none = np.zeros(0)
+    return Frame(index, index / 60.0, np.zeros((4, 3)), none, np.zeros((0, 9)), none)
+
+
+def _watched() -> Mailbox:
+    post = Mailbox()
+    post.subscribe(lambda: None, lambda: _frame(0))
+    post.take_news()
+    return post
+
+
+def test_nobody_is_sent_anything_and_who_comes_begins_with_how_it_is():
+    post, woken = Mailbox(), []
+    post.send_line("lost")
+    post.tell_state({"doing": "jump"})
+    assert post.take_news() == [] and not post.watched
+    post.subscribe(lambda: woken.append(True), lambda: _frame(7))
+    (first,) = post.take_news()
+    assert isinstance(first, Frame) and first.index == 7 and woken == [True] and post.watched
+    post.unsubscribe()
+    assert post.take_requests() == [Release()] and not post.watched
+    post.send_line("lost")
+    assert post.take_news() == [] and woken == [True]
+
+
+def test_a_state_is_told_when_it_is_new_or_who_watches_is():
+    post = _watched()
+    for state in ({"doing": "jump"}, {"doing": "jump"}, {"doing": "stand"}):
+        post.tell_state(state)
+    assert post.take_news() == [{"doing": "jump"}, {"doing": "stand"}]
+    post.subscribe(lambda: None, lambda: _frame(1))
+    post.tell_state({"doing": "stand"})
+    assert post.take_news()[1:] == [{"doing": "stand"}]
+
+
+def test_of_what_waits_the_oldest_frames_go_and_no_news():
+    post = _watched()
+    with patch("egs_warp.web.mailbox._MOST_WAITING", 4):
+        post.send_line("first")
+        for index in range(1, 6):
+            post.send(_frame(index))
+        post.send_line("last")
+    left = [one.index if isinstance(one, Frame) else one["text"] for one in post.take_news()]
+    assert left == ["first", 4, 5, "last"]
+
+
+def test_busy_ends_whatever_goes_wrong():
+    post = _watched()
+    try:
+        with post.send_busy():
+            raise ValueError
+    except ValueError:
+        pass
+    assert post.take_news() == [{"type": "busy", "on": True}, {"type": "busy", "on": False}]
+
+
+def test_a_session_that_is_held_wakes_when_asked_and_ends_when_stopped():
+    post, turns = _watched(), []
+    post.tell_state({"doing": "stand"})
+    # Not held, nothing told or something asked: no waiting.
+    assert post.wait_for_work(lambda: False, lambda: None)
+    thread = threading.Thread(target=lambda: turns.append(post.wait_for_work(lambda: True, lambda: None)))
+    thread.start()
+    time.sleep(0.05)
+    assert turns == []
+    post.put_request(Pause(True))
+    thread.join(timeout=20)
+    assert turns == [True] and post.take_requests() == [Pause(True)]
+    post.stop()
+    assert not post.wait_for_work(lambda: True, lambda: None)
+
+
+def test_time_is_waited_for_unless_something_is_asked():
+    post = Mailbox()
+    due = time.perf_counter() + 0.05
+    post.wait_until(lambda: due - time.perf_counter())
+    assert time.perf_counter() >= due
+    post.put_request(Pause(False))
+    post.wait_until(lambda: 3600.0)
