@@ -42,11 +42,11 @@ export class Cage {
       const start = 3 * (tets[4 * t] as number);
       for (let k = 0; k < 3; k++) this.maps[16 * t + 12 + k] = rest[start + k] as number;
     }
-    this.carry(rest);
+    this.update(rest);
   }
 
   /** Takes the cage to node `positions`. */
-  carry(positions: Float32Array): void {
+  update(positions: Float32Array): void {
     const { maps, inverses, tets } = this;
     for (let t = 0; t < tets.length / 4; t++) {
       const m = edges(positions, tets, t);
@@ -78,7 +78,7 @@ function edges(points: Float32Array, tets: Int32Array, t: number): Nine {
 }
 
 /** A texture with one tetrahedron that stays: what is behind the creature is drawn by the same shader. */
-export function stillCage(): THREE.DataTexture {
+export function identityCage(): THREE.DataTexture {
   const { texture, values } = floatTexture(4);
   values.set([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0]);
   return texture;

@@ -5,10 +5,10 @@ export function element<K extends keyof HTMLElementTagNameMap>(
   attributes: Record<string, string> = {},
   ...children: (Node | string)[]
 ): HTMLElementTagNameMap[K] {
-  const made = document.createElement(tag);
-  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-  made.append(...children);
-  return made;
+  const created = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) created.setAttribute(name, value);
+  created.append(...children);
+  return created;
 }
 
 const ICONS = {
@@ -40,19 +40,19 @@ const ICONS = {
 export type Icon = keyof typeof ICONS;
 
 export function icon(name: Icon): string {
-  const drawn = 'fill="none" stroke="currentColor" stroke-width="1.6" aria-hidden="true"';
-  return `<svg viewBox="0 0 24 24" width="20" height="20" ${drawn}>${ICONS[name]}</svg>`;
+  const attributes = 'fill="none" stroke="currentColor" stroke-width="1.6" aria-hidden="true"';
+  return `<svg viewBox="0 0 24 24" width="20" height="20" ${attributes}>${ICONS[name]}</svg>`;
 }
 
-export function button(name: Icon, title: string, pressed: () => void): HTMLButtonElement {
-  const made = element("button", { type: "button", class: "icon", title, "aria-label": title });
-  made.innerHTML = icon(name);
-  made.addEventListener("click", (event) => {
-    pressed();
+export function button(name: Icon, title: string, onClick: () => void): HTMLButtonElement {
+  const created = element("button", { type: "button", class: "icon", title, "aria-label": title });
+  created.innerHTML = icon(name);
+  created.addEventListener("click", (event) => {
+    onClick();
     // Keys go to the page again, not to what was clicked last.
-    if (event.detail > 0) made.blur();
+    if (event.detail > 0) created.blur();
   });
-  return made;
+  return created;
 }
 
 /** Gives a file to the user. */

@@ -54,7 +54,7 @@ export interface Frame {
 
 const MAGIC = "EGSPAGE1";
 
-interface Listed {
+interface ArrayEntry {
   type: string;
   shape: number[];
   start: number;
@@ -62,16 +62,16 @@ interface Listed {
 
 /** The header at the start of `bytes`, and where what follows it begins. */
 export function readHeader(bytes: ArrayBuffer): { header: Header; end: number } {
-  const whole = new DataView(bytes);
+  const dataView = new DataView(bytes);
   const text = new TextDecoder();
   if (bytes.byteLength < 12 || text.decode(new Uint8Array(bytes, 0, 8)) !== MAGIC) {
     throw new Error("this is no run of egs_warp");
   }
-  const length = whole.getUint32(8, true);
-  const { arrays: listed, bytes: size, ...facts } = JSON.parse(text.decode(new Uint8Array(bytes, 12, length)));
+  const length = dataView.getUint32(8, true);
+  const { arrays: entries, bytes: size, ...facts } = JSON.parse(text.decode(new Uint8Array(bytes, 12, length)));
   const base = Math.ceil((12 + length) / 8) * 8;
   const arrays = new Map<string, Numbers>();
-  for (const [name, { type, shape, start }] of Object.entries(listed as Record<string, Listed>)) {
+  for (const [name, { type, shape, start }] of Object.entries(entries as Record<string, ArrayEntry>)) {
     const count = shape.reduce((product, side) => product * side, 1);
     arrays.set(name, view(type, bytes, base + start, count));
   }
@@ -117,11 +117,11 @@ export function readFrame(bytes: ArrayBuffer, start: number): Frame {
 
 /** All frames of a file after its header, each with its length before it. */
 export function readFrames(bytes: ArrayBuffer, start: number): Frame[] {
-  const whole = new DataView(bytes);
+  const dataView = new DataView(bytes);
   const frames: Frame[] = [];
   let at = start;
   while (at + 4 <= bytes.byteLength) {
-    const length = whole.getUint32(at, true);
+    const length = dataView.getUint32(at, true);
     if (at + 4 + length > bytes.byteLength) break;
     frames.push(readFrame(bytes, at + 4));
     at += 4 + length;

@@ -7,7 +7,7 @@ export interface FrameSource {
   /** All frames known so far, in order; a socket's grow. */
   readonly frames: Frame[];
   /** Whether more may come. */
-  readonly open: boolean;
+  readonly isOpen: boolean;
   /** Told of each frame that comes later. */
   onFrame: (frame: Frame) => void;
 }
@@ -17,13 +17,13 @@ export function fromBytes(bytes: ArrayBuffer): FrameSource {
   const { header, end } = readHeader(bytes);
   const frames = readFrames(bytes, end);
   if (frames.length === 0) throw new Error("the run has no frames");
-  return { header, frames, open: false, onFrame: () => {} };
+  return { header, frames, isOpen: false, onFrame: () => {} };
 }
 
 export async function fromAddress(address: string): Promise<FrameSource> {
-  const answer = await fetch(address);
-  if (!answer.ok) throw new Error(`the run cannot be read (${answer.status}): is egs-warp view still running?`);
-  return fromBytes(await answer.arrayBuffer());
+  const response = await fetch(address);
+  if (!response.ok) throw new Error(`the run cannot be read (${response.status}): is egs-warp view still running?`);
+  return fromBytes(await response.arrayBuffer());
 }
 
 /** Runs that a page carries within itself: base64 of gzip. */
@@ -61,10 +61,10 @@ export type News =
 /** A session that lives: frames as they are made, news beside them, and a way to ask for something. */
 export class LiveSource implements FrameSource {
   readonly frames: Frame[] = [];
-  open = true;
+  isOpen = true;
   onFrame: (frame: Frame) => void = () => {};
   onNews: (news: News) => void = () => {};
-  private early: News[] | undefined = [];
+  private pendingNews: News[] | undefined = [];
 
   constructor(
     readonly header: Header,
@@ -78,14 +78,14 @@ export class LiveSource implements FrameSource {
   /** News that came before anybody listened are told then. */
   listen(onNews: (news: News) => void): void {
     this.onNews = onNews;
-    for (const news of this.early ?? []) onNews(news);
-    this.early = undefined;
+    for (const news of this.pendingNews ?? []) onNews(news);
+    this.pendingNews = undefined;
   }
 
-  take(data: ArrayBuffer | string): void {
+  receive(data: ArrayBuffer | string): void {
     if (typeof data === "string") {
       const news = JSON.parse(data) as News;
-      if (this.early !== undefined) this.early.push(news);
+      if (this.pendingNews !== undefined) this.pendingNews.push(news);
       this.onNews(news);
       return;
     }
@@ -118,12 +118,12 @@ export function fromSocket(address: string, onState: (lost: string | undefined) 
           onState(undefined);
           return;
         }
-        source?.take(data);
+        source?.receive(data);
         if (source?.frames.length === 1) resolve(source);
       };
       socket.onclose = ({ code, reason }) => {
         if (source === undefined) reject(new Error(reason || `no connection (${code})`));
-        else if (code === 1000) source.open = false;
+        else if (code === 1000) source.isOpen = false;
         else {
           onState(reason || "connection lost, trying again");
           setTimeout(connect, 500);

@@ -5,7 +5,7 @@ import { LineMaterial } from "three/examples/jsm/lines/LineMaterial.js";
 import { LineSegments2 } from "three/examples/jsm/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/examples/jsm/lines/LineSegmentsGeometry.js";
 
-export class Strokes {
+export class WideLines {
   readonly object: LineSegments2;
   private readonly material: LineMaterial;
   private geometry = new LineSegmentsGeometry();
