@@ -77,7 +77,7 @@ def test_pause_step_sliders_and_script(chromium: Any, session: Session):
         page.keyboard.press(" ")
         wait_until(page, "egs.live.state?.motions === 1")
         with page.expect_download() as script:
-            page.click("[title^='Save what it did']")
+            page.click("[title^='Save the performed motions']")
         assert script.value.suggested_filename == "script.json"
         assert json.loads(Path(script.value.path()).read_text())[0]["motion"] == "jump"
 

@@ -1,4 +1,4 @@
-// Small curves that move with the time line.
+// Small charts of the audit's curves with a marker at the current frame.
 
 import { element } from "./dom";
 import type { FrameSource } from "./frame_source";

@@ -1,15 +1,16 @@
-// Shows a session evenly, however unevenly its frames come: a little behind the newest, as slow as the solver is.
+// Playback clock of a live session. It runs slightly behind the newest frame, at the average speed of the solver, so
+// that playback is smooth although frames arrive irregularly.
 
 import type { Frame } from "./packets";
 
-/** Frames that are kept to look back at. */
+/** Number of past frames that are stored. */
 const MAX_FRAMES = 900;
-/** Seconds over which the solver's speed is averaged. */
+/** Averaging window of the solver's speed, s. */
 const AVERAGING_TIME = 4;
-/** Seconds behind the newest frame: at least and at most. */
+/** Limits of the delay behind the newest frame, s. */
 const MIN_DELAY = 0.03;
 const MAX_DELAY = 0.6;
-/** The last of a motion is shown, however slowly it came. */
+/** Minimum playback speed, so that the last frames of a motion are always shown. */
 const MIN_SPEED = 0.02;
 
 interface Arrival {
@@ -18,11 +19,11 @@ interface Arrival {
 }
 
 export class LiveClock {
-  /** Of the moment shown, seconds of the creature's time. */
+  /** Simulated time that is shown, s. */
   time = 0;
-  /** Frames, with a fraction between two of them. */
+  /** Fractional index of the frame that is shown. */
   framePosition = 0;
-  /** Seconds of the creature's time that the solver makes in one of ours. */
+  /** Simulated seconds per wall-clock second. */
   speed = 0;
   private arrivals: Arrival[] = [];
   private shownSpeed = 0;
@@ -32,7 +33,7 @@ export class LiveClock {
     this.updateFramePosition();
   }
 
-  /** Told of the newest frame; `wall` in seconds. */
+  /** Record the arrival of the newest frame at wall-clock time `wall`, s. */
   addArrival(wall: number): void {
     const { frames } = this;
     const newest = frames.at(-1) as Frame;
@@ -53,19 +54,19 @@ export class LiveClock {
     this.updateFramePosition();
   }
 
-  /** The solver pauses: what comes after is not to be averaged with what was before. */
+  /** Restart the averaging of the speed, because the solver has paused. */
   resetSpeed(): void {
     this.arrivals = [];
   }
 
-  /** After `elapsed` seconds; true where the picture is another one. */
+  /** Advance by `elapsed` wall-clock seconds; return true if the shown time has changed. */
   advance(elapsed: number): boolean {
     const newest = this.frames.at(-1);
     if (newest === undefined || this.time >= newest.time) return false;
     const lead = newest.time - this.time;
     const targetLead = this.speed * this.delay();
-    // Slower with little ahead; with much hardly faster: in the air steps are quick, and what they gain bridges the
-    // slow ones on the ground.
+    // Play slower if few frames are left, but hardly faster if many are: steps in the air are quick, and the frames
+    // gained there bridge the slow steps on the ground.
     const speed =
       lead < targetLead
         ? this.speed * Math.max(lead / targetLead, 0.15)
@@ -76,7 +77,7 @@ export class LiveClock {
     return true;
   }
 
-  /** Seconds of ours that the picture is behind the newest frame: the longest pause between two, of late. */
+  /** Return the delay behind the newest frame, s: the longest recent interval between two arrivals. */
   private delay(): number {
     let longest = 0;
     for (let k = Math.max(1, this.arrivals.length - 12); k < this.arrivals.length; k++) {
@@ -99,7 +100,7 @@ export class LiveClock {
   }
 }
 
-/** Whether the creature was put elsewhere between two frames: nothing moves so far in a step. */
+/** Return true if the creature was moved to another place between two frames: no step moves it that far. */
 function isDiscontinuous(before: Frame, after: Frame): boolean {
   const [a, b] = [before.positions, after.positions];
   let low = Infinity;

@@ -1,5 +1,5 @@
-// The deformer of egs_warp/kernels/deformation, for one splat: the same numbers, without the SVD that a covariance does
-// not need.
+// Deformation of one splat in the shader. It gives the same values as egs_warp/kernels/deformation, but needs no SVD,
+// because it returns a covariance.
 
 import { TEXTURE_WIDTH } from "./cage";
 
@@ -44,7 +44,7 @@ vec3 egsBand(sampler2D bands, mat4 scales, int at, int k) {
   return (egsTexel(bands, at + k).rgb * 255.0 - 128.0) / 127.0 * scales[k / 4][k % 4];
 }
 
-/* Bands 1 to 3 towards the unit direction d, INRIA's signs. */
+/* Colour of the spherical harmonics bands 1 to 3 in the unit direction d, with the signs of INRIA's convention. */
 vec3 egsColour(sampler2D bands, mat4 scales, int index, int degree, vec3 d) {
   if (degree == 0) return vec3(0.0);
   int at = index * ((degree + 1) * (degree + 1) - 1);
@@ -66,8 +66,8 @@ vec3 egsColour(sampler2D bands, mat4 scales, int index, int degree, vec3 d) {
   return c;
 }
 
-/* Light that the creature leaves to a splat of the ground at p; place: middle of the shadow, half its side,
-   body height. */
+/* Fraction of light that reaches a background splat at p under the creature's shadow. region: centre of the shadow map
+   (x, y), half its side length, body height. */
 float egsLight(sampler2D shade, vec4 region, vec3 p) {
   vec2 uv = 0.5 + 0.5 * (p.xy - region.xy) / region.z;
   float near = 1.0 - smoothstep(0.02, 0.08, abs(p.z) / region.w);
@@ -95,7 +95,7 @@ CovSplat egsDeformed(
   if (straddles) {
     int arm = 4 * int(colour.w);
     e = egsTexel(arms, arm); f = egsTexel(arms, arm + 1); g = egsTexel(arms, arm + 2); h = egsTexel(arms, arm + 3);
-    /* Far outside: only turned and moved (RIGID). */
+    /* Far outside the cage: rotation and translation only (RIGID). */
     if (f.z == 3.0) { around.gradient = egsPolar(around.gradient); straddles = false; }
   }
   vec3 moved = egsImage(around, mean);

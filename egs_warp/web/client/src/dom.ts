@@ -1,4 +1,4 @@
-// Elements and icons.
+// Helpers that create elements, icons and downloads.
 
 export function element<K extends keyof HTMLElementTagNameMap>(
   tag: K,
@@ -49,13 +49,13 @@ export function button(name: Icon, title: string, onClick: () => void): HTMLButt
   created.innerHTML = icon(name);
   created.addEventListener("click", (event) => {
     onClick();
-    // Keys go to the page again, not to what was clicked last.
+    // Return the keyboard focus to the page.
     if (event.detail > 0) created.blur();
   });
   return created;
 }
 
-/** Gives a file to the user. */
+/** Download a blob as a file. */
 export function save(blob: Blob, name: string): void {
   const link = element("a", { href: URL.createObjectURL(blob), download: name });
   link.click();

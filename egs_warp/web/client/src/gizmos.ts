@@ -1,9 +1,9 @@
-// What the user's hand and the creature's aim look like: where it goes, which way it faces, what pulls at it.
+// Markers of user interaction: the goal on the ground, the facing direction, the pulling spring and the push ring.
 
 import * as THREE from "three";
 import { WideLines } from "./wide_lines";
 
-/** As the shader writes it. */
+/** Converted, because the shader writes sRGB values. */
 const ACCENT = new THREE.Color(0x7fd1b8).convertLinearToSRGB();
 const PULL = new THREE.Color(0xffc24a).toArray();
 
@@ -17,7 +17,7 @@ export class Gizmos {
   constructor(private readonly height: number) {
     const square = new THREE.PlaneGeometry(0.32 * height, 0.32 * height);
     this.goal = new THREE.Mesh(square, groundMaterial("abs(length(p) - 0.72) - 0.16", 0.85));
-    // An arrow head: within a triangle, outside of the notch behind.
+    // Distance field of an arrow head: a triangle with a notch at the back.
     const head = "max(0.45 * (p.x - 0.8) + 0.89 * abs(p.y), 0.85 * (-0.2 - 0.625 * abs(p.y) - p.x))";
     this.facing = new THREE.Mesh(new THREE.PlaneGeometry(0.26 * height, 0.26 * height), groundMaterial(head, 0.75));
     for (const mark of [this.goal, this.facing]) {
@@ -34,14 +34,14 @@ export class Gizmos {
     if (goal !== null) this.goal.position.set(goal[0], goal[1], this.goal.position.z);
   }
 
-  /** An arrow on the ground ahead of `middle`. */
+  /** Show an arrow on the ground at distance `reach` from `centre`. */
   showFacing(centre: THREE.Vector3, [x, y]: [number, number], reach: number): void {
     this.facing.visible = true;
     this.facing.position.set(centre.x + reach * x, centre.y + reach * y, this.facing.position.z);
     this.facing.rotation.z = Math.atan2(y, x);
   }
 
-  /** From where the body is held to the hand; without both, none. */
+  /** Show the spring from the grabbed point to the pointer's target, or hide it. */
   showSpring(grabbed?: THREE.Vector3, target?: THREE.Vector3): void {
     if (grabbed === undefined || target === undefined) {
       this.spring.set([], []);
@@ -52,7 +52,7 @@ export class Gizmos {
     this.spring.set(points, points.map((_, k) => PULL[k % 3]!));
   }
 
-  /** A ring that grows around what was hit, `age` from 0 to 1, as `camera` sees it round; without them, none. */
+  /** Show a ring facing `camera` that grows around the pushed point as `age` goes from 0 to 1, or hide it. */
   showPush(centre?: THREE.Vector3, age = 0, camera?: THREE.Camera): void {
     if (centre === undefined || camera === undefined) {
       this.ring.set([], []);
@@ -65,7 +65,7 @@ export class Gizmos {
   }
 }
 
-/** Segments of a circle whose plane has two unit vectors. */
+/** Return the line segments of a circle in the plane of two unit vectors. */
 function circle(centre: THREE.Vector3, radius: number, first: THREE.Vector3, second: THREE.Vector3): number[] {
   const at = (k: number): number[] => {
     const angle = (Math.PI * k) / 12;
@@ -75,8 +75,9 @@ function circle(centre: THREE.Vector3, radius: number, first: THREE.Vector3, sec
   return Array.from({ length: 24 }, (_, k) => [...at(k), ...at(k + 1)]).flat();
 }
 
-/** Flat on the ground, smooth at its edge however few pixels there are: `distance` of p, each side of the square at 1,
- * is negative inside. */
+/** Create an antialiased material from a signed distance field.
+ *
+ * `distance` is a GLSL expression of p, with p in [-1, 1]^2 on the square; it is negative inside the shape. */
 function groundMaterial(distance: string, opacity: number): THREE.ShaderMaterial {
   return new THREE.ShaderMaterial({
     uniforms: { colour: { value: ACCENT } },

@@ -1,11 +1,11 @@
-// The ground: a grid that fades with the distance, and the creature's soft shadow on it.
+// Ground plane with a grid that fades with distance, and the creature's soft shadow on it.
 
 import * as THREE from "three";
 
 const SHADOW_SIDE = 256;
 
 export class Ground {
-  /** What the creature's shadow is drawn to, and where that lies: middle, half its side, the body's height. */
+  /** Shadow map and its region on the ground: centre (x, y), half its side length, body height. */
   readonly shadow: { texture: THREE.Texture; region: THREE.Vector4 };
   readonly mesh: THREE.Mesh<THREE.PlaneGeometry, THREE.ShaderMaterial>;
   private readonly target: THREE.WebGLRenderTarget;
@@ -99,7 +99,7 @@ export class Ground {
     (this.mesh.material.uniforms.centre!.value as THREE.Vector2).set(x, y);
   }
 
-  /** Draws the shadow of the cage at node `positions`, whose centre of mass is `middle`. */
+  /** Render the shadow map of the cage at node `positions`, centred at `centreOfMass`. */
   cast(renderer: THREE.WebGLRenderer, positions: Float32Array, centreOfMass: THREE.Vector3): void {
     (this.points.array as Float32Array).set(positions);
     this.points.needsUpdate = true;
@@ -123,7 +123,7 @@ export class Ground {
     renderer.setClearColor(saved.colour, saved.alpha);
   }
 
-  /** Where the shadow is: nowhere else need a pixel look for it. */
+  /** Set the bounding box of the shadow; the shader samples the shadow map only inside it. */
   private updateShadowBox(positions: Float32Array, centreOfMass: THREE.Vector3, softness: number): void {
     let [left, right, near, far] = [Infinity, -Infinity, Infinity, -Infinity];
     for (let k = 0; k < positions.length; k += 3) {
@@ -134,7 +134,7 @@ export class Ground {
     }
     const half = this.shadow.region.z;
     const at = (x: number, centre: number): number => 0.5 + (0.5 * (x - centre)) / half;
-    // A pixel of the shadow's own picture beyond its softness; no further out than that picture is.
+    // One texel more than the blur radius, clipped to the shadow map.
     const edge = softness + 2 / SHADOW_SIDE;
     (this.mesh.material.uniforms.box!.value as THREE.Vector4).set(
       Math.max(at(left, centreOfMass.x) - edge, 0),

@@ -1,4 +1,4 @@
-// What the user does, as what is asked of the session: keys, gamepad, buttons, and the pointer on creature and ground.
+// User input: keys, gamepad, buttons and the pointer, translated into commands to the session.
 
 import * as THREE from "three";
 import type { LiveSource } from "./frame_source";
@@ -6,7 +6,7 @@ import type { Viewer } from "./viewer";
 
 export type Action = "forward" | "back" | "left" | "right" | "jump" | "leap" | "hop";
 
-/** What each action asks for; it walks where it can. */
+/** Return the motion of an action; a body that can walk walks, another one hops. */
 export function motionText(action: Action, walks: boolean): string {
   return {
     forward: walks ? "walk 0.2" : "hop 0.4 0.2",
@@ -19,7 +19,8 @@ export function motionText(action: Action, walks: boolean): string {
   }[action];
 }
 
-/** How it is driven while a key is held: sqrt(g H), radians in sqrt(H / g); as fast as it can where that is less. */
+/** Driving speeds while a key is held: forward in sqrt(g H), turn in rad per sqrt(H / g). A slower body moves as fast
+ * as it can. */
 const DRIVES: Partial<Record<Action, { forward?: number; turn?: number }>> = {
   forward: { forward: 0.3 },
   back: { forward: -0.3 },
@@ -40,7 +41,7 @@ const KEYS: Record<string, Action> = {
   KeyJ: "leap",
   KeyH: "hop",
 };
-/** Buttons of a standard gamepad. */
+/** Button numbers of a standard gamepad. */
 const GAMEPAD_BUTTONS: [number, Action][] = [
   [0, "jump"],
   [1, "leap"],
@@ -52,12 +53,12 @@ const GAMEPAD_BUTTONS: [number, Action][] = [
 ];
 const GAMEPAD_PUSH_BUTTON = 3;
 const STICK_THRESHOLD = 0.6;
-/** Seconds after which what is held is done again and again. */
+/** Time after which a held key repeats, s. */
 const REPEAT_DELAY = 0.45;
 
 export class InputControls {
   walks = false;
-  /** What comes next, as the session says. */
+  /** Name of the queued motion, as reported by the session. */
   queued: string | null = null;
   private pressed: { action: Action; source: string; since: number; isRepeating: boolean } | undefined;
   private lastSent = 0;
@@ -77,7 +78,7 @@ export class InputControls {
 
   release(source: string): void {
     if (this.pressed?.source !== source) return;
-    // What was asked for by holding on, beyond the first, is not to be done any more.
+    // Cancel the repeated motions that were requested by holding the key.
     if (this.pressed.isRepeating) this.source.send({ type: this.driveFor(this.pressed.action) ? "drive" : "cancel" });
     this.pressed = undefined;
   }
@@ -86,7 +87,7 @@ export class InputControls {
     if (this.pressed !== undefined) this.release(this.pressed.source);
   }
 
-  /** A key that moves the creature; whether it is one. */
+  /** Handle a key press; return true if the key moves the creature. */
   keyDown(event: KeyboardEvent): boolean {
     const action = KEYS[event.code];
     if (action === undefined) return false;
@@ -98,7 +99,7 @@ export class InputControls {
     this.release(event.code);
   }
 
-  /** Repeats what is held, and looks at the gamepad. */
+  /** Poll the gamepad and repeat the action of a held key. */
   tick(): void {
     this.pollGamepad();
     const now = performance.now() / 1000;
@@ -142,9 +143,9 @@ export class InputControls {
   }
 }
 
-/** The pointer: a drag that begins on the creature pulls at it, a click pushes it; one on the ground sends it there. */
+/** Pointer on the canvas: dragging the creature pulls it, clicking it pushes it, clicking the ground sends it there. */
 export class Pointer {
-  /** What is held, and where the hand is. */
+  /** Grabbed node and the point to which it is pulled. */
   grab: { node: number; target: THREE.Vector3 } | undefined;
   private readonly plane = new THREE.Plane();
   private start: { x: number; y: number; id: number } | undefined;
@@ -158,7 +159,7 @@ export class Pointer {
   ) {
     const { canvas } = viewer;
     const container = canvas.parentElement as HTMLElement;
-    // Before the camera's own controls hear of it.
+    // Capture the event before the camera controls receive it.
     container.addEventListener("pointerdown", (event) => this.down(event), { capture: true });
     canvas.addEventListener("pointermove", (event) => this.move(event));
     for (const end of ["pointerup", "pointercancel"] as const) canvas.addEventListener(end, (event) => this.up(event));

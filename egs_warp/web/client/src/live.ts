@@ -1,4 +1,4 @@
-// A creature that lives: its clock, the controls under it, and what the session says.
+// Live session: playback clock, control bar, settings, and messages of the session.
 
 import { StylePanel } from "./style_panel";
 import { button, element, icon, save } from "./dom";
@@ -11,38 +11,38 @@ import type { LiveSource, News } from "./frame_source";
 import type { Viewer } from "./viewer";
 
 type State = Extract<News, { type: "state" }>;
-/** Milliseconds for which a line is shown. */
+/** Time for which a message is shown, ms. */
 const TOAST_TIME = 7000;
-/** Of a body that was told nothing else. */
+/** Default sag of a body, rho g H / E. */
 const DEFAULT_SAG = 0.05;
-/** Slower than this it is said. */
+/** Below this fraction of real time the speed is displayed. */
 const MIN_REAL_TIME_SPEED = 0.95;
 const HELP: [string[], string][] = [
   [["\u2191", "W"], "forward"],
   [["\u2190", "\u2192", "A", "D"], "turn"],
-  [["\u2193", "S"], "turn round"],
+  [["\u2193", "S"], "turn around"],
   [["Space"], "jump"],
-  [["J"], "leap ahead"],
+  [["J"], "long jump"],
   [["H"], "hop"],
   [["B"], "push it away from you"],
-  [["Esc"], "drop what comes next"],
+  [["Esc"], "cancel the next motion"],
   [["P"], "pause"],
   [["."], "one step"],
   [["R"], "record a take"],
-  [["\u232b"], "stand up at the start"],
+  [["\u232b"], "reset to the start"],
 ];
 
 export class Live {
   readonly clock: LiveClock;
-  /** What the session said last. */
+  /** Latest state of the session. */
   state: State | undefined;
-  /** Lines for the user, the newest last. */
+  /** All messages to the user, the newest last. */
   readonly messages: string[] = [];
   private readonly input: InputControls;
   private readonly pointer: Pointer;
   private readonly gizmos: Gizmos;
   private readonly pushTool: PushTool;
-  private readonly speedLabel = element("output", { class: "pace", title: "How fast it lives, beside real time" });
+  private readonly speedLabel = element("output", { class: "pace", title: "Simulation speed relative to real time" });
   private readonly pauseButton: HTMLButtonElement;
   private readonly recordButton: HTMLButtonElement;
   private readonly toasts = element("div", { class: "toasts", role: "status", "aria-live": "polite" });
@@ -73,7 +73,7 @@ export class Live {
       friction: createSlider("Friction", limits?.friction ?? [0, 2], 0.05, (value) => value.toFixed(2), (friction) =>
         source.send({ type: "set", friction }),
       ),
-      // To the right it is stiffer, each way by the same factor.
+      // Logarithmic scale; stiffer to the right.
       sag: createSlider(
         "Stiffness",
         [-Math.log(maxSag), -Math.log(minSag)],
@@ -105,7 +105,7 @@ export class Live {
     window.addEventListener("blur", () => this.input.releaseAll());
   }
 
-  /** Whether something moves, or did a moment ago. */
+  /** True if the creature moves or has moved within the last half second. */
   get isMoving(): boolean {
     return performance.now() - this.lastMotion < 500;
   }
@@ -118,7 +118,7 @@ export class Live {
       for (const end of ["pointerup", "pointerleave", "pointercancel"]) {
         created.addEventListener(end, () => this.input.release(title));
       }
-      // A keyboard's press of the button itself.
+      // The button was activated by the keyboard.
       created.addEventListener("click", (event) => {
         if (event.detail !== 0) return;
         this.input.press(action, title);
@@ -138,16 +138,16 @@ export class Live {
       actionButton("forward", "Forward (\u2191)"),
       actionButton("right", "Turn right (\u2192)"),
       actionButton("jump", "Jump (space)"),
-      actionButton("leap", "Leap ahead (j)"),
+      actionButton("leap", "Long jump (j)"),
       button("push", "Push it away from you (b)", () => this.pushTool.push()),
     );
     const actions = element(
       "div",
       {},
-      button("stand", "Stand up at the start (backspace)", () => this.source.send({ type: "stand" })),
+      button("stand", "Reset to the start (backspace)", () => this.source.send({ type: "stand" })),
       button("sliders", "Style, friction, stiffness, pushes", toggleSheet(this.settingsSheet, this.helpSheet)),
       this.recordButton,
-      button("script", "Save what it did as a script", () => this.source.send({ type: "script" })),
+      button("script", "Save the performed motions as a script", () => this.source.send({ type: "script" })),
       button("help", "Keys (?)", toggleSheet(this.helpSheet, this.settingsSheet)),
     );
     const step = button("step", "One step (.)", () => this.step());
@@ -156,7 +156,7 @@ export class Live {
     return [dock, this.settingsSheet, this.helpSheet, this.toasts];
   }
 
-  /** After `elapsed` seconds; true where the picture is another one. */
+  /** Advance by `elapsed` wall-clock seconds; return true if the shown time has changed. */
   advance(elapsed: number): boolean {
     this.input.tick();
     this.pushTool.tick();
@@ -165,7 +165,7 @@ export class Live {
     return moved;
   }
 
-  /** Told after each picture: what follows hand and body. */
+  /** Update the gizmos and the speed label after each rendered image. */
   updateGizmos(): void {
     const { grab } = this.pointer;
     if (grab !== undefined) this.gizmos.showSpring(this.viewer.nodePosition(grab.node), grab.target);
@@ -177,7 +177,7 @@ export class Live {
     this.updateSpeedLabel();
   }
 
-  /** A key; whether it is one of ours. */
+  /** Handle a key press; return true if the key has a function. */
   keyDown(event: KeyboardEvent): boolean {
     if (this.input.keyDown(event)) return true;
     if (event.key === "p") this.togglePause();
@@ -202,7 +202,7 @@ export class Live {
       this.busy = news.on;
       this.clock.resetSpeed();
     } else if (news.type === "script") {
-      if (news.motions === 0) this.showMessage("it has done nothing yet that a script could hold");
+      if (news.motions === 0) this.showMessage("there is no motion to save yet");
       else save(new Blob([news.text], { type: "application/json" }), "script.json");
     } else this.showMessage(news.error, true);
   }
@@ -215,7 +215,7 @@ export class Live {
     if (state.paused || state.resting) this.clock.resetSpeed();
     if (before?.paused !== state.paused) {
       this.pauseButton.innerHTML = icon(state.paused ? "play" : "pause");
-      this.pauseButton.title = state.paused ? "Go on (p)" : "Pause (p)";
+      this.pauseButton.title = state.paused ? "Continue (p)" : "Pause (p)";
     }
     this.recordButton.classList.toggle("on", state.recording);
     this.recordButton.setAttribute("aria-pressed", String(state.recording));
@@ -229,7 +229,7 @@ export class Live {
   private updateSpeedLabel(): void {
     const { state, clock } = this;
     let text = "";
-    if (this.busy) text = "one moment\u2026";
+    if (this.busy) text = "please wait\u2026";
     else if (state?.paused) text = "paused";
     else if (state?.doing === "fallen") text = "fallen";
     else if (!this.isMoving || clock.speed === 0) text = "at rest";
@@ -270,6 +270,6 @@ function createHelpSheet(): HTMLElement {
   }
   list.append(element("dt", {}, "click"), element("dd", {}, "on the ground: go there"));
   list.append(element("dt", {}, "click"), element("dd", {}, "the creature: push it there, away from you"));
-  list.append(element("dt", {}, "drag"), element("dd", {}, "the creature: pull at it"));
+  list.append(element("dt", {}, "drag"), element("dd", {}, "the creature: pull it"));
   return element("section", { class: "sheet", "aria-label": "Keys", hidden: "" }, list);
 }

@@ -1,11 +1,11 @@
-// Finds the runs of the page, and begins it.
+// Entry point: find the runs of the page and show them.
 
 import { element } from "./dom";
 import { Page } from "./page";
 import { fromAddress, fromElement, fromSocket, type FrameSource } from "./frame_source";
 import "./style.css";
 
-/** The runs of this page: carried within it, sent by a socket, or lying beside it. */
+/** Return the runs of this page: embedded in it, sent by a socket, or files on the server. */
 async function findRuns(): Promise<FrameSource[]> {
   const embedded = [...document.querySelectorAll<HTMLElement>("script[data-run]")];
   if (embedded.length > 0) return Promise.all(embedded.map(fromElement));
@@ -20,7 +20,7 @@ async function findRuns(): Promise<FrameSource[]> {
   return Promise.all(Array.from({ length: count }, (_, k) => fromAddress(`run/${k}`)));
 }
 
-/** Says why nothing comes; undefined: it comes again. */
+/** Show why the connection is lost; undefined means that it is restored. */
 function showConnection(reason: string | undefined): void {
   document.body.classList.toggle("lost", reason !== undefined);
   document.body.dataset.lost = reason ?? "";
@@ -36,7 +36,7 @@ function showMessage(message: string): void {
 
 declare global {
   interface Window {
-    /** For scripts that drive the page. */
+    /** Access for scripts that control the page. */
     egs?: Page;
   }
 }
@@ -45,8 +45,8 @@ async function start(): Promise<void> {
   const root = document.getElementById("page") as HTMLElement;
   if (!webgl2()) {
     showMessage(
-      "This browser has no WebGL2, which draws the splats. " +
-        "Another browser, or hardware acceleration in its settings, will do.",
+      "This browser has no WebGL2, which is needed to draw the splats. " +
+        "Enable hardware acceleration in its settings or use another browser.",
     );
     return;
   }

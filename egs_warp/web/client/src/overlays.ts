@@ -1,4 +1,4 @@
-// What the mechanics knows, drawn over the splats: cage, muscles, feet, contacts, centre of mass.
+// Mechanical quantities drawn over the splats: cage, muscles, soles, contacts and centre of mass.
 
 import * as THREE from "three";
 import { SoleOverlay } from "./sole_overlay";
@@ -7,7 +7,7 @@ import { WideLines } from "./wide_lines";
 
 export type Layer = "cage" | "muscles" | "feet" | "contacts" | "path";
 
-/** Three mixes in linear light. */
+/** Convert a colour to linear RGB, in which Three.js blends. */
 const linear = (hex: number): number[] => new THREE.Color(hex).toArray();
 
 const COLOURS = {
@@ -79,7 +79,7 @@ export class Overlays {
     this.apply();
   }
 
-  /** `positions` may lie between two frames; `frame` is the nearest. */
+  /** Redraw the visible layers. `positions` may be interpolated; `frame` is the nearest frame. */
   update(frame: Frame, positions: Float32Array, frames: Frame[]): void {
     if (this.visible.has("cage")) this.drawCage(positions);
     if (this.visible.has("muscles")) this.drawMuscles(frame, positions);
@@ -180,7 +180,7 @@ export class Overlays {
     this.lines.path.set(lines.points, lines.colours);
   }
 
-  /** Dashed, where the motion had planned it. */
+  /** Add the planned path of the centre of mass as a dashed line. */
   private addPlan(lines: SegmentList): void {
     if (!this.header.arrays.has("plan")) return;
     const plan = floatsOf(this.header, "plan");
@@ -207,7 +207,7 @@ class SegmentList {
   }
 }
 
-/** A round dot. */
+/** Create the texture of a round dot. */
 function disc(): THREE.Texture {
   const side = 32;
   const canvas = document.createElement("canvas");

@@ -1,4 +1,4 @@
-// The page: lays out the stages and the controls, and keeps time.
+// The page: layout of viewers and controls, and the animation loop.
 
 import { Charts } from "./charts";
 import { button, element, icon, save } from "./dom";
@@ -9,7 +9,7 @@ import { LiveSource, type FrameSource } from "./frame_source";
 import { Viewer, type Preset, type LayerToggle } from "./viewer";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
-/** Seconds a picture from which fewer pixels are drawn: of a run, and of a creature that lives. */
+/** Time per image above which the resolution is reduced, s: for a recorded run and for a live session. */
 const MAX_FRAME_TIME = 1 / 15;
 const MAX_LIVE_FRAME_TIME = 1 / 25;
 const LAYERS: { name: LayerToggle; title: string; on: boolean; key: string }[] = [
@@ -32,7 +32,7 @@ const PRESETS: { name: Preset; title: string }[] = [
 export class Page {
   readonly viewers: Viewer[] = [];
   readonly player: Player;
-  /** Of a creature that lives. */
+  /** Only of live sessions. */
   readonly live: Live | undefined;
   private readonly charts: Charts;
   private readonly recorder = new VideoRecorder();
@@ -43,7 +43,7 @@ export class Page {
   private readonly clock = element("output", { class: "clock" });
   private readonly checkboxes = new Map<LayerToggle, HTMLInputElement>();
   private lastTime = 0;
-  /** Seconds between two pictures while the run plays, of late. */
+  /** Smoothed time between two images during playback, s. */
   private frameTime = 0;
 
   constructor(root: HTMLElement, sources: FrameSource[]) {
@@ -82,7 +82,7 @@ export class Page {
     requestAnimationFrame((now) => this.animate(now));
   }
 
-  /** The layer as a user ticks it. */
+  /** Show or hide a layer in all viewers, as its checkbox does. */
   setLayer(name: LayerToggle, on: boolean): void {
     const box = this.checkboxes.get(name);
     if (box !== undefined) box.checked = on;
@@ -91,11 +91,11 @@ export class Page {
   }
 
   private isShown(name: LayerToggle, viewer: Viewer): boolean {
-    // A captured scene has a ground of its own.
+    // A captured scene contains its own ground.
     return name !== "ground" || !viewer.hasScene;
   }
 
-  /** Frames, with a fraction between two of them: what is shown. */
+  /** Fractional index of the frame that is shown. */
   get framePosition(): number {
     return this.live?.clock.framePosition ?? this.player.framePosition;
   }
@@ -231,7 +231,7 @@ export class Page {
     event.preventDefault();
   }
 
-  /** A machine that is slow plays with fewer pixels, as long as it plays. */
+  /** Reduce the resolution during playback if the machine is too slow. */
   private adaptResolution(elapsed: number): void {
     if (this.recorder.recording) return;
     if (this.live === undefined ? !this.player.playing : !this.live.isMoving) {
@@ -245,7 +245,7 @@ export class Page {
     this.frameTime = 1 / 60;
   }
 
-  /** Shows where the player stands. */
+  /** Show the current frame in viewers, charts and controls. */
   private update(): void {
     const { player } = this;
     for (const viewer of this.viewers) viewer.show(this.framePosition);
@@ -258,7 +258,7 @@ export class Page {
     this.playButton.innerHTML = icon(player.playing ? "pause" : "play");
   }
 
-  /** A slow machine waits for its splats to be sorted: as they lay some pictures ago, the ground would hide the
+  /** True if a slow machine must wait until its splats are sorted. In an outdated order the ground would hide the
    * body. */
   private get isWaitingForSort(): boolean {
     return this.player.playing && this.frameTime > MAX_FRAME_TIME && this.viewers.some((viewer) => viewer.sorting);

@@ -1,4 +1,4 @@
-// Where in the run we are, and how it goes on.
+// Playback state of recorded runs.
 
 import type { FrameSource } from "./frame_source";
 
@@ -6,7 +6,7 @@ export class Player {
   playing = false;
   loop = true;
   speed = 1;
-  /** Frames, with a fraction between two of them. */
+  /** Fractional index of the frame that is shown. */
   framePosition = 0;
 
   constructor(
@@ -14,7 +14,7 @@ export class Player {
     private readonly onChange: () => void,
   ) {}
 
-  /** The longest of the runs side by side; a shorter one waits at its end. */
+  /** Last frame of the longest run; shorter runs stay at their last frame. */
   get lastFrame(): number {
     return Math.max(...this.sources.map((source) => source.frames.length)) - 1;
   }
@@ -38,16 +38,16 @@ export class Player {
     this.onChange();
   }
 
-  /** One frame on or back. */
+  /** Pause and move by a number of frames. */
   step(frames: number): void {
     this.playing = false;
     this.seek(Math.round(this.framePosition) + frames);
   }
 
-  /** After `elapsed` seconds. */
+  /** Advance the playback by `elapsed` seconds. */
   advance(elapsed: number): void {
     if (!this.playing) return;
-    // A tab that slept goes on where it was.
+    // Limit the step, so that a tab that was in the background continues where it stopped.
     this.framePosition += Math.min(elapsed, 0.25) * this.rate * this.speed;
     if (this.framePosition >= this.lastFrame) {
       if (this.loop && this.lastFrame > 0) this.framePosition %= this.lastFrame;

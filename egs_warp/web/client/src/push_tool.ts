@@ -1,4 +1,4 @@
-// Pushes: away from whoever looks, along the ground, on all of the creature or around a place that is hit.
+// Pushes away from the camera along the ground, on the whole creature or around the height of a clicked point.
 
 import * as THREE from "three";
 import type { Gizmos } from "./gizmos";
@@ -6,11 +6,11 @@ import { floatsOf } from "./packets";
 import type { LiveSource } from "./frame_source";
 import type { Viewer } from "./viewer";
 
-/** Seconds for which a ring shows where it was. */
+/** Time for which the ring is shown, s. */
 const RING_TIME = 0.35;
 
 export class PushTool {
-  /** m sqrt(g H). */
+  /** Impulse in m sqrt(g H). */
   strength = 0.15;
   private readonly rest: Float32Array;
   private lastPush: { where: () => THREE.Vector3; since: number } | undefined;
@@ -23,7 +23,7 @@ export class PushTool {
     this.rest = floatsOf(source.header, "rest");
   }
 
-  /** Around the height of `node` in the standing creature; without it, all of it alike. */
+  /** Push around the height of `node` in the rest pose, or the whole creature if there is none. */
   push(node?: number): void {
     const { x, y } = this.pushDirection().multiplyScalar(this.strength);
     const height = node === undefined ? {} : { height: this.heightOf(node) };
@@ -32,7 +32,7 @@ export class PushTool {
     this.lastPush = { where, since: performance.now() / 1000 };
   }
 
-  /** Lets the ring grow and go. */
+  /** Animate the ring and remove it at the end. */
   tick(): void {
     if (this.lastPush === undefined) return;
     const age = (performance.now() / 1000 - this.lastPush.since) / RING_TIME;
@@ -44,7 +44,7 @@ export class PushTool {
     this.viewer.invalidate();
   }
 
-  /** Where the eye looks along the ground; from straight above, what is up in the picture. */
+  /** Return the camera's horizontal viewing direction; from straight above, the up direction of the image. */
   private pushDirection(): THREE.Vector3 {
     const { camera } = this.viewer;
     const flat = (direction: THREE.Vector3): THREE.Vector3 => direction.setZ(0);

@@ -1,4 +1,4 @@
-// A slider with a name and what it stands at.
+// A slider with its name and value.
 
 import { element } from "./dom";
 
@@ -7,7 +7,7 @@ export interface Slider {
   show(value: number): void;
 }
 
-/** A slider under its name; `set` is told once it is let go of. */
+/** Create a labelled slider; `onChange` is called when the user releases it. */
 export function createSlider(
   title: string,
   [min, max]: [number, number],

@@ -1,4 +1,4 @@
-// What the body stands on: the sole of each foot, bright while the ground bears it.
+// Soles of the feet, bright while they carry load.
 
 import * as THREE from "three";
 import { indicesOf, type Frame, type Header } from "./packets";
@@ -6,7 +6,7 @@ import { WideLines } from "./wide_lines";
 
 const LOADED_COLOUR = new THREE.Color(0x7fd1b8).toArray();
 const UNLOADED_COLOUR = new THREE.Color(0x8a94a6).toArray();
-/** Body weights: less is no load. */
+/** Minimum load of a loaded foot, in body weights. */
 const MIN_LOAD = 1e-3;
 
 export class SoleOverlay {
@@ -59,7 +59,7 @@ export class SoleOverlay {
     this.outline.set(lines, tints);
   }
 
-  /** What each foot carries, in body weights: a contact belongs to the foot whose sole is next to it. */
+  /** Compute the load of each foot in body weights. A contact belongs to the foot with the nearest sole node. */
   private computeLoads(frame: Frame, positions: Float32Array): void {
     this.load.fill(0);
     const { contacts } = frame;
@@ -75,7 +75,7 @@ export class SoleOverlay {
     }
   }
 
-  /** Triangles of the cage's surface, all of one sole. */
+  /** Return the surface triangles whose three nodes belong to one sole. */
   private soleFaces(): number[] {
     const surface = indicesOf(this.header, "surface");
     const faces: number[] = [];
@@ -88,7 +88,7 @@ export class SoleOverlay {
   }
 }
 
-/** Edges that belong to one of the `faces` alone. */
+/** Return the edges that belong to exactly one of the `faces`. */
 function boundaryEdges(faces: number[]): [number, number][] {
   const counts = new Map<string, { edge: [number, number]; count: number }>();
   for (let k = 0; k < faces.length; k += 3) {

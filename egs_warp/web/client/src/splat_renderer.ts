@@ -1,13 +1,13 @@
-// How Spark draws its sorted splats here: with the cut, the low-pass and the edge of our own renderer
-// (docs/concepts/renderer.md), and many splats to an instance, since a small instance costs as much as a large one, in
-// software a hundred times more than what is in it.
+// Spark with shaders that use the opacity cut, low-pass filter and clipping of our own renderer
+// (docs/concepts/renderer.md). Many splats share one instance, because the cost of an instance hardly depends on its
+// size; in a software rasteriser an instance costs a hundred times more than one splat.
 
 import { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
 
 const QUADS_PER_INSTANCE = 1024;
 
-/** Quads, so many to an instance; Spark says how many splats are to be drawn. */
+/** Geometry with a fixed number of splats per instance. Spark sets the number of splats. */
 class QuadBatches extends THREE.InstancedBufferGeometry {
   constructor(count: { value: number }) {
     super();
@@ -55,7 +55,7 @@ void main() {
   vec3 p = renderToViewBasis * mean + renderToViewPos;
   vec4 clip = projectionMatrix * vec4(p, 1.0);
   if (!(cut > 0.0) || -clip.w > clip.z || clip.w <= 0.0) return;
-  // The Jacobian is taken no further out than 15 % beyond the picture, where it would grow without bound.
+  // The Jacobian grows without bound outside the image, so it is evaluated at most 15 % of the image size beyond.
   vec2 focal = 0.5 * renderSize * vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
   vec2 slope = clamp(p.xy / -p.z, -0.65 * renderSize / focal, 0.65 * renderSize / focal);
   vec3 right = vec3(focal.x, 0.0, focal.x * slope.x) / -p.z;

@@ -1,5 +1,5 @@
-// Splats that the cage carries in a shader: means, F Sigma F^T and the turned colour bands (Eq. 14, 15), drawn by
-// Spark.
+// Splats that a shader deforms with the cage and Spark draws: means, covariances F Sigma F^T and rotated colour bands
+// (Eq. 14, 15).
 
 import { dyno, SplatGenerator } from "@sparkjsdev/spark";
 import * as THREE from "three";
@@ -9,12 +9,13 @@ import { DEFORM_GLSL } from "./deform.glsl";
 
 export interface DeformedSplats {
   generator: SplatGenerator;
-  /** Told that the cage has moved. */
+  /** Regenerate the splats after the cage has changed. */
   update(): void;
 }
 
-/** The splats `name` of a run, carried by the maps in `cage`; `still` ones all lie in its first tetrahedron. On those
- * at the height of the ground a `shadow` may fall. */
+/** Create the splats `name` of a run, deformed by the maps in `cage`.
+ *
+ * Static splats all use the first tetrahedron. A `shadow` darkens the splats near the ground. */
 export function deformedSplats(
   header: Header,
   name: "splats" | "scene",
@@ -53,7 +54,7 @@ export function deformedSplats(
     bands: dyno.dynoSampler2D(bandTexture(bytesOf(header, `${name}_bands`), count, degree), "egsBands"),
     bandScales: dyno.dynoMat4(new THREE.Matrix4().fromArray(bandScales), "egsBandScales"),
     cage: dyno.dynoSampler2D(cage, "egsCage"),
-    // Without a shadow its place has no size, and any texture will do.
+    // Without a shadow the region has size 0 and the texture is not sampled.
     shade: dyno.dynoSampler2D(shadow?.texture ?? cage, "egsShade"),
     shadeRegion: dyno.dynoVec4(shadow?.region ?? new THREE.Vector4(), "egsShadeRegion"),
     eye: dyno.dynoVec3(eye, "egsEye"),
@@ -95,7 +96,7 @@ export function deformedSplats(
   return { generator, update: () => generator.updateVersion() };
 }
 
-/** One texel of three bytes for each coefficient above band 0. */
+/** Create a texture with one RGB texel per coefficient above band 0. */
 function bandTexture(bands: Uint8Array, count: number, degree: number): THREE.DataTexture {
   const each = (degree + 1) ** 2 - 1;
   const texels = Math.max(1, each * count);

@@ -1,15 +1,15 @@
-// How it jumps: styles by name, and the numbers that they are made of.
+// Style of jumps: buttons of the named styles, and a slider for each parameter.
 
 import { element } from "./dom";
 import type { Facts, Style } from "./packets";
 import { createSlider, type Slider } from "./slider";
 
-/** Numbers of a style differ by no less. */
+/** Resolution of the parameters. */
 const STEP = 0.05;
 const FIELDS: [keyof Style, string, string][] = [
-  ["anticipation", "Anticipation", "How deep and long it crouches before a jump"],
-  ["squash", "Squash", "How far a landing gives way"],
-  ["timing", "Timing", "How long crouch and thrust take: to the left it is quick and hard"],
+  ["anticipation", "Anticipation", "Depth and duration of the crouch before a jump"],
+  ["squash", "Squash", "Compression of the body on landing"],
+  ["timing", "Timing", "Duration of crouch and thrust; smaller is faster and harder"],
 ];
 
 export class StylePanel {
@@ -19,7 +19,7 @@ export class StylePanel {
   private readonly sliders: Record<keyof Style, Slider>;
   private style: Style = { anticipation: 1, squash: 1, timing: 1 };
 
-  /** `set` is told what the user chose. */
+  /** `onChange` is called with the style that the user chooses. */
   constructor(
     { styles, limits }: Facts,
     private readonly onChange: (style: Style) => void,
@@ -36,7 +36,7 @@ export class StylePanel {
       this.buttons.set(name, button);
       row.append(button);
     }
-    // In the middle it is the usual, each way by the same factor.
+    // Logarithmic scale with the default in the middle.
     const sliders = FIELDS.map(([name, title, hint]) => {
       const format = (value: number): string => `${rounded(Math.exp(value)).toFixed(2)}\u00d7`;
       const onSlide = (value: number): void => this.choose({ ...this.style, [name]: rounded(Math.exp(value)) });
@@ -49,7 +49,7 @@ export class StylePanel {
     this.show(this.style);
   }
 
-  /** What the session says that it is. */
+  /** Show the style reported by the session. */
   show(style: Style): void {
     this.style = style;
     for (const [name] of FIELDS) this.sliders[name].show(Math.log(style[name]));

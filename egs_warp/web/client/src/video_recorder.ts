@@ -1,4 +1,4 @@
-// The canvas as a video file, recorded while the run plays once.
+// Records the canvas as a video file.
 
 const MIME_TYPES = ["video/mp4;codecs=avc1", "video/webm;codecs=vp9", "video/webm"];
 
@@ -9,10 +9,10 @@ export class VideoRecorder {
     return this.recorder !== undefined;
   }
 
-  /** Begins; what was recorded is given to `done` after `stop`. */
+  /** Start recording; `stop` passes the video to `onFinished`. */
   start(canvas: HTMLCanvasElement, onFinished: (blob: Blob, ending: string) => void): void {
     const mimeType = MIME_TYPES.find((one) => MediaRecorder.isTypeSupported(one));
-    if (mimeType === undefined) throw new Error("this browser records no video");
+    if (mimeType === undefined) throw new Error("this browser cannot record video");
     const chunks: Blob[] = [];
     const recorder = new MediaRecorder(canvas.captureStream(60), { mimeType, videoBitsPerSecond: 16e6 });
     recorder.ondataavailable = ({ data }) => chunks.push(data);

@@ -1,4 +1,4 @@
-// One run on one canvas: splats, overlays, ground and camera.
+// Viewer of one run on one canvas: splats, overlays, ground and camera.
 
 import type { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
@@ -19,9 +19,9 @@ export class Viewer {
   readonly renderer: THREE.WebGLRenderer;
   readonly camera = new THREE.PerspectiveCamera();
   readonly controls: OrbitControls;
-  /** Whether the camera goes along with the centre of mass. */
+  /** True if the camera follows the centre of mass. */
   follow = false;
-  /** Share of the window's pixels that are drawn along each side; less where a machine is slow. */
+  /** Fraction of the canvas resolution along each side; reduced on slow machines. */
   private resolution = 1;
   private readonly scene = new THREE.Scene();
   private readonly spark: SparkRenderer;
@@ -42,7 +42,7 @@ export class Viewer {
     readonly source: FrameSource,
   ) {
     const { header } = source;
-    // Spark advises against multisampling: splats gain nothing by it.
+    // Spark advises against multisampling, which does not improve splats.
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
     this.renderer.setClearColor(BACKGROUND, 1);
     this.camera.up.set(0, 0, 1);
@@ -93,7 +93,7 @@ export class Viewer {
     this.invalidate();
   }
 
-  /** The run at `place` frames; what lies between two of them is mixed. */
+  /** Show the run at a fractional frame index; positions are interpolated linearly. */
   show(framePosition: number): void {
     const { frames } = this.source;
     const at = Math.min(framePosition, frames.length - 1);
@@ -142,7 +142,7 @@ export class Viewer {
     this.invalidate();
   }
 
-  /** Another stage's camera. */
+  /** Copy the camera of another viewer. */
   copyCamera(from: Viewer): void {
     this.camera.position.copy(from.camera.position);
     this.controls.target.copy(from.controls.target);
@@ -156,7 +156,7 @@ export class Viewer {
     this.renderer.setPixelRatio(this.resolution * Math.min(window.devicePixelRatio, 2));
     this.renderer.setSize(width, height, false);
     const aspect = width / height;
-    // A film is square: its sides stay within a window that is taller than wide.
+    // Films are square: in a window that is taller than wide, keep the horizontal field of view.
     const half = Math.tan((Math.PI * this.filmFov) / 360) / Math.min(aspect, 1);
     this.camera.fov = (360 / Math.PI) * Math.atan(half);
     this.camera.aspect = aspect;
@@ -167,34 +167,34 @@ export class Viewer {
     this.invalidate();
   }
 
-  /** Draws fewer pixels, if there are not few already. */
+  /** Reduce the resolution by a quarter, to no less than one half. */
   reduceResolution(): void {
     this.setResolution(Math.max(this.resolution - 0.25, 0.5));
   }
 
-  /** Draws so many of the window's pixels along each side. */
+  /** Set the fraction of the canvas resolution along each side. */
   setResolution(fraction: number): void {
     if (fraction === this.resolution) return;
     this.resolution = fraction;
     this.resize();
   }
 
-  /** Whether the splats are still to be sorted for what was drawn last. */
+  /** True while the splats of the last image are being sorted. */
   get sorting(): boolean {
     return this.spark.sorting;
   }
 
-  /** Draws where something has changed; true if it did. */
+  /** Draw if something has changed; return true if so. */
   draw(): boolean {
     this.controls.update();
     if (!this.dirty) return false;
     this.renderer.render(this.scene, this.camera);
-    // Splats that were made anew for this picture are in it already; once they are sorted, Spark says so again.
+    // This image contains the regenerated splats; Spark calls invalidate() again once they are sorted.
     this.dirty = false;
     return true;
   }
 
-  /** Draws once the splats are sorted for this very view. */
+  /** Draw after the splats are sorted for the current view. */
   async drawSorted(): Promise<void> {
     for (let round = 0; round < 2; round++) {
       this.camera.updateMatrixWorld();
@@ -207,22 +207,26 @@ export class Viewer {
     this.renderer.render(this.scene, this.camera);
   }
 
-  /** A picture of what is seen now. */
+  /** Return a PNG image of the current view. */
   screenshot(): Promise<Blob> {
-    // A canvas holds its picture until the browser has shown it.
+    // The canvas keeps its content only until the browser has presented it.
     this.renderer.render(this.scene, this.camera);
     return new Promise((resolve, reject) => {
-      this.canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error("no picture came"))), "image/png");
+      const finish = (blob: Blob | null): void => {
+        if (blob === null) reject(new Error("the browser returned no image"));
+        else resolve(blob);
+      };
+      this.canvas.toBlob(finish, "image/png");
     });
   }
 
-  /** Draws `mark`, too. */
+  /** Add an object to the scene. */
   add(object: THREE.Object3D): void {
     this.scene.add(object);
     this.invalidate();
   }
 
-  /** From the eye through a place of the window. */
+  /** Return the ray from the camera through a window position. */
   ray(clientX: number, clientY: number): THREE.Ray {
     const box = this.canvas.getBoundingClientRect();
     const [x, y] = [(clientX - box.left) / box.width, (clientY - box.top) / box.height];
@@ -233,7 +237,7 @@ export class Viewer {
     return raycaster.ray;
   }
 
-  /** What of the body is seen at a place of the window: the point, and the node next to it. */
+  /** Return the visible surface point at a window position and the nearest node, if the body is there. */
   pick(clientX: number, clientY: number): { node: number; point: THREE.Vector3 } | undefined {
     const ray = this.ray(clientX, clientY);
     const surface = indicesOf(this.source.header, "surface");
@@ -253,7 +257,7 @@ export class Viewer {
     return nearest.node < 0 ? undefined : { node: nearest.node, point: nearest.point };
   }
 
-  /** Where a place of the window lies on the ground, if it does and is not too far. */
+  /** Return the ground point at a window position, unless there is none or it is too far away. */
   groundPoint(clientX: number, clientY: number): THREE.Vector3 | undefined {
     const ground = new THREE.Plane(new THREE.Vector3(0, 0, 1), 0);
     const point = this.ray(clientX, clientY).intersectPlane(ground, new THREE.Vector3());
@@ -261,12 +265,12 @@ export class Viewer {
     return point;
   }
 
-  /** Where a node is now. */
+  /** Return the current position of a node. */
   nodePosition(index: number): THREE.Vector3 {
     return new THREE.Vector3().fromArray(this.positions, 3 * index);
   }
 
-  /** The centre of mass now. */
+  /** Current centre of mass. */
   get centreOfMass(): THREE.Vector3 {
     return this.currentCentre.clone();
   }
