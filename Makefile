@@ -11,10 +11,10 @@ unexport PYTHONDONTWRITEBYTECODE
 MINUTES ?= 10
 # Of make mutation, each with its own copy of the tree.
 PROCESSES ?= 2
-BIN := $(VENV)/bin
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-rest test-all fuzz mutation coverage release setup lint types docs pictures paper build web examples clean
+.PHONY: demo test test-rest test-all test-page fuzz mutation coverage release setup lint types docs pictures paper build web examples clean
 
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
@@ -42,6 +42,10 @@ test-rest: setup
 
 test-all: test test-rest
 
+# The quick tests of the viewer's page in the system's Chromium or Chrome; SHOTS=FOLDER stores a screenshot of each.
+test-page: setup
+	$(SHOTS:%=EGS_WARP_SHOTS=%) $(PYTEST) tests/web -m "browser and not slow"
+
 # Branch coverage of these packages by their own fast tests and those of odd numbers and faults, with a floor.
 COVERED := contact deformation fem geometry io locomotion meshing muscles render segmentation
 FLOOR := 95
@@ -65,6 +69,7 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-logo
+	$(BIN)/actionlint .github/workflows/*.yml
 
 types: setup
 	$(BIN)/pyright

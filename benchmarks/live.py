@@ -38,25 +38,25 @@ ASKED_NODES = {250: 175, 541: 400}
 """--nodes that gives the pawn a cage of about so many."""
 
 MOVE = """(seconds) => new Promise((resolve) => {
-    const stage = egs.stages[0], { source } = stage, { clock } = egs.live;
+    const viewer = egs.viewers[0], { source } = viewer, { clock } = egs.live;
     const seen = { drawn: 0, arrived: [], bytes: 0, shown: [] }, began = performance.now();
     const now = () => (performance.now() - began) / 1000;
-    const draw = stage.draw.bind(stage), take = source.take.bind(source);
-    stage.draw = () => { const done = draw(); seen.drawn += done ? 1 : 0; return done; };
-    source.take = (data) => {
+    const draw = viewer.draw.bind(viewer), receive = source.receive.bind(source);
+    viewer.draw = () => { const done = draw(); seen.drawn += done ? 1 : 0; return done; };
+    source.receive = (data) => {
         if (typeof data !== "string") { seen.arrived.push(now()); seen.bytes += data.byteLength; }
-        take(data);
+        receive(data);
     };
     const look = () => {
         seen.shown.push([now(), clock.time]);
         if (now() < seconds) requestAnimationFrame(look);
-        else { delete stage.draw; delete source.take; resolve(seen); }
+        else { delete viewer.draw; delete source.receive; resolve(seen); }
     };
     look();
 })"""
 """What arrives and what is drawn within some seconds."""
 WAIT_FOR_PIXEL = """() => {
-    const stage = egs.stages[0], { canvas } = stage, copy = document.createElement("canvas");
+    const viewer = egs.viewers[0], { canvas } = viewer, copy = document.createElement("canvas");
     copy.width = canvas.width; copy.height = canvas.height;
     const context = copy.getContext("2d", { willReadFrequently: true });
     const pixels = () => {
@@ -67,22 +67,22 @@ WAIT_FOR_PIXEL = """() => {
     window.watching = false;
     let before, pressed;
     document.addEventListener("keydown", (event) => { pressed = event.timeStamp; }, { once: true, capture: true });
-    const draw = stage.draw.bind(stage);
+    const draw = viewer.draw.bind(viewer);
     // As many pixels before as after.
-    stage.sharpen = () => {};
-    stage.draw = () => {
+    viewer.setResolution = () => {};
+    viewer.draw = () => {
         if (!draw()) return false;
         const now = pixels();
         window.watching = true;
         if (pressed === undefined) before = now;
         else if (now.some((value, k) => Math.abs(value - before[k]) > 4)) {
             window.latency = performance.now() - pressed;
-            delete stage.draw;
-            delete stage.sharpen;
+            delete viewer.draw;
+            delete viewer.setResolution;
         }
         return true;
     };
-    stage.invalidate();
+    viewer.invalidate();
 }"""
 """Compares every picture after a key with the last one before it."""
 
@@ -156,7 +156,7 @@ def measured(address: str, browser: str, seconds: float, presses: int) -> Row:
         facts = page.evaluate(
             """() => {
                 const gl = document.createElement("canvas").getContext("webgl2");
-                const { arrays } = egs.stages[0].source.header;
+                const { arrays } = egs.viewers[0].source.header;
                 const name = gl.getExtension("WEBGL_debug_renderer_info");
                 return { nodes: arrays.get("rest").length / 3, splats: arrays.get("splats_means").length / 3,
                          renderer: gl.getParameter(name ? name.UNMASKED_RENDERER_WEBGL : gl.RENDERER) };
@@ -169,7 +169,7 @@ def measured(address: str, browser: str, seconds: float, presses: int) -> Row:
         page.keyboard.press("Escape")
         latencies = []
         for press in range(presses):
-            _wait(page, "egs.live.state.resting && egs.live.clock.time >= egs.stages[0].source.frames.at(-1).time")
+            _wait(page, "egs.live.state.resting && egs.live.clock.time >= egs.viewers[0].source.frames.at(-1).time")
             page.wait_for_timeout(1500)
             page.evaluate(WAIT_FOR_PIXEL)
             _wait(page, "window.watching")
@@ -217,7 +217,7 @@ def _wait(page: Any, condition: str) -> None:
     end = time.monotonic() + 150.0
     while not page.evaluate(condition):
         if time.monotonic() > end:
-            raise TimeoutError(f"{condition}: {page.evaluate('JSON.stringify([egs.live.state, egs.live.told])')}")
+            raise TimeoutError(f"{condition}: {page.evaluate('JSON.stringify([egs.live.state, egs.live.messages])')}")
         page.wait_for_timeout(50)
 
 

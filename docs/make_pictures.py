@@ -25,13 +25,13 @@ ASSETS = ROOT / "docs" / "assets"
 RECORDED, RECORDED_RATE = (720, 360), 20
 """Pixels of the window in which a page is recorded, and pictures a second of its run."""
 BESIDE = """() => {
-    const [stage] = egs.stages, { middle } = stage.bounds;
+    const [viewer] = egs.viewers, { centre } = viewer.bounds;
     egs.player.seek(0);
-    const from = stage.middle;
+    const from = viewer.centreOfMass;
     egs.player.seek(1e6);
-    const ahead = stage.middle.sub(from).setZ(0).normalize();
-    const way = middle.clone().set(ahead.y + 0.35 * ahead.x, 0.35 * ahead.y - ahead.x, 0.3).normalize();
-    stage.look(middle.clone().addScaledVector(way, 1.25 * stage.bounds.size), middle);
+    const ahead = viewer.centreOfMass.sub(from).setZ(0).normalize();
+    const way = centre.clone().set(ahead.y + 0.35 * ahead.x, 0.35 * ahead.y - ahead.x, 0.3).normalize();
+    viewer.setCamera(centre.clone().addScaledVector(way, 1.25 * viewer.bounds.size), centre);
     egs.setLayer("path", true);
 }"""
 CAPTURES = "python examples/captures.py --out out/captures"
@@ -145,9 +145,9 @@ def record(page: Path, film: Path) -> None:
         bare = "for (const part of document.querySelectorAll('.tools, .dock, figcaption')) part.style.display = 'none'"
         shown.evaluate(f"() => {{ {bare} }}")
         shown.evaluate(BESIDE)
-        count = shown.evaluate("egs.stages[0].source.frames.length")
+        count = shown.evaluate("egs.viewers[0].source.frames.length")
         for number, frame in enumerate(range(0, count, 60 // RECORDED_RATE)):
-            shown.evaluate("async (frame) => { egs.player.seek(frame); await egs.stages[0].settle(); }", frame)
+            shown.evaluate("async (frame) => { egs.player.seek(frame); await egs.viewers[0].drawSorted(); }", frame)
             shown.screenshot(path=f"{folder}/{number:04d}.png")
         lossless = ("-c:v", "libx264", "-qp", "0", "-pix_fmt", "yuv444p")
         ffmpeg("-framerate", str(RECORDED_RATE), "-i", f"{folder}/%04d.png", *lossless, str(film))

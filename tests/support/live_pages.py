@@ -17,7 +17,7 @@ from tests.support.pages import served
 
 needs_page = pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it")
 KEEP_SENT = """() => {
-    const { source } = egs.stages[0], send = source.send.bind(source);
+    const { source } = egs.viewers[0], send = source.send.bind(source);
     window.sent = [];
     source.send = (message) => { window.sent.push(message); send(message); };
 }"""

@@ -42,19 +42,19 @@ def test_what_is_shown_goes_evenly_and_never_back(chromium: Any, session: Sessio
 @in_browser
 def test_a_picture_is_drawn_once_and_again_when_its_splats_are_sorted(chromium: Any, session: Session):
     with watched(chromium, session) as page:
-        wait_until(page, "egs.live.state?.resting && !egs.stages[0].sorting && !egs.stages[0].dirty")
+        wait_until(page, "egs.live.state?.resting && !egs.viewers[0].sorting && !egs.viewers[0].dirty")
         left = page.evaluate(
             """() => {
-                const stage = egs.stages[0], draw = stage.draw.bind(stage);
+                const viewer = egs.viewers[0], draw = viewer.draw.bind(viewer);
                 window.drawn = 0;
-                stage.draw = () => { const done = draw(); window.drawn += done ? 1 : 0; return done; };
-                stage.show(stage.source.frames.length - 1);
-                stage.draw();
-                return stage.dirty;
+                viewer.draw = () => { const done = draw(); window.drawn += done ? 1 : 0; return done; };
+                viewer.show(viewer.source.frames.length - 1);
+                viewer.draw();
+                return viewer.dirty;
             }"""
         )
         assert left is False
-        wait_until(page, "window.drawn >= 2 && !egs.stages[0].sorting")
+        wait_until(page, "window.drawn >= 2 && !egs.viewers[0].sorting")
 
 
 @in_browser
@@ -66,7 +66,7 @@ def test_pause_step_sliders_and_script(chromium: Any, session: Session):
         held = session.state.time
         for _ in range(2):
             page.keyboard.press(".")
-        wait_until(page, f"egs.stages[0].source.frames.at(-1).time > {held + 1.5 / 60.0}")
+        wait_until(page, f"egs.viewers[0].source.frames.at(-1).time > {held + 1.5 / 60.0}")
         assert session.state.time == pytest.approx(held + 2.0 / 60.0)
         page.click("[title='Style, friction, stiffness, pushes']")
         slider = page.locator("[aria-label=Friction]")
@@ -77,7 +77,7 @@ def test_pause_step_sliders_and_script(chromium: Any, session: Session):
         page.keyboard.press(" ")
         wait_until(page, "egs.live.state?.motions === 1")
         with page.expect_download() as script:
-            page.click("[title^='Save what it did']")
+            page.click("[title^='Save the performed motions']")
         assert script.value.suggested_filename == "script.json"
         assert json.loads(Path(script.value.path()).read_text())[0]["motion"] == "jump"
 
@@ -118,7 +118,7 @@ def test_a_lost_connection_is_taken_up_and_the_session_goes_on(chromium: Any, se
     page.evaluate("window.stayed = true")
     held = session.state.time
     with served(feed=feed, port=port, token=token):
-        wait_until(page, f"egs.stages[0].source.frames.at(-1).time > {held + 0.1}")
+        wait_until(page, f"egs.viewers[0].source.frames.at(-1).time > {held + 0.1}")
         assert not page.evaluate("document.body.classList.contains('lost')")
         assert page.evaluate("window.stayed") and page.evaluate("egs.live.state?.doing") in ("jump", "stand")
         page.close()

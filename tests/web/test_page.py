@@ -47,9 +47,9 @@ def _picture(page: Any, stage: int = 0) -> np.ndarray:
     """(H, W, 3) 0 to 1: the canvas of a stage, its splats sorted."""
     text = page.evaluate(
         """async (k) => {
-            const stage = window.egs.stages[k];
-            await stage.settle();
-            const bytes = new Uint8Array(await (await stage.picture()).arrayBuffer());
+            const viewer = window.egs.viewers[k];
+            await viewer.drawSorted();
+            const bytes = new Uint8Array(await (await viewer.screenshot()).arrayBuffer());
             return btoa(bytes.reduce((text, byte) => text + String.fromCharCode(byte), ""));
         }""",
         stage,
@@ -61,7 +61,7 @@ def _own_picture(recording: Recording, page: Any, frame: int) -> np.ndarray:
     """The same frame through the page's own camera, by our renderer."""
     seen = page.evaluate(
         """() => {
-            const { camera, controls, canvas } = window.egs.stages[0];
+            const { camera, controls, canvas } = window.egs.viewers[0];
             return [camera.position.toArray(), controls.target.toArray(), camera.fov, canvas.width, canvas.height];
         }"""
     )
@@ -87,7 +87,7 @@ def test_canvas_is_like_our_own_picture_of_the_same_frame_and_camera(
     chromium: Any, file: str, recording: Recording, preset: str
 ):
     page, complaints = opened(chromium, file)
-    page.evaluate("(name) => { egs.setLayer('ground', false); egs.stages[0].preset(name); }", preset)
+    page.evaluate("(name) => { egs.setLayer('ground', false); egs.viewers[0].preset(name); }", preset)
     for frame in (0, 12):
         page.evaluate("(frame) => egs.player.seek(frame)", frame)
         assert _psnr_on_body(_own_picture(recording, page, frame), _picture(page)) >= 40.0
@@ -106,20 +106,20 @@ def test_motion_is_seen(chromium: Any, file: str, recording: Recording):
 def test_play_advances_and_loops(chromium: Any, file: str):
     page, complaints = opened(chromium, file)
     page.click("button.play")
-    wait_until(page, "egs.player.place > 3")
-    wait_until(page, "egs.player.place > 9")
-    wait_until(page, "egs.player.place < 6")
+    wait_until(page, "egs.player.framePosition > 3")
+    wait_until(page, "egs.player.framePosition > 9")
+    wait_until(page, "egs.player.framePosition < 6")
     page.keyboard.press(" ")
-    stopped = page.evaluate("egs.player.place")
+    stopped = page.evaluate("egs.player.framePosition")
     page.wait_for_timeout(200)
-    assert page.evaluate("egs.player.place") == stopped
+    assert page.evaluate("egs.player.framePosition") == stopped
     page.keyboard.press("ArrowRight")
-    assert page.evaluate("egs.player.place") == min(round(stopped) + 1, 12)
+    assert page.evaluate("egs.player.framePosition") == min(round(stopped) + 1, 12)
     page.click("#loop")
     page.select_option(".speed", "2")
     page.evaluate("egs.player.seek(0)")
     page.click("button.play")
-    wait_until(page, "!egs.player.playing && egs.player.place === 12")
+    wait_until(page, "!egs.player.playing && egs.player.framePosition === 12")
     assert page.text_content(".clock") == "0.20 / 0.20 s"
     assert complaints == []
     page.close()
@@ -128,14 +128,14 @@ def test_play_advances_and_loops(chromium: Any, file: str):
 def test_a_slow_machine_waits_for_its_splats_to_be_sorted(chromium: Any, file: str):
     """An old order would draw the ground over a body that has moved."""
     page, _ = opened(chromium, file)
-    page.evaluate("Object.defineProperty(egs.stages[0], 'sorting', { get: () => window.held })")
-    page.evaluate("() => { window.held = true; egs.player.playing = true; egs.pace = 0.001; }")
-    wait_until(page, "egs.player.place > 0")
-    page.evaluate("() => { egs.pace = 1; window.at = egs.player.place; }")
+    page.evaluate("Object.defineProperty(egs.viewers[0], 'sorting', { get: () => window.held })")
+    page.evaluate("() => { window.held = true; egs.player.playing = true; egs.frameTime = 0.001; }")
+    wait_until(page, "egs.player.framePosition > 0")
+    page.evaluate("() => { egs.frameTime = 1; window.at = egs.player.framePosition; }")
     page.wait_for_timeout(500)
-    assert page.evaluate("egs.player.playing && egs.player.place === window.at")
+    assert page.evaluate("egs.player.playing && egs.player.framePosition === window.at")
     page.evaluate("window.held = false")
-    wait_until(page, "egs.player.place !== window.at")
+    wait_until(page, "egs.player.framePosition !== window.at")
     page.close()
 
 
@@ -160,7 +160,7 @@ def test_a_foot_is_bright_while_the_ground_bears_it(chromium: Any, file: str):
     for carried in (True, False):
         if not carried:
             page.evaluate(
-                "for (const frame of egs.stages[0].source.frames)"
+                "for (const frame of egs.viewers[0].source.frames)"
                 " Object.defineProperty(frame, 'contacts', { value: new Float32Array(0) })"
             )
         # The first state has no step before it, and so no forces.
@@ -184,20 +184,20 @@ def test_curves_move_with_the_time_line(chromium: Any, file: str):
         said.append(page.text_content(".row .value"))
     assert page.locator(".curve").count() == 5 and said[0] != said[1]
     page.locator(".curve").first.click(position={"x": 100, "y": 5})
-    assert 0 < page.evaluate("egs.player.place") < 12
+    assert 0 < page.evaluate("egs.player.framePosition") < 12
     assert complaints == []
     page.close()
 
 
 def test_orbit_turns_the_camera(chromium: Any, file: str):
     page, _ = opened(chromium, file)
-    before = page.evaluate("egs.stages[0].camera.position.toArray()")
+    before = page.evaluate("egs.viewers[0].camera.position.toArray()")
     page.mouse.move(240, 200)
     page.mouse.down()
     page.mouse.move(340, 200, steps=4)
     page.mouse.up()
     page.wait_for_timeout(100)
-    after = page.evaluate("egs.stages[0].camera.position.toArray()")
+    after = page.evaluate("egs.viewers[0].camera.position.toArray()")
     assert np.linalg.norm(np.subtract(after, before)) > 0.2
     page.close()
 
@@ -238,7 +238,7 @@ def test_a_phone_shows_creature_and_controls(chromium: Any, file: str):
 def test_two_runs_side_by_side_share_time_and_camera(chromium: Any, recording: Recording):
     with served(recording, recording) as server:
         page, complaints = opened(chromium, server.address, 800, 400)
-        page.evaluate("egs.setLayer('ground', false); egs.stages[0].preset('side'); egs.player.seek(6)")
+        page.evaluate("egs.setLayer('ground', false); egs.viewers[0].preset('side'); egs.player.seek(6)")
         first, second = _picture(page, 0), _picture(page, 1)
         assert first.shape == second.shape
         assert np.abs(first - second).max() < 0.02
@@ -295,7 +295,7 @@ def on_a_floor(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> st
 def test_a_scene_behind_lies_on_the_ground_and_takes_the_shadow(chromium: Any, on_a_floor: str):
     page, complaints = opened(chromium, on_a_floor)
     assert not page.evaluate("document.getElementById('layer-ground').checked")
-    page.evaluate("egs.stages[0].preset('top'); egs.setLayer('splats', false)")
+    page.evaluate("egs.viewers[0].preset('top'); egs.setLayer('splats', false)")
     picture = _picture(page)
     # Grey where light is let through, darker under the creature, nowhere outside of the floor's range.
     middle = picture[picture.shape[0] // 2, picture.shape[1] // 2]

@@ -16,10 +16,10 @@ from egs_warp.web.session import Session
 from tests.support.chromium import wait_until
 from tests.support.live_pages import KEEP_SENT, in_browser, watched
 
-_FAR = "Math.hypot(...egs.stages[0].middle.toArray().map((x, k) => x - {}[k])) > 0.01"
+_FAR = "Math.hypot(...egs.viewers[0].centreOfMass.toArray().map((x, k) => x - {}[k])) > 0.01"
 """The centre of mass is no longer there."""
 _AWAY = """() => {
-    const { camera } = egs.stages[0], way = camera.getWorldDirection(camera.position.clone());
+    const { camera } = egs.viewers[0], way = camera.getWorldDirection(camera.position.clone());
     return [way.x, way.y].map((part) => part / Math.hypot(way.x, way.y));
 }"""
 """Where the eye looks along the ground."""
@@ -33,10 +33,10 @@ def test_a_key_makes_it_jump_and_the_take_says_so(chromium: Any, session: Sessio
         page.keyboard.press("j")
         wait_until(page, "egs.live.state?.doing === 'jump'")
         wait_until(page, "egs.live.state?.doing === 'stand'")
-        heights = page.evaluate("egs.stages[0].source.frames.map((frame) => frame.curves[0])")
+        heights = page.evaluate("egs.viewers[0].source.frames.map((frame) => frame.curves[0])")
         assert max(heights) - heights[0] > 0.2
         page.keyboard.press("r")
-        wait_until(page, "egs.live.told.some((line) => line.startsWith('wrote '))")
+        wait_until(page, "egs.live.messages.some((line) => line.startsWith('wrote '))")
         report = json.loads((tmp_path / "take-1" / "report.json").read_text())
         assert [motion["name"] for motion in report["motion"]] == ["jump"]
         assert report["motion"][0]["reached"]["distance"] > 0.4
@@ -88,11 +88,11 @@ def test_a_click_on_the_ground_sends_it_there(chromium: Any, session: Session):
         page.mouse.click(box["x"] + 400, box["y"] + 300)
         wait_until(page, "egs.live.state?.goal")
         goal = np.array(page.evaluate("egs.live.state?.goal"))
-        start = np.array(page.evaluate("egs.stages[0].middle.toArray()"))[:2]
+        start = np.array(page.evaluate("egs.viewers[0].centreOfMass.toArray()"))[:2]
         assert np.linalg.norm(goal - start) > 0.25
         # Some hundred steps of a walk, beside a page that is drawn on the same cores.
         wait_until(page, "egs.live.state?.goal === null", seconds=600.0)
-        assert not [line for line in page.evaluate("egs.live.told") if line.startswith("go")]
+        assert not [line for line in page.evaluate("egs.live.messages") if line.startswith("go")]
         place = session.steering.place
         feet = sole_shares(place.body, place.ground, place.standing) @ session.state.positions
         assert np.linalg.norm(feet[:2] - goal) < 0.15
@@ -101,12 +101,12 @@ def test_a_click_on_the_ground_sends_it_there(chromium: Any, session: Session):
 @in_browser
 def test_a_drag_pulls_at_it(chromium: Any, session: Session):
     with watched(chromium, session) as page:
-        before = page.evaluate("egs.stages[0].middle.toArray()")
-        camera = page.evaluate("egs.stages[0].camera.position.toArray()")
+        before = page.evaluate("egs.viewers[0].centreOfMass.toArray()")
+        camera = page.evaluate("egs.viewers[0].camera.position.toArray()")
         seen = page.evaluate(
             """() => {
-                const stage = egs.stages[0], box = stage.canvas.getBoundingClientRect();
-                const p = stage.middle.project(stage.camera);
+                const viewer = egs.viewers[0], box = viewer.canvas.getBoundingClientRect();
+                const p = viewer.centreOfMass.project(viewer.camera);
                 return [box.left + (p.x + 1) / 2 * box.width, box.top + (1 - p.y) / 2 * box.height];
             }"""
         )
@@ -118,7 +118,7 @@ def test_a_drag_pulls_at_it(chromium: Any, session: Session):
         page.mouse.up()
         wait_until(page, "!egs.live.state?.pulled")
         # The camera has gone along with it, and was not turned.
-        moved = np.subtract(page.evaluate("egs.stages[0].camera.position.toArray()"), camera)
+        moved = np.subtract(page.evaluate("egs.viewers[0].camera.position.toArray()"), camera)
         assert np.linalg.norm(moved) < 0.5
 
 
@@ -128,19 +128,19 @@ def test_a_key_a_button_and_a_click_push_it_away_from_the_eye(chromium: Any, ses
         page.evaluate(KEEP_SENT)
         page.keyboard.press("r")
         wait_until(page, "egs.live.state?.recording")
-        away, before = np.array(page.evaluate(_AWAY)), np.array(page.evaluate("egs.stages[0].middle.toArray()"))
+        away, before = np.array(page.evaluate(_AWAY)), np.array(page.evaluate("egs.viewers[0].centreOfMass.toArray()"))
         page.keyboard.down("b")
         page.keyboard.down("b")  # as a key that is held repeats itself
         page.keyboard.up("b")
         page.click("[title='Push it away from you (b)']")
         wait_until(page, _FAR.format(before.tolist()))
-        moved = np.array(page.evaluate("egs.stages[0].middle.toArray()")) - before
+        moved = np.array(page.evaluate("egs.viewers[0].centreOfMass.toArray()")) - before
         assert moved[:2] @ away > 0.9 * np.linalg.norm(moved[:2])
         head = page.evaluate(
             """() => {
-                const stage = egs.stages[0], box = stage.canvas.getBoundingClientRect();
-                const place = stage.middle.add({ x: 0, y: 0, z: 0.45 * stage.source.header.facts.height });
-                const p = place.project(stage.camera);
+                const viewer = egs.viewers[0], box = viewer.canvas.getBoundingClientRect();
+                const place = viewer.centreOfMass.add({ x: 0, y: 0, z: 0.45 * viewer.source.header.facts.height });
+                const p = place.project(viewer.camera);
                 return [box.left + (p.x + 1) / 2 * box.width, box.top + (1 - p.y) / 2 * box.height];
             }"""
         )
@@ -155,9 +155,9 @@ def test_a_key_a_button_and_a_click_push_it_away_from_the_eye(chromium: Any, ses
         for push, size in zip(pushes, (0.15, 0.15, 0.1), strict=True):
             assert push["z"] == 0.0 and [push["x"], push["y"]] == pytest.approx((size * away).tolist(), abs=0.02 * size)
         taken = session.state.time
-        wait_until(page, f"egs.stages[0].source.frames.at(-1).time > {taken + 0.1}")
+        wait_until(page, f"egs.viewers[0].source.frames.at(-1).time > {taken + 0.1}")
         page.keyboard.press("r")
-        wait_until(page, "egs.live.told.some((line) => line.startsWith('wrote '))")
+        wait_until(page, "egs.live.messages.some((line) => line.startsWith('wrote '))")
     trajectory = Trajectory.load(tmp_path / "take-1" / "trajectory.npz")
     given = np.einsum("n,kni->i", trajectory.node_mass, trajectory.kick_velocity)
     body = session.creature.body

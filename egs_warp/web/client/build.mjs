@@ -1,4 +1,4 @@
-// One HTML file with script and style in it: what the package ships, serves and exports.
+// Builds page.html, a single file with script and style, which the package ships, serves and exports.
 import { readFile, writeFile } from "node:fs/promises";
 import { build } from "esbuild";
 
@@ -14,14 +14,14 @@ const result = await build({
   legalComments: "inline",
 });
 const text = (ending) => result.outputFiles.find((file) => file.path.endsWith(ending)).text;
-// Their licences ask to go where the code goes.
+// The licences require their text to accompany the code.
 const licences = await Promise.all(
   ["three", "@sparkjsdev/spark", "fflate"].map(
     async (name) => `${name}\n\n${await readFile(`node_modules/${name}/LICENSE`, "utf8")}`,
   ),
 );
 const shell = await readFile("src/index.html", "utf8");
-// Replacements are functions: a bundle is full of "$&".
+// Replacements are functions, because the bundle contains "$&".
 const page = shell
   .replace("<!-- licences -->", () => `<!--\n${licences.join("\n\n").replaceAll("--", "- -")}\n-->`)
   .replace("/* style */", () => text(".css"))

@@ -1,10 +1,10 @@
-// The affine map of each tetrahedron of the cage, frame after frame (Eq. 14), as a texture for the splats' shader.
+// Per-frame affine map of each cage tetrahedron (Eq. 14), stored in a texture for the splat shader.
 
 import * as THREE from "three";
 
 export const TEXTURE_WIDTH = 2048;
 
-/** A texture of `count` texels of four floats, row after row. */
+/** Create a float texture with at least `count` RGBA texels, filled row by row. */
 export function floatTexture(count: number): { texture: THREE.DataTexture; values: Float32Array } {
   const rows = Math.max(1, Math.ceil(count / TEXTURE_WIDTH));
   const values = new Float32Array(4 * TEXTURE_WIDTH * rows);
@@ -14,7 +14,7 @@ export function floatTexture(count: number): { texture: THREE.DataTexture; value
 }
 
 export class Cage {
-  /** Four texels a tetrahedron: the rows of F, each with a coordinate of x0' behind it; x0. */
+  /** Four texels per tetrahedron: three rows of F, each followed by one coordinate of x0', and then x0. */
   readonly texture: THREE.DataTexture;
   private readonly maps: Float32Array;
   private readonly inverses: Float64Array;
@@ -42,11 +42,11 @@ export class Cage {
       const start = 3 * (tets[4 * t] as number);
       for (let k = 0; k < 3; k++) this.maps[16 * t + 12 + k] = rest[start + k] as number;
     }
-    this.carry(rest);
+    this.update(rest);
   }
 
-  /** Takes the cage to node `positions`. */
-  carry(positions: Float32Array): void {
+  /** Compute the maps for node `positions`. */
+  update(positions: Float32Array): void {
     const { maps, inverses, tets } = this;
     for (let t = 0; t < tets.length / 4; t++) {
       const m = edges(positions, tets, t);
@@ -67,7 +67,7 @@ export class Cage {
 
 type Nine = [number, number, number, number, number, number, number, number, number];
 
-/** Row by row the matrix with columns x1 - x0, x2 - x0, x3 - x0. */
+/** Return the matrix with columns x1 - x0, x2 - x0, x3 - x0, row by row. */
 function edges(points: Float32Array, tets: Int32Array, t: number): Nine {
   const at = (corner: number, axis: number): number => points[3 * (tets[4 * t + corner] as number) + axis] as number;
   const m: number[] = [];
@@ -77,8 +77,8 @@ function edges(points: Float32Array, tets: Int32Array, t: number): Nine {
   return m as Nine;
 }
 
-/** A texture with one tetrahedron that stays: what is behind the creature is drawn by the same shader. */
-export function stillCage(): THREE.DataTexture {
+/** Create the texture of one undeformed tetrahedron, so that the same shader draws the static background. */
+export function identityCage(): THREE.DataTexture {
   const { texture, values } = floatTexture(4);
   values.set([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0]);
   return texture;

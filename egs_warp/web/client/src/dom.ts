@@ -1,14 +1,14 @@
-// Elements and icons.
+// Helpers that create elements, icons and downloads.
 
 export function element<K extends keyof HTMLElementTagNameMap>(
   tag: K,
   attributes: Record<string, string> = {},
   ...children: (Node | string)[]
 ): HTMLElementTagNameMap[K] {
-  const made = document.createElement(tag);
-  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-  made.append(...children);
-  return made;
+  const created = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) created.setAttribute(name, value);
+  created.append(...children);
+  return created;
 }
 
 const ICONS = {
@@ -40,22 +40,22 @@ const ICONS = {
 export type Icon = keyof typeof ICONS;
 
 export function icon(name: Icon): string {
-  const drawn = 'fill="none" stroke="currentColor" stroke-width="1.6" aria-hidden="true"';
-  return `<svg viewBox="0 0 24 24" width="20" height="20" ${drawn}>${ICONS[name]}</svg>`;
+  const attributes = 'fill="none" stroke="currentColor" stroke-width="1.6" aria-hidden="true"';
+  return `<svg viewBox="0 0 24 24" width="20" height="20" ${attributes}>${ICONS[name]}</svg>`;
 }
 
-export function button(name: Icon, title: string, pressed: () => void): HTMLButtonElement {
-  const made = element("button", { type: "button", class: "icon", title, "aria-label": title });
-  made.innerHTML = icon(name);
-  made.addEventListener("click", (event) => {
-    pressed();
-    // Keys go to the page again, not to what was clicked last.
-    if (event.detail > 0) made.blur();
+export function button(name: Icon, title: string, onClick: () => void): HTMLButtonElement {
+  const created = element("button", { type: "button", class: "icon", title, "aria-label": title });
+  created.innerHTML = icon(name);
+  created.addEventListener("click", (event) => {
+    onClick();
+    // Return the keyboard focus to the page.
+    if (event.detail > 0) created.blur();
   });
-  return made;
+  return created;
 }
 
-/** Gives a file to the user. */
+/** Download a blob as a file. */
 export function save(blob: Blob, name: string): void {
   const link = element("a", { href: URL.createObjectURL(blob), download: name });
   link.click();

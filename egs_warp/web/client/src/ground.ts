@@ -1,12 +1,12 @@
-// The ground: a grid that fades with the distance, and the creature's soft shadow on it.
+// Ground plane with a grid that fades with distance, and the creature's soft shadow on it.
 
 import * as THREE from "three";
 
 const SHADOW_SIDE = 256;
 
 export class Ground {
-  /** What the creature's shadow is drawn to, and where that lies: middle, half its side, the body's height. */
-  readonly shadow: { texture: THREE.Texture; place: THREE.Vector4 };
+  /** Shadow map and its region on the ground: centre (x, y), half its side length, body height. */
+  readonly shadow: { texture: THREE.Texture; region: THREE.Vector4 };
   readonly mesh: THREE.Mesh<THREE.PlaneGeometry, THREE.ShaderMaterial>;
   private readonly target: THREE.WebGLRenderTarget;
   private readonly camera: THREE.OrthographicCamera;
@@ -22,7 +22,7 @@ export class Ground {
   ) {
     this.target = new THREE.WebGLRenderTarget(SHADOW_SIDE, SHADOW_SIDE, { depthBuffer: false });
     const half = 1.5 * height;
-    this.shadow = { texture: this.target.texture, place: new THREE.Vector4(0, 0, half, height) };
+    this.shadow = { texture: this.target.texture, region: new THREE.Vector4(0, 0, half, height) };
     this.camera = new THREE.OrthographicCamera(-half, half, half, -half, -100 * height, 100 * height);
     const geometry = new THREE.BufferGeometry();
     this.points = new THREE.BufferAttribute(new Float32Array(3 * nodeCount), 3);
@@ -59,13 +59,13 @@ export class Ground {
         softness: { value: 0.04 },
         box: { value: new THREE.Vector4() },
       },
-      vertexShader: `varying vec3 place;
+      vertexShader: `varying vec3 world;
         void main() {
-          vec4 p = modelMatrix * vec4(position, 1.0); place = p.xyz;
+          vec4 p = modelMatrix * vec4(position, 1.0); world = p.xyz;
           gl_Position = projectionMatrix * viewMatrix * p;
         }`,
       fragmentShader: `
-        varying vec3 place; uniform sampler2D shade; uniform vec2 centre, shadeCentre;
+        varying vec3 world; uniform sampler2D shade; uniform vec2 centre, shadeCentre;
         uniform float shadeHalf, reach, cell, softness; uniform vec4 box;
         float line(vec2 p, float width) {
           vec2 d = abs(fract(p / cell + 0.5) - 0.5) * cell, w = fwidth(p) * width;
@@ -73,7 +73,7 @@ export class Ground {
           return max(l.x, l.y);
         }
         void main() {
-          vec2 p = place.xy;
+          vec2 p = world.xy;
           float fade = smoothstep(1.0, 0.25, distance(p, centre) / reach);
           vec3 colour = mix(vec3(0.105, 0.115, 0.13), vec3(0.21, 0.23, 0.26), line(p, 1.1));
           vec2 uv = 0.5 + 0.5 * (p - shadeCentre) / shadeHalf;
@@ -99,18 +99,18 @@ export class Ground {
     (this.mesh.material.uniforms.centre!.value as THREE.Vector2).set(x, y);
   }
 
-  /** Draws the shadow of the cage at node `positions`, whose centre of mass is `middle`. */
-  cast(renderer: THREE.WebGLRenderer, positions: Float32Array, middle: THREE.Vector3): void {
+  /** Render the shadow map of the cage at node `positions`, centred at `centreOfMass`. */
+  cast(renderer: THREE.WebGLRenderer, positions: Float32Array, centreOfMass: THREE.Vector3): void {
     (this.points.array as Float32Array).set(positions);
     this.points.needsUpdate = true;
     const { uniforms } = this.mesh.material;
-    (uniforms.shadeCentre!.value as THREE.Vector2).set(middle.x, middle.y);
-    uniforms.softness!.value = 0.02 + 0.05 * Math.min(Math.max(middle.z / this.height - 0.2, 0), 1.5);
-    this.shadeBox(positions, middle, uniforms.softness!.value as number);
-    this.camera.position.set(middle.x, middle.y, 0);
-    this.shadow.place.x = middle.x;
-    this.shadow.place.y = middle.y;
-    const before = {
+    (uniforms.shadeCentre!.value as THREE.Vector2).set(centreOfMass.x, centreOfMass.y);
+    uniforms.softness!.value = 0.02 + 0.05 * Math.min(Math.max(centreOfMass.z / this.height - 0.2, 0), 1.5);
+    this.updateShadowBox(positions, centreOfMass, uniforms.softness!.value as number);
+    this.camera.position.set(centreOfMass.x, centreOfMass.y, 0);
+    this.shadow.region.x = centreOfMass.x;
+    this.shadow.region.y = centreOfMass.y;
+    const saved = {
       target: renderer.getRenderTarget(),
       colour: renderer.getClearColor(new THREE.Color()),
       alpha: renderer.getClearAlpha(),
@@ -119,12 +119,12 @@ export class Ground {
     renderer.setClearColor(0x000000, 1);
     renderer.clear();
     renderer.render(this.casters, this.camera);
-    renderer.setRenderTarget(before.target);
-    renderer.setClearColor(before.colour, before.alpha);
+    renderer.setRenderTarget(saved.target);
+    renderer.setClearColor(saved.colour, saved.alpha);
   }
 
-  /** Where the shadow is: nowhere else need a pixel look for it. */
-  private shadeBox(positions: Float32Array, middle: THREE.Vector3, softness: number): void {
+  /** Set the bounding box of the shadow; the shader samples the shadow map only inside it. */
+  private updateShadowBox(positions: Float32Array, centreOfMass: THREE.Vector3, softness: number): void {
     let [left, right, near, far] = [Infinity, -Infinity, Infinity, -Infinity];
     for (let k = 0; k < positions.length; k += 3) {
       left = Math.min(left, positions[k]!);
@@ -132,15 +132,15 @@ export class Ground {
       near = Math.min(near, positions[k + 1]!);
       far = Math.max(far, positions[k + 1]!);
     }
-    const half = this.shadow.place.z;
+    const half = this.shadow.region.z;
     const at = (x: number, centre: number): number => 0.5 + (0.5 * (x - centre)) / half;
-    // A pixel of the shadow's own picture beyond its softness; no further out than that picture is.
+    // One texel more than the blur radius, clipped to the shadow map.
     const edge = softness + 2 / SHADOW_SIDE;
     (this.mesh.material.uniforms.box!.value as THREE.Vector4).set(
-      Math.max(at(left, middle.x) - edge, 0),
-      Math.max(at(near, middle.y) - edge, 0),
-      Math.min(at(right, middle.x) + edge, 1),
-      Math.min(at(far, middle.y) + edge, 1),
+      Math.max(at(left, centreOfMass.x) - edge, 0),
+      Math.max(at(near, centreOfMass.y) - edge, 0),
+      Math.min(at(right, centreOfMass.x) + edge, 1),
+      Math.min(at(far, centreOfMass.y) + edge, 1),
     );
   }
 }

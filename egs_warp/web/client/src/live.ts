@@ -1,246 +1,251 @@
-// A creature that lives: its clock, the controls under it, and what the session says.
+// Live session: playback clock, control bar, settings, and messages of the session.
 
-import { Acting } from "./acting";
+import { StylePanel } from "./style_panel";
 import { button, element, icon, save } from "./dom";
 import { LiveClock } from "./clock";
-import { Hands, Pointer, type Action } from "./hands";
-import { Marks } from "./marks";
-import { Pushes } from "./pushes";
-import { slide, type Slide } from "./slide";
-import type { LiveSource, News } from "./source";
-import type { Stage } from "./stage";
+import { InputControls, Pointer, type Action } from "./input";
+import { Gizmos } from "./gizmos";
+import { PushTool } from "./push_tool";
+import { createSlider, type Slider } from "./slider";
+import type { LiveSource, News } from "./frame_source";
+import type { Viewer } from "./viewer";
 
 type State = Extract<News, { type: "state" }>;
-/** Milliseconds for which a line is shown. */
-const SHOWN = 7000;
-/** Of a body that was told nothing else. */
-const ORDINARY_SAG = 0.05;
-/** Slower than this it is said. */
-const SLOWER = 0.95;
+/** Time for which a message is shown, ms. */
+const TOAST_TIME = 7000;
+/** Default sag of a body, rho g H / E. */
+const DEFAULT_SAG = 0.05;
+/** Below this fraction of real time the speed is displayed. */
+const MIN_REAL_TIME_SPEED = 0.95;
 const HELP: [string[], string][] = [
   [["\u2191", "W"], "forward"],
   [["\u2190", "\u2192", "A", "D"], "turn"],
-  [["\u2193", "S"], "turn round"],
+  [["\u2193", "S"], "turn around"],
   [["Space"], "jump"],
-  [["J"], "leap ahead"],
+  [["J"], "long jump"],
   [["H"], "hop"],
   [["B"], "push it away from you"],
-  [["Esc"], "drop what comes next"],
+  [["Esc"], "cancel the next motion"],
   [["P"], "pause"],
   [["."], "one step"],
   [["R"], "record a take"],
-  [["\u232b"], "stand up at the start"],
+  [["\u232b"], "reset to the start"],
 ];
 
 export class Live {
   readonly clock: LiveClock;
-  /** What the session said last. */
+  /** Latest state of the session. */
   state: State | undefined;
-  /** Lines for the user, the newest last. */
-  readonly told: string[] = [];
-  private readonly hands: Hands;
+  /** All messages to the user, the newest last. */
+  readonly messages: string[] = [];
+  private readonly input: InputControls;
   private readonly pointer: Pointer;
-  private readonly marks: Marks;
-  private readonly pushes: Pushes;
-  private readonly pace = element("output", { class: "pace", title: "How fast it lives, beside real time" });
+  private readonly gizmos: Gizmos;
+  private readonly pushTool: PushTool;
+  private readonly speedLabel = element("output", { class: "pace", title: "Simulation speed relative to real time" });
   private readonly pauseButton: HTMLButtonElement;
-  private readonly takeButton: HTMLButtonElement;
+  private readonly recordButton: HTMLButtonElement;
   private readonly toasts = element("div", { class: "toasts", role: "status", "aria-live": "polite" });
-  private readonly body: HTMLElement;
-  private readonly help: HTMLElement;
-  private readonly sliders: { friction: Slide; sag: Slide };
-  private readonly acting: Acting;
+  private readonly settingsSheet: HTMLElement;
+  private readonly helpSheet: HTMLElement;
+  private readonly sliders: { friction: Slider; sag: Slider };
+  private readonly stylePanel: StylePanel;
   private busy = false;
-  private lastMoved = -Infinity;
-  private facing = false;
+  private lastMotion = -Infinity;
+  private isFacingShown = false;
 
   constructor(
     private readonly source: LiveSource,
-    private readonly stage: Stage,
+    private readonly viewer: Viewer,
   ) {
     this.clock = new LiveClock(source.frames);
-    this.marks = new Marks(source.header.facts.height);
-    stage.add(this.marks.group);
-    this.pushes = new Pushes(stage, source, this.marks);
-    this.hands = new Hands(source, () => this.pushes.push());
-    this.pointer = new Pointer(stage, source, (node) => this.pushes.push(node));
+    this.gizmos = new Gizmos(source.header.facts.height);
+    viewer.add(this.gizmos.group);
+    this.pushTool = new PushTool(viewer, source, this.gizmos);
+    this.input = new InputControls(source, () => this.pushTool.push());
+    this.pointer = new Pointer(viewer, source, (node) => this.pushTool.push(node));
     this.pauseButton = button("pause", "Pause (p)", () => this.togglePause());
     const recording = "Record a take: a run folder, as animate writes one (r)";
-    this.takeButton = button("record", recording, () => this.toggleTake());
+    this.recordButton = button("record", recording, () => this.toggleRecording());
     const { limits } = source.header.facts;
-    const [least, most] = limits?.sag ?? [0.01, 0.1];
+    const [minSag, maxSag] = limits?.sag ?? [0.01, 0.1];
     this.sliders = {
-      friction: slide("Friction", limits?.friction ?? [0, 2], 0.05, (value) => value.toFixed(2), (friction) =>
+      friction: createSlider("Friction", limits?.friction ?? [0, 2], 0.05, (value) => value.toFixed(2), (friction) =>
         source.send({ type: "set", friction }),
       ),
-      // To the right it is stiffer, each way by the same factor.
-      sag: slide(
+      // Logarithmic scale; stiffer to the right.
+      sag: createSlider(
         "Stiffness",
-        [-Math.log(most), -Math.log(least)],
+        [-Math.log(maxSag), -Math.log(minSag)],
         "any",
-        (value) => `${(ORDINARY_SAG * Math.exp(value)).toFixed(1)}\u00d7`,
-        (value) => source.send({ type: "set", sag: Math.min(Math.max(Math.exp(-value), least), most) }),
+        (value) => `${(DEFAULT_SAG * Math.exp(value)).toFixed(1)}\u00d7`,
+        (value) => source.send({ type: "set", sag: Math.min(Math.max(Math.exp(-value), minSag), maxSag) }),
       ),
     };
-    const push = slide("Push", [0.05, 1], 0.05, (value) => value.toFixed(2), (value) => (this.pushes.strength = value));
-    push.show(this.pushes.strength);
-    this.acting = new Acting(source.header.facts, (style) => source.send({ type: "style", ...style }));
+    const setStrength = (value: number): void => {
+      this.pushTool.strength = value;
+    };
+    const push = createSlider("Push", [0.05, 1], 0.05, (value) => value.toFixed(2), setStrength);
+    push.show(this.pushTool.strength);
+    this.stylePanel = new StylePanel(source.header.facts, (style) => source.send({ type: "style", ...style }));
     const sheet = { class: "sheet", "aria-label": "Style, body, ground and pushes", hidden: "" };
-    this.body = element(
+    this.settingsSheet = element(
       "section",
       sheet,
-      ...this.acting.parts,
+      ...this.stylePanel.elements,
       element("hr", {}),
-      this.sliders.friction.part,
-      this.sliders.sag.part,
-      push.part,
+      this.sliders.friction.element,
+      this.sliders.sag.element,
+      push.element,
     );
-    this.help = helpSheet();
-    source.onFrame = () => this.clock.arrived(performance.now() / 1000);
-    source.listen((news) => this.hear(news));
-    document.addEventListener("keyup", (event) => this.hands.keyUp(event));
-    window.addEventListener("blur", () => this.hands.releaseAll());
+    this.helpSheet = createHelpSheet();
+    source.onFrame = () => this.clock.addArrival(performance.now() / 1000);
+    source.listen((news) => this.handleNews(news));
+    document.addEventListener("keyup", (event) => this.input.keyUp(event));
+    window.addEventListener("blur", () => this.input.releaseAll());
   }
 
-  /** Whether something moves, or did a moment ago. */
-  get moving(): boolean {
-    return performance.now() - this.lastMoved < 500;
+  /** True if the creature moves or has moved within the last half second. */
+  get isMoving(): boolean {
+    return performance.now() - this.lastMotion < 500;
   }
 
-  parts(): HTMLElement[] {
-    const act = (action: Action, title: string): HTMLButtonElement => {
+  elements(): HTMLElement[] {
+    const actionButton = (action: Action, title: string): HTMLButtonElement => {
       const name = action === "back" || action === "hop" ? "forward" : action;
-      const made = button(name, title, () => {});
-      made.addEventListener("pointerdown", () => this.hands.press(action, title));
+      const created = button(name, title, () => {});
+      created.addEventListener("pointerdown", () => this.input.press(action, title));
       for (const end of ["pointerup", "pointerleave", "pointercancel"]) {
-        made.addEventListener(end, () => this.hands.release(title));
+        created.addEventListener(end, () => this.input.release(title));
       }
-      // A keyboard's press of the button itself.
-      made.addEventListener("click", (event) => {
+      // The button was activated by the keyboard.
+      created.addEventListener("click", (event) => {
         if (event.detail !== 0) return;
-        this.hands.press(action, title);
-        this.hands.release(title);
+        this.input.press(action, title);
+        this.input.release(title);
       });
-      made.id = action;
-      return made;
+      created.id = action;
+      return created;
     };
-    const open = (sheet: HTMLElement, other: HTMLElement) => () => {
+    const toggleSheet = (sheet: HTMLElement, other: HTMLElement) => () => {
       sheet.hidden = !sheet.hidden;
       other.hidden = true;
     };
     const pad = element(
       "div",
       { class: "pad" },
-      act("left", "Turn left (\u2190)"),
-      act("forward", "Forward (\u2191)"),
-      act("right", "Turn right (\u2192)"),
-      act("jump", "Jump (space)"),
-      act("leap", "Leap ahead (j)"),
-      button("push", "Push it away from you (b)", () => this.pushes.push()),
+      actionButton("left", "Turn left (\u2190)"),
+      actionButton("forward", "Forward (\u2191)"),
+      actionButton("right", "Turn right (\u2192)"),
+      actionButton("jump", "Jump (space)"),
+      actionButton("leap", "Long jump (j)"),
+      button("push", "Push it away from you (b)", () => this.pushTool.push()),
     );
-    const keep = element(
+    const actions = element(
       "div",
       {},
-      button("stand", "Stand up at the start (backspace)", () => this.source.send({ type: "stand" })),
-      button("sliders", "Style, friction, stiffness, pushes", open(this.body, this.help)),
-      this.takeButton,
-      button("script", "Save what it did as a script", () => this.source.send({ type: "script" })),
-      button("help", "Keys (?)", open(this.help, this.body)),
+      button("stand", "Reset to the start (backspace)", () => this.source.send({ type: "stand" })),
+      button("sliders", "Style, friction, stiffness, pushes", toggleSheet(this.settingsSheet, this.helpSheet)),
+      this.recordButton,
+      button("script", "Save the performed motions as a script", () => this.source.send({ type: "script" })),
+      button("help", "Keys (?)", toggleSheet(this.helpSheet, this.settingsSheet)),
     );
-    const time = element("div", {}, this.pauseButton, button("step", "One step (.)", () => this.step()), this.pace);
-    return [element("footer", { class: "dock live" }, time, pad, keep), this.body, this.help, this.toasts];
+    const step = button("step", "One step (.)", () => this.step());
+    const time = element("div", {}, this.pauseButton, step, this.speedLabel);
+    const dock = element("footer", { class: "dock live" }, time, pad, actions);
+    return [dock, this.settingsSheet, this.helpSheet, this.toasts];
   }
 
-  /** After `elapsed` seconds; true where the picture is another one. */
+  /** Advance by `elapsed` wall-clock seconds; return true if the shown time has changed. */
   advance(elapsed: number): boolean {
-    this.hands.tick();
-    this.pushes.tick();
+    this.input.tick();
+    this.pushTool.tick();
     const moved = this.clock.advance(elapsed);
-    if (moved) this.lastMoved = performance.now();
+    if (moved) this.lastMotion = performance.now();
     return moved;
   }
 
-  /** Told after each picture: what follows hand and body. */
-  drawn(): void {
-    const { pulled } = this.pointer;
-    if (pulled !== undefined) this.marks.showSpring(this.stage.node(pulled.node), pulled.hand);
-    else this.marks.showSpring();
-    if (this.state !== undefined && (this.moving || !this.facing)) {
-      this.marks.showFacing(this.stage.middle, this.state.facing, 0.62 * this.source.header.facts.height);
-      this.facing = true;
+  /** Update the gizmos and the speed label after each rendered image. */
+  updateGizmos(): void {
+    const { grab } = this.pointer;
+    if (grab !== undefined) this.gizmos.showSpring(this.viewer.nodePosition(grab.node), grab.target);
+    else this.gizmos.showSpring();
+    if (this.state !== undefined && (this.isMoving || !this.isFacingShown)) {
+      this.gizmos.showFacing(this.viewer.centreOfMass, this.state.facing, 0.62 * this.source.header.facts.height);
+      this.isFacingShown = true;
     }
-    this.tellPace();
+    this.updateSpeedLabel();
   }
 
-  /** A key; whether it is one of ours. */
+  /** Handle a key press; return true if the key has a function. */
   keyDown(event: KeyboardEvent): boolean {
-    if (this.hands.keyDown(event)) return true;
+    if (this.input.keyDown(event)) return true;
     if (event.key === "p") this.togglePause();
     else if (event.key === ".") this.step();
-    else if (event.key === "r") this.toggleTake();
+    else if (event.key === "r") this.toggleRecording();
     else if (event.key === "b") {
-      if (!event.repeat) this.pushes.push();
+      if (!event.repeat) this.pushTool.push();
     }
-    else if (event.key === "?") this.help.hidden = !this.help.hidden;
+    else if (event.key === "?") this.helpSheet.hidden = !this.helpSheet.hidden;
     else if (event.key === "Backspace") this.source.send({ type: "stand" });
     else if (event.key === "Escape") {
       this.source.send({ type: "cancel" });
-      this.help.hidden = this.body.hidden = true;
+      this.helpSheet.hidden = this.settingsSheet.hidden = true;
     } else return false;
     return true;
   }
 
-  private hear(news: News): void {
+  private handleNews(news: News): void {
     if (news.type === "state") this.show(news);
-    else if (news.type === "told") this.tell(news.text);
+    else if (news.type === "told") this.showMessage(news.text);
     else if (news.type === "busy") {
       this.busy = news.on;
-      this.clock.hold();
+      this.clock.resetSpeed();
     } else if (news.type === "script") {
-      if (news.motions === 0) this.tell("it has done nothing yet that a script could hold");
+      if (news.motions === 0) this.showMessage("there is no motion to save yet");
       else save(new Blob([news.text], { type: "application/json" }), "script.json");
-    } else this.tell(news.error, true);
+    } else this.showMessage(news.error, true);
   }
 
   private show(state: State): void {
     const before = this.state;
     this.state = state;
-    this.hands.walks = state.walks;
-    this.hands.queued = state.queued;
-    if (state.paused || state.resting) this.clock.hold();
+    this.input.walks = state.walks;
+    this.input.queued = state.queued;
+    if (state.paused || state.resting) this.clock.resetSpeed();
     if (before?.paused !== state.paused) {
       this.pauseButton.innerHTML = icon(state.paused ? "play" : "pause");
-      this.pauseButton.title = state.paused ? "Go on (p)" : "Pause (p)";
+      this.pauseButton.title = state.paused ? "Continue (p)" : "Pause (p)";
     }
-    this.takeButton.classList.toggle("on", state.recording);
-    this.takeButton.setAttribute("aria-pressed", String(state.recording));
+    this.recordButton.classList.toggle("on", state.recording);
+    this.recordButton.setAttribute("aria-pressed", String(state.recording));
     this.sliders.friction.show(state.friction);
     this.sliders.sag.show(-Math.log(state.sag));
-    this.acting.show(state.style);
-    this.marks.showGoal(state.goal);
-    this.stage.invalidate();
+    this.stylePanel.show(state.style);
+    this.gizmos.showGoal(state.goal);
+    this.viewer.invalidate();
   }
 
-  private tellPace(): void {
+  private updateSpeedLabel(): void {
     const { state, clock } = this;
-    let said = "";
-    if (this.busy) said = "one moment\u2026";
-    else if (state?.paused) said = "paused";
-    else if (state?.doing === "fallen") said = "fallen";
-    else if (!this.moving || clock.speed === 0) said = "at rest";
-    else if (clock.speed < SLOWER) {
-      said = `${clock.speed.toFixed(clock.speed < 0.1 ? 2 : 1)}\u00d7 \u00b7 ${state?.doing ?? ""}`;
+    let text = "";
+    if (this.busy) text = "please wait\u2026";
+    else if (state?.paused) text = "paused";
+    else if (state?.doing === "fallen") text = "fallen";
+    else if (!this.isMoving || clock.speed === 0) text = "at rest";
+    else if (clock.speed < MIN_REAL_TIME_SPEED) {
+      text = `${clock.speed.toFixed(clock.speed < 0.1 ? 2 : 1)}\u00d7 \u00b7 ${state?.doing ?? ""}`;
     }
-    else said = `1\u00d7 \u00b7 ${state?.doing ?? ""}`;
-    if (this.pace.textContent !== said) this.pace.textContent = said;
+    else text = `1\u00d7 \u00b7 ${state?.doing ?? ""}`;
+    if (this.speedLabel.textContent !== text) this.speedLabel.textContent = text;
   }
 
-  private tell(line: string, wrong = false): void {
-    this.told.push(line);
-    const toast = element("p", { class: wrong ? "toast wrong" : "toast" }, line);
+  private showMessage(line: string, isError = false): void {
+    this.messages.push(line);
+    const toast = element("p", { class: isError ? "toast wrong" : "toast" }, line);
     this.toasts.append(toast);
     while (this.toasts.childElementCount > 3) this.toasts.firstElementChild?.remove();
-    setTimeout(() => toast.remove(), SHOWN);
+    setTimeout(() => toast.remove(), TOAST_TIME);
   }
 
   private togglePause(): void {
@@ -252,12 +257,12 @@ export class Live {
     this.source.send({ type: "step" });
   }
 
-  private toggleTake(): void {
+  private toggleRecording(): void {
     this.source.send({ type: "record", on: !(this.state?.recording ?? false) });
   }
 }
 
-function helpSheet(): HTMLElement {
+function createHelpSheet(): HTMLElement {
   const list = element("dl", { class: "keys" });
   for (const [keys, what] of HELP) {
     const names = keys.flatMap((key) => [" ", element("kbd", {}, key)]);
@@ -265,6 +270,6 @@ function helpSheet(): HTMLElement {
   }
   list.append(element("dt", {}, "click"), element("dd", {}, "on the ground: go there"));
   list.append(element("dt", {}, "click"), element("dd", {}, "the creature: push it there, away from you"));
-  list.append(element("dt", {}, "drag"), element("dd", {}, "the creature: pull at it"));
+  list.append(element("dt", {}, "drag"), element("dd", {}, "the creature: pull it"));
   return element("section", { class: "sheet", "aria-label": "Keys", hidden: "" }, list);
 }

@@ -1,27 +1,27 @@
-// Finds the runs of the page, and begins it.
+// Entry point: find the runs of the page and show them.
 
 import { element } from "./dom";
 import { Page } from "./page";
-import { fromAddress, fromElement, fromSocket, type FrameSource } from "./source";
+import { fromAddress, fromElement, fromSocket, type FrameSource } from "./frame_source";
 import "./style.css";
 
-/** The runs of this page: carried within it, sent by a socket, or lying beside it. */
+/** Return the runs of this page: embedded in it, sent by a socket, or files on the server. */
 async function findRuns(): Promise<FrameSource[]> {
-  const carried = [...document.querySelectorAll<HTMLElement>("script[data-run]")];
-  if (carried.length > 0) return Promise.all(carried.map(fromElement));
-  const asked = new URLSearchParams(location.search);
-  if (asked.has("live")) {
+  const embedded = [...document.querySelectorAll<HTMLElement>("script[data-run]")];
+  if (embedded.length > 0) return Promise.all(embedded.map(fromElement));
+  const parameters = new URLSearchParams(location.search);
+  if (parameters.has("live")) {
     const address = new URL("live", location.href);
     address.protocol = address.protocol.replace("http", "ws");
     address.search = "";
-    return [await fromSocket(address.href, lost)];
+    return [await fromSocket(address.href, showConnection)];
   }
-  const count = Number(asked.get("runs") ?? "1");
+  const count = Number(parameters.get("runs") ?? "1");
   return Promise.all(Array.from({ length: count }, (_, k) => fromAddress(`run/${k}`)));
 }
 
-/** Says why nothing comes; undefined: it comes again. */
-function lost(reason: string | undefined): void {
+/** Show why the connection is lost; undefined means that it is restored. */
+function showConnection(reason: string | undefined): void {
   document.body.classList.toggle("lost", reason !== undefined);
   document.body.dataset.lost = reason ?? "";
 }
@@ -30,32 +30,32 @@ function webgl2(): boolean {
   return document.createElement("canvas").getContext("webgl2") !== null;
 }
 
-function tell(message: string): void {
-  document.getElementById("page")?.replaceChildren(element("p", { class: "told", role: "alert" }, message));
+function showMessage(message: string): void {
+  document.getElementById("page")?.replaceChildren(element("p", { class: "message", role: "alert" }, message));
 }
 
 declare global {
   interface Window {
-    /** For scripts that drive the page. */
+    /** Access for scripts that control the page. */
     egs?: Page;
   }
 }
 
-async function begin(): Promise<void> {
+async function start(): Promise<void> {
   const root = document.getElementById("page") as HTMLElement;
   if (!webgl2()) {
-    tell(
-      "This browser has no WebGL2, which draws the splats. " +
-        "Another browser, or hardware acceleration in its settings, will do.",
+    showMessage(
+      "This browser has no WebGL2, which is needed to draw the splats. " +
+        "Enable hardware acceleration in its settings or use another browser.",
     );
     return;
   }
-  tell("Loading\u2026");
+  showMessage("Loading\u2026");
   try {
     window.egs = new Page(root, await findRuns());
   } catch (error) {
-    tell(error instanceof Error ? error.message : String(error));
+    showMessage(error instanceof Error ? error.message : String(error));
   }
 }
 
-void begin();
+void start();

@@ -1,13 +1,13 @@
-// What the mechanics knows, drawn over the splats: cage, muscles, feet, contacts, centre of mass.
+// Mechanical quantities drawn over the splats: cage, muscles, soles, contacts and centre of mass.
 
 import * as THREE from "three";
-import { Feet } from "./feet";
+import { SoleOverlay } from "./sole_overlay";
 import { floatsOf, indicesOf, type Frame, type Header } from "./packets";
-import { Strokes } from "./strokes";
+import { WideLines } from "./wide_lines";
 
 export type Layer = "cage" | "muscles" | "feet" | "contacts" | "path";
 
-/** Three mixes in linear light. */
+/** Convert a colour to linear RGB, in which Three.js blends. */
 const linear = (hex: number): number[] => new THREE.Color(hex).toArray();
 
 const COLOURS = {
@@ -28,16 +28,16 @@ const WEIGHT_LENGTH = 0.5;
 
 export class Overlays {
   readonly group = new THREE.Group();
-  private readonly strokes: Record<Exclude<Layer, "feet">, Strokes> = {
-    cage: new Strokes(1, 0.4, 10),
-    muscles: new Strokes(2.5, 0.9, 11),
-    contacts: new Strokes(3, 1, 14),
-    path: new Strokes(2.5, 0.95, 12),
+  private readonly lines: Record<Exclude<Layer, "feet">, WideLines> = {
+    cage: new WideLines(1, 0.4, 10),
+    muscles: new WideLines(2.5, 0.9, 11),
+    contacts: new WideLines(3, 1, 14),
+    path: new WideLines(2.5, 0.95, 12),
   };
-  private readonly cones = new Strokes(1, 0.4, 13);
-  private readonly middle: THREE.Mesh;
+  private readonly cones = new WideLines(1, 0.4, 13);
+  private readonly centreMarker: THREE.Mesh;
   private readonly points: THREE.Points;
-  private readonly feet: Feet;
+  private readonly feet: SoleOverlay;
   private readonly visible = new Set<Layer>();
   private readonly ends: Float32Array;
   /** Centre of mass of each frame. */
@@ -45,15 +45,15 @@ export class Overlays {
 
   constructor(
     private readonly header: Header,
-    private readonly centres: (frame: Frame) => THREE.Vector3,
+    private readonly centreOf: (frame: Frame) => THREE.Vector3,
   ) {
-    for (const strokes of [...Object.values(this.strokes), this.cones]) this.group.add(strokes.object);
+    for (const lines of [...Object.values(this.lines), this.cones]) this.group.add(lines.object);
     const height = header.facts.height;
-    this.middle = new THREE.Mesh(
+    this.centreMarker = new THREE.Mesh(
       new THREE.SphereGeometry(0.018 * height, 20, 14),
       new THREE.MeshBasicMaterial({ color: 0xf4f6fa, depthTest: false, transparent: true }),
     );
-    this.middle.renderOrder = 14;
+    this.centreMarker.renderOrder = 14;
     this.points = new THREE.Points(
       new THREE.BufferGeometry(),
       new THREE.PointsMaterial({
@@ -67,8 +67,8 @@ export class Overlays {
     );
     this.points.renderOrder = 15;
     this.points.frustumCulled = false;
-    this.feet = new Feet(header);
-    this.group.add(this.middle, this.points, this.feet.group);
+    this.feet = new SoleOverlay(header);
+    this.group.add(this.centreMarker, this.points, this.feet.group);
     this.ends = new Float32Array(3 * (indicesOf(header, "muscle_end_starts").length - 1));
     this.apply();
   }
@@ -79,7 +79,7 @@ export class Overlays {
     this.apply();
   }
 
-  /** `positions` may lie between two frames; `frame` is the nearest. */
+  /** Redraw the visible layers. `positions` may be interpolated; `frame` is the nearest frame. */
   update(frame: Frame, positions: Float32Array, frames: Frame[]): void {
     if (this.visible.has("cage")) this.drawCage(positions);
     if (this.visible.has("muscles")) this.drawMuscles(frame, positions);
@@ -89,10 +89,10 @@ export class Overlays {
   }
 
   private apply(): void {
-    for (const [layer, strokes] of Object.entries(this.strokes)) {
+    for (const [layer, strokes] of Object.entries(this.lines)) {
       strokes.object.visible = this.visible.has(layer as Layer);
     }
-    this.middle.visible = this.visible.has("path");
+    this.centreMarker.visible = this.visible.has("path");
     this.feet.group.visible = this.visible.has("feet");
     this.points.visible = this.cones.object.visible = this.visible.has("contacts");
   }
@@ -101,7 +101,7 @@ export class Overlays {
     const edges = indicesOf(this.header, "edges");
     const lines = new Float32Array(3 * edges.length);
     for (let k = 0; k < edges.length; k++) lines.set(positions.subarray(3 * edges[k]!, 3 * edges[k]! + 3), 3 * k);
-    this.strokes.cage.set(lines, tinted(edges.length, COLOURS.cage));
+    this.lines.cage.set(lines, tinted(edges.length, COLOURS.cage));
   }
 
   private drawMuscles(frame: Frame, positions: Float32Array): void {
@@ -123,19 +123,19 @@ export class Overlays {
       lines.set(this.ends.subarray(3 * segments[k]!, 3 * segments[k]! + 3), 3 * k);
       const level = (frame.activations[k >> 1] ?? 0) / 127;
       const towards = level > 0 ? COLOURS.contracts : COLOURS.extends;
-      const share = Math.sqrt(Math.abs(level));
+      const strength = Math.sqrt(Math.abs(level));
       for (let c = 0; c < 3; c++) {
-        colours[3 * k + c] = COLOURS.relaxed[c]! + share * (towards[c]! - COLOURS.relaxed[c]!);
+        colours[3 * k + c] = COLOURS.relaxed[c]! + strength * (towards[c]! - COLOURS.relaxed[c]!);
       }
     }
-    this.strokes.muscles.set(lines, colours);
+    this.lines.muscles.set(lines, colours);
   }
 
   private drawContacts(frame: Frame): void {
     const { height, weight, friction } = this.header.facts;
     const scale = (WEIGHT_LENGTH * height) / weight;
-    const arrows = new Lines();
-    const cones = new Lines();
+    const arrows = new SegmentList();
+    const cones = new SegmentList();
     const points: number[] = [];
     for (let k = 0; k < frame.contacts.length; k += 9) {
       const [point, normal, force] = [0, 3, 6].map((at) => new THREE.Vector3().fromArray(frame.contacts, k + at)) as [
@@ -144,8 +144,8 @@ export class Overlays {
         THREE.Vector3,
       ];
       points.push(...point.toArray());
-      const pressed = scale * force.dot(normal);
-      if (pressed < 1e-3 * height) continue;
+      const normalForce = scale * force.dot(normal);
+      if (normalForce < 1e-3 * height) continue;
       arrows.add(point, point.clone().addScaledVector(force, scale), COLOURS.force);
       const side = new THREE.Vector3(Math.abs(normal.x) < 0.9 ? 1 : 0, Math.abs(normal.x) < 0.9 ? 0 : 1, 0);
       side.addScaledVector(normal, -side.dot(normal)).normalize();
@@ -154,34 +154,34 @@ export class Overlays {
         const angle = (2 * Math.PI * j) / CONE_SIDES;
         return point
           .clone()
-          .addScaledVector(normal, pressed)
-          .addScaledVector(side, friction * pressed * Math.cos(angle))
-          .addScaledVector(other, friction * pressed * Math.sin(angle));
+          .addScaledVector(normal, normalForce)
+          .addScaledVector(side, friction * normalForce * Math.cos(angle))
+          .addScaledVector(other, friction * normalForce * Math.sin(angle));
       };
       for (let j = 0; j < CONE_SIDES; j++) {
         cones.add(rim(j), rim(j + 1), COLOURS.cone);
         if (j % 3 === 0) cones.add(point, rim(j), COLOURS.cone);
       }
     }
-    this.strokes.contacts.set(arrows.points, arrows.colours);
+    this.lines.contacts.set(arrows.points, arrows.colours);
     this.cones.set(cones.points, cones.colours);
     this.points.geometry.setAttribute("position", new THREE.Float32BufferAttribute(points, 3));
   }
 
   private drawPath(frame: Frame, frames: Frame[]): void {
-    const lines = new Lines();
-    const every = frames.map((one) => this.path.get(one) ?? this.remembered(one));
-    for (let k = 0; k + 1 < every.length; k++) {
-      lines.add(every[k]!, every[k + 1]!, frames[k]!.time < frame.time ? COLOURS.past : COLOURS.future);
+    const lines = new SegmentList();
+    const centres = frames.map((one) => this.path.get(one) ?? this.cacheCentre(one));
+    for (let k = 0; k + 1 < centres.length; k++) {
+      lines.add(centres[k]!, centres[k + 1]!, frames[k]!.time < frame.time ? COLOURS.past : COLOURS.future);
     }
     this.addPlan(lines);
-    const now = this.middle.position.copy(this.centres(frame));
+    const now = this.centreMarker.position.copy(this.centreOf(frame));
     lines.add(now, now.clone().setZ(0), COLOURS.plumb);
-    this.strokes.path.set(lines.points, lines.colours);
+    this.lines.path.set(lines.points, lines.colours);
   }
 
-  /** Dashed, where the motion had planned it. */
-  private addPlan(lines: Lines): void {
+  /** Add the planned path of the centre of mass as a dashed line. */
+  private addPlan(lines: SegmentList): void {
     if (!this.header.arrays.has("plan")) return;
     const plan = floatsOf(this.header, "plan");
     const at = (k: number): THREE.Vector3 => new THREE.Vector3().fromArray(plan, 3 * k);
@@ -190,14 +190,14 @@ export class Overlays {
     }
   }
 
-  private remembered(frame: Frame): THREE.Vector3 {
-    const centre = this.centres(frame);
+  private cacheCentre(frame: Frame): THREE.Vector3 {
+    const centre = this.centreOf(frame);
     this.path.set(frame, centre);
     return centre;
   }
 }
 
-class Lines {
+class SegmentList {
   readonly points: number[] = [];
   readonly colours: number[] = [];
 
@@ -207,7 +207,7 @@ class Lines {
   }
 }
 
-/** A round dot. */
+/** Create the texture of a round dot. */
 function disc(): THREE.Texture {
   const side = 32;
   const canvas = document.createElement("canvas");

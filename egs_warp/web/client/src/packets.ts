@@ -1,4 +1,4 @@
-// What the page is sent: one header, then a packet for each frame (egs_warp/web/packets.py is the writer).
+// Binary format of a run: one header, then one packet per frame. egs_warp/web/packets.py writes it.
 
 export interface Curve {
   name: string;
@@ -20,14 +20,14 @@ export interface Facts {
   motion: { name: string; reached?: Record<string, number> }[];
   notes: string[];
   degree: { splats: number; scene: number };
-  /** Of a creature that lives: which session this is, and how far its sliders go. */
+  /** Only of live sessions: identifier of the session and limits of its sliders. */
   session?: string;
   limits?: { friction: [number, number]; sag: [number, number]; style: [number, number] };
-  /** Ways to jump that have a name. */
+  /** Named styles. */
   styles?: Record<string, Style>;
 }
 
-/** How a jump is acted, times the usual (egs_warp/motions/style.py). */
+/** Style of a jump; each value is a factor on the default (egs_warp/motions/style.py). */
 export interface Style {
   anticipation: number;
   squash: number;
@@ -45,33 +45,33 @@ export interface Frame {
   index: number;
   time: number;
   positions: Float32Array;
-  /** -127 to 127 of the most that each segment can do. */
+  /** Activation of each muscle segment; -127 and 127 are its limits. */
   activations: Int8Array;
-  /** Nine numbers a contact: point, normal, force. */
+  /** Nine numbers per contact: point, normal, force. */
   contacts: Float32Array;
   curves: Float32Array;
 }
 
 const MAGIC = "EGSPAGE1";
 
-interface Listed {
+interface ArrayEntry {
   type: string;
   shape: number[];
   start: number;
 }
 
-/** The header at the start of `bytes`, and where what follows it begins. */
+/** Read the header at the start of `bytes`; `end` is the offset of the first frame. */
 export function readHeader(bytes: ArrayBuffer): { header: Header; end: number } {
-  const whole = new DataView(bytes);
+  const dataView = new DataView(bytes);
   const text = new TextDecoder();
   if (bytes.byteLength < 12 || text.decode(new Uint8Array(bytes, 0, 8)) !== MAGIC) {
-    throw new Error("this is no run of egs_warp");
+    throw new Error("this file is not a run of egs_warp");
   }
-  const length = whole.getUint32(8, true);
-  const { arrays: listed, bytes: size, ...facts } = JSON.parse(text.decode(new Uint8Array(bytes, 12, length)));
+  const length = dataView.getUint32(8, true);
+  const { arrays: entries, bytes: size, ...facts } = JSON.parse(text.decode(new Uint8Array(bytes, 12, length)));
   const base = Math.ceil((12 + length) / 8) * 8;
   const arrays = new Map<string, Numbers>();
-  for (const [name, { type, shape, start }] of Object.entries(listed as Record<string, Listed>)) {
+  for (const [name, { type, shape, start }] of Object.entries(entries as Record<string, ArrayEntry>)) {
     const count = shape.reduce((product, side) => product * side, 1);
     arrays.set(name, view(type, bytes, base + start, count));
   }
@@ -87,11 +87,11 @@ function view(type: string, bytes: ArrayBuffer, start: number, count: number): N
     case "uint8":
       return new Uint8Array(bytes, start, count);
     default:
-      throw new Error(`numbers of type ${type}`);
+      throw new Error(`arrays of type ${type} are not supported`);
   }
 }
 
-/** One frame; it starts at a multiple of four bytes. */
+/** Read one frame; `start` is a multiple of four. */
 export function readFrame(bytes: ArrayBuffer, start: number): Frame {
   const words = new Uint32Array(bytes, start, 8);
   const counts = [words[2], words[3], words[4], words[5]] as [number, number, number, number];
@@ -115,13 +115,13 @@ export function readFrame(bytes: ArrayBuffer, start: number): Frame {
   };
 }
 
-/** All frames of a file after its header, each with its length before it. */
+/** Read all frames of a file, each preceded by its length, from offset `start`. */
 export function readFrames(bytes: ArrayBuffer, start: number): Frame[] {
-  const whole = new DataView(bytes);
+  const dataView = new DataView(bytes);
   const frames: Frame[] = [];
   let at = start;
   while (at + 4 <= bytes.byteLength) {
-    const length = whole.getUint32(at, true);
+    const length = dataView.getUint32(at, true);
     if (at + 4 + length > bytes.byteLength) break;
     frames.push(readFrame(bytes, at + 4));
     at += 4 + length;

@@ -1,18 +1,18 @@
-// The page: lays out the stages and the controls, and keeps time.
+// The page: layout of viewers and controls, and the animation loop.
 
-import { Curves } from "./curves";
+import { Charts } from "./charts";
 import { button, element, icon, save } from "./dom";
-import { FilmRecorder } from "./film";
+import { VideoRecorder } from "./video_recorder";
 import { Live } from "./live";
 import { Player } from "./player";
-import { LiveSource, type FrameSource } from "./source";
-import { Stage, type Preset, type Tick } from "./stage";
+import { LiveSource, type FrameSource } from "./frame_source";
+import { Viewer, type Preset, type LayerToggle } from "./viewer";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
-/** Seconds a picture from which fewer pixels are drawn: of a run, and of a creature that lives. */
-const SLOW = 1 / 15;
-const SLOW_LIFE = 1 / 25;
-const LAYERS: { name: Tick; title: string; on: boolean; key: string }[] = [
+/** Time per image above which the resolution is reduced, s: for a recorded run and for a live session. */
+const MAX_FRAME_TIME = 1 / 15;
+const MAX_LIVE_FRAME_TIME = 1 / 25;
+const LAYERS: { name: LayerToggle; title: string; on: boolean; key: string }[] = [
   { name: "splats", title: "Creature", on: true, key: "1" },
   { name: "scene", title: "Scene", on: true, key: "2" },
   { name: "ground", title: "Ground", on: true, key: "3" },
@@ -30,21 +30,21 @@ const PRESETS: { name: Preset; title: string }[] = [
 ];
 
 export class Page {
-  readonly stages: Stage[] = [];
+  readonly viewers: Viewer[] = [];
   readonly player: Player;
-  /** Of a creature that lives. */
+  /** Only of live sessions. */
   readonly live: Live | undefined;
-  private readonly curves: Curves;
-  private readonly film = new FilmRecorder();
+  private readonly charts: Charts;
+  private readonly recorder = new VideoRecorder();
   private readonly playButton: HTMLButtonElement;
   private readonly slider = element("input", {
     ...{ type: "range", min: "0", step: "any", class: "line", "aria-label": "Time" },
   });
   private readonly clock = element("output", { class: "clock" });
-  private readonly boxes = new Map<Tick, HTMLInputElement>();
-  private before = 0;
-  /** Seconds between two pictures while the run plays, of late. */
-  private pace = 0;
+  private readonly checkboxes = new Map<LayerToggle, HTMLInputElement>();
+  private lastTime = 0;
+  /** Smoothed time between two images during playback, s. */
+  private frameTime = 0;
 
   constructor(root: HTMLElement, sources: FrameSource[]) {
     this.player = new Player(sources, () => this.update());
@@ -55,72 +55,74 @@ export class Page {
     for (const source of sources) {
       const canvas = element("canvas", { class: "view", tabindex: "0", "aria-label": source.header.facts.title });
       views.append(element("figure", {}, canvas, element("figcaption", {}, source.header.facts.title)));
-      const stage = new Stage(canvas, source);
-      this.stages.push(stage);
+      const viewer = new Viewer(canvas, source);
+      this.viewers.push(viewer);
     }
-    if (first instanceof LiveSource) this.live = new Live(first, this.stages[0] as Stage);
-    for (const stage of this.stages) {
-      stage.controls.addEventListener("change", () => {
-        for (const other of this.stages) if (other !== stage) other.copyView(stage);
+    if (first instanceof LiveSource) this.live = new Live(first, this.viewers[0] as Viewer);
+    for (const viewer of this.viewers) {
+      viewer.controls.addEventListener("change", () => {
+        for (const other of this.viewers) if (other !== viewer) other.copyCamera(viewer);
       });
     }
-    this.curves = new Curves(first, (place) => this.player.seek(place));
+    this.charts = new Charts(first, (framePosition) => this.player.seek(framePosition));
     this.playButton = button("play", "Play (space)", () => this.player.toggle());
     this.playButton.classList.add("play");
-    root.append(this.tools(), this.curves.panel, ...(this.live?.parts() ?? [this.dock()]));
-    this.curves.panel.hidden = true;
+    root.append(this.toolbar(), this.charts.panel, ...(this.live?.elements() ?? [this.playbackBar()]));
+    this.charts.panel.hidden = true;
     new ResizeObserver(() => {
-      for (const stage of this.stages) stage.resize();
-      this.curves.draw(this.place);
+      for (const viewer of this.viewers) viewer.resize();
+      this.charts.draw(this.framePosition);
     }).observe(views);
-    document.addEventListener("keydown", (event) => this.pressed(event));
+    document.addEventListener("keydown", (event) => this.keyDown(event));
     if (this.live !== undefined) this.setFollow(true);
-    for (const { name, on } of LAYERS) for (const stage of this.stages) stage.tick(name, on && this.shown(name, stage));
+    for (const { name, on } of LAYERS) {
+      for (const viewer of this.viewers) viewer.setLayerVisible(name, on && this.isShown(name, viewer));
+    }
     this.update();
-    requestAnimationFrame((now) => this.tick(now));
+    requestAnimationFrame((now) => this.animate(now));
   }
 
-  /** The layer as a user ticks it. */
-  setLayer(name: Tick, on: boolean): void {
-    const box = this.boxes.get(name);
+  /** Show or hide a layer in all viewers, as its checkbox does. */
+  setLayer(name: LayerToggle, on: boolean): void {
+    const box = this.checkboxes.get(name);
     if (box !== undefined) box.checked = on;
-    for (const stage of this.stages) stage.tick(name, on);
+    for (const viewer of this.viewers) viewer.setLayerVisible(name, on);
     this.update();
   }
 
-  private shown(name: Tick, stage: Stage): boolean {
-    // A captured scene has a ground of its own.
-    return name !== "ground" || !stage.hasScene;
+  private isShown(name: LayerToggle, viewer: Viewer): boolean {
+    // A captured scene contains its own ground.
+    return name !== "ground" || !viewer.hasScene;
   }
 
-  /** Frames, with a fraction between two of them: what is shown. */
-  get place(): number {
-    return this.live?.clock.place ?? this.player.place;
+  /** Fractional index of the frame that is shown. */
+  get framePosition(): number {
+    return this.live?.clock.framePosition ?? this.player.framePosition;
   }
 
   private setFollow(on: boolean): void {
     const box = document.getElementById("follow");
     if (box instanceof HTMLInputElement) box.checked = on;
-    for (const stage of this.stages) stage.follow = on;
+    for (const viewer of this.viewers) viewer.follow = on;
   }
 
-  private tools(): HTMLElement {
+  private toolbar(): HTMLElement {
     const layers = element("div", { class: "menu", hidden: "" });
     for (const { name, title, on, key } of LAYERS) {
-      if (name === "scene" && !this.stages.some((stage) => stage.hasScene)) continue;
+      if (name === "scene" && !this.viewers.some((viewer) => viewer.hasScene)) continue;
       const box = element("input", { type: "checkbox", id: `layer-${name}` });
-      box.checked = on && this.stages.some((stage) => this.shown(name, stage));
+      box.checked = on && this.viewers.some((viewer) => this.isShown(name, viewer));
       box.addEventListener("change", () => this.setLayer(name, box.checked));
-      this.boxes.set(name, box);
+      this.checkboxes.set(name, box);
       layers.append(element("label", {}, box, element("span", {}, title), element("kbd", {}, key)));
     }
     const views = element("div", { class: "menu", hidden: "" });
     for (const { name, title } of PRESETS) {
-      const made = element("button", { type: "button", class: "item", id: `view-${name}` }, title);
-      made.addEventListener("click", () => {
-        for (const stage of this.stages) stage.preset(name);
+      const item = element("button", { type: "button", class: "item", id: `view-${name}` }, title);
+      item.addEventListener("click", () => {
+        for (const viewer of this.viewers) viewer.preset(name);
       });
-      views.append(made);
+      views.append(item);
     }
     const follow = element("input", { type: "checkbox", id: "follow" });
     follow.addEventListener("change", () => this.setFollow(follow.checked));
@@ -144,7 +146,7 @@ export class Page {
     );
   }
 
-  private dock(): HTMLElement {
+  private playbackBar(): HTMLElement {
     this.slider.addEventListener("input", () => this.player.seek(Number(this.slider.value)));
     const speed = element("select", { class: "speed", "aria-label": "Speed", title: "Speed" });
     for (const value of SPEEDS) speed.append(element("option", { value: String(value) }, `${value}\u00d7`));
@@ -162,26 +164,26 @@ export class Page {
   }
 
   private toggleCurves(): void {
-    this.curves.panel.hidden = !this.curves.panel.hidden;
-    this.curves.draw(this.place);
+    this.charts.panel.hidden = !this.charts.panel.hidden;
+    this.charts.draw(this.framePosition);
   }
 
   private async screenshot(): Promise<void> {
     this.player.playing = false;
-    for (const stage of this.stages) {
-      stage.sharpen(1);
-      await stage.settle();
-      save(await stage.picture(), `${this.fileName()}-${Math.round(this.place)}.png`);
+    for (const viewer of this.viewers) {
+      viewer.setResolution(1);
+      await viewer.drawSorted();
+      save(await viewer.screenshot(), `${this.fileName()}-${Math.round(this.framePosition)}.png`);
     }
   }
 
-  private record(pressed: HTMLButtonElement): void {
-    const [stage] = this.stages;
-    if (stage === undefined) return;
-    if (this.film.recording) {
-      this.film.stop();
+  private record(recordButton: HTMLButtonElement): void {
+    const [viewer] = this.viewers;
+    if (viewer === undefined) return;
+    if (this.recorder.recording) {
+      this.recorder.stop();
       this.player.playing = false;
-      pressed.classList.remove("on");
+      recordButton.classList.remove("on");
       return;
     }
     const { loop } = this.player;
@@ -189,34 +191,35 @@ export class Page {
       this.player.seek(0);
       this.player.loop = false;
     }
-    this.film.start(stage.canvas, (blob, ending) => save(blob, `${this.fileName()}.${ending}`));
-    pressed.classList.add("on");
+    this.recorder.start(viewer.canvas, (blob, ending) => save(blob, `${this.fileName()}.${ending}`));
+    recordButton.classList.add("on");
     if (this.live !== undefined) return;
     this.player.playing = true;
     const watch = setInterval(() => {
-      if (this.player.playing && this.film.recording) return;
+      if (this.player.playing && this.recorder.recording) return;
       clearInterval(watch);
-      this.film.stop();
+      this.recorder.stop();
       this.player.loop = loop;
-      pressed.classList.remove("on");
+      recordButton.classList.remove("on");
     }, 50);
   }
 
   private fileName(): string {
-    const { title } = (this.stages[0] as Stage).source.header.facts;
+    const { title } = (this.viewers[0] as Viewer).source.header.facts;
     return title.replace(/[^\p{L}\p{N}]+/gu, "-").replace(/^-|-$/g, "") || "run";
   }
 
-  private pressed(event: KeyboardEvent): void {
-    const held = event.ctrlKey || event.metaKey || event.altKey;
-    const typed = event.target instanceof HTMLSelectElement || (this.live && event.target instanceof HTMLInputElement);
-    if (typed || held) return;
+  private keyDown(event: KeyboardEvent): void {
+    const hasModifier = event.ctrlKey || event.metaKey || event.altKey;
+    const { target } = event;
+    const isTyping = target instanceof HTMLSelectElement || (this.live && target instanceof HTMLInputElement);
+    if (isTyping || hasModifier) return;
     if (this.live?.keyDown(event)) {
       event.preventDefault();
       return;
     }
     const layer = LAYERS.find(({ key }) => key === event.key);
-    if (layer !== undefined) this.setLayer(layer.name, !(this.boxes.get(layer.name)?.checked ?? false));
+    if (layer !== undefined) this.setLayer(layer.name, !(this.checkboxes.get(layer.name)?.checked ?? false));
     else if (event.key === "c") this.toggleCurves();
     else if (this.live !== undefined) return;
     else if (event.key === " ") this.player.toggle();
@@ -228,51 +231,51 @@ export class Page {
     event.preventDefault();
   }
 
-  /** A machine that is slow plays with fewer pixels, as long as it plays. */
-  private keepUp(elapsed: number): void {
-    if (this.film.recording) return;
-    if (this.live === undefined ? !this.player.playing : !this.live.moving) {
-      this.pace = 0;
-      for (const stage of this.stages) stage.sharpen(1);
+  /** Reduce the resolution during playback if the machine is too slow. */
+  private adaptResolution(elapsed: number): void {
+    if (this.recorder.recording) return;
+    if (this.live === undefined ? !this.player.playing : !this.live.isMoving) {
+      this.frameTime = 0;
+      for (const viewer of this.viewers) viewer.setResolution(1);
       return;
     }
-    this.pace = this.pace === 0 ? 1 / 60 : this.pace + 0.05 * (Math.min(elapsed, 0.2) - this.pace);
-    if (this.pace <= (this.live === undefined ? SLOW : SLOW_LIFE)) return;
-    for (const stage of this.stages) stage.coarsen();
-    this.pace = 1 / 60;
+    this.frameTime = this.frameTime === 0 ? 1 / 60 : this.frameTime + 0.05 * (Math.min(elapsed, 0.2) - this.frameTime);
+    if (this.frameTime <= (this.live === undefined ? MAX_FRAME_TIME : MAX_LIVE_FRAME_TIME)) return;
+    for (const viewer of this.viewers) viewer.reduceResolution();
+    this.frameTime = 1 / 60;
   }
 
-  /** Shows where the player stands. */
+  /** Show the current frame in viewers, charts and controls. */
   private update(): void {
     const { player } = this;
-    for (const stage of this.stages) stage.show(this.place);
-    this.curves.draw(this.place);
+    for (const viewer of this.viewers) viewer.show(this.framePosition);
+    this.charts.draw(this.framePosition);
     if (this.live !== undefined) return;
-    this.slider.max = String(player.last);
-    this.slider.value = String(player.place);
-    this.slider.style.setProperty("--done", `${(100 * player.place) / Math.max(player.last, 1)}%`);
-    this.clock.textContent = `${player.seconds.toFixed(2)} / ${(player.last / player.rate).toFixed(2)} s`;
+    this.slider.max = String(player.lastFrame);
+    this.slider.value = String(player.framePosition);
+    this.slider.style.setProperty("--done", `${(100 * player.framePosition) / Math.max(player.lastFrame, 1)}%`);
+    this.clock.textContent = `${player.seconds.toFixed(2)} / ${(player.lastFrame / player.rate).toFixed(2)} s`;
     this.playButton.innerHTML = icon(player.playing ? "pause" : "play");
   }
 
-  /** A slow machine waits for its splats to be sorted: as they lay some pictures ago, the ground would hide the
+  /** True if a slow machine must wait until its splats are sorted. In an outdated order the ground would hide the
    * body. */
-  private get waits(): boolean {
-    return this.player.playing && this.pace > SLOW && this.stages.some((stage) => stage.sorting);
+  private get isWaitingForSort(): boolean {
+    return this.player.playing && this.frameTime > MAX_FRAME_TIME && this.viewers.some((viewer) => viewer.sorting);
   }
 
-  private tick(now: number): void {
-    if (this.waits) {
-      requestAnimationFrame((next) => this.tick(next));
+  private animate(now: number): void {
+    if (this.isWaitingForSort) {
+      requestAnimationFrame((next) => this.animate(next));
       return;
     }
-    const elapsed = this.before === 0 ? 0 : (now - this.before) / 1000;
-    this.before = now;
+    const elapsed = this.lastTime === 0 ? 0 : (now - this.lastTime) / 1000;
+    this.lastTime = now;
     if (this.live === undefined) this.player.advance(elapsed);
     else if (this.live.advance(elapsed)) this.update();
-    this.keepUp(elapsed);
-    for (const stage of this.stages) stage.draw();
-    this.live?.drawn();
-    requestAnimationFrame((next) => this.tick(next));
+    this.adaptResolution(elapsed);
+    for (const viewer of this.viewers) viewer.draw();
+    this.live?.updateGizmos();
+    requestAnimationFrame((next) => this.animate(next));
   }
 }

@@ -1,21 +1,21 @@
-// Where in the run we are, and how it goes on.
+// Playback state of recorded runs.
 
-import type { FrameSource } from "./source";
+import type { FrameSource } from "./frame_source";
 
 export class Player {
   playing = false;
   loop = true;
   speed = 1;
-  /** Frames, with a fraction between two of them. */
-  place = 0;
+  /** Fractional index of the frame that is shown. */
+  framePosition = 0;
 
   constructor(
     private readonly sources: FrameSource[],
-    private readonly changed: () => void,
+    private readonly onChange: () => void,
   ) {}
 
-  /** The longest of the runs side by side; a shorter one waits at its end. */
-  get last(): number {
+  /** Last frame of the longest run; shorter runs stay at their last frame. */
+  get lastFrame(): number {
     return Math.max(...this.sources.map((source) => source.frames.length)) - 1;
   }
 
@@ -24,38 +24,38 @@ export class Player {
   }
 
   get seconds(): number {
-    return this.place / this.rate;
+    return this.framePosition / this.rate;
   }
 
   toggle(): void {
     this.playing = !this.playing;
-    if (this.playing && this.place >= this.last) this.place = 0;
-    this.changed();
+    if (this.playing && this.framePosition >= this.lastFrame) this.framePosition = 0;
+    this.onChange();
   }
 
-  seek(place: number): void {
-    this.place = Math.min(Math.max(place, 0), this.last);
-    this.changed();
+  seek(framePosition: number): void {
+    this.framePosition = Math.min(Math.max(framePosition, 0), this.lastFrame);
+    this.onChange();
   }
 
-  /** One frame on or back. */
+  /** Pause and move by a number of frames. */
   step(frames: number): void {
     this.playing = false;
-    this.seek(Math.round(this.place) + frames);
+    this.seek(Math.round(this.framePosition) + frames);
   }
 
-  /** After `elapsed` seconds. */
+  /** Advance the playback by `elapsed` seconds. */
   advance(elapsed: number): void {
     if (!this.playing) return;
-    // A tab that slept goes on where it was.
-    this.place += Math.min(elapsed, 0.25) * this.rate * this.speed;
-    if (this.place >= this.last) {
-      if (this.loop && this.last > 0) this.place %= this.last;
+    // Limit the step, so that a tab that was in the background continues where it stopped.
+    this.framePosition += Math.min(elapsed, 0.25) * this.rate * this.speed;
+    if (this.framePosition >= this.lastFrame) {
+      if (this.loop && this.lastFrame > 0) this.framePosition %= this.lastFrame;
       else {
-        this.place = this.last;
+        this.framePosition = this.lastFrame;
         this.playing = false;
       }
     }
-    this.changed();
+    this.onChange();
   }
 }

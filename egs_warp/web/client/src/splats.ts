@@ -1,26 +1,27 @@
-// Splats that the cage carries in a shader: means, F Sigma F^T and the turned colour bands (Eq. 14, 15), drawn by
-// Spark.
+// Splats that a shader deforms with the cage and Spark draws: means, covariances F Sigma F^T and rotated colour bands
+// (Eq. 14, 15).
 
 import { dyno, SplatGenerator } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { floatTexture, TEXTURE_WIDTH } from "./cage";
 import { bytesOf, floatsOf, indicesOf, type Header } from "./packets";
-import { CARRY_GLSL } from "./carry.glsl";
+import { DEFORM_GLSL } from "./deform.glsl";
 
-export interface CarriedSplats {
+export interface DeformedSplats {
   generator: SplatGenerator;
-  /** Told that the cage has moved. */
-  moved(): void;
+  /** Regenerate the splats after the cage has changed. */
+  update(): void;
 }
 
-/** The splats `name` of a run, carried by the maps in `cage`; `still` ones all lie in its first tetrahedron. On those
- * at the height of the ground a `shadow` may fall. */
-export function carriedSplats(
+/** Create the splats `name` of a run, deformed by the maps in `cage`.
+ *
+ * Static splats all use the first tetrahedron. A `shadow` darkens the splats near the ground. */
+export function deformedSplats(
   header: Header,
   name: "splats" | "scene",
   cage: THREE.DataTexture,
-  { still, shadow }: { still: boolean; shadow?: { texture: THREE.Texture; place: THREE.Vector4 } },
-): CarriedSplats {
+  { isStatic, shadow }: { isStatic: boolean; shadow?: { texture: THREE.Texture; region: THREE.Vector4 } },
+): DeformedSplats {
   const means = floatsOf(header, `${name}_means`);
   const count = means.length / 3;
   const degree = header.facts.degree[name];
@@ -29,8 +30,8 @@ export function carriedSplats(
   const scales = floatsOf(header, `${name}_scales`);
   const opacities = floatsOf(header, `${name}_opacities`);
   const colours = floatsOf(header, `${name}_colours`);
-  const codes = still ? undefined : indicesOf(header, "mean_tets");
-  const armRows = still ? new Float32Array(0) : floatsOf(header, "arms");
+  const codes = isStatic ? undefined : indicesOf(header, "mean_tets");
+  const armRows = isStatic ? new Float32Array(0) : floatsOf(header, "arms");
   let arm = 0;
   for (let i = 0; i < count; i++) {
     const code = codes?.[i] ?? 0;
@@ -53,15 +54,15 @@ export function carriedSplats(
     bands: dyno.dynoSampler2D(bandTexture(bytesOf(header, `${name}_bands`), count, degree), "egsBands"),
     bandScales: dyno.dynoMat4(new THREE.Matrix4().fromArray(bandScales), "egsBandScales"),
     cage: dyno.dynoSampler2D(cage, "egsCage"),
-    // Without a shadow its place has no size, and any texture will do.
+    // Without a shadow the region has size 0 and the texture is not sampled.
     shade: dyno.dynoSampler2D(shadow?.texture ?? cage, "egsShade"),
-    shadePlace: dyno.dynoVec4(shadow?.place ?? new THREE.Vector4(), "egsShadePlace"),
+    shadeRegion: dyno.dynoVec4(shadow?.region ?? new THREE.Vector4(), "egsShadeRegion"),
     eye: dyno.dynoVec3(eye, "egsEye"),
     degree: dyno.dynoConst("int", degree),
   };
   const covGenerator = dyno.dynoBlock({ index: "int" }, { covsplat: dyno.CovSplat }, ({ index }) => {
     if (index === undefined) throw new Error("Spark gave no index");
-    const carry = new dyno.Dyno({
+    const deform = new dyno.Dyno({
       inTypes: {
         index: "int",
         splats: "sampler2D",
@@ -70,19 +71,19 @@ export function carriedSplats(
         bandScales: "mat4",
         cage: "sampler2D",
         shade: "sampler2D",
-        shadePlace: "vec4",
+        shadeRegion: "vec4",
         eye: "vec3",
         degree: "int",
       },
       outTypes: { covsplat: dyno.CovSplat },
       inputs: { index, ...uniforms },
-      globals: () => [dyno.defineGsplat, dyno.defineCovSplat, CARRY_GLSL],
+      globals: () => [dyno.defineGsplat, dyno.defineCovSplat, DEFORM_GLSL],
       statements: ({ inputs: i, outputs }) => [
-        `${outputs.covsplat} = egsCarried(${i.index}, ${i.splats}, ${i.arms}, ${i.bands}, ${i.bandScales}, ` +
-          `${i.cage}, ${i.shade}, ${i.shadePlace}, ${i.eye}, ${i.degree});`,
+        `${outputs.covsplat} = egsDeformed(${i.index}, ${i.splats}, ${i.arms}, ${i.bands}, ${i.bandScales}, ` +
+          `${i.cage}, ${i.shade}, ${i.shadeRegion}, ${i.eye}, ${i.degree});`,
       ],
     });
-    return { covsplat: carry.outputs.covsplat };
+    return { covsplat: deform.outputs.covsplat };
   });
   const generator = new SplatGenerator({
     numSplats: count,
@@ -92,10 +93,10 @@ export function carriedSplats(
     },
   });
   generator.frustumCulled = false;
-  return { generator, moved: () => generator.updateVersion() };
+  return { generator, update: () => generator.updateVersion() };
 }
 
-/** One texel of three bytes for each coefficient above band 0. */
+/** Create a texture with one RGB texel per coefficient above band 0. */
 function bandTexture(bands: Uint8Array, count: number, degree: number): THREE.DataTexture {
   const each = (degree + 1) ** 2 - 1;
   const texels = Math.max(1, each * count);

@@ -1,25 +1,25 @@
-// What the user's hand and the creature's aim look like: where it goes, which way it faces, what pulls at it.
+// Markers of user interaction: the goal on the ground, the facing direction, the pulling spring and the push ring.
 
 import * as THREE from "three";
-import { Strokes } from "./strokes";
+import { WideLines } from "./wide_lines";
 
-/** As the shader writes it. */
+/** Converted, because the shader writes sRGB values. */
 const ACCENT = new THREE.Color(0x7fd1b8).convertLinearToSRGB();
 const PULL = new THREE.Color(0xffc24a).toArray();
 
-export class Marks {
+export class Gizmos {
   readonly group = new THREE.Group();
   private readonly goal: THREE.Mesh;
   private readonly facing: THREE.Mesh;
-  private readonly spring = new Strokes(2.5, 0.95, 16);
-  private readonly ring = new Strokes(3.5, 0.9, 16);
+  private readonly spring = new WideLines(2.5, 0.95, 16);
+  private readonly ring = new WideLines(3.5, 0.9, 16);
 
   constructor(private readonly height: number) {
     const square = new THREE.PlaneGeometry(0.32 * height, 0.32 * height);
-    this.goal = new THREE.Mesh(square, drawn("abs(length(p) - 0.72) - 0.16", 0.85));
-    // An arrow head: within a triangle, outside of the notch behind.
+    this.goal = new THREE.Mesh(square, groundMaterial("abs(length(p) - 0.72) - 0.16", 0.85));
+    // Distance field of an arrow head: a triangle with a notch at the back.
     const head = "max(0.45 * (p.x - 0.8) + 0.89 * abs(p.y), 0.85 * (-0.2 - 0.625 * abs(p.y) - p.x))";
-    this.facing = new THREE.Mesh(new THREE.PlaneGeometry(0.26 * height, 0.26 * height), drawn(head, 0.75));
+    this.facing = new THREE.Mesh(new THREE.PlaneGeometry(0.26 * height, 0.26 * height), groundMaterial(head, 0.75));
     for (const mark of [this.goal, this.facing]) {
       mark.renderOrder = -5;
       mark.position.z = 0.002 * height;
@@ -34,50 +34,51 @@ export class Marks {
     if (goal !== null) this.goal.position.set(goal[0], goal[1], this.goal.position.z);
   }
 
-  /** An arrow on the ground ahead of `middle`. */
-  showFacing(middle: THREE.Vector3, [x, y]: [number, number], reach: number): void {
+  /** Show an arrow on the ground at distance `reach` from `centre`. */
+  showFacing(centre: THREE.Vector3, [x, y]: [number, number], reach: number): void {
     this.facing.visible = true;
-    this.facing.position.set(middle.x + reach * x, middle.y + reach * y, this.facing.position.z);
+    this.facing.position.set(centre.x + reach * x, centre.y + reach * y, this.facing.position.z);
     this.facing.rotation.z = Math.atan2(y, x);
   }
 
-  /** From where the body is held to the hand; without both, none. */
-  showSpring(held?: THREE.Vector3, hand?: THREE.Vector3): void {
-    if (held === undefined || hand === undefined) {
+  /** Show the spring from the grabbed point to the pointer's target, or hide it. */
+  showSpring(grabbed?: THREE.Vector3, target?: THREE.Vector3): void {
+    if (grabbed === undefined || target === undefined) {
       this.spring.set([], []);
       return;
     }
-    const ring = circle(hand, 0.015 * this.height, new THREE.Vector3(1, 0, 0), new THREE.Vector3(0, 1, 0));
-    const points = [...held.toArray(), ...hand.toArray(), ...ring];
+    const ring = circle(target, 0.015 * this.height, new THREE.Vector3(1, 0, 0), new THREE.Vector3(0, 1, 0));
+    const points = [...grabbed.toArray(), ...target.toArray(), ...ring];
     this.spring.set(points, points.map((_, k) => PULL[k % 3]!));
   }
 
-  /** A ring that grows around what was hit, `age` from 0 to 1, as `camera` sees it round; without them, none. */
-  showPush(middle?: THREE.Vector3, age = 0, camera?: THREE.Camera): void {
-    if (middle === undefined || camera === undefined) {
+  /** Show a ring facing `camera` that grows around the pushed point as `age` goes from 0 to 1, or hide it. */
+  showPush(centre?: THREE.Vector3, age = 0, camera?: THREE.Camera): void {
+    if (centre === undefined || camera === undefined) {
       this.ring.set([], []);
       return;
     }
     const across = new THREE.Vector3(1, 0, 0).applyQuaternion(camera.quaternion);
     const up = new THREE.Vector3(0, 1, 0).applyQuaternion(camera.quaternion);
-    const points = circle(middle, (0.03 + 0.12 * Math.sqrt(age)) * this.height, across, up);
+    const points = circle(centre, (0.03 + 0.12 * Math.sqrt(age)) * this.height, across, up);
     this.ring.set(points, points.map((_, k) => PULL[k % 3]!));
   }
 }
 
-/** Segments of a circle whose plane has two unit vectors. */
-function circle(middle: THREE.Vector3, radius: number, first: THREE.Vector3, second: THREE.Vector3): number[] {
+/** Return the line segments of a circle in the plane of two unit vectors. */
+function circle(centre: THREE.Vector3, radius: number, first: THREE.Vector3, second: THREE.Vector3): number[] {
   const at = (k: number): number[] => {
     const angle = (Math.PI * k) / 12;
-    const point = middle.clone().addScaledVector(first, radius * Math.cos(angle));
+    const point = centre.clone().addScaledVector(first, radius * Math.cos(angle));
     return point.addScaledVector(second, radius * Math.sin(angle)).toArray();
   };
   return Array.from({ length: 24 }, (_, k) => [...at(k), ...at(k + 1)]).flat();
 }
 
-/** Flat on the ground, smooth at its edge however few pixels there are: `distance` of p, each side of the square at 1,
- * is negative inside. */
-function drawn(distance: string, opacity: number): THREE.ShaderMaterial {
+/** Create an antialiased material from a signed distance field.
+ *
+ * `distance` is a GLSL expression of p, with p in [-1, 1]^2 on the square; it is negative inside the shape. */
+function groundMaterial(distance: string, opacity: number): THREE.ShaderMaterial {
   return new THREE.ShaderMaterial({
     uniforms: { colour: { value: ACCENT } },
     vertexShader: `varying vec2 p;

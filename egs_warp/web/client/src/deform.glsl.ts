@@ -1,9 +1,9 @@
-// The deformer of egs_warp/kernels/deformation, for one splat: the same numbers, without the SVD that a covariance does
-// not need.
+// Deformation of one splat in the shader. It gives the same values as egs_warp/kernels/deformation, but needs no SVD,
+// because it returns a covariance.
 
 import { TEXTURE_WIDTH } from "./cage";
 
-export const CARRY_GLSL = /* glsl */ `
+export const DEFORM_GLSL = /* glsl */ `
 vec4 egsTexel(sampler2D map, int k) { return texelFetch(map, ivec2(k % ${TEXTURE_WIDTH}, k / ${TEXTURE_WIDTH}), 0); }
 
 struct EgsAffine { mat3 gradient; vec3 start; vec3 moved; };
@@ -30,21 +30,21 @@ mat3 egsPolar(mat3 f) {
   return f;
 }
 
-vec3 egsArm(sampler2D cage, int tet, float share, int own, vec3 mean, vec3 movedMean, vec3 axis, vec3 through) {
-  if (tet == own) return through;
+vec3 egsArm(sampler2D cage, int tet, float share, int own, vec3 mean, vec3 movedMean, vec3 axis, vec3 ownAxis) {
+  if (tet == own) return ownAxis;
   EgsAffine end = egsAffine(cage, tet);
-  vec3 there = end.gradient * axis;
-  if (share >= 0.0) return share * through + (1.0 - share) * there;
-  vec3 result = there - (egsImage(end, mean) - movedMean) / share;
-  float limit = 1.5 * max(length(through), length(there)), reach = length(result);
-  return reach > limit ? result * (limit / reach) : result;
+  vec3 endAxis = end.gradient * axis;
+  if (share >= 0.0) return share * ownAxis + (1.0 - share) * endAxis;
+  vec3 result = endAxis - (egsImage(end, mean) - movedMean) / share;
+  float limit = 1.5 * max(length(ownAxis), length(endAxis)), size = length(result);
+  return size > limit ? result * (limit / size) : result;
 }
 
 vec3 egsBand(sampler2D bands, mat4 scales, int at, int k) {
   return (egsTexel(bands, at + k).rgb * 255.0 - 128.0) / 127.0 * scales[k / 4][k % 4];
 }
 
-/* Bands 1 to 3 towards the unit direction d, INRIA's signs. */
+/* Colour of the spherical harmonics bands 1 to 3 in the unit direction d, with the signs of INRIA's convention. */
 vec3 egsColour(sampler2D bands, mat4 scales, int index, int degree, vec3 d) {
   if (degree == 0) return vec3(0.0);
   int at = index * ((degree + 1) * (degree + 1) - 1);
@@ -66,11 +66,11 @@ vec3 egsColour(sampler2D bands, mat4 scales, int index, int degree, vec3 d) {
   return c;
 }
 
-/* Light that the creature leaves to a splat of the ground at p; place: middle of the shadow, half its side,
-   body height. */
-float egsLight(sampler2D shade, vec4 place, vec3 p) {
-  vec2 uv = 0.5 + 0.5 * (p.xy - place.xy) / place.z;
-  float near = 1.0 - smoothstep(0.02, 0.08, abs(p.z) / place.w);
+/* Fraction of light that reaches a background splat at p under the creature's shadow. region: centre of the shadow map
+   (x, y), half its side length, body height. */
+float egsLight(sampler2D shade, vec4 region, vec3 p) {
+  vec2 uv = 0.5 + 0.5 * (p.xy - region.xy) / region.z;
+  float near = 1.0 - smoothstep(0.02, 0.08, abs(p.z) / region.w);
   if (near <= 0.0 || any(greaterThan(abs(uv - 0.5), vec2(0.5)))) return 1.0;
   float dark = 0.0;
   for (int k = 0; k < 12; k++) {
@@ -80,9 +80,9 @@ float egsLight(sampler2D shade, vec4 place, vec3 p) {
   return 1.0 - 0.05 * dark * near;
 }
 
-CovSplat egsCarried(
+CovSplat egsDeformed(
     int index, sampler2D splats, sampler2D arms, sampler2D bands, mat4 scales, sampler2D cage, sampler2D shade,
-    vec4 shadePlace, vec3 eye, int degree) {
+    vec4 shadeRegion, vec3 eye, int degree) {
   vec4 a = egsTexel(splats, 4 * index), q = egsTexel(splats, 4 * index + 1);
   vec4 s = egsTexel(splats, 4 * index + 2), colour = egsTexel(splats, 4 * index + 3);
   vec3 mean = a.xyz;
@@ -95,20 +95,20 @@ CovSplat egsCarried(
   if (straddles) {
     int arm = 4 * int(colour.w);
     e = egsTexel(arms, arm); f = egsTexel(arms, arm + 1); g = egsTexel(arms, arm + 2); h = egsTexel(arms, arm + 3);
-    /* Far outside: only turned and moved (RIGID). */
+    /* Far outside the cage: rotation and translation only (RIGID). */
     if (f.z == 3.0) { around.gradient = egsPolar(around.gradient); straddles = false; }
   }
   vec3 moved = egsImage(around, mean);
-  mat3 through = around.gradient * axes;
-  mat3 stretched = through;
+  mat3 ownAxes = around.gradient * axes;
+  mat3 stretched = ownAxes;
   if (straddles) {
     mat3 plus, minus;
-    plus[0] = egsArm(cage, int(e.x), f.z, tet, mean, moved, axes[0], through[0]);
-    plus[1] = egsArm(cage, int(e.y), f.w, tet, mean, moved, axes[1], through[1]);
-    plus[2] = egsArm(cage, int(e.z), g.x, tet, mean, moved, axes[2], through[2]);
-    minus[0] = -egsArm(cage, int(e.w), g.y, tet, mean, moved, -axes[0], -through[0]);
-    minus[1] = -egsArm(cage, int(f.x), g.z, tet, mean, moved, -axes[1], -through[1]);
-    minus[2] = -egsArm(cage, int(f.y), g.w, tet, mean, moved, -axes[2], -through[2]);
+    plus[0] = egsArm(cage, int(e.x), f.z, tet, mean, moved, axes[0], ownAxes[0]);
+    plus[1] = egsArm(cage, int(e.y), f.w, tet, mean, moved, axes[1], ownAxes[1]);
+    plus[2] = egsArm(cage, int(e.z), g.x, tet, mean, moved, axes[2], ownAxes[2]);
+    minus[0] = -egsArm(cage, int(e.w), g.y, tet, mean, moved, -axes[0], -ownAxes[0]);
+    minus[1] = -egsArm(cage, int(f.x), g.z, tet, mean, moved, -axes[1], -ownAxes[1]);
+    minus[2] = -egsArm(cage, int(f.y), g.w, tet, mean, moved, -axes[2], -ownAxes[2]);
     moved += (plus - minus) * h.xyz;
     mat3 average = 0.5 * (plus + minus);
     if (determinant(average) > 0.0) stretched = average;
@@ -122,7 +122,7 @@ CovSplat egsCarried(
   result.flags = GSPLAT_FLAG_ACTIVE;
   result.index = index;
   result.rgba = vec4(max(colour.rgb + egsColour(bands, scales, index, degree, direction), 0.0), s.w);
-  if (shadePlace.z > 0.0) result.rgba.rgb *= egsLight(shade, shadePlace, moved);
+  if (shadeRegion.z > 0.0) result.rgba.rgb *= egsLight(shade, shadeRegion, moved);
   result.xxyyzz = max(vec3(covariance[0][0], covariance[1][1], covariance[2][2]), 1e-16);
   result.xyxzyz = vec3(covariance[1][0], covariance[2][0], covariance[2][1]);
   return result;

@@ -1,39 +1,39 @@
-// One run on one canvas: splats, overlays, ground and camera.
+// Viewer of one run on one canvas: splats, overlays, ground and camera.
 
 import type { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
-import { Cage, stillCage } from "./cage";
-import { splatRenderer } from "./drawing";
+import { Cage, identityCage } from "./cage";
+import { splatRenderer } from "./splat_renderer";
 import { Ground } from "./ground";
 import { Overlays, type Layer } from "./overlays";
 import { floatsOf, indicesOf, type Frame } from "./packets";
-import type { FrameSource } from "./source";
-import { carriedSplats, type CarriedSplats } from "./splats";
+import type { FrameSource } from "./frame_source";
+import { deformedSplats, type DeformedSplats } from "./splats";
 
 export const BACKGROUND = 0x14161a;
 export type Preset = "film" | "front" | "side" | "top";
-export type Tick = Layer | "splats" | "scene" | "ground";
+export type LayerToggle = Layer | "splats" | "scene" | "ground";
 
-export class Stage {
+export class Viewer {
   readonly renderer: THREE.WebGLRenderer;
   readonly camera = new THREE.PerspectiveCamera();
   readonly controls: OrbitControls;
-  /** Whether the camera goes along with the centre of mass. */
+  /** True if the camera follows the centre of mass. */
   follow = false;
-  /** Share of the window's pixels that are drawn along each side; less where a machine is slow. */
-  private sharpness = 1;
+  /** Fraction of the canvas resolution along each side; reduced on slow machines. */
+  private resolution = 1;
   private readonly scene = new THREE.Scene();
   private readonly spark: SparkRenderer;
   private readonly cage: Cage;
-  private readonly splats: CarriedSplats;
-  private readonly still: CarriedSplats | undefined;
+  private readonly splats: DeformedSplats;
+  private readonly background: DeformedSplats | undefined;
   private readonly overlays: Overlays;
   private readonly ground: Ground;
   private readonly masses: Float32Array;
-  private readonly bounds: { middle: THREE.Vector3; size: number };
+  private readonly bounds: { centre: THREE.Vector3; size: number };
   private readonly positions: Float32Array;
-  private readonly followed = new THREE.Vector3();
+  private readonly currentCentre = new THREE.Vector3();
   private filmFov = 30;
   private dirty = true;
 
@@ -42,7 +42,7 @@ export class Stage {
     readonly source: FrameSource,
   ) {
     const { header } = source;
-    // Spark advises against multisampling: splats gain nothing by it.
+    // Spark advises against multisampling, which does not improve splats.
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
     this.renderer.setClearColor(BACKGROUND, 1);
     this.camera.up.set(0, 0, 1);
@@ -50,22 +50,22 @@ export class Stage {
     const rest = floatsOf(header, "rest");
     this.positions = new Float32Array(rest);
     this.cage = new Cage(rest, indicesOf(header, "tets"));
-    this.splats = carriedSplats(header, "splats", this.cage.texture, { still: false });
+    this.splats = deformedSplats(header, "splats", this.cage.texture, { isStatic: false });
     this.spark = splatRenderer(this.renderer, () => this.invalidate());
     this.scene.add(this.spark, this.splats.generator);
-    this.overlays = new Overlays(header, (frame) => this.centre(frame.positions));
+    this.overlays = new Overlays(header, (frame) => this.computeCentre(frame.positions));
     this.scene.add(this.overlays.group);
-    this.bounds = this.reach();
+    this.bounds = this.runBounds();
     const { height } = header.facts;
-    const reach = 3.5 * height + 1.5 * this.bounds.size;
-    this.ground = new Ground(indicesOf(header, "surface"), rest.length / 3, height, reach);
-    this.ground.centreOn(this.bounds.middle.x, this.bounds.middle.y);
+    const runBounds = 3.5 * height + 1.5 * this.bounds.size;
+    this.ground = new Ground(indicesOf(header, "surface"), rest.length / 3, height, runBounds);
+    this.ground.centreOn(this.bounds.centre.x, this.bounds.centre.y);
     if (header.arrays.has("scene_means")) {
       const { shadow } = this.ground;
-      this.still = carriedSplats(header, "scene", stillCage(), { still: true, shadow });
-      this.scene.add(this.still.generator);
+      this.background = deformedSplats(header, "scene", identityCage(), { isStatic: true, shadow });
+      this.scene.add(this.background.generator);
     }
-    this.ground.mesh.visible = this.still === undefined;
+    this.ground.mesh.visible = this.background === undefined;
     this.scene.add(this.ground.mesh);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.enableDamping = true;
@@ -77,73 +77,73 @@ export class Stage {
   }
 
   get hasScene(): boolean {
-    return this.still !== undefined;
+    return this.background !== undefined;
   }
 
   invalidate(): void {
     this.dirty = true;
   }
 
-  tick(layer: Tick, visible: boolean): void {
+  setLayerVisible(layer: LayerToggle, visible: boolean): void {
     if (layer === "splats") this.splats.generator.visible = visible;
     else if (layer === "ground") this.ground.mesh.visible = visible;
     else if (layer === "scene") {
-      if (this.still !== undefined) this.still.generator.visible = visible;
+      if (this.background !== undefined) this.background.generator.visible = visible;
     } else this.overlays.show(layer, visible);
     this.invalidate();
   }
 
-  /** The run at `place` frames; what lies between two of them is mixed. */
-  show(place: number): void {
+  /** Show the run at a fractional frame index; positions are interpolated linearly. */
+  show(framePosition: number): void {
     const { frames } = this.source;
-    const at = Math.min(place, frames.length - 1);
+    const at = Math.min(framePosition, frames.length - 1);
     const before = frames[Math.floor(at)] as Frame;
     const after = frames[Math.min(Math.floor(at) + 1, frames.length - 1)] as Frame;
-    const share = at - Math.floor(at);
+    const fraction = at - Math.floor(at);
     for (let k = 0; k < this.positions.length; k++) {
-      this.positions[k] = before.positions[k]! + share * (after.positions[k]! - before.positions[k]!);
+      this.positions[k] = before.positions[k]! + fraction * (after.positions[k]! - before.positions[k]!);
     }
-    this.cage.carry(this.positions);
-    this.splats.moved();
-    this.overlays.update(share < 0.5 ? before : after, this.positions, frames);
-    const middle = this.centre(this.positions);
+    this.cage.update(this.positions);
+    this.splats.update();
+    this.overlays.update(fraction < 0.5 ? before : after, this.positions, frames);
+    const centre = this.computeCentre(this.positions);
     if (this.follow) {
-      const moved = middle.clone().sub(this.followed);
+      const moved = centre.clone().sub(this.currentCentre);
       this.camera.position.add(moved);
       this.controls.target.add(moved);
     }
-    this.followed.copy(middle);
-    if (this.source.open) this.ground.centreOn(middle.x, middle.y);
-    this.ground.cast(this.renderer, this.positions, middle);
+    this.currentCentre.copy(centre);
+    if (this.source.isOpen) this.ground.centreOn(centre.x, centre.y);
+    this.ground.cast(this.renderer, this.positions, centre);
     this.invalidate();
   }
 
   preset(name: Preset): void {
     const { camera } = this.source.header.facts;
     this.filmFov = camera.fov;
-    const { middle, size } = this.bounds;
+    const { centre, size } = this.bounds;
     if (name === "film") {
       const eye = new THREE.Vector3(...camera.position);
       const forward = new THREE.Vector3(...camera.forward);
-      this.look(eye, eye.clone().addScaledVector(forward, Math.max(middle.clone().sub(eye).dot(forward), 1e-3)));
+      this.setCamera(eye, eye.clone().addScaledVector(forward, Math.max(centre.clone().sub(eye).dot(forward), 1e-3)));
     } else {
-      const ways = { front: [1, 0, 0.12], side: [0, -1, 0.12], top: [0, -1e-3, 1] } as const;
-      const way = new THREE.Vector3(...ways[name]).normalize();
+      const directions = { front: [1, 0, 0.12], side: [0, -1, 0.12], top: [0, -1e-3, 1] } as const;
+      const direction = new THREE.Vector3(...directions[name]).normalize();
       const distance = (0.62 * size) / Math.tan((Math.PI * camera.fov) / 360);
-      this.look(middle.clone().addScaledVector(way, distance), middle);
+      this.setCamera(centre.clone().addScaledVector(direction, distance), centre);
     }
     this.resize();
   }
 
-  look(eye: THREE.Vector3, target: THREE.Vector3): void {
+  setCamera(eye: THREE.Vector3, target: THREE.Vector3): void {
     this.camera.position.copy(eye);
     this.controls.target.copy(target);
     this.controls.update();
     this.invalidate();
   }
 
-  /** Another stage's camera. */
-  copyView(from: Stage): void {
+  /** Copy the camera of another viewer. */
+  copyCamera(from: Viewer): void {
     this.camera.position.copy(from.camera.position);
     this.controls.target.copy(from.controls.target);
     this.camera.lookAt(this.controls.target);
@@ -153,10 +153,10 @@ export class Stage {
   resize(): void {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (width === 0 || height === 0) return;
-    this.renderer.setPixelRatio(this.sharpness * Math.min(window.devicePixelRatio, 2));
+    this.renderer.setPixelRatio(this.resolution * Math.min(window.devicePixelRatio, 2));
     this.renderer.setSize(width, height, false);
     const aspect = width / height;
-    // A film is square: its sides stay within a window that is taller than wide.
+    // Films are square: in a window that is taller than wide, keep the horizontal field of view.
     const half = Math.tan((Math.PI * this.filmFov) / 360) / Math.min(aspect, 1);
     this.camera.fov = (360 / Math.PI) * Math.atan(half);
     this.camera.aspect = aspect;
@@ -167,38 +167,38 @@ export class Stage {
     this.invalidate();
   }
 
-  /** Draws fewer pixels, if there are not few already. */
-  coarsen(): void {
-    this.sharpen(Math.max(this.sharpness - 0.25, 0.5));
+  /** Reduce the resolution by a quarter, to no less than one half. */
+  reduceResolution(): void {
+    this.setResolution(Math.max(this.resolution - 0.25, 0.5));
   }
 
-  /** Draws so many of the window's pixels along each side. */
-  sharpen(share: number): void {
-    if (share === this.sharpness) return;
-    this.sharpness = share;
+  /** Set the fraction of the canvas resolution along each side. */
+  setResolution(fraction: number): void {
+    if (fraction === this.resolution) return;
+    this.resolution = fraction;
     this.resize();
   }
 
-  /** Whether the splats are still to be sorted for what was drawn last. */
+  /** True while the splats of the last image are being sorted. */
   get sorting(): boolean {
     return this.spark.sorting;
   }
 
-  /** Draws where something has changed; true if it did. */
+  /** Draw if something has changed; return true if so. */
   draw(): boolean {
     this.controls.update();
     if (!this.dirty) return false;
     this.renderer.render(this.scene, this.camera);
-    // Splats that were made anew for this picture are in it already; once they are sorted, Spark says so again.
+    // This image contains the regenerated splats; Spark calls invalidate() again once they are sorted.
     this.dirty = false;
     return true;
   }
 
-  /** Draws once the splats are sorted for this very view. */
-  async settle(): Promise<void> {
+  /** Draw after the splats are sorted for the current view. */
+  async drawSorted(): Promise<void> {
     for (let round = 0; round < 2; round++) {
       this.camera.updateMatrixWorld();
-      this.splats.moved();
+      this.splats.update();
       this.renderer.render(this.scene, this.camera);
       await this.spark.update({ scene: this.scene, camera: this.camera });
       while (this.spark.sorting) await new Promise((resolve) => setTimeout(resolve, 5));
@@ -207,71 +207,75 @@ export class Stage {
     this.renderer.render(this.scene, this.camera);
   }
 
-  /** A picture of what is seen now. */
-  picture(): Promise<Blob> {
-    // A canvas holds its picture until the browser has shown it.
+  /** Return a PNG image of the current view. */
+  screenshot(): Promise<Blob> {
+    // The canvas keeps its content only until the browser has presented it.
     this.renderer.render(this.scene, this.camera);
     return new Promise((resolve, reject) => {
-      this.canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error("no picture came"))), "image/png");
+      const finish = (blob: Blob | null): void => {
+        if (blob === null) reject(new Error("the browser returned no image"));
+        else resolve(blob);
+      };
+      this.canvas.toBlob(finish, "image/png");
     });
   }
 
-  /** Draws `mark`, too. */
-  add(mark: THREE.Object3D): void {
-    this.scene.add(mark);
+  /** Add an object to the scene. */
+  add(object: THREE.Object3D): void {
+    this.scene.add(object);
     this.invalidate();
   }
 
-  /** From the eye through a place of the window. */
+  /** Return the ray from the camera through a window position. */
   ray(clientX: number, clientY: number): THREE.Ray {
     const box = this.canvas.getBoundingClientRect();
     const [x, y] = [(clientX - box.left) / box.width, (clientY - box.top) / box.height];
-    const place = new THREE.Vector2(2 * x - 1, 1 - 2 * y);
-    const caster = new THREE.Raycaster();
+    const ndc = new THREE.Vector2(2 * x - 1, 1 - 2 * y);
+    const raycaster = new THREE.Raycaster();
     this.camera.updateMatrixWorld();
-    caster.setFromCamera(place, this.camera);
-    return caster.ray;
+    raycaster.setFromCamera(ndc, this.camera);
+    return raycaster.ray;
   }
 
-  /** What of the body is seen at a place of the window: the point, and the node next to it. */
+  /** Return the visible surface point at a window position and the nearest node, if the body is there. */
   pick(clientX: number, clientY: number): { node: number; point: THREE.Vector3 } | undefined {
     const ray = this.ray(clientX, clientY);
     const surface = indicesOf(this.source.header, "surface");
-    const corner = (k: number): THREE.Vector3 => this.node(surface[k] as number);
-    const found = { distance: Infinity, node: -1, point: new THREE.Vector3() };
+    const corner = (k: number): THREE.Vector3 => this.nodePosition(surface[k] as number);
+    const nearest = { distance: Infinity, node: -1, point: new THREE.Vector3() };
     const hit = new THREE.Vector3();
     for (let k = 0; k < surface.length; k += 3) {
       const corners = [corner(k), corner(k + 1), corner(k + 2)] as const;
       if (ray.intersectTriangle(...corners, false, hit) === null) continue;
       const distance = hit.distanceTo(ray.origin);
-      if (distance >= found.distance) continue;
-      const apart = corners.map((one) => one.distanceTo(hit));
-      found.distance = distance;
-      found.node = surface[k + apart.indexOf(Math.min(...apart))] as number;
-      found.point.copy(hit);
+      if (distance >= nearest.distance) continue;
+      const distances = corners.map((one) => one.distanceTo(hit));
+      nearest.distance = distance;
+      nearest.node = surface[k + distances.indexOf(Math.min(...distances))] as number;
+      nearest.point.copy(hit);
     }
-    return found.node < 0 ? undefined : { node: found.node, point: found.point };
+    return nearest.node < 0 ? undefined : { node: nearest.node, point: nearest.point };
   }
 
-  /** Where a place of the window lies on the ground, if it does and is not too far. */
-  onGround(clientX: number, clientY: number): THREE.Vector3 | undefined {
+  /** Return the ground point at a window position, unless there is none or it is too far away. */
+  groundPoint(clientX: number, clientY: number): THREE.Vector3 | undefined {
     const ground = new THREE.Plane(new THREE.Vector3(0, 0, 1), 0);
     const point = this.ray(clientX, clientY).intersectPlane(ground, new THREE.Vector3());
-    if (point === null || point.distanceTo(this.middle) > 40 * this.source.header.facts.height) return undefined;
+    if (point === null || point.distanceTo(this.centreOfMass) > 40 * this.source.header.facts.height) return undefined;
     return point;
   }
 
-  /** Where a node is now. */
-  node(index: number): THREE.Vector3 {
+  /** Return the current position of a node. */
+  nodePosition(index: number): THREE.Vector3 {
     return new THREE.Vector3().fromArray(this.positions, 3 * index);
   }
 
-  /** The centre of mass now. */
-  get middle(): THREE.Vector3 {
-    return this.followed.clone();
+  /** Current centre of mass. */
+  get centreOfMass(): THREE.Vector3 {
+    return this.currentCentre.clone();
   }
 
-  private centre(positions: Float32Array): THREE.Vector3 {
+  private computeCentre(positions: Float32Array): THREE.Vector3 {
     const sum = new THREE.Vector3();
     let total = 0;
     this.masses.forEach((mass, k) => {
@@ -283,13 +287,13 @@ export class Stage {
     return sum.divideScalar(total);
   }
 
-  private reach(): { middle: THREE.Vector3; size: number } {
+  private runBounds(): { centre: THREE.Vector3; size: number } {
     const box = new THREE.Box3();
     for (const frame of this.source.frames) {
       for (let k = 0; k < frame.positions.length; k += 3) {
         box.expandByPoint(new THREE.Vector3().fromArray(frame.positions, k));
       }
     }
-    return { middle: box.getCenter(new THREE.Vector3()), size: box.getSize(new THREE.Vector3()).length() };
+    return { centre: box.getCenter(new THREE.Vector3()), size: box.getSize(new THREE.Vector3()).length() };
   }
 }

@@ -1,17 +1,17 @@
-// What the body stands on: the sole of each foot, bright while the ground bears it.
+// Soles of the feet, bright while they carry load.
 
 import * as THREE from "three";
 import { indicesOf, type Frame, type Header } from "./packets";
-import { Strokes } from "./strokes";
+import { WideLines } from "./wide_lines";
 
-const BEARS = new THREE.Color(0x7fd1b8).toArray();
-const LIFTED = new THREE.Color(0x8a94a6).toArray();
-/** Body weights: less is no load. */
-const LEAST_LOAD = 1e-3;
+const LOADED_COLOUR = new THREE.Color(0x7fd1b8).toArray();
+const UNLOADED_COLOUR = new THREE.Color(0x8a94a6).toArray();
+/** Minimum load of a loaded foot, in body weights. */
+const MIN_LOAD = 1e-3;
 
-export class Feet {
+export class SoleOverlay {
   readonly group = new THREE.Group();
-  private readonly rim = new Strokes(2.5, 0.95, 13);
+  private readonly outline = new WideLines(2.5, 0.95, 13);
   private readonly geometry = new THREE.BufferGeometry();
   private readonly footFromNode: Int32Array;
   private readonly soles: number[] = [];
@@ -27,27 +27,27 @@ export class Feet {
     });
     this.load = Array.from({ length: Math.max(-1, ...this.footFromNode) + 1 }, () => 0);
     const faces = this.soleFaces();
-    this.edges = rimOf(faces);
+    this.edges = boundaryEdges(faces);
     this.colours = new Float32Array(3 * nodes);
     this.geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(3 * nodes), 3));
     this.geometry.setAttribute("color", new THREE.BufferAttribute(this.colours, 3));
     this.geometry.setIndex(faces);
-    const look = { vertexColors: true, transparent: true, opacity: 0.35, depthTest: false, side: THREE.DoubleSide };
-    const fill = new THREE.Mesh(this.geometry, new THREE.MeshBasicMaterial(look));
+    const material = { vertexColors: true, transparent: true, opacity: 0.35, depthTest: false, side: THREE.DoubleSide };
+    const fill = new THREE.Mesh(this.geometry, new THREE.MeshBasicMaterial(material));
     fill.frustumCulled = false;
     fill.renderOrder = 12;
-    this.group.add(fill, this.rim.object);
+    this.group.add(fill, this.outline.object);
   }
 
   update(frame: Frame, positions: Float32Array): void {
-    this.weigh(frame, positions);
+    this.computeLoads(frame, positions);
     for (const node of this.soles) {
-      const colour = (this.load[this.footFromNode[node]!] ?? 0) > LEAST_LOAD ? BEARS : LIFTED;
+      const colour = (this.load[this.footFromNode[node]!] ?? 0) > MIN_LOAD ? LOADED_COLOUR : UNLOADED_COLOUR;
       this.colours.set(colour, 3 * node);
     }
-    const place = this.geometry.getAttribute("position") as THREE.BufferAttribute;
-    (place.array as Float32Array).set(positions);
-    place.needsUpdate = this.geometry.getAttribute("color").needsUpdate = true;
+    const positionAttribute = this.geometry.getAttribute("position") as THREE.BufferAttribute;
+    (positionAttribute.array as Float32Array).set(positions);
+    positionAttribute.needsUpdate = this.geometry.getAttribute("color").needsUpdate = true;
     const lines: number[] = [];
     const tints: number[] = [];
     for (const edge of this.edges) {
@@ -56,26 +56,26 @@ export class Feet {
         tints.push(...this.colours.subarray(3 * node, 3 * node + 3));
       }
     }
-    this.rim.set(lines, tints);
+    this.outline.set(lines, tints);
   }
 
-  /** What each foot carries, in body weights: a contact belongs to the foot whose sole is next to it. */
-  private weigh(frame: Frame, positions: Float32Array): void {
+  /** Compute the load of each foot in body weights. A contact belongs to the foot with the nearest sole node. */
+  private computeLoads(frame: Frame, positions: Float32Array): void {
     this.load.fill(0);
     const { contacts } = frame;
     for (let k = 0; k < contacts.length; k += 9) {
-      let [least, foot] = [Infinity, -1];
+      let [minDistance, foot] = [Infinity, -1];
       for (const node of this.soles) {
-        const away = [0, 1, 2].map((axis) => positions[3 * node + axis]! - contacts[k + axis]!);
-        const distance = Math.hypot(...away);
-        if (distance < least) [least, foot] = [distance, this.footFromNode[node]!];
+        const offset = [0, 1, 2].map((axis) => positions[3 * node + axis]! - contacts[k + axis]!);
+        const distance = Math.hypot(...offset);
+        if (distance < minDistance) [minDistance, foot] = [distance, this.footFromNode[node]!];
       }
-      const pressed = [0, 1, 2].reduce((sum, axis) => sum + contacts[k + 3 + axis]! * contacts[k + 6 + axis]!, 0);
-      if (foot >= 0) this.load[foot]! += pressed / this.header.facts.weight;
+      const normalForce = [0, 1, 2].reduce((sum, axis) => sum + contacts[k + 3 + axis]! * contacts[k + 6 + axis]!, 0);
+      if (foot >= 0) this.load[foot]! += normalForce / this.header.facts.weight;
     }
   }
 
-  /** Triangles of the cage's surface, all of one sole. */
+  /** Return the surface triangles whose three nodes belong to one sole. */
   private soleFaces(): number[] {
     const surface = indicesOf(this.header, "surface");
     const faces: number[] = [];
@@ -88,17 +88,17 @@ export class Feet {
   }
 }
 
-/** Edges that belong to one of the `faces` alone. */
-function rimOf(faces: number[]): [number, number][] {
-  const seen = new Map<string, { edge: [number, number]; count: number }>();
+/** Return the edges that belong to exactly one of the `faces`. */
+function boundaryEdges(faces: number[]): [number, number][] {
+  const counts = new Map<string, { edge: [number, number]; count: number }>();
   for (let k = 0; k < faces.length; k += 3) {
     for (const [i, j] of [[0, 1], [1, 2], [2, 0]] as const) {
       const [a, b] = [faces[k + i]!, faces[k + j]!];
       const key = a < b ? `${a} ${b}` : `${b} ${a}`;
-      const entry = seen.get(key) ?? { edge: [a, b], count: 0 };
+      const entry = counts.get(key) ?? { edge: [a, b], count: 0 };
       entry.count++;
-      seen.set(key, entry);
+      counts.set(key, entry);
     }
   }
-  return [...seen.values()].filter(({ count }) => count === 1).map(({ edge }) => edge);
+  return [...counts.values()].filter(({ count }) => count === 1).map(({ edge }) => edge);
 }

@@ -1,23 +1,23 @@
-// How Spark draws its sorted splats here: with the cut, the low-pass and the edge of our own renderer
-// (docs/concepts/renderer.md), and many splats to an instance, since a small instance costs as much as a large one, in
-// software a hundred times more than what is in it.
+// Spark with shaders that use the opacity cut, low-pass filter and clipping of our own renderer
+// (docs/concepts/renderer.md). Many splats share one instance, because the cost of an instance hardly depends on its
+// size; in a software rasteriser an instance costs a hundred times more than one splat.
 
 import { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
 
-const BATCH = 1024;
+const QUADS_PER_INSTANCE = 1024;
 
-/** Quads, so many to an instance; Spark says how many splats are to be drawn. */
-class Batches extends THREE.InstancedBufferGeometry {
+/** Geometry with a fixed number of splats per instance. Spark sets the number of splats. */
+class QuadBatches extends THREE.InstancedBufferGeometry {
   constructor(count: { value: number }) {
     super();
-    const corners = new Float32Array(9 * BATCH);
-    for (let k = 0; k < BATCH; k++) {
+    const corners = new Float32Array(9 * QUADS_PER_INSTANCE);
+    for (let k = 0; k < QUADS_PER_INSTANCE; k++) {
       corners.set([0, 2, k, -Math.sqrt(3), -1, k, Math.sqrt(3), -1, k], 9 * k);
     }
     this.setAttribute("position", new THREE.BufferAttribute(corners, 3));
     Object.defineProperty(this, "instanceCount", {
-      get: () => Math.ceil(count.value / BATCH),
+      get: () => Math.ceil(count.value / QUADS_PER_INSTANCE),
       set: (splats: number) => {
         count.value = splats;
       },
@@ -39,12 +39,12 @@ uniform usampler2D ordering;
 uniform usampler2DArray extSplats;
 uniform usampler2DArray extSplats2;
 uniform int splatCount;
-out vec2 place;
+out vec2 offsetInSigmas;
 flat out vec4 rgba;
 
 void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
-  int rank = gl_InstanceID * ${BATCH} + int(position.z);
+  int rank = gl_InstanceID * ${QUADS_PER_INSTANCE} + int(position.z);
   if (rank >= splatCount) return;
   uint index = texelFetch(ordering, ivec2((rank >> 2) & 4095, rank >> 14), 0)[rank & 3];
   if (index == 0xffffffffu) return;
@@ -53,9 +53,9 @@ void main() {
   unpackSplatExtCov(texelFetch(extSplats, texel, 0), texelFetch(extSplats2, texel, 0), mean, rgba, squares, products);
   float cut = log(255.0 * rgba.a);
   vec3 p = renderToViewBasis * mean + renderToViewPos;
-  vec4 middle = projectionMatrix * vec4(p, 1.0);
-  if (!(cut > 0.0) || -middle.w > middle.z || middle.w <= 0.0) return;
-  // The Jacobian is taken no further out than 15 % beyond the picture, where it would grow without bound.
+  vec4 clip = projectionMatrix * vec4(p, 1.0);
+  if (!(cut > 0.0) || -clip.w > clip.z || clip.w <= 0.0) return;
+  // The Jacobian grows without bound outside the image, so it is evaluated at most 15 % of the image size beyond.
   vec2 focal = 0.5 * renderSize * vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
   vec2 slope = clamp(p.xy / -p.z, -0.65 * renderSize / focal, 0.65 * renderSize / focal);
   vec3 right = vec3(focal.x, 0.0, focal.x * slope.x) / -p.z;
@@ -72,20 +72,20 @@ void main() {
   vec2 axis = root < 1e-6 * mid ? vec2(1.0, 0.0) : normalize(along);
   float reach = sqrt(2.0 * cut);
   vec2 offset = reach * (position.x * sqrt(large) * axis + position.y * sqrt(small) * vec2(-axis.y, axis.x));
-  vec2 seen = abs(middle.xy) / middle.w * renderSize - renderSize;
-  if (max(seen.x, seen.y) > 2.0 * reach * sqrt(large)) return;
-  place = reach * position.xy;
-  gl_Position = vec4(middle.xy + 2.0 * offset / renderSize * middle.w, middle.zw);
+  vec2 outside = abs(clip.xy) / clip.w * renderSize - renderSize;
+  if (max(outside.x, outside.y) > 2.0 * reach * sqrt(large)) return;
+  offsetInSigmas = reach * position.xy;
+  gl_Position = vec4(clip.xy + 2.0 * offset / renderSize * clip.w, clip.zw);
 }`;
 
 const FRAGMENT = /* glsl */ `
 precision highp float;
-in vec2 place;
+in vec2 offsetInSigmas;
 flat in vec4 rgba;
 out vec4 colour;
 
 void main() {
-  float alpha = min(rgba.a * exp(-0.5 * dot(place, place)), 0.999);
+  float alpha = min(rgba.a * exp(-0.5 * dot(offsetInSigmas, offsetInSigmas)), 0.999);
   if (alpha < 1.0 / 255.0) discard;
   colour = vec4(rgba.rgb * alpha, alpha);
 }`;
@@ -104,6 +104,6 @@ export function splatRenderer(renderer: THREE.WebGLRenderer, onDirty: () => void
     onDirty,
   });
   spark.geometry.dispose();
-  spark.geometry = new Batches(splatCount);
+  spark.geometry = new QuadBatches(splatCount);
   return spark;
 }

@@ -1,32 +1,32 @@
-// Where frames come from: a file that holds them all, or a socket that sends them as they are made.
+// Sources of frames: a file with all frames of a run, or a socket that sends frames during the simulation.
 
 import { readFrame, readFrames, readHeader, type Frame, type Header, type Style } from "./packets";
 
 export interface FrameSource {
   readonly header: Header;
-  /** All frames known so far, in order; a socket's grow. */
+  /** All frames received so far, in order of time. */
   readonly frames: Frame[];
-  /** Whether more may come. */
-  readonly open: boolean;
-  /** Told of each frame that comes later. */
+  /** True if more frames may arrive. */
+  readonly isOpen: boolean;
+  /** Called for each frame that arrives later. */
   onFrame: (frame: Frame) => void;
 }
 
-/** A file of one run; `.open` never is. */
+/** Read a file of one complete run. */
 export function fromBytes(bytes: ArrayBuffer): FrameSource {
   const { header, end } = readHeader(bytes);
   const frames = readFrames(bytes, end);
   if (frames.length === 0) throw new Error("the run has no frames");
-  return { header, frames, open: false, onFrame: () => {} };
+  return { header, frames, isOpen: false, onFrame: () => {} };
 }
 
 export async function fromAddress(address: string): Promise<FrameSource> {
-  const answer = await fetch(address);
-  if (!answer.ok) throw new Error(`the run cannot be read (${answer.status}): is egs-warp view still running?`);
-  return fromBytes(await answer.arrayBuffer());
+  const response = await fetch(address);
+  if (!response.ok) throw new Error(`the run cannot be read (${response.status}): is egs-warp view still running?`);
+  return fromBytes(await response.arrayBuffer());
 }
 
-/** Runs that a page carries within itself: base64 of gzip. */
+/** Read a run embedded in the page as base64 of gzip. */
 export async function fromElement(element: HTMLElement): Promise<FrameSource> {
   const text = element.textContent?.trim() ?? "";
   const packed = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
@@ -34,7 +34,7 @@ export async function fromElement(element: HTMLElement): Promise<FrameSource> {
   return fromBytes(await new Response(unpacked).arrayBuffer());
 }
 
-/** What a session says beside its frames. */
+/** Messages of a session other than frames. */
 export type News =
   | {
       type: "state";
@@ -58,13 +58,13 @@ export type News =
   | { type: "busy"; on: boolean }
   | { type?: undefined; error: string };
 
-/** A session that lives: frames as they are made, news beside them, and a way to ask for something. */
+/** A live session: receives frames and messages, and sends commands. */
 export class LiveSource implements FrameSource {
   readonly frames: Frame[] = [];
-  open = true;
+  isOpen = true;
   onFrame: (frame: Frame) => void = () => {};
   onNews: (news: News) => void = () => {};
-  private early: News[] | undefined = [];
+  private pendingNews: News[] | undefined = [];
 
   constructor(
     readonly header: Header,
@@ -75,23 +75,23 @@ export class LiveSource implements FrameSource {
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
   }
 
-  /** News that came before anybody listened are told then. */
+  /** Set the message handler and pass it the messages that arrived earlier. */
   listen(onNews: (news: News) => void): void {
     this.onNews = onNews;
-    for (const news of this.early ?? []) onNews(news);
-    this.early = undefined;
+    for (const news of this.pendingNews ?? []) onNews(news);
+    this.pendingNews = undefined;
   }
 
-  take(data: ArrayBuffer | string): void {
+  receive(data: ArrayBuffer | string): void {
     if (typeof data === "string") {
       const news = JSON.parse(data) as News;
-      if (this.early !== undefined) this.early.push(news);
+      if (this.pendingNews !== undefined) this.pendingNews.push(news);
       this.onNews(news);
       return;
     }
     const frame = readFrame(data, 0);
     const last = this.frames.at(-1);
-    // Another beginning, or a moment that is known already.
+    // The session was reset, or the frame replaces one with the same time.
     if (last !== undefined && frame.time < last.time) this.frames.length = 0;
     else if (last !== undefined && frame.time === last.time) this.frames.pop();
     this.frames.push(frame);
@@ -99,7 +99,7 @@ export class LiveSource implements FrameSource {
   }
 }
 
-/** A socket: the header comes first, then frames and news. A lost connection is taken up again. */
+/** Connect to a session, and reconnect after a lost connection. The header comes first, then frames and messages. */
 export function fromSocket(address: string, onState: (lost: string | undefined) => void): Promise<LiveSource> {
   return new Promise((resolve, reject) => {
     let source: LiveSource | undefined;
@@ -111,19 +111,19 @@ export function fromSocket(address: string, onState: (lost: string | undefined) 
         if (first) {
           first = false;
           const { header } = readHeader(data as ArrayBuffer);
-          // After a lost connection the same session goes on; another one has another creature.
+          // Continue after a reconnection to the same session; reload if it is another one.
           if (source === undefined) source = new LiveSource(header, socket);
           else if (source.header.facts.session !== header.facts.session) location.reload();
           else source.socket = socket;
           onState(undefined);
           return;
         }
-        source?.take(data);
+        source?.receive(data);
         if (source?.frames.length === 1) resolve(source);
       };
       socket.onclose = ({ code, reason }) => {
         if (source === undefined) reject(new Error(reason || `no connection (${code})`));
-        else if (code === 1000) source.open = false;
+        else if (code === 1000) source.isOpen = false;
         else {
           onState(reason || "connection lost, trying again");
           setTimeout(connect, 500);

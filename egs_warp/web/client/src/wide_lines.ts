@@ -1,11 +1,11 @@
-// Lines of a width in pixels that change with every frame.
+// Lines with a width in pixels that may change every frame.
 
 import * as THREE from "three";
 import { LineMaterial } from "three/examples/jsm/lines/LineMaterial.js";
 import { LineSegments2 } from "three/examples/jsm/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/examples/jsm/lines/LineSegmentsGeometry.js";
 
-export class Strokes {
+export class WideLines {
   readonly object: LineSegments2;
   private readonly material: LineMaterial;
   private geometry = new LineSegmentsGeometry();
@@ -26,7 +26,7 @@ export class Strokes {
     this.object.renderOrder = order;
   }
 
-  /** Segments of six coordinates, with six numbers of colour each. */
+  /** Set the segments: six coordinates and six colour values each. */
   set(positions: ArrayLike<number>, colours: ArrayLike<number>): void {
     if (positions.length > this.positions.length) {
       this.geometry.dispose();
@@ -39,7 +39,7 @@ export class Strokes {
     }
     this.geometry.instanceCount = positions.length / 6;
     if (positions.length === 0) return;
-    // setPositions keeps the array that it is given.
+    // setPositions stores a reference to its array.
     write(this.geometry.getAttribute("instanceStart"), positions);
     write(this.geometry.getAttribute("instanceColorStart"), colours);
   }

@@ -1,17 +1,17 @@
-// Small curves that move with the time line.
+// Small charts of the audit's curves with a marker at the current frame.
 
 import { element } from "./dom";
-import type { FrameSource } from "./source";
+import type { FrameSource } from "./frame_source";
 
 const COLOURS = ["#d9dee8", "#ffca61", "#7fd1b8", "#5cadff", "#ff8f73"];
 
-export class Curves {
+export class Charts {
   readonly panel = element("section", { class: "curves", "aria-label": "Curves of the audit" });
   private readonly rows: { canvas: HTMLCanvasElement; value: HTMLElement }[] = [];
 
   constructor(
     private readonly source: FrameSource,
-    seek: (place: number) => void,
+    seek: (framePosition: number) => void,
   ) {
     for (const { title, unit } of source.header.facts.curves) {
       const canvas = element("canvas", { class: "curve" });
@@ -32,25 +32,25 @@ export class Curves {
     }
   }
 
-  draw(place: number): void {
+  draw(framePosition: number): void {
     if (this.panel.hidden) return;
     const { frames } = this.source;
-    const now = frames[Math.min(Math.round(place), frames.length - 1)];
+    const now = frames[Math.min(Math.round(framePosition), frames.length - 1)];
     this.rows.forEach(({ canvas, value }, k) => {
       const values = frames.map((frame) => frame.curves[k] ?? 0);
-      value.textContent = said(now?.curves[k] ?? 0);
-      plot(canvas, values, place / Math.max(frames.length - 1, 1), COLOURS[k % COLOURS.length]!);
+      value.textContent = formatted(now?.curves[k] ?? 0);
+      plot(canvas, values, framePosition / Math.max(frames.length - 1, 1), COLOURS[k % COLOURS.length]!);
     });
   }
 }
 
-function said(value: number): string {
+function formatted(value: number): string {
   const size = Math.abs(value);
   if (size !== 0 && size < 1e-3) return value.toExponential(0);
   return value.toFixed(size < 10 ? 2 : 0).replace(/^-(0\.00)$/, "$1");
 }
 
-function plot(canvas: HTMLCanvasElement, values: number[], share: number, colour: string): void {
+function plot(canvas: HTMLCanvasElement, values: number[], fraction: number, colour: string): void {
   const ratio = Math.min(window.devicePixelRatio, 2);
   const [width, height] = [canvas.clientWidth * ratio, canvas.clientHeight * ratio];
   if (width === 0) return;
@@ -81,10 +81,10 @@ function plot(canvas: HTMLCanvasElement, values: number[], share: number, colour
   context.globalAlpha = 1;
   context.save();
   context.beginPath();
-  context.rect(0, 0, share * width, height);
+  context.rect(0, 0, fraction * width, height);
   context.clip();
   trace();
   context.restore();
   context.fillStyle = colour;
-  context.fillRect(share * width - 0.5 * ratio, 0, ratio, height);
+  context.fillRect(fraction * width - 0.5 * ratio, 0, ratio, height);
 }

@@ -1,0 +1,59 @@
+// Pushes away from the camera along the ground, on the whole creature or around the height of a clicked point.
+
+import * as THREE from "three";
+import type { Gizmos } from "./gizmos";
+import { floatsOf } from "./packets";
+import type { LiveSource } from "./frame_source";
+import type { Viewer } from "./viewer";
+
+/** Time for which the ring is shown, s. */
+const RING_TIME = 0.35;
+
+export class PushTool {
+  /** Impulse in m sqrt(g H). */
+  strength = 0.15;
+  private readonly rest: Float32Array;
+  private lastPush: { where: () => THREE.Vector3; since: number } | undefined;
+
+  constructor(
+    private readonly viewer: Viewer,
+    private readonly source: LiveSource,
+    private readonly marks: Gizmos,
+  ) {
+    this.rest = floatsOf(source.header, "rest");
+  }
+
+  /** Push around the height of `node` in the rest pose, or the whole creature if there is none. */
+  push(node?: number): void {
+    const { x, y } = this.pushDirection().multiplyScalar(this.strength);
+    const height = node === undefined ? {} : { height: this.heightOf(node) };
+    this.source.send({ type: "push", x, y, z: 0, ...height });
+    const where = () => (node === undefined ? this.viewer.centreOfMass : this.viewer.nodePosition(node));
+    this.lastPush = { where, since: performance.now() / 1000 };
+  }
+
+  /** Animate the ring and remove it at the end. */
+  tick(): void {
+    if (this.lastPush === undefined) return;
+    const age = (performance.now() / 1000 - this.lastPush.since) / RING_TIME;
+    if (age < 1) this.marks.showPush(this.lastPush.where(), age, this.viewer.camera);
+    else {
+      this.lastPush = undefined;
+      this.marks.showPush();
+    }
+    this.viewer.invalidate();
+  }
+
+  /** Return the camera's horizontal viewing direction; from straight above, the up direction of the image. */
+  private pushDirection(): THREE.Vector3 {
+    const { camera } = this.viewer;
+    const flat = (direction: THREE.Vector3): THREE.Vector3 => direction.setZ(0);
+    const ahead = flat(camera.getWorldDirection(new THREE.Vector3()));
+    if (ahead.length() > 0.05) return ahead.normalize();
+    return flat(new THREE.Vector3(0, 1, 0).applyQuaternion(camera.quaternion)).normalize();
+  }
+
+  private heightOf(node: number): number {
+    return Math.min(Math.max(this.rest[3 * node + 2]! / this.source.header.facts.height, 0), 1);
+  }
+}

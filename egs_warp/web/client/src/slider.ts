@@ -1,0 +1,43 @@
+// A slider with its name and value.
+
+import { element } from "./dom";
+
+export interface Slider {
+  element: HTMLElement;
+  show(value: number): void;
+}
+
+/** Create a labelled slider; `onChange` is called when the user releases it. */
+export function createSlider(
+  title: string,
+  [min, max]: [number, number],
+  step: number | "any",
+  format: (value: number) => string,
+  onChange: (value: number) => void,
+): Slider {
+  const range = { min: String(min), max: String(max), step: String(step) };
+  const input = element("input", { type: "range", class: "line", ...range, "aria-label": title });
+  const value = element("output", { class: "value" });
+  const label = (): void => {
+    value.textContent = format(Number(input.value));
+    input.style.setProperty("--done", `${(100 * (Number(input.value) - min)) / (max - min)}%`);
+  };
+  let isDragging = false;
+  input.addEventListener("input", () => {
+    isDragging = true;
+    label();
+  });
+  input.addEventListener("change", () => {
+    isDragging = false;
+    onChange(Number(input.value));
+    input.blur();
+  });
+  return {
+    element: element("label", { class: "slide" }, element("span", {}, title), value, input),
+    show: (newValue) => {
+      if (isDragging) return;
+      input.value = String(newValue);
+      label();
+    },
+  };
+}
