@@ -49,10 +49,13 @@ coverage: setup
 	$(PYTEST) -m "not (slow or data or example or browser)" $(COVERED:%=tests/%) tests/test_extremes.py tests/test_faults.py \
 		$(COVERED:%=--cov=egs_warp/%) --cov-branch --cov-report=term:skip-covered --cov-fail-under=$(FLOOR)
 
-# Damaged files for every reader; Atheris drives them where it installs. What breaks a reader is kept in tests/corpus.
+# Random search; make test runs a fixed set of examples. First the property tests with ten times as many examples, which
+# takes about ten minutes on two cores: each failing example is printed as an @example line to add to its test. Then
+# damaged files for every reader, driven by Atheris where it installs: files that break a reader go to tests/corpus.
 fuzz: setup
 	-$(PIP) -e ".[fuzz]"
-	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --minutes $(MINUTES)
+	status=0; HYPOTHESIS_PROFILE=fuzz $(PYTEST) -m "hypothesis and not (slow or data or example or browser)" || status=1; \
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --minutes $(MINUTES) || status=1; exit $$status
 
 # Small changes of the code that a room's fast tests must notice; goes on where it stopped. ROOMS and COUNT say how many.
 mutation: setup

@@ -25,6 +25,7 @@ from egs_warp.meshing.cage import Cage, CageMethod, build_cage
 from egs_warp.meshing.occupancy import solid_from_gaussians
 from egs_warp.meshing.stuffing import stuff
 from egs_warp.segmentation.base_plane import find_base_plane
+from tests.support.properties import examples
 
 _UP = np.array([0.0, 0.0, 1.0])
 _FLOOR = Plane(_UP, 0.0)
@@ -223,7 +224,7 @@ def test_where_tetwild_fails_the_lattice_stands_in(monkeypatch: pytest.MonkeyPat
     assert np.array_equal(cage.mesh.tets, lattice.mesh.tets)
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @example(325082, 0.098)
 @example(306295, 0.09375)
 @given(st.integers(0, 10**6), st.floats(0.08, 0.16))
