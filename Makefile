@@ -12,7 +12,8 @@ MINUTES ?= 10
 # Of make mutation, each with its own copy of the tree.
 PROCESSES ?= 2
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# Errors only: warnings about mirrors and the root user would fill the screen.
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 
 .PHONY: demo test test-rest test-all fuzz mutation coverage release setup lint types docs pictures paper build web examples clean
 
