@@ -227,10 +227,12 @@ def test_where_tetwild_fails_the_lattice_stands_in(monkeypatch: pytest.MonkeyPat
 @settings(max_examples=examples(25))
 @example(325082, 0.098)
 @example(306295, 0.09375)
+@example(38649, 0.10291887719719599)
 @given(st.integers(0, 10**6), st.floats(0.08, 0.16))
 def test_stuffing_quality(seed: int, cell: float) -> None:
-    """Any smooth solid: closed surface, flat floor, volume of the level set, no angle below the paper's 10.7 degrees;
-    at the floor, where halves of lattice tetrahedra lie, none below 7 (of 6,400 solids one had less than 9.9).
+    """Any smooth solid: closed surface, flat floor, volume of the level set, no angle below the 9.26 degrees that
+    ``test_stuffing_bound`` finds; at the floor, where halves of lattice tetrahedra lie, none below 7 (of 6,400 solids
+    one had less than 9.9).
     """
     random = np.random.default_rng(seed)
     axes, centre = random.uniform(0.3, 0.5, 3), np.array([0.0, 0.0, 0.31]) + random.uniform(-0.05, 0.05, 3)
@@ -247,7 +249,7 @@ def test_stuffing_quality(seed: int, cell: float) -> None:
     assert mesh.nodes[:, 2].min() >= 0.0
     assert mesh.min_dihedral_degrees() >= 7.0
     above = mesh.tets[mesh.nodes[mesh.tets, 2].min(axis=1) > 0.0]
-    assert TetMesh(mesh.nodes, above).min_dihedral_degrees() >= 10.7
+    assert TetMesh(mesh.nodes, above).min_dihedral_degrees() >= 9.26
     probe = random.uniform(low, high, (200_000, 3))
     expected = np.mean(field(probe) < 0.0) * np.prod(high - low)
     assert mesh.volumes().sum() == pytest.approx(expected, rel=0.08)
