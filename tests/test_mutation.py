@@ -80,6 +80,7 @@ def test_the_nearest_test_comes_first() -> None:
         assert len(mutants.tests_of(chosen, "")) == len(list((mutants.ROOT / "tests" / chosen).glob("test_*.py"))) > 3
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Results are on disk one by one; survivors are tried again when asked."""
     tried: list[str] = []

@@ -214,7 +214,7 @@ def test_steps_converge_at_order_one(count: int) -> None:
     second difference is half of the first.
     """
 
-    @drawn(max(count // 2, 1), shape=shapes(), throw=throws())
+    @drawn(count // 2 if count > QUICK else 3, shape=shapes(), throw=throws())
     def law(shape: Shape, throw: Throw) -> None:
         body, smooth = shape.body(), replace(throw, noise=0.0)
         time, ends = 0.25 * np.sqrt(shape.sag) * body.time_unit, []

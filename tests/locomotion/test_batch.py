@@ -202,6 +202,7 @@ def test_what_a_world_does_does_not_hang_on_its_neighbours(creature: Creature) -
         np.testing.assert_allclose(end, ends[0], rtol=0, atol=1e-13 * creature.body.height)
 
 
+@pytest.mark.slow
 def test_small_chunks_change_nothing(creature: Creature) -> None:
     starts, activations, dt = rough(creature)
     whole, cut = (

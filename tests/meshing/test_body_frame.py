@@ -32,7 +32,7 @@ def body_cage(lying: Lying) -> tuple[BodyFrame, Cage]:
     return frame.moved(anchor), cage_of_body(body_gaussians(near, frame))
 
 
-@pytest.fixture(scope="module", params=["pawn", "stool"])
+@pytest.fixture(scope="module", params=["pawn", pytest.param("stool", marks=pytest.mark.slow)])
 def thing(request: pytest.FixtureRequest) -> Lying:
     """A round body and one with a front, coarse."""
     made = {"pawn": pawn, "stool": stool}[request.param](gaussian_count=3000)

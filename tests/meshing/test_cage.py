@@ -168,6 +168,7 @@ def test_floaters_and_strays_make_no_elements() -> None:
     assert other.below_plane_opacity_mass == pytest.approx(100 / 8250, rel=0.05)
 
 
+@pytest.mark.slow
 def test_open_and_pierced_surface_is_filled() -> None:
     """A shell without a bottom and with a hole in its side still is a solid."""
     shell = _box_surface((-0.3, -0.3, 0.0), (0.3, 0.3, 1.0), 12000)

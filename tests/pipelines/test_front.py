@@ -32,7 +32,9 @@ def degrees(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1.0, 1.0))))
 
 
-@pytest.fixture(scope="module", params=[figurine, stool], ids=["figurine", "stool"])
+@pytest.fixture(
+    scope="module", params=[figurine, pytest.param(stool, marks=pytest.mark.slow)], ids=["figurine", "stool"]
+)
 def thing(request: pytest.FixtureRequest) -> BuiltInObject:
     return request.param(gaussian_count=6000)
 
