@@ -31,8 +31,9 @@ examples: setup
 	fi
 	$(BIN)/python examples/finetune.py --out out/finetune $(FRAMES:%=--steps %)
 
-# Two processes, each with one thread. The tests of a file go to the same one, so that what they share is made once.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+# Two processes, each with one thread. The tests of a file go to the same one, so that what they share is made once;
+# tests/conftest.py starts with the long files, so that both processes end at about the same time.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test: setup
 	$(PYTEST) -m "not (slow or data or example or browser)"

@@ -21,9 +21,13 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 
 _DATA = Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
+_LONG_FIRST = ("pipelines", "segmentation", "inpainting", "locomotion", "meshing", "commands", "assets", "web")
+"""Folders whose tests take longest."""
+
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip, with the reason, what this machine cannot run."""
+    """Skip, with the reason, what this machine cannot run; put folders of long tests first."""
+    items.sort(key=lambda item: item.path.parent.name not in _LONG_FIRST)
     no_data = pytest.mark.skip(reason=f"real captures not found in {_DATA}; set EGS_WARP_DATA")
     no_cuda = pytest.mark.skip(reason="no CUDA device")
     for item in items:

@@ -26,7 +26,7 @@ def test_the_good_file_is_valid(reader: Reader, tmp_path: Path) -> None:
 
 
 @settings(
-    max_examples=examples(60),
+    max_examples=examples(30),
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
 )
 @given(st.data())

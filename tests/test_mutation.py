@@ -71,6 +71,7 @@ def test_an_edited_file_has_no_mutants_of_its_old_text(room: Path) -> None:
     assert mutant.is_stale
 
 
+@pytest.mark.slow
 def test_the_nearest_test_comes_first() -> None:
     """By the imports that lead from a test to the module, over host code to its kernels; its own before others."""
     nearest = ["tests/contact/test_points.py", "tests/contact/test_batch_contacts.py"]

@@ -117,6 +117,7 @@ def test_nothing_to_learn_from() -> None:
         PatchSynthesis().fill(np.zeros((40, 40, 3), np.float32), hole, ~hole)
 
 
+@pytest.mark.slow
 def test_what_lies_in_the_shade_is_not_copied():
     """A hole with shade on one side of it: all of it may be darkened, or what is near the shade alone."""
     rows, columns = np.indices((96, 96))

@@ -154,6 +154,7 @@ def test_no_worker_outlives_the_program(number: signal.Signals, crew: str, tmp_p
         assert program.returncode == 130
 
 
+@pytest.mark.slow
 def test_what_a_script_defines_is_found(tmp_path: Path) -> None:
     script = tmp_path / "cubes.py"
     script.write_text(

@@ -82,6 +82,7 @@ def plain_box(width: float, depth: float) -> Lying:
     return Lying(cloud, Plane(np.array([0.0, 0.0, 1.0]), 0.0))
 
 
+@pytest.mark.slow
 def test_what_was_photographed_from_one_side_shows_its_front_there() -> None:
     """A box that says nothing itself."""
     box = plain_box(0.9, 0.5)
