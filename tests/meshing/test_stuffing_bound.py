@@ -73,7 +73,7 @@ def test_stuffing_bound() -> None:
     A corner of a tetrahedron is inside, outside, or was moved by at most its limit along one of 14 edges; an edge from
     inside to outside is cut no nearer to either end than the limit, as the end would have been moved otherwise. All
     states that agree with signs of the lattice points are tried with moves and cuts at their ends and middles; the
-    least angle is at ends. With the paper's limits (0.24999, 0.41189) the same search gives its 9.3171 degrees.
+    least angle is at ends. The 10.7 degrees of the paper hold for smaller limits and its parity rule for diagonals.
     """
     states = np.array([s for s in product(range(-2, 14), repeat=4) if INSIDE in s and is_possible(s)])
     patterns, pattern_of = np.unique(np.minimum(states, 0), axis=0, return_inverse=True)
