@@ -19,7 +19,7 @@ Field = Callable[[np.ndarray], np.ndarray]
 
 _SNAP_LONG, _SNAP_SHORT = 0.25, 0.41
 """Share of a long (cube side) or short (half body diagonal) edge within which a point is moved onto the surface. Away
-from the floor dihedral angles are at least 9.26 degrees (tests/meshing/test_stuffing_bound.py)."""
+from the floor dihedral angles are at least 9.26 degrees (tests/meshing/test_stuffing.py)."""
 
 
 def stuff(field: Field, low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
