@@ -12,7 +12,8 @@ MINUTES ?= 10
 # Of make mutation, each with its own copy of the tree.
 PROCESSES ?= 2
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# Errors only: warnings about mirrors and the root user would fill the screen.
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 
 .PHONY: demo test test-rest test-all test-page fuzz mutation coverage release setup lint types docs pictures paper build web examples clean
 
@@ -30,8 +31,9 @@ examples: setup
 	fi
 	$(BIN)/python examples/finetune.py --out out/finetune $(FRAMES:%=--steps %)
 
-# Two processes, each with one thread. The tests of a file go to the same one, so that what they share is made once.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+# Two processes, each with one thread. The tests of a file go to the same one, so that what they share is made once;
+# tests/conftest.py starts with the long files, so that both processes end at about the same time.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test: setup
 	$(PYTEST) -m "not (slow or data or example or browser)"
@@ -53,10 +55,13 @@ coverage: setup
 	$(PYTEST) -m "not (slow or data or example or browser)" $(COVERED:%=tests/%) tests/test_extremes.py tests/test_disk_faults.py \
 		$(COVERED:%=--cov=egs_warp/%) --cov-branch --cov-report=term:skip-covered --cov-fail-under=$(FLOOR)
 
-# Damaged files for every reader; Atheris drives them where it installs. What breaks a reader is kept in tests/corpus.
+# Random search; make test runs a fixed set of examples. First the property tests with ten times as many examples, which
+# takes about ten minutes on two cores: each failing example is printed as an @example line to add to its test. Then
+# damaged files for every reader, driven by Atheris where it installs: files that break a reader go to tests/corpus.
 fuzz: setup
 	-$(PIP) -e ".[fuzz]"
-	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --minutes $(MINUTES)
+	status=0; HYPOTHESIS_PROFILE=fuzz $(PYTEST) -m "hypothesis and not (slow or data or example or browser)" || status=1; \
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --minutes $(MINUTES) || status=1; exit $$status
 
 # Small changes of the code that a package's fast tests must notice; goes on where it stopped. PACKAGES and COUNT say how many.
 mutation: setup

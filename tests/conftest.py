@@ -10,16 +10,24 @@ import pytest
 import warp as wp
 from hypothesis import settings
 
+from tests.support.properties import example_lines
+
 wp.config.log_level = wp.LOG_WARNING
-# No test is timed; what else there is is Hypothesis's own, which differs in CI.
-settings.register_profile("untimed", settings(), deadline=None)
-settings.load_profile("untimed")
+# The same examples in every run, and no example has a time limit. ``make fuzz`` sets HYPOTHESIS_PROFILE=fuzz: random
+# examples, ten times as many. A test that it breaks gets the @example line that the end of its output shows.
+settings.register_profile("fixed", derandomize=True, database=None, deadline=None)
+settings.register_profile("fuzz", derandomize=False, database=None, deadline=None, max_examples=1000, print_blob=True)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 
 _DATA = Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
+_LONG_FIRST = ("pipelines", "segmentation", "inpainting", "locomotion", "meshing", "commands", "assets", "web")
+"""Folders whose tests take longest."""
+
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip, with the reason, what this machine cannot run."""
+    """Skip, with the reason, what this machine cannot run; put folders of long tests first."""
+    items.sort(key=lambda item: item.path.parent.name not in _LONG_FIRST)
     no_data = pytest.mark.skip(reason=f"real captures not found in {_DATA}; set EGS_WARP_DATA")
     no_cuda = pytest.mark.skip(reason="no CUDA device")
     for item in items:
@@ -27,6 +35,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(no_data)
         if "cuda" in item.keywords and not wp.is_cuda_available():
             item.add_marker(no_cuda)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print the failing examples of Hypothesis as decorators to paste above the tests."""
+    for report in terminalreporter.stats.get("failed", []):
+        for line in example_lines(report.longreprtext):
+            terminalreporter.write_line(f"add to {report.nodeid}:\n    {line}")
 
 
 @pytest.fixture(scope="session")

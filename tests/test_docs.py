@@ -81,6 +81,7 @@ def test_every_page_of_concepts_says_where_its_code_is() -> None:
             assert (ROOT / room).exists() or (ROOT / f"{room}.py").exists(), f"{page.name}: no {room}"
 
 
+@pytest.mark.example
 def test_pages_start_from_captures_and_keys_that_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made_once = cache(scene)
     monkeypatch.setattr(egs_warp, "scene", made_once)

@@ -222,7 +222,9 @@ def test_what_fails_after_a_ctrl_c_that_was_meant_keeps_its_line() -> None:
     assert ended(body) == (2, "prog: take.npz: cannot be written\n")
 
 
-@pytest.mark.parametrize("after", [0.05, 0.3, 0.8, 1.5, 2.5, 4.0])
+@pytest.mark.parametrize(
+    "after", [0.05, 0.8, 4.0, *(pytest.param(after, marks=pytest.mark.slow) for after in (0.3, 1.5, 2.5))]
+)
 def test_ctrl_c_in_any_phase_is_one_line(after: float, tmp_path: Path) -> None:
     """Imports, preparation, simulation and film of a short run: none leaves a traceback or a half-written file."""
     code = """

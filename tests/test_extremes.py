@@ -19,6 +19,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import LARGEST, LARGEST_LOG_SCALE, GaussianCloud, unit_quaternions
 from egs_warp.render import render_gaussians
 from tests.support.deformation_scenes import bent, box
+from tests.support.properties import examples
 
 torch = pytest.importorskip("torch")
 from egs_warp.render.autograd import render_torch  # noqa: E402
@@ -76,8 +77,8 @@ def assert_finite(values: dict[str, Any]) -> None:
 
 
 def tried(law: Any) -> Any:
-    """80 cases, the same each time."""
-    profile = settings(max_examples=80, derandomize=True, database=None, phases=[Phase.generate])
+    """40 cases in ``make test``."""
+    profile = settings(max_examples=examples(40), phases=[Phase.generate])
     return profile(given(changed=changes())(law))
 
 
@@ -121,7 +122,7 @@ def test_a_cage_carries_it_and_all_others_as_if_it_were_not_there(changed: dict[
         np.testing.assert_array_equal(value[kept[0]], arrays(splits[1].cloud)[name][kept[1]])
 
 
-@settings(max_examples=30, derandomize=True, database=None, phases=[Phase.generate])
+@settings(max_examples=examples(15), phases=[Phase.generate])
 @given(changed=changes())
 def test_training_stays_finite_or_says_why(changed: dict[str, tuple[int, float]]) -> None:
     views = render_views(cloud_of(ordinary()), [CAMERA])

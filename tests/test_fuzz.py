@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from tests.support import readers
 from tests.support.corruption import damaged
+from tests.support.properties import example_lines, examples
 from tests.support.readers import READERS, BrokenPromiseError, Reader, outcome, prepare
 
 CORPUS = Path(__file__).parent / "corpus"
@@ -25,8 +26,7 @@ def test_the_good_file_is_valid(reader: Reader, tmp_path: Path) -> None:
 
 
 @settings(
-    max_examples=60,
-    derandomize=True,
+    max_examples=examples(30),
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
 )
 @given(st.data())
@@ -61,3 +61,18 @@ def test_slow_is_what_is_slow_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     times[:] = [0.3, 0.3]
     with pytest.raises(BrokenPromiseError, match=r"^slow: 0\.3 s of work in .*; 0\.3 s of work in .* the first time$"):
         outcome(slow, tmp_path, b"")
+
+
+def test_a_failing_example_is_printed_as_a_decorator() -> None:
+    """Arguments on several lines and comments are joined; examples of ``st.data()`` have no decorator."""
+
+    @settings(max_examples=50)
+    @given(shape=st.builds(dict, x=st.integers(10**4, 10**5)), note=st.text())
+    def law(shape: dict[str, int], note: str) -> None:
+        assert shape["x"] < 0
+
+    with pytest.raises(AssertionError) as caught:
+        law()
+    (line,) = example_lines("\n".join(caught.value.__notes__))
+    assert line.startswith("@example(shape=") and "10000" in line and line.endswith(", note='')")
+    assert example_lines("E   Failing test case: law(\nE       data=data(...),\nE   )\n") == []

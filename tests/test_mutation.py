@@ -71,6 +71,7 @@ def test_an_edited_file_has_no_mutants_of_its_old_text(room: Path) -> None:
     assert mutant.is_stale
 
 
+@pytest.mark.slow
 def test_the_nearest_test_comes_first() -> None:
     """By the imports that lead from a test to the module, over host code to its kernels; its own before others."""
     nearest = ["tests/contact/test_selection.py", "tests/contact/test_batch_contacts.py"]
@@ -80,6 +81,7 @@ def test_the_nearest_test_comes_first() -> None:
         assert len(mutants.tests_of(chosen, "")) == len(list((mutants.ROOT / "tests" / chosen).glob("test_*.py"))) > 3
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Results are on disk one by one; survivors are tried again when asked."""
     tried: list[str] = []

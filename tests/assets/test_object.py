@@ -82,6 +82,7 @@ def test_stool_stands_on_four_feet() -> None:
     assert not np.any(np.abs(feet[:, :2]).min(axis=1) < 0.12)
 
 
+@pytest.mark.slow
 def test_same_bits_in_another_process() -> None:
     """The pawn is the same in every process, and another seed gives another one."""
     program = "from egs_warp.assets import pawn; from tests.support.captures import digest; print(digest(pawn().cloud))"

@@ -8,8 +8,12 @@ import pytest
 from egs_warp.assets import BUILT_IN_SCENES, SQUARE, scene
 from egs_warp.errors import UserError
 
+LONG = {"figurine", "snake"}
 
-@pytest.mark.parametrize("name", BUILT_IN_SCENES)
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in BUILT_IN_SCENES]
+)
 def test_scene(name: str) -> None:
     """The floor is complete, also under the object; the camera sees the object; the parts add up."""
     made = scene(name)

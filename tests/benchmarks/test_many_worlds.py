@@ -40,6 +40,7 @@ def test_all_that_were_run_alone_for_long_enough_must_be_alike(many_worlds: Modu
     assert many_worlds.summary(few, "cpu")["why_null"]["many_alike"] == "no world was run alone for 30 steps"
 
 
+@pytest.mark.slow
 def test_a_row_tells_the_rate_where_the_time_goes_and_how_far_apart(many_worlds: ModuleType) -> None:
     creature = coarse_pawn()
     jump = many_worlds.recorded(creature, 2)

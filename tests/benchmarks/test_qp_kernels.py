@@ -26,6 +26,7 @@ def programs(benchmark: ModuleType) -> list[Any]:
     return benchmark.recorded(pawn, 60, "jump", most=14, seed=0)
 
 
+@pytest.mark.slow
 def test_recorded_programs_end_as_osqp_ends_on_them(benchmark: ModuleType, programs: list[Any], device: str) -> None:
     """|x - x'| at most 1e-6 of the largest |x| and the same status, by iterations alone; after 50 iterations; and as
     the engine solves them."""

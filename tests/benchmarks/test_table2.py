@@ -58,6 +58,7 @@ def test_what_contact_answers_obeys_coulomb(table2: ModuleType) -> None:
         assert_coulomb(pieces, answered)
 
 
+@pytest.mark.slow
 def test_every_strategy_solves_frames_of_an_animation(table2: ModuleType) -> None:
     """Their programs have the activations of its muscle groups alone, within whose bounds those that made it are."""
     frames = table2.animation_frames(table2.body_named("pawn", "cpu", nodes=60), frames=6, activations=4, contacts=3)

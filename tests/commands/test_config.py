@@ -21,6 +21,7 @@ from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.finished_run import FinishedRun
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse")
 def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=4000).cloud)

@@ -73,6 +73,7 @@ def test_plane_then_segment_take_each_others_files(
     assert (tmp_path / "parts" / "segment.png").is_file()
 
 
+@pytest.mark.slow
 def test_without_cameras_a_ring_is_used_and_written(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -146,6 +147,7 @@ def test_mistakes_are_one_line(
     assert message in lines[-1]
 
 
+@pytest.mark.slow
 def test_inpaint_fills_the_hole_that_animate_fills(folder: Path, tmp_path: Path) -> None:
     """Outline and margin go from segment to inpaint by plane.json; an object elsewhere has its own foot."""
     cloud, spec = read_capture(folder / "scene.ply").cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5]))

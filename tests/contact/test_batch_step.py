@@ -129,6 +129,7 @@ def test_ends_are_those_of_each_alone(
     assert joined > (20 if few else 3)
 
 
+@pytest.mark.slow
 def test_steps_that_hardly_converge_go_the_way_of_each_alone(creature: Creature) -> None:
     """Crushed, thrown at the ground, torn by all muscles at odds, in steps four times too long: lengths of steps and
     tangents are chosen as alone, so that even what has not converged when time is up is the same."""

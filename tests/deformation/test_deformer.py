@@ -21,6 +21,7 @@ from egs_warp.launching import launch_rows
 from egs_warp.render import render_gaussians
 from tests.support.deformation_scenes import bent, box, covariances, matrices, random_cloud
 from tests.support.kernels import orders_kernel, rotation_parts_kernel, signed_kernel
+from tests.support.properties import examples
 
 
 def colours(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -241,7 +242,7 @@ def test_a_bend_about_any_axis_of_a_needle_is_read(device: str, along: int, quar
     assert measure.bend_degrees[0] == pytest.approx(40.0, abs=1.0)
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(
     seed=st.integers(0, 2**31),
     noise=st.sampled_from([0.0, 0.05, 0.3, 2.0]),

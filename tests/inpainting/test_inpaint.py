@@ -107,6 +107,7 @@ def test_gloss_of_the_surround_without_its_colour(done: tuple[GaussianCloud, Inp
     assert not np.allclose(mean_colours(matte, PLANE), mean_colours(new, PLANE), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_training_comes_nearer_to_what_was_painted() -> None:
     """Face-on, the picture's error falls; places and directions stay."""
     truth, hole = floor(), disc(PLANE, on_plane(0.1, 0.05), RADIUS)

@@ -91,7 +91,7 @@ def test_meld_takes_the_gradients_and_drops_the_step() -> None:
     assert np.abs(poisson_blend(image, hole, np.ones_like(hole), same) - image).max() < 1e-9
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
 def test_no_island_of_what_lies_far_from_the_hole(seed: int) -> None:
     """A hole in an unevenly lit pale sheet on dark boards, with little of the sheet left around it, gets no dark patch;
     a crack that runs through a hole in the boards goes on."""
@@ -117,6 +117,7 @@ def test_nothing_to_learn_from() -> None:
         PatchSynthesis().fill(np.zeros((40, 40, 3), np.float32), hole, ~hole)
 
 
+@pytest.mark.slow
 def test_what_lies_in_the_shade_is_not_copied():
     """A hole with shade on one side of it: all of it may be darkened, or what is near the shade alone."""
     rows, columns = np.indices((96, 96))

@@ -19,6 +19,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import read_points
+from tests.support.properties import examples
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -332,7 +333,7 @@ def test_bad_colmap(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-@settings(max_examples=200, derandomize=True)
+@settings(max_examples=examples(200))
 @given(st.data())
 @pytest.mark.parametrize("name", ["cameras.txt", "images.txt", "cameras.bin", "images.bin", "transforms.json"])
 def test_any_bytes(name: str, data: st.DataObject) -> None:

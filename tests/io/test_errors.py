@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from egs_warp.errors import UserError
 from egs_warp.io import read_capture, write_spz
 from tests.support.captures import WRITERS, good_bytes, message, small_cloud, written
+from tests.support.properties import examples
 
 PLY_HEADER = b"ply\nformat binary_little_endian 1.0\n"
 
@@ -219,7 +220,7 @@ def assert_capture_or_one_line(name: str, data: bytes) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-@settings(max_examples=150, derandomize=True)
+@settings(max_examples=examples(150))
 @given(st.data())
 @pytest.mark.parametrize("name", WRITERS)
 def test_any_truncation_and_any_flipped_bytes(name: str, data: st.DataObject) -> None:
@@ -234,7 +235,7 @@ def test_any_truncation_and_any_flipped_bytes(name: str, data: st.DataObject) ->
 
 
 @pytest.mark.filterwarnings("error")
-@settings(max_examples=200, derandomize=True)
+@settings(max_examples=examples(200))
 @given(st.data())
 def test_any_flipped_bytes_inside_gzip(data: st.DataObject) -> None:
     """Behind the checksum, where flips of the compressed file do not reach."""
@@ -252,7 +253,7 @@ JSON = st.recursive(
 
 
 @pytest.mark.filterwarnings("error")
-@settings(max_examples=200, derandomize=True)
+@settings(max_examples=examples(200))
 @given(st.data())
 def test_any_entry_of_meta_json_replaced(data: st.DataObject) -> None:
     with tempfile.TemporaryDirectory() as folder:

@@ -182,6 +182,7 @@ def test_what_does_not_converge_is_done_in_halves_as_alone(creature: Creature) -
             check(creature, one, other)
 
 
+@pytest.mark.slow
 def test_what_a_world_does_does_not_hang_on_its_neighbours(creature: Creature) -> None:
     """Whatever the others do meanwhile: stand, fall, go in halves, or break. To rounding: products of fewer or more
     worlds, and with more contacts, round otherwise. It stands on its rim: of 32 points on so coarse a base an operator
@@ -204,6 +205,7 @@ def test_what_a_world_does_does_not_hang_on_its_neighbours(creature: Creature) -
         np.testing.assert_allclose(end, ends[0], rtol=0, atol=1e-13 * creature.body.height)
 
 
+@pytest.mark.slow
 def test_small_chunks_change_nothing(creature: Creature) -> None:
     starts, activations, dt = rough(creature)
     whole, cut = (
@@ -232,6 +234,7 @@ def test_a_world_that_cannot_be_solved_is_told_and_leaves(creature: Creature) ->
     assert not lost.any() and torch.isfinite(state.positions).all()
 
 
+@pytest.mark.slow
 def test_a_world_that_never_converges_is_lost(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not even in its smallest parts, as where all accuracy is asked."""
     monkeypatch.setattr("egs_warp.contact.coupled_step.CoupledSolver.tolerance", 0.0)

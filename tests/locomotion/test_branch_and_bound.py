@@ -56,6 +56,7 @@ def test_a_limit_is_not_called_a_proof() -> None:
     assert exact_states(program, qp_limit=1) is None
 
 
+@pytest.mark.slow
 def test_a_search_that_is_cut_short_never_promises_too_much() -> None:
     """Wherever it ends its bound is below the optimum, and the longer it goes on the nearer it is."""
     for seed in range(5, 9):

@@ -91,6 +91,7 @@ def test_what_has_finished_rests_before_it_ends(made: CoarseCreature, before: li
     assert len(done.frames) == 1 + len(before) + REST_FRAMES and not done.stopped
 
 
+@pytest.mark.slow
 def test_steps_that_have_no_solution(made: CoarseCreature) -> None:
     """Found in the first step, before anything is done: no number, too fast and too far for double precision."""
     still, positions = np.zeros_like(made.start.velocities), made.start.positions

@@ -20,6 +20,7 @@ from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_f
 from egs_warp.meshing.cage import Cage, build_cage, cage_of_body
 from egs_warp.segmentation.base_plane import find_base_plane
 from tests.support.frames import Lying
+from tests.support.properties import examples
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -31,7 +32,7 @@ def body_cage(lying: Lying) -> tuple[BodyFrame, Cage]:
     return frame.moved(anchor), cage_of_body(body_gaussians(near, frame))
 
 
-@pytest.fixture(scope="module", params=["pawn", "stool"])
+@pytest.fixture(scope="module", params=["pawn", pytest.param("stool", marks=pytest.mark.slow)])
 def thing(request: pytest.FixtureRequest) -> Lying:
     """A round body and one with a front, coarse."""
     made = {"pawn": pawn, "stool": stool}[request.param](gaussian_count=3000)
@@ -96,7 +97,7 @@ def test_base_plane_goes_along(thing: Lying) -> None:
     assert find_base_plane(turned.cloud, turned.up).offset == pytest.approx(level, abs=1e-5)
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(
     st.integers(0, 10**6),
     st.floats(1e-3, 1e3),

@@ -120,6 +120,7 @@ def test_a_body_on_two_legs_keeps_its_balance(route: Route) -> None:
     check_audit(done)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("route", [straight_route(0.04), pytest.param(turn_route(0.2), marks=pytest.mark.slow)])
 def test_a_block_waddles(route: Route) -> None:
     """It lifts one side of its base, turns about the other, and so on: it comes to its place, upright."""

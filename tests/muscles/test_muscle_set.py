@@ -18,6 +18,7 @@ from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres, automatic_muscles
 from egs_warp.muscles.tension import activation_jacobian
 from tests.support.meshes import box_mesh
+from tests.support.properties import examples
 
 COLUMN = box_mesh((4, 4, 10), (0.4, 0.4, 1.0))
 
@@ -30,7 +31,7 @@ def random_muscles(rng: np.random.Generator) -> MuscleSet:
     return attach_fibres(COLUMN, fibres)
 
 
-@settings(max_examples=15)
+@settings(max_examples=examples(15))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_columns_make_no_net_force_or_torque(seed: int) -> None:
     """Eq. (7): whatever the pose, every column's nodal forces sum to nothing and turn nothing."""

@@ -202,6 +202,7 @@ def press(rod: SoftBody, load: float, *, follows: bool) -> np.ndarray:
     return x
 
 
+@pytest.mark.slow
 def test_a_tendon_holds_the_rod_straight_that_its_dead_load_buckles(rod: SoftBody) -> None:
     """A tendon inside a rod cannot buckle it (its thrust bends with the rod);
     with its direction frozen over a step it does.

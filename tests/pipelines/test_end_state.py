@@ -76,7 +76,7 @@ def test_a_run_ends_in_the_worst_state_of_its_motions() -> None:
     assert [state.is_failure for state in State] == [False, False, False, True, True]
 
 
-@pytest.mark.parametrize("after", [0, 3, "fall"])
+@pytest.mark.parametrize("after", [*(pytest.param(step, marks=pytest.mark.slow) for step in (0, 3)), "fall"])
 def test_a_run_that_stops_or_falls_writes_all_of_its_files(
     after: int | str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -32,7 +32,9 @@ def degrees(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1.0, 1.0))))
 
 
-@pytest.fixture(scope="module", params=[figurine, stool], ids=["figurine", "stool"])
+@pytest.fixture(
+    scope="module", params=[figurine, pytest.param(stool, marks=pytest.mark.slow)], ids=["figurine", "stool"]
+)
 def thing(request: pytest.FixtureRequest) -> BuiltInObject:
     return request.param(gaussian_count=6000)
 
@@ -80,6 +82,7 @@ def plain_box(width: float, depth: float) -> Lying:
     return Lying(cloud, Plane(np.array([0.0, 0.0, 1.0]), 0.0))
 
 
+@pytest.mark.slow
 def test_what_was_photographed_from_one_side_shows_its_front_there() -> None:
     """A box that says nothing itself."""
     box = plain_box(0.9, 0.5)

@@ -62,6 +62,7 @@ def has_colour(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
     return bool((np.abs(picture[:, :, ::-1].astype(int) - colour).max(axis=2) <= 2).sum() > 30)
 
 
+@pytest.mark.slow
 def test_the_picture_has_every_foot_in_its_colour(chair: BodyInfo, tmp_path: Path) -> None:
     draw_info(tmp_path / "info.png", chair)
     picture = cv2.imread(str(tmp_path / "info.png"))

@@ -117,6 +117,7 @@ def test_progress_ends_where_all_is_done(told: list[tuple[int, int]], outcomes: 
     assert told[-1] == (frames, frames) and done == sorted(done) and all(one <= of for one, of in told)
 
 
+@pytest.mark.slow
 def test_side_by_side_each_is_as_alone(creature: Creature, tmp_path: Path) -> None:
     """Jobs of two lengths of step, on three grounds, one longer than the others, beside one that goes to a worker and
     two that cannot be done: trajectories to 1e-9 body heights, all in the order of the jobs."""
@@ -220,6 +221,7 @@ def test_a_creature_can_be_sent(creature: Creature) -> None:
         assert np.array_equal(getattr(other.cloud, name).numpy(), getattr(creature.cloud, name).numpy()), name
 
 
+@pytest.mark.slow
 def test_other_ground_is_that_of_a_creature_made_on_it(creature: Creature) -> None:
     again = coarse_pawn(friction=0.4)
     other = creature.with_friction(0.4)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from egs_warp.locomotion.ledger import energy_balance
@@ -18,6 +19,7 @@ def picture(path: Path) -> np.ndarray:
     return np.asarray(Image.open(path).convert("RGB"), dtype=float)
 
 
+@pytest.mark.slow
 def test_the_same_run_gives_the_same_bytes_and_another_another_picture(tmp_path: Path) -> None:
     t = slide().trajectory()
     books = energy_balance(t)

@@ -200,6 +200,7 @@ def test_an_animation_that_fails_loses_none_of_the_parts(
     assert not (out / "filled.png").exists(), "no floor was filled"
 
 
+@pytest.mark.slow
 def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
     cloud, _ = ball_on_floor()
     told: list[tuple[str, float]] = []
@@ -223,6 +224,7 @@ def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
     assert viewing_directions(prepared, []) is None
 
 
+@pytest.mark.slow
 def test_what_hangs_above_the_ground_leaves_no_hole(tmp_path: Path) -> None:
     """A ball a fifth of its size above the floor comes down; nothing is painted, ``plane.json`` tells of no hole."""
     cloud, truth = ball_on_floor(lift=0.33)

@@ -134,7 +134,7 @@ SLEEPERS = """
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("crew", ["2", pytest.param("ray", marks=[NO_RAY, pytest.mark.slow])])
 def test_no_worker_outlives_the_program(number: signal.Signals, crew: str, tmp_path: Path) -> None:
     """Ctrl-C, which a terminal sends to the whole group, ends in one line; nothing is left even where the program had
@@ -154,6 +154,7 @@ def test_no_worker_outlives_the_program(number: signal.Signals, crew: str, tmp_p
         assert program.returncode == 130
 
 
+@pytest.mark.slow
 def test_what_a_script_defines_is_found(tmp_path: Path) -> None:
     script = tmp_path / "cubes.py"
     script.write_text(

@@ -98,12 +98,14 @@ def on_flat(flat: tuple[GaussianCloud, np.ndarray]) -> tuple[LocatedPlane, Locat
     return located, same, measured
 
 
+@pytest.mark.slow
 def test_flat_ground_stays_a_plane(on_flat: tuple[LocatedPlane, LocatedPlane, MeasuredGround]) -> None:
     located, same, measured = on_flat
     assert same is located
     assert measured.roughness < 4e-3 and measured.known.sum() > 500
 
 
+@pytest.mark.slow
 def test_roughness_that_views_do_not_agree_on_is_no_ground(
     flat: tuple[GaussianCloud, np.ndarray], on_flat: tuple[LocatedPlane, LocatedPlane, MeasuredGround]
 ) -> None:

@@ -45,6 +45,7 @@ def test_a_bias_makes_the_object_leaner_or_fuller() -> None:
         labels_of_votes(Votes(np.zeros(6), np.ones(6), np.ones(6)))
 
 
+@pytest.mark.slow
 def test_rough_masks_of_three_views_find_a_stool_with_its_legs() -> None:
     """Masks whose edges are three pixels off, up and down: the cut is right where votes alone are not."""
     made = scene("stool")

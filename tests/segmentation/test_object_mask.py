@@ -181,7 +181,9 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
         read_object(str(tmp_path / "IMG_02.png"), cloud, posed)
 
 
-@pytest.mark.parametrize("name", ["pawn", "stool", "figurine"])
+@pytest.mark.parametrize(
+    "name", ["pawn", *(pytest.param(name, marks=pytest.mark.slow) for name in ("stool", "figurine"))]
+)
 def test_built_in_scenes_come_apart(name: str) -> None:
     """Against the known object: all of it above the foot, and none of the room but what nobody can see."""
     made = scene(name)

@@ -55,6 +55,7 @@ def pixel_of(camera: Camera, point: tuple[float, float, float]) -> tuple[float, 
     return camera.cx + camera.fx * x / z, camera.cy + camera.fy * y / z
 
 
+@pytest.mark.slow
 def test_one_click_is_marked_in_every_view_and_cuts_what_touches(cameras: list[Camera]) -> None:
     """Of two balls that touch the one that is clicked on is found, whole; by that click without a network, both."""
     cloud = balls(TONES)
@@ -176,6 +177,7 @@ def test_what_stands_out_of_most_views_is_taken(cameras: list[Camera]) -> None:
         salient_masks(cloud, cameras, Nothing.__new__(Nothing))
 
 
+@pytest.mark.slow
 def test_a_mask_model_at_the_command_line(
     tmp_path: Path, cameras: list[Camera], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -31,7 +31,14 @@ def candidates(room: GaussianCloud) -> list[Plane]:
     return planes_below(room, UP, MIDDLE)
 
 
-@pytest.mark.parametrize("click", [(0.0, 0.0, 0.5), (0.3, 0.2, 0.85), (0.2, -0.35, 0.2)])
+@pytest.mark.parametrize(
+    "click",
+    [
+        (0.0, 0.0, 0.5),
+        pytest.param((0.3, 0.2, 0.85), marks=pytest.mark.slow),
+        pytest.param((0.2, -0.35, 0.2), marks=pytest.mark.slow),
+    ],
+)
 def test_a_click_on_a_ball_finds_the_table_top(room: GaussianCloud, click: tuple[float, float, float]) -> None:
     """Within 1 degree and 0.5 % of the ball's height, and the ball is the object; the floor is far wider."""
     located = locate_plane(room, ObjectSpec(point=np.array(click)), up=UP)
@@ -41,6 +48,7 @@ def test_a_click_on_a_ball_finds_the_table_top(room: GaussianCloud, click: tuple
     assert found[:BALL].mean() > 0.97 and found[BALL:].sum() == 0
 
 
+@pytest.mark.slow
 def test_a_mask_and_a_box_find_it_too(room: GaussianCloud) -> None:
     eye = np.array([2.0, -3.0, 2.0])
     camera = Camera.look_at(eye, np.array([0.0, 0.0, 0.4]), UP, width=240, height=240, vertical_fov_degrees=40.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -22,8 +23,9 @@ from tests.support.meshes import UP
 from tests.support.stances import DT, FLOOR
 
 
+@cache
 def coarse_pawn(*, friction: float = 0.8, device: str = "cpu") -> Creature:
-    """The built-in pawn of few Gaussians, made by the package in a cage of about 50 nodes."""
+    """The built-in pawn of few Gaussians, made by the package in a cage of about 50 nodes, once a process."""
     made = pawn(gaussian_count=3000, device=device)
     return make_creature(made.cloud, plane=made.plane, nodes=50, friction=friction)
 

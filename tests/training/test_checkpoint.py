@@ -73,6 +73,7 @@ def cut_off(views: list[TrainingView], path: Path, at: int, *, resume: bool) -> 
         finetune(start(), views, options=OPTIONS, checkpoint=path, resume=resume, progress=stop)
 
 
+@pytest.mark.slow
 def test_cut_off_three_times_it_has_the_same_bits(views: list[TrainingView], tmp_path: Path) -> None:
     whole = finetune(start(), views, options=OPTIONS)
     assert len(whole.misfits) == 1 and whole.cloud.count == 90

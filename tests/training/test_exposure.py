@@ -18,6 +18,7 @@ from egs_warp.training.outlier_views import is_outlier  # noqa: E402
 from egs_warp.training.relocation import Population, _pace  # noqa: E402
 
 
+@pytest.mark.slow
 def test_gains_and_shifts_of_the_views_are_found_and_their_mean_is_none() -> None:
     """Six views of one ball under gains from 0.7 to 1.2 and a warm or cold tint: what remains between two is theirs."""
     random = np.random.default_rng(0)

@@ -127,7 +127,14 @@ def test_an_empty_take_and_a_folder_that_cannot_be_written_are_told(tmp_path: Pa
     assert not played.session.state_message()["recording"]
 
 
-@pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EACCES, errno.EPIPE], ids=["full", "refused", "pipe"])
+@pytest.mark.parametrize(
+    "reason",
+    [
+        pytest.param(errno.ENOSPC, id="full"),
+        pytest.param(errno.EACCES, id="refused", marks=pytest.mark.slow),
+        pytest.param(errno.EPIPE, id="pipe", marks=pytest.mark.slow),
+    ],
+)
 def test_each_opening_and_renaming_of_a_take_fails_once(
     reason: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
