@@ -1,4 +1,7 @@
-"""The ground: gaps, contact points, Coulomb's law and the step that obeys it (section 3.3, Eq. 8, 9).
+"""Contact with the ground and solids: gaps, contact points, Coulomb's law and the coupled step (section 3.3, Eq. 8, 9).
 
-In: a moving cage with embedded Gaussians, and terrain. Out: contact points and the forces that obey Coulomb at them.
+The input is a moving cage with embedded Gaussians, and terrain. The output is contact points and the forces on them
+that satisfy Coulomb's law. A step runs through ``detection`` (gaps), ``selection`` (contact points) and
+``coupled_step`` (Newton's method), which uses ``newton`` and ``coulomb``. The ``host_`` and ``device_`` modules
+implement the same for one body on a CPU and on a GPU, the ``batch_`` modules for many worlds.
 """

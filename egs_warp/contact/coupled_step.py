@@ -1,4 +1,10 @@
-"""A step with contact: velocities and contact forces are sought together until both equations hold (Eq. 4, 8, 9)."""
+"""Newton's method on the velocities and contact forces of one step, until both equations hold (Eq. 4, 8, 9).
+
+A step is solved in rounds with a fixed contact set (``CoupledSolver._round``). A Newton step solves Coulomb's law for
+the contact forces, moves velocities and forces to the solution, and shortens the step while the residual is too large.
+Points that would end too deep are added to the set, and the next round begins. The iterates come from ``newton`` (host)
+or ``device_newton`` (GPU).
+"""
 
 from __future__ import annotations
 
@@ -14,43 +20,47 @@ from egs_warp.fem.step_problem import StepProblem
 from egs_warp.muscles.tension import MuscleEnergy
 
 MIN_STEP_LENGTH = 1e-3
+"""Length at which the line search gives up, as a fraction of a Newton step."""
 MAX_ACTIVATION_ROUNDS = 6
+"""Rounds of a step. Points may be added to the contact set after each but the last."""
 PUSH_OUT_FRACTION = 0.2
-"""Of the depth beyond the tolerance, a step."""
+"""Fraction of the depth beyond the tolerance that a step pushes a point out."""
 ACTIVATION_DEPTH = 0.6
-"""Of the tolerance: points that would end deeper join at once."""
+"""Fraction of the penetration tolerance. Points that would end deeper are added to the contact set."""
 ACTIVATION_RESIDUAL = 1e-3
-"""Residual over dt x weight below which a round that comes down to it looks for them, as at its end: by then it is
-known well enough where that is."""
+"""Residual over dt x weight. When a round first falls below it, points that would end too deep are added; the end is
+known well enough by then. They are also added at the end of the round.
+"""
 MAX_SINK = 0.3
-"""Of the tolerance: by how much what is deep already may go deeper in a step; by next to nothing beyond the tolerance.
+"""Fraction of the penetration tolerance by which a point that is already deep may sink in a step without being added.
 """
 MAX_CREEP = 0.02
+"""The same limit for a point that would end deeper than the tolerance itself."""
 COULOMB_TOLERANCE = 1e-6
-"""Of dt g, which a step gives what falls: by how much less the forces of its end miss Coulomb's law."""
+"""Violation of Coulomb's law at the end of a step, as a fraction of dt g, the speed that free fall gains in a step."""
 MAX_COULOMB_FAILURES = 3
-"""Times that forces may miss it by more before the step is given up, to be done in halves."""
+"""Newton steps of a round whose forces may violate it by more before the solve fails and the step is halved."""
 
 
 @dataclass(frozen=True)
 class CoupledResult:
-    """End of a step with contact."""
+    """Result of a step with contact."""
 
     velocities: np.ndarray
     """(N, 3) m/s."""
     contacts: ContactSet
     forces: np.ndarray
-    """(n, 3) newtons on the body: normal and two tangents of each contact."""
+    """(n, 3) newtons on the body: normal and two tangential components for each contact."""
     converged: bool
     residual: float
-    """Norm of what the equation of motion misses, over dt x weight."""
+    """Norm of the residual of the equation of motion, over dt x weight."""
     iterations: int
     factorization_count: int
-    """Factorisations made on the way."""
+    """Number of factorisations computed in the solve."""
     linearization: ContactLinearization
-    """By the last of them: of the contacts of the end."""
+    """The last linearisation, with the contacts at the end."""
     penetration: PenetrationCheck | None
-    """At the end; None if nobody looked."""
+    """Penetration test at the end; None if it was not evaluated."""
 
 
 @dataclass(frozen=True)
@@ -60,21 +70,31 @@ class CoupledSolver:
     detector: ContactDetector
     points: ContactSelector
     push_out_cap: float
-    """m/s."""
+    """Maximum push-out speed, m/s."""
     penetration_tolerance: float
-    """Metres: points that would end deeper join the set."""
+    """Metres. Points that would end deeper than ``ACTIVATION_DEPTH`` of it are added to the contact set."""
     tolerance: float = 1e-8
-    """Residual over dt x weight."""
+    """Residual over dt x weight at which the solve ends."""
 
     def normal_bias(self, contacts: ContactSet, dt: float) -> np.ndarray:
-        """(n,) m/s, the constant of the normal measure of a step of ``dt`` seconds: nothing goes deeper, and
-        what is deeper than the tolerance comes out gently."""
+        """Return the velocity bias added to each contact's normal velocity.
+
+        It forbids further penetration during the step and pushes contacts that are deeper than
+        ``penetration_tolerance`` out at a limited speed.
+
+        Args:
+            contacts: n active contacts.
+            dt: step size, s.
+
+        Returns:
+            (n,) m/s.
+        """
         return push_out_speeds(contacts.gaps, dt, self.push_out_cap, PUSH_OUT_FRACTION, self.penetration_tolerance)
 
     def convergence_state(self, problem: StepProblem, *, last: bool = False) -> ConvergenceState:
-        """Of a round of the step, which in the ``last`` no points join."""
-        answered = COULOMB_TOLERANCE * problem.residual_scale / problem.body.mass
-        return ConvergenceState(self.tolerance, 0.0 if last else ACTIVATION_RESIDUAL, answered)
+        """Return the state of the Newton loop at the start of a round. In the ``last`` round no points are added."""
+        coulomb_tolerance = COULOMB_TOLERANCE * problem.residual_scale / problem.body.mass
+        return ConvergenceState(self.tolerance, 0.0 if last else ACTIVATION_RESIDUAL, coulomb_tolerance)
 
     def solve(
         self,
@@ -84,8 +104,13 @@ class CoupledSolver:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> CoupledResult:
-        """The step from a start of ``velocities`` (N, 3), which invert no element, and ``forces`` (n, 3); ``response``
-        is kept while it serves.
+        """Solve the step with Newton's method and return its end.
+
+        Args:
+            response: linearisation with the initial contacts, reused while it converges well.
+            tension: muscle energy of the step, or None.
+            velocities: (N, 3) m/s, the start. They must invert no element.
+            forces: (n, 3) newtons, the start.
         """
         iterations = tangents = 0
         for number in range(MAX_ACTIVATION_ROUNDS):
@@ -102,24 +127,24 @@ class CoupledSolver:
     def _with_penetrating_points(
         self, problem: StepProblem, contacts: ContactSet, end: NewtonIterate
     ) -> ContactSet | None:
-        """``contacts``, and points that would ``end`` too deep; None if none would."""
-        seen, start = end.penetration, problem.state.positions
-        if seen is not None and not seen.is_penetrating:
+        """Return ``contacts`` and the points that would be too deep at ``end``; None if there are none."""
+        check, start = end.penetration, problem.state.positions
+        if check is not None and not check.is_penetrating:
             return None
-        if seen is not None and seen.deepest is not None:
-            joining = seen.deepest[self.points.order_by_gap(seen.deepest[:, 0], seen.deepest[:, 1])]
+        if check is not None and check.deepest is not None:
+            deepest = check.deepest[self.points.order_by_gap(check.deepest[:, 0], check.deepest[:, 1])]
             return self.detector.contact_set_at(
-                np.concatenate([contacts.points, joining[:, 0].astype(int)]),
+                np.concatenate([contacts.points, deepest[:, 0].astype(int)]),
                 start,
-                np.concatenate([contacts.gaps, joining[:, 2]]),
-                np.concatenate([contacts.faces, joining[:, 3].astype(np.int32)]),
+                np.concatenate([contacts.gaps, deepest[:, 2]]),
+                np.concatenate([contacts.faces, deepest[:, 3].astype(np.int32)]),
             )
         gaps, _ = self.detector.gaps(problem.end_positions(end.velocities))
         depth = ACTIVATION_DEPTH * self.penetration_tolerance
         if gaps.min() >= -depth:
             return None
         start_gaps, _ = self.detector.gaps(start)
-        # What is deep already is held where it is only once it would go deeper.
+        # A point that is already deep is added only if it would sink further.
         allowed = np.where(gaps < -self.penetration_tolerance, MAX_CREEP, MAX_SINK) * self.penetration_tolerance
         added = self.points.find_deeper(contacts.points, np.where(gaps < start_gaps - allowed, gaps, 0.0), depth)
         if len(added) == 0:
@@ -135,53 +160,65 @@ class CoupledSolver:
         *,
         last: bool,
     ) -> tuple[CoupledResult, ContactSet | None]:
-        """With the contacts of ``response``: where it ends, or where points are found that are to join them, and all of
-        these; None in the ``last`` round."""
+        """Run Newton's method with the contacts of ``response``.
+
+        Returns:
+            The end of the round, and the extended contact set if penetrating points were found; None otherwise and in
+                the ``last`` round.
+        """
         problem, contacts = response.tangent.problem, response.contacts
-        shift = self.normal_bias(contacts, problem.dt)
+        normal_bias = self.normal_bias(contacts, problem.dt)
         friction = self.detector.geometry.friction
-        course = self.convergence_state(problem, last=last)
-        tangents, unanswered, fresh = 0, 0, False
-        now = response.iterate_at(tension, velocities, forces)
-        while course.steps < MAX_NEWTON_STEPS:
-            stretch = now.newton_steps(shift, friction, course)
-            now, trial, missed = stretch.base, stretch.trial, stretch.coulomb_violation
-            course, fresh = course.after_steps(*stretch.accepted_residuals), fresh and not stretch.accepted_residuals
-            obeys = missed <= course.coulomb_tolerance
-            unanswered += not obeys
+        convergence = self.convergence_state(problem, last=last)
+        tangents, coulomb_failures, tangent_is_current = 0, 0, False
+        iterate = response.iterate_at(tension, velocities, forces)
+        while convergence.steps < MAX_NEWTON_STEPS:
+            steps = iterate.newton_steps(normal_bias, friction, convergence)
+            iterate, trial, violation = steps.base, steps.trial, steps.coulomb_violation
+            convergence, tangent_is_current = (
+                convergence.after_steps(*steps.accepted_residuals),
+                tangent_is_current and not steps.accepted_residuals,
+            )
+            satisfies_coulomb = violation <= convergence.coulomb_tolerance
+            coulomb_failures += not satisfies_coulomb
             length = 1.0
-            while not (better := course.is_acceptable(trial.residual_norm, length)) and length > 2.0 * MIN_STEP_LENGTH:
+            while (
+                not (better := convergence.is_acceptable(trial.residual_norm, length))
+                and length > 2.0 * MIN_STEP_LENGTH
+            ):
                 length *= 0.5
-                trial = now.line_search_point(stretch.forces, length)
+                trial = iterate.line_search_point(steps.forces, length)
             if better:
-                before, now = now, trial
+                before, iterate = iterate, trial
                 # After a whole step the contact velocities are those that were solved for, by linearity.
-                obeys = obeys and length == 1.0
-                ended = obeys and now.residual_norm <= course.tolerance
-                slow = course.converges_slowly(now.residual_norm, before.residual_norm) or not obeys
-                joins = (
-                    not last
-                    and obeys
-                    and (ended or course.may_activate_contacts(now.residual_norm, before.residual_norm))
+                satisfies_coulomb = satisfies_coulomb and length == 1.0
+                ended = satisfies_coulomb and iterate.residual_norm <= convergence.tolerance
+                slow = (
+                    convergence.converges_slowly(iterate.residual_norm, before.residual_norm) or not satisfies_coulomb
                 )
-                course = course.after_steps(now.residual_norm)
-                if joins:
-                    wider = self._with_penetrating_points(problem, contacts, now)
+                activates = (
+                    not last
+                    and satisfies_coulomb
+                    and (ended or convergence.may_activate_contacts(iterate.residual_norm, before.residual_norm))
+                )
+                convergence = convergence.after_steps(iterate.residual_norm)
+                if activates:
+                    wider = self._with_penetrating_points(problem, contacts, iterate)
                     if wider is not None:
-                        return _result(now, ended, course.steps, tangents), wider
+                        return _result(iterate, ended, convergence.steps, tangents), wider
                 if ended:
-                    return _result(now, True, course.steps, tangents), None
+                    return _result(iterate, True, convergence.steps, tangents), None
             else:
-                course, slow = course.after_failed_step(), True
-                if fresh:
+                convergence, slow = convergence.after_failed_step(), True
+                if tangent_is_current:
                     break
-            if unanswered > MAX_COULOMB_FAILURES:
+            if coulomb_failures > MAX_COULOMB_FAILURES:
                 break
-            fresh = False
+            tangent_is_current = False
             if slow:
-                now = now.with_new_tangent()
-                tangents, fresh = tangents + 1, True
-        return _result(now, False, course.steps, tangents), None
+                iterate = iterate.with_new_tangent()
+                tangents, tangent_is_current = tangents + 1, True
+        return _result(iterate, False, convergence.steps, tangents), None
 
 
 def _result(end: NewtonIterate, converged: bool, iterations: int, tangents: int) -> CoupledResult:

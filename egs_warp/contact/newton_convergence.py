@@ -1,4 +1,8 @@
-"""What tells whether a round of Newton steps with contact goes on (Eq. 4, 8): on the host, and in a loop on a GPU."""
+"""Convergence test of the Newton loop with contact (Eq. 4, 8).
+
+The host loop in ``coupled_step`` uses the methods of ``ConvergenceState``. The GPU loop uses the kernels of
+``kernels/contact/newton_convergence.py``, which read the packed state.
+"""
 
 from __future__ import annotations
 
@@ -10,55 +14,64 @@ from egs_warp.contact.coulomb import FAILURE_TOLERANCE
 from egs_warp.kernels.contact.newton_convergence import MIN_DECREASE, REFACTOR_RATIO, RESIDUAL_WINDOW
 
 MAX_NEWTON_STEPS = 60
-"""Of a round at most."""
+"""Newton steps of a round."""
 
 
 @dataclass(frozen=True)
 class ConvergenceState:
-    """A round so far, and its terms. Residuals are over dt x weight."""
+    """State and tolerances of one Newton loop (round). Residuals are over dt x weight."""
 
     tolerance: float
-    """Residual at which it ends."""
+    """Residual at which the loop ends."""
     activation_residual: float
-    """Residual below which a round that comes down to it looks for points that are to join; 0 if none may."""
+    """Residual threshold; when the loop first falls below it, penetrating points are looked up. 0 disables this."""
     coulomb_tolerance: float
-    """m/s by which forces may miss their laws."""
+    """Maximum violation of Coulomb's law, m/s."""
     steps: int = 0
     recent_residuals: tuple[float, ...] = ()
-    """Residuals after the last steps that went well, of which the largest must be undercut."""
+    """Residuals after the last accepted steps. A step must end below the largest of them."""
     max_steps: int = MAX_NEWTON_STEPS
-    """Steps, of all of the round, that may be taken without a look."""
+    """Number of steps in the round at which the GPU loop stops and returns to the host."""
 
     def is_acceptable(self, size: float, length: float = 1.0) -> bool:
-        """Whether it may go on from a residual of ``size``, at the end of so much of a step. Contacts that open, close
-        or begin to slide change the forces at once: it need not fall in every step. It is no number where an element is
-        inverted."""
-        least = max((1.0 - MIN_DECREASE * length) * max(self.recent_residuals, default=np.inf), self.tolerance)
-        return bool(np.isfinite(size)) and size < least
+        """Return True if the line search may accept a point.
+
+        The test is non-monotone, because contacts that open, close or begin to slide change the forces at once.
+
+        Args:
+            size: residual at the point; not finite where an element is inverted.
+            length: fraction of the Newton step.
+        """
+        limit = max((1.0 - MIN_DECREASE * length) * max(self.recent_residuals, default=np.inf), self.tolerance)
+        return bool(np.isfinite(size)) and size < limit
 
     def converges_slowly(self, size: float, before: float) -> bool:
-        """Whether a step from a residual ``before`` to one of ``size`` speaks against its tangent."""
+        """Return True if a step from residual ``before`` to ``size`` shows that the tangent should be updated."""
         return self.steps > 0 and size > REFACTOR_RATIO * before
 
     def may_activate_contacts(self, size: float, before: float) -> bool:
-        """Whether it has come down to where points are looked for that are to join."""
+        """Return True if a step from residual ``before`` to ``size`` passes the activation threshold."""
         return before > self.activation_residual >= size
 
     def after_steps(self, *sizes: float) -> ConvergenceState:
-        """After steps to residuals of these ``sizes``, which went well."""
+        """Return the state after accepted steps to residuals ``sizes``."""
         recent = (*self.recent_residuals, *sizes)[-RESIDUAL_WINDOW:]
         return replace(self, steps=self.steps + len(sizes), recent_residuals=recent)
 
     def after_failed_step(self) -> ConvergenceState:
-        """After a step that did not."""
+        """Return the state after a step that was not accepted."""
         return replace(self, steps=self.steps + 1)
 
     def pack(self, unit: float, size: float | None) -> np.ndarray:
-        """As ``begin_kernel`` and ``judge_kernel`` read it, with residuals in N s, of which ``unit`` are 1: it goes on
-        from one of ``size``, or from that of the last trial."""
-        begin = -1.0 if size is None else unit * size
+        """Pack the state for ``init_convergence_kernel`` and ``check_convergence_kernel``.
+
+        Args:
+            unit: dt x weight, N s. The packed residuals are in N s.
+            size: residual at the start of the loop; None uses that of the last trial.
+        """
+        start = -1.0 if size is None else unit * size
         residuals = unit * np.array([self.tolerance, self.activation_residual]), unit * np.array(self.recent_residuals)
-        gone = np.full(RESIDUAL_WINDOW - len(self.recent_residuals), -1.0)
-        # What is led astray is for the host to find.
+        padding = np.full(RESIDUAL_WINDOW - len(self.recent_residuals), -1.0)
+        # The loop also stops at a numerical failure of the Coulomb solve, which the host repairs.
         terms = np.array([min(self.coulomb_tolerance, FAILURE_TOLERANCE), float(self.max_steps), 0.0])
-        return np.concatenate([[float(self.steps), begin, begin], residuals[0], terms, gone, residuals[1]])
+        return np.concatenate([[float(self.steps), start, start], residuals[0], terms, padding, residuals[1]])

@@ -121,8 +121,8 @@ CONTACT = [
     ),
     Survivor(
         "contact/coulomb.py",
-        "wanted = ((1, 5, size), real), ((1, 2, size), int), ((1, size, (size + 4) // 4), Vec4)",
-        "wanted = ((1, 5, size), real), (( 2, 2, size), int), ((1, size, (size + 4) // 4), Vec4)",
+        "scratch_shapes = ((1, 5, size), real), ((1, 2, size), int), ((1, size, (size + 4) // 4), Vec4)",
+        "scratch_shapes = ((1, 5, size), real), (( 2, 2, size), int), ((1, size, (size + 4) // 4), Vec4)",
         "room for numbers that nothing reads",
     ),
     Survivor(
