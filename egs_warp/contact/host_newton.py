@@ -1,4 +1,8 @@
-"""Newton steps with contact on a CPU by a launch or two, where arrays of the host take twenty calls (Eq. 4, 8)."""
+"""Newton steps with contact on a CPU, in one or two kernel launches instead of twenty NumPy calls (Eq. 4, 8).
+
+The kernels are in ``kernels/contact/iterate_cpu.py``. ``HostNewtonWorkspace.trial`` moves an iterate along a Newton
+step and evaluates the residual there; ``HostNewtonWorkspace.newton`` solves for the next contact-free velocities.
+"""
 
 from __future__ import annotations
 
@@ -18,27 +22,32 @@ from egs_warp.precision import real
 
 
 class IterateBuffer:
-    """What a step of Newton's method starts from, in one piece of memory: addresses take longer to find out than to
-    use."""
+    """Data of a Newton iterate in one block of memory, since looking up an array's address takes longer than using
+    it.
+    """
 
     def __init__(self, contacts: ContactSet) -> None:
         size, width = 3 * contacts.node_count, 3 * contacts.count
         self.contacts, self._all = contacts, np.empty(3 * size + 2 * width)
         self._ends = [size, 2 * size, 3 * size, 3 * size + width]
-        places = address_of(self._all)
-        self.velocities_at, self.loose_at, self.free_at, self.forces_at, self.speeds_at = (
-            places + 8 * begin for begin in (0, *self._ends)
-        )
+        address = address_of(self._all)
+        (
+            self.velocities_at,
+            self.free_velocities_at,
+            self.free_residual_at,
+            self.forces_at,
+            self.free_contact_velocities_at,
+        ) = (address + 8 * offset for offset in (0, *self._ends))
 
     @classmethod
     def of(cls, contacts: ContactSet, velocities: np.ndarray, forces: np.ndarray) -> IterateBuffer:
-        """At nodal ``velocities`` (N, 3) and contact ``forces`` (n, 3)."""
+        """Create a buffer with nodal ``velocities`` (N, 3) and contact ``forces`` (n, 3)."""
         state = cls(contacts)
         state.velocities[:], state.forces[:] = velocities, forces
         return state
 
     def copy(self) -> IterateBuffer:
-        """In memory of its own."""
+        """Return a copy in separate memory."""
         other = IterateBuffer(self.contacts)
         other._all[:] = self._all
         return other
@@ -60,12 +69,12 @@ class IterateBuffer:
 
     @property
     def free_contact_velocities(self) -> np.ndarray:
-        """(3n,) m/s of the contacts after that step."""
+        """(3n,) m/s, contact velocities after a Newton step without contact forces."""
         return self._all[self._ends[3] :]
 
 
 class HostNewtonWorkspace:
-    """Memory for a step of so many nodes, and what of it has been told already."""
+    """Buffers of a step of a body with ``nodes`` nodes. The data of the last step and contact set stay loaded."""
 
     def __init__(self, nodes: int) -> None:
         self._device = wp.get_device("cpu")
@@ -77,16 +86,16 @@ class HostNewtonWorkspace:
             "inverse_inertia": 9,
             "masses": nodes,
         }
-        self._told: dict[str, np.ndarray] = {}
+        self._step_arrays: dict[str, np.ndarray] = {}
         for name, size in sizes.items():
-            self._told[name], array = _shared(size)
+            self._step_arrays[name], array = _shared(size)
             setattr(self._step, name, array)
         _, self._ends = _shared((nodes, 3))
         _, self._gradient = _shared((nodes, 3))
-        rest, self._rest = _shared((nodes, 3))
-        """N s, the residual of the last trial."""
-        self._rest_at = address_of(rest)
-        self._size, self._size_array = _shared(1)
+        residual, self._residual = _shared((nodes, 3))
+        """N s, residual of the last trial with contact forces."""
+        self._residual_at = address_of(residual)
+        self._norm, self._norm_array = _shared(1)
         self._problem: StepProblem | None = None
         self._contacts: tuple[ContactSet | None, list[Any], list[Any]] = (None, [], [])
 
@@ -97,61 +106,78 @@ class HostNewtonWorkspace:
         base: IterateBuffer,
         step: tuple[int, np.ndarray, float] | None = None,
     ) -> tuple[IterateBuffer, float]:
-        """From ``base`` on after a ``step``, or where that is: the state there, and the size of what the equation
-        misses.
+        """Evaluate the residual at ``base``, or at a point on the Newton step from there.
 
-        A step is the address of columns (3N, 3n), contact forces (n, 3) that are wanted with them, and how much of the
-        way is gone.
+        Args:
+            problem: the step.
+            tension: muscle energy, or None.
+            base: start of the Newton step.
+            step: address of the columns (3N, 3n), contact forces (n, 3) of the Newton step, and the fraction of the
+                step to take; None evaluates ``base`` itself.
+
+        Returns:
+            The state there, and the norm of the residual over dt x weight.
         """
-        self._take(problem)
+        self._load(problem)
         elements = problem.body.assembly.elements
         assert isinstance(elements, SimdElasticity)
-        columns, wanted, length = 0, base.forces_at, 0.0
+        columns, target_forces, length = 0, base.forces_at, 0.0
         end = base
         if step is not None:
-            columns, given, length = step
-            wanted, end = address_of(given), IterateBuffer(base.contacts)
+            columns, forces, length = step
+            target_forces, end = address_of(forces), IterateBuffer(base.contacts)
         launch_cached(
             kernels.trial_kernel,
             1,
             inputs=[
                 *(elements.elements, elements.lines_of(tension), self._step, problem.damping.start),
                 *(problem.dt, 1.0 + problem.dt * problem.drag, *self._contacts_of(base.contacts), columns),
-                *(base.velocities_at, base.loose_at, base.forces_at, wanted, float(length)),
+                *(base.velocities_at, base.free_velocities_at, base.forces_at, target_forces, float(length)),
             ],
             outputs=[
-                *(self._ends, self._gradient, self._rest, end.velocities_at, end.forces_at, end.free_at),
-                self._size_array,
+                *(self._ends, self._gradient, self._residual, end.velocities_at, end.forces_at, end.free_residual_at),
+                self._norm_array,
             ],
             device=self._device,
         )
-        return end, float(self._size[0]) / problem.residual_scale
+        return end, float(self._norm[0]) / problem.residual_scale
 
     def newton(self, tangent: Tangent, state: IterateBuffer, *, rest: bool = False) -> None:
-        """In the ``state``: velocities and contact speeds after a Newton step by ``tangent`` without contact forces,
-        or, from the last trial, with those that it has (``rest``)."""
+        """Write the velocities and contact velocities after a Newton step without contact forces into ``state``.
+
+        Args:
+            tangent: factored tangent.
+            state: the iterate.
+            rest: use the residual of the last trial, with contact forces, instead.
+        """
         factors = tangent.factors
         assert isinstance(factors, MultifrontalLdl)
-        solving, added, room = factors.solving_one(tangent.momentum_projection)
-        right = self._rest_at if rest else state.free_at
+        factor_arrays, low_rank_arrays, scratch = factors.solving_one(tangent.momentum_projection)
+        right_side = self._residual_at if rest else state.free_residual_at
         launch_cached(
             kernels.newton_kernel,
             1,
-            inputs=[*solving, *added, *self._contacts_of(state.contacts), right, state.velocities_at],
-            outputs=[room, state.loose_at, state.speeds_at],
+            inputs=[
+                *factor_arrays,
+                *low_rank_arrays,
+                *self._contacts_of(state.contacts),
+                right_side,
+                state.velocities_at,
+            ],
+            outputs=[scratch, state.free_velocities_at, state.free_contact_velocities_at],
             device=self._device,
         )
 
-    def _take(self, problem: StepProblem) -> None:
+    def _load(self, problem: StepProblem) -> None:
         if self._problem is problem:
             return
-        self._problem, told, state = problem, self._told, problem.state
-        told["positions"][:], told["arms"][:] = state.positions.ravel(), problem.lever_arms.ravel()
-        told["ballistic_velocities"][:] = (state.velocities + problem.dt * problem.body.gravity).ravel()
-        told["inverse_inertia"][:], told["masses"][:] = problem.inverse_inertia.ravel(), problem.body.node_mass
+        self._problem, arrays, state = problem, self._step_arrays, problem.state
+        arrays["positions"][:], arrays["arms"][:] = state.positions.ravel(), problem.lever_arms.ravel()
+        arrays["ballistic_velocities"][:] = (state.velocities + problem.dt * problem.body.gravity).ravel()
+        arrays["inverse_inertia"][:], arrays["masses"][:] = problem.inverse_inertia.ravel(), problem.body.node_mass
 
     def _contacts_of(self, contacts: ContactSet) -> list[Any]:
-        """How many they are, and the addresses of their nodes, weights and axes."""
+        """Return the number of contacts and the addresses of their nodes, weights and axes."""
         if self._contacts[0] is not contacts:
             parts = [
                 np.ascontiguousarray(part, dtype=kind)
@@ -162,7 +188,7 @@ class HostNewtonWorkspace:
 
 
 host_newton_workspace = thread_local_cache(4)(HostNewtonWorkspace)
-"""That of so many nodes, and of this thread."""
+"""Return the workspace of this thread for the given number of nodes."""
 
 
 def _shared(shape: int | tuple[int, ...]) -> tuple[np.ndarray, wp.array]:
@@ -171,6 +197,6 @@ def _shared(shape: int | tuple[int, ...]) -> tuple[np.ndarray, wp.array]:
 
 
 def address_of(values: np.ndarray) -> int:
-    """Of its first number, behind which the others lie row by row."""
+    """Return the address of a C-contiguous array."""
     assert values.flags.c_contiguous
     return values.ctypes.data

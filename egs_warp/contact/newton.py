@@ -1,4 +1,10 @@
-"""What contact forces bring about by a step's tangent, and Newton steps with them (Eq. 4, 8, 9)."""
+"""Linearised contact and the Newton iterates of a step with contact (Eq. 4, 8, 9).
+
+For a factored tangent J, ``ContactLinearization`` holds the columns dt J^-1 W^T and the Delassus operator G = dt W J^-1
+W^T. A ``NewtonIterate`` is a pair of velocities and contact forces; its Newton step solves Coulomb's law at the
+contact-free velocities and adds the columns times the forces. On a CPU the kernels of ``host_newton`` evaluate an
+iterate; ``device_newton`` is the version on a GPU.
+"""
 
 from __future__ import annotations
 
@@ -18,21 +24,23 @@ from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.muscles.tension import MuscleEnergy
 
 DELASSUS_REGULARIZATION = 1e-7
-"""Of the mean of the Delassus operator's diagonal: more points than the cage can resolve leave it singular."""
+"""Diagonal shift of the Delassus operator, as a fraction of the mean of its diagonal. The operator is singular with
+more points than the cage can resolve.
+"""
 
 
 @dataclass(frozen=True)
 class ContactLinearization:
-    """What forces at contact points bring about, by the tangent of one step."""
+    """Contact velocities as an affine function of contact forces, for the tangent of one step."""
 
     tangent: Tangent
     contacts: ContactSet
     columns: Any
-    """(3N, 3n) m/s for each newton, where the factors are."""
+    """(3N, 3n) m/s per newton, dt J^-1 W^T, on the device of the factors."""
 
     @classmethod
     def of(cls, tangent: Tangent, contacts: ContactSet, columns: np.ndarray | None = None) -> ContactLinearization:
-        """Of ``contacts``; ``columns`` if they are known."""
+        """Linearise ``contacts`` by ``tangent``; ``columns`` are computed unless they are passed."""
         if columns is None:
             columns = tangent.solve(contacts.dense_jacobian.T)
             columns *= tangent.problem.dt
@@ -40,12 +48,12 @@ class ContactLinearization:
 
     @cached_property
     def delassus(self) -> np.ndarray:
-        """(3n, 3n) m/(N s), contact velocities for each newton."""
+        """(3n, 3n) m/(N s), the Delassus operator G: contact velocities per newton."""
         return self.contacts.contact_velocities(self.columns)
 
     @cached_property
     def columns_address(self) -> int:
-        """Address of the ``columns`` on the host."""
+        """Host address of ``columns``."""
         return address_of(self.columns)
 
     @cached_property
@@ -57,40 +65,58 @@ class ContactLinearization:
     def solve_coulomb(
         self, speeds: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        """(n, 3) newtons that obey contact and friction if the contacts move at ``speeds`` (3n,) without them, and the
-        m/s by which they miss that."""
+        """Solve Coulomb's law and complementarity for the contact forces.
+
+        Args:
+            speeds: (3n,) m/s, contact velocities without contact forces.
+            shift: (n,) m/s, bias of the normal velocities.
+            friction: Coulomb coefficient.
+            start: (n, 3) newtons, initial forces.
+
+        Returns:
+            The forces (n, 3) in newtons, and their violation of the law in m/s.
+        """
         if self.contacts.count == 0:
             return start, 0.0
         return coulomb_forces(self._regular, speeds, shift, friction, start)
 
     def with_added_contacts(self, contacts: ContactSet) -> ContactLinearization:
-        """By the same tangent, of ``contacts`` that begin with these."""
+        """Return the linearisation of ``contacts``, which begin with the present ones, by the same tangent."""
         new = contacts.dense_jacobian[3 * self.contacts.count :].T
         columns = np.hstack([self.columns, self.tangent.problem.dt * self.tangent.solve(new)])
         return ContactLinearization.of(self.tangent, contacts, columns)
 
     def iterate_at(self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray) -> NewtonIterate:
-        """The step's equation at ``velocities`` (N, 3) and contact ``forces`` (n, 3), under ``tension``."""
-        if _elements_are_here(self.tangent):
+        """Return the Newton iterate at ``velocities`` (N, 3) and contact ``forces`` (n, 3), under ``tension``."""
+        if _elements_on_host(self.tangent):
             return NativeNewtonIterate.at(self, tension, velocities, forces)
         return NumpyNewtonIterate(self, tension, velocities, forces)
 
 
 class ContactLinearizer(Protocol):
-    """Responses of one body, by one tangent after the other."""
+    """Protocol of the objects that build the contact linearisations of one body."""
 
     def __call__(self, tangent: Tangent, contacts: ContactSet) -> ContactLinearization:
-        """Of ``contacts`` by ``tangent``."""
+        """Linearise ``contacts`` by ``tangent``."""
         ...
 
     def select_contacts(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
-        """The contacts of a step, after the points ``before`` (m,), of which those ``loaded`` (m,) bool pressed; None
-        if the gaps are on the host."""
+        """Select the contacts of a step where the gaps are on a GPU.
+
+        Args:
+            problem: the step.
+            before: (m,) contact points of the previous step.
+            loaded: (m,) bool, which of them carried load.
+
+        Returns:
+            The contacts; None if the gaps are on the host.
+        """
         ...
 
     def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray) -> None:
-        """Begin to ``choose`` for a step of ``dt`` seconds from ``state``, after the points ``before`` (m,), which
-        comes next, likely."""
+        """Start ``select_contacts`` for the probable next step, of ``dt`` seconds from ``state``, after the points
+        ``before`` (m,).
+        """
         ...
 
     def predict_velocities(
@@ -101,24 +127,34 @@ class ContactLinearizer(Protocol):
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> np.ndarray | None:
-        """(N, 3) m/s after a Newton step from ``velocities`` (N, 3) under ``tension`` and contact ``forces`` (n, 3), as
-        they are; None if it inverts an element."""
+        """Take one Newton step with fixed contact forces.
+
+        Args:
+            tangent: factored tangent.
+            contacts: n contacts.
+            tension: muscle energy of the step, or None.
+            velocities: (N, 3) m/s, the start.
+            forces: (n, 3) newtons.
+
+        Returns:
+            (N, 3) m/s; None if the step inverts an element.
+        """
         ...
 
 
 class HostContactLinearizer:
-    """``Responder`` in arrays of the host."""
+    """``ContactLinearizer`` with NumPy arrays."""
 
     def __call__(self, tangent: Tangent, contacts: ContactSet) -> ContactLinearization:
-        """See ``Responder``."""
+        """Linearise ``contacts`` by ``tangent``."""
         return ContactLinearization.of(tangent, contacts)
 
     def select_contacts(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
-        """See ``Responder``."""
+        """Return None; the caller selects contacts on the host."""
         return None
 
     def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray) -> None:
-        """See ``Responder``: the host has nobody who would look meanwhile."""
+        """Do nothing; there is no device to work in parallel."""
 
     def predict_velocities(
         self,
@@ -128,44 +164,52 @@ class HostContactLinearizer:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> np.ndarray | None:
-        """See ``Responder``. One right-hand side, where a response has three for each contact."""
+        """Take one Newton step with fixed contact forces. It needs one right-hand side, a linearisation three for
+        each contact.
+        """
         problem = tangent.problem
-        if _elements_are_here(tangent):
-            room, state = host_newton_workspace(contacts.node_count), IterateBuffer.of(contacts, velocities, forces)
-            room.trial(problem, tension, state)
-            room.newton(tangent, state, rest=True)
+        if _elements_on_host(tangent):
+            workspace, state = (
+                host_newton_workspace(contacts.node_count),
+                IterateBuffer.of(contacts, velocities, forces),
+            )
+            workspace.trial(problem, tension, state)
+            workspace.newton(tangent, state, rest=True)
             return state.free_velocities if problem.is_inversion_free(state.free_velocities) else None
-        missing = problem.residual(velocities, tension).ravel() - problem.dt * contacts.nodal_forces(forces)
-        ahead = velocities - tangent.solve(missing).reshape(velocities.shape)
-        return ahead if problem.is_inversion_free(ahead) else None
+        residual = problem.residual(velocities, tension).ravel() - problem.dt * contacts.nodal_forces(forces)
+        end = velocities - tangent.solve(residual).reshape(velocities.shape)
+        return end if problem.is_inversion_free(end) else None
 
 
 @dataclass(frozen=True)
 class PenetrationCheck:
-    """What a trial on a GPU has seen on its way."""
+    """Penetration test that a GPU evaluates with each trial."""
 
     is_penetrating: bool
-    """Whether points sink that are in no contact, see ``CoupledSolver``."""
+    """True if points outside the contact set penetrate too far (see ``CoupledSolver``)."""
     min_gap: float
-    """Metres, of all points."""
+    """Minimum gap of all points, m."""
     internal_torque: np.ndarray
-    """(3,) N m about the centre of mass of the internal gradient at the end."""
+    """(3,) N m, torque of the internal gradient about the centre of mass at the end."""
     deepest: np.ndarray | None = None
-    """(k, 4) the deepest of each cell of those that sink: its number, its gap there, metres, and gap and face at the
-    start of the step; None if nobody asked which."""
+    """(k, 4) deepest penetrating point of each cell: its index, its gap at the end in metres, and its gap and face
+    at the start of the step. None if it was not downloaded.
+    """
 
     @classmethod
-    def of(cls, found: np.ndarray) -> PenetrationCheck:
-        """As it was ``found`` (5,), one behind the other."""
-        return cls(found[0] > 0.0, float(found[1]), np.array(found[2:]))
+    def of(cls, readback: np.ndarray) -> PenetrationCheck:
+        """Unpack the read-back (5,)."""
+        return cls(readback[0] > 0.0, float(readback[1]), np.array(readback[2:]))
 
 
 class NewtonIterate(Protocol):
-    """Velocities and contact forces at which the equation of a step is looked at, and the Newton step from there."""
+    """Protocol of a Newton iterate: velocities and contact forces, the residual there, and the Newton step from
+    there.
+    """
 
     @property
     def linearization(self) -> ContactLinearization:
-        """By which the Newton step is."""
+        """Linearisation that defines the Newton step."""
         ...
 
     @property
@@ -180,77 +224,89 @@ class NewtonIterate(Protocol):
 
     @property
     def residual_norm(self) -> float:
-        """Norm of what the equation misses, over dt x weight; not finite where an element is inverted."""
+        """Norm of the residual with contact forces, over dt x weight; not finite where an element is inverted."""
         ...
 
     @property
     def is_inversion_free(self) -> bool:
-        """Whether no element is inverted."""
+        """True if no element is inverted."""
         ...
 
     @property
     def free_contact_velocities(self) -> np.ndarray:
-        """(3n,) m/s of the contacts after a Newton step without contact forces."""
+        """(3n,) m/s, contact velocities after a Newton step without contact forces."""
         ...
 
     @property
     def penetration(self) -> PenetrationCheck | None:
-        """What is seen on the way; None if nobody looked."""
+        """Penetration test at the iterate; None if it was not evaluated."""
         ...
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> NewtonIterate:
-        """``length`` of the way to the end of a Newton step with contact ``forces`` (n, 3)."""
+        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
         ...
 
     def newton_steps(
-        self, shift: np.ndarray, friction: float, course: ConvergenceState | None = None
+        self, shift: np.ndarray, friction: float, convergence: ConvergenceState | None = None
     ) -> NewtonStepResult:
-        """A Newton step with the forces that obey contact and friction if the contacts move at these ``speeds`` without
-        them; where the ``course`` of a round is known, as many of them as go well, if nobody need look at each."""
+        """Take Newton steps, each with the contact forces that satisfy Coulomb's law at its contact-free velocities.
+
+        Without ``convergence``, and on the host, it is one step. A GPU takes steps until one is not acceptable or the
+        test of ``convergence`` returns to the host; all but the last are accepted.
+
+        Args:
+            shift: (n,) m/s, bias of the normal velocities.
+            friction: Coulomb coefficient.
+            convergence: state of the Newton loop.
+        """
         ...
 
     def with_new_tangent(self) -> NewtonIterate:
-        """The same place, of which the Newton step is by a tangent made there, with the muscles' stiffness."""
+        """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""
         ...
 
 
 @dataclass(frozen=True)
 class NewtonStepResult:
-    """Newton steps with contact, of which the last is to be looked at."""
+    """Result of one or more Newton steps. The caller decides on the last one."""
 
     accepted_residuals: tuple[float, ...]
-    """Residuals after those before it, which went well."""
+    """Residuals after the accepted steps before the last one."""
     base: NewtonIterate
-    """Where it begins."""
+    """Iterate at the start of the last step."""
     forces: np.ndarray
-    """(n, 3) newtons, with which it is."""
+    """(n, 3) newtons, contact forces of the last step."""
     coulomb_violation: float
-    """m/s by which they miss contact and friction."""
+    """Violation of Coulomb's law by these forces, m/s."""
     trial: NewtonIterate
 
 
-def _onward(now: NativeNewtonIterate | NumpyNewtonIterate, shift: np.ndarray, friction: float) -> NewtonStepResult:
-    """``Iterate.onward`` by one step."""
-    forces, missed = now.linearization.solve_coulomb(now.free_contact_velocities, shift, friction, now.forces)
-    return NewtonStepResult((), now, forces, missed, now.line_search_point(forces))
+def _newton_step(
+    iterate: NativeNewtonIterate | NumpyNewtonIterate, shift: np.ndarray, friction: float
+) -> NewtonStepResult:
+    """Take one Newton step from an iterate on the host."""
+    forces, violation = iterate.linearization.solve_coulomb(
+        iterate.free_contact_velocities, shift, friction, iterate.forces
+    )
+    return NewtonStepResult((), iterate, forces, violation, iterate.line_search_point(forces))
 
 
-def _response_at(place: NativeNewtonIterate | NumpyNewtonIterate) -> ContactLinearization:
-    """Of the same contacts, by a tangent made at that ``place``."""
-    old = place.linearization.tangent
+def _linearization_at(iterate: NativeNewtonIterate | NumpyNewtonIterate) -> ContactLinearization:
+    """Return the linearisation of the same contacts by the tangent at the iterate."""
+    old = iterate.linearization.tangent
     return ContactLinearization.of(
-        old.problem.tangent(old.factors, place.velocities, place.tension), place.linearization.contacts
+        old.problem.tangent(old.factors, iterate.velocities, iterate.tension), iterate.linearization.contacts
     )
 
 
-def _elements_are_here(tangent: Tangent) -> bool:
-    """Whether the elements are on a CPU; the factors are, then."""
+def _elements_on_host(tangent: Tangent) -> bool:
+    """Return True if the elements are on a CPU, which implies that the factors are."""
     return isinstance(tangent.problem.body.assembly.elements, SimdElasticity)
 
 
 @dataclass(frozen=True, eq=False)
 class NativeNewtonIterate:
-    """``Iterate`` by kernels of a CPU, which say what ``HostIterate`` says."""
+    """``NewtonIterate`` evaluated by CPU kernels; equal to ``NumpyNewtonIterate``."""
 
     linearization: ContactLinearization
     tension: MuscleEnergy | None
@@ -262,61 +318,61 @@ class NativeNewtonIterate:
     def at(
         cls, response: ContactLinearization, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
     ) -> Self:
-        """At ``velocities`` (N, 3) and ``forces`` (n, 3)."""
+        """Evaluate the iterate at ``velocities`` (N, 3) and ``forces`` (n, 3)."""
         state = IterateBuffer.of(response.contacts, velocities, forces)
-        return cls(response, tension, *_room_of(response).trial(response.tangent.problem, tension, state))
+        return cls(response, tension, *_workspace_of(response).trial(response.tangent.problem, tension, state))
 
     @property
     def velocities(self) -> np.ndarray:
-        """See ``Iterate``."""
+        """(N, 3) m/s."""
         return self.state.velocities
 
     @property
     def forces(self) -> np.ndarray:
-        """See ``Iterate``."""
+        """(n, 3) newtons."""
         return self.state.forces
 
     @property
     def is_inversion_free(self) -> bool:
-        """See ``Iterate``."""
+        """True if no element is inverted."""
         return bool(np.isfinite(self.residual_norm))
 
     @cached_property
     def _after(self) -> IterateBuffer:
-        """The state, with what is after a Newton step without contact forces."""
-        _room_of(self.linearization).newton(self.linearization.tangent, self.state)
+        """The state, with the contact-free velocities of the Newton step filled in."""
+        _workspace_of(self.linearization).newton(self.linearization.tangent, self.state)
         return self.state
 
     @property
     def free_contact_velocities(self) -> np.ndarray:
-        """See ``Iterate``."""
+        """(3n,) m/s, contact velocities after a Newton step without contact forces."""
         return self._after.free_contact_velocities
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> Self:
-        """See ``Iterate``."""
+        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
         response = self.linearization
         step = response.columns_address, forces, length
-        found = _room_of(response).trial(response.tangent.problem, self.tension, self._after, step)
-        return type(self)(response, self.tension, *found)
+        state_and_norm = _workspace_of(response).trial(response.tangent.problem, self.tension, self._after, step)
+        return type(self)(response, self.tension, *state_and_norm)
 
     def newton_steps(
-        self, shift: np.ndarray, friction: float, course: ConvergenceState | None = None
+        self, shift: np.ndarray, friction: float, convergence: ConvergenceState | None = None
     ) -> NewtonStepResult:
-        """See ``Iterate``."""
-        return _onward(self, shift, friction)
+        """Take one Newton step with the contact forces that satisfy Coulomb's law."""
+        return _newton_step(self, shift, friction)
 
     def with_new_tangent(self) -> Self:
-        """See ``Iterate``."""
-        return replace(self, linearization=_response_at(self), state=self.state.copy())
+        """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""
+        return replace(self, linearization=_linearization_at(self), state=self.state.copy())
 
 
-def _room_of(response: ContactLinearization) -> HostNewtonWorkspace:
+def _workspace_of(response: ContactLinearization) -> HostNewtonWorkspace:
     return host_newton_workspace(response.contacts.node_count)
 
 
 @dataclass(frozen=True)
 class NumpyNewtonIterate:
-    """``Iterate`` in arrays of the host, each made when it is asked for: for elements of a GPU without torch."""
+    """``NewtonIterate`` in NumPy arrays, each computed on first use. Used for elements on a GPU without torch."""
 
     linearization: ContactLinearization
     tension: MuscleEnergy | None
@@ -325,43 +381,43 @@ class NumpyNewtonIterate:
     penetration: None = None
 
     @cached_property
-    def _free(self) -> np.ndarray:
-        """(N, 3) N s, the residual without contact."""
+    def _free_residual(self) -> np.ndarray:
+        """(N, 3) N s, residual without contact forces."""
         return self.linearization.tangent.problem.residual(self.velocities, self.tension)
 
     @property
     def residual_norm(self) -> float:
-        """See ``Iterate``."""
-        return self._size
+        """Norm of the residual with contact forces, over dt x weight; not finite where an element is inverted."""
+        return self._residual_norm
 
     @cached_property
-    def _size(self) -> float:
+    def _residual_norm(self) -> float:
         problem = self.linearization.tangent.problem
-        rest = self._free.ravel() - problem.dt * self.linearization.contacts.nodal_forces(self.forces)
+        rest = self._free_residual.ravel() - problem.dt * self.linearization.contacts.nodal_forces(self.forces)
         return float(np.linalg.norm(rest)) / problem.residual_scale
 
     @property
     def is_inversion_free(self) -> bool:
-        """See ``Iterate``."""
+        """True if no element is inverted."""
         return self.linearization.tangent.problem.is_inversion_free(self.velocities)
 
     @cached_property
-    def _loose(self) -> np.ndarray:
+    def _free_velocities(self) -> np.ndarray:
         """(3N,) m/s after a Newton step without contact forces."""
-        return self.velocities.ravel() - self.linearization.tangent.solve(self._free.ravel())
+        return self.velocities.ravel() - self.linearization.tangent.solve(self._free_residual.ravel())
 
     @property
     def free_contact_velocities(self) -> np.ndarray:
-        """See ``Iterate``."""
-        return self._speeds
+        """(3n,) m/s, contact velocities after a Newton step without contact forces."""
+        return self._contact_velocities
 
     @cached_property
-    def _speeds(self) -> np.ndarray:
-        return self.linearization.contacts.contact_velocities(self._loose)
+    def _contact_velocities(self) -> np.ndarray:
+        return self.linearization.contacts.contact_velocities(self._free_velocities)
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> Self:
-        """See ``Iterate``."""
-        end = (self._loose + self.linearization.columns @ forces.ravel()).reshape(self.velocities.shape)
+        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
+        end = (self._free_velocities + self.linearization.columns @ forces.ravel()).reshape(self.velocities.shape)
         return replace(
             self,
             velocities=self.velocities + length * (end - self.velocities),
@@ -369,13 +425,13 @@ class NumpyNewtonIterate:
         )
 
     def newton_steps(
-        self, shift: np.ndarray, friction: float, course: ConvergenceState | None = None
+        self, shift: np.ndarray, friction: float, convergence: ConvergenceState | None = None
     ) -> NewtonStepResult:
-        """See ``Iterate``."""
-        return _onward(self, shift, friction)
+        """Take one Newton step with the contact forces that satisfy Coulomb's law."""
+        return _newton_step(self, shift, friction)
 
     def with_new_tangent(self) -> Self:
-        """See ``Iterate``."""
-        other = replace(self, linearization=_response_at(self))
-        vars(other)["_free"] = self._free
+        """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""
+        other = replace(self, linearization=_linearization_at(self))
+        vars(other)["_free_residual"] = self._free_residual
         return other
