@@ -1,4 +1,9 @@
-"""Contact of the Gaussians' bidirectional embeddings with the ground (Eq. 8-10): what touches, and in which frames."""
+"""Contact geometry of the Gaussians' bidirectional embeddings, their gaps to ground and solids, and the contact
+Jacobian (Eq. 8-10).
+
+``contact_geometry`` builds the points once for a body. ``ContactDetector`` evaluates their gaps with the kernels in
+``kernels/contact/gaps.py`` and ``kernels/contact/height_field.py``, and builds the ``ContactSet`` of a step.
+"""
 
 from __future__ import annotations
 
@@ -27,82 +32,90 @@ from egs_warp.launching import PinnedMirror, launch_cached
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 MIN_OUTSIDE_FRACTION = 0.1
-"""Share of the Gaussians above the ground that are outside of all solids at rest."""
-_SHORTENINGS = 40
-"""Halvings in which an arm finds where it meets uneven ground."""
-_BEND = 1e-7
-"""Of a tetrahedron's points: far above the rounding of a double, far below what makes a point of a grid a vertex."""
-_PLACES = 4
-"""Positions whose gaps are kept: a step ends where the next one starts, and asks for either several times."""
-_SLACK = 0.25
-"""Of the grid: what is not deeper is in the plane once it is moved to the grid."""
-_FINE = 0.5
-"""Of the spacing of uneven ground: in each such square of it the lowest point of each tetrahedron counts."""
+"""Minimum fraction of the Gaussians above the ground that must lie outside all solids at rest."""
+_BISECTIONS = 40
+"""Bisection steps that shorten an arm to uneven ground."""
+_HULL_BULGE = 1e-7
+"""Relative outward shift of a tetrahedron's points before the hull is computed. It is far above double rounding and
+far below what would make another point of the grid a vertex.
+"""
+_CACHED_CONFIGURATIONS = 4
+"""Number of configurations whose gaps are cached. A step ends where the next one starts, and both are requested
+several times.
+"""
+_SLACK_FRACTION = 0.25
+"""Fraction of the grid spacing. A point that is no deeper below a plane counts as on it, as it does after rounding
+to the grid.
+"""
+_SQUARE_FRACTION = 0.5
+"""Side of a square, in spacings of uneven ground. In each square the lowest point of each tetrahedron is retained."""
 
 
 @dataclass(frozen=True)
 class ContactGeometry:
-    """Every point of the body that can ever be the first of its tetrahedron to touch. Constant."""
+    """All points of the body that can be the first of their tetrahedron to touch, and the obstacles. Constant."""
 
     mesh: TetMesh
     planes: tuple[Plane, ...]
     friction: float
     """Coulomb coefficient mu."""
     tet_from_point: np.ndarray
-    """(P,) int32, tetrahedron of each point kept."""
+    """(P,) int32, tetrahedron of each point."""
     weights: np.ndarray
-    """(P, 4) float64, barycentric weights in it (Eq. 2)."""
+    """(P, 4) float64, barycentric weights in the tetrahedron (Eq. 2)."""
     excluded_count: int
     """Gaussians whose mean lies below a plane at rest."""
     excluded_opacity: float
-    """Their share of the opacity mass."""
+    """Their fraction of the total opacity."""
     solid_from_plane: tuple[int, ...] = ()
-    """Which solid each plane is a face of, in ascending order; empty: each is a half space of its own."""
+    """Index of the solid that each plane belongs to, in ascending order. If empty, each plane is a half space."""
     field: HeightField | None = None
-    """Ground that is not flat, in place of the first plane."""
+    """Uneven ground, which replaces the first plane."""
 
     @property
     def solid_of_each_plane(self) -> np.ndarray:
-        """(planes,) int32."""
+        """(planes,) int32, index of the solid of each plane."""
         return np.array(self.solid_from_plane or range(len(self.planes)), dtype=np.int32)
 
     def ground_heights(self, points: np.ndarray) -> np.ndarray:
-        """(...,) metres of ``points`` (..., 3) above the ground."""
+        """Return the heights (...,) in metres of ``points`` (..., 3) above the ground."""
         return (self.field or self.planes[0]).heights(points)
 
 
 @dataclass(frozen=True)
 class ContactSet:
-    """The n points that take part in one step."""
+    """The n active contact points of one step."""
 
     points: np.ndarray
     """(n,) indices into the geometry's points."""
     nodes: np.ndarray
-    """(n, 4) int32."""
+    """(n, 4) int32, nodes of each point's tetrahedron."""
     weights: np.ndarray
-    """(n, 4) float64, sum 1."""
+    """(n, 4) float64, barycentric weights, sum 1."""
     axes: np.ndarray
-    """(n, 3, 3): rows are the normal and two tangents, unit."""
+    """(n, 3, 3), contact frames: the rows are the unit normal and two unit tangents."""
     gaps: np.ndarray
-    """(n,) signed distance at the start of the step, metres."""
+    """(n,) m, signed distance at the start of the step."""
     faces: np.ndarray
-    """(n,) int32: which of the geometry's planes each is held to; 0 is the ground, flat or not."""
+    """(n,) int32, index of the contact plane of each point; 0 is the ground, flat or not."""
     node_count: int
-    """N."""
+    """Number N of nodes."""
 
     @property
     def count(self) -> int:
-        """n."""
+        """Number n of contacts."""
         return len(self.points)
 
     @cached_property
     def jacobian(self) -> sparse.csr_matrix:
-        """(3n, 3N): rows 3i, 3i+1, 3i+2 give the velocity of contact i along its normal and two tangents."""
-        shares = self.weights[:, None, :, None] * self.axes[:, :, None]
-        places = 3 * self.nodes[:, None, :, None] + np.arange(3, dtype=np.int32)
-        offsets = np.arange(0, shares.size + 1, 12, dtype=np.int32)
-        indices = np.broadcast_to(places, shares.shape).reshape(-1)
-        return sparse.csr_matrix((shares.reshape(-1), indices, offsets), (3 * self.count, 3 * self.node_count))
+        """Sparse (3n, 3N) contact Jacobian W. Rows 3i to 3i + 2 map nodal velocities to the normal and two
+        tangential velocities of contact i.
+        """
+        entries = self.weights[:, None, :, None] * self.axes[:, :, None]
+        columns = 3 * self.nodes[:, None, :, None] + np.arange(3, dtype=np.int32)
+        offsets = np.arange(0, entries.size + 1, 12, dtype=np.int32)
+        indices = np.broadcast_to(columns, entries.shape).reshape(-1)
+        return sparse.csr_matrix((entries.reshape(-1), indices, offsets), (3 * self.count, 3 * self.node_count))
 
     @cached_property
     def _jacobian_columns(self) -> sparse.csc_matrix:
@@ -110,25 +123,25 @@ class ContactSet:
 
     @property
     def dense_jacobian(self) -> np.ndarray:
-        """(3n, 3N) ``rows`` with their zeros."""
+        """Dense (3n, 3N) contact Jacobian W."""
         return self.jacobian.toarray()
 
     @property
     def nearest_nodes(self) -> np.ndarray:
-        """(n,) the node that each point goes with most."""
+        """(n,) node with the largest weight of each point."""
         return self.nodes[np.arange(self.count), np.argmax(self.weights, axis=1)]
 
     def contact_velocities(self, velocities: np.ndarray) -> np.ndarray:
-        """``rows`` times nodal velocities (3N,) or (3N, k)."""
+        """Return W v for nodal velocities v (3N,) or (3N, k)."""
         return self.jacobian @ velocities
 
     def nodal_forces(self, forces: np.ndarray) -> np.ndarray:
-        """(3N,) ``rows`` transposed times ``forces`` (n, 3), newtons on each node's axes."""
+        """Return (3N,) newtons, W^T f for contact ``forces`` (n, 3)."""
         return self._jacobian_columns @ forces.ravel()
 
     def end_gaps(self, dt: float, velocities: np.ndarray) -> np.ndarray:
-        """(n,) gap after a step of ``dt`` with nodal end velocities (N, 3), to the tangent plane of the start where the
-        ground is not flat.
+        """Return (n,) m, the gaps after a step of ``dt`` seconds with nodal end velocities (N, 3). On uneven ground
+        they are measured to the tangent plane at the start.
         """
         return self.gaps + dt * self.contact_velocities(velocities.ravel())[0::3]
 
@@ -145,16 +158,27 @@ def contact_geometry(
     grid: float | None = None,
     device: str | None = None,
 ) -> ContactGeometry:
-    """Points of all T+ and T- (Eq. 3); endpoints below a plane at rest are shortened to it (docs/concepts/contact.md).
+    """Build the contact points from all T+ and T- (Eq. 3) (docs/concepts/contact.md).
 
-    ``planes`` bound half spaces, the first of them the ground, whose place ``field`` takes where it is not flat;
-    ``solids`` stand on it. Only vertices of the convex hull of each tetrahedron's points are kept: a deformation is
-    affine inside a tetrahedron, so the deepest point of it is always one of those. A bump can be deepest between them:
-    over uneven ground the lowest point of each small square stays as well. With a ``grid`` (metres) all are moved to
-    the nearest of its points and put in the order of their places: of the same body in another file, whose numbers
-    are rounded otherwise, nearly all are the same then.
+    End points below an obstacle at rest are shortened to it. Only the vertices of the convex hull of each tetrahedron's
+    points are stored: the deformation is affine inside a tetrahedron, so its deepest point is always one of them.
+    Uneven ground can have a bump between them, so there the lowest point of each tetrahedron over each small square is
+    stored too.
 
-    Raises ``UserError`` for a solid that holds the body.
+    Args:
+        cloud: the Gaussians.
+        mesh: the cage.
+        planes: half spaces, of which the first is the ground.
+        field: uneven ground, which replaces the first plane.
+        solids: further obstacles.
+        friction: Coulomb coefficient.
+        gamma: length of the arms in standard deviations.
+        grid: spacing in metres to which points are rounded, after which they are sorted. The same body read from
+            another file, with other rounding, then has nearly the same points.
+        device: device on which the points are embedded.
+
+    Raises:
+        ArgumentError: for a solid that contains the body.
     """
     means = cloud.means.numpy().astype(np.float64)
     quaternions = cloud.rotations.numpy().astype(np.float64)
@@ -162,8 +186,8 @@ def contact_geometry(
     arms = gamma * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :] * axes
     obstacles = [Solid((plane,)) for plane in planes] + list(solids)
     grounds = planes if field is None else (field, *planes[1:])
-    # Of a base that is flat many means and arms lie in the plane, to rounding: none of them is below it.
-    slack = 0.0 if grid is None else _SLACK * grid
+    # Many points of a flat base lie in the plane to rounding; they do not count as below it.
+    slack = 0.0 if grid is None else _SLACK_FRACTION * grid
     above = np.all([ground.heights(means) >= -slack for ground in grounds], axis=0)
     least = MIN_OUTSIDE_FRACTION * np.count_nonzero(above)
     for number, solid in enumerate(solids, start=1):
@@ -181,30 +205,30 @@ def contact_geometry(
             arm = sign * arms[above, :, axis]
             reach = np.ones(len(arm))
             if field is not None:
-                reach = _reach_over(field, means[above], arm)
+                reach = _fraction_above(field, means[above], arm)
             for solid in obstacles if field is None else obstacles[1:]:
-                rooms = np.stack([face.heights(means[above]) for face in solid.faces])
-                facing = np.argmax(rooms, axis=0)
+                heights = np.stack([face.heights(means[above]) for face in solid.faces])
+                facing = np.argmax(heights, axis=0)
                 normals = np.stack([face.normal for face in solid.faces])[facing]
-                drop, room = -(arm * normals).sum(axis=1), rooms.max(axis=0) + slack
-                reach = np.minimum(reach, np.where(drop > room, room / np.where(drop > room, drop, 1.0), 1.0))
+                drop, height = -(arm * normals).sum(axis=1), heights.max(axis=0) + slack
+                reach = np.minimum(reach, np.where(drop > height, height / np.where(drop > height, drop, 1.0), 1.0))
             points.append(means[above] + reach[:, None] * arm)
-    everything = np.concatenate(points)
-    places = everything
+    all_points = np.concatenate(points)
+    grid_points = all_points
     if grid is not None:
-        places = distinct_rows(np.rint(everything / grid).astype(np.int64))[0].astype(np.float64)
-        everything = grid * places
-    embedding = embed_points(mesh, everything, device=device)
+        grid_points = distinct_rows(np.rint(all_points / grid).astype(np.int64))[0].astype(np.float64)
+        all_points = grid * grid_points
+    embedding = embed_points(mesh, all_points, device=device)
     tet_from_point, weights = embedding.tets.numpy(), embedding.weights.numpy()
-    kept = _hull_points(tet_from_point, weights[:, 1:] if grid is None else places, len(mesh.tets))
+    retained = _hull_points(tet_from_point, weights[:, 1:] if grid is None else grid_points, len(mesh.tets))
     if field is not None:
-        kept = np.union1d(kept, _lowest_points(tet_from_point, everything, field))
+        retained = np.union1d(retained, _lowest_points(tet_from_point, all_points, field))
     return ContactGeometry(
         mesh,
         tuple(face for solid in obstacles for face in solid.faces),
         friction,
-        tet_from_point[kept],
-        weights[kept],
+        tet_from_point[retained],
+        weights[retained],
         int((~above).sum()),
         float(opacities[~above].sum() / opacities.sum()),
         tuple(index for index, solid in enumerate(obstacles) for _ in solid.faces),
@@ -212,11 +236,13 @@ def contact_geometry(
     )
 
 
-def _reach_over(field: HeightField, means: np.ndarray, arms: np.ndarray) -> np.ndarray:
-    """(n,) share of the ``arms`` (n, 3) of ``means`` (n, 3), which are above the ground, that stays above it."""
+def _fraction_above(field: HeightField, means: np.ndarray, arms: np.ndarray) -> np.ndarray:
+    """Return (n,) the fraction of the ``arms`` (n, 3) that stays above the ground; the ``means`` (n, 3) are above
+    it.
+    """
     low, high = np.zeros(len(arms)), np.ones(len(arms))
     low = np.where(field.heights(means + arms) >= 0.0, 1.0, low)
-    for _ in range(_SHORTENINGS):
+    for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         free = field.heights(means + middle[:, None] * arms) >= 0.0
         low, high = np.where(free, np.maximum(middle, low), low), np.where(free, high, middle)
@@ -224,8 +250,10 @@ def _reach_over(field: HeightField, means: np.ndarray, arms: np.ndarray) -> np.n
 
 
 def _lowest_points(tet_from_point: np.ndarray, points: np.ndarray, field: HeightField) -> np.ndarray:
-    """(k,) of ``points`` (P, 3) the lowest of each tetrahedron over each small square of the ground."""
-    square = np.floor((points - field.origin) @ field.axes[:2].T / (_FINE * field.spacing)).astype(np.int64)
+    """Return (k,) indices into ``points`` (P, 3): the lowest of each tetrahedron over each small square of the
+    ground.
+    """
+    square = np.floor((points - field.origin) @ field.axes[:2].T / (_SQUARE_FRACTION * field.spacing)).astype(np.int64)
     place = np.column_stack([tet_from_point, square])
     order = np.argsort(field.heights(points), kind="stable")
     _, first = np.unique(place[order], axis=0, return_index=True)
@@ -233,35 +261,35 @@ def _lowest_points(tet_from_point: np.ndarray, points: np.ndarray, field: Height
 
 
 def _hull_points(tet_from_point: np.ndarray, places: np.ndarray, tet_count: int) -> np.ndarray:
-    """(k,) of the points the vertices of the hull of those of each tetrahedron; ``places`` (P, 3) in any axes, even
-    oblique ones.
+    """Return (k,) indices of the hull vertices of each tetrahedron's points; ``places`` (P, 3) in any affine
+    coordinates.
     """
     order = np.argsort(tet_from_point, kind="stable")
     bounds = np.searchsorted(tet_from_point[order], np.arange(tet_count + 1))
-    kept = []
+    vertices = []
     for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
         members = order[start:stop]
         if len(members) > 8:
             try:
-                members = members[ConvexHull(_bent_in(places[members])).vertices]
-            except QhullError:  # all in one plane: each may matter
+                members = members[ConvexHull(_bulge(places[members])).vertices]
+            except QhullError:  # all in one plane: keep each
                 pass
-        kept.append(members)
-    return np.sort(np.concatenate(kept))
+        vertices.append(members)
+    return np.sort(np.concatenate(vertices))
 
 
-def _bent_in(places: np.ndarray) -> np.ndarray:
-    """``places`` (n, 3), each a little nearer to the middle the nearer it is: what lies in an edge or a face of the
-    hull lies inside then (|p|^2 is convex), and what does not stays a vertex. Else such points are vertices or none by
-    luck.
+def _bulge(places: np.ndarray) -> np.ndarray:
+    """Return the scaled offsets of ``places`` (n, 3) from their mean, lengthened slightly more the longer they are.
+    A point on an edge or face of the hull then lies strictly inside (|p|^2 is convex) and a vertex remains a
+    vertex; otherwise rounding would decide.
     """
     arms = places - places.mean(axis=0)
     arms /= max(float(np.abs(arms).max()), 1e-300)
-    return arms * (1.0 + _BEND * (arms**2).sum(axis=1, keepdims=True))
+    return arms * (1.0 + _HULL_BULGE * (arms**2).sum(axis=1, keepdims=True))
 
 
 class ContactDetector:
-    """Gaps of all points, and the frames of those that take part."""
+    """Evaluates the gaps of all points and builds contact sets."""
 
     def __init__(self, geometry: ContactGeometry, *, device: str | None = None) -> None:
         self.geometry = geometry
@@ -269,7 +297,7 @@ class ContactDetector:
         self._tet_from_point = wp.array(geometry.tet_from_point, dtype=int, device=device)
         self._weights = wp.array(geometry.weights, dtype=Vec4, device=device)
         self._tets = wp.array(geometry.mesh.tets, dtype=wp.vec4i, device=device)
-        # Uneven ground takes the first plane's place.
+        # Uneven ground replaces the first plane.
         flat = slice(0 if geometry.field is None else 1, None)
         rows = np.array([[*plane.normal, plane.offset] for plane in geometry.planes])[flat]
         self._planes = wp.array(rows.reshape(-1, 4), dtype=Vec4, device=device)
@@ -282,46 +310,53 @@ class ContactDetector:
         self._corners = wp.array(geometry.mesh.tets[geometry.tet_from_point], dtype=wp.vec4i, device=device)
         self._heights = wp.zeros(len(rows) * len(geometry.mesh.nodes), dtype=real, device=device)
         self._positions = wp.zeros(len(geometry.mesh.nodes), dtype=Vec3, device=device)
-        self._positions_here = PinnedMirror(self._positions)
+        self._host_positions = PinnedMirror(self._positions)
         count = len(geometry.tet_from_point)
         self._gaps = wp.zeros(count, dtype=real, device=device)
         self._nearest = wp.zeros(count, dtype=int, device=device)
-        self._gaps_here, self._nearest_here = PinnedMirror(self._gaps), PinnedMirror(self._nearest)
+        self._host_gaps, self._host_nearest = PinnedMirror(self._gaps), PinnedMirror(self._nearest)
         self._frames = np.array([[plane.normal, *plane.tangents()] for plane in geometry.planes]).reshape(-1, 3, 3)
         self._only_face: np.ndarray | None = None
         if len(geometry.planes) == 1:
             self._only_face = np.zeros(count, np.int32)
             self._only_face.flags.writeable = False
-        self._found: OrderedDict[bytes, tuple[np.ndarray, np.ndarray]] = OrderedDict()
+        self._cached_gaps: OrderedDict[bytes, tuple[np.ndarray, np.ndarray]] = OrderedDict()
 
     def gaps(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(P,) signed distance of every point at ``positions`` (N, 3) to the nearest solid, and (P,) its face's index;
-        both are kept, and not to be written to.
+        """Evaluate the gaps of all points; the result is cached and read-only.
 
-        Of a solid's faces the one counts that the point is furthest in front of, or least far behind; to ground that is
-        not flat the distance is ``HeightField.gaps``.
+        The distance to a solid is the largest signed distance to its faces. The distance to uneven ground is that of
+        ``HeightField.gaps``.
+
+        Args:
+            positions: (N, 3) m.
+
+        Returns:
+            (P,) m, signed distance to the nearest solid, and (P,) the index of its face.
         """
-        place = positions.tobytes()
-        if place not in self._found:
-            self._found[place] = self._find(positions)
-            while len(self._found) > _PLACES:
-                self._found.popitem(last=False)
-        return self._found[place]
+        key = positions.tobytes()
+        if key not in self._cached_gaps:
+            self._cached_gaps[key] = self._compute_gaps(positions)
+            while len(self._cached_gaps) > _CACHED_CONFIGURATIONS:
+                self._cached_gaps.popitem(last=False)
+        return self._cached_gaps[key]
 
-    def _find(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        self._positions_here.put(positions)
+    def _compute_gaps(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        self._host_positions.put(positions)
         self.enqueue_gaps(self._positions, self._gaps, self._nearest)
         nearest = self._only_face
         if nearest is None:
-            gaps, nearest = PinnedMirror.get_all(self._gaps_here, self._nearest_here)
+            gaps, nearest = PinnedMirror.get_all(self._host_gaps, self._host_nearest)
             nearest.flags.writeable = False
         else:
-            gaps = self._gaps_here.get()
+            gaps = self._host_gaps.get()
         gaps.flags.writeable = False
         return gaps, nearest
 
     def enqueue_gaps(self, positions: wp.array, gaps: wp.array, nearest: wp.array) -> None:
-        """The same of what lies on the device, into ``gaps`` (P,) and ``nearest`` (P,), with nothing that waits."""
+        """Evaluate the gaps of ``positions`` (N,) on the device into ``gaps`` (P,) and ``nearest`` (P,),
+        asynchronously.
+        """
         solids, outputs = [self._planes, self._solids, positions], [gaps, nearest]
         if self.device.is_cpu:
             inputs = [self._corners, self._weights, *solids]
@@ -343,20 +378,24 @@ class ContactDetector:
             )
 
     def points_within(self, positions: np.ndarray, distance: float) -> np.ndarray:
-        """(k, 3) contact points that are nearer than ``distance`` metres to a plane at ``positions`` (N, 3)."""
+        """Return the positions (k, 3) of the contact points closer than ``distance`` metres to an obstacle at
+        ``positions`` (N, 3).
+        """
         near = np.flatnonzero(self.gaps(positions)[0] < distance)
         nodes = self.geometry.mesh.tets[self.geometry.tet_from_point[near]]
         return np.einsum("kw,kwi->ki", self.geometry.weights[near], positions[nodes])
 
     def contact_set(self, points: np.ndarray, positions: np.ndarray) -> ContactSet:
-        """The given points with their frames; ``positions`` (N, 3) at the start of the step."""
+        """Return the contact set of ``points`` (n,); ``positions`` (N, 3) at the start of the step."""
         gaps, nearest = self.gaps(positions)
         return self.contact_set_at(points, positions, gaps[points], nearest[points])
 
     def contact_set_at(
         self, points: np.ndarray, positions: np.ndarray, gaps: np.ndarray, faces: np.ndarray
     ) -> ContactSet:
-        """The same with ``gaps`` (n,) metres and ``faces`` (n,) of the ``points`` (n,) that are known."""
+        """Return the contact set of ``points`` (n,) whose ``gaps`` (n,) in metres and ``faces`` (n,) are known;
+        ``positions`` (N, 3) at the start of the step.
+        """
         nodes = self.geometry.mesh.tets[self.geometry.tet_from_point[points]]
         weights = self.geometry.weights[points]
         axes = self._frames[faces]
@@ -368,13 +407,20 @@ class ContactDetector:
 
 
 def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float, slop: float) -> np.ndarray:
-    """(n,) constant of the normal measure c = N^T u' + max(phi, 0) / dt + min(phi + slop, 0) b / dt, the push-out
-    capped (docs/concepts/contact.md); b is ``factor``.
+    """Return (n,) m/s, the constant of the normal measure c = N^T u' + max(phi, 0) / dt + max(min(phi + slop, 0) b /
+    dt, -cap) (docs/concepts/contact.md).
+
+    Args:
+        gaps: (n,) phi, m.
+        dt: step size, s.
+        cap: maximum push-out speed, m/s.
+        factor: b, fraction of the depth removed in a step.
+        slop: depth that is tolerated, m.
     """
     return np.maximum(gaps, 0.0) / dt + np.maximum(np.minimum(gaps + slop, 0.0) * factor / dt, -cap)
 
 
 def tangent_directions(count: int) -> np.ndarray:
-    """(count, 2) unit directions D of the friction pyramid, evenly spaced in the two tangents."""
+    """Return (count, 2) unit directions D of the friction pyramid, evenly spaced in the tangent plane."""
     angles = 2.0 * np.pi * np.arange(count) / count
     return np.stack([np.cos(angles), np.sin(angles)], axis=1)

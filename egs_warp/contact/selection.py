@@ -1,4 +1,4 @@
-"""Which points of the body take part in contact: few, spread evenly, and the same ones from step to step (Eq. 8)."""
+"""Selection of the contact points of a step: few, evenly spread and stable from step to step (Eq. 8)."""
 
 from __future__ import annotations
 
@@ -8,53 +8,67 @@ from scipy.spatial import KDTree
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.geometry.tetmesh import mean_edge_length
 
-MOST_AT_REST = 32
-"""Cells that touch the ground at rest: the cage cannot resolve more forces than it has nodes there, nor a base tell
-more apart.
+MAX_CELLS_AT_REST = 32
+"""Maximum number of cells that touch the ground at rest. The cage cannot resolve more forces than it has nodes
+there.
 """
-_FINEST = 0.4
-"""Edges of the cage across the smallest cells: small feet stand on several."""
-ALIKE = 1e-7
-"""Of the distance at which points take part: those whose gaps are the same but for so much lie alike, and the one next
-to the middle of its cell is taken. What is flat lies flat on the ground to rounding, which would choose otherwise on
-each machine."""
-_WIDER = 1.1
-"""Growth of the cells until they are few enough."""
+_MIN_SPACING = 0.4
+"""Minimum spacing of the cells in mean edge lengths of the cage, so that small feet stand on several."""
+GAP_TOLERANCE_FRACTION = 1e-7
+"""Gap tolerance as a fraction of the activation distance. Of points whose gaps are equal within it, the one closest
+to the centre of the cell is selected. A flat sole is flat only to rounding, and rounding would select different
+points on different machines.
+"""
+_SPACING_GROWTH = 1.1
+"""Growth factor of the cell spacing until few enough cells touch the ground."""
 
 
 class ContactSelector:
-    """Cells of the body's surface about as wide as an edge of the cage, each with at most one point in the contact set.
+    """Selector of contact points: cells of the surface, at least 0.4 mean cage edges apart, with at most one point
+    each.
 
-    A cell brings its lowest point. Points that press stay, and so do those that a step has added; others leave once
-    they are clear of the ground by twice the distance at which they came, or their cell has a clearly lower one: points
-    that come and go make the load chatter.
+    A cell contributes its lowest point. A selected point is dropped once its gap exceeds twice the activation distance.
+    A point without load is also dropped if its cell has a clearly lower point. Points that come and go would make the
+    load oscillate.
     """
 
     def __init__(self, geometry: ContactGeometry, *, near: float, lower: float) -> None:
-        """``near`` metres: a cell takes part if the step may bring it so near to a solid. ``lower`` metres: by how much
-        another point of a cell must lie lower to take its place.
+        """Divide the surface into cells.
+
+        Args:
+            geometry: the points.
+            near: activation distance, m. A cell is active if its lowest point may come this close to a solid in the
+                step.
+            lower: hysteresis, m. Another point of the cell replaces an unloaded one only if it is lower by this much.
         """
         self.geometry, self.activation_distance, self.hysteresis, self.gap_tolerance = (
             geometry,
             near,
             lower,
-            ALIKE * near,
+            GAP_TOLERANCE_FRACTION * near,
         )
         corners = geometry.mesh.tets[geometry.tet_from_point]
-        places = np.einsum("pw,pwi->pi", geometry.weights, geometry.mesh.nodes[corners])
-        # What is as far from one seed as from another goes to the same on every machine.
-        places = self.gap_tolerance * np.rint(places / self.gap_tolerance)
-        heights = geometry.ground_heights(places)
+        positions = np.einsum("pw,pwi->pi", geometry.weights, geometry.mesh.nodes[corners])
+        # Rounding makes points equally far from two centres go to the same cell on every machine.
+        positions = self.gap_tolerance * np.rint(positions / self.gap_tolerance)
+        heights = geometry.ground_heights(positions)
         sole = np.flatnonzero(heights < heights.min() + 2.0 * near)
-        spacing = _FINEST * mean_edge_length(geometry.mesh)
-        self.cell_from_point, away = _few_cells(places, heights, sole, spacing, MOST_AT_REST)
+        spacing = _MIN_SPACING * mean_edge_length(geometry.mesh)
+        self.cell_from_point, away = _few_cells(positions, heights, sole, spacing, MAX_CELLS_AT_REST)
         self.order = np.lexsort((np.rint(away / self.gap_tolerance), self.cell_from_point))
-        """(P,) points cell by cell, those next to its middle first."""
+        """(P,) point indices sorted by cell, those closest to the cell centre first."""
         self.cell_count = int(self.cell_from_point.max()) + 1
 
     def select(self, previous: np.ndarray, loaded: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """(n,) points of the next step in ascending order; ``previous`` (m,) were the last's, ``loaded`` (m,) bool
-        those that pressed; ``gaps`` (P,) metres as it may end.
+        """Select the points of the next step.
+
+        Args:
+            previous: (m,) points of the previous step.
+            loaded: (m,) bool, which of them carried load.
+            gaps: (P,) m, at the predicted end of the step.
+
+        Returns:
+            (n,) points in ascending order.
         """
         lowest = self._lowest(gaps < self.activation_distance, gaps)
         return self.select_from(previous, loaded, gaps[previous], lowest, gaps[lowest])
@@ -62,18 +76,28 @@ class ContactSelector:
     def select_from(
         self, previous: np.ndarray, loaded: np.ndarray, gaps: np.ndarray, lowest: np.ndarray, lowest_gaps: np.ndarray
     ) -> np.ndarray:
-        """``choose``, of the ``previous`` (m,) points with ``gaps`` (m,), and of the ``lowest`` (k,) of each cell that
-        is near, with ``lowest_gaps`` (k,) metres."""
+        """Select the points of the next step from the lowest point of each cell.
+
+        Args:
+            previous: (m,) points of the previous step.
+            loaded: (m,) bool, which of them carried load.
+            gaps: (m,) m, of ``previous`` at the predicted end.
+            lowest: (k,) lowest point of each active cell.
+            lowest_gaps: (k,) m.
+
+        Returns:
+            (n,) points in ascending order.
+        """
         cells = self.cell_from_point
-        near = gaps < 2.0 * self.activation_distance
+        close = gaps < 2.0 * self.activation_distance
         low = np.full(self.cell_count, np.inf)
         low[cells[lowest]] = lowest_gaps
-        kept = previous[near & (loaded | (gaps <= low[cells[previous]] + self.hysteresis))]
-        fresh = lowest[~np.isin(cells[lowest], cells[kept])]
-        return np.sort(np.concatenate([kept, fresh]))
+        retained = previous[close & (loaded | (gaps <= low[cells[previous]] + self.hysteresis))]
+        added = lowest[~np.isin(cells[lowest], cells[retained])]
+        return np.sort(np.concatenate([retained, added]))
 
     def find_deeper(self, points: np.ndarray, gaps: np.ndarray, depth: float) -> np.ndarray:
-        """(k,) the deepest point of each cell of which one ends more than ``depth`` metres deep that is not among
+        """Return (k,) the deepest point of each cell that ends more than ``depth`` metres deep and is not in
         ``points`` (n,).
         """
         deep = gaps < -depth
@@ -81,27 +105,28 @@ class ContactSelector:
         return self._lowest(deep, gaps)
 
     def order_by_gap(self, points: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """(n,) the order of ``points`` (n,) with ``gaps`` (n,) metres, each the lowest of its cell, in ``deeper``."""
+        """Return (n,) the order in which ``find_deeper`` lists ``points`` (n,) with ``gaps`` (n,) m, each the lowest
+        of its cell.
+        """
         return np.lexsort((points, np.rint(gaps / self.gap_tolerance)))
 
     def _lowest(self, among: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """(k,) of the points ``among`` (P,) bool the lowest of each cell, the lowest of all first; of those that lie
-        alike the one next to the cell's middle."""
+        """Return (k,) the lowest point of each cell in the mask ``among`` (P,), lowest first. Ties go to the point
+        closest to the centre.
+        """
         if not among.any():
             return self.order[:0]
         points = self.order[among[self.order]]
         cells, heights = self.cell_from_point[points], np.rint(gaps[points] / self.gap_tolerance)
-        begins = np.flatnonzero(np.diff(cells, prepend=-1))
-        least = np.repeat(np.minimum.reduceat(heights, begins), np.diff(begins, append=len(points)))
-        found = np.flatnonzero(heights == least)
-        found = points[found[np.diff(cells[found], prepend=-1) > 0]]
-        return found[self.order_by_gap(found, gaps[found])]
+        starts = np.flatnonzero(np.diff(cells, prepend=-1))
+        lowest_heights = np.repeat(np.minimum.reduceat(heights, starts), np.diff(starts, append=len(points)))
+        lowest = np.flatnonzero(heights == lowest_heights)
+        lowest = points[lowest[np.diff(cells[lowest], prepend=-1) > 0]]
+        return lowest[self.order_by_gap(lowest, gaps[lowest])]
 
     @staticmethod
     def transfer_forces(points: np.ndarray, before: np.ndarray, forces: np.ndarray) -> np.ndarray:
-        """(n, 3) the ``forces`` (m, 3) of the points ``before`` (m,) on those of them among ``points`` (n,), zero on
-        others.
-        """
+        """Map ``forces`` (m, 3) at the points ``before`` (m,) to ``points`` (n,); zero where a point is new."""
         matched = np.zeros((len(points), 3))
         now, then = np.nonzero(points[:, None] == before)
         matched[now] = forces[then]
@@ -109,27 +134,45 @@ class ContactSelector:
 
 
 def _few_cells(
-    places: np.ndarray, heights: np.ndarray, sole: np.ndarray, spacing: float, most: int
+    positions: np.ndarray, heights: np.ndarray, sole: np.ndarray, spacing: float, maximum: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(P,) nearest seed of each of ``places`` (P, 3), and how far it is (P,); as many seeds as are ``spacing`` metres
-    apart, or fewer, until at most ``most`` of them are nearest to points of the ``sole``.
+    """Assign points to cells, at most ``maximum`` of which touch the ground.
+
+    Args:
+        positions: (P, 3) m, points at rest.
+        heights: (P,) m above the ground.
+        sole: indices of the points near the ground.
+        spacing: minimum distance of the cell centres, m; it grows until the cells are few enough.
+        maximum: maximum number of cells with points of the sole.
+
+    Returns:
+        (P,) cell of each point and (P,) its distance to the cell centre, m.
     """
-    seeds, apart = _spread(places, int(np.argmin(heights)), spacing)
+    seeds, apart = _spread(positions, int(np.argmin(heights)), spacing)
     while True:
         first = seeds[: np.count_nonzero(apart >= spacing)]
-        away, nearest = (np.asarray(each) for each in KDTree(places[first]).query(places))
-        if len(np.unique(nearest[sole])) <= most:
+        away, nearest = (np.asarray(each) for each in KDTree(positions[first]).query(positions))
+        if len(np.unique(nearest[sole])) <= maximum:
             return nearest.astype(int), away
-        spacing *= _WIDER
+        spacing *= _SPACING_GROWTH
 
 
-def _spread(places: np.ndarray, start: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """(k,) points from ``start`` on, always the one furthest from all before, and how far it was (k,), at least
-    ``spacing`` metres: fewer points, further apart, are the first of these.
+def _spread(positions: np.ndarray, start: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Select points by farthest-point sampling, at least ``spacing`` metres apart.
+
+    A coarser sampling is a prefix of the result.
+
+    Args:
+        positions: (P, 3) m.
+        start: index of the first point.
+        spacing: minimum distance, m.
+
+    Returns:
+        (k,) indices and (k,) the distance of each to those before it, m.
     """
-    columns = np.ascontiguousarray(places.T)
+    columns = np.ascontiguousarray(positions.T)
     seeds, apart = [start], [np.inf]
-    distance = np.full(len(places), np.inf)
+    distance = np.full(len(positions), np.inf)
     while True:
         x, y, z = columns - columns[:, seeds[-1], None]
         np.minimum(distance, np.sqrt(x * x + y * y + z * z), out=distance)

@@ -1,5 +1,5 @@
-"""What there is to stand on: uneven ground, and solid things beside it that a body can touch (steps, walls, tilted
-floors, each an intersection of half spaces).
+"""Terrain beside the ground plane: solids that a body can touch (steps, walls, tilted floors), each an intersection
+of half spaces.
 """
 
 from __future__ import annotations
@@ -15,31 +15,34 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.text import parse_json, read_text
 
-MOST_FACES = 64
+MAX_FACES = 64
+"""Maximum number of faces in a terrain file."""
 
 
 class Surface(Protocol):
-    """Something to stand on: a ``Solid`` or a ``HeightField``."""
+    """Protocol of the surfaces that a body can stand on: ``Solid`` and ``HeightField``."""
 
     def distance_along(self, point: np.ndarray, up: np.ndarray) -> float:
-        """How far along ``up`` (3,) from ``point`` (3,) it ends; -inf where it is not above or below the point."""
+        """Return the signed distance along ``up`` (3,) from ``point`` (3,) to the top of the surface; -inf if it is
+        not above or below the point.
+        """
         ...
 
 
 @dataclass(frozen=True)
 class Solid:
-    """Everything behind all of its faces; one face is a half space, as a floor or a wall."""
+    """Convex solid behind all of its faces. One face makes a half space, such as a floor or a wall."""
 
     faces: tuple[Plane, ...]
-    """Normals point out of the solid."""
+    """Faces with outward normals."""
 
     def scaled(self, factor: float) -> Solid:
-        """The same solid after all lengths are multiplied by ``factor``."""
+        """Return the solid with all lengths multiplied by ``factor``."""
         return Solid(tuple(face.scaled(factor) for face in self.faces))
 
     def distance_along(self, point: np.ndarray, up: np.ndarray) -> float:
-        """How far along ``up`` (3,) from ``point`` (3,) the solid ends;
-        -inf where it is not above or below the point.
+        """Return the signed distance along ``up`` (3,) from ``point`` (3,) to the top of the solid; -inf if it is
+        not above or below the point.
         """
         low, high = -np.inf, np.inf
         for face in self.faces:
@@ -54,17 +57,26 @@ class Solid:
 
 
 def step(ground: Plane, edge: np.ndarray, forward: np.ndarray, height: float) -> Solid:
-    """A step of ``height`` on ``ground`` that begins at the point ``edge`` (3,) and goes on ``forward`` (3,)."""
+    """Create a step that extends without limit.
+
+    Args:
+        ground: ground plane.
+        edge: (3,) point on the front edge.
+        forward: (3,) direction in which the step extends.
+        height: height above the ground.
+    """
     flat = forward - (forward @ ground.normal) * ground.normal
     flat = flat / np.linalg.norm(flat)
     return Solid((Plane(ground.normal, ground.offset - height), Plane(-flat, float(flat @ edge))))
 
 
 def read_terrain(path: Path) -> tuple[Solid, ...]:
-    """Solids from JSON, in the units of the capture: a list of solids, each a list of faces [nx, ny, nz, d].
+    """Read solids from JSON, in the units of the capture: a list of solids, each a list of faces [nx, ny, nz, d].
 
-    A point is inside where n.x + d < 0 for every face. Raises ``UserError`` for the first malformed entry, with its
-    place.
+    A point is inside where n.x + d < 0 for every face.
+
+    Raises:
+        UserError: for the first malformed entry, with the number of its solid.
     """
     entries = parse_json(read_text(path), path)
     if not isinstance(entries, list) or not entries:
@@ -78,8 +90,8 @@ def read_terrain(path: Path) -> tuple[Solid, ...]:
         except UserError as error:
             raise UserError(f"{path}, solid {number}: {error}") from None
     count = sum(len(solid.faces) for solid in solids)
-    if count > MOST_FACES:
-        raise UserError(f"{path}: {count} faces; at most {MOST_FACES} are handled")
+    if count > MAX_FACES:
+        raise UserError(f"{path}: {count} faces; at most {MAX_FACES} are supported")
     return tuple(solids)
 
 
@@ -92,5 +104,7 @@ def _is_face(face: object) -> bool:
 
 
 def surface_above(solids: Sequence[Surface], point: np.ndarray, up: np.ndarray) -> float:
-    """How far along ``up`` (3,) from ``point`` (3,) the highest surface is; -inf over nothing."""
+    """Return the signed distance along ``up`` (3,) from ``point`` (3,) to the highest surface; -inf if there is
+    none.
+    """
     return max((solid.distance_along(point, up) for solid in solids), default=-np.inf)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from egs_warp.contact.detection import ContactGeometry
-from egs_warp.contact.selection import MOST_AT_REST, ContactSelector
+from egs_warp.contact.selection import MAX_CELLS_AT_REST, ContactSelector
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.geometry.plane import Plane
 from tests.support.meshes import block_mesh
@@ -38,7 +38,7 @@ def test_few_points_one_a_cell(geometry: ContactGeometry) -> None:
     points = ContactSelector(geometry, near=NEAR, lower=1e-3)
     gaps = gaps_of(geometry)
     chosen = points.select(np.zeros(0, int), np.zeros(0, bool), gaps)
-    assert 4 <= len(chosen) <= MOST_AT_REST
+    assert 4 <= len(chosen) <= MAX_CELLS_AT_REST
     cells = points.cell_from_point[chosen]
     assert len(np.unique(cells)) == len(cells)
     for point, cell in zip(chosen, cells, strict=True):
@@ -81,7 +81,7 @@ def test_cells_are_as_few_wherever_the_ground_is() -> None:
         )
         for floor in (Plane(np.array([0.0, 0.0, 1.0]), 0.0), Plane(np.array([0.0, 0.0, 1.0]), 0.3))
     ]
-    assert 0.5 * MOST_AT_REST < len(np.unique(points[0].cell_from_point)) <= MOST_AT_REST
+    assert 0.5 * MAX_CELLS_AT_REST < len(np.unique(points[0].cell_from_point)) <= MAX_CELLS_AT_REST
     assert np.array_equal(points[0].cell_from_point, points[1].cell_from_point)
 
 

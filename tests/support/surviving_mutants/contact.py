@@ -1,4 +1,4 @@
-"""Of ``contact`` and its kernels."""
+"""Surviving mutants of ``contact`` and its kernels."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ CONTACT = [
     ),
     Survivor(
         "contact/detection.py",
-        "_SHORTENINGS = 40",
-        "_SHORTENINGS = 39",
+        "_BISECTIONS = 40",
+        "_BISECTIONS = 39",
         "halving 39 times ends an arm 2e-12 of its length from the ground, 40 times 1e-12",
     ),
     Survivor(
