@@ -1,4 +1,8 @@
-"""Forces of a step's contacts where a GPU has their operator: ``coulomb_forces`` with nothing that waits."""
+"""Coulomb solve of a step's contacts on a GPU, asynchronously; ``coulomb_forces`` is the version on the host.
+
+There is no continuation: a solve that fails is repeated on the host (``DeviceNewtonIterate.newton_steps``). The kernel
+is in ``kernels/contact/coulomb.py``.
+"""
 
 from __future__ import annotations
 
@@ -15,41 +19,56 @@ from egs_warp.precision import Vec4, real
 
 
 class CoulombWorkspace:
-    """Memory for so many contacts, of which some are there."""
+    """Buffers of the Coulomb solve for up to ``capacity`` contacts."""
 
-    def __init__(self, stream: GraphStream, places: int, count: torch.Tensor) -> None:
-        """``count`` (1,) of those that are there."""
-        width, device = 3 * places, stream.device
-        self._laws, self._laws_here, self._count = PinnedUpload(stream, 1 + places), np.zeros(0), count
-        self.friction, self.shifts = self._laws.device.split([1, places])
+    def __init__(self, stream: GraphStream, capacity: int, count: torch.Tensor) -> None:
+        """Allocate the buffers.
+
+        Args:
+            stream: stream on which the solve is queued.
+            capacity: K, maximum number of contacts.
+            count: (1,) number of contacts, on the device.
+        """
+        width, device = 3 * capacity, stream.device
+        self._parameters, self._uploaded_parameters, self._count = (
+            PinnedUpload(stream, 1 + capacity),
+            np.zeros(0),
+            count,
+        )
+        self.friction, self.shifts = self._parameters.device.split([1, capacity])
         self.counts = torch.zeros(1, dtype=torch.int32, device=device)
-        """(1,) contacts of the operator; ``friction`` (1,), ``shifts`` (places,) m/s."""
+        """(1,) int32, contacts of the operator. ``friction`` is (1,), ``shifts`` (K,) m/s."""
         self._regular = torch.zeros((width, width), dtype=torch.float64, device=device)
         self._vectors, self._indices = self._regular.new_zeros((1, 5, width)), self.counts.new_zeros((1, 2, width))
         self._matrices = self._regular.new_zeros((1, width, (width + 4) // 4, 4))
 
     def upload(self, shifts: np.ndarray, friction: float) -> None:
-        """Of contacts with ``shifts`` (n,) m/s."""
-        laws = np.array([friction, *shifts])
-        # From look to look they are the same.
-        if not np.array_equal(laws, self._laws_here):
-            self._laws.set(laws)
-            self._laws_here = laws
+        """Upload the normal bias ``shifts`` (n,) in m/s and the Coulomb coefficient, if they have changed."""
+        parameters = np.array([friction, *shifts])
+        # They are the same for all Newton steps of a round.
+        if not np.array_equal(parameters, self._uploaded_parameters):
+            self._parameters.set(parameters)
+            self._uploaded_parameters = parameters
 
     def has_uploaded(self, shifts: np.ndarray, friction: float) -> bool:
-        """Whether these were told last."""
-        return np.array_equal(np.array([friction, *shifts]), self._laws_here)
+        """Return True if these were uploaded last."""
+        return np.array_equal(np.array([friction, *shifts]), self._uploaded_parameters)
 
     def enqueue_operator(self, delassus: torch.Tensor) -> None:
-        """The ``delassus`` operator (3K, 3K) m/(N s) from now on."""
+        """Set the ``delassus`` operator (3K, 3K) m/(N s), and regularise it."""
         self.counts.copy_(self._count)
         self._regular.copy_(delassus)
         mean = delassus.diagonal().sum() / (3.0 * self._count).clamp(min=1.0)
         self._regular.diagonal().add_(DELASSUS_REGULARIZATION * mean)
 
-    def enqueue_forces(self, speeds: torch.Tensor, forces: torch.Tensor, missed: torch.Tensor) -> None:
-        """``forces`` (3K,) newtons, from these on, of contacts that move at ``speeds`` (3K,) m/s without them; and (1,)
-        m/s by which they have ``missed`` the laws."""
+    def enqueue_forces(self, speeds: torch.Tensor, forces: torch.Tensor, violation: torch.Tensor) -> None:
+        """Solve for the contact forces.
+
+        Args:
+            speeds: (3K,) m/s, contact velocities without contact forces.
+            forces: (3K,) newtons, the start; overwritten with the solution.
+            violation: (1,) m/s, overwritten with the residual of Coulomb's law.
+        """
         lanes = kernels.BLOCK if speeds.is_cuda else 1
         launch_on(
             speeds.device,
@@ -61,6 +80,6 @@ class CoulombWorkspace:
                 *(TOLERANCE, MAX_ITERATIONS, (forces[None], real), (self._vectors, real)),
                 *((self._indices, wp.int32), (self._matrices, Vec4)),
             ],
-            outputs=[(missed, real)],
+            outputs=[(violation, real)],
             block_dim=lanes,
         )

@@ -1,4 +1,10 @@
-"""Contact responses and iterates on a GPU: matrices stay there, a round of Newton steps is one loop and one look."""
+"""Contact linearisations and Newton iterates on a GPU (Eq. 4, 8, 9).
+
+``DeviceContactLinearizer`` queues a linearisation in the buffers of a ``NewtonWorkspace``.
+``DeviceNewtonIterate.newton_steps`` then runs a whole Newton loop on the device and synchronises once, at the end of
+the loop. Matrices stay on the device. The workspace has two slots of iterates, ``base`` and ``trial``; an iterate that
+is in neither is uploaded again.
+"""
 
 from __future__ import annotations
 
@@ -22,32 +28,33 @@ from egs_warp.launching import round_up
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy
 
-_PLACES = 8
-"""Contacts are so many at a time: each number of them has memory and graphs of its own."""
+_CAPACITY_STEP = 8
+"""Contact capacities are multiples of this. Each capacity has buffers and graphs of its own."""
 
 
 class DeviceContactLinearizer(StepWorkspace):
-    """Responses by dense factors of one body, where its elements are. The last one is at hand, others are not; of what
-    was tried the last two."""
+    """Builds contact linearisations with the dense factors of one body on the device of its elements. Only the last
+    linearisation, ``current``, can be used.
+    """
 
     def __init__(
-        self, factors: DenseCholesky, body: SoftBody, muscles: MuscleSet, sight: DeviceContactSelector
+        self, factors: DenseCholesky, body: SoftBody, muscles: MuscleSet, selector: DeviceContactSelector
     ) -> None:
-        super().__init__(factors, body, muscles, sight)
-        self._rooms: dict[int, NewtonWorkspace] = {}
+        super().__init__(factors, body, muscles, selector)
+        self._workspaces: dict[int, NewtonWorkspace] = {}
         self.current: DeviceContactLinearization | None = None
 
     def __call__(self, tangent: Tangent, contacts: ContactSet) -> DeviceContactLinearization:
-        """The response at hand from now on."""
+        """Linearise ``contacts`` by ``tangent`` and make the result ``current``. Blocks only for pending factors."""
         assert tangent.factors is self.factors
-        room, self.predicted_start = self.workspace_for(contacts), None
+        workspace, self.predicted_start = self.workspace_for(contacts), None
         with self.stream:
             self.set_problem(tangent.problem)
-            room.linearize(tangent.problem, contacts)
+            workspace.linearize(tangent.problem, contacts)
             if not tangent.wait():
-                room.linearize(tangent.problem, contacts)
-        room.base_iterate = room.trial_iterate = room.pending_iterate = None
-        self.current = DeviceContactLinearization.from_workspace(tangent, contacts, self, room)
+                workspace.linearize(tangent.problem, contacts)
+        workspace.base_iterate = workspace.trial_iterate = workspace.pending_iterate = None
+        self.current = DeviceContactLinearization.from_workspace(tangent, contacts, self, workspace)
         return self.current
 
     def predict_velocities(
@@ -58,90 +65,104 @@ class DeviceContactLinearizer(StepWorkspace):
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> np.ndarray | None:
-        """See ``Responder``. No response is at hand then."""
+        """Take one Newton step with fixed contact forces; ``current`` becomes None.
+
+        Returns:
+            (N, 3) m/s; None if the step inverts an element.
+        """
         assert tangent.factors is self.factors
-        room = self.workspace_for(contacts)
-        self.predicted_start = self.current = room.base_iterate = room.trial_iterate = room.pending_iterate = None
+        workspace = self.workspace_for(contacts)
+        self.predicted_start = self.current = workspace.base_iterate = workspace.trial_iterate = (
+            workspace.pending_iterate
+        ) = None
         with self.stream:
             self.set_problem(tangent.problem)
-        size, ahead = room.predict_velocities(tangent.problem, contacts, tension, velocities, forces)
+        size, end = workspace.predict_velocities(tangent.problem, contacts, tension, velocities, forces)
         if not tangent.wait():
-            size, ahead = room.predict_velocities(tangent.problem, contacts, tension, velocities, forces)
-        return ahead.reshape(velocities.shape).copy() if np.isfinite(size) else None
+            size, end = workspace.predict_velocities(tangent.problem, contacts, tension, velocities, forces)
+        return end.reshape(velocities.shape).copy() if np.isfinite(size) else None
 
     def workspace_for(self, contacts: ContactSet) -> NewtonWorkspace:
-        """Memory for them."""
-        places = round_up(contacts.count, _PLACES)
-        if places not in self._rooms:
-            self._rooms[places] = NewtonWorkspace(self, places)
-        return self._rooms[places]
+        """Return the workspace with enough capacity for ``contacts``."""
+        capacity = round_up(contacts.count, _CAPACITY_STEP)
+        if capacity not in self._workspaces:
+            self._workspaces[capacity] = NewtonWorkspace(self, capacity)
+        return self._workspaces[capacity]
 
 
 @dataclass(frozen=True)
 class DeviceContactLinearization(ContactLinearization):
-    """``ContactResponse`` whose columns are a tensor on the device."""
+    """``ContactLinearization`` whose columns are a tensor on the device."""
 
     owner: DeviceContactLinearizer
     workspace: NewtonWorkspace
 
     @classmethod
     def from_workspace(
-        cls, tangent: Tangent, contacts: ContactSet, owner: DeviceContactLinearizer, room: NewtonWorkspace
+        cls, tangent: Tangent, contacts: ContactSet, owner: DeviceContactLinearizer, workspace: NewtonWorkspace
     ) -> DeviceContactLinearization:
-        """What the ``room`` has, or will have."""
-        return cls(tangent, contacts, room.columns[:, : 3 * contacts.count], owner, room)
+        """Create the linearisation that ``workspace`` holds or that is queued there."""
+        return cls(tangent, contacts, workspace.columns[:, : 3 * contacts.count], owner, workspace)
 
     @cached_property
     def delassus(self) -> np.ndarray:
-        """See ``ContactResponse``; of the one that is at hand."""
+        """(3n, 3n) m/(N s), the Delassus operator. Blocks until it is downloaded; valid for the current
+        linearisation only.
+        """
         assert self.owner.current is self
         self.owner.stream.wait()
         width = 3 * self.contacts.count
         return self.workspace.download_delassus()[:width, :width]
 
     def with_added_contacts(self, contacts: ContactSet) -> DeviceContactLinearization:
-        """See ``ContactResponse``."""
+        """Return the linearisation of ``contacts``, which begin with the present ones, by the same tangent."""
         return self.owner(self.tangent, contacts)
 
     def iterate_at(
         self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
     ) -> DeviceNewtonIterate:
-        """See ``ContactResponse``."""
-        for known in (self.workspace.trial_iterate, self.workspace.pending_iterate):
-            if known is not None and known.is_at(self, tension, velocities, forces):
-                return known
+        """Return the Newton iterate at ``velocities`` (N, 3) and contact ``forces`` (n, 3), under ``tension``. An
+        iterate at these arrays that the workspace already holds is reused.
+        """
+        for iterate in (self.workspace.trial_iterate, self.workspace.pending_iterate):
+            if iterate is not None and iterate.is_at(self, tension, velocities, forces):
+                return iterate
         return self.running_iterate_at(tension, velocities, forces)
 
     def running_iterate_at(
         self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
     ) -> DeviceNewtonIterate:
-        """``at``, where the room's last trial is then."""
+        """Start a trial at ``velocities`` and ``forces`` asynchronously and return its iterate, which is then in the
+        ``trial`` slot.
+        """
         assert self.owner.current is self
-        room = self.workspace
-        room.start_trial(self.tangent.problem, tension, velocities, forces)
-        room.base_iterate, room.trial_iterate, room.pending_iterate = (
+        workspace = self.workspace
+        workspace.start_trial(self.tangent.problem, tension, velocities, forces)
+        workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = (
             None,
             DeviceNewtonIterate(self, tension, velocities, forces),
             None,
         )
-        return room.trial_iterate
+        return workspace.trial_iterate
 
     def parse_iterate(
-        self, tension: MuscleEnergy | None, forces: np.ndarray, found: TrialReadback
+        self, tension: MuscleEnergy | None, forces: np.ndarray, readback: TrialReadback
     ) -> DeviceNewtonIterate:
-        """Of what the room has ``found``."""
+        """Create an iterate from the read-back of a trial."""
         return self.iterate(
             tension,
             forces,
-            float(found.residual_norm[0]),
-            found.free_contact_velocities,
-            found.velocities,
-            self.parse_penetration(found),
+            float(readback.residual_norm[0]),
+            readback.free_contact_velocities,
+            readback.velocities,
+            self.parse_penetration(readback),
         )
 
-    def parse_penetration(self, found: TrialReadback) -> PenetrationCheck | None:
-        """What there is to be seen in what the room has ``found``; None if nobody has looked at the step's start."""
-        return PenetrationCheck.of(found.penetration) if self.owner.gaps_of is self.tangent.problem else None
+    def parse_penetration(self, readback: TrialReadback) -> PenetrationCheck | None:
+        """Return the penetration test in the read-back; None if the gaps at the start of the step were not
+        evaluated.
+        """
+        return PenetrationCheck.of(readback.penetration) if self.owner.gaps_of is self.tangent.problem else None
 
     def iterate(
         self,
@@ -150,17 +171,27 @@ class DeviceContactLinearization(ContactLinearization):
         size: float,
         speeds: np.ndarray,
         velocities: np.ndarray,
-        seen: PenetrationCheck | None,
+        penetration: PenetrationCheck | None,
     ) -> DeviceNewtonIterate:
-        """At those ``velocities`` (3N,), under ``forces`` (n, 3), where the equation misses ``size`` N s and contacts
-        go on at ``speeds`` (3K,)."""
-        place = DeviceNewtonIterate(self, tension, velocities.reshape(-1, 3).copy(), forces)
-        place.know(size / self.tangent.problem.residual_scale, speeds, seen)
-        return place
+        """Create an iterate whose values are known.
+
+        Args:
+            tension: muscle energy, or None.
+            forces: (n, 3) newtons.
+            size: norm of the residual, N s.
+            speeds: (3K,) m/s, contact-free velocities of the contacts.
+            velocities: (3N,) m/s.
+            penetration: penetration test, or None.
+        """
+        iterate = DeviceNewtonIterate(self, tension, velocities.reshape(-1, 3).copy(), forces)
+        iterate.set_values(size / self.tangent.problem.residual_scale, speeds, penetration)
+        return iterate
 
 
 class DeviceNewtonIterate:
-    """``Iterate`` that lies on the device. What it is asked for may be on its way, and its tangent only begun."""
+    """``NewtonIterate`` on the device. Its values may still be in flight, and its tangent only queued; the
+    properties block for them.
+    """
 
     def __init__(
         self,
@@ -169,48 +200,54 @@ class DeviceNewtonIterate:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> None:
-        self._response, self.tension, self.velocities, self.forces = response, tension, velocities, forces
-        self._size: float | None = None
-        self._speeds: np.ndarray | None = None
-        self._seen: PenetrationCheck | None = None
-        self._begun = False
+        self._linearization, self.tension, self.velocities, self.forces = response, tension, velocities, forces
+        self._residual_norm: float | None = None
+        self._contact_velocities: np.ndarray | None = None
+        self._penetration: PenetrationCheck | None = None
+        self._tangent_pending = False
 
-    def know(self, size: float, speeds: np.ndarray, seen: PenetrationCheck | None) -> None:
-        """What has come: of the residual, ``speeds`` (3K,) of the contacts, and what is ``seen``."""
-        self._size, self._seen = size, seen
-        self._speeds = speeds[: 3 * self._response.contacts.count].copy()
+    def set_values(self, size: float, speeds: np.ndarray, penetration: PenetrationCheck | None) -> None:
+        """Set the values that were downloaded.
+
+        Args:
+            size: norm of the residual, over dt x weight.
+            speeds: (3K,) m/s, contact-free velocities of the contacts.
+            penetration: penetration test, or None.
+        """
+        self._residual_norm, self._penetration = size, penetration
+        self._contact_velocities = speeds[: 3 * self._linearization.contacts.count].copy()
 
     @property
     def linearization(self) -> DeviceContactLinearization:
-        """See ``Iterate``."""
-        return self._response
+        """Linearisation that defines the Newton step."""
+        return self._linearization
 
     @property
     def residual_norm(self) -> float:
-        """See ``Iterate``."""
-        if self._size is None:
-            self._wait()
-        assert self._size is not None
-        return self._size
+        """Norm of the residual with contact forces, over dt x weight; not finite where an element is inverted."""
+        if self._residual_norm is None:
+            self._wait_values()
+        assert self._residual_norm is not None
+        return self._residual_norm
 
     @property
     def free_contact_velocities(self) -> np.ndarray:
-        """See ``Iterate``."""
-        if self._speeds is None:
-            self._wait()
-        assert self._speeds is not None
-        return self._speeds
+        """(3n,) m/s, contact velocities after a Newton step without contact forces."""
+        if self._contact_velocities is None:
+            self._wait_values()
+        assert self._contact_velocities is not None
+        return self._contact_velocities
 
     @property
     def penetration(self) -> PenetrationCheck | None:
-        """See ``Iterate``."""
-        if self._size is None:
-            self._wait()
-        return self._seen
+        """Penetration test at the iterate; None if it was not evaluated."""
+        if self._residual_norm is None:
+            self._wait_values()
+        return self._penetration
 
     @property
     def is_inversion_free(self) -> bool:
-        """See ``Iterate``."""
+        """True if no element is inverted."""
         return bool(np.isfinite(self.residual_norm))
 
     def is_at(
@@ -220,7 +257,7 @@ class DeviceNewtonIterate:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> bool:
-        """Whether it is what is asked for: at these very arrays."""
+        """Return True if this is the iterate of these very arrays, with equal tensions."""
         if self.linearization is not response or self.velocities is not velocities or self.forces is not forces:
             return False
         if tension is None or self.tension is None:
@@ -228,120 +265,145 @@ class DeviceNewtonIterate:
         return np.array_equal(tension.tensions, self.tension.tensions)
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> DeviceNewtonIterate:
-        """See ``Iterate``."""
-        self._settle()
-        room, problem = self.linearization.workspace, self.linearization.tangent.problem
+        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
+        self._wait_tangent()
+        workspace, problem = self.linearization.workspace, self.linearization.tangent.problem
         assert self.linearization.owner.current is self.linearization
-        found = room.run_trial(problem, length=length, wanted=forces, base=self._base())
-        told = forces if length == 1.0 else self.forces + length * (forces - self.forces)
-        room.base_iterate, room.trial_iterate, room.pending_iterate = (
+        readback = workspace.run_trial(problem, length=length, target_forces=forces, base=self._slot())
+        trial_forces = forces if length == 1.0 else self.forces + length * (forces - self.forces)
+        workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = (
             self,
-            self.linearization.parse_iterate(self.tension, told, found),
+            self.linearization.parse_iterate(self.tension, trial_forces, readback),
             None,
         )
-        return room.trial_iterate
+        return workspace.trial_iterate
 
     def newton_steps(
-        self, shift: np.ndarray, friction: float, course: ConvergenceState | None = None
+        self, shift: np.ndarray, friction: float, convergence: ConvergenceState | None = None
     ) -> NewtonStepResult:
-        """See ``Iterate``."""
-        response, room = self.linearization, self.linearization.workspace
+        """Run the Newton loop on the device and block for its end (arguments as in ``NewtonIterate``).
+
+        A loop that is already queued from this iterate with the same parameters is used. Without ``convergence`` one
+        step is taken. If the Coulomb solve of the last step failed, it is repeated on the host.
+        """
+        response, workspace = self.linearization, self.linearization.workspace
         owner, problem, count = response.owner, response.tangent.problem, response.contacts.count
-        course = course or ConvergenceState(0.0, 0.0, np.inf, max_steps=1)
+        convergence = convergence or ConvergenceState(0.0, 0.0, np.inf, max_steps=1)
         assert owner.current is response
         if (
-            room.pending_iterate is not self
-            or room.convergence != course
-            or not room.coulomb.has_uploaded(shift, friction)
+            workspace.pending_iterate is not self
+            or workspace.convergence != convergence
+            or not workspace.coulomb.has_uploaded(shift, friction)
         ):
-            base = self._base()
-            if base == FROM_BASE and room.trial_iterate is not None:
-                # The speeds are the trial's.
-                room.reevaluate(base=base)
-            room.start_newton(problem, shift, friction, course, base=base, size=self._size)
-        found = room.wait_newton()
-        if self._begun and not owner.factors.is_ready:
-            room.base_iterate = room.trial_iterate = room.pending_iterate = None
-            self._settle()
-            return self.newton_steps(shift, friction, course)
-        self._begun = False
-        if found.steps_taken == 0:
-            # A plan that was not as usual: the device has stayed there.
-            room.base_iterate, room.trial_iterate, room.pending_iterate = None, self, None
-            return self.newton_steps(shift, friction, course)
-        sizes, first = found.step_residuals, self
+            base = self._slot()
+            if base == FROM_BASE and workspace.trial_iterate is not None:
+                # The contact velocities in the buffer are those of the trial.
+                workspace.reevaluate(base=base)
+            workspace.start_newton(problem, shift, friction, convergence, base=base, residual_norm=self._residual_norm)
+        readback = workspace.wait_newton()
+        if self._tangent_pending and not owner.factors.is_ready:
+            workspace.base_iterate = workspace.trial_iterate = workspace.pending_iterate = None
+            self._wait_tangent()
+            return self.newton_steps(shift, friction, convergence)
+        self._tangent_pending = False
+        if readback.steps_taken == 0:
+            # The plan was rejected, so the loop has not run. The device still holds this iterate as its trial.
+            workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = None, self, None
+            return self.newton_steps(shift, friction, convergence)
+        sizes, first = readback.step_residuals, self
         if len(sizes) == 1:
-            if self._speeds is None:
-                self.know(
-                    float(found.convergence[FIRST_RESIDUAL]) / problem.residual_scale,
-                    found.previous_contact_velocities,
-                    self._seen,
+            if self._contact_velocities is None:
+                self.set_values(
+                    float(readback.convergence[FIRST_RESIDUAL]) / problem.residual_scale,
+                    readback.previous_contact_velocities,
+                    self._penetration,
                 )
         else:
-            forces = found.forces_before[: 3 * count].reshape(-1, 3).copy()
+            forces = readback.forces_before[: 3 * count].reshape(-1, 3).copy()
             first = response.iterate(
-                self.tension, forces, float(sizes[-2]), found.previous_contact_velocities, found.velocities_before, None
+                self.tension,
+                forces,
+                float(sizes[-2]),
+                readback.previous_contact_velocities,
+                readback.velocities_before,
+                None,
             )
-        forces, missed = found.forces[: 3 * count].reshape(-1, 3).copy(), float(found.coulomb_violation[0])
-        end = response.parse_iterate(self.tension, forces, found)
-        if end._seen is not None and end._seen.is_penetrating:
-            end._seen = replace(end._seen, deepest=owner.selector.deepest(room.capacity))
-        room.base_iterate, room.trial_iterate, room.pending_iterate = first, end, None
-        owner.last_solve = SolveEnd(end.velocities, problem.dt, response.contacts.points, room.capacity)
-        if missed > FAILURE_TOLERANCE:
-            forces, missed = response.solve_coulomb(first.free_contact_velocities, shift, friction, first.forces)
+        forces, violation = readback.forces[: 3 * count].reshape(-1, 3).copy(), float(readback.coulomb_violation[0])
+        end = response.parse_iterate(self.tension, forces, readback)
+        if end._penetration is not None and end._penetration.is_penetrating:
+            end._penetration = replace(end._penetration, deepest=owner.selector.deepest(workspace.capacity))
+        workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = first, end, None
+        owner.last_solve = SolveEnd(end.velocities, problem.dt, response.contacts.points, workspace.capacity)
+        if violation > FAILURE_TOLERANCE:
+            forces, violation = response.solve_coulomb(first.free_contact_velocities, shift, friction, first.forces)
             end = first.line_search_point(forces)
-        return NewtonStepResult(tuple(sizes[:-1] / problem.residual_scale), first, forces, missed, end)
+        return NewtonStepResult(tuple(sizes[:-1] / problem.residual_scale), first, forces, violation, end)
 
     def with_new_tangent(self) -> DeviceNewtonIterate:
-        """See ``Iterate``. No response but that is at hand then."""
-        old, owner, room = self.linearization, self.linearization.owner, self.linearization.workspace
+        """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles. It
+        is queued asynchronously, and its linearisation becomes ``current``.
+        """
+        old, owner, workspace = self.linearization, self.linearization.owner, self.linearization.workspace
         assert owner.current is old
         problem = old.tangent.problem
-        room.refactor(problem, self.tension, self.velocities, base=self._base())
-        response = DeviceContactLinearization.from_workspace(Tangent(problem, owner.factors), old.contacts, owner, room)
-        place = DeviceNewtonIterate(response, self.tension, self.velocities, self.forces)
-        place._size, place._seen, place._begun = self._size, self._seen, True
-        owner.current, room.base_iterate, room.trial_iterate, room.pending_iterate = response, place, None, None
-        return place
+        workspace.refactor(problem, self.tension, self.velocities, base=self._slot())
+        response = DeviceContactLinearization.from_workspace(
+            Tangent(problem, owner.factors), old.contacts, owner, workspace
+        )
+        iterate = DeviceNewtonIterate(response, self.tension, self.velocities, self.forces)
+        iterate._residual_norm, iterate._penetration, iterate._tangent_pending = (
+            self._residual_norm,
+            self._penetration,
+            True,
+        )
+        owner.current, workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = (
+            response,
+            iterate,
+            None,
+            None,
+        )
+        return iterate
 
-    def _wait(self) -> None:
-        """For what is on its way, which nothing has gone past."""
-        self._settle()
-        response, room = self.linearization, self.linearization.workspace
-        assert room.pending_iterate is None and self is (room.trial_iterate or room.base_iterate)
+    def _wait_values(self) -> None:
+        """Block for the values in flight. No other trial may have been started since."""
+        self._wait_tangent()
+        response, workspace = self.linearization, self.linearization.workspace
+        assert workspace.pending_iterate is None and self is (workspace.trial_iterate or workspace.base_iterate)
         response.owner.stream.wait()
-        size, seen = self._size, self._seen
-        if self is room.trial_iterate:
-            size, seen = (
-                float(room.readback.residual_norm[0]) / response.tangent.problem.residual_scale,
-                response.parse_penetration(room.readback),
+        size, penetration = self._residual_norm, self._penetration
+        if self is workspace.trial_iterate:
+            size, penetration = (
+                float(workspace.readback.residual_norm[0]) / response.tangent.problem.residual_scale,
+                response.parse_penetration(workspace.readback),
             )
         assert size is not None
-        self.know(size, room.readback.free_contact_velocities, seen)
+        self.set_values(size, workspace.readback.free_contact_velocities, penetration)
 
-    def _settle(self) -> None:
-        """Wait for a tangent that is begun; if it is not definite, another is made: a sum may be where its first part
-        is not."""
-        if not self._begun:
+    def _wait_tangent(self) -> None:
+        """Block for a queued tangent. If it is not definite, compute another: the sum with the muscles' stiffness
+        may be definite where the first part alone is not.
+        """
+        if not self._tangent_pending:
             return
-        self._begun = False
+        self._tangent_pending = False
         owner, old = self.linearization.owner, self.linearization
         if owner.factors.is_ready:
             return
         problem = old.tangent.problem
-        self._response = owner(problem.tangent(owner.factors, self.velocities, self.tension), old.contacts)
-        self._speeds = None
-        room = self._response.workspace
-        room.start_trial(problem, self.tension, self.velocities, self.forces)
-        room.trial_iterate = self
+        self._linearization = owner(problem.tangent(owner.factors, self.velocities, self.tension), old.contacts)
+        self._contact_velocities = None
+        workspace = self._linearization.workspace
+        workspace.start_trial(problem, self.tension, self.velocities, self.forces)
+        workspace.trial_iterate = self
 
-    def _base(self) -> float:
-        """Where it lies; what the device has left behind is told it again."""
-        room = self.linearization.workspace
-        if self is room.base_iterate:
+    def _slot(self) -> float:
+        """Return the slot of the iterate, ``FROM_BASE`` or ``FROM_TRIAL``. An iterate that is in neither is uploaded
+        first.
+        """
+        workspace = self.linearization.workspace
+        if self is workspace.base_iterate:
             return FROM_BASE
-        if self is not room.trial_iterate:
-            room.start_trial(self.linearization.tangent.problem, self.tension, self.velocities, self.forces)
-            room.base_iterate, room.trial_iterate, room.pending_iterate = None, self, None
+        if self is not workspace.trial_iterate:
+            workspace.start_trial(self.linearization.tangent.problem, self.tension, self.velocities, self.forces)
+            workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = None, self, None
         return FROM_TRIAL

@@ -125,7 +125,7 @@ def test_what_was_no_number_is_left_behind(creature: Creature, device: str, monk
             room.ends,
             room._base,
             room._trial,
-            room._pushed,
+            room._force_velocities,
             respond.momentum_projection,
         ):
             part.fill_(np.nan)

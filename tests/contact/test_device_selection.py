@@ -97,7 +97,7 @@ def test_the_points_of_a_step_are_the_host_s(kind: str, device: str) -> None:
         assert np.array_equal(found[:, 3], before_it[1][joining])
         loaded = random.random(len(taken)) < 0.5
         expected = points.select(taken, loaded, detector.gaps(after)[0])
-        assert_alike(sight.select(taken, loaded, then, places=len(places)), detector.contact_set(expected, then))
+        assert_alike(sight.select(taken, loaded, then, capacity=len(places)), detector.contact_set(expected, then))
         sight.enqueue_penetration(next_ends, told, torch.tensor([len(taken)], dtype=torch.int32, device=device), seen)
         later = detector.gaps(after)[0]
         allowed = np.where(later < -TOLERANCE, MAX_CREEP, MAX_SINK) * TOLERANCE
