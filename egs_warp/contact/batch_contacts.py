@@ -1,4 +1,6 @@
-"""Contacts of many worlds of one body side by side: gaps, points, frames and forces, on the device (Eq. 8, 9)."""
+"""Contacts of many worlds with copies of one body: gaps, contact points, frames and Coulomb forces, on the device
+(Eq. 8, 9).
+"""
 
 from __future__ import annotations
 
@@ -22,81 +24,93 @@ from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 @dataclass(frozen=True)
 class BatchContacts(BatchedRecord):
-    """The points that take part in one step of c worlds: in each the first of K places, the rest without weight."""
+    """Active contact points of one step in c worlds, padded to the capacity K. Padding has zero weights."""
 
     points: torch.Tensor
-    """(c, K) int64."""
+    """(c, K) int64, point indices."""
     counts: torch.Tensor
-    """(c,) int32."""
+    """(c,) int32, number of contacts of each world."""
     nodes: torch.Tensor
     """(c, K, 4) int32."""
     weights: torch.Tensor
-    """(c, K, 4)."""
+    """(c, K, 4), barycentric weights."""
     axes: torch.Tensor
-    """(c, K, 3, 3): rows are the normal and two tangents."""
+    """(c, K, 3, 3), contact frames: the rows are the unit normal and two unit tangents."""
     gaps: torch.Tensor
-    """(c, K) metres at the start of the step."""
+    """(c, K) m, signed distance at the start of the step."""
     faces: torch.Tensor
-    """(c, K) int64."""
+    """(c, K) int64, index of the contact plane."""
 
     @property
     def capacity(self) -> int:
-        """K."""
+        """Capacity K."""
         return self.points.shape[1]
 
     @property
     def valid(self) -> torch.Tensor:
-        """(c, K) bool: the places that are taken."""
+        """(c, K) bool, which entries are contacts."""
         return torch.arange(self.capacity, device=self.counts.device) < self.counts[:, None]
 
-    def _each(self) -> list[Any]:
+    def _kernel_inputs(self) -> list[Any]:
         pairs = (self.counts, wp.int32), (self.nodes, wp.vec4i), (self.weights, Vec4), (self.axes, Mat33)
         return [(each.contiguous(), kind) for each, kind in pairs]
 
     def jacobian_transposed(self, node_count: int) -> torch.Tensor:
-        """(c, 3N, 3K): each column the impulses on the nodes of one along an axis of a contact."""
+        """Return (c, 3N, 3K), the transposed contact Jacobian W^T."""
         rows = self.weights.new_zeros((len(self.counts), 3 * node_count, 3 * self.capacity))
         self._launch(kernels.contact_jacobian_kernel, (len(rows), self.capacity), [], rows, real)
         return rows
 
     def contact_velocities(self, velocities: torch.Tensor) -> torch.Tensor:
-        """(c, 3K, m) of the contacts at nodal ``velocities`` (c, 3N, m)."""
-        made = self.weights.new_empty((len(self.counts), 3 * self.capacity, velocities.shape[2]))
-        dim = (len(made), self.capacity, velocities.shape[2])
-        self._launch(kernels.contact_velocities_kernel, dim, [(velocities.contiguous(), real)], made, real)
-        return made
+        """Return (c, 3K, m), W v for nodal velocities v (c, 3N, m)."""
+        out = self.weights.new_empty((len(self.counts), 3 * self.capacity, velocities.shape[2]))
+        dim = (len(out), self.capacity, velocities.shape[2])
+        self._launch(kernels.contact_velocities_kernel, dim, [(velocities.contiguous(), real)], out, real)
+        return out
 
     def nodal_forces(self, forces: torch.Tensor, node_count: int) -> torch.Tensor:
-        """(c, N, 3) newtons of ``forces`` (c, K, 3) along the contacts' axes."""
-        made = self.weights.new_empty((len(self.counts), node_count, 3))
-        self._launch(kernels.nodal_forces_kernel, made.shape[:2], [(forces.contiguous(), Vec3)], made, Vec3)
-        return made
+        """Return (c, N, 3) newtons, W^T f for contact ``forces`` (c, K, 3)."""
+        out = self.weights.new_empty((len(self.counts), node_count, 3))
+        self._launch(kernels.nodal_forces_kernel, out.shape[:2], [(forces.contiguous(), Vec3)], out, Vec3)
+        return out
 
     def end_gaps(self, dt: float, velocities: torch.Tensor) -> torch.Tensor:
-        """(c, K) metres after ``dt`` seconds at nodal end ``velocities`` (c, N, 3)."""
+        """Return (c, K) m, the gaps after ``dt`` seconds at nodal end ``velocities`` (c, N, 3)."""
         return self.gaps + dt * self.contact_velocities(velocities.flatten(1)[:, :, None])[:, 0::3, 0]
 
-    def _launch(self, kernel: Any, dim: tuple[int, ...], given: list[Any], made: torch.Tensor, kind: Any) -> None:
-        if made.numel() > 0:
-            launch_on(made.device, kernel, tuple(dim), inputs=[*self._each(), *given], outputs=[(made, kind)])
+    def _launch(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], out: torch.Tensor, kind: Any) -> None:
+        if out.numel() > 0:
+            launch_on(out.device, kernel, tuple(dim), inputs=[*self._kernel_inputs(), *inputs], outputs=[(out, kind)])
 
-    def with_capacity(self, most: int) -> BatchContacts:
-        """With places for ``most``, at least as many as now."""
-        more = most - self.capacity
-        wide = {name: padded(value, more) for name, value in self.batched_fields() if name != "counts"}
-        return replace(self, **wide)
+    def with_capacity(self, capacity: int) -> BatchContacts:
+        """Return the contacts padded to ``capacity``, which is not below the present one."""
+        more = capacity - self.capacity
+        arrays = {name: padded(value, more) for name, value in self.batched_fields() if name != "counts"}
+        return replace(self, **arrays)
 
 
 def padded(values: torch.Tensor, more: int) -> torch.Tensor:
-    """``values`` (c, K, ...) with so many ``more`` zeros behind the K."""
+    """Pad ``values`` (c, K, ...) with ``more`` zeros along the second axis."""
     return torch.cat([values, values.new_zeros((len(values), more, *values.shape[2:]))], dim=1) if more else values
 
 
 class BatchDetector:
-    """Gaps, and the choice of points, of at most ``count`` worlds: ``ContactDetector`` and ``ContactPoints``."""
+    """Gaps and selection of contact points for at most ``count`` worlds, as ``ContactDetector`` and
+    ``ContactSelector``.
+    """
 
     def __init__(self, geometry: ContactGeometry, points: ContactSelector, count: int, *, device: torch.device) -> None:
-        """Raises ``ArgumentError`` for ground that is not flat."""
+        """Upload the model.
+
+        Args:
+            geometry: the points and obstacles of one world.
+            points: selector, which defines the cells.
+            count: maximum number of worlds.
+            device: device of all tensors.
+
+        Raises:
+            ArgumentError: for uneven ground.
+        """
         if geometry.field is not None:
             raise ArgumentError("geometry", "many worlds stand on flat ground only; run these over processes")
         self.device, self.near, self.lower, self.alike = (
@@ -127,7 +141,7 @@ class BatchDetector:
         return torch.as_tensor(np.asarray(values, dtype=np.float64), device=self.device)
 
     def gaps(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """(c, P) metres of every point at ``positions`` (c, N, 3), and (c, P) int64 the plane it is held to."""
+        """Return (c, P) m, the gap of every point at ``positions`` (c, N, 3), and (c, P) int64, its contact plane."""
         gaps = positions.new_empty((len(positions), self.point_count))
         faces = torch.empty_like(gaps, dtype=torch.int32)
         launch_on(
@@ -140,30 +154,44 @@ class BatchDetector:
         return gaps, faces.long()
 
     def select(
-        self, previous: torch.Tensor, there: torch.Tensor, loaded: torch.Tensor, gaps: torch.Tensor
+        self, previous: torch.Tensor, valid: torch.Tensor, loaded: torch.Tensor, gaps: torch.Tensor
     ) -> torch.Tensor:
-        """(c, P) bool, the points of the next step: ``ContactPoints.choose``. ``previous`` (c, K) were the last's,
-        where ``there`` (c, K), ``loaded`` (c, K) those that pressed; ``gaps`` (c, P) as it may end."""
+        """Select the points of the next step, as ``ContactSelector.select``.
+
+        Args:
+            previous: (c, K) points of the previous step.
+            valid: (c, K) bool, which entries of ``previous`` are points.
+            loaded: (c, K) bool, which of them carried load.
+            gaps: (c, P) m, at the predicted end of the step.
+
+        Returns:
+            (c, P) bool.
+        """
         lowest = self._lowest(gaps < self.near, gaps)
         low = gaps.new_full((len(gaps), self._cell_count), torch.inf)
         low.scatter_reduce_(1, self._cells.expand_as(gaps), torch.where(lowest, gaps, torch.inf), "amin")
         cells, before = self._cells[previous], gaps.gather(1, previous)
         close = before <= low.gather(1, cells) + self.lower
-        kept = there & (before < 2.0 * self.near) & (loaded | close)
-        held = torch.zeros_like(low, dtype=torch.int32).scatter_reduce_(1, cells, kept.int(), "amax") > 0
-        chosen = lowest & ~held.gather(1, self._cells.expand_as(gaps))
-        return chosen | (torch.zeros_like(gaps, dtype=torch.int32).scatter_reduce_(1, previous, kept.int(), "amax") > 0)
+        retained = valid & (before < 2.0 * self.near) & (loaded | close)
+        retained_cells = torch.zeros_like(low, dtype=torch.int32).scatter_reduce_(1, cells, retained.int(), "amax") > 0
+        chosen = lowest & ~retained_cells.gather(1, self._cells.expand_as(gaps))
+        return chosen | (
+            torch.zeros_like(gaps, dtype=torch.int32).scatter_reduce_(1, previous, retained.int(), "amax") > 0
+        )
 
     def find_deeper(self, contacts: BatchContacts, gaps: torch.Tensor, depth: float) -> torch.Tensor:
-        """(c, P) bool: ``ContactPoints.deeper`` of these ``contacts`` at ``gaps`` (c, P)."""
+        """Return (c, P) bool, the deepest point of each cell that is below ``-depth`` in ``gaps`` (c, P) and not in
+        ``contacts``.
+        """
         deep = gaps < -depth
-        taken = torch.zeros_like(gaps, dtype=torch.int32)
-        taken.scatter_reduce_(1, contacts.points, contacts.valid.int(), "amax")
-        return self._lowest(deep & (taken == 0), gaps)
+        active = torch.zeros_like(gaps, dtype=torch.int32)
+        active.scatter_reduce_(1, contacts.points, contacts.valid.int(), "amax")
+        return self._lowest(deep & (active == 0), gaps)
 
     def _lowest(self, among: torch.Tensor, gaps: torch.Tensor) -> torch.Tensor:
-        """(c, P) bool: of the points ``among`` the lowest of each cell, of several that lie alike the one next to its
-        middle."""
+        """Return (c, P) bool, the lowest point of each cell in the mask ``among``. Ties go to the point closest to
+        the centre.
+        """
         cells, heights = self._cells.expand_as(gaps), (gaps / self.alike).round()
         low = gaps.new_full((len(gaps), self._cell_count), torch.inf)
         low.scatter_reduce_(1, cells, torch.where(among, heights, torch.inf), "amin")
@@ -174,57 +202,74 @@ class BatchDetector:
         return ranks == first.gather(1, cells)
 
     def contacts(
-        self, chosen: torch.Tensor, gaps: torch.Tensor, faces: torch.Tensor, order: torch.Tensor | None = None
+        self, selected: torch.Tensor, gaps: torch.Tensor, faces: torch.Tensor, order: torch.Tensor | None = None
     ) -> BatchContacts:
-        """At the points ``chosen`` (c, P), in ascending order, or in that of ``order``, metres; ``gaps`` and ``faces``
-        (c, P) at the start of the step. Waits for the device."""
-        counts = chosen.sum(dim=1)
-        most = int(counts.max()) if len(counts) else 0
-        places = (chosen.cumsum(dim=1) - 1).clamp(min=0)
-        # Behind the last place lies what was not chosen.
-        points = torch.zeros((len(chosen), most + 1), dtype=torch.int64, device=self.device)
-        numbers = torch.arange(self.point_count, device=self.device).expand_as(chosen)
-        points.scatter_(1, torch.where(chosen, places, most), torch.where(chosen, numbers, 0))
-        points = points[:, :most]
-        there = torch.arange(most, device=self.device) < counts[:, None]
+        """Build the contacts of the selected points. Blocks for the device.
+
+        Args:
+            selected: (c, P) bool.
+            gaps: (c, P) m, at the start of the step.
+            faces: (c, P), at the start of the step.
+            order: (c, P) m, gaps by which the points are sorted; None sorts by index.
+        """
+        counts = selected.sum(dim=1)
+        capacity = int(counts.max()) if len(counts) else 0
+        columns = (selected.cumsum(dim=1) - 1).clamp(min=0)
+        # Points that are not selected go to an extra column, which is cut off.
+        points = torch.zeros((len(selected), capacity + 1), dtype=torch.int64, device=self.device)
+        numbers = torch.arange(self.point_count, device=self.device).expand_as(selected)
+        points.scatter_(1, torch.where(selected, columns, capacity), torch.where(selected, numbers, 0))
+        points = points[:, :capacity]
+        valid = torch.arange(capacity, device=self.device) < counts[:, None]
         if order is not None:
-            key = torch.where(there, (order.gather(1, points) / self.alike).round(), torch.inf)
+            key = torch.where(valid, (order.gather(1, points) / self.alike).round(), torch.inf)
             points = points.gather(1, key.argsort(dim=1, stable=True))
         at = faces.gather(1, points)
         return BatchContacts(
             points,
             counts.int(),
             self._nodes[points],
-            self._weights[points] * there[:, :, None],
-            self._axes[at] * there[:, :, None, None],
-            gaps.gather(1, points) * there,
+            self._weights[points] * valid[:, :, None],
+            self._axes[at] * valid[:, :, None, None],
+            gaps.gather(1, points) * valid,
             at,
         )
 
     def append_contacts(
         self, contacts: BatchContacts, forces: torch.Tensor, added: BatchContacts
     ) -> tuple[BatchContacts, torch.Tensor]:
-        """The ``added`` behind the ``contacts``, with ``forces`` (c, K, 3) of zero. Waits for the device."""
+        """Append the contacts ``added`` to ``contacts``, with zeros appended to ``forces`` (c, K, 3). Blocks for the
+        device.
+        """
         wide = contacts.with_capacity(max(int((contacts.counts + added.counts).max()), contacts.capacity))
         forces = padded(forces, wide.capacity - contacts.capacity)
-        world, place = added.valid.nonzero(as_tuple=True)
-        at = contacts.counts.long()[world] + place
+        world, slot = added.valid.nonzero(as_tuple=True)
+        at = contacts.counts.long()[world] + slot
         counts = contacts.counts + added.counts
         grown = {name: value.clone() for name, value in wide.batched_fields() if name != "counts"}
         for name, value in grown.items():
-            value[world, at] = getattr(added, name)[world, place]
+            value[world, at] = getattr(added, name)[world, slot]
         return replace(wide, counts=counts, **grown), forces
 
     def transfer_forces(
-        self, contacts: BatchContacts, before: torch.Tensor, there: torch.Tensor, forces: torch.Tensor
+        self, contacts: BatchContacts, before: torch.Tensor, valid: torch.Tensor, forces: torch.Tensor
     ) -> torch.Tensor:
-        """(c, K, 3) the ``forces`` (c, L, 3) of the points ``before`` (c, L), where ``there`` (c, L), on those of them
-        that are in contact now, zero on others."""
-        every = forces.new_zeros((len(forces), self.point_count, 3))
-        world, place = there.nonzero(as_tuple=True)
-        every[world, before[world, place]] = forces[world, place]
-        now = every.gather(1, contacts.points[:, :, None].expand(-1, -1, 3))
-        return now * contacts.valid[:, :, None]
+        """Map contact forces of the previous step to ``contacts``; zero where a point is new.
+
+        Args:
+            contacts: contacts of the step.
+            before: (c, L) points of the previous step.
+            valid: (c, L) bool, which entries of ``before`` are points.
+            forces: (c, L, 3) newtons.
+
+        Returns:
+            (c, K, 3) newtons.
+        """
+        by_point = forces.new_zeros((len(forces), self.point_count, 3))
+        world, slot = valid.nonzero(as_tuple=True)
+        by_point[world, before[world, slot]] = forces[world, slot]
+        current = by_point.gather(1, contacts.points[:, :, None].expand(-1, -1, 3))
+        return current * contacts.valid[:, :, None]
 
 
 def coulomb_forces_batch(
@@ -235,30 +280,40 @@ def coulomb_forces_batch(
     frictions: torch.Tensor,
     start: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """``coulomb_forces`` of c worlds with ``counts`` (c,) int32 contacts in K places: (c, K, 3) newtons, and (c,) m/s
-    by which they miss contact and friction. ``delassus`` (c, 3K, 3K), ``free_velocity`` (c, 3K), ``shift`` (c, K),
-    ``frictions`` (c,), ``start`` (c, K, 3)."""
-    worlds, most, _ = start.shape
-    if worlds == 0 or most == 0:
+    """Compute Coulomb forces of c worlds, as ``coulomb_forces``.
+
+    Args:
+        counts: (c,) int32, number of contacts of each world.
+        delassus: (c, 3K, 3K) m/(N s).
+        free_velocity: (c, 3K) m/s.
+        shift: (c, K) m/s.
+        frictions: (c,).
+        start: (c, K, 3) newtons.
+
+    Returns:
+        (c, K, 3) newtons and the residuals (c,) in m/s.
+    """
+    worlds, capacity, _ = start.shape
+    if worlds == 0 or capacity == 0:
         return start.clone(), start.new_zeros(worlds)
-    found, missed = _found(counts, delassus, free_velocity, shift, frictions, start)
-    astray = nonzero(missed > FAILURE_TOLERANCE)
-    if len(astray) == 0:
-        return found, missed
+    result, residual = _solve(counts, delassus, free_velocity, shift, frictions, start)
+    failed = nonzero(residual > FAILURE_TOLERANCE)
+    if len(failed) == 0:
+        return result, residual
     counts, operators, free, shift, frictions, forces = (
-        each[astray].contiguous() for each in (counts, delassus, free_velocity, shift, frictions, start)
+        each[failed].contiguous() for each in (counts, delassus, free_velocity, shift, frictions, start)
     )
     diagonal = operators.diagonal(dim1=1, dim2=2)
     mean = diagonal.sum(dim=1, keepdim=True) / (3 * counts[:, None])
     for softness in (*REGULARIZATION_STEPS, 0.0):
         soft = operators + torch.diag_embed((softness * mean).expand_as(diagonal))
-        forces, left = _found(counts, soft, free, shift, frictions, forces)
-    better = left < missed[astray]
-    found[astray[better]], missed[astray[better]] = forces[better], left[better]
-    return found, missed
+        forces, new_residual = _solve(counts, soft, free, shift, frictions, forces)
+    better = new_residual < residual[failed]
+    result[failed[better]], residual[failed[better]] = forces[better], new_residual[better]
+    return result, residual
 
 
-def _found(
+def _solve(
     counts: torch.Tensor,
     delassus: torch.Tensor,
     free_velocity: torch.Tensor,
@@ -266,25 +321,25 @@ def _found(
     frictions: torch.Tensor,
     start: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The same by the kernel alone."""
-    worlds, most, _ = start.shape
-    forces, missed, size = start.clone(), start.new_zeros(worlds), 3 * most
+    """Compute the forces by the kernel alone, without continuation."""
+    worlds, capacity, _ = start.shape
+    forces, residual, size = start.clone(), start.new_zeros(worlds), 3 * capacity
     vectors = start.new_empty((worlds, 5, size))
-    numbers = torch.empty((worlds, 2, size), dtype=torch.int32, device=start.device)
+    indices = torch.empty((worlds, 2, size), dtype=torch.int32, device=start.device)
     matrices = start.new_empty((worlds, size, (size + 4) // 4, 4))
     lanes = coulomb.BLOCK if start.is_cuda else 1
-    given = delassus, free_velocity, shift, frictions
+    values = delassus, free_velocity, shift, frictions
     launch_on(
         start.device,
         coulomb.coulomb_kernel,
         (worlds, lanes),
         inputs=[
             (counts, wp.int32),
-            *((each.contiguous(), real) for each in given),
+            *((each.contiguous(), real) for each in values),
             *(TOLERANCE, MAX_ITERATIONS),
-            *((forces.view(worlds, size), real), (vectors, real), (numbers, wp.int32), (matrices, Vec4)),
+            *((forces.view(worlds, size), real), (vectors, real), (indices, wp.int32), (matrices, Vec4)),
         ],
-        outputs=[(missed, real)],
+        outputs=[(residual, real)],
         block_dim=lanes,
     )
-    return forces, missed
+    return forces, residual

@@ -1,6 +1,6 @@
-"""Steps with contact of many worlds side by side: ``coupled_step`` in lockstep, on the device (Eq. 4, 8, 9).
+"""Steps with contact of many worlds in lockstep on the device (Eq. 4, 8, 9).
 
-Every world takes the decisions that it would take alone; those that are done wait for the others.
+Every world takes the decisions of ``coupled_step``; converged worlds are left out of later iterations.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from egs_warp.kernels.contact.newton_convergence import REFACTOR_RATIO, RESIDUAL
 
 
 class StageTimer(Protocol):
-    """Whoever wants to know where the time goes."""
+    """Protocol of a timer for the stages of a step."""
 
     def __call__(self, name: str) -> AbstractContextManager[object]:
-        """Around the work of the stage ``name``."""
+        """Return a context that measures the stage ``name``."""
         ...
 
 
 def no_timer(name: str) -> AbstractContextManager[object]:
-    """``Stages`` of nobody."""
+    """Return an empty context: a ``StageTimer`` that measures nothing."""
     return nullcontext()
 
 
 @dataclass(frozen=True)
 class BatchLinearization(BatchedRecord):
-    """``ContactResponse`` of c worlds, by the tangents in their slots."""
+    """``ContactLinearization`` of c worlds, by the tangents in their slots."""
 
     momentum_projection: BatchMomentumProjection
     columns: torch.Tensor
-    """(c, 3N, 3K)."""
+    """(c, 3N, 3K) m/s per newton, dt J^-1 W^T."""
     delassus: torch.Tensor
-    """(c, 3K, 3K), made regular."""
+    """(c, 3K, 3K) m/(N s), the regularised Delassus operator."""
 
 
 @dataclass(frozen=True)
@@ -67,18 +67,18 @@ class BatchResult(BatchedRecord):
     iterations: torch.Tensor
     """(c,) int64."""
     is_singular: torch.Tensor
-    """(c,) bool: a tangent had no factors, ``UnsolvableStepError``."""
+    """(c,) bool, True if a tangent could not be factored (``UnsolvableStepError``)."""
     contacts_added: torch.Tensor
-    """(c,) bool: it ended where points were found that are to join."""
+    """(c,) bool, True if the round ended because points were found to add."""
 
 
 @dataclass(frozen=True)
 class BatchSolver:
-    """``CoupledSolver`` of many worlds."""
+    """``CoupledSolver`` for many worlds."""
 
     detector: BatchDetector
     push_out_cap: float
-    """m/s."""
+    """Maximum push-out speed, m/s."""
     penetration_tolerance: float
     """Metres."""
     tolerance: float
@@ -86,7 +86,7 @@ class BatchSolver:
     stages: StageTimer = no_timer
 
     def normal_bias(self, contacts: BatchContacts, dt: float) -> torch.Tensor:
-        """(c, K) m/s: ``push_out_speeds``."""
+        """Return (c, K) m/s, the velocity bias of ``push_out_speeds``."""
         gaps = contacts.gaps
         deep = ((gaps + self.penetration_tolerance).clamp(max=0.0) * PUSH_OUT_FRACTION / dt).clamp(
             min=-self.push_out_cap
@@ -94,18 +94,20 @@ class BatchSolver:
         return (gaps.clamp(min=0.0) / dt + deep) * contacts.valid
 
     def linearize(
-        self, problem: BatchProblem, contacts: BatchContacts, turning: BatchMomentumProjection | None = None
+        self, problem: BatchProblem, contacts: BatchContacts, momentum_projection: BatchMomentumProjection | None = None
     ) -> BatchLinearization:
-        """By the tangents in the worlds' slots, with their ``turning`` if it is known."""
+        """Linearise ``contacts`` by the tangents in the worlds' slots; the momentum projection is computed unless it
+        is passed.
+        """
         with self.stages("substitute"):
-            columns, turning = apply_inverse(
-                problem, problem.dt * contacts.jacobian_transposed(problem.positions.shape[1]), turning
+            columns, momentum_projection = apply_inverse(
+                problem, problem.dt * contacts.jacobian_transposed(problem.positions.shape[1]), momentum_projection
             )
         delassus = contacts.contact_velocities(columns)
         diagonal = delassus.diagonal(dim1=1, dim2=2)
         mean = diagonal.sum(dim=1, keepdim=True) / (3 * contacts.counts[:, None]).clamp(min=1)
         diagonal += DELASSUS_REGULARIZATION * mean
-        return BatchLinearization(turning, columns, delassus)
+        return BatchLinearization(momentum_projection, columns, delassus)
 
     def solve_coulomb(
         self,
@@ -116,8 +118,19 @@ class BatchSolver:
         frictions: torch.Tensor,
         start: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """``ContactResponse.forces``: (c, K, 3) newtons where the bodies move at ``free`` (c, N, 3) without, and (c,)
-        m/s by which they miss the laws."""
+        """Solve Coulomb's law and complementarity for the contact forces.
+
+        Args:
+            contacts: contacts of c worlds.
+            response: their linearisation.
+            free: (c, N, 3) m/s, nodal velocities without contact forces.
+            shift: (c, K) m/s, bias of the normal velocities.
+            frictions: (c,) Coulomb coefficients.
+            start: (c, K, 3) newtons, initial forces.
+
+        Returns:
+            (c, K, 3) newtons, and their violation of the law (c,) in m/s.
+        """
         with self.stages("coulomb"):
             speeds = contacts.contact_velocities(free.flatten(1)[:, :, None])[:, :, 0]
             return coulomb_forces_batch(contacts.counts, response.delassus, speeds, shift, frictions, start)
@@ -134,25 +147,38 @@ class BatchSolver:
         forces: torch.Tensor,
         start_gaps: tuple[torch.Tensor, torch.Tensor],
     ) -> tuple[BatchContacts, BatchResult]:
-        """The steps from a start of ``velocities`` (c, N, 3) and ``forces`` (c, K, 3) under muscles' ``tensions``
-        (c, M) newtons; ``start_gaps`` are gaps and faces at the start of the step."""
+        """Solve the steps with Newton's method.
+
+        Args:
+            problem: the steps of c worlds.
+            contacts: initial contacts.
+            response: their linearisation.
+            tensions: (c, M) newtons of the muscles.
+            frictions: (c,) Coulomb coefficients.
+            velocities: (c, N, 3) m/s, the start.
+            forces: (c, K, 3) newtons, the start.
+            start_gaps: (c, P) gaps and faces at the start of the step.
+
+        Returns:
+            The contacts at the end, and the result.
+        """
         count = len(velocities)
-        whole = BatchResult(
+        result = BatchResult(
             velocities.clone(),
             forces.clone(),
             torch.zeros(count, dtype=torch.bool, device=velocities.device),
             torch.zeros(count, dtype=torch.int64, device=velocities.device),
             *torch.zeros((2, count), dtype=torch.bool, device=velocities.device),
         )
-        todo = every = torch.arange(count, device=velocities.device)
+        todo = all_worlds = torch.arange(count, device=velocities.device)
         for number in range(MAX_ACTIVATION_ROUNDS):
-            part, touched = problem.subset(todo), contacts.subset(todo)
-            shift, gaps = self.normal_bias(touched, problem.dt), start_gaps[0][todo]
-            task = _RoundInputs(part, touched, shift, tensions[todo], frictions[todo], gaps)
+            part, active_contacts = problem.subset(todo), contacts.subset(todo)
+            shift, gaps = self.normal_bias(active_contacts, problem.dt), start_gaps[0][todo]
+            task = _RoundInputs(part, active_contacts, shift, tensions[todo], frictions[todo], gaps)
             last = number == MAX_ACTIVATION_ROUNDS - 1
-            done, left = self._round(task, response, whole.velocities[todo], whole.forces[todo], last=last)
-            done = replace(done, iterations=done.iterations + whole.iterations[todo])
-            whole.scatter(todo, done)
+            done, left = self._round(task, response, result.velocities[todo], result.forces[todo], last=last)
+            done = replace(done, iterations=done.iterations + result.iterations[todo])
+            result.scatter(todo, done)
             if last:
                 break
             with self.stages("detect"):
@@ -161,20 +187,21 @@ class BatchSolver:
             if len(more) == 0:
                 break
             new = self.detector.contacts(added[more], *(each[todo[more]] for each in start_gaps), order=ends[more])
-            grown, forces = self.detector.append_contacts(touched.gather(more), done.forces[more], new)
-            wider = grown.capacity - contacts.capacity
-            # A copy: those that were given stay as they are.
-            contacts = contacts.with_capacity(grown.capacity).gather(every)
-            whole = replace(whole, forces=padded(whole.forces, wider))
+            grown, forces = self.detector.append_contacts(active_contacts.gather(more), done.forces[more], new)
+            extra = grown.capacity - contacts.capacity
+            # Copied, since the caller's contacts must not change.
+            contacts = contacts.with_capacity(grown.capacity).gather(all_worlds)
+            result = replace(result, forces=padded(result.forces, extra))
             todo = todo[more]
             contacts.scatter(todo, grown)
-            whole.forces[todo] = forces
+            result.forces[todo] = forces
             response = self.linearize(problem.subset(todo), grown, left.momentum_projection.gather(more))
-        return contacts, whole
+        return contacts, result
 
     def _points_to_add(self, task: _RoundInputs, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """(c, P) bool: the points that would end too deep by ``velocities`` (c, N, 3); (c, P) metres, the gaps of all
-        at the end."""
+        """Return (c, P) bool, the points that would end too deep by ``velocities`` (c, N, 3), and (c, P) m, all gaps
+        at the end.
+        """
         gaps, _ = self.detector.gaps(task.problem.end_positions(velocities))
         tolerance = self.penetration_tolerance
         allowed = torch.where(gaps < -tolerance, MAX_CREEP * tolerance, MAX_SINK * tolerance)
@@ -190,20 +217,21 @@ class BatchSolver:
         *,
         last: bool,
     ) -> tuple[BatchResult, BatchLinearization]:
-        """Newton's method with the task's contacts, until points are found that are to join, but in the ``last`` round;
-        the last tangents' response comes along."""
+        """Run Newton's method with the contacts of ``task`` until points are found to add (never in the ``last``
+        round). Returns the result and the last linearisations.
+        """
         with self.stages("elasticity"):
-            every = _NewtonState.begin(velocities, forces, *task.contact_free_residual(velocities, forces))
+            state = _NewtonState.begin(velocities, forces, *task.contact_free_residual(velocities, forces))
         for iteration in range(1, MAX_NEWTON_STEPS + 1):
-            active = nonzero(every.active)
+            active = nonzero(state.active)
             if len(active) == 0:
                 break
-            part, search = task.subset(active), every.subset(active)
+            part, search = task.subset(active), state.subset(active)
             search.iterations.fill_(iteration)
             slow = self._newton_step(part, search, response.subset(active), first=iteration == 1)
-            looking = nonzero(search.is_near_end)
-            if len(looking) > 0 and not last:
-                self._check_penetration(part.subset(looking), search, looking)
+            to_check = nonzero(search.is_near_end)
+            if len(to_check) > 0 and not last:
+                self._check_penetration(part.subset(to_check), search, to_check)
             fresh = nonzero(slow & search.active)
             if len(fresh) > 0:
                 again = part.subset(fresh)
@@ -213,56 +241,59 @@ class BatchSolver:
                 search.tangent_is_current[fresh] = True
                 search.is_singular[fresh] = ~factored
                 search.active[fresh] = factored
-            if search is not every:
-                every.scatter(active, search)
+            if search is not state:
+                state.scatter(active, search)
         ends = (
-            every.velocities,
-            every.forces,
-            every.converged,
-            every.iterations,
-            every.is_singular,
-            every.contacts_added,
+            state.velocities,
+            state.forces,
+            state.converged,
+            state.iterations,
+            state.is_singular,
+            state.contacts_added,
         )
         return BatchResult(*ends), response
 
-    def _check_penetration(self, task: _RoundInputs, search: _NewtonState, places: torch.Tensor) -> None:
-        """Whether points are to join in the worlds of the ``task``, which are at ``places`` of the ``search``."""
+    def _check_penetration(self, task: _RoundInputs, search: _NewtonState, rows: torch.Tensor) -> None:
+        """Find points to add in the worlds of ``task``, which are the rows ``rows`` of ``search``, and end the round
+        of worlds that have some.
+        """
         with self.stages("detect"):
-            added, _ = self._points_to_add(task, search.velocities[places])
+            added, _ = self._points_to_add(task, search.velocities[rows])
         joined = added.any(dim=1)
-        search.contacts_added[places], search.active[places] = joined, ~joined
+        search.contacts_added[rows], search.active[rows] = joined, ~joined
 
     def _newton_step(
         self, task: _RoundInputs, search: _NewtonState, response: BatchLinearization, *, first: bool
     ) -> torch.Tensor:
-        """One Newton step of each world in ``search``, which has it then; (c,) bool, where the tangent is to be made
-        anew."""
+        """Take one Newton step in each world of ``search``, in place. Returns (c,) bool, True where the tangent must
+        be updated.
+        """
         problem = task.problem
-        answered = COULOMB_TOLERANCE * problem.residual_scale / problem.body.body.mass
+        coulomb_tolerance = COULOMB_TOLERANCE * problem.residual_scale / problem.body.body.mass
         with self.stages("substitute"):
-            moved, _ = apply_inverse(
+            solved, _ = apply_inverse(
                 problem, search.contact_free_residual.flatten(1)[:, :, None], response.momentum_projection
             )
-        loose = search.velocities - moved.view_as(search.velocities)
-        wanted, missed = self.solve_coulomb(
-            task.contacts, response, loose, task.normal_bias, task.frictions, search.forces
+        free_velocities = search.velocities - solved.view_as(search.velocities)
+        target_forces, violation = self.solve_coulomb(
+            task.contacts, response, free_velocities, task.normal_bias, task.frictions, search.forces
         )
-        unanswered = missed > answered
-        search.coulomb_failures.add_(unanswered)
-        pushed = (response.columns @ wanted.flatten(1)[:, :, None]).view_as(loose)
-        change, turned = loose + pushed - search.velocities, wanted - search.forces
+        violated = violation > coulomb_tolerance
+        search.coulomb_failures.add_(violated)
+        force_velocities = (response.columns @ target_forces.flatten(1)[:, :, None]).view_as(free_velocities)
+        change, force_change = free_velocities + force_velocities - search.velocities, target_forces - search.forces
         before = search.residual_norm.clone()
         better, whole = torch.zeros((2, len(before)), dtype=torch.bool, device=before.device)
-        most = search.recent_residuals.amax(dim=1)
-        most = torch.where(most >= 0.0, most, torch.inf)
+        maximum = search.recent_residuals.amax(dim=1)
+        maximum = torch.where(maximum >= 0.0, maximum, torch.inf)
         waiting, length = torch.arange(len(before), device=before.device), 1.0
         while length > MIN_STEP_LENGTH and len(waiting) > 0:
             trial = search.velocities[waiting] + length * change[waiting]
-            trial_forces = search.forces[waiting] + length * turned[waiting]
+            trial_forces = search.forces[waiting] + length * force_change[waiting]
             with self.stages("elasticity"):
                 free, size = task.subset(waiting).contact_free_residual(trial, trial_forces)
-            least = ((1.0 - 1e-4 * length) * most[waiting]).clamp(min=self.tolerance)
-            good = size.isfinite() & (size < least) if not first else size.isfinite()
+            limit = ((1.0 - 1e-4 * length) * maximum[waiting]).clamp(min=self.tolerance)
+            good = size.isfinite() & (size < limit) if not first else size.isfinite()
             at = waiting[good]
             better[at] = True
             whole[at] = length == 1.0
@@ -271,24 +302,24 @@ class BatchSolver:
             waiting, length = waiting[~good], 0.5 * length
         recent = torch.cat([search.recent_residuals[:, 1:], search.residual_norm[:, None]], dim=1)
         search.recent_residuals.copy_(torch.where(better[:, None], recent, search.recent_residuals))
-        search.converged.copy_(whole & (search.residual_norm <= self.tolerance) & ~unanswered)
+        search.converged.copy_(whole & (search.residual_norm <= self.tolerance) & ~violated)
         search.is_near_end.copy_(
             whole
             & (before > ACTIVATION_RESIDUAL)
             & (search.residual_norm <= ACTIVATION_RESIDUAL)
-            & ~unanswered
+            & ~violated
             & ~search.converged
         )
-        given_up = (~better & search.tangent_is_current) | (search.coulomb_failures > MAX_COULOMB_FAILURES)
-        search.active.copy_(~search.converged & ~given_up)
+        failed = (~better & search.tangent_is_current) | (search.coulomb_failures > MAX_COULOMB_FAILURES)
+        search.active.copy_(~search.converged & ~failed)
         search.tangent_is_current.fill_(False)
-        slow = ~better | ~whole | unanswered
+        slow = ~better | ~whole | violated
         return slow if first else slow | (search.residual_norm > REFACTOR_RATIO * before)
 
 
 @dataclass(frozen=True)
 class _RoundInputs(BatchedRecord):
-    """What a round of c worlds is asked."""
+    """Inputs of a round of c worlds."""
 
     problem: BatchProblem
     contacts: BatchContacts
@@ -297,15 +328,16 @@ class _RoundInputs(BatchedRecord):
     tensions: torch.Tensor
     """(c, M) newtons."""
     frictions: torch.Tensor
-    """(c,)."""
+    """(c,) Coulomb coefficients."""
     start_gaps: torch.Tensor
-    """(c, P) metres."""
+    """(c, P) m, gaps at the start of the step."""
 
     def contact_free_residual(
         self, velocities: torch.Tensor, forces: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(c, N, 3) N s, the residual without contact at ``velocities`` (c, N, 3), and (c,) the size of that with
-        ``forces`` (c, K, 3), over dt x weight."""
+        """Return (c, N, 3) N s, the residual without contact forces at ``velocities`` (c, N, 3), and (c,) the norm
+        of the residual with ``forces`` (c, K, 3), over dt x weight.
+        """
         problem = self.problem
         free = problem.residual(velocities, self.tensions)
         rest = free - problem.dt * self.contacts.nodal_forces(forces, velocities.shape[1])
@@ -314,40 +346,40 @@ class _RoundInputs(BatchedRecord):
 
 @dataclass(frozen=True)
 class _NewtonState(BatchedRecord):
-    """Where Newton's method is in each of c worlds; written in place."""
+    """State of Newton's method in c worlds, written in place."""
 
     velocities: torch.Tensor
     """(c, N, 3) m/s."""
     forces: torch.Tensor
     """(c, K, 3) newtons."""
     contact_free_residual: torch.Tensor
-    """(c, N, 3) N s, the residual without contact."""
+    """(c, N, 3) N s, residual without contact forces."""
     residual_norm: torch.Tensor
-    """(c,) of the residual with it, over dt x weight."""
+    """(c,) norm of the residual with contact forces, over dt x weight."""
     recent_residuals: torch.Tensor
-    """(c, MEMORY) sizes of the last steps; -1 where there was none."""
+    """(c, RESIDUAL_WINDOW) residuals after the last steps; -1 where there is none."""
     coulomb_failures: torch.Tensor
-    """(c,) int64: how often forces missed their laws."""
+    """(c,) int64, number of steps whose forces violated Coulomb's law."""
     iterations: torch.Tensor
     """(c,) int64."""
     active: torch.Tensor
-    """(c,) bool."""
+    """(c,) bool, True while the world is being solved."""
     tangent_is_current: torch.Tensor
-    """(c,) bool: the tangent is that of the velocities."""
+    """(c,) bool, True if the tangent is that of the present velocities."""
     converged: torch.Tensor
     """(c,) bool."""
     is_singular: torch.Tensor
-    """(c,) bool."""
+    """(c,) bool, True if a tangent could not be factored."""
     is_near_end: torch.Tensor
-    """(c,) bool: by its last step the end is known well enough to look for points that are to join."""
+    """(c,) bool, True if the last step came near enough to the end to search for points to add."""
     contacts_added: torch.Tensor
-    """(c,) bool: there were some."""
+    """(c,) bool, True if there were some."""
 
     @classmethod
     def begin(
         cls, velocities: torch.Tensor, forces: torch.Tensor, free: torch.Tensor, size: torch.Tensor
     ) -> _NewtonState:
-        """All worlds are to go."""
+        """Create the state at the start of a round, with all worlds active."""
         count, device = len(size), size.device
         numbers = torch.zeros((2, count), dtype=torch.int64, device=device)
         flags = torch.zeros((6, count), dtype=torch.bool, device=device)

@@ -55,14 +55,14 @@ CONTACT = [
     ),
     Survivor(
         "contact/batch_contacts.py",
-        "points.scatter_(1, torch.where(chosen, places, most), torch.where(chosen, numbers, 0))",
-        "points.scatter_(1, torch.where(chosen, places, most), torch.where(chosen, numbers, 1))",
+        "points.scatter_(1, torch.where(selected, columns, capacity), torch.where(selected, numbers, 0))",
+        "points.scatter_(1, torch.where(selected, columns, capacity), torch.where(selected, numbers, 1))",
         "what is not chosen goes into the column behind the last place, which is cut off",
     ),
     Survivor(
         "contact/batch_step.py",
-        "least = ((1.0 - 1e-4 * length) * most[waiting]).clamp(min=self.tolerance)",
-        "least = ((1.0 - 1e-4 % length) * most[waiting]).clamp(min=self.tolerance)",
+        "limit = ((1.0 - 1e-4 * length) * maximum[waiting]).clamp(min=self.tolerance)",
+        "limit = ((1.0 - 1e-4 % length) * maximum[waiting]).clamp(min=self.tolerance)",
         "the same for whole steps; half a step may be worse by a ten-thousandth where less is asked for",
     ),
     Survivor(
