@@ -1,4 +1,6 @@
-"""Contacts of many bodies with one mesh: their rows in the velocities, and what forces on them push."""
+"""Kernels of contacts of many worlds with one mesh: the products W^T, W v and W^T f with the contact Jacobian W (Eq.
+8).
+"""
 
 import warp as wp
 
@@ -17,14 +19,16 @@ def contact_jacobian_kernel(
     # Out:
     rows_out: wp.array3d[real],
 ):
-    """(c, 3N, 3K), zero before: of each contact the impulses on each node's axes that one along each of its own is."""
+    """Write the transposed contact Jacobian W^T (c, 3N, 3K) into zeroed memory: the nodal impulses of a unit impulse
+    along each contact axis.
+    """
     world, k = wp.tid()
     if k < counts[world]:
         for corner in range(4):
             node = nodes[world, k][corner]
-            for own in range(3):
+            for axis in range(3):
                 for i in range(3):
-                    rows_out[world, 3 * node + i, 3 * k + own] = weights[world, k][corner] * axes[world, k][own, i]
+                    rows_out[world, 3 * node + i, 3 * k + axis] = weights[world, k][corner] * axes[world, k][axis, i]
 
 
 @wp.kernel
@@ -38,18 +42,18 @@ def contact_velocities_kernel(
     # Out:
     speeds_out: wp.array3d[real],
 ):
-    """(c, 3K, m) along the axes of each contact, for nodal velocities (c, 3N, m); zero for those beyond the count."""
+    """Compute the contact velocities W v (c, 3K, m) for nodal velocities v (c, 3N, m). Padding gets zero."""
     world, k, column = wp.tid()
     at_point = Vec3()
     if k < counts[world]:
         for corner in range(4):
             n = 3 * nodes[world, k][corner]
-            share = weights[world, k][corner]
+            weight = weights[world, k][corner]
             for i in range(3):
-                at_point[i] += share * velocities[world, n + i, column]
+                at_point[i] += weight * velocities[world, n + i, column]
     speeds = axes[world, k] * at_point
-    for own in range(3):
-        speeds_out[world, 3 * k + own, column] = speeds[own]
+    for axis in range(3):
+        speeds_out[world, 3 * k + axis, column] = speeds[axis]
 
 
 @wp.kernel
@@ -63,7 +67,7 @@ def nodal_forces_kernel(
     # Out:
     pushes_out: wp.array2d[Vec3],
 ):
-    """(c, N) newtons on each node, gathered in the order of the contacts."""
+    """Compute the nodal forces W^T f (c, N) in newtons. Each node sums over the contacts in their order."""
     world, node = wp.tid()
     total = Vec3()
     for k in range(counts[world]):

@@ -1,4 +1,4 @@
-"""Contact detection of embedded points against planes."""
+"""Kernels of contact detection between embedded points and planes (Eq. 8)."""
 
 import warp as wp
 
@@ -22,10 +22,11 @@ def point_gaps_kernel(
     gaps_out: wp.array[real],
     planes_out: wp.array[int],
 ):
-    """Signed distance of each embedded point to the nearest solid, and which of its planes faces the point.
+    """Compute the signed distance of each embedded point to the nearest solid, and the plane of it that faces the
+    point.
 
-    The planes of a solid, its intersection, follow each other; the largest distance to them bounds that to the solid
-    from below.
+    The planes of a solid, which is their intersection, are consecutive. The largest signed distance to them is a lower
+    bound of the distance to the solid.
     """
     point = wp.tid()
     tet = tets[tet_from_point[point]]
@@ -103,7 +104,7 @@ def write_gaps(
     gaps_out: wp.array[real],
     planes_out: wp.array[int],
 ) -> None:
-    """See ``all_gaps_kernel``."""
+    """Compute the gaps of all points (native code of ``all_gaps_kernel``)."""
     ...
 
 
@@ -121,6 +122,8 @@ def all_gaps_kernel(
     gaps_out: wp.array[real],
     planes_out: wp.array[int],
 ):
-    """``point_gaps_kernel`` of all points, each among four ``nodes``, by one thread of a CPU: ``heights``, room for
-    planes times nodes, are those of the nodes, between which they are linear."""
+    """Do the same as ``point_gaps_kernel`` for all points in one CPU thread, each point on four ``nodes``.
+    ``heights`` is a workspace of planes times nodes for the signed distances of the nodes, which are interpolated
+    linearly.
+    """
     write_gaps(nodes, weights, planes, solid_from_plane, positions, heights, gaps_out, planes_out)

@@ -1,4 +1,4 @@
-"""Contact detection of embedded points against a height field."""
+"""Kernel of contact detection between embedded points and a height field (Eq. 8)."""
 
 import warp as wp
 
@@ -9,8 +9,8 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def spline_weights(f: real):
-    """Weights of a quadratic B-spline at the node before, the nearest and the one after; ``f`` from the nearest, in
-    spacings.
+    """Return the weights of a quadratic B-spline at the previous, the nearest and the next node; ``f`` is the offset
+    from the nearest in spacings.
     """
     half = real(0.5)
     return Vec3(half * (half - f) * (half - f), real(0.75) - f * f, half * (half + f) * (half + f))
@@ -18,7 +18,7 @@ def spline_weights(f: real):
 
 @wp.func
 def spline_slopes(f: real):
-    """Derivatives of ``spline_weights``."""
+    """Return the derivatives of ``spline_weights``."""
     return Vec3(f - real(0.5), -real(2.0) * f, f + real(0.5))
 
 
@@ -38,8 +38,11 @@ def ground_gaps_kernel(
     gaps: wp.array[real],
     faces: wp.array[int],
 ):
-    """Distance of each embedded point from the tangent plane of the ground under it, where that is nearer than the
-    ``gaps`` to all else; the ground is face 0, what ``faces`` told before counts one more.
+    """Compute the distance of each embedded point to the tangent plane of the ground below it, and merge it into
+    ``gaps``.
+
+    Where the ground is nearer than the obstacle in ``gaps``, its distance is stored and ``faces`` becomes 0. Elsewhere
+    ``faces`` is incremented by 1, since the ground is face 0.
     """
     point = wp.tid()
     tet = tets[tet_from_point[point]]
@@ -50,7 +53,7 @@ def ground_gaps_kernel(
     v = away[1] / spacing
     rows = coefficients.shape[0]
     columns = coefficients.shape[1]
-    # Far out the edge goes on, so where exactly is of no account.
+    # Far outside, the edge value extends without limit, so clamping the index changes nothing.
     column = wp.clamp(wp.floor(u + real(0.5)), real(-2.0), real(columns) + real(2.0))
     row = wp.clamp(wp.floor(v + real(0.5)), real(-2.0), real(rows) + real(2.0))
     across = spline_weights(wp.clamp(u - column, real(-0.5), real(0.5)))

@@ -1,4 +1,8 @@
-"""A trial of Newton's method on a step with contact, a thread for each node or contact (Eq. 4, 8)."""
+"""Kernels that evaluate a trial of Newton's method on a step with contact on a GPU, one thread for each node or
+contact (Eq. 4, 8).
+
+The host code is ``egs_warp/contact/device_newton_workspace.py``; ``iterate_cpu`` is the version on a CPU.
+"""
 
 import warp as wp
 
@@ -10,18 +14,18 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def select_base_kernel(
     # In:
-    told: wp.array[real],
+    slot: wp.array[real],
     trial: wp.array[real],
-    begun: wp.array[real],
+    start: wp.array[real],
     # Out:
     base_out: wp.array[real],
 ):
-    """The base stays, becomes the ``trial`` (1), or what was ``begun`` (2), as is told."""
+    """Overwrite the base with the ``trial`` if ``slot`` is 1, with ``start`` if it is 2; keep it if it is 0."""
     i = wp.tid()
-    if told[0] == real(1.0):
+    if slot[0] == real(1.0):
         base_out[i] = trial[i]
-    elif told[0] == real(2.0):
-        base_out[i] = begun[i]
+    elif slot[0] == real(2.0):
+        base_out[i] = start[i]
 
 
 @wp.kernel
@@ -30,10 +34,10 @@ def invert_momentum_matrix_kernel(
     ratio: real,
     momenta: wp.array[Mat33],
     # Out:
-    held_out: wp.array[Mat33],
+    inverse_out: wp.array[Mat33],
 ):
-    """Inverse of ``ratio`` times the angular momenta (1,) of what three of them bring about."""
-    held_out[0] = wp.inverse(ratio * momenta[0])
+    """Invert ``ratio`` times the angular momenta (3 x 3) of the responses to the three rigid rotations."""
+    inverse_out[0] = wp.inverse(ratio * momenta[0])
 
 
 @wp.kernel
@@ -44,19 +48,22 @@ def trial_kernel(
     # In:
     lengths: wp.array[real],
     velocities: wp.array[Vec3],
-    loose: wp.array[Vec3],
-    pushed: wp.array[Vec3],
+    free_velocities: wp.array[Vec3],
+    force_velocities: wp.array[Vec3],
     # Out:
     velocities_out: wp.array[Vec3],
     ends_out: wp.array[Vec3],
 ):
-    """``lengths[0]`` of the way to the end of a Newton step, which moves at ``loose`` without contact forces and is
-    ``pushed`` by them; where the nodes are then, from ``starts`` on. Of a way of which nothing is gone the end need be
-    no number."""
+    """Move the velocities along a Newton step by the fraction ``lengths[0]``, and compute the end positions of the
+    nodes.
+
+    The full step ends at ``free_velocities`` (without contact forces) plus ``force_velocities`` (their effect). At
+    length 0 these may be not finite.
+    """
     node = wp.tid()
     velocity = velocities[node]
     if lengths[0] != real(0.0):
-        end = loose[node] + pushed[node]
+        end = free_velocities[node] + force_velocities[node]
         velocity = velocities[node] + lengths[0] * (end - velocities[node])
     velocities_out[node] = velocity
     ends_out[node] = starts[node] + dt * velocity
@@ -67,15 +74,15 @@ def trial_forces_kernel(
     # In:
     lengths: wp.array[real],
     forces: wp.array[Vec3],
-    wanted: wp.array[Vec3],
+    target_forces: wp.array[Vec3],
     # Out:
     forces_out: wp.array[Vec3],
 ):
-    """``lengths[0]`` of the way from ``forces`` to those that are ``wanted``."""
+    """Move the contact ``forces`` towards ``target_forces`` by the fraction ``lengths[0]``."""
     contact = wp.tid()
     force = forces[contact]
     if lengths[0] != real(0.0):
-        force = forces[contact] + lengths[0] * (wanted[contact] - forces[contact])
+        force = forces[contact] + lengths[0] * (target_forces[contact] - forces[contact])
     forces_out[contact] = force
 
 
@@ -101,38 +108,42 @@ def residual_kernel(
     free_out: wp.array[Vec3],
     rest_out: wp.array[Vec3],
 ):
-    """``StepProblem.residual``, without contact forces and with them, N s; ``torque`` N m of what is ``internal``,
-    newtons of the other sign; contacts that are not there weigh nothing."""
+    """Compute ``StepProblem.residual`` in N s, without contact forces and with them.
+
+    ``internal`` is the internal gradient, in newtons (minus the forces), and ``torque`` its torque in N m. Padded
+    contacts have zero weight.
+    """
     node = wp.tid()
     spin = dt * (turning_rates[0] * torque[0])
     change = ratio * velocities[node] - old_velocities[node] - dt * gravity - wp.cross(spin, arms[node])
     free = masses[node] * change + dt * internal[node]
-    push = Vec3(real(0.0))
+    contact_force = Vec3(real(0.0))
     for contact in range(nodes.shape[0]):
         corners = nodes[contact]
         for corner in range(4):
             if corners[corner] == node:
-                push += weights[contact][corner] * (wp.transpose(axes[contact]) * forces[contact])
+                contact_force += weights[contact][corner] * (wp.transpose(axes[contact]) * forces[contact])
     free_out[node] = free
-    rest_out[node] = free - dt * push
+    rest_out[node] = free - dt * contact_force
 
 
 @wp.kernel
 def free_velocity_kernel(
     # Model:
-    turned: wp.array2d[real],
+    rotation_response: wp.array2d[real],
     # In:
     velocities: wp.array[Vec3],
     solved: wp.array[Vec3],
-    turn: wp.array[real],
+    rotation: wp.array[real],
     # Out:
-    loose_out: wp.array[Vec3],
+    free_velocities_out: wp.array[Vec3],
 ):
-    """Where a Newton step without contact forces ends: ``solved`` lacks so much of a ``turn``, in the ``turned``
-    columns."""
+    """Compute the velocities after a Newton step without contact forces. ``rotation_response`` (3N, 3) times
+    ``rotation`` is the momentum correction added to ``solved``.
+    """
     node = wp.tid()
-    lacking = Vec3(real(0.0))
+    correction = Vec3(real(0.0))
     for i in range(3):
         for k in range(3):
-            lacking[i] += turned[3 * node + i, k] * turn[k]
-    loose_out[node] = velocities[node] - solved[node] - lacking
+            correction[i] += rotation_response[3 * node + i, k] * rotation[k]
+    free_velocities_out[node] = velocities[node] - solved[node] - correction

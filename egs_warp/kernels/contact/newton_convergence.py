@@ -1,4 +1,6 @@
-"""Convergence test of the Newton loop with contact (Eq. 4, 8); see ``egs_warp/contact/newton_convergence.py``."""
+"""Convergence test of the Newton loop with contact on a GPU (Eq. 4, 8); ``egs_warp/contact/newton_convergence.py``
+has the same rules for the host.
+"""
 
 import warp as wp
 
@@ -7,12 +9,13 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 REFACTOR_RATIO = 0.7
-"""A tangent is made anew where the residual falls by less than this factor, but in the first step of a round, in which
-forces of contacts that are new come about. It takes as long as many steps by an old one."""
+"""The tangent is updated if a step leaves more than this fraction of the residual. The first step of a round is
+exempt, because it creates the forces of new contacts. A new tangent costs as much as many steps.
+"""
 MIN_DECREASE = 1e-4
-"""Of the residuals that a whole step must undercut: by so much."""
+"""Sufficient decrease of a full step, as a fraction of the largest recent residual."""
 RESIDUAL_WINDOW = 3
-"""Residuals of which the largest must be undercut."""
+"""Number of recent residuals; a step must end below the largest of them."""
 (
     STEPS,
     RESIDUAL,
@@ -24,16 +27,25 @@ RESIDUAL_WINDOW = 3
     STEPS_TAKEN,
     RECENT_RESIDUALS,
 ) = range(9)
-"""What is known of a round, one behind the other: its steps so far, the residual where the next begins and where the
-first without a look began, the terms of ``Course``, the most steps, how many were taken without a look, and ``MEMORY``
-residuals, -1 for those that are not there."""
+"""Indices into the packed state: steps so far, residual at the start of the next step, residual at the start of the
+loop, the fields of ``ConvergenceState``, step limit, steps taken by this loop, and ``RESIDUAL_WINDOW`` recent
+residuals, -1 where there is none.
+"""
 HEADER_SIZE = RECENT_RESIDUALS + RESIDUAL_WINDOW
 
-_SLOW, _LESS, _MEMORY = wp.constant(real(REFACTOR_RATIO)), wp.constant(real(MIN_DECREASE)), wp.constant(RESIDUAL_WINDOW)
-_STEPS, _SIZE, _FIRST = wp.constant(STEPS), wp.constant(RESIDUAL), wp.constant(FIRST_RESIDUAL)
+_REFACTOR_RATIO, _MIN_DECREASE, _WINDOW = (
+    wp.constant(real(REFACTOR_RATIO)),
+    wp.constant(real(MIN_DECREASE)),
+    wp.constant(RESIDUAL_WINDOW),
+)
+_STEPS, _RESIDUAL, _FIRST_RESIDUAL = wp.constant(STEPS), wp.constant(RESIDUAL), wp.constant(FIRST_RESIDUAL)
 _TOLERANCE = wp.constant(TOLERANCE)
-_JOINING, _ANSWERED, _MOST = wp.constant(ACTIVATION_RESIDUAL), wp.constant(COULOMB_TOLERANCE), wp.constant(MAX_STEPS)
-_TAKEN, _RECENT, _HEADER = wp.constant(STEPS_TAKEN), wp.constant(RECENT_RESIDUALS), wp.constant(HEADER_SIZE)
+_ACTIVATION_RESIDUAL, _COULOMB_TOLERANCE, _MAX_STEPS = (
+    wp.constant(ACTIVATION_RESIDUAL),
+    wp.constant(COULOMB_TOLERANCE),
+    wp.constant(MAX_STEPS),
+)
+_STEPS_TAKEN, _RECENT, _HEADER = wp.constant(STEPS_TAKEN), wp.constant(RECENT_RESIDUALS), wp.constant(HEADER_SIZE)
 
 
 @wp.kernel
@@ -42,55 +54,59 @@ def init_convergence_kernel(
     enabled: wp.array[int],
     sizes: wp.array[real],
     # In and out:
-    course: wp.array[real],
+    state: wp.array[real],
     # Out:
-    going_out: wp.array[int],
+    condition_out: wp.array[int],
 ):
-    """The round whose course was told goes on, if all is as ``usual``, from the residual that was told, or, where that
-    is less than 0, from the one of ``sizes[0]``."""
-    if course[_SIZE] < real(0.0):
-        course[_SIZE] = sizes[0]
-    course[_FIRST] = course[_SIZE]
-    going_out[0] = enabled[0]
+    """Set the loop condition to ``enabled``. A negative residual in the packed ``state`` is replaced by
+    ``sizes[0]``, the residual of the last trial.
+    """
+    if state[_RESIDUAL] < real(0.0):
+        state[_RESIDUAL] = sizes[0]
+    state[_FIRST_RESIDUAL] = state[_RESIDUAL]
+    condition_out[0] = enabled[0]
 
 
 @wp.kernel
 def check_convergence_kernel(
     # In:
     sizes: wp.array[real],
-    missed: wp.array[real],
-    sinking: wp.array[real],
+    violation: wp.array[real],
+    penetrating: wp.array[real],
     # In and out:
-    course: wp.array[real],
+    state: wp.array[real],
     # Out:
-    going_out: wp.array[int],
+    condition_out: wp.array[int],
 ):
-    """A step has come to a residual of ``sizes[0]``, with forces that have ``missed`` their laws by so many m/s, and so
-    many points are ``sinking``: whether the next is as plain. Behind the header of ``course`` are the residuals of all
-    steps that were taken."""
+    """Test whether the loop on the device may take another step without the host.
+
+    The last step ended at the residual ``sizes[0]`` in N s. Its forces violate Coulomb's law by ``violation[0]`` m/s,
+    and ``penetrating[0]`` points penetrate too far. The residual after each step is stored behind the header of
+    ``state``.
+    """
     size = sizes[0]
-    before = course[_SIZE]
-    most = real(-1.0)
-    for k in range(_MEMORY):
-        most = wp.max(most, course[_RECENT + k])
-    undercut = wp.max((real(1.0) - _LESS) * most, course[_TOLERANCE])
-    if most < real(0.0):
-        undercut = real(wp.inf)
-    goes = int(0)
-    if size > course[_TOLERANCE] and size < undercut and missed[0] <= course[_ANSWERED]:
-        goes = 1
-    if course[_STEPS] > real(0.0) and size > _SLOW * before:
-        goes = 0
-    if sinking[0] > real(0.0) and before > course[_JOINING] and size <= course[_JOINING]:
-        goes = 0
-    taken = int(course[_TAKEN])
-    course[_HEADER + taken] = size
-    course[_TAKEN] = real(taken + 1)
-    course[_STEPS] += real(1.0)
-    if course[_STEPS] >= course[_MOST]:
-        goes = 0
-    for k in range(_MEMORY - 1):
-        course[_RECENT + k] = course[_RECENT + k + 1]
-    course[_RECENT + _MEMORY - 1] = size
-    course[_SIZE] = size
-    going_out[0] = goes
+    before = state[_RESIDUAL]
+    maximum = real(-1.0)
+    for k in range(_WINDOW):
+        maximum = wp.max(maximum, state[_RECENT + k])
+    limit = wp.max((real(1.0) - _MIN_DECREASE) * maximum, state[_TOLERANCE])
+    if maximum < real(0.0):
+        limit = real(wp.inf)
+    proceed = int(0)
+    if size > state[_TOLERANCE] and size < limit and violation[0] <= state[_COULOMB_TOLERANCE]:
+        proceed = 1
+    if state[_STEPS] > real(0.0) and size > _REFACTOR_RATIO * before:
+        proceed = 0
+    if penetrating[0] > real(0.0) and before > state[_ACTIVATION_RESIDUAL] and size <= state[_ACTIVATION_RESIDUAL]:
+        proceed = 0
+    steps_taken = int(state[_STEPS_TAKEN])
+    state[_HEADER + steps_taken] = size
+    state[_STEPS_TAKEN] = real(steps_taken + 1)
+    state[_STEPS] += real(1.0)
+    if state[_STEPS] >= state[_MAX_STEPS]:
+        proceed = 0
+    for k in range(_WINDOW - 1):
+        state[_RECENT + k] = state[_RECENT + k + 1]
+    state[_RECENT + _WINDOW - 1] = size
+    state[_RESIDUAL] = size
+    condition_out[0] = proceed

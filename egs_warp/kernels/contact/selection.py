@@ -1,4 +1,4 @@
-"""What a step's choice of contact points needs of the gaps of all points, found where these are."""
+"""Kernels of contact selection: reductions of the gaps of all points, where they are on a GPU (Eq. 8)."""
 
 import warp as wp
 
@@ -17,7 +17,7 @@ def lowest_point_per_cell_kernel(
     order: wp.array[int],
     bounds: wp.array[int],
     near: real,
-    alike: real,
+    gap_tolerance: real,
     # In:
     gaps: wp.array[real],
     start_gaps: wp.array[real],
@@ -25,29 +25,33 @@ def lowest_point_per_cell_kernel(
     # Out:
     lowest_out: wp.array[Vec4],
 ):
-    """Of each cell, whose points are ``order`` from ``bounds[cell]`` on, the lowest of those nearer than ``near``, see
-    ``ContactPoints``: its number, -1 if there is none, its gap, and gap and face at the start of the step."""
+    """Find the lowest point of each cell among those closer than ``near``, as ``ContactSelector`` does.
+
+    The points of a cell are ``order[bounds[cell]:bounds[cell + 1]]``. Gaps that are equal within ``gap_tolerance`` tie,
+    and the first point in ``order`` wins. The output is the point's index, -1 if there is none, its gap, and its gap
+    and face at the start of the step.
+    """
     cell, lane = wp.tid()
-    least = real(wp.inf)
+    min_height = real(wp.inf)
     first = real(wp.inf)
     for k in range(bounds[cell] + lane, bounds[cell + 1], wp.block_dim()):
         gap = gaps[order[k]]
         if gap < near:
-            height = wp.rint(gap / alike)
-            if height < least:
-                least = height
+            height = wp.rint(gap / gap_tolerance)
+            if height < min_height:
+                min_height = height
                 first = real(k)
-    lowest = -block_max(-least)
+    min_height_of_cell = -block_max(-min_height)
     sync_block()
-    if least > lowest:
+    if min_height > min_height_of_cell:
         first = real(wp.inf)
     first = -block_max(-first)
     if lane == 0:
-        found = Vec4(real(-1.0), real(0.0), real(0.0), real(0.0))
+        result = Vec4(real(-1.0), real(0.0), real(0.0), real(0.0))
         if first < real(wp.inf):
             point = order[int(first)]
-            found = Vec4(real(point), gaps[point], start_gaps[point], real(start_faces[point]))
-        lowest_out[cell] = found
+            result = Vec4(real(point), gaps[point], start_gaps[point], real(start_faces[point]))
+        lowest_out[cell] = result
 
 
 @wp.kernel
@@ -58,12 +62,12 @@ def gather_gaps_kernel(
     start_gaps: wp.array[real],
     start_faces: wp.array[int],
     # Out:
-    known_out: wp.array[Vec4],
+    gathered_out: wp.array[Vec4],
 ):
-    """The same of ``points``, which are known."""
+    """Write index, gap, and gap and face at the start of the step of the given ``points``."""
     k = wp.tid()
     point = int(points[k])
-    known_out[k] = Vec4(points[k], gaps[point], start_gaps[point], real(start_faces[point]))
+    gathered_out[k] = Vec4(points[k], gaps[point], start_gaps[point], real(start_faces[point]))
 
 
 @wp.kernel
@@ -71,33 +75,37 @@ def penetrating_points_kernel(
     # Model:
     depth: real,
     tolerance: real,
-    sinks: real,
-    creeps: real,
+    max_sink: real,
+    max_creep: real,
     # In:
     points: wp.array[int],
     counts: wp.array[int],
     gaps: wp.array[real],
     start_gaps: wp.array[real],
     # In and out:
-    sinking: wp.array[real],
+    penetrating: wp.array[real],
     # Out:
     deep_out: wp.array[real],
 ):
-    """How many points more than ``depth`` metres deep sink, see ``CoupledSolver``, that are none of ``counts[0]``
-    ``points``; their gaps in ``deep_out``, 0 for all others."""
+    """Count the points that penetrate too far (see ``CoupledSolver``) and are none of the first ``counts[0]``
+    ``points``.
+
+    A point counts if it is deeper than ``depth`` metres and has sunk by more than ``max_sink``, or ``max_creep`` if it
+    is deeper than ``tolerance``, times ``tolerance``. ``deep_out`` has the gaps of these points, 0 for all others.
+    """
     point = wp.tid()
     gap = gaps[point]
     deep = real(0.0)
     if gap < -depth:
-        allowed = sinks * tolerance
+        allowed = max_sink * tolerance
         if gap < -tolerance:
-            allowed = creeps * tolerance
+            allowed = max_creep * tolerance
         if gap < start_gaps[point] - allowed:
-            among = int(0)
+            is_active = int(0)
             for k in range(counts[0]):
                 if points[k] == point:
-                    among = 1
-            if among == 0:
-                wp.atomic_add(sinking, 0, real(1.0))
+                    is_active = 1
+            if is_active == 0:
+                wp.atomic_add(penetrating, 0, real(1.0))
                 deep = gap
     deep_out[point] = deep
