@@ -58,7 +58,10 @@ EQUATIONS: dict[int, Mutation] = {
         ),
         (
             *(6, "the drag on the end velocity", "kernels/contact/iterate_cpu.py"),
-            *("(ratio * v[i + t] - known[i + t]", "(v[i + t] + (ratio - 1.0) * known[i + t] - known[i + t]"),
+            *(
+                "(ratio * v[i + t] - ballistic[i + t]",
+                "(v[i + t] + (ratio - 1.0) * ballistic[i + t] - ballistic[i + t]",
+            ),
             "fem/test_step_problem.py::test_drag_slows_free_flight_exponentially",
         ),
         (

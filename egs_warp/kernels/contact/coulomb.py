@@ -1,7 +1,13 @@
-"""Contact forces with Coulomb friction for given Delassus operators: sweeps, then Newton's method on projections.
+"""Coulomb solve for given Delassus operators: Gauss-Seidel sweeps, then semismooth Newton on the projection
+equations (Eq. 8, 9).
 
-Each problem has a block of threads to itself on a GPU, one thread on a CPU; what a thread is within its block is its
-``lane``. All lanes take the same way: each does its share of what is wide, and all of what is short.
+Projecting the forces onto the cone of Coulomb's law gives equations P(f) = f - proj(f - rate u(f)) = 0, whose solutions
+satisfy the law (Alart and Curnier). An attempt sweeps over the contacts, then takes Newton steps on P:
+``projection_residual`` evaluates P, ``find_step`` solves for the step, and the step is halved until the norm of P
+decreases. Later attempts use full steps and other rates. The last attempt polishes the best forces.
+
+A block of threads solves each problem on a GPU, one thread on a CPU; ``lane`` is the index of a thread in its block.
+All lanes take the same branches. Wide work is split over the lanes; short work is repeated by each.
 """
 
 import warp as wp
@@ -25,33 +31,38 @@ from egs_warp.precision import Vec3, Vec4, real
 wp.set_module_options({"enable_backward": False})
 
 _FEW_SWEEPS, _MORE_SWEEPS = wp.constant(3), wp.constant(20)
-"""Before the first attempt, and before each further one."""
+"""Sweeps before the first attempt, and before each later one."""
 _ATTEMPTS = wp.constant(7)
 _Rates = wp.types.vector(7, real)
 _RATES = wp.constant(_Rates(1.0, 0.3, 3.0, 0.1, 10.0, 0.03, 30.0))
-"""Of the attempts. Where the kinks of the projections keep the steps of one rate from making them smaller, whole steps
-of another get on. Every second attempt takes another rate in each of its steps: what goes around in a circle at one
-rate leaves it."""
-_BOLD = wp.constant(12)
-"""Whole steps of each attempt but the first."""
+"""Projection rate of each attempt. Where the kinks of the projection stop the steps of one rate from decreasing the
+residual, full steps of another make progress. Every second attempt changes the rate in each step, which breaks
+cycles.
+"""
+_FULL_STEPS = wp.constant(12)
+"""Full steps of each attempt but the first."""
 _HALVINGS = wp.constant(10)
-_SWEPT = wp.constant(MAX_SWEPT_CONTACTS)
-_LEAST = wp.constant(real(1e-5))
-"""Pivots on the diagonal of the equations, whose entries are about 1, that are larger are taken without exchange."""
-_LESS = wp.constant(real(1e-4))
-"""Of a step's length: share by which it has to make the residual smaller."""
-_SHORT, _SHORTER = wp.constant(real(1e-6)), wp.constant(real(1e-4))
-"""Added to the diagonal of the equations of contacts that stick, whose entries are about 1: of the steps that redundant
-contacts leave, a short one is taken, and rounding is not made large by those that they nearly leave. The second in the
-``_CAREFUL`` first steps of all attempts but the first. Of 296 problems of jumps that 1e-9 and steps of one rate left at
-1e-4 m/s, 1e-6 and another rate in each attempt leave 16; with the second, and other rates in each step of every second
-attempt, 3 are left."""
-_CAREFUL = wp.constant(6)
-_POLISHES = wp.constant(2)
-_FINEST = wp.constant(real(1e-10))
-"""The same in the last steps: too small to be seen in the answer."""
-_POLISHED = wp.constant(real(1e-2))
-"""Of the tolerance: what is so near is left as it is."""
+"""Line search: halvings of a step."""
+_MAX_SWEPT = wp.constant(MAX_SWEPT_CONTACTS)
+_MIN_PIVOT = wp.constant(real(1e-5))
+"""Pivot threshold of the elimination by blocks, which exchanges no rows. The equations have entries of about 1."""
+_MIN_DECREASE = wp.constant(real(1e-4))
+"""Sufficient decrease of the residual norm, per unit of the step length."""
+_REGULARIZATION, _STRONG_REGULARIZATION = wp.constant(real(1e-6)), wp.constant(real(1e-4))
+"""Regularisation: added to the diagonal of the normal and sticking equations, whose entries are about 1. It selects
+a short step where contacts are redundant, and limits the rounding where they nearly are. The second value is used
+in the first ``_STRONG_STEPS`` steps of all attempts but the first. Of 296 problems of jumps that 1e-9 and steps of one
+rate left at 1e-4 m/s, 1e-6 and another rate in each attempt leave 16 unsolved; the second value, and another rate
+in each step of every second attempt, leave 3.
+"""
+_STRONG_STEPS = wp.constant(6)
+"""Steps of an attempt with the second regularisation."""
+_POLISH_STEPS = wp.constant(2)
+"""Polishing steps of the last attempt."""
+_POLISH_REGULARIZATION = wp.constant(real(1e-10))
+"""Regularisation in the polishing steps, too small to change the result."""
+_POLISH_FRACTION = wp.constant(real(1e-2))
+"""Fraction of the tolerance at which polishing stops."""
 
 
 @wp.func_native(
@@ -90,19 +101,21 @@ _POLISHED = wp.constant(real(1e-2))
     )
 )
 def speeds_by(delassus: wp.array2d[real], size: int, i: int, forces: wp.array[real]) -> Vec3:
-    """See ``speeds_of``."""
+    """Return G_i f (native code of ``speeds_of``)."""
     ...
 
 
 @wp.func
 def speeds_of(contacts: Contacts, i: int, forces: wp.array[real]):
-    """That ``forces`` (3n,) give contact ``i``, m/s."""
+    """Return the velocity of contact ``i`` in m/s that ``forces`` (3n,) cause."""
     return speeds_by(contacts.delassus, 3 * contacts.count, i, forces)
 
 
 @wp.func
 def projected_force(contacts: Contacts, i: int, forces: wp.array[real], velocity: Vec3):
-    """The force that contact ``i``'s own normal and tangents ask for at its ``velocity``, m/s, shifted (Eq. 8, 9)."""
+    """Return the force of contact ``i`` after one projected Gauss-Seidel update at its biased ``velocity``, m/s (Eq.
+    8, 9).
+    """
     n = 3 * i
     normal = wp.max(forces[n] - velocity[0] / contacts.delassus[n, n], real(0.0))
     change = normal - forces[n]
@@ -118,7 +131,7 @@ def projected_force(contacts: Contacts, i: int, forces: wp.array[real], velocity
 
 @wp.func
 def sweep(contacts: Contacts, sweeps: int, forces: wp.array[real]):
-    """``sweeps`` rounds over all contacts, each of which takes the force that it asks for."""
+    """Perform ``sweeps`` Gauss-Seidel sweeps: each contact takes its ``projected_force`` in turn."""
     for _ in range(sweeps):
         for i in range(contacts.count):
             n = 3 * i
@@ -129,15 +142,16 @@ def sweep(contacts: Contacts, sweeps: int, forces: wp.array[real]):
                 speeds[1] + contacts.free_velocity[n + 1],
                 speeds[2] + contacts.free_velocity[n + 2],
             )
-            asked = projected_force(contacts, i, forces, velocity)
+            force = projected_force(contacts, i, forces, velocity)
             for t in range(3):
-                forces[n + t] = asked[t]
+                forces[n + t] = force[t]
 
 
 @wp.func
 def projection_residual(contacts: Contacts, forces: wp.array[real], scale: real, length: real, newton: Newton):
-    """Value f - projection of f - rate u at ``length`` of the step from ``forces``; its largest part and its norm, both
-    in m/s."""
+    """Evaluate P at ``length`` of the step from ``forces``, and return its largest component and its norm, both
+    divided by the rate, in m/s. They are infinite where something is not finite.
+    """
     if is_gpu() == 1:
         return residual_by_block(
             contacts.delassus, contacts.friction, contacts.count, forces, newton.velocities, newton.step,
@@ -160,36 +174,40 @@ def projection_residual(contacts: Contacts, forces: wp.array[real], scale: real,
             share = radius / pull
         newton.residual[n + 1] = f1 - share * first
         newton.residual[n + 2] = f2 - share * second
-    most = real(0.0)
+    maximum = real(0.0)
     square = real(0.0)
     for i in range(contacts.count):
         rate = rate_of(contacts, i, scale)
         for t in range(3):
             speed = newton.residual[3 * i + t] / rate
-            most = wp.max(most, wp.abs(speed))
+            maximum = wp.max(maximum, wp.abs(speed))
             square += speed * speed
-    # A maximum passes over what is no number, a sum does not.
+    # A maximum ignores NaN, a sum does not.
     if not square < real(wp.inf):
-        most = real(wp.inf)
-    return wp.vec2d(most, wp.sqrt(square))
+        maximum = real(wp.inf)
+    return wp.vec2d(maximum, wp.sqrt(square))
 
 
 @wp.func
-def find_step(contacts: Contacts, forces: wp.array[real], scale: real, short: real, newton: Newton):
-    """A Newton step from the values at ``forces``, and what it changes of the velocities."""
+def find_step(contacts: Contacts, forces: wp.array[real], scale: real, regularization: real, newton: Newton):
+    """Compute a Newton step from ``forces`` and its velocity change.
+
+    On a GPU the block routines are tried first, for up to 120 and then up to 256 unknowns; if they fail, the
+    elimination with row exchanges is used.
+    """
     solved = int(0)
     if is_gpu() == 1:
         solved = step_by_block(
             shared_memory(), contacts.delassus, contacts.friction, contacts.count, forces, newton.velocities,
-            newton.residual, scale, short, _LEAST, newton.step, newton.velocity_change,
+            newton.residual, scale, regularization, _MIN_PIVOT, newton.step, newton.velocity_change,
         )  # fmt: skip
         if solved == 0:
             solved = wide_step_by_block(
                 shared_memory(), contacts.delassus, contacts.friction, contacts.count, forces, newton.velocities,
-                newton.residual, scale, short, _LEAST, newton.step, newton.velocity_change, newton.matrix,
+                newton.residual, scale, regularization, _MIN_PIVOT, newton.step, newton.velocity_change, newton.matrix,
             )  # fmt: skip
     if solved == 0:
-        unknowns = write_equations(contacts, forces, scale, short, newton)
+        unknowns = write_equations(contacts, forces, scale, regularization, newton)
         solve_equations(unknowns, newton)
     if is_gpu() == 1:
         speeds_by_block(contacts.delassus, 3 * contacts.count, newton.step, newton.velocity_change)
@@ -202,7 +220,7 @@ def find_step(contacts: Contacts, forces: wp.array[real], scale: real, short: re
 
 @wp.func
 def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
-    """Those at ``forces``; no step is left."""
+    """Compute the biased velocities at ``forces``, and clear the step."""
     if is_gpu() == 1:
         speeds_by_block(contacts.delassus, 3 * contacts.count, forces, newton.velocities)
     for i in range(newton.lane, contacts.count, wp.block_dim()):
@@ -221,14 +239,15 @@ def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
 
 @wp.func
 def sweep_cooperative(contacts: Contacts, sweeps: int, forces: wp.array[real], newton: Newton):
-    """``sweep`` by a block of threads. Of more contacts than ``sweep_by_block`` takes each is every lane's to work out,
-    and each lane keeps the velocities of some rows up with it."""
+    """Perform ``sweep`` with a block of threads. For more contacts than ``sweep_by_block`` takes, every lane
+    computes each force, and each lane updates the velocities of some rows.
+    """
     if is_gpu() == 0:
         sweep(contacts, sweeps, forces)
         return
     if contacts.count == 0:
         return
-    if contacts.count <= _SWEPT:
+    if contacts.count <= _MAX_SWEPT:
         sweep_by_block(
             shared_memory(), contacts.delassus, contacts.free_velocity, contacts.normal_bias, contacts.friction,
             contacts.count, sweeps, forces,
@@ -240,9 +259,9 @@ def sweep_cooperative(contacts: Contacts, sweeps: int, forces: wp.array[real], n
         for i in range(contacts.count):
             n = 3 * i
             velocity = Vec3(newton.velocities[n], newton.velocities[n + 1], newton.velocities[n + 2])
-            asked = projected_force(contacts, i, forces, velocity)
-            change = asked - Vec3(forces[n], forces[n + 1], forces[n + 2])
-            # All lanes have read what they change now.
+            force = projected_force(contacts, i, forces, velocity)
+            change = force - Vec3(forces[n], forces[n + 1], forces[n + 2])
+            # All lanes must have read before any of them writes.
             sync_block()
             for row in range(newton.lane, size, wp.block_dim()):
                 newton.velocities[row] = newton.velocities[row] + (
@@ -252,13 +271,13 @@ def sweep_cooperative(contacts: Contacts, sweeps: int, forces: wp.array[real], n
                 )
             if newton.lane == 0:
                 for t in range(3):
-                    forces[n + t] = asked[t]
+                    forces[n + t] = force[t]
             sync_block()
 
 
 @wp.func
 def advance(contacts: Contacts, forces: wp.array[real], length: real, newton: Newton):
-    """Go ``length`` of the step; no step is left."""
+    """Move forces and velocities by ``length`` of the step, and clear it."""
     for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
         forces[k] = forces[k] + length * newton.step[k]
         newton.velocities[k] = newton.velocities[k] + length * newton.velocity_change[k]
@@ -269,7 +288,7 @@ def advance(contacts: Contacts, forces: wp.array[real], length: real, newton: Ne
 
 @wp.func
 def copy_vector(contacts: Contacts, source: wp.array[real], target: wp.array[real], newton: Newton):
-    """``target`` is ``source`` (3n,) then."""
+    """Copy ``source`` (3n,) to ``target``."""
     for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
         target[k] = source[k]
     sync_block()
@@ -277,68 +296,68 @@ def copy_vector(contacts: Contacts, source: wp.array[real], target: wp.array[rea
 
 @wp.func
 def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp.array[real], newton: Newton):
-    """Of one problem, see ``coulomb_kernel``; its residual."""
-    least = real(wp.inf)
+    """Solve one problem (see ``coulomb_kernel``) and return its residual."""
+    best_residual = real(wp.inf)
     copy_vector(contacts, forces, newton.best_forces, newton)
     for attempt in range(_ATTEMPTS + 1):
-        # The last one begins at the best, once they are near enough, and takes them to rounding: in the same loop, so
-        # that a GPU has the code of a step once.
-        polishes = least < tolerance
-        if attempt == _ATTEMPTS and not polishes:
+        # The last attempt polishes the best forces, if they are within the tolerance. It shares the loop, so that a GPU
+        # has the code of a step only once.
+        is_polishing = best_residual < tolerance
+        if attempt == _ATTEMPTS and not is_polishing:
             copy_vector(contacts, newton.best_forces, forces, newton)
             break
         scale = real(1.0)
-        short = _FINEST
-        steps = _POLISHES
-        if polishes:
+        regularization = _POLISH_REGULARIZATION
+        steps = _POLISH_STEPS
+        if is_polishing:
             copy_vector(contacts, newton.best_forces, forces, newton)
         else:
             scale = _RATES[attempt]
             sweeps = _MORE_SWEEPS
-            steps = _BOLD
+            steps = _FULL_STEPS
             if attempt == 0:
                 sweeps = _FEW_SWEEPS
                 steps = iterations
             sweep_cooperative(contacts, sweeps, forces, newton)
         find_velocities(contacts, forces, newton)
         for number in range(steps):
-            if not polishes:
-                short = _SHORT
-                if attempt > 0 and number < _CAREFUL:
-                    short = _SHORTER
+            if not is_polishing:
+                regularization = _REGULARIZATION
+                if attempt > 0 and number < _STRONG_STEPS:
+                    regularization = _STRONG_REGULARIZATION
                 if attempt % 2 == 1:
                     scale = _RATES[(attempt + number) % _ATTEMPTS]
-            size = projection_residual(contacts, forces, scale, real(0.0), newton)
-            near = tolerance
-            if polishes:
-                near = _POLISHED * tolerance
-                least = size[0]
-            elif size[0] < least:
-                least = size[0]
+            residual = projection_residual(contacts, forces, scale, real(0.0), newton)
+            threshold = tolerance
+            if is_polishing:
+                threshold = _POLISH_FRACTION * tolerance
+                best_residual = residual[0]
+            elif residual[0] < best_residual:
+                best_residual = residual[0]
                 copy_vector(contacts, forces, newton.best_forces, newton)
-            if size[0] < near:
+            if residual[0] < threshold:
                 break
-            find_step(contacts, forces, scale, short, newton)
+            find_step(contacts, forces, scale, regularization, newton)
             length = real(1.0)
-            if polishes or attempt == 0:
-                found = int(0)
+            if is_polishing or attempt == 0:
+                is_accepted = int(0)
                 halvings = int(0)
-                while found == 0 and halvings < _HALVINGS:
+                while is_accepted == 0 and halvings < _HALVINGS:
                     trial = projection_residual(contacts, forces, scale, length, newton)
                     halvings += 1
-                    if polishes:
+                    if is_polishing:
                         halvings = _HALVINGS
                         if trial[0] < tolerance:
-                            found = 1
-                            least = trial[0]
-                    elif trial[1] < (real(1.0) - _LESS * length) * size[1]:
-                        found = 1
+                            is_accepted = 1
+                            best_residual = trial[0]
+                    elif trial[1] < (real(1.0) - _MIN_DECREASE * length) * residual[1]:
+                        is_accepted = 1
                     else:
                         length *= real(0.5)
-                if found == 0:
+                if is_accepted == 0:
                     break
             advance(contacts, forces, length, newton)
-        if polishes:
+        if is_polishing:
             break
     for i in range(newton.lane, contacts.count, wp.block_dim()):
         n = 3 * i
@@ -350,7 +369,7 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
         forces[n] = normal
         forces[n + 1] = share * forces[n + 1]
         forces[n + 2] = share * forces[n + 2]
-    return least
+    return best_residual
 
 
 @wp.kernel(launch_bounds=BLOCK)
@@ -358,8 +377,8 @@ def coulomb_kernel(
     # In:
     counts: wp.array[int],
     delassus: wp.array3d[real],
-    free: wp.array2d[real],
-    shifts: wp.array2d[real],
+    free_velocity: wp.array2d[real],
+    normal_bias: wp.array2d[real],
     frictions: wp.array[real],
     tolerance: real,
     iterations: int,
@@ -371,17 +390,18 @@ def coulomb_kernel(
     # Out:
     residuals_out: wp.array[real],
 ):
-    """Of each problem ``Contacts`` and ``Newton``, whose vectors and indices lie in ``vectors`` (B, 5, 3n) and
-    ``indices`` (B, 2, 3n): sweeps, then semismooth Newton on the projection equations of Alart and Curnier, the step
-    halved until it makes them smaller; where that gets stuck, more sweeps and whole steps at other rates. ``forces``
-    are the best that were met, within the cone; ``residuals_out`` is how far from the equations they are, m/s, and
-    infinite where nothing is a number."""
+    """Solve each problem for its contact forces.
+
+    ``vectors`` (B, 5, 3n), ``indices`` (B, 2, 3n) and ``matrices`` are the workspace of ``Newton``. ``forces`` are the
+    start, and in the end the best forces found, projected onto the cone. ``residuals_out`` is their residual in m/s,
+    infinite where no forces were finite.
+    """
     problem, lane = wp.tid()
     contacts = Contacts()
     contacts.count = counts[problem]
     contacts.delassus = delassus[problem]
-    contacts.free_velocity = free[problem]
-    contacts.normal_bias = shifts[problem]
+    contacts.free_velocity = free_velocity[problem]
+    contacts.normal_bias = normal_bias[problem]
     contacts.friction = frictions[problem]
     newton = Newton()
     newton.lane = lane
@@ -403,5 +423,5 @@ def sweeps_kernel(
     # In and out:
     forces: wp.array[real],
 ):
-    """The sweeps alone, in one thread."""
+    """Perform the sweeps alone, in one thread."""
     sweep(contacts, sweeps, forces)

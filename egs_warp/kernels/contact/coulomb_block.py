@@ -1,7 +1,8 @@
-"""What a block of threads on a GPU does of the search for contact forces, see ``kernels.contact.coulomb``: the same
-sums as one thread on a CPU, in another order. On a CPU, none of these is called.
+"""Block-cooperative routines of the Coulomb solve on a GPU: products, sweeps and residual (see
+``kernels.contact.coulomb``).
 
-Blocks have ``BLOCK`` threads, and all of them call; what they have written is seen by all of them after each of these.
+They compute the same sums as one thread on a CPU, in another order, and are not called on a CPU. All ``BLOCK`` threads
+of a block call each routine; its results are visible to all of them afterwards.
 """
 
 import warp as wp
@@ -14,12 +15,12 @@ wp.set_module_options({"enable_backward": False})
 BLOCK = 256
 """Threads for each problem on a GPU."""
 MAX_SWEPT_CONTACTS = 128
-"""Contacts at most that ``sweep_by_block`` sweeps."""
+"""Maximum number of contacts of ``sweep_by_block``."""
 SHARED_MEMORY_DOUBLES = 5264
-"""Numbers in the memory that a block shares: all that it may have, which one after the other has to itself."""
+"""Size of the shared memory of a block in doubles. It is the maximum, and the routines use it one after the other."""
 
 _RECIPROCALS = """
-    // Of normal numbers: to rounding, and without ways for what is none.
+    // Reciprocal and reciprocal root to rounding, for normal numbers only.
     auto over = [](double value) {
         double by;
         asm("rcp.approx.ftz.f64 %0, %1;" : "=d"(by) : "d"(value));
@@ -37,11 +38,11 @@ _RECIPROCALS = """
 
 
 def gpu_or_cpu(body: str, *, otherwise: str = "") -> str:
-    """``body`` by a block on a GPU, ``otherwise`` on a CPU, which never comes there."""
-    sizes = f"SWEPT = {MAX_SWEPT_CONTACTS}, ROOM = {SHARED_MEMORY_DOUBLES}"
-    given = f"{_RECIPROCALS}    constexpr int WARPS = {BLOCK // 32}, {sizes};\n"
-    given += "    (void)WARPS, (void)SWEPT, (void)ROOM;\n"
-    return by_block(f"#if defined(__CUDA_ARCH__)\n{given}{body}\n#else\n{otherwise}\n#endif\n")
+    """Return native code: ``body`` on a GPU, ``otherwise`` on a CPU, where it is not called."""
+    sizes = f"MAX_SWEPT = {MAX_SWEPT_CONTACTS}, SHARED_DOUBLES = {SHARED_MEMORY_DOUBLES}"
+    definitions = f"{_RECIPROCALS}    constexpr int WARPS = {BLOCK // 32}, {sizes};\n"
+    definitions += "    (void)WARPS, (void)MAX_SWEPT, (void)SHARED_DOUBLES;\n"
+    return by_block(f"#if defined(__CUDA_ARCH__)\n{definitions}{body}\n#else\n{otherwise}\n#endif\n")
 
 
 @wp.func_native("""
@@ -52,28 +53,28 @@ def gpu_or_cpu(body: str, *, otherwise: str = "") -> str:
 #endif
 """)
 def is_gpu() -> int:
-    """Whether this is a GPU, known while it is compiled: what is another's way is left out."""
+    """Return 1 on a GPU, 0 on a CPU; a compile-time constant, so that the other branch is not compiled."""
     ...
 
 
 @wp.func_native(
     gpu_or_cpu(
         """
-    __shared__ __align__(16) double room[ROOM];
-    return static_cast<unsigned>(__cvta_generic_to_shared(room));
+    __shared__ __align__(16) double memory[SHARED_DOUBLES];
+    return static_cast<unsigned>(__cvta_generic_to_shared(memory));
 """,
         otherwise="    return 0;",
     )
 )
 def shared_memory() -> wp.uint32:
-    """Where ``ROOM`` numbers lie that the threads of a block share."""
+    """Return the shared-memory address of the ``SHARED_MEMORY_DOUBLES`` doubles."""
     ...
 
 
 @wp.func_native(
     gpu_or_cpu("""
-    // Eight threads take turns in a row, so that a warp has four rows.
-    const double *const G = delassus.data, *const x = given.data;
+    // Eight threads share a row, so a warp has four rows.
+    const double *const G = delassus.data, *const x = forces.data;
     const int stride = delassus.strides[0] / 8, place = own & 7, part = own >> 3;
     for (int first = 4 * warp; first < size; first += 4 * WARPS) {
         const int row = first + part < size ? first + part : size - 1;
@@ -96,26 +97,27 @@ def shared_memory() -> wp.uint32:
         }
         sum += other;
         for (int away = 4; away > 0; away >>= 1) sum += __shfl_xor_sync(0xffffffffu, sum, away);
-        if (place == 0 && first + part < size) made.data[row] = sum;
+        if (place == 0 && first + part < size) speeds.data[row] = sum;
     }
     WAIT;
 """)
 )
-def speeds_by_block(delassus: wp.array2d[real], size: int, given: wp.array[real], made: wp.array[real]) -> None:
-    """``made`` (size,) m/s that the forces ``given`` (size,) give."""
+def speeds_by_block(delassus: wp.array2d[real], size: int, forces: wp.array[real], speeds: wp.array[real]) -> None:
+    """Compute the velocities ``speeds`` (size,) in m/s that ``forces`` (size,) cause."""
     ...
 
 
 @wp.func_native(
     gpu_or_cpu("""
-    // The first warp finds the forces of a group of contacts one after the other, while the others work out the speeds
-    // at the next group, to which the first adds what its own change of them, and lay out what it needs there.
+    // The first warp updates the forces of a group of contacts in turn. Meanwhile the other warps compute the
+    // velocities at the next group, to which the first warp adds the effect of its own changes, and load the entries
+    // it needs there.
     constexpr int GROUP = 5, ROWS = 3 * GROUP, PITCH = 17;
-    double* const all = (double*)__cvta_shared_to_generic(room);
-    double (*const fresh)[16] = (double (*)[16])(all + 3 * SWEPT), (*const speeds)[16] = fresh + 2;
+    double* const all = (double*)__cvta_shared_to_generic(shared_address);
+    double (*const fresh)[16] = (double (*)[16])(all + 3 * MAX_SWEPT), (*const speeds)[16] = fresh + 2;
     double (*const window)[2 * ROWS * PITCH] = (double (*)[2 * ROWS * PITCH])(speeds + 2);
     double (*const by)[4] = (double (*)[4])(window + 2);
-    static_assert(7 * SWEPT + 4 * (16 + ROWS * PITCH) <= ROOM, "");
+    static_assert(7 * MAX_SWEPT + 4 * (16 + ROWS * PITCH) <= SHARED_DOUBLES, "");
     const int size = 3 * count, groups = (count + GROUP - 1) / GROUP, turns = sweeps * groups;
     const int stride = delassus.strides[0] / 8;
     const double* const G = delassus.data;
@@ -136,7 +138,7 @@ def speeds_by_block(delassus: wp.array2d[real], size: int, given: wp.array[real]
         const int before = turn > 0 ? ROWS * (group > 0 ? group - 1 : groups - 1) : -ROWS;
         if (warp == 0) {
             if (turn >= 0) {
-                // A thread has the speed of a row of this group or of the next; all find the same force.
+                // Each thread holds the velocity of a row of this group or the next; all compute the same force.
                 const int some = count - GROUP * group < GROUP ? count - GROUP * group : GROUP;
                 const double *const f = groups == 1 && turn > 0 ? fresh[next] : all + ROWS * group;
                 const double *const b = by[GROUP * group];
@@ -189,7 +191,7 @@ def speeds_by_block(delassus: wp.array2d[real], size: int, given: wp.array[real]
         WAIT;
         group = ahead;
     }
-    // Those of the last two groups are not among all yet.
+    // The forces of the last two groups have not been written to all yet.
     const int last = (turns - 1) % groups, other = turns > 1 ? (turns - 2) % groups : -1;
     for (int k = lane; k < size; k += lanes) {
         const int mine = k / ROWS, r = k - ROWS * mine;
@@ -199,7 +201,7 @@ def speeds_by_block(delassus: wp.array2d[real], size: int, given: wp.array[real]
 """)
 )
 def sweep_by_block(
-    room: wp.uint32,
+    shared_address: wp.uint32,
     delassus: wp.array2d[real],
     free: wp.array[real],
     shifts: wp.array[real],
@@ -208,7 +210,9 @@ def sweep_by_block(
     sweeps: int,
     forces: wp.array[real],
 ) -> None:
-    """``sweep`` over ``count`` contacts, 1 to ``SWEPT``; ``room`` is the block's."""
+    """Perform ``sweep`` over ``count`` contacts, 1 to ``MAX_SWEPT_CONTACTS``; ``shared_address`` is from
+    ``shared_memory``.
+    """
     ...
 
 
@@ -238,7 +242,7 @@ def sweep_by_block(
         values.data[n + 1] = b;
         values.data[n + 2] = c;
         most = fmax(most, speed * fmax(fabs(a), fmax(fabs(b), fabs(c))));
-        // A maximum passes over what is no number, a sum does not.
+        // A maximum ignores NaN, a sum does not.
         square += speed * speed * (a * a + b * b + c * c) + 0.0 * trial;
     }
     if (32 * warp < count) {
@@ -259,7 +263,7 @@ def sweep_by_block(
         most = fmax(most, parts[0][i]);
         square += parts[1][i];
     }
-    // The next are written once all threads are here.
+    // All threads must have read parts before the next call writes them.
     WAIT;
     if (count == 0) most = square = 0.0;
     if (!(square < INFINITY)) most = INFINITY;
@@ -280,5 +284,7 @@ def residual_by_block(
     length: real,
     values: wp.array[real],
 ) -> wp.vec2d:
-    """See ``missed``."""
+    """Evaluate the projection equations into ``values`` and return the largest component and the norm, as
+    ``projection_residual``.
+    """
     ...

@@ -1,6 +1,8 @@
-"""The equations of a Newton step on contact forces: the derivative of their projections, and elimination.
+"""Linear equations of a Newton step on contact forces: the generalised Jacobian of the projection equations, and
+their elimination.
 
-A problem has a block of threads to itself, see ``kernels.contact.coulomb``; a thread is its ``lane``.
+This is the general path, with row exchanges; ``coulomb_step`` and ``coulomb_wide_step`` are faster on a GPU. A block of
+threads solves each problem (see ``kernels.contact.coulomb``); ``lane`` is the index of a thread.
 """
 
 import warp as wp
@@ -12,21 +14,23 @@ from egs_warp.precision import Vec3, Vec4, real
 wp.set_module_options({"enable_backward": False})
 
 _ACROSS = wp.constant(32)
-"""Threads side by side in a row of the equations."""
+"""Threads that share a row of the equations."""
 _SINGULAR = wp.constant(real(1e-14))
-"""Of the largest pivot so far: one that is smaller leaves its unknown at zero."""
+"""Relative pivot threshold. An unknown whose pivot is smaller than this fraction of the largest so far stays zero."""
 
 
 @wp.struct
 class Contacts:
-    """n contacts; forces and velocities are contact-major: normal and two tangents. Arrays may have room for more."""
+    """Problem of n contacts. Forces and velocities are stored contact by contact: normal and two tangents. Arrays
+    may have extra capacity.
+    """
 
     count: int
-    """n."""
+    """Number n of contacts."""
     delassus: wp.array2d[real]
-    """(3n, 3n) m/(N s)."""
+    """(3n, 3n) m/(N s), Delassus operator."""
     free_velocity: wp.array[real]
-    """(3n,) m/s without forces."""
+    """(3n,) m/s, contact velocities without contact forces."""
     normal_bias: wp.array[real]
     """(n,) m/s, added to the normal velocities."""
     friction: real
@@ -34,40 +38,40 @@ class Contacts:
 
 @wp.struct
 class Newton:
-    """Scratch memory of the search for 3n forces."""
+    """Workspace of the Newton method for 3n forces."""
 
     lane: int
     velocities: wp.array[real]
     residual: wp.array[real]
-    """(3n,) what the projection equations miss."""
+    """(3n,) newtons, residual of the projection equations."""
     step: wp.array[real]
     velocity_change: wp.array[real]
-    """(3n,) of the velocities by a whole step."""
+    """(3n,) m/s, change of the velocities by the full step."""
     best_forces: wp.array[real]
     unknowns: wp.array[int]
-    """(3n,) rows that the equations do not give at once."""
+    """(3n,) components of the step that the equations do not give directly."""
     pivots: wp.array[int]
-    """(3n,) in which of their columns each row has its pivot."""
+    """(3n,) pivot column of each row."""
     matrix: wp.array2d[Vec4]
-    """(3n, >= (3n + 1) / 4) their linear equations, right sides last, columns by fours: taken at once."""
+    """(3n, >= (3n + 1) / 4) linear equations with the right side last; four columns are one vector."""
 
 
 @wp.struct
 class Pivots:
-    """Of the elimination so far."""
+    """State of the elimination."""
 
     rank: int
-    """Rows that have one."""
+    """Number of rows with a pivot."""
     largest: real
-    found: int
-    """In the last panel."""
+    panel_count: int
+    """Number of pivots in the last panel."""
     parts: wp.vec4i
-    """In which of its columns."""
+    """Their columns within the panel."""
 
 
 @wp.func
 def rate_of(contacts: Contacts, i: int, scale: real):
-    """Newtons for each m/s by which contact ``i`` is projected."""
+    """Return the projection rate of contact ``i``, newtons per m/s."""
     n = 3 * i
     trace = contacts.delassus[n, n] + contacts.delassus[n + 1, n + 1] + contacts.delassus[n + 2, n + 2]
     return scale * real(3.0) / trace
@@ -129,17 +133,24 @@ def write_row(
     places: int,
     matrix: wp.array2d[Vec4],
 ):
-    """Row ``a`` of the equations, that of ``row`` of the derivative: ``weights`` of its contact's three rows of the
-    Delassus operator and its ``own`` three entries, in the ``columns`` that are unknown; its right side, less what the
-    others' steps move. On a GPU the threads of a warp write it, each at its ``place`` of 32 ``places``."""
+    """Write row ``a`` of the equations, from row ``row`` of the Jacobian.
+
+    ``weights`` are the coefficients of the contact's three rows of the Delassus operator, ``own`` its three additional
+    entries. Only the ``columns`` of unknowns are written; known components of the step go to the right side. On a GPU a
+    warp writes the row, thread ``place`` of ``places`` (32) every 32nd entry.
+    """
     ...
 
 
 @wp.func
-def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, short: real, newton: Newton):
-    """The derivative of the values, row by row as each contact separates, sticks or slides, and how many unknowns it
-    leaves: steps of forces that fall to zero are their values."""
-    # Each lane writes the same here.
+def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, regularization: real, newton: Newton):
+    """Write the equations of a Newton step, by the state of each contact: separating, sticking or sliding. Returns
+    the number of unknowns.
+
+    Components that project to zero are known: their step is minus the residual. ``regularization`` is added to the
+    diagonal of normal and sticking components.
+    """
+    # All lanes write the same values here.
     unknowns = int(0)
     for i in range(contacts.count):
         n = 3 * i
@@ -171,7 +182,7 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, sho
         weights = Vec3()
         own = Vec3()
         weights[row - n] = rate
-        own[row - n] = short
+        own[row - n] = regularization
         if row > n:
             first = forces[n + 1] - rate * newton.velocities[n + 1]
             second = forces[n + 2] - rate * newton.velocities[n + 2]
@@ -198,7 +209,7 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, sho
 @wp.func_native("""
     int best = rank;
 #if defined(__CUDA_ARCH__)
-    // To single precision: what is so near the largest serves as well. Bits of what is positive are in its order.
+    // Compared in single precision, which is enough for a pivot. Bits of positive floats sort like their values.
     __shared__ unsigned int sizes[32];
     __shared__ int rows[32];
     const double* const M = (const double*)matrix.data;
@@ -226,16 +237,17 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, sho
 def pivot_row(
     matrix: wp.array2d[Vec4], column: wp.int32, rank: wp.int32, unknowns: wp.int32, lane: wp.int32
 ) -> wp.int32:
-    """Of the rows from ``rank`` on the one whose entry in the ``column`` is largest, found by a block of threads."""
+    """Return the row from ``rank`` on with the largest entry in ``column``, found by a block of threads."""
     ...
 
 
 @wp.func
 def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
-    """Find pivots in the four columns of a ``panel``, which alone are worked on; a row has its shares of the pivots'
-    rows in their columns then."""
+    """Find the pivots in the four columns of ``panel`` and eliminate within the panel. Below the pivots, the panel
+    then holds the multipliers of the pivot rows.
+    """
     lanes = wp.block_dim()
-    pivots.found = 0
+    pivots.panel_count = 0
     for part in range(4):
         if 4 * panel + part < unknowns:
             pivot = pivot_row(newton.matrix, 4 * panel + part, pivots.rank, unknowns, newton.lane)
@@ -245,9 +257,9 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
                 pivots.largest = wp.max(pivots.largest, size)
                 if pivot != pivots.rank:
                     for quad in range(panel + newton.lane, (unknowns + 4) / 4, lanes):
-                        kept = newton.matrix[pivots.rank, quad]
+                        swapped = newton.matrix[pivots.rank, quad]
                         newton.matrix[pivots.rank, quad] = newton.matrix[pivot, quad]
-                        newton.matrix[pivot, quad] = kept
+                        newton.matrix[pivot, quad] = swapped
                 sync_block()
                 top = newton.matrix[pivots.rank, panel]
                 for a in range(pivots.rank + 1 + newton.lane, unknowns, lanes):
@@ -259,8 +271,8 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
                     newton.matrix[a, panel] = row
                 sync_block()
                 newton.pivots[pivots.rank] = 4 * panel + part
-                pivots.parts[pivots.found] = part
-                pivots.found += 1
+                pivots.parts[pivots.panel_count] = part
+                pivots.panel_count += 1
                 pivots.rank += 1
     return pivots
 
@@ -290,13 +302,13 @@ def solve_alone(
     matrix: wp.array2d[Vec4],
     step: wp.array[real],
 ):
-    """``solve_equations`` by one thread of a CPU, sixteen columns at a time."""
+    """Do the same as ``solve_equations`` in one CPU thread, sixteen columns at a time."""
     ...
 
 
 @wp.func
 def eliminate(unknowns: int, newton: Newton):
-    """The same by a block of threads, four columns at a time."""
+    """Eliminate with a block of threads, four columns at a time."""
     lanes = wp.block_dim()
     across = wp.min(lanes, _ACROSS)
     quads = (unknowns + 4) / 4
@@ -304,9 +316,9 @@ def eliminate(unknowns: int, newton: Newton):
     for panel in range((unknowns + 3) / 4):
         first = pivots.rank
         pivots = eliminate_panel(panel, unknowns, pivots, newton)
-        # What the pivots' rows leave of each other in the columns to come, then of those below.
+        # Update the pivot rows in the later columns, then the rows below them.
         for quad in range(panel + 1 + newton.lane, quads, lanes):
-            for t in range(1, pivots.found):
+            for t in range(1, pivots.panel_count):
                 left = newton.matrix[first + t, quad]
                 for s in range(t):
                     left -= newton.matrix[first + t, panel][pivots.parts[s]] * newton.matrix[first + s, quad]
@@ -314,7 +326,7 @@ def eliminate(unknowns: int, newton: Newton):
         sync_block()
         for a in range(pivots.rank + newton.lane / across, unknowns, lanes / across):
             shares = newton.matrix[a, panel]
-            if pivots.found == 4:
+            if pivots.panel_count == 4:
                 for quad in range(panel + 1 + newton.lane % across, quads, across):
                     newton.matrix[a, quad] = newton.matrix[a, quad] - (
                         shares[0] * newton.matrix[first, quad]
@@ -323,7 +335,7 @@ def eliminate(unknowns: int, newton: Newton):
                         + shares[3] * newton.matrix[first + 3, quad]
                     )
             else:
-                for s in range(pivots.found):
+                for s in range(pivots.panel_count):
                     share = shares[pivots.parts[s]]
                     for quad in range(panel + 1 + newton.lane % across, quads, across):
                         newton.matrix[a, quad] = newton.matrix[a, quad] - share * newton.matrix[first + s, quad]
@@ -333,8 +345,8 @@ def eliminate(unknowns: int, newton: Newton):
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    // By turns in two places, so that none is written that others have not read.
-    __shared__ double found[2];
+    // Two slots in turn, so that none is overwritten before all threads have read it.
+    __shared__ double solved[2];
     double* const M = (double*)matrix.data;
     const int stride = matrix.strides[0] / 8;
     for (int a = lane; a < rank; a += blockDim.x) M[a * stride + pivots.data[a]] = 1.0 / M[a * stride + pivots.data[a]];
@@ -342,11 +354,11 @@ def eliminate(unknowns: int, newton: Newton):
         const int j = pivots.data[back];
         if (lane == back % blockDim.x) {
             const double own = M[back * stride + unknowns] * M[back * stride + j];
-            found[back & 1] = own;
+            solved[back & 1] = own;
             step.data[places.data[j]] = own;
         }
         __syncthreads();
-        const double value = found[back & 1];
+        const double value = solved[back & 1];
         for (int a = lane; a < back; a += blockDim.x) M[a * stride + unknowns] -= M[a * stride + j] * value;
     }
     __syncthreads();
@@ -361,15 +373,15 @@ def substitute(
     lane: wp.int32,
     step: wp.array[real],
 ):
-    """The unknowns of a triangular matrix, last first, by a block of threads: each has rows whose right sides it keeps
-    up with what is found."""
+    """Back-substitute with a block of threads: each thread updates the right sides of its rows after every unknown."""
     ...
 
 
 @wp.func
 def solve_equations(unknowns: int, newton: Newton):
-    """Gaussian elimination, rows exchanged; unknowns that the others make redundant stay zero,
-    which keeps the forces bounded. The step has them in the end."""
+    """Solve for the step by Gaussian elimination with row exchanges. Unknowns that are redundant stay zero, which
+    keeps the forces bounded.
+    """
     if wp.block_dim() == 1:
         solve_alone(unknowns, _SINGULAR, newton.pivots, newton.unknowns, newton.matrix, newton.step)
         return

@@ -1,5 +1,9 @@
-"""A Newton step of the search for contact forces by a block of threads on a GPU, see ``coulomb_block``: each thread has
-equations of its own, eliminated eight unknowns at a time."""
+"""Newton step of the Coulomb solve by a block of threads on a GPU, for up to 120 unknowns (see ``coulomb_block``).
+
+The equations are written as tiles of 8 x 8, which the threads hold in registers, and eliminated eight unknowns at a
+time on the tensor cores. ``_TILES`` lays out the shared memory, ``LIST`` finds the unknowns and writes their lines,
+``_WRITE`` expands the lines to tiles, ``_ELIMINATE`` solves.
+"""
 
 import warp as wp
 
@@ -9,53 +13,55 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 TILES = 15
-"""Eights of unknowns that the threads have room for."""
+"""Maximum number of tiles of eight unknowns."""
 
 _TILES = f"""
     constexpr int TILES = {TILES}, FEWEST = 0, PAIRS = WARPS, PITCH = 8 * TILES + 10, EACH = 9;
-    // Tiles of eight rows and columns, in the order in which the threads of a warp have them: the unknowns' that are
-    // eliminated now or next, what the others' rows have of them; the inverse of those on the diagonal; the two of each
-    // warp in the rows of the next. Before that, rows of the equations, and sixteen of them written out.
-    double* const shared = (double*)__cvta_shared_to_generic(room);
+    // Tiles of eight rows and columns, in the order of the threads of a warp: lefts are the columns of the unknowns
+    // that are eliminated now or next, inverses those of their diagonal tiles, tops the two tiles of each warp in the
+    // rows of the next. Before the elimination, the memory holds the lines of the equations, and sixteen rows expanded
+    // in strip.
+    double* const shared = (double*)__cvta_shared_to_generic(shared_address);
     double (*const line)[EACH] = (double (*)[EACH])shared;
     double (*const strip)[PITCH] = (double (*)[PITCH])(line + 8 * TILES);
     double (*const lefts)[64] = (double (*)[64])shared, (*const inverses)[64] = lefts + 2 * (TILES + 1);
     double (*const tops)[64] = inverses + 2 + 2 * warp;
-    static_assert(8 * EACH * TILES + 16 * PITCH <= ROOM && (2 * (TILES + 1) + 2 + 2 * WARPS) * 64 <= ROOM, "");
+    static_assert(8 * EACH * TILES + 16 * PITCH <= SHARED_DOUBLES
+        && (2 * (TILES + 1) + 2 + 2 * WARPS) * 64 <= SHARED_DOUBLES, "");
 """
 
 LIST = """
-    // A row of the equations has EACH numbers of its line.
-    __shared__ int column[8 * TILES], ahead[WARPS], sound[2];
+    // A line has EACH numbers: three weights, three own entries, the right side, a zero, padding.
+    __shared__ int column[8 * TILES], ahead[WARPS], regular[2];
     const double *const G = delassus.data, *const f = forces.data, *const u = velocities.data;
     const int stride = delassus.strides[0] / 8;
     double* const s = step.data;
     if (count > lanes) return 0;
-    // Each thread has a contact: what is unknown of its step, and what the others' steps move.
+    // Each thread has a contact: which components of its step are unknown, and the effect of the known ones.
     const int n = 3 * lane, size = 3 * count;
     const bool mine = lane < count;
-    bool bears = false, rubs = false;
+    bool presses = false, has_tangents = false;
     double rate = 0.0, first = 0.0, second = 0.0, known[3] = {0.0, 0.0, 0.0};
     if (mine) {
         const double* const d = G + n * stride + n;
         rate = 3.0 * scale * over(d[0] + d[stride + 1] + d[2 * stride + 2]);
         first = f[n + 1] - rate * u[n + 1];
         second = f[n + 2] - rate * u[n + 2];
-        bears = f[n] - rate * u[n] > 0.0;
-        rubs = !(f[n] <= 0.0 && first * first + second * second > 0.0);
-        if (!bears) known[0] = -values.data[n];
-        if (!rubs) {
+        presses = f[n] - rate * u[n] > 0.0;
+        has_tangents = !(f[n] <= 0.0 && first * first + second * second > 0.0);
+        if (!presses) known[0] = -values.data[n];
+        if (!has_tangents) {
             known[1] = -values.data[n + 1];
             known[2] = -values.data[n + 2];
         }
         for (int t = 0; t < 3; ++t) s[n + t] = known[t];
     }
-    const unsigned bearing = __ballot_sync(0xffffffffu, bears), rubbing = __ballot_sync(0xffffffffu, rubs);
+    const unsigned pressing = __ballot_sync(0xffffffffu, presses), tangents = __ballot_sync(0xffffffffu, has_tangents);
     const unsigned below = (1u << own) - 1u;
-    if (own == 0) ahead[warp] = __popc(bearing) + 2 * __popc(rubbing);
-    if (lane < 2) sound[lane] = 1;
+    if (own == 0) ahead[warp] = __popc(pressing) + 2 * __popc(tangents);
+    if (lane < 2) regular[lane] = 1;
     const int moves = __syncthreads_or(!(known[0] == 0.0 && known[1] == 0.0 && known[2] == 0.0));
-    int place = __popc(bearing & below) + 2 * __popc(rubbing & below), unknowns = 0;
+    int place = __popc(pressing & below) + 2 * __popc(tangents & below), unknowns = 0;
     #pragma unroll 1
     for (int i = 0; i < WARPS; ++i) {
         if (i < warp) place += ahead[i];
@@ -72,20 +78,20 @@ LIST = """
         }
         WAIT;
     }
-    // Its rows of the equations: the weights of its rows of the operator, its own entries and the right side.
+    // Write the lines of its unknowns.
     if (mine) {
         double moved[3] = {0.0, 0.0, 0.0};
         if (moves)
             for (int t = 0; t < 3; ++t) moved[t] = change.data[n + t];
-        if (bears) {
+        if (presses) {
             double* const to = line[place];
             column[place++] = n;
             to[0] = rate;
-            to[3] = short_step;
+            to[3] = regularization;
             to[1] = to[2] = to[4] = to[5] = to[7] = 0.0;
             to[6] = -values.data[n] - rate * moved[0];
         }
-        if (rubs) {
+        if (has_tangents) {
             const double square = first * first + second * second, radius = friction * fmax(f[n], 0.0);
             const bool slides = square > radius * radius;
             const double by = over_root(square), share = radius * by, d[2] = {first * by, second * by};
@@ -97,7 +103,7 @@ LIST = """
                     // Sliding: 1 - share (1 - d d^T) (1 - rate G) - friction d by the normal force.
                     const double same = t == k ? 1.0 : 0.0, along = share * (same - d[t] * d[k]);
                     w[k] = rate * (slides ? along : same);
-                    o[1 + k] = same * short_step + (slides ? same - along : 0.0);
+                    o[1 + k] = same * regularization + (slides ? same - along : 0.0);
                 }
                 if (slides) o[0] = -friction * d[t];
                 double* const to = line[place];
@@ -115,7 +121,7 @@ LIST = """
 """
 
 _WRITE = """
-    // Written out sixteen rows at a time, from where each warp takes its columns, at most two of tiles.
+    // Expand sixteen rows at a time into strip, from which each warp loads its columns of tiles, at most two.
     const int r = own >> 2, q = own & 3;
     double part[2][PAIRS][4];
     #pragma unroll 1
@@ -164,8 +170,8 @@ _WRITE = """
 """
 
 PRODUCTS = """
-    // Products of a tile's threads: the first two pairs of numbers are rows r of one side and columns r of the other,
-    // at 2q and 2q + 1 of what is summed over.
+    // Products of tiles: a thread holds row r of one factor and column r of the other, at the summation indices 2q and
+    // 2q + 1.
     auto product = [](double (&to)[2], const double2& one, const double2& other) {
         asm volatile("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 {%0,%1},{%2},{%3},{%0,%1};"
                      : "+d"(to[0]), "+d"(to[1]) : "d"(one.x), "d"(other.x));
@@ -188,18 +194,18 @@ PRODUCTS = """
     };
     auto store = [&](double* to, double one, double two) { *(double2*)(to + 2 * own) = make_double2(one, two); };
     auto load = [&](const double* from) { return *(const double2*)(from + 2 * own); };
-    // By a warp: the inverse of a tile on the diagonal, and whether it has pivots.
+    // A warp inverts a diagonal tile, and returns whether its pivots are large enough.
     auto invert = [&](double* to, double* inverse) {
-        const double2 given = load(to);
-        double d0 = given.x, d1 = given.y;
-        bool good = true;
+        const double2 tile = load(to);
+        double d0 = tile.x, d1 = tile.y;
+        bool is_regular = true;
         #pragma unroll
         for (int p = 0; p < 8; ++p) {
             const double some = p & 1 ? d1 : d0, pivot = __shfl_sync(0xffffffffu, some, 4 * p + p / 2);
             const double factor = __shfl_sync(0xffffffffu, some, (own & 28) | (p / 2));
             const double t0 = __shfl_sync(0xffffffffu, d0, 4 * p + q);
             const double t1 = __shfl_sync(0xffffffffu, d1, 4 * p + q);
-            good = good && fabs(pivot) > least;
+            is_regular = is_regular && fabs(pivot) > min_pivot;
             const double by = over(pivot), share = (r == p ? 1.0 : -factor) * by;
             if (r == p) d0 = d1 = 0.0;
             d0 = fma(share, t0, d0);
@@ -207,17 +213,17 @@ PRODUCTS = """
             if (q == p / 2) (p & 1 ? d1 : d0) = share;
         }
         store(inverse, d0, d1);
-        // Of its own rows, less this leaves the inverse's product.
-        store(to, given.x - (r == 2 * q ? 1.0 : 0.0), given.y - (r == 2 * q + 1 ? 1.0 : 0.0));
-        return good;
+        // The tile less the identity: eliminating it from its own rows leaves the product with the inverse.
+        store(to, tile.x - (r == 2 * q ? 1.0 : 0.0), tile.y - (r == 2 * q + 1 ? 1.0 : 0.0));
+        return is_regular;
     };
 """
 
 _ELIMINATE = """
-    // Eight unknowns at a time.
+    // Eliminate eight unknowns at a time.
     for (int k = -1; k < tiles; ++k) {
         if (k >= 0) {
-            if (!sound[k & 1]) return 0;
+            if (!regular[k & 1]) return 0;
             const bool one = warp > k && warp <= tiles, two = warp + WARPS > k && warp + WARPS <= tiles;
             const double (*const left)[64] = lefts + (k & 1) * (TILES + 1);
             const double2 inverse = load(inverses[k & 1]);
@@ -279,7 +285,7 @@ _ELIMINATE = """
                 }
             if (warp == next % WARPS) {
                 __syncwarp();
-                if (!invert(left[next], inverses[next & 1])) sound[next & 1] = 0;
+                if (!invert(left[next], inverses[next & 1])) regular[next & 1] = 0;
             }
         }
         WAIT;
@@ -306,7 +312,7 @@ _ELIMINATE = """
     )
 )
 def step_by_block(
-    room: wp.uint32,
+    shared_address: wp.uint32,
     delassus: wp.array2d[real],
     friction: real,
     count: int,
@@ -314,12 +320,15 @@ def step_by_block(
     velocities: wp.array[real],
     values: wp.array[real],
     scale: real,
-    short_step: real,
-    least: real,
+    regularization: real,
+    min_pivot: real,
     step: wp.array[real],
     change: wp.array[real],
 ) -> int:
-    """The ``step`` that ``write_equations`` and ``solve_equations`` find, rows not exchanged; 0, and what is no step,
-    where a pivot is not larger than ``least`` or there are more unknowns than 120. ``room`` is the block's,
-    ``change`` (3n,) is scratch memory."""
+    """Compute the Newton ``step`` of ``write_equations`` and ``solve_equations``, without row exchanges.
+
+    ``shared_address`` is from ``shared_memory``, ``values`` (3n,) the residual of the projection equations, ``change``
+    (3n,) scratch memory. Returns 1; or 0, with an invalid step, if a pivot is not larger than ``min_pivot`` or there
+    are more than 120 unknowns.
+    """
     ...

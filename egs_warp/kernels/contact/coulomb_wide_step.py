@@ -1,5 +1,6 @@
-"""A Newton step of the search for contact forces of more unknowns than ``coulomb_step`` has room for: 64 columns of its
-equations at a time."""
+"""Newton step of the Coulomb solve by a block of threads on a GPU, for 121 to 256 unknowns: the method of
+``coulomb_step`` in passes of 64 columns.
+"""
 
 import warp as wp
 
@@ -12,24 +13,23 @@ wp.set_module_options({"enable_backward": False})
 
 _TILES = f"""
     constexpr int TILES = 4 * WARPS, FEWEST = {FEWER} + 1, WIDTH = 8, SLOTS = 8, PITCH = 8 * WIDTH + 8, EACH = 9;
-    // As in coulomb_step; what columns of a pass have in the rows of the next, by all warps, and its right sides. The
-    // strip has 64 rows.
-    double* const shared = (double*)__cvta_shared_to_generic(room);
+    // As in coulomb_step, but tops holds the tiles of all columns of a pass in the rows of the next unknowns, and
+    // rights their right sides. The strip has 64 rows.
+    double* const shared = (double*)__cvta_shared_to_generic(shared_address);
     double (*const lefts)[TILES][64] = (double (*)[TILES][64])shared;
     double (*const inverses)[64] = (double (*)[64])(lefts + 2);
     double (*const tops)[WIDTH][64] = (double (*)[WIDTH][64])(inverses + 2);
     double (*const rights)[8] = (double (*)[8])(tops + 2);
     double (*const strip)[PITCH] = (double (*)[PITCH])shared;
     double (*const line)[EACH] = (double (*)[EACH])matrix.data;
-    static_assert((2 * TILES + 2 + 2 * WIDTH) * 64 + 16 <= ROOM && 64 * PITCH <= ROOM, "");
+    static_assert((2 * TILES + 2 + 2 * WIDTH) * 64 + 16 <= SHARED_DOUBLES && 64 * PITCH <= SHARED_DOUBLES, "");
 """
 
 _PREPARE = """
-    // A warp has two columns of tiles, and every second pair of their rows; the right sides of the rows of every eighth
-    // tile. What the unknowns of earlier passes leave of a row for each one in a later pass is kept behind the lines,
-    // where the equations would have had at least as much room.
+    // A warp has two columns of tiles with every second pair of rows, and the right sides of every eighth tile. The
+    // multipliers of earlier passes' unknowns are stored behind the lines in matrix, which has space for all equations.
     const int r = own >> 2, q = own & 3, group = warp & 3, half = warp >> 2, slots = (pairs + 1 - half) / 2;
-    double* const kept = (double*)matrix.data + (EACH * unknowns + 7) / 8 * 8;
+    double* const factors = (double*)matrix.data + (EACH * unknowns + 7) / 8 * 8;
     double part[2][SLOTS][4], right[TILES / WARPS];
     #pragma unroll
     for (int i = 0; i < TILES / WARPS; ++i) {
@@ -39,7 +39,7 @@ _PREPARE = """
     auto fetch = [&](int k) {
         for (int e = lane; e < 32 * tiles; e += 8 * 32) {
             const int a = e >> 2, there = a < unknowns ? 16 : 0;
-            const double* const from = kept + (k * unknowns + (there ? a : 0)) * 8 + 2 * (e & 3);
+            const double* const from = factors + (k * unknowns + (there ? a : 0)) * 8 + 2 * (e & 3);
             const unsigned to = __cvta_generic_to_shared(lefts[k & 1][0] + 2 * e);
             asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" : : "r"(to), "l"(from), "r"(there) : "memory");
         }
@@ -47,7 +47,7 @@ _PREPARE = """
 """
 
 _WRITE = """
-        // Written out 64 rows at a time, from where each warp takes its tiles.
+        // Expand 64 rows at a time into strip, from which each warp loads its tiles.
         #pragma unroll 1
         for (int chunk = 0; 4 * chunk < pairs; ++chunk) {
             #pragma unroll 1
@@ -98,10 +98,10 @@ _PASSES = """
     for (int first = tiles - (tiles + WIDTH - 1) / WIDTH * WIDTH; first < tiles; first += WIDTH) {
         const int begin = first > 0 ? first : 0, end = first + WIDTH;
         WRITE
-        // Less what earlier passes' unknowns leave, then eight more unknowns at a time.
+        // Apply the multipliers of earlier passes, then eliminate eight more unknowns at a time.
         for (int k = -1; k < end; ++k) {
             const int next = k + 1, now = k & 1, then = next & 1;
-            if (k >= begin && !sound[now]) return 0;
+            if (k >= begin && !regular[now]) return 0;
             if (next < begin) fetch(next);
             const bool one = first + group > k && first + group >= 0;
             const bool two = first + group + 4 > k && first + group + 4 >= 0;
@@ -165,10 +165,10 @@ _PASSES = """
                     }
                 if (next / 2 % 2 == half) {
                     __syncwarp();
-                    if (!invert(lefts[then][next], inverses[then])) sound[then] = 0;
+                    if (!invert(lefts[then][next], inverses[then])) regular[then] = 0;
                 }
             }
-            // What they leave for each of these eight, for right sides and later passes.
+            // Multipliers of these eight unknowns, for the right sides and for later passes.
             if (k >= begin) {
                 const double2 inverse = make_double2(inverses[now][16 * q + r], inverses[now][16 * q + 8 + r]);
                 const double2 solved = *(const double2*)(rights[now] + 2 * q);
@@ -179,7 +179,7 @@ _PASSES = """
                         double share[2] = {0.0, 0.0};
                         product(share, load(lefts[now][tile]), inverse);
                         if (end < tiles && a < unknowns)
-                            *(double2*)(kept + (k * unknowns + a) * 8 + 2 * q) = make_double2(share[0], share[1]);
+                            *(double2*)(factors + (k * unknowns + a) * 8 + 2 * q) = make_double2(share[0], share[1]);
                         double sum = share[0] * solved.x + share[1] * solved.y;
                         sum += __shfl_xor_sync(0xffffffffu, sum, 1);
                         sum += __shfl_xor_sync(0xffffffffu, sum, 2);
@@ -213,7 +213,7 @@ _PASSES = """
     )
 )
 def wide_step_by_block(
-    room: wp.uint32,
+    shared_address: wp.uint32,
     delassus: wp.array2d[real],
     friction: real,
     count: int,
@@ -221,12 +221,13 @@ def wide_step_by_block(
     velocities: wp.array[real],
     values: wp.array[real],
     scale: real,
-    short_step: real,
-    least: real,
+    regularization: real,
+    min_pivot: real,
     step: wp.array[real],
     change: wp.array[real],
     matrix: wp.array2d[Vec4],
 ) -> int:
-    """``step_by_block`` of more unknowns than 120, up to 256; 0 where there are not so many, too. ``matrix`` is scratch
-    memory."""
+    """Do the same as ``step_by_block`` for 121 to 256 unknowns, and return 0 for other numbers too. ``matrix`` is
+    scratch memory.
+    """
     ...

@@ -1,5 +1,8 @@
-"""``kernels.contact.iterate`` on a CPU: a trial of Newton's method, and the Newton step from there, in one thread each
-(Eq. 4, 8)."""
+"""Kernels of a Newton iterate on a CPU, in one thread each: a trial, and the Newton step from there (Eq. 4, 8).
+
+The host code is ``egs_warp/contact/host_newton.py``; ``iterate`` is the version on a GPU. uint64 arguments are
+addresses of host arrays.
+"""
 
 import warp as wp
 
@@ -13,16 +16,16 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Step:
-    """``fem.StepProblem`` of N nodes."""
+    """Data of ``fem.StepProblem`` for N nodes."""
 
     positions: wp.array[real]
-    """(3N,) metres at the start."""
+    """(3N,) m, at the start of the step."""
     ballistic_velocities: wp.array[real]
-    """(3N,) m/s, the velocities at the start after gravity alone."""
+    """(3N,) m/s, velocities at the start plus dt times gravity."""
     arms: wp.array[real]
-    """(3N,) metres from the centre of mass."""
+    """(3N,) m, positions relative to the centre of mass."""
     inverse_inertia: wp.array[real]
-    """(9,) 1/(kg m^2), the inverse of the inertia."""
+    """(9,) 1/(kg m^2), inverse inertia tensor."""
     masses: wp.array[real]
     """(N,) kg."""
 
@@ -30,9 +33,9 @@ class Step:
 @wp.func_native(
     on_cpu("""
     const int unknowns = ends.shape[0] * 3;
-    const double *const old = (const double*)base, *const free = (const double*)loose;
+    const double *const old = (const double*)base, *const free = (const double*)free_velocities;
     const double* const c = (const double*)columns;
-    const double *const before = (const double*)forces, *const then = (const double*)wanted;
+    const double *const before = (const double*)forces, *const then = (const double*)target_forces;
     double *const v = (double*)velocities_out, *const f = (double*)forces_out, *const x = (double*)ends.data;
     for (int k = 0; k < width; ++k) f[k] = before[k] + length * (then[k] - before[k]);
     for (int i = 0; i < unknowns; ++i) {
@@ -54,19 +57,22 @@ def advance_trial(
     starts: wp.array[real],
     dt: real,
     base: wp.uint64,
-    loose: wp.uint64,
+    free_velocities: wp.uint64,
     columns: wp.uint64,
     width: wp.int32,
     forces: wp.uint64,
-    wanted: wp.uint64,
+    target_forces: wp.uint64,
     length: real,
     velocities_out: wp.uint64,
     ends: wp.array2d[real],
     forces_out: wp.uint64,
 ):
-    """``length`` of the way from ``base`` velocities (3N,) and ``forces`` (3n,) to the end of a Newton step, which
-    moves at ``loose`` (3N,) without contact forces, by ``columns`` (3N, 3n) with those that are ``wanted`` (3n,);
-    where the nodes are then."""
+    """Move velocities and forces along a Newton step by the fraction ``length``, and compute the end positions of
+    the nodes.
+
+    The step starts at velocities ``base`` (3N,) and ``forces`` (3n,). It ends at ``target_forces`` (3n,) and at
+    ``free_velocities`` (3N,), without contact forces, plus ``columns`` (3N, 3n) times ``target_forces``.
+    """
     ...
 
 
@@ -77,9 +83,9 @@ def advance_trial(
     const double *const v = (const double*)velocities, *const f = (const double*)forces, *const in = gradient.data;
     const int* const node = (const int*)contact_nodes;
     const double *const weight = (const double*)contact_weights, *const axis = (const double*)contact_axes;
-    const double *const r = step.arms.data, *const known = step.ballistic_velocities.data;
+    const double *const r = step.arms.data, *const ballistic = step.ballistic_velocities.data;
     const double* const rate = step.inverse_inertia.data;
-    double *const free = (double*)free_out, *const missed = (double*)rest.data;
+    double *const free = (double*)free_residual_out, *const total = (double*)residual.data;
     double torque[3] = {0.0, 0.0, 0.0}, spin[3];
     for (int i = 0; i < 3 * nodes_count; i += 3) {
         torque[0] += r[i + 1] * in[i + 2] - r[i + 2] * in[i + 1];
@@ -92,7 +98,7 @@ def advance_trial(
         const double turned[3] = {spin[1] * r[i + 2] - spin[2] * r[i + 1], spin[2] * r[i] - spin[0] * r[i + 2],
                                   spin[0] * r[i + 1] - spin[1] * r[i]};
         for (int t = 0; t < 3; ++t)
-            missed[i + t] = free[i + t] = step.masses.data[n] * (ratio * v[i + t] - known[i + t] - turned[t])
+            total[i + t] = free[i + t] = step.masses.data[n] * (ratio * v[i + t] - ballistic[i + t] - turned[t])
                 + dt * in[i + t];
     }
     for (int c = 0; c < contacts; ++c) {
@@ -101,10 +107,10 @@ def advance_trial(
             push[t] = dt * (axis[9 * c + t] * f[3 * c] + axis[9 * c + 3 + t] * f[3 * c + 1]
                 + axis[9 * c + 6 + t] * f[3 * c + 2]);
         for (int k = 0; k < 4; ++k)
-            for (int t = 0; t < 3; ++t) missed[3 * node[4 * c + k] + t] -= weight[4 * c + k] * push[t];
+            for (int t = 0; t < 3; ++t) total[3 * node[4 * c + k] + t] -= weight[4 * c + k] * push[t];
     }
     double square = 0.0;
-    for (int i = 0; i < 3 * nodes_count; ++i) square += missed[i] * missed[i];
+    for (int i = 0; i < 3 * nodes_count; ++i) square += total[i] * total[i];
     return __builtin_sqrt(square);
 """,
         elsewhere="return 0.0;",
@@ -121,10 +127,12 @@ def step_residual(
     gradient: wp.array2d[real],
     velocities: wp.uint64,
     forces: wp.uint64,
-    free_out: wp.uint64,
-    rest: wp.array2d[real],
+    free_residual_out: wp.uint64,
+    residual: wp.array2d[real],
 ) -> real:
-    """``StepProblem.residual`` without contact forces (3N,) and with them (N, 3), and the norm of that."""
+    """Compute ``StepProblem.residual`` without contact forces (3N,) and with them (N, 3), N s, and return the norm
+    of the latter.
+    """
     ...
 
 
@@ -132,8 +140,8 @@ def step_residual(
     on_cpu("""
     const int k = directions;
     const double *const u = (const double*)across, *const z = (const double*)through;
-    const double *const small = (const double*)inverse, *const given = (const double*)right;
-    double *const x = (double*)solved, *const along = room.data, *const by = along + k;
+    const double *const small = (const double*)inverse, *const rhs = (const double*)right_side;
+    double *const x = (double*)solved, *const along = scratch.data, *const by = along + k;
     for (int j = 0; j < k; ++j) along[j] = 0.0;
     for (int i = 0; i < unknowns; ++i)
         for (int j = 0; j < k; ++j) along[j] += u[(long long)i * k + j] * x[i];
@@ -147,12 +155,12 @@ def step_residual(
         for (int j = 0; j < k; ++j) away += z[(long long)i * k + j] * by[j];
         x[i] -= away;
         for (int t = 0; t < 3; ++t)
-            missing[t] += kept.rotation_modes.data[3 * i + t] * given[i]
-                - kept.inertia_ratio.data[0] * kept.mode_momenta.data[3 * i + t] * x[i];
+            missing[t] += projection.rotation_modes.data[3 * i + t] * rhs[i]
+                - projection.inertia_ratio.data[0] * projection.mode_momenta.data[3 * i + t] * x[i];
     }
-    for (int t = 0; t < 9; ++t) turn[t / 3] += kept.inverse.data[t] * missing[t % 3];
+    for (int t = 0; t < 9; ++t) turn[t / 3] += projection.inverse.data[t] * missing[t % 3];
     for (int i = 0; i < unknowns; ++i)
-        for (int t = 0; t < 3; ++t) x[i] += kept.rotation_response.data[3 * i + t] * turn[t];
+        for (int t = 0; t < 3; ++t) x[i] += projection.rotation_response.data[3 * i + t] * turn[t];
 """)
 )
 def add_low_rank(
@@ -161,13 +169,16 @@ def add_low_rank(
     across: wp.uint64,
     through: wp.uint64,
     inverse: wp.uint64,
-    kept: MomentumProjection,
-    right: wp.uint64,
-    room: wp.array[real],
+    projection: MomentumProjection,
+    right_side: wp.uint64,
+    scratch: wp.array[real],
     solved: wp.uint64,
 ) -> None:
-    """To what is ``solved`` (3N,) of the ``right`` side (3N,) by the factors alone: Woodbury's formula for a sum of so
-    many ``directions``, see ``SparseFactors.add``, then what is ``kept``."""
+    """Correct the solution of the sparse factors for low-rank terms and momentum.
+
+    ``solved`` (3N,) is the solution for ``right_side`` (3N,) by the factors alone. Woodbury's formula adds a sum of
+    ``directions`` rank-one terms (see ``MultifrontalLdl.add_low_rank``); ``projection`` then restores the momentum.
+    """
     ...
 
 
@@ -176,7 +187,7 @@ def add_low_rank(
     const double *const v = (const double*)velocities, *const w = (const double*)contact_weights;
     const double* const axis = (const double*)contact_axes;
     const int* const node = (const int*)contact_nodes;
-    double *const x = (double*)solved, *const speeds = (double*)speeds_out;
+    double *const x = (double*)solved, *const speeds = (double*)contact_velocities_out;
     for (int i = 0; i < unknowns; ++i) x[i] = v[i] - x[i];
     for (int c = 0; c < contacts; ++c) {
         double at[3] = {0.0, 0.0, 0.0};
@@ -196,9 +207,9 @@ def apply_update(
     contact_axes: wp.uint64,
     velocities: wp.uint64,
     solved: wp.uint64,
-    speeds_out: wp.uint64,
+    contact_velocities_out: wp.uint64,
 ) -> None:
-    """What is ``solved`` (3N,) becomes what it leaves of the ``velocities`` (3N,), and the contacts' speeds (3n,)."""
+    """Overwrite ``solved`` (3N,) with ``velocities`` (3N,) minus it, and compute the contact velocities (3n,) there."""
     ...
 
 
@@ -218,27 +229,30 @@ def trial_kernel(
     columns: wp.uint64,
     # In:
     base: wp.uint64,
-    loose: wp.uint64,
+    free_velocities: wp.uint64,
     forces: wp.uint64,
-    wanted: wp.uint64,
+    target_forces: wp.uint64,
     length: real,
     # Out:
     ends: wp.array2d[real],
     gradient: wp.array2d[real],
-    rest_out: wp.array2d[real],
+    residual_out: wp.array2d[real],
     velocities_out: wp.uint64,
     forces_out: wp.uint64,
-    free_out: wp.uint64,
-    size_out: wp.array[real],
+    free_residual_out: wp.uint64,
+    norm_out: wp.array[real],
 ):
-    """See ``gone``, then ``missed_by``; no ``loose`` and no ``columns`` where the ``length`` is 0."""
+    """Run ``advance_trial``, the internal gradient and ``step_residual``. With ``length`` 0, ``free_velocities`` and
+    ``columns`` are not read.
+    """
     advance_trial(
-        step.positions, dt, base, loose, columns, 3 * contacts, forces, wanted, length, velocities_out, ends, forces_out
+        step.positions, dt, base, free_velocities, columns, 3 * contacts, forces, target_forces, length,
+        velocities_out, ends, forces_out,
     )  # fmt: skip
     gradient_native(elements, lines, ends, starts, dt, gradient)
-    size_out[0] = step_residual(
+    norm_out[0] = step_residual(
         step, dt, ratio, contacts, contact_nodes, contact_weights, contact_axes, gradient, velocities_out, forces_out,
-        free_out, rest_out,
+        free_residual_out, residual_out,
     )  # fmt: skip
 
 
@@ -251,7 +265,7 @@ def newton_kernel(
     factor: wp.array[real],
     inverses: wp.array[real],
     reciprocals: wp.array[real],
-    kept: MomentumProjection,
+    projection: MomentumProjection,
     directions: wp.int32,
     across: wp.uint64,
     through: wp.uint64,
@@ -261,19 +275,54 @@ def newton_kernel(
     contact_weights: wp.uint64,
     contact_axes: wp.uint64,
     # In:
-    right: wp.uint64,
+    right_side: wp.uint64,
     velocities: wp.uint64,
     # Out:
-    room: wp.array[real],
-    loose_out: wp.uint64,
-    speeds_out: wp.uint64,
+    scratch: wp.array[real],
+    free_velocities_out: wp.uint64,
+    contact_velocities_out: wp.uint64,
 ):
-    """(3N,) m/s after the step that takes off the ``right`` side (3N,), N s, and the contacts' speeds (3n,) then."""
+    """Compute the velocities (3N,) in m/s after a Newton step for the residual ``right_side`` (3N,) in N s, and the
+    contact velocities (3n,) there.
+    """
     if directions == 0:
-        solve_vector_native(fronts, blocks, unknowns, factor, inverses, reciprocals, right, 1, kept, room, loose_out)
+        solve_vector_native(
+            fronts,
+            blocks,
+            unknowns,
+            factor,
+            inverses,
+            reciprocals,
+            right_side,
+            1,
+            projection,
+            scratch,
+            free_velocities_out,
+        )
     else:
         solve_vector_native(
-            fronts, blocks, unknowns, factor, inverses, reciprocals, right, 1, MomentumProjection(), room, loose_out
+            fronts,
+            blocks,
+            unknowns,
+            factor,
+            inverses,
+            reciprocals,
+            right_side,
+            1,
+            MomentumProjection(),
+            scratch,
+            free_velocities_out,
         )
-        add_low_rank(unknowns, directions, across, through, inverse, kept, right, room, loose_out)
-    apply_update(unknowns, contacts, contact_nodes, contact_weights, contact_axes, velocities, loose_out, speeds_out)
+        add_low_rank(
+            unknowns, directions, across, through, inverse, projection, right_side, scratch, free_velocities_out
+        )
+    apply_update(
+        unknowns,
+        contacts,
+        contact_nodes,
+        contact_weights,
+        contact_axes,
+        velocities,
+        free_velocities_out,
+        contact_velocities_out,
+    )

@@ -7,8 +7,8 @@ from tests.support.surviving_mutants.survivor import Survivor
 CONTACT = [
     Survivor(
         "kernels/contact/coulomb.py",
-        "elif trial[1] < (real(1.0) - _LESS * length) * size[1]:",
-        "elif trial[1] < (real(1.0) + _LESS * length) * size[1]:",
+        "elif trial[1] < (real(1.0) - _MIN_DECREASE * length) * residual[1]:",
+        "elif trial[1] < (real(1.0) + _MIN_DECREASE * length) * residual[1]:",
         "a step that is worse by a ten-thousandth is gone on from, but the best forces so far are what comes out",
     ),
     Survivor(
@@ -91,8 +91,8 @@ CONTACT = [
     ),
     Survivor(
         "kernels/contact/coulomb.py",
-        "_BOLD = wp.constant(12)",
-        "_BOLD = wp.constant( 13)",
+        "_FULL_STEPS = wp.constant(12)",
+        "_FULL_STEPS = wp.constant( 13)",
         "how many bold steps are tried before shorter ones: one more",
     ),
     Survivor(
