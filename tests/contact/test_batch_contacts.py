@@ -1,4 +1,4 @@
-"""Contacts of many worlds against those of one: their choice, frames, and what forces on them push."""
+"""Contacts of many worlds equal those of one: selection, frames, and nodal forces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps with contact of many worlds side by side are those of each alone."""
+"""Steps with contact of many worlds in one batch equal those of each world alone."""
 
 from __future__ import annotations
 

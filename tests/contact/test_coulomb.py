@@ -1,5 +1,5 @@
-"""Contact forces for a given Delassus operator: the sweeps against a slow twin, and what the answer must fulfil where
-tangents differ. The laws themselves are in ``test_detection.py``.
+"""Contact forces for a given Delassus operator: the sweeps against a slow reference, and solutions where tangents
+differ. ``test_detection.py`` tests Coulomb's law itself.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def test_the_answer_obeys_where_tangents_differ(friction: float) -> None:
 
 
 def test_forces_of_what_is_no_number_are_those_of_the_start() -> None:
-    """They are told apart: the residual is infinite."""
+    """The residual of a failed solve is infinite."""
     delassus, free, shift, start = problem(0)
     free[4] = np.nan
     forces, size = coulomb_forces(delassus, free, shift, 0.5, start)
@@ -94,7 +94,7 @@ def test_forces_of_what_is_no_number_are_those_of_the_start() -> None:
 
 
 def test_problems_side_by_side_have_the_bits_of_each_alone() -> None:
-    """Whatever room for contacts there is behind theirs, and whatever lies in it."""
+    """The result does not depend on the capacity, nor on the contents of the padding."""
     counts, room, frictions = [5, 3, 0], 7, np.array([0.4, 1.5, 0.8])
     random = np.random.default_rng(3)
     delassus, free = random.normal(size=(3, 3 * room, 3 * room)), random.normal(size=(3, 3 * room))
@@ -134,7 +134,7 @@ def test_problems_that_take_all_iterations_have_the_same_bits_side_by_side() -> 
 @pytest.mark.cuda
 @pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
 def test_a_block_of_threads_finds_the_forces_of_one(friction: float) -> None:
-    """Of groups that are full and not, of as many unknowns as one pass has room for and more."""
+    """Full and partial groups; numbers of unknowns up to the capacity of one pass and above it."""
     counts, room = [1, 4, 5, 6, 11, 33, 40, 45, 64, 65, 70], 70
     random = np.random.default_rng(1)
     delassus, free = np.zeros((len(counts), 3 * room, 3 * room)), random.normal(size=(len(counts), 3 * room))
@@ -154,8 +154,9 @@ def test_a_block_of_threads_finds_the_forces_of_one(friction: float) -> None:
 @pytest.mark.cuda
 @pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
 def test_a_block_of_threads_finds_the_forces_of_many_contacts_that_press(friction: float) -> None:
-    """Of more unknowns than one pass has room for: in full passes of columns and not, with full tiles and not, and of
-    more than there are passes for; of more contacts than are swept together."""
+    """More unknowns than the capacity of one pass: full and partial passes and tiles, more unknowns than the passes
+    take, and more contacts than one block sweeps.
+    """
     counts, room = [41, 42, 43, 50, 53, 62, 64, 65, 80, 85, 86, 100, 130], 130
     random = np.random.default_rng(4)
     delassus, free = np.zeros((len(counts), 3 * room, 3 * room)), random.normal(size=(len(counts), 3 * room))
@@ -177,8 +178,8 @@ def test_a_block_of_threads_finds_the_forces_of_many_contacts_that_press(frictio
 
 
 def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:
-    """25 points that move as 12 unknowns do, made unique as a step makes them, pressed, pushed and turned: their
-    equations hold, and no force is large.
+    """25 points with 12 degrees of freedom, regularised as in a step, pressed, pushed and turned. The equations
+    hold, and no force is large.
     """
     random = np.random.default_rng(2)
     place = np.stack(np.meshgrid(np.linspace(-1.0, 1.0, 5), np.linspace(-1.0, 1.0, 5)), axis=-1).reshape(-1, 2)
@@ -195,7 +196,7 @@ def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:
 
 
 def test_what_was_solved_before_changes_nothing() -> None:
-    """Memory is used again: the same bits after a problem without numbers, and after one that took all attempts."""
+    """Memory is reused: the bits are the same after a problem with NaN, and after one that took all attempts."""
     delassus, free, shift, start = problem(1)
     expected, missed = coulomb_forces(delassus, free, shift, 0.4, start)
     assert missed < 1e-10 and np.abs(expected).max() > 0.1
@@ -206,8 +207,10 @@ def test_what_was_solved_before_changes_nothing() -> None:
 
 
 def test_forces_of_more_points_than_nodes_are_found_where_contacts_give_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first step of a jump on 32 points of a coarse foot, from muscles at rest to those of the whole step: from the
-    forces at hand the kernel alone finds none, and where contacts give way a little it does; many worlds likewise."""
+    """First step of a jump on 32 points of a coarse foot, from muscles at rest to those of the whole step. From the
+    present forces the kernel alone does not converge; continuation from compliant contacts does, also for many
+    worlds.
+    """
     creature = coarse_pawn()
     first = simulate(creature, motion("jump"), frames=2).simulation.reports[0]
     problems: list[tuple[Any, ...]] = []

@@ -1,5 +1,5 @@
-"""Velocities and contact forces sought together (Eq. 4, 8, 9): what contact, friction and both momenta ask for; bodies
-that fall, rest, slide, hold on a slope, and come out of the ground.
+"""Coupled solve for velocities and contact forces (Eq. 4, 8, 9): contact, friction and conservation of both momenta,
+for bodies that fall, rest, slide, stick on a slope, and rise out of the ground.
 """
 
 from __future__ import annotations
@@ -224,7 +224,7 @@ def test_a_sunk_body_comes_out_gently_to_the_tolerance(depth: float) -> None:
 
 
 def on_one_corner(falling: PassiveBody) -> tuple[StepProblem, CoupledResult]:
-    """A step of the ``falling`` body that starts with one corner in its set."""
+    """Solve a step of the ``falling`` body that starts with one corner in its contact set."""
     x, solver = falling.state.positions, falling.solver
     problem = StepProblem(falling.body, BodyState(x, np.tile([0.0, 0.0, -1.0], (len(x), 1))), DT)
     contacts = solver.detector.contact_set(np.array([0]), x)
@@ -233,7 +233,7 @@ def on_one_corner(falling: PassiveBody) -> tuple[StepProblem, CoupledResult]:
 
 
 def test_points_that_would_sink_join_the_set() -> None:
-    """A step that starts with one corner in its set ends with every point above the tolerance."""
+    """A step that starts with one corner in its contact set ends with every point above the tolerance."""
     falling = block()
     solver = falling.solver
     problem, result = on_one_corner(falling)
@@ -244,7 +244,7 @@ def test_points_that_would_sink_join_the_set() -> None:
 
 
 def test_points_join_before_the_step_without_them_has_converged(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same do, and the end is the same, in fewer iterations."""
+    """Early activation adds the same points and reaches the same end, in fewer iterations."""
     falling = block()
     _, soon = on_one_corner(falling)
     monkeypatch.setattr(coupled_step, "ACTIVATION_RESIDUAL", 0.0)
@@ -255,8 +255,8 @@ def test_points_join_before_the_step_without_them_has_converged(monkeypatch: pyt
 
 
 def test_a_tangent_that_leads_nowhere_is_made_anew() -> None:
-    """That of a body without stiffness and a billionth as heavy inverts elements however short its step: the end is the
-    one that the body's own tangent leads to, which is made once.
+    """The tangent of a body with no stiffness and a billionth of the mass inverts elements at any step length. The
+    end is that of the body's own tangent, which is computed once.
     """
     standing = block()
     body, solver = standing.body, standing.solver
@@ -324,7 +324,7 @@ def test_foreseen_forces_press_and_rub_no_more_than_they_may() -> None:
 
 
 def test_a_step_that_nothing_joins_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It looks at the gaps of its end, once that is known well enough and once it is there, and not again."""
+    """The gaps at the end are evaluated twice: when the activation threshold is passed, and at the end."""
     resting = block(sag=0.01, damping_ratio=0.5)
     for _ in range(5):
         resting.advance(DT)
@@ -336,8 +336,8 @@ def test_a_step_that_nothing_joins_is_solved_once(monkeypatch: pytest.MonkeyPatc
 
 
 def test_forces_that_miss_coulombs_law_end_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The motion may obey its equation: where the forces do not theirs, another tangent is tried, and then the step is
-    told to be done in halves.
+    """The equation of motion may hold. Where the forces violate Coulomb's law, another tangent is tried, and then
+    the solve fails, so that the caller takes two half steps.
     """
     resting, answered = block(sag=0.01, damping_ratio=0.5), responses.coulomb_forces
     for _ in range(5):

@@ -1,4 +1,4 @@
-"""Contact (Eq. 3, 8, 9): which points may touch, their frames, and the exact Coulomb forces of a set of contacts."""
+"""Contact (Eq. 3, 8, 9): candidate points, contact frames, and the exact Coulomb forces of a set of contacts."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_points_on_a_grid_do_not_hang_on_the_last_bits_of_a_file() -> None:
 
 
 def test_what_lies_in_an_edge_or_a_face_of_the_hull_is_no_vertex() -> None:
-    """Of the grid of a cube its corners alone are kept, whatever the order."""
+    """Only the corners of a cubic grid are hull vertices, in any order of its points."""
     line = np.arange(5.0)
     cube = np.stack(np.meshgrid(line, line, line), axis=-1).reshape(-1, 3)
     for seed in range(20):
@@ -324,8 +324,7 @@ def test_coulomb_forces_of_forty_points_under_a_rigid_base(regularisation: float
 
 
 def test_gaps_are_those_of_the_place_asked_for(device: str) -> None:
-    """Over more places than are kept, in any order, a place changed in its own memory among them; what is given, which
-    is kept, nobody can write to."""
+    """More configurations than the cache holds, in any order, some changed in place. The cached result is read-only."""
     mesh = block_mesh()
     geometry = contact_geometry(surface_cloud(mesh, 50, lowest=0.05), mesh, (FLOOR,), device=device)
     kept, place = ContactDetector(geometry, device=device), mesh.nodes.copy()

@@ -1,4 +1,4 @@
-"""Responses and iterates that stay on the device are those of the host, on every device."""
+"""Linearisations and iterates on the device equal those of the host, on every device."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def pulled(creature: Creature, seed: int, strength: float = 0.3) -> MuscleEnergy
 
 
 def problems(stepper: LocomotionStepper, creature: Creature) -> list[StepProblem]:
-    """Of a body that falls and trembles, without drag and with it, in steps of two lengths."""
+    """Create steps of two sizes for a falling, vibrating body, without drag and with it."""
     nodes, random = creature.start.positions, np.random.default_rng(0)
     state = BodyState(nodes, np.array([0.1, 0.0, -0.3]) + 0.02 * random.standard_normal(nodes.shape))
     return [StepProblem(stepper.body, state, dt, drag) for dt, drag in ((0.01, 0.0), (0.005, 0.3), (0.01, 0.0))]
@@ -54,8 +54,9 @@ def assert_alike(one: NewtonIterate, other: NewtonIterate) -> None:
 def test_iterates_go_the_host_s_way(
     creature: Creature, points: np.ndarray, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Begun, tried in whole and in part, from there on, by another tangent with the muscles' stiffness in it, and on:
-    twice, for what a GPU has recorded the first time it plays the second."""
+    """Start, full and partial trials, further trials, and a new tangent with the muscles' stiffness. Everything runs
+    twice, because a GPU replays graphs the second time.
+    """
     stepper = on_device(creature, device, monkeypatch)
     respond, factors = stepper.linearizer, stepper.factors
     assert isinstance(respond, DeviceContactLinearizer)
@@ -89,7 +90,7 @@ def test_iterates_go_the_host_s_way(
 
 
 def test_what_inverts_an_element_is_no_number(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And the place before it is still there to go on from."""
+    """The previous iterate remains usable."""
     stepper = on_device(creature, device, monkeypatch)
     respond, (problem, *_) = stepper.linearizer, problems(stepper, creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
@@ -107,7 +108,7 @@ def test_what_inverts_an_element_is_no_number(creature: Creature, device: str, m
 
 
 def test_what_was_no_number_is_left_behind(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step is begun alike after another whose matrix had no factor, or whose end was no number."""
+    """A step does not depend on NaN left by an earlier one, from a matrix without factors or a diverged end."""
     stepper = on_device(creature, device, monkeypatch)
     respond, (problem, *_) = stepper.linearizer, problems(stepper, creature)
     assert isinstance(respond, DeviceContactLinearizer)
@@ -142,8 +143,9 @@ def test_what_was_no_number_is_left_behind(creature: Creature, device: str, monk
 def test_what_is_at_hand_no_more_is_told_again(
     creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Memory is there for two places: from others a step goes on as it did the first time. And it is there for one
-    response: another fails, in place of going on from what is not its own."""
+    """The workspace holds two iterates; an evicted one is uploaded again and gives the same step. It holds one
+    linearisation; an older one raises instead of using data of another.
+    """
     stepper = on_device(creature, device, monkeypatch)
     respond, (problem, *_) = stepper.linearizer, problems(stepper, creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
@@ -155,7 +157,7 @@ def test_what_is_at_hand_no_more_is_told_again(
     assert_alike(first.line_search_point(forces), second)
     shift = np.zeros(6)
     begun = first.newton_steps(shift, 0.8)
-    # The device goes on past what it has told first.
+    # The device continues past the first result.
     again = first.newton_steps(shift, 0.8, ConvergenceState(1e-12, 0.0, np.inf))
     assert len(again.accepted_residuals) > 1
     for one, other in (
@@ -178,7 +180,7 @@ def test_what_is_at_hand_no_more_is_told_again(
 def test_a_step_has_the_same_contacts_whatever_was_looked_ahead_for(
     creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """That very step, one from another state, of another length, or after other points."""
+    """The prefetch is for that very step, or for one with another state, step size or set of points."""
     stepper = on_device(creature, device, monkeypatch)
     first, second, _ = problems(stepper, creature)
     lifted = BodyState(creature.start.positions + [0.0, 0.0, 0.004], first.state.velocities)
@@ -203,7 +205,9 @@ def test_a_step_has_the_same_contacts_whatever_was_looked_ahead_for(
 def test_a_tangent_whose_sum_fails_is_the_host_s(
     creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where what the muscles add is not definite by itself: factored as a whole, from the same place on."""
+    """The muscles' stiffness is not definite by itself: the whole matrix is factored, and the iterate stays the
+    same.
+    """
     stepper = on_device(creature, device, monkeypatch)
     problem, *_ = problems(stepper, creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
@@ -216,7 +220,7 @@ def test_a_tangent_whose_sum_fails_is_the_host_s(
     )
     monkeypatch.setattr(dense_cholesky._InverseFactor, "add", lambda root, directions, sign: 0.0 * directions[0, 0])
     found = place.with_new_tangent()
-    # Nobody has waited for the sum so far.
+    # The sum has not been synchronised so far.
     assert len(found.free_contact_velocities) == 18
     whole = problem.tangent(stepper.factors, place.velocities, tension)
     expected = ContactLinearization.of(whole, contacts).iterate_at(tension, place.velocities, place.forces)

@@ -1,4 +1,4 @@
-"""Contact points that are chosen on the device are those of the host, on every kind of ground."""
+"""Contact points selected on the device equal those of the host, on every kind of ground."""
 
 from __future__ import annotations
 
@@ -49,8 +49,9 @@ def assert_alike(there: ContactSet, here: ContactSet) -> None:
 
 @pytest.mark.parametrize("kind", ["flat", "corner", "waves"])
 def test_the_points_of_a_step_are_the_host_s(kind: str, device: str) -> None:
-    """Of a body that comes down, leans, slides to the wall and leaves: each after the points of the look before, of
-    which some press; and what sinks, but for points that are in contact."""
+    """A body comes down, leans, slides to the wall and leaves. Each selection follows the previous points, some of
+    them loaded. Penetrating points are counted except those in contact.
+    """
     geometry = ground(kind)
     nodes, random = geometry.mesh.nodes, np.random.default_rng(0)
     detector, points = ContactDetector(geometry, device=device), ContactSelector(geometry, near=NEAR, lower=1e-3)
@@ -83,7 +84,7 @@ def test_the_points_of_a_step_are_the_host_s(kind: str, device: str) -> None:
             detector.gaps(at),
             points.find_deeper(taken, np.where(sinks, gaps, 0.0), ACTIVATION_DEPTH * TOLERANCE),
         )
-        # Where it ends the next step begins.
+        # The next step starts at the end of this one.
         after = then + 0.002 * random.standard_normal(nodes.shape)
         next_ends = wp.array(after, dtype=Vec3, device=device)
         places = torch.as_tensor(np.append(taken, [0] * 5).astype(np.int32), device=device)

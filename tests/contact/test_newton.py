@@ -1,4 +1,4 @@
-"""Newton steps with contact on the host: what they say of the step's equation is what the equation says (Eq. 4, 8)."""
+"""Newton steps with contact on the host agree with the equation of the step (Eq. 4, 8)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def creature() -> Creature:
 
 
 def falling(creature: Creature) -> tuple[StepProblem, MuscleEnergy, np.random.Generator]:
-    """A step of a body that falls and trembles, and muscles that pull."""
+    """Create a step of a falling, vibrating body with active muscles."""
     random = np.random.default_rng(0)
     nodes, muscles = creature.start.positions, creature.muscles
     state = BodyState(nodes, np.array([0.1, 0.0, -0.3]) + 0.02 * random.standard_normal(nodes.shape))
@@ -34,9 +34,9 @@ def falling(creature: Creature) -> tuple[StepProblem, MuscleEnergy, np.random.Ge
 
 
 def test_a_newton_step_solves_the_linear_equation(creature: Creature) -> None:
-    """A body that the tangent speaks true of (the residual is linear where it is looked at so near) has nothing left
-    to miss after a whole step, and half as much after half of one; the contacts' speeds are of the step without
-    forces."""
+    """Near the solution the residual is linear: after a full or a half step with matching forces it vanishes. The
+    free contact velocities are those of the step without forces.
+    """
     problem, tension, random = falling(creature)
     factors, solver = MultifrontalLdl(creature.body.assembly.upper_pattern), creature.stepper.solver
     contacts = solver.detector.contact_set(np.arange(0, 40, 7), problem.state.positions)
@@ -60,7 +60,7 @@ def test_a_newton_step_solves_the_linear_equation(creature: Creature) -> None:
 
 
 def test_another_tangent_changes_the_newton_step_alone(creature: Creature) -> None:
-    """Made where the iterate is, with the muscles' stiffness in it."""
+    """The new tangent is that of the iterate, with the muscles' stiffness."""
     problem, tension, random = falling(creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(5), problem.state.positions)
     first, second = (
@@ -96,7 +96,7 @@ def test_a_wider_response_is_that_of_all_its_contacts(creature: Creature) -> Non
 
 
 def test_a_step_ahead_is_newton_s_with_forces_as_they_are(creature: Creature) -> None:
-    """And none where it would invert an element."""
+    """The result is None where the step would invert an element."""
     problem, tension, random = falling(creature)
     respond = HostContactLinearizer()
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
@@ -118,7 +118,9 @@ def test_a_step_ahead_is_newton_s_with_forces_as_they_are(creature: Creature) ->
 
 @pytest.mark.parametrize("pulled", [True, False])
 def test_kernels_say_what_arrays_say(creature: Creature, pulled: bool) -> None:
-    """Sizes, contact speeds and Newton steps, whole and in part; with the muscles' stiffness in the tangent, too."""
+    """Residual norms, contact velocities and Newton steps, full and partial, also with the muscles' stiffness in the
+    tangent.
+    """
     problem, tension, random = falling(creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(0, 36, 5), problem.state.positions)
     stiff = tension if pulled else None

@@ -1,4 +1,4 @@
-"""A GPU's loop of Newton steps goes on for as long as the host would, and no longer (Eq. 4, 8)."""
+"""The Newton loop on a GPU takes exactly the steps that the host would take (Eq. 4, 8)."""
 
 from __future__ import annotations
 
@@ -25,8 +25,18 @@ def in_a_loop(
     *,
     usual: int = 1,
 ) -> np.ndarray:
-    """Residuals of those of the ``steps`` (residual, m/s missed, points that sink) that are taken from a residual of
-    ``begin``, or of the last trial; of the last one, where it begins, whether another comes and how many have been."""
+    """Run the loop's convergence kernels on prescribed steps.
+
+    Args:
+        course: state at the start of the loop.
+        begin: residual at the start; None uses that of the last trial.
+        steps: residual, Coulomb violation in m/s and number of penetrating points after each step.
+        device: Warp device.
+        usual: 0 disables the loop.
+
+    Returns:
+        The residuals of the steps that were taken.
+    """
 
     def array(*values: float) -> wp.array:
         return wp.array(np.array(values), dtype=real, device=device)
@@ -47,7 +57,7 @@ def in_a_loop(
 
 
 def by_the_host(course: ConvergenceState, begin: float, steps: list[tuple[float, float, float]]) -> list[float]:
-    """The same, one step after the other: until one ends the round, or is to be looked at."""
+    """Return the residuals of the steps up to the first that ends the round or needs the host."""
     taken, before = [], begin
     for residual, missed, sinking in steps:
         taken.append(residual)
@@ -103,7 +113,7 @@ def test_a_loop_takes_the_steps_that_need_no_look(
 
 
 def test_a_loop_goes_the_host_s_way(device: str) -> None:
-    """Residuals that fall and rise by chance, from the middle of a round."""
+    """Residuals that fall and rise at random, from the middle of a round."""
     random, lengths = np.random.default_rng(0), set()
     for _ in range(100):
         course = replace(FIRST, max_steps=int(random.integers(6, 20)))

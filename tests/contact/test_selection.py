@@ -1,4 +1,4 @@
-"""Contact points: one a cell, the lowest, and the same ones from step to step."""
+"""Contact selection: one point for each cell, the lowest, and stable from step to step."""
 
 from __future__ import annotations
 
@@ -86,8 +86,9 @@ def test_cells_are_as_few_wherever_the_ground_is() -> None:
 
 
 def test_rounding_chooses_neither_cells_nor_points(geometry: ContactGeometry) -> None:
-    """The last bits of weights and gaps are others on every machine: of what lies alike on the ground the one
-    next to the middle of its cell is taken."""
+    """The last bits of weights and gaps differ between machines. Of points that lie alike on the ground, the one
+    closest to the centre of its cell is selected.
+    """
     random = np.random.default_rng(0)
     weights = geometry.weights + 1e-15 * random.standard_normal(geometry.weights.shape)
     other = ContactSelector(replace(geometry, weights=weights), near=NEAR, lower=1e-3)

@@ -1,5 +1,5 @@
-"""What there is to stand on: tops of solids, mistakes of a terrain file named in one line; uneven ground: gaps, frames
-against their twins, and a body that comes to rest on waves.
+"""Terrain: tops of solids and one-line errors of a terrain file; uneven ground: gaps and frames against references,
+and a body that comes to rest on waves.
 """
 
 from __future__ import annotations
