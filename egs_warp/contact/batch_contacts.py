@@ -113,7 +113,7 @@ class BatchDetector:
         """
         if geometry.field is not None:
             raise ArgumentError("geometry", "many worlds stand on flat ground only; run these over processes")
-        self.device, self.near, self.lower, self.alike = (
+        self.device, self._activation_distance, self._hysteresis, self._gap_tolerance = (
             device,
             points.activation_distance,
             points.hysteresis,
@@ -167,12 +167,12 @@ class BatchDetector:
         Returns:
             (c, P) bool.
         """
-        lowest = self._lowest(gaps < self.near, gaps)
+        lowest = self._lowest(gaps < self._activation_distance, gaps)
         low = gaps.new_full((len(gaps), self._cell_count), torch.inf)
         low.scatter_reduce_(1, self._cells.expand_as(gaps), torch.where(lowest, gaps, torch.inf), "amin")
         cells, before = self._cells[previous], gaps.gather(1, previous)
-        close = before <= low.gather(1, cells) + self.lower
-        retained = valid & (before < 2.0 * self.near) & (loaded | close)
+        close = before <= low.gather(1, cells) + self._hysteresis
+        retained = valid & (before < 2.0 * self._activation_distance) & (loaded | close)
         retained_cells = torch.zeros_like(low, dtype=torch.int32).scatter_reduce_(1, cells, retained.int(), "amax") > 0
         chosen = lowest & ~retained_cells.gather(1, self._cells.expand_as(gaps))
         return chosen | (
@@ -192,7 +192,7 @@ class BatchDetector:
         """Return (c, P) bool, the lowest point of each cell in the mask ``among``. Ties go to the point closest to
         the centre.
         """
-        cells, heights = self._cells.expand_as(gaps), (gaps / self.alike).round()
+        cells, heights = self._cells.expand_as(gaps), (gaps / self._gap_tolerance).round()
         low = gaps.new_full((len(gaps), self._cell_count), torch.inf)
         low.scatter_reduce_(1, cells, torch.where(among, heights, torch.inf), "amin")
         ranks = self._ranks.expand_as(gaps)
@@ -222,7 +222,7 @@ class BatchDetector:
         points = points[:, :capacity]
         valid = torch.arange(capacity, device=self.device) < counts[:, None]
         if order is not None:
-            key = torch.where(valid, (order.gather(1, points) / self.alike).round(), torch.inf)
+            key = torch.where(valid, (order.gather(1, points) / self._gap_tolerance).round(), torch.inf)
             points = points.gather(1, key.argsort(dim=1, stable=True))
         at = faces.gather(1, points)
         return BatchContacts(
