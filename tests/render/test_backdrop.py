@@ -89,7 +89,7 @@ def test_the_shadow_lies_on_an_uneven_floor_without_an_edge() -> None:
 
 
 def blurred(values: np.ndarray, sigma: float) -> np.ndarray:
-    """Return the length of a blur kernel that reaches four standard deviations."""
+    """Return ``values`` blurred by a kernel that reaches four standard deviations."""
     size = 2 * int(np.ceil(4.0 * sigma)) + 1
     return cv2.GaussianBlur(values, (size, size), sigma)
 

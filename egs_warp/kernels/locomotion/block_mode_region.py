@@ -234,7 +234,7 @@ def list_contact_rows(program: Program, workspace: Workspace, sticks: int, slide
 def solve_force_map(program: Program, workspace: Workspace, closed_count: int, held_count: int):
     """Compute the forces that keep the held contact velocities at zero, as affine functions of the activations.
 
-    Returns: 1, or 0 if the system is singular without pivoting.
+    Returns: 1, or 0 if a pivot is too small; rows are not exchanged.
     """
     lane = lane_of_block()
     m = program.m

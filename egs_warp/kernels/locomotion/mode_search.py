@@ -49,7 +49,8 @@ _CURRENT, _NEXT = wp.constant(CURRENT), wp.constant(NEXT)
 _NEXT_SINGLE, _WARM_START = wp.constant(NEXT_SINGLE), wp.constant(WARM_START)
 _HEADER = wp.constant(HEADER_SIZE)
 INFEASIBLE_COST = wp.constant(real(1e6))
-"""Cost limit relative to the objective at the minimum, above which a QP counts as infeasible, as on the host."""
+"""Cost above which a QP counts as infeasible, relative to the decrease of the objective from the origin to the
+unconstrained minimum; as on the host."""
 _ACTIVE, _GAIN, _ZERO_SPEED = (wp.constant(real(each)) for each in (ACTIVE, GAIN, ZERO_SPEED))
 
 
@@ -298,7 +299,7 @@ def copy_modes(workspace: Workspace, n: int, source: int, target: int):
 
 @wp.func
 def unpack_program(packed: wp.array[real]):
-    """Return views of the packed input by its header."""
+    """Return the parts of the packed input according to its header."""
     program = Program()
     program.packed = packed
     program.m = int(packed[0])
