@@ -1,4 +1,4 @@
-"""One function for every way of carrying Gaussians with a cage: the paper's and its peers' (Table 1)."""
+"""The paper's deformation of Gaussians by a cage and its baselines (Table 1), behind one function."""
 
 from __future__ import annotations
 
@@ -22,32 +22,33 @@ from egs_warp.launching import empty, launch_rows
 from egs_warp.precision import Vec3
 
 LOCAL_REACH = 3.0 / np.sqrt(3.0)
-"""The corners of a Gaussian's own tetrahedron lie 3 standard deviations out; it then holds the one-sigma ellipsoid."""
+"""Distance of the corners of a Gaussian's own tetrahedron: 3 standard deviations, so that it contains the one-sigma
+ellipsoid."""
 
 
 class DeformationMethod(Enum):
-    """How a Gaussian's F is found."""
+    """Source of the deformation gradient F of a Gaussian."""
 
     SURFACE = "surface"
-    """From the nearest surface triangle (SuGaR, Guedon and Lepetit 2024)."""
+    """Nearest surface triangle (SuGaR, Guedon and Lepetit 2024)."""
     MEAN_GRADIENT = "mean gradient"
-    """From the tetrahedron that holds the mean (PhysGaussian, Xie et al. 2024)."""
+    """Tetrahedron that contains the mean (PhysGaussian, Xie et al. 2024)."""
     LOCAL_TETRAHEDRON = "local tetrahedron"
-    """From a tetrahedron around each Gaussian, embedded in the cage (VR-GS, Jiang et al. 2024)."""
+    """Tetrahedron around each Gaussian, embedded in the cage (VR-GS, Jiang et al. 2024)."""
     BIDIRECTIONAL_NO_SPLIT = "bidirectional, no split"
-    """From T+ and T- (Eq. 14, 15)."""
+    """T+ and T- (Eq. 14, 15)."""
     BIDIRECTIONAL = "bidirectional"
-    """From T+ and T-, splitting what bends (Eq. 14-17)."""
+    """T+ and T-, with splitting of bent Gaussians (Eq. 14-17)."""
 
 
 @dataclass(frozen=True)
 class BoundSurface:
-    """Triangles at rest that ``CarryMethod.SURFACE`` binds Gaussians to; the cage carries their corners."""
+    """Triangles at rest to which ``DeformationMethod.SURFACE`` binds Gaussians; the cage deforms their vertices."""
 
     vertices: np.ndarray
-    """(V, 3) float64, metres."""
+    """(V, 3) float64, m."""
     faces: np.ndarray
-    """(F, 3) int32, none without area."""
+    """(F, 3) int32, each triangle with positive area."""
 
     def __post_init__(self) -> None:
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
@@ -70,11 +71,15 @@ def deform_with_method(
     max_depth: int = 3,
     max_growth: float = 4.0,
 ) -> list[GaussianCloud]:
-    """The cloud in each of ``frames``: node positions (N, 3) or (N,) vec3d, metres, of the cage ``mesh``.
+    """Return the cloud in each of ``frames``.
 
-    ``surface`` is what ``SURFACE`` binds to, the cage's own if there is none.
-    ``rule``, ``threshold_degrees``, ``min_error``, ``max_depth`` and ``max_growth`` are those of ``split_for_motion``
-    and matter to ``BIDIRECTIONAL``.
+    Args:
+        cloud: Gaussians at rest.
+        mesh: cage, or its locator.
+        frames: node positions (N, 3) or (N,) vec3d, m, of the cage.
+        method: source of F.
+        surface: triangles for ``SURFACE``; default: the cage's own surface.
+        rule, threshold_degrees, min_error, max_depth, max_growth: for ``BIDIRECTIONAL``, see ``split_for_motion``.
     """
     cage = mesh if isinstance(mesh, CageLocator) else CageLocator(mesh, device=cloud.device)
     if method in (DeformationMethod.BIDIRECTIONAL, DeformationMethod.BIDIRECTIONAL_NO_SPLIT):
@@ -91,14 +96,14 @@ def deform_with_method(
                 max_growth=max_growth,
             )
             cloud, embedding = split.cloud, split.embedding
-        # A Deformer of its own for each frame, since all results are kept.
+        # One Deformer per frame, since it would overwrite the earlier results.
         return [Deformer(cloud, embedding).deform(positions).cloud for positions in frames]
-    peer = _BaselineDeformer(cloud, cage, method, surface)
-    return [peer.deform(positions).cloud for positions in frames]
+    baseline = _BaselineDeformer(cloud, cage, method, surface)
+    return [baseline.deform(positions).cloud for positions in frames]
 
 
 class _BaselineDeformer:
-    """One embedding of another paper, made once and used for every frame."""
+    """One baseline method, whose embedding is built once and used for every frame."""
 
     def __init__(
         self, cloud: GaussianCloud, cage: CageLocator, method: DeformationMethod, surface: BoundSurface | None
@@ -111,30 +116,30 @@ class _BaselineDeformer:
                 self._faces = wp.array(faces, dtype=wp.vec3i)
                 self._rest = wp.array(vertices, dtype=Vec3)
                 self._vertices = None if surface is None else cage.locate(self._rest)
-                searched = None if surface is None else cage.local_surface(vertices, faces)
-                self._face_from_gaussian = cage.nearest_faces(cloud.means, searched)
+                searched_surface = None if surface is None else cage.local_surface(vertices, faces)
+                self._face_from_gaussian = cage.nearest_faces(cloud.means, searched_surface)
             elif method is DeformationMethod.LOCAL_TETRAHEDRON:
                 corners = empty(4 * cloud.count, Vec3, cloud.device)
                 self._launch(
                     kernels.local_tetrahedron_kernel,
-                    [cloud.means, cloud.rotations, cloud.log_scales, LOCAL_REACH, self._least_length],
+                    [cloud.means, cloud.rotations, cloud.log_scales, LOCAL_REACH, self._min_length],
                     [corners],
                 )
                 self._corners: PointEmbedding = cage.locate(corners)
             else:
-                self._carrier = CageMaps(cage)
+                self._cage_maps = CageMaps(cage)
                 means = wp.array(cloud.means.numpy().astype(np.float64), dtype=Vec3)
                 self._means: PointEmbedding = cage.locate(means)
 
     @property
-    def _least_length(self) -> float:
+    def _min_length(self) -> float:
         return 1e-6 * self._cage.extent
 
     def _launch(self, kernel: Any, inputs: Sequence[object], outputs: Sequence[object]) -> None:
         launch_rows(kernel, self._cloud.count, inputs=inputs, outputs=outputs, device=self._cloud.device)
 
     def deform(self, positions: wp.array | np.ndarray) -> DeformedGaussians:
-        """The cloud for node ``positions``, in arrays of its own."""
+        """Return the cloud for node ``positions``, in newly allocated arrays."""
         rest = self._cloud
         uploaded = node_positions(positions, len(self._cage.mesh.nodes), rest.device)
         cloud = GaussianCloud(
@@ -144,21 +149,21 @@ class _BaselineDeformer:
             opacity_logits=rest.opacity_logits,
             sh=wp.clone(rest.sh),
         )
-        turns = empty(rest.count, wp.vec4, rest.device)
-        outputs = [cloud.means, cloud.rotations, cloud.log_scales, turns]
+        polar_rotations = empty(rest.count, wp.vec4, rest.device)
+        outputs = [cloud.means, cloud.rotations, cloud.log_scales, polar_rotations]
         shape = [rest.rotations, rest.log_scales]
         if self._method is DeformationMethod.SURFACE:
             corners = uploaded if self._vertices is None else self._vertices.interpolate(uploaded)
             bound = [self._rest, corners, self._faces, self._face_from_gaussian]
-            self._launch(kernels.carry_surface_kernel, [rest.means, *shape, *bound], outputs)
+            self._launch(kernels.deform_with_surface_kernel, [rest.means, *shape, *bound], outputs)
         elif self._method is DeformationMethod.LOCAL_TETRAHEDRON:
             corners = self._corners.interpolate(uploaded)
-            inputs = [*shape, corners, LOCAL_REACH, self._least_length]
-            self._launch(kernels.carry_local_tetrahedron_kernel, inputs, outputs)
+            inputs = [*shape, corners, LOCAL_REACH, self._min_length]
+            self._launch(kernels.deform_with_tetrahedron_kernel, inputs, outputs)
         else:
             means = self._means
-            inputs = [*shape, uploaded, means.nodes, means.weights, means.tets, self._carrier.update(uploaded)]
-            self._launch(kernels.carry_gradient_kernel, inputs, outputs)
+            inputs = [*shape, uploaded, means.nodes, means.weights, means.tets, self._cage_maps.update(uploaded)]
+            self._launch(kernels.deform_with_gradient_kernel, inputs, outputs)
         if rest.sh_degree:
-            self._launch(rotate_sh_kernel, [turns, rest.sh, rest.sh_degree], [cloud.sh])
-        return DeformedGaussians(cloud, turns)
+            self._launch(rotate_sh_kernel, [polar_rotations, rest.sh, rest.sh_degree], [cloud.sh])
+        return DeformedGaussians(cloud, polar_rotations)

@@ -1,4 +1,4 @@
-"""Carry Gaussians with their cage (Eq. 14, 15) and measure how much the motion bends each (Eq. 16)."""
+"""Deform Gaussians with their cage (Eq. 14, 15) and measure how much the motion bends each (Eq. 16)."""
 
 from __future__ import annotations
 
@@ -20,55 +20,52 @@ from egs_warp.launching import empty, launch_rows, zeros
 from egs_warp.precision import Vec3
 
 MAX_STRETCH = 1.5
-"""An arm may be stretched this many times more than the matter at its two ends; beyond that it would be a spike."""
+"""Largest stretch of an arm relative to the material at its two ends; more would show as a spike."""
 
-LEAST_BRIDGE = 1e-3
-"""Arms shorter than this, over the cage's diagonal, are never carried by a difference of positions:
-float32 is too coarse.
-"""
+MIN_BRIDGE = 1e-3
+"""Shortest arm, relative to the cage's diagonal, that is deformed by a difference of positions; below that float32 is
+too coarse."""
 
 
 @dataclass(frozen=True)
 class DeformedGaussians:
-    """Gaussians as the cage has carried them."""
+    """Gaussians deformed by the cage."""
 
     cloud: GaussianCloud
-    """(n,) at their new places. ``opacity_logits`` is the rest cloud's own array."""
+    """(n,) deformed Gaussians. ``opacity_logits`` is the rest cloud's own array."""
     rotations: wp.array
-    """(n,) vec4, unit quaternions w, x, y, z:
-    the rotation R_polar of F by which each Gaussian and its colour were turned.
-    """
+    """(n,) vec4, unit quaternions w, x, y, z: the rotation R_polar of F, which rotates each Gaussian and its colour."""
 
 
 @dataclass(frozen=True)
 class BendMeasure:
-    """How far a motion is from affine across each Gaussian: the most of each over all frames given."""
+    """Deviation of a motion from affine across each Gaussian: the maximum of each measure over all frames."""
 
     bend_degrees: np.ndarray
-    """(n,) theta of Eq. (16)."""
+    """(n,) deg, theta of Eq. (16)."""
     curl_degrees: np.ndarray
-    """(n, 3) angle between the two ends of each axis: by how much the motion bends or twists along it."""
+    """(n, 3) deg, angle between the two ends of each axis: bending or twisting along it."""
     fit_error: np.ndarray
-    """(n, 3) metres: what the affine F leaves out along each axis, at one standard deviation from the mean."""
+    """(n, 3) m, displacement that the affine F leaves out along each axis, at one standard deviation from the mean."""
 
 
 class CageMaps:
-    """The map of every tetrahedron of a cage, frame after frame, in the same arrays."""
+    """Affine map of every tetrahedron of a cage; each update overwrites the same arrays."""
 
     def __init__(self, cage: CageLocator) -> None:
         self._cage = cage
         tet_count = len(cage.mesh.tets)
         with wp.ScopedDevice(cage.device):
             self._rest = wp.array(cage.mesh.nodes, dtype=Vec3)
-            self._carried = cage_maps.CageMaps()
-            self._carried.maps = empty(3 * tet_count, wp.vec4, cage.device)
-            self._carried.frames = empty(2 * tet_count, wp.vec4, cage.device)
+            self._maps = cage_maps.CageMaps()
+            self._maps.maps = empty(3 * tet_count, wp.vec4, cage.device)
+            self._maps.frames = empty(2 * tet_count, wp.vec4, cage.device)
 
     def update(self, positions: wp.array | np.ndarray) -> Any:
-        """A ``CarriedCage`` for node ``positions``, as for ``Deformer.deform``."""
+        """Return the kernels' ``CageMaps`` for node ``positions``, as for ``Deformer.deform``."""
         cage, device = self._cage, self._cage.device
         launch_rows(
-            cage_maps.carry_tets_kernel,
+            cage_maps.update_maps_kernel,
             len(cage.mesh.tets),
             inputs=[
                 node_positions(positions, len(cage.mesh.nodes), device),
@@ -76,25 +73,25 @@ class CageMaps:
                 cage.tets,
                 cage.inverse_edges,
             ],
-            outputs=[self._carried],
+            outputs=[self._maps],
             device=device,
         )
-        return self._carried
+        return self._maps
 
 
 class Deformer:
-    """Carries one cloud, frame after frame, into the same output arrays."""
+    """Deforms one cloud, frame after frame, into the same output arrays."""
 
     def __init__(self, cloud: GaussianCloud, embedding: GaussianEmbedding, *, max_stretch: float = MAX_STRETCH) -> None:
-        # Kernels read whole rows at once.
+        # Kernels read whole rows in one load.
         self.rest = cloud = replace(cloud, rotations=cloud.rotations.contiguous(), sh=cloud.sh.contiguous())
         self.embedding = embedding
         self.max_stretch = max_stretch
         self._degree = cloud.sh_degree
-        self._carrier = CageMaps(embedding.cage)
+        self._cage_maps = CageMaps(embedding.cage)
         with wp.ScopedDevice(cloud.device):
             self.plan = cage_maps.ArmPlan()
-            """What each Gaussian asks of the cage, the same in every frame."""
+            """Frame-independent plan of the arms of each Gaussian."""
             self.plan.mean_tets = empty(cloud.count, wp.int32, cloud.device)
             self.plan.end_tets = empty((6, cloud.count), wp.int32, cloud.device)
             self.plan.inside_fractions = empty((6, cloud.count), wp.float32, cloud.device)
@@ -122,16 +119,17 @@ class Deformer:
                 embedding.arms,
                 cage.tets,
                 cage.inverse_edges,
-                LEAST_BRIDGE * cage.extent,
+                MIN_BRIDGE * cage.extent,
             ],
             outputs=[self.plan],
             device=cloud.device,
         )
 
     def deform(self, positions: wp.array | np.ndarray) -> DeformedGaussians:
-        """The cloud for node positions (N, 3) or (N,) vec3d, metres (Eq. 14, 15); the next call overwrites it."""
+        """Deform the cloud to node positions (N, 3) or (N,) vec3d, m (Eq. 14, 15); the next call overwrites the
+        result."""
         deformed, cloud, rest = self._deformed, self._deformed.cloud, self.rest
-        inputs = self._carrying_inputs(positions)
+        inputs = self._kernel_inputs(positions)
         outputs = [cloud.means, cloud.rotations, cloud.log_scales, deformed.rotations]
         if rest.device.is_cuda and self._degree == 3:
             kernels_cuda.deform_with_colour(rest.count, [*inputs, rest.sh], [*outputs, cloud.sh], rest.device)
@@ -148,7 +146,7 @@ class Deformer:
         return deformed
 
     def measure_bend(self, frames: Iterable[wp.array | np.ndarray]) -> BendMeasure:
-        """The most that any of ``frames``, each as ``positions`` of ``deform``, bends each Gaussian (Eq. 16)."""
+        """Return the maximum bend of each Gaussian over ``frames``, each as ``positions`` of ``deform`` (Eq. 16)."""
         count = self.rest.count
         bend = zeros(count, wp.float32, self.rest.device)
         curl, error = (zeros(count, wp.vec3, self.rest.device) for _ in range(2))
@@ -156,20 +154,20 @@ class Deformer:
             launch_rows(
                 kernels.measure_bend_kernel,
                 count,
-                inputs=[*self._carrying_inputs(positions), self.embedding.arms],
+                inputs=[*self._kernel_inputs(positions), self.embedding.arms],
                 outputs=[bend, curl, error],
                 device=self.rest.device,
             )
         return BendMeasure(bend.numpy(), curl.numpy(), error.numpy())
 
-    def _carrying_inputs(self, positions: wp.array | np.ndarray) -> list[object]:
+    def _kernel_inputs(self, positions: wp.array | np.ndarray) -> list[object]:
         rest = self.rest
         return [
             rest.means,
             rest.rotations,
             rest.log_scales,
             self.max_stretch,
-            self._carrier.update(positions),
+            self._cage_maps.update(positions),
             self.plan,
         ]
 
@@ -181,16 +179,22 @@ def deform(
     *,
     max_stretch: float = MAX_STRETCH,
 ) -> DeformedGaussians:
-    """Carry ``cloud`` with its cage to node ``positions``, (N, 3) or (N,) vec3d, metres (Eq. 14, 15).
+    """Deform ``cloud`` with its cage to node ``positions``, (N, 3) or (N,) vec3d, m (Eq. 14, 15).
 
-    For many frames keep a ``Deformer``, which reuses its output arrays. Raises ``UserError`` if the node count differs
-    from the cage's.
+    For many frames use a ``Deformer``, which reuses its output arrays.
+
+    Raises:
+        UserError: the node count differs from the cage's.
     """
     return Deformer(cloud, embedding, max_stretch=max_stretch).deform(positions)
 
 
 def node_positions(positions: wp.array | np.ndarray, node_count: int, device: wp.Device) -> wp.array:
-    """(N,) vec3d on ``device`` from (N, 3) or (N,) vec3d; raises ``UserError`` unless N is ``node_count``."""
+    """Return (N,) vec3d on ``device`` from (N, 3) or (N,) vec3d.
+
+    Raises:
+        UserError: N is not ``node_count``.
+    """
     if len(positions) != node_count:
         raise UserError(f"deformation: {len(positions)} node positions for a cage of {node_count} nodes")
     if isinstance(positions, wp.array) and positions.dtype == Vec3 and positions.device == device:

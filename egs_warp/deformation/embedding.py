@@ -1,4 +1,4 @@
-"""Embed points, and Gaussians with their axis end points, in a rest cage (Eq. 2, 3)."""
+"""Embedding of points, and of Gaussians with their axis end points, in a rest cage (Eq. 2, 3)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from egs_warp.precision import Mat33, Vec3, Vec4
 UNSCENTED_GAMMA = 3.0**0.5
 """Arm length in standard deviations for which the seven points integrate cubics over the Gaussian exactly."""
 
-LEAST_ARM = 1e-6
-"""Shortest arm over the cage's diagonal: even float64 differences over a scale of e^-16 would be mostly rounding."""
+MIN_ARM_LENGTH = 1e-6
+"""Shortest arm, relative to the cage's diagonal: even float64 differences over a scale of e^-16 would be mostly
+rounding."""
 
 
 @dataclass(frozen=True)
@@ -26,13 +27,13 @@ class PointEmbedding:
     """Points as fixed combinations of the corners of one tetrahedron each (Eq. 2)."""
 
     tets: wp.array
-    """(P,) int32, the containing tetrahedron, or the nearest one of a point outside all."""
+    """(P,) int32, containing tetrahedron, or the nearest one of a point outside all."""
     nodes: wp.array
-    """(P,) vec4i, its corners, node indices."""
+    """(P,) vec4i, node indices of its corners."""
     weights: wp.array
     """(P,) vec4d, barycentric weights of sum 1; negative ones extrapolate."""
     inside: wp.array
-    """(P,) bool, whether a tetrahedron contains the point."""
+    """(P,) bool, True if a tetrahedron contains the point."""
 
     @property
     def count(self) -> int:
@@ -40,7 +41,7 @@ class PointEmbedding:
         return self.tets.shape[0]
 
     def interpolate(self, positions: wp.array) -> wp.array:
-        """(P,) vec3d: the points for node positions (N,) vec3d (Eq. 2)."""
+        """Return the points (P,) vec3d for node positions (N,) vec3d (Eq. 2)."""
         device = device_of(self.tets)
         points = empty(self.count, Vec3, device)
         launch_rows(
@@ -54,16 +55,17 @@ class PointEmbedding:
 
 
 class CageLocator:
-    """Finds tetrahedra of one rest mesh by position: a bounding-volume hierarchy over them and one over the surface."""
+    """Locates points in the tetrahedra of a rest mesh, by bounding volume hierarchies over them and over the
+    surface."""
 
     def __init__(self, mesh: TetMesh, *, device: str | wp.Device | None = None) -> None:
         self.mesh = mesh
         self.device = wp.get_device(device)
         lower, upper = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-        # The hierarchies are float32: measure from the middle so that a far-off origin costs no digits.
+        # The hierarchies are float32: coordinates relative to the centre keep precision far from the origin.
         self._origin = 0.5 * (lower + upper)
         self.extent = float(np.linalg.norm(upper - lower))
-        """Diagonal of the bounding box, metres."""
+        """Diagonal of the bounding box, m."""
         local = mesh.nodes - self._origin
         corners = local[mesh.tets]
         edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
@@ -73,14 +75,14 @@ class CageLocator:
             self.tets = wp.array(mesh.tets, dtype=wp.vec4i)
             """(T,) vec4i node indices."""
             self.inverse_edges = wp.array(np.linalg.inv(edges), dtype=Mat33)
-            """(T,) mat33d, D_m^-1 of each rest tetrahedron, 1/metre."""
+            """(T,) mat33d, D_m^-1 of each rest tetrahedron, 1/m."""
             self._box_lowers = wp.array((corners.min(axis=1) - margin).astype(np.float32), dtype=wp.vec3)
             self._box_uppers = wp.array((corners.max(axis=1) + margin).astype(np.float32), dtype=wp.vec3)
             self._boxes = wp.Bvh(self._box_lowers, self._box_uppers)
         self._surface = self.local_surface(mesh.nodes, mesh.boundary_faces())
 
     def locate(self, points: wp.array) -> PointEmbedding:
-        """Embed finite ``points`` (P,) vec3d of this device; see ``embed_points``."""
+        """Embed finite ``points`` (P,) vec3d on this device, as ``embed_points``."""
         embedding = self._empty_embedding(points.shape[0])
         launch_rows(
             kernels.locate_points_kernel,
@@ -92,7 +94,8 @@ class CageLocator:
         return embedding
 
     def locate_gaussians(self, cloud: GaussianCloud, gamma: float) -> tuple[PointEmbedding, wp.array]:
-        """Embed the seven points of each Gaussian; see ``embed_gaussians``. Returns (7n rows, arm lengths (n, 6))."""
+        """Embed the seven points of each Gaussian, as ``embed_gaussians``; return 7n rows and the arm lengths (n, 6),
+        m."""
         embedding = self._empty_embedding(7 * cloud.count)
         arms = empty((cloud.count, 6), wp.float32, self.device)
         launch_rows(
@@ -103,7 +106,7 @@ class CageLocator:
                 cloud.rotations,
                 cloud.log_scales,
                 gamma,
-                LEAST_ARM * self.extent,
+                MIN_ARM_LENGTH * self.extent,
                 *self._search_inputs(),
             ],
             outputs=[embedding.tets, embedding.nodes, embedding.weights, embedding.inside, arms],
@@ -112,8 +115,10 @@ class CageLocator:
         return embedding, arms
 
     def nearest_faces(self, points: wp.array, surface: wp.Mesh | None = None) -> wp.array:
-        """(P,) int32, the triangle nearest to each of ``points`` (P,) vec3, in float32: a row of
-        ``mesh.boundary_faces()``, or of another ``surface`` that ``local_surface`` has made.
+        """Find the triangle nearest to each of ``points`` (P,) vec3, in float32.
+
+        Returns:
+            (P,) int32, rows of ``mesh.boundary_faces()``, or of ``surface`` from ``local_surface`` if given.
         """
         faces = empty(points.shape[0], wp.int32, self.device)
         launch_rows(
@@ -126,7 +131,8 @@ class CageLocator:
         return faces
 
     def local_surface(self, vertices: np.ndarray, faces: np.ndarray) -> wp.Mesh:
-        """Triangles ``faces`` (F, 3) of ``vertices`` (V, 3), metres, to be searched from the middle of the cage."""
+        """Return triangles ``faces`` (F, 3) of ``vertices`` (V, 3), m, as a Warp mesh relative to the centre of the
+        cage."""
         with wp.ScopedDevice(self.device):
             return wp.Mesh(
                 points=wp.array((vertices - self._origin).astype(np.float32), dtype=wp.vec3),
@@ -156,13 +162,14 @@ class CageLocator:
 
 
 def embed_points(mesh: TetMesh, points: np.ndarray, *, device: str | wp.Device | None = None) -> PointEmbedding:
-    """Barycentric weights of ``points`` (P, 3), metres, in the tetrahedra of the rest ``mesh`` (Eq. 2).
+    """Embed ``points`` (P, 3), m, in the tetrahedra of the rest ``mesh`` (Eq. 2).
 
     A point on a shared face belongs to the tetrahedron of lowest index. A point outside every tetrahedron is
-    extrapolated from the nearest one by true distance; where several are equally near, from the one whose least weight
-    is largest.
+    extrapolated from the nearest one by true distance; at equal distance, from the one whose smallest weight is
+    largest.
 
-    Raises ``UserError`` for a point that is not finite.
+    Raises:
+        UserError: a point is not finite.
     """
     points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
@@ -180,9 +187,9 @@ class GaussianEmbedding:
     """7n rows. Row 7 i is the mean of Gaussian i, rows 7 i + 1 .. 3 the ends m + arm r_j of its axes, rows 7 i + 4 .. 6
     the ends m - arm r_j."""
     arms: wp.array
-    """(n, 6) float32, metres: arm lengths of the three ends of T+, then of T-; gamma s_j, or less where shortened."""
+    """(n, 6) float32, m, arm lengths of the three ends of T+, then of T-; gamma s_j, or less where shortened."""
     cage: CageLocator
-    """The rest cage."""
+    """Rest cage."""
     gamma: float
     """Arm length in standard deviations, before shortening."""
 
@@ -197,10 +204,10 @@ def embed_gaussians(
 ) -> GaussianEmbedding:
     """Embed the mean and the six axis ends m +- ``gamma`` s_j r_j of every Gaussian in the rest cage (Eq. 3).
 
-    The paper's gamma is 3. At sqrt 3 the seven points are the cubature of degree three for the Gaussian's mass, which
-    follows the kinks of a coarse cage better (measured in benchmarks/table1.py).
-    Where an end's barycentric weights would leave [-1, 2] its arm is shortened until they do not. Pass a
-    ``CageLocator`` to embed several clouds in one cage.
+    Where the barycentric weights of an end would leave [-1, 2], its arm is shortened until they do not. Pass a
+    ``CageLocator`` to embed several clouds in one cage. The paper's gamma is 3. At sqrt 3 the seven points are the
+    degree-three cubature of the Gaussian's mass, which follows the kinks of a coarse cage better (measured in
+    benchmarks/table1.py).
     """
     cage = mesh if isinstance(mesh, CageLocator) else CageLocator(mesh, device=cloud.device)
     points, arms = cage.locate_gaussians(cloud, gamma)

@@ -1,4 +1,4 @@
-"""A whole cloud in another frame: its Gaussians and their colours turned, moved and scaled as one."""
+"""Similarity transform of a whole cloud into another frame, colours included."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egs_warp.launching import launch_rows
 
 
 def to_body_frame(cloud: GaussianCloud, frame: BodyFrame) -> GaussianCloud:
-    """The capture's ``cloud`` in ``frame``, in the order of its own; looks the same from there."""
+    """Return the capture's ``cloud`` in ``frame``, in the same order; it looks the same from there."""
     turn = Rotation.from_matrix(frame.axes)
     rotations = cloud.rotations.numpy().astype(np.float64)
     moved = GaussianCloud.from_numpy(

@@ -1,4 +1,4 @@
-"""Split bent Gaussians in the rest configuration, so that their parts can bend (Eq. 16, 17)."""
+"""Splitting of bent Gaussians in the rest configuration, so that their parts can bend (Eq. 16, 17)."""
 
 from __future__ import annotations
 
@@ -16,50 +16,51 @@ from egs_warp.kernels.deformation.splitting import split_kernel
 from egs_warp.launching import empty, launch_rows
 
 MIN_OPACITY = 2.0 / 255.0
-"""A Gaussian that never exceeds this cannot be seen to be wrong."""
+"""Opacity up to which a Gaussian is not split: its error is invisible."""
 
 SPLIT_DEGREES = 4.0
-"""Ends of an axis turned against each other by less than this are left alone. With arms of sqrt 3 standard deviations;
-the paper's 15 degrees at 3 are 9 here, which gave 0.01 to 0.02 dB less on Table 1's chair, and more where finer misfits
-split."""
+"""Smallest angle, deg, between the two ends of an axis at which it is split, for arms of sqrt 3 standard deviations.
+The paper's 15 degrees at 3 are 9 here, which gave 0.01 to 0.02 dB less on Table 1's chair, and more where finer fit
+errors are split."""
 
 MIN_FIT_ERROR = 7e-4
-"""Over the cage's diagonal: an affine motion that is wrong by less than this is good enough. Less would follow a motion
-better still (benchmarks/table1.py), but of a fuzzy capture so many would split that 45 dB at rest are missed."""
+"""Smallest fit error that is split, relative to the cage's diagonal. A smaller value would follow a motion better still
+(benchmarks/table1.py), but would split enough Gaussians of a fuzzy capture to fall below 45 dB at rest."""
 
 
 class SplitRule(Enum):
-    """Which Gaussians split, along which axis, and into what. Every rule keeps mass, mean and covariance exactly."""
+    """Rule for the Gaussians to split, the axis, and the children. Every rule keeps mass, mean and covariance
+    exactly."""
 
     MEASURED = "measured"
     """Three children at -s, 0, s with standard deviation s/sqrt 2 (mixture weights 1/4, 1/2, 1/4), with the opacities
-    of least image error; along the axis whose misfit is largest, where that misfit can be seen."""
+    of least image error; along the axis with the largest fit error, where that error is visible."""
     PAPER = "paper"
     """Two children of half-normal mean and variance (Eq. 17 with kappa = gamma sqrt(pi/2)), across the longest axis."""
 
 
 @dataclass(frozen=True)
 class SplitGaussians:
-    """A cloud after splitting, still in the rest configuration, with embeddings of its own."""
+    """Cloud after splitting, still in the rest configuration, with its own embedding."""
 
     cloud: GaussianCloud
     """(n',) the Gaussians that were not split, in their old order, then the children."""
     embedding: GaussianEmbedding
-    """(n',)"""
+    """Embedding of the n' Gaussians."""
     parents: np.ndarray
-    """(n',) int32, index of each in the cloud that was split first."""
+    """(n',) int32, index of each in the first cloud."""
     depths: np.ndarray
-    """(n',) int8, how many splits led to each."""
+    """(n',) int8, number of splits that led to each."""
 
     @property
     def split_count(self) -> int:
-        """How many Gaussians of the first cloud have been replaced by children."""
+        """Return the number of Gaussians of the first cloud that were replaced by children."""
         return len(np.unique(self.parents[self.depths > 0]))
 
 
-# Opacity of one Gaussian, and of the outer and the middle of its three children, for which the pictures of parent and
+# Opacity of one Gaussian, and of the outer and the middle of its three children, for which the images of parent and
 # children differ least (root mean square over viewing directions spread evenly over the sphere); 1.5 to 1.9 % of the
-# opacity remain. benchmarks/splitting.py finds the table again.
+# opacity remain. benchmarks/splitting.py recomputes the table.
 _OPACITIES = np.array(
     [
         (0.0, 0.0, 0.0),
@@ -85,16 +86,15 @@ _OPACITIES = np.array(
 
 
 def child_layout(rule: SplitRule) -> tuple[np.ndarray, float]:
-    """Offsets (k,) of the children, and their standard deviation,
-    both in standard deviations of the parent (Eq. 17).
-    """
+    """Return the offsets (k,) of the children and their standard deviation, both in standard deviations of the parent
+    (Eq. 17)."""
     if rule is SplitRule.PAPER:
         return np.array([-1.0, 1.0]) * np.sqrt(2.0 / np.pi), float(np.sqrt(1.0 - 2.0 / np.pi))
     return np.array([-1.0, 0.0, 1.0]), float(np.sqrt(0.5))
 
 
 def child_opacities(opacities: np.ndarray, rule: SplitRule) -> np.ndarray:
-    """(n, k) peak opacities of the children of Gaussians with peak opacity (n,), 0 to 1."""
+    """Return the peak opacities (n, k) of the children of Gaussians with peak ``opacities`` (n,), 0 to 1."""
     if rule is SplitRule.PAPER:
         # Half the mass each; the peak of a narrower Gaussian of the same mass is higher.
         peak = np.minimum(opacities / (2.0 * np.sqrt(1.0 - 2.0 / np.pi)), 0.99)
@@ -117,13 +117,21 @@ def split_bent(
     max_depth: int = 3,
     max_count: int | None = None,
 ) -> SplitGaussians:
-    """Replace each Gaussian that ``bend`` marks by its children, once (Eq. 17). Everything stays at rest.
+    """Replace each Gaussian that ``bend`` marks by its children, once (Eq. 17), in the rest configuration.
 
-    ``MEASURED`` marks an axis whose ends are turned against each other by more than ``threshold_degrees``, if the
-    affine motion is wrong by more than ``min_error`` metres at one standard deviation (default: ``LEAST_MISFIT`` of the
-    cage's diagonal). ``PAPER`` marks theta of Eq. (16) alone. ``parents`` and ``depths`` (n,) are those of an earlier
-    call; a Gaussian of ``max_depth`` is not split again. Where there would be more than ``max_count`` Gaussians, those
-    with the largest misfit are split.
+    ``MEASURED`` marks an axis whose ends are rotated relative to each other by more than ``threshold_degrees``, if the
+    fit error is larger than ``min_error``. ``PAPER`` marks by theta of Eq. (16) alone.
+
+    Args:
+        cloud: n Gaussians.
+        embedding: their embedding.
+        bend: measured bend of each.
+        threshold_degrees: smallest angle to split.
+        min_error: m, at one standard deviation; default: ``MIN_FIT_ERROR`` times the cage's diagonal.
+        rule: rule to apply.
+        parents, depths: (n,), those of an earlier call.
+        max_depth: a Gaussian of this depth is not split again.
+        max_count: largest number of Gaussians; if it would be exceeded, those with the largest fit error are split.
     """
     count = cloud.count
     parents = np.arange(count, dtype=np.int32) if parents is None else parents
@@ -133,28 +141,28 @@ def split_bent(
         axes = np.argmax(cloud.log_scales.numpy(), axis=1)
         marked = bend.bend_degrees > threshold_degrees
     else:
-        least = MIN_FIT_ERROR * embedding.cage.extent if min_error is None else min_error
+        error_limit = MIN_FIT_ERROR * embedding.cage.extent if min_error is None else min_error
         error = np.where(bend.curl_degrees > threshold_degrees, bend.fit_error, 0.0)
         axes = np.argmax(error, axis=1)
-        marked = error.max(axis=1) > least
+        marked = error.max(axis=1) > error_limit
     marked &= (depths < max_depth) & (opacities > MIN_OPACITY)
     offsets, shrink = child_layout(rule)
     chosen = np.flatnonzero(marked)
     if max_count is not None:
-        room = max(0, (max_count - count) // (len(offsets) - 1))
-        worst = np.argsort(-bend.fit_error.max(axis=1)[chosen], kind="stable")[:room]
+        capacity = max(0, (max_count - count) // (len(offsets) - 1))
+        worst = np.argsort(-bend.fit_error.max(axis=1)[chosen], kind="stable")[:capacity]
         chosen = np.sort(chosen[worst])
     if len(chosen) == 0:
         return SplitGaussians(cloud, embedding, parents, depths)
-    kept = np.setdiff1d(np.arange(count), chosen)
-    sources = np.concatenate([kept, np.repeat(chosen, len(offsets))]).astype(np.int32)
+    unsplit = np.setdiff1d(np.arange(count), chosen)
+    sources = np.concatenate([unsplit, np.repeat(chosen, len(offsets))]).astype(np.int32)
     split_axes = np.full(len(sources), -1, dtype=np.int32)
-    split_axes[len(kept) :] = np.repeat(axes[chosen], len(offsets))
+    split_axes[len(unsplit) :] = np.repeat(axes[chosen], len(offsets))
     row_offsets = np.zeros(len(sources), dtype=np.float32)
-    row_offsets[len(kept) :] = np.tile(offsets, len(chosen))
+    row_offsets[len(unsplit) :] = np.tile(offsets, len(chosen))
     logits = cloud.opacity_logits.numpy()[sources]
     peaks = np.clip(child_opacities(opacities[chosen], rule), 1e-6, 1.0 - 1e-6).ravel()
-    logits[len(kept) :] = np.log(peaks / (1.0 - peaks))
+    logits[len(unsplit) :] = np.log(peaks / (1.0 - peaks))
     children = _gather(cloud, sources, split_axes, row_offsets, shrink, logits)
     return SplitGaussians(
         children,
@@ -175,10 +183,14 @@ def split_for_motion(
     max_depth: int = 3,
     max_growth: float = 4.0,
 ) -> SplitGaussians:
-    """Split whatever any of ``frames`` (node positions, as for ``deform``) bends, until it is fine enough everywhere.
+    """Split all Gaussians that any of ``frames`` bends, until none is bent too much.
 
-    A motion that is known in advance is split for once, before its first frame, so that nothing can pop. A few frames
-    that hold the extremes are enough. At most ``max_growth`` times as many Gaussians come out. See ``split_bent``.
+    A motion known in advance is split for once, before its first frame, so that no Gaussian changes during it. A few
+    frames with the extremes are enough. See ``split_bent``.
+
+    Args:
+        frames: node positions, as for ``deform``.
+        max_growth: largest ratio of the number of Gaussians after and before.
     """
     result = SplitGaussians(
         cloud, embedding, np.arange(cloud.count, dtype=np.int32), np.zeros(cloud.count, dtype=np.int8)

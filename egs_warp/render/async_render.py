@@ -1,4 +1,4 @@
-"""Pictures that a GPU makes beside what else it does."""
+"""Asynchronous rendering: a GPU renders images concurrently with other work."""
 
 from __future__ import annotations
 
@@ -14,43 +14,45 @@ from egs_warp.render.compositing import PendingImage
 
 
 class AsyncRenderer:
-    """Pictures of one size, each begun and taken later, on a stream of their own; a CPU makes each as it is begun."""
+    """Renders images of one size, each submitted and fetched later, on a stream of its own; on a CPU ``submit``
+    blocks."""
 
     def __init__(self, width: int, height: int, device: wp.Device) -> None:
         shape = (height, width, 3)
-        self._levels = self._here = empty(shape, wp.uint8, device)
+        self._levels = self._host = empty(shape, wp.uint8, device)
         self._stream: wp.Stream | None = None
         if device.is_cuda:
-            self._stream, self._sent = wp.Stream(device), wp.Event(device)
-            self._here = empty(shape, wp.uint8, "cpu", pinned=True)
-        self._begun: PendingImage | None = None
+            self._stream, self._downloaded = wp.Stream(device), wp.Event(device)
+            self._host = empty(shape, wp.uint8, "cpu", pinned=True)
+        self._pending: PendingImage | None = None
 
     def stream_context(self) -> AbstractContextManager[Any]:
-        """A context of what goes on their stream, which waits for nothing: what pictures are made of is made there, or
-        is there already."""
+        """Return a context that queues work on the renderer's stream. It does not synchronise with the caller's stream:
+        everything an image depends on must be queued on this stream or already be finished."""
         return nullcontext() if self._stream is None else wp.ScopedStream(self._stream, sync_enter=False)
 
     def submit(self, draw: Callable[[], PendingImage]) -> None:
-        """What ``draw`` begins; the one before has been taken."""
+        """Queue the image of ``draw`` and its download; the previous result must have been fetched."""
         with self.stream_context():
-            self._begun = draw()
-            self._send(self._begun)
+            self._pending = draw()
+            self._download(self._pending)
 
     def result(self) -> np.ndarray | None:
-        """(H, W, 3) uint8 of what was begun, in memory that the next one overwrites; None if nothing was."""
-        begun, self._begun = self._begun, None
-        if begun is None:
+        """Wait for the submitted image; return it as (H, W, 3) uint8 in memory that the next one overwrites, or None if
+        there is none."""
+        pending, self._pending = self._pending, None
+        if pending is None:
             return None
         with self.stream_context():
-            settled = begun.result()
-            if settled is not begun:
-                self._send(settled)
+            finished = pending.result()
+            if finished is not pending:
+                self._download(finished)
         if self._stream is not None:
-            wp.synchronize_event(self._sent)
-        return self._here.numpy()
+            wp.synchronize_event(self._downloaded)
+        return self._host.numpy()
 
-    def _send(self, begun: PendingImage) -> None:
-        begun.image.quantise(self._levels)
+    def _download(self, pending: PendingImage) -> None:
+        pending.image.quantise(self._levels)
         if self._stream is not None:
-            wp.copy(self._here, self._levels)
-            self._stream.record_event(self._sent)
+            wp.copy(self._host, self._levels)
+            self._stream.record_event(self._downloaded)

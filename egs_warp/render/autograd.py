@@ -1,4 +1,5 @@
-"""The renderer as a function of torch tensors, with gradients. The only module of ``render`` that imports torch."""
+"""The renderer as a differentiable function of torch tensors. This is the only module of ``render`` that imports
+torch."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ _ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
 @dataclass(frozen=True)
 class TorchImage:
-    """One differentiable picture; the tensors share memory with the renderer's arrays."""
+    """Differentiable image; the tensors share memory with the renderer's arrays."""
 
     colour: torch.Tensor
     """(H, W, 3) float32."""
@@ -36,10 +37,10 @@ class TorchImage:
     depth: torch.Tensor
     """(H, W) float32, expected z-depth divided by alpha."""
     slot_end: wp.array
-    """(n,) int64: number of tiles reached by the Gaussians up to and including this one."""
+    """(n,) int64, cumulative number of tiles reached by the Gaussians, inclusive."""
 
     def visible(self) -> torch.Tensor:
-        """(n,) bool: Gaussians that reach a tile."""
+        """Return (n,) bool, True for Gaussians that reach a tile."""
         slot_end = wp.to_torch(self.slot_end)
         return torch.diff(slot_end, prepend=slot_end.new_zeros(1)) > 0
 
@@ -60,32 +61,39 @@ def render_torch(
     mask: np.ndarray | None = None,
     threads: int | None = None,
 ) -> TorchImage:
-    """Picture of Gaussians given as float32 tensors (n, 3), (n, 4), (n, 3), (n,), (n, K, 3), all on one device.
+    """Render Gaussians given as float32 tensors (n, 3), (n, 4), (n, 3), (n,), (n, K, 3), all on one device.
 
-    Gradients flow to all five, and to the camera's pose where ``rotation`` (3, 3) and ``translation`` (3,) are given
-    (they then replace the camera's; the gradient by ``rotation`` is by its nine entries, taken as free). ``screen``
-    (n, 2), any values, receives the gradient by the screen positions in pixels, which densification by splitting
-    watches. ``mask`` is that of ``render_gaussians``; no gradient comes from tiles that it leaves out. On CUDA the work
-    is queued on torch's current stream. Raises ``UserError`` as ``render_gaussians`` does.
+    Gradients flow to all five, and to the camera pose if it is given as tensors. On CUDA the work is queued on torch's
+    current stream.
+
+    Args:
+        rotation: (3, 3), replaces the camera's; its gradient is by the nine entries, taken as independent.
+        translation: (3,), replaces the camera's; given together with ``rotation`` or not at all.
+        screen: (n, 2), any values; receives the gradient by the screen positions in pixels, which densification uses.
+        background, antialiased, threads: as for ``render_gaussians``.
+        mask: as for ``render_gaussians``; tiles that it leaves out contribute no gradient.
+
+    Raises:
+        UserError: as ``render_gaussians``, and for tensors of another shape, type or device.
     """
     attributes = (means, rotations, log_scales, opacity_logits, sh)
-    _refuse_misfits(*attributes)
+    _check_tensors(*attributes)
     if (rotation is None) != (translation is None):
         raise UserError("render: give the pose's rotation and translation together, or neither")
-    # A GPU does not ask for threads, and to count them is a call of the system.
+    # A GPU does not use threads, and counting them is a system call.
     threads = 1 if means.is_cuda else threads or available_threads()
     task = _Task(camera, background, antialiased, mask, threads)
-    given = (*attributes, rotation, translation, screen)
-    # What records nothing needs none of autograd's ways.
-    if torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in given):
-        colour, alpha, depth = _Render.apply(*given, task)
+    inputs = (*attributes, rotation, translation, screen)
+    # Without gradients, skip the overhead of autograd.
+    if torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in inputs):
+        colour, alpha, depth = _Render.apply(*inputs, task)
         assert task.slot_end is not None
         return TorchImage(colour, alpha, depth, task.slot_end)
-    (colour, alpha, depth), done = _draw(attributes, rotation, translation, task)
-    return TorchImage(colour, alpha, depth, done.projected.slot_end)
+    (colour, alpha, depth), forward_pass = _draw(attributes, rotation, translation, task)
+    return TorchImage(colour, alpha, depth, forward_pass.projected.slot_end)
 
 
-def _refuse_misfits(*attributes: torch.Tensor) -> None:
+def _check_tensors(*attributes: torch.Tensor) -> None:
     """Raise ``UserError`` for a tensor of another shape, type or device than ``render_torch`` takes."""
     means, _, _, _, sh = attributes
     count, device = means.shape[0], means.device
@@ -100,7 +108,7 @@ def _refuse_misfits(*attributes: torch.Tensor) -> None:
 
 @dataclass
 class _Task:
-    """What goes into and comes out of ``_Render`` besides tensors."""
+    """Arguments of ``_Render`` other than tensors, and ``slot_end``, a further output."""
 
     camera: Camera
     background: Any
@@ -112,10 +120,10 @@ class _Task:
 
 @dataclass(frozen=True)
 class _Forward:
-    """What the backward pass needs of the forward pass."""
+    """Results of the forward pass that the backward pass needs."""
 
     owners: tuple[torch.Tensor, ...]
-    """Of the cloud's memory and of the picture's."""
+    """Tensors that own the memory of the cloud and of the image."""
     cloud: GaussianCloud
     view: Any
     projected: ProjectedGaussians
@@ -124,26 +132,26 @@ class _Forward:
 
 
 def torch_stream(device: torch.device) -> AbstractContextManager[Any]:
-    """Warp works on the stream that torch works on, where there are streams."""
+    """Return a context in which Warp uses torch's current stream, on devices with streams."""
     if device.type != "cuda":
         return nullcontext()
     return wp.ScopedStream(warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
 
 
 def _cloud_of(tensors: tuple[torch.Tensor, ...]) -> GaussianCloud:
-    """The contiguous ``tensors`` as a capture without a copy; ``wp.from_torch`` would take twice as long."""
-    places = tuple(tensor.data_ptr() for tensor in tensors)
-    return _cloud_at(places, tensors[0].shape[0], tensors[4].shape[1], wp.device_from_torch(tensors[0].device).alias)
+    """Return the contiguous ``tensors`` as a cloud without a copy; ``wp.from_torch`` would take twice as long."""
+    addresses = tuple(tensor.data_ptr() for tensor in tensors)
+    return _cloud_at(addresses, tensors[0].shape[0], tensors[4].shape[1], wp.device_from_torch(tensors[0].device).alias)
 
 
 @lru_cache(maxsize=16)
-def _cloud_at(places: tuple[int, ...], count: int, coefficients: int, device: str) -> GaussianCloud:
-    """The capture whose attributes begin at these addresses; it owns no memory, so it may be made once for all."""
+def _cloud_at(addresses: tuple[int, ...], count: int, coefficients: int, device: str) -> GaussianCloud:
+    """Return the cloud whose attributes start at these addresses. It owns no memory, so it can be cached."""
 
-    def wrapped(place: int, dtype: Any, *shape: int) -> wp.array:
-        return wp.array(ptr=place, dtype=dtype, shape=shape, device=device)
+    def wrapped(address: int, dtype: Any, *shape: int) -> wp.array:
+        return wp.array(ptr=address, dtype=dtype, shape=shape, device=device)
 
-    means, rotations, log_scales, opacity_logits, sh = places
+    means, rotations, log_scales, opacity_logits, sh = addresses
     return GaussianCloud(
         means=wrapped(means, wp.vec3, count),
         rotations=wrapped(rotations, wp.vec4, count),
@@ -154,19 +162,19 @@ def _cloud_at(places: tuple[int, ...], count: int, coefficients: int, device: st
 
 
 @lru_cache(maxsize=64)
-def _array_at(place: int, dtype: Any, shape: tuple[int, ...], device: str) -> wp.array:
-    """The array that begins at this address; it owns no memory, as ``_cloud_at``."""
-    return wp.array(ptr=place, dtype=dtype, shape=shape, device=device)
+def _array_at(address: int, dtype: Any, shape: tuple[int, ...], device: str) -> wp.array:
+    """Return the array that starts at this address; like ``_cloud_at``, it owns no memory."""
+    return wp.array(ptr=address, dtype=dtype, shape=shape, device=device)
 
 
 _PIXEL_TYPES = (wp.vec3, wp.float32, wp.float32)
-"""Of a picture's colour, alpha and depth."""
+"""Element types of an image's colour, alpha and depth."""
 
 
 def _draw(
     attributes: Sequence[torch.Tensor], rotation: torch.Tensor | None, translation: torch.Tensor | None, task: _Task
 ) -> tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], _Forward]:
-    """Colour, alpha and depth, and what a backward pass needs of the way there."""
+    """Render; return colour, alpha and depth, and the results that a backward pass needs."""
     camera = task.camera
     if rotation is not None and translation is not None:
         camera = replace(
@@ -184,7 +192,7 @@ def _draw(
         with translate_out_of_memory(cloud, camera):
             projected = project(cloud, view, antialiased=task.antialiased, threads=threads)
             shape = (camera.height, camera.width)
-            # torch's memory, for to make a tensor of Warp's takes as long as three launches.
+            # Memory of torch: converting a Warp array to a tensor takes as long as three launches.
             picture = (
                 torch.empty((*shape, 3), dtype=torch.float32, device=device),
                 torch.empty(shape, dtype=torch.float32, device=device),
@@ -195,11 +203,13 @@ def _draw(
                 *(_array_at(t.data_ptr(), d, shape, alias) for t, d in zip(picture, _PIXEL_TYPES, strict=True))
             )
             behind = background_of(task.background, camera, cloud.device)
-            drawn = tile_mask_array(task.mask, camera, cloud.device)
-            begun = PendingImage(projected, view, background=behind, threads=threads, onto=onto, drawn=drawn).result()
-    # The picture's own tensors will hold this.
+            tile_mask = tile_mask_array(task.mask, camera, cloud.device)
+            pending = PendingImage(
+                projected, view, background=behind, threads=threads, onto=onto, tile_mask=tile_mask
+            ).result()
+    # Owners of the memory that the Warp arrays refer to.
     owners = (*tensors, *(tensor.detach() for tensor in picture))
-    return picture, _Forward(owners, cloud, view, projected, begun.lists, begun.image)
+    return picture, _Forward(owners, cloud, view, projected, pending.lists, pending.image)
 
 
 class _Render(torch.autograd.Function):
@@ -216,21 +226,27 @@ class _Render(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *pixel_gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
-        done: _Forward = ctx.forward_pass
-        device = done.owners[0].device
+        forward_pass: _Forward = ctx.forward_pass
+        device = forward_pass.owners[0].device
         with torch_stream(device):
-            alias = done.cloud.device.alias
-            # Held until the kernels that read them are queued.
-            given = tuple(None if gradient is None else gradient.detach().contiguous() for gradient in pixel_gradients)
-            shape = done.image.alpha.shape
+            alias = forward_pass.cloud.device.alias
+            # Keep these alive until the kernels that read them are queued.
+            inputs = tuple(None if gradient is None else gradient.detach().contiguous() for gradient in pixel_gradients)
+            shape = forward_pass.image.alpha.shape
             by_colour, by_alpha, by_depth = (
                 None if gradient is None else _array_at(gradient.data_ptr(), dtype, shape, alias)
-                for gradient, dtype in zip(given, _PIXEL_TYPES, strict=True)
+                for gradient, dtype in zip(inputs, _PIXEL_TYPES, strict=True)
             )
-            with translate_out_of_memory(done.cloud, ctx.task.camera):
-                by_attributes = tuple(torch.empty_like(tensor) for tensor in done.owners[:5])
+            with translate_out_of_memory(forward_pass.cloud, ctx.task.camera):
+                by_attributes = tuple(torch.empty_like(tensor) for tensor in forward_pass.owners[:5])
                 gradients = backward(
-                    *(done.cloud, done.view, done.projected, done.lists, done.image),
+                    *(
+                        forward_pass.cloud,
+                        forward_pass.view,
+                        forward_pass.projected,
+                        forward_pass.lists,
+                        forward_pass.image,
+                    ),
                     colour_gradient=by_colour,
                     alpha_gradient=by_alpha,
                     depth_gradient=by_depth,
@@ -240,7 +256,7 @@ class _Render(torch.autograd.Function):
                     threads=ctx.task.threads,
                     onto=_cloud_of(by_attributes),
                 )
-            # The pose's gradient is the sum of every Gaussian's part.
+            # The gradient by the pose is the sum over the Gaussians.
             by_pose = (
                 None if part is None else wp.to_torch(part).sum(dim=0)
                 for part in (gradients.pose_rotation, gradients.pose_translation)

@@ -1,6 +1,5 @@
-"""What is behind the moving object: a plain floor with a grid, one colour, or a captured scene; and the object's soft
-shadow on it.
-"""
+"""Backdrop of an animation: a plain floor with a grid, one colour, or a captured scene, with the object's soft shadow
+on it."""
 
 from __future__ import annotations
 
@@ -18,32 +17,32 @@ from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.render.shadow import ContactShadow
 
 _SKY, _FLOOR, _LINE = wp.vec3(1.0, 1.0, 1.0), wp.vec3(0.86, 0.86, 0.87), wp.vec3(0.74, 0.75, 0.78)
-_BUMP = 0.06
-"""Of the shadow's reach: what is this high above the plane still takes its shadow, at half strength; of what lies below
-it, twice as deep, for through thin spots of a floor one sees deeper."""
-_SOFTENED = 0.25
-"""Of the window of the median: blur of the edge of what takes the shadow."""
+_MAX_BUMP_HEIGHT = 0.06
+"""Height over the plane, relative to the shadow's reach, at which a surface receives the shadow at half strength. Below
+the plane the range is twice as large, because thin spots of a captured floor appear deeper."""
+_EDGE_BLUR_FRACTION = 0.25
+"""Standard deviation of the blur of the shadow mask's edge, relative to the window of the median filter."""
 
 
 @dataclass(frozen=True)
 class Backdrop:
-    """What an animation is drawn over, and where on it the shadow of what moves falls. Made for one camera."""
+    """Background of an animation, and the part of it that receives the object's shadow, for one camera."""
 
     unshadowed: wp.array
-    """(H W,) vec3."""
+    """(H W,) vec3, background colour without the shadow."""
     shadow: ContactShadow
     strength: wp.array | None
-    """(H W,) float32: how much of the shadow each pixel takes; None without one."""
+    """(H W,) float32, strength of the shadow at each pixel; None without shadow."""
 
     def shadow_opacity(self, body: GaussianCloud) -> wp.array:
-        """(H, W) float32, 0 to about 0.5: how much of what is behind the shadow hides."""
+        """Return (H, W) float32, 0 to about 0.5, the opacity of the shadow of ``body``."""
         camera = self.shadow.camera
         if self.strength is None:
             return wp.zeros((camera.height, camera.width), dtype=wp.float32, device=self.shadow.device)
         return self.shadow.cover(body, self.strength).reshape((camera.height, camera.width))
 
     def background(self, body: GaussianCloud) -> wp.array:
-        """(H, W) vec3: what is seen behind ``body``, with its shadow."""
+        """Return (H, W) vec3, the background with the shadow of ``body``."""
         camera, device = self.shadow.camera, self.shadow.device
         shape = (camera.height, camera.width)
         if self.strength is None:
@@ -55,7 +54,7 @@ class Backdrop:
 
 
 def grid_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> Backdrop:
-    """A pale plane with a grid whose lines are ``cell`` (world units) apart."""
+    """Return a pale plane with a grid whose lines are ``cell`` (world units) apart."""
     colour = empty(len(ground.depth), wp.vec3, ground.device)
     launch_rows(
         kernels.grid_kernel,
@@ -68,9 +67,9 @@ def grid_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> Ba
 
 
 def plain_colour(ground: ContactShadow, colour: tuple[float, float, float], *, shadow: bool = True) -> Backdrop:
-    """One colour, on which only the shadow falls; its ``cover`` is a shadow to be laid over something else."""
-    bare = wp.full(len(ground.depth), wp.vec3(*colour), dtype=wp.vec3, device=ground.device)
-    return Backdrop(bare, ground, ground.fade if shadow else None)
+    """Return a backdrop of one colour with only the shadow. Its ``shadow_opacity`` can be laid over another image."""
+    colour_without_shadow = wp.full(len(ground.depth), wp.vec3(*colour), dtype=wp.vec3, device=ground.device)
+    return Backdrop(colour_without_shadow, ground, ground.fade if shadow else None)
 
 
 def captured_scene(
@@ -84,10 +83,15 @@ def captured_scene(
     height: float,
     shadow: bool = True,
 ) -> Backdrop:
-    """The rest of a capture, rendered once; the shadow falls where the plane is what one sees.
+    """Render the rest of a capture once; the shadow falls where the visible surface is near the plane.
 
-    ``scene`` in the world's units; ``centre`` (3,) and ``reach`` bound the shadow, ``grain`` and ``height`` are as
-    ``ContactShadow`` wants them.
+    Args:
+        scene: rest of the capture, world units.
+        camera: camera.
+        plane: ground.
+        centre, reach: (3,) and radius of the disc that can be in shadow, world units.
+        grain, height: as for ``ContactShadow``.
+        shadow: False for no shadow.
     """
     import cv2
 
@@ -103,15 +107,17 @@ def captured_scene(
         height=height,
         depth=np.asarray(cv2.medianBlur(depth, 5)),
     )
-    bare = wp.array(np.clip(image.colour.numpy(), 0.0, 1.0).reshape(-1, 3), dtype=wp.vec3, device=scene.device)
+    colour_without_shadow = wp.array(
+        np.clip(image.colour.numpy(), 0.0, 1.0).reshape(-1, 3), dtype=wp.vec3, device=scene.device
+    )
     if not shadow:
-        return Backdrop(bare, ground, None)
-    lift = ground.lift.numpy().reshape(shape) / (_BUMP * reach)
+        return Backdrop(colour_without_shadow, ground, None)
+    lift = ground.lift.numpy().reshape(shape) / (_MAX_BUMP_HEIGHT * reach)
     on_plane = np.clip(1.5 - np.where(lift > 0.0, lift, -0.5 * lift), 0.0, 1.0)
     on_plane *= ground.depth.numpy().reshape(shape) > 0.0
-    # Specks in the air before the floor would shine in the shadow, and hard edges look cut out.
+    # Floating specks in front of the floor would appear bright in the shadow, and hard edges look cut out.
     kernel = 2 * (max(camera.width, camera.height) // 40) + 1
     on_plane = np.asarray(cv2.medianBlur(np.rint(255.0 * on_plane).astype(np.uint8), kernel), np.float32) / 255.0
-    on_plane = cv2.GaussianBlur(on_plane, (0, 0), _SOFTENED * kernel)
+    on_plane = cv2.GaussianBlur(on_plane, (0, 0), _EDGE_BLUR_FRACTION * kernel)
     strength = on_plane * ground.fade.numpy().reshape(shape) * image.alpha.numpy()
-    return Backdrop(bare, ground, wp.array(strength.ravel(), dtype=wp.float32, device=scene.device))
+    return Backdrop(colour_without_shadow, ground, wp.array(strength.ravel(), dtype=wp.float32, device=scene.device))

@@ -1,4 +1,4 @@
-"""From gradients of pixels to gradients of Gaussians and of the camera's pose."""
+"""Backward pass of the renderer: gradients by pixels to gradients by Gaussians and by the camera pose."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from egs_warp.render.tiles import TileLists
 
 @dataclass(frozen=True)
 class CloudGradients:
-    """Gradient of a scalar loss by everything that shaped the picture."""
+    """Gradient of a scalar loss by all inputs of the image."""
 
     means: wp.array
     """(n,) vec3."""
     rotations: wp.array
-    """(n,) vec4, by the quaternion as stored; orthogonal to it, because its length does not matter."""
+    """(n,) vec4, by the quaternion as stored; orthogonal to it, because its length has no effect."""
     log_scales: wp.array
     """(n,) vec3."""
     opacity_logits: wp.array
@@ -33,9 +33,9 @@ class CloudGradients:
     sh: wp.array
     """(n, K) vec3."""
     screen: wp.array | None
-    """(n,) vec2, by the centre on the screen in pixels; None where not asked for."""
+    """(n,) vec2, by the screen position in pixels; None if not requested."""
     pose_rotation: wp.array | None
-    """(n,) mat33: each Gaussian's part of the gradient by the camera's rotation matrix; None where not asked for."""
+    """(n,) mat33, each Gaussian's part of the gradient by the camera's rotation matrix; None if not requested."""
     pose_translation: wp.array | None
     """(n,) vec3, likewise for the translation."""
 
@@ -56,13 +56,21 @@ def backward(
     threads: int,
     onto: GaussianCloud | None = None,
 ) -> CloudGradients:
-    """From gradients (H, W) by ``image``'s colour (vec3), alpha and depth (float32); None stands for zero.
+    """Compute the gradients by the Gaussians.
 
-    The gradients by the attributes go into the arrays of ``onto`` where given.
+    Args:
+        cloud, view, projected, lists, image: inputs and results of the forward pass.
+        colour_gradient: (H, W) vec3, gradient by ``image``'s colour; None for zero.
+        alpha_gradient, depth_gradient: (H, W) float32, likewise.
+        antialiased: as in the forward pass.
+        want_pose: also compute the gradient by the camera pose.
+        want_screen: also compute the gradient by the screen positions.
+        threads: CPU threads.
+        onto: cloud whose arrays receive the gradients by the attributes; default: new arrays.
     """
     device, count = cloud.device, cloud.count
     (moments,) = empty_pooled(device, ((grow_capacity(projected.slot_count), 3), wp.vec4))
-    walked = [
+    tile_inputs = [
         *(view.width, view.height, lists.tile_start, lists.tile_mask),
         *(lists.gaussian_from_intersection, lists.slot_from_intersection),
         *(projected.ellipse, projected.falloff, projected.colour_depth),
@@ -72,7 +80,7 @@ def backward(
         launch_cached(
             composite_backward_block_kernel,
             lists.tile_count * TILE_PIXELS,
-            inputs=[*walked, *pixels],
+            inputs=[*tile_inputs, *pixels],
             outputs=[moments],
             device=device,
         )
@@ -91,7 +99,7 @@ def backward(
         launch_rows(
             composite_backward_tile_kernel,
             lists.tile_count,
-            inputs=[*walked, sum_gradient, remaining],
+            inputs=[*tile_inputs, sum_gradient, remaining],
             outputs=[moments],
             device=device,
             threads=threads,
@@ -112,12 +120,12 @@ def backward(
         pose_translation=empty(count, wp.vec3, device) if want_pose else None,
     )
     by_gaussian = {"device": device, "threads": threads}
-    walked_back = [projected.slot_end, moments]
-    places = [cloud.means, cloud.rotations, cloud.log_scales]
+    gradient_inputs = [projected.slot_end, moments]
+    pose_inputs = [cloud.means, cloud.rotations, cloud.log_scales]
     launch_rows(
         project_backward_kernel,
         count,
-        inputs=[view, int(antialiased), *places, cloud.opacity_logits, cloud.sh, *walked_back],
+        inputs=[view, int(antialiased), *pose_inputs, cloud.opacity_logits, cloud.sh, *gradient_inputs],
         outputs=[*(gradients.means, gradients.rotations, gradients.log_scales, gradients.opacity_logits, gradients.sh)],
         **by_gaussian,
     )
@@ -125,7 +133,7 @@ def backward(
         launch_rows(
             pose_backward_kernel,
             count,
-            inputs=[view, int(antialiased), *places, cloud.sh, *walked_back],
+            inputs=[view, int(antialiased), *pose_inputs, cloud.sh, *gradient_inputs],
             outputs=[gradients.screen, gradients.pose_rotation, gradients.pose_translation],
             **by_gaussian,
         )

@@ -1,4 +1,4 @@
-"""From tile lists to pixels."""
+"""Compositing: tile lists to pixels."""
 
 from __future__ import annotations
 
@@ -21,39 +21,41 @@ from egs_warp.render.tiles import TileLists, build_tile_lists, lists_fit
 
 @dataclass(frozen=True)
 class Background:
-    """What shows where the Gaussians let light through."""
+    """Background behind the Gaussians."""
 
     flat: wp.vec3
-    """One colour, where there is no image."""
+    """Uniform colour, used if there is no image."""
     image: wp.array | None = None
     """(H * W,) vec3."""
 
 
 @dataclass(frozen=True)
 class RenderedImage:
-    """One picture. Pixel (row, column) has its centre at (column + 0.5, row + 0.5)."""
+    """Rendered image. Pixel (row, column) has its centre at (column + 0.5, row + 0.5)."""
 
     colour: wp.array
     """(H, W) vec3 float32, background included; display-referred as the capture's colours are, not clipped above 1."""
     alpha: wp.array
-    """(H, W) float32, 0 to 1: one minus the light that the background sends through."""
+    """(H, W) float32, 0 to 1, one minus the transmittance to the background."""
     depth: wp.array
     """(H, W) float32: alpha-weighted mean z-depth divided by alpha, scene units; 0 where alpha is 0."""
     median_depth: wp.array | None = None
-    """(H, W) float32: z-depth of the splat that stops half of the light, 0 where none does; only if asked for."""
+    """(H, W) float32, z-depth of the splat at which the transmittance falls to half, 0 where there is none; None unless
+    requested."""
     median_gaussian: wp.array | None = None
-    """(H, W) int32: which splat that is, -1 where none does; only if asked for."""
+    """(H, W) int32, index of that splat, -1 where there is none; None unless requested."""
     normal: wp.array | None = None
-    """(H, W) vec3 in camera axes: blended thinnest axis of each splat, on the camera's side; only if asked for."""
+    """(H, W) vec3 in camera axes, blended thinnest axis of each splat, pointing towards the camera; None unless
+    requested."""
 
     def colour_srgb8(self) -> np.ndarray:
-        """(H, W, 3) uint8 on the host, ready for PNG or video: clipped and quantised; SH colours are sRGB already."""
+        """Return (H, W, 3) uint8 on the host for PNG or video, clipped and quantised; SH colours are sRGB already."""
         levels = empty((*self.colour.shape, 3), wp.uint8, device_of(self.colour))
         self.quantise(levels)
         return levels.numpy()
 
     def quantise(self, levels: wp.array) -> None:
-        """The same into ``levels`` (H, W, 3) uint8 on the device."""
+        """Write the quantised colour to ``levels`` (H, W, 3) uint8 on the device."""
         height, width = self.colour.shape
         launch_rows(
             quantise_kernel,
@@ -65,8 +67,10 @@ class RenderedImage:
 
 
 class PendingImage:
-    """A picture and its tile lists, queued: a GPU that waited for the number of pairs would stand still meanwhile, so
-    that is guessed, and looked at later."""
+    """Image and tile lists that are queued on the device.
+
+    A GPU would idle while the host waits for the number of pairs. So that number is guessed, and checked in ``result``.
+    """
 
     def __init__(
         self,
@@ -76,19 +80,20 @@ class PendingImage:
         background: Background,
         threads: int,
         onto: RenderedImage | None = None,
-        drawn: wp.array | None = None,
+        tile_mask: wp.array | None = None,
         guess: bool = True,
     ) -> None:
         self.projected, self.view = projected, view
-        self.lists = replace(build_tile_lists(projected, view, threads=threads, guess=guess), tile_mask=drawn)
+        self.lists = replace(build_tile_lists(projected, view, threads=threads, guess=guess), tile_mask=tile_mask)
         self.image = composite(projected, self.lists, view, background=background, threads=threads, onto=onto)
         self._fit = partial(lists_fit, self.lists, projected)
-        given = {"background": background, "threads": threads, "drawn": drawn}
-        self._anew = partial(PendingImage, projected, view, onto=self.image, guess=False, **given)
+        options = {"background": background, "threads": threads, "tile_mask": tile_mask}
+        self._render_again = partial(PendingImage, projected, view, onto=self.image, guess=False, **options)
 
     def result(self) -> PendingImage:
-        """This, once it is known that all pairs had room; where they had not, another into the same arrays."""
-        return self if self._fit() else self._anew()
+        """Wait for the number of pairs; return this image, or one rendered again into the same arrays if the guess was
+        too small."""
+        return self if self._fit() else self._render_again()
 
 
 def composite(
@@ -100,7 +105,7 @@ def composite(
     threads: int,
     onto: RenderedImage | None = None,
 ) -> RenderedImage:
-    """Blend every tile's Gaussians from front to back over ``background``, into the arrays of ``onto`` where given."""
+    """Blend every tile's Gaussians from front to back over ``background``, into the arrays of ``onto`` if given."""
     device = device_of(projected.ellipse)
     width, height = int(view.width), int(view.height)
     shape = (height, width)
@@ -138,7 +143,7 @@ def add_geometry(
     *,
     threads: int,
 ) -> RenderedImage:
-    """``image`` with median depth, the splats it is of, and normals."""
+    """Return ``image`` with median depth, the splats at that depth, and normals."""
     device = cloud.device
     width, height = int(view.width), int(view.height)
     splat_normals = empty(cloud.count, wp.vec3, device)

@@ -1,4 +1,4 @@
-"""Screen-space ellipses of a Gaussian cloud seen by one camera."""
+"""Projection of a Gaussian cloud to the screen-space ellipses of one camera."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
 @dataclass(frozen=True)
 class ProjectedGaussians:
-    """Every Gaussian on the screen; entries of Gaussians that reach no tile are undefined."""
+    """Screen ellipses of all Gaussians; entries of Gaussians that reach no tile are undefined."""
 
     ellipse: wp.array
     """(n,) vec4: centre x, y in pixels, then a and shear of -ln(alpha / opacity) = a (dx + shear dy)^2 + v dy^2."""
@@ -33,22 +33,27 @@ class ProjectedGaussians:
     colour_depth: wp.array
     """(n,) vec4: red, green, blue (display-referred, at least 0) and z-depth."""
     slot_end: wp.array
-    """(n,) int64: number of tiles reached by the Gaussians up to and including this one."""
+    """(n,) int64, cumulative number of tiles reached by the Gaussians, inclusive."""
     count_slots: Callable[[], int]
-    """Reads ``slot_count``."""
+    """Function that computes ``slot_count``."""
 
     @cached_property
     def slot_count(self) -> int:
-        """Number of (Gaussian, tile) pairs; on a GPU the first to ask waits for it.
+        """Number of (Gaussian, tile) pairs. On a GPU the first access blocks.
 
-        Raises ``UserError`` that names the first Gaussian with a non-finite value, if there is one.
+        Raises:
+            UserError: names the first Gaussian with a non-finite value, or says that there are too many pairs.
         """
         return self.count_slots()
 
 
 def view_from_camera(camera: Camera) -> Any:
-    """The camera in single precision, with the bounds of the projection's Jacobian, not to be changed: equal cameras
-    share it. Raises ``UserError`` for an impossible camera.
+    """Return the camera in single precision, with the limits of the projection's Jacobian.
+
+    Equal cameras share the result, which must not be modified.
+
+    Raises:
+        UserError: the camera is invalid.
     """
     rotation = np.asarray(camera.rotation, dtype=np.float64)
     translation = np.asarray(camera.translation, dtype=np.float64)
@@ -58,7 +63,7 @@ def view_from_camera(camera: Camera) -> Any:
 
 @lru_cache(maxsize=1024)
 def _view(width: int, height: int, lens: tuple[float, ...], rotation: bytes, translation: bytes) -> Any:
-    """Kept, for to fill it in takes longer than to launch a kernel."""
+    """Build the view; cached, because filling the struct takes longer than a kernel launch."""
     fx, fy, cx, cy, near, far = lens
     turn, shift = np.frombuffer(rotation), np.frombuffer(translation)
     if not all(map(math.isfinite, (fx, fy, cx, cy, near, *turn, *shift))) or fx <= 0 or fy <= 0:
@@ -107,45 +112,47 @@ def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int)
 
 
 class _ReadBack:
-    """One number in page-locked memory, which what comes from a GPU reaches twice as fast, and when it is there."""
+    """One number in page-locked memory, to which a GPU copies twice as fast, and an event that marks the end of the
+    copy."""
 
     def __init__(self, device: wp.Device) -> None:
         self.array = empty(1, wp.int64, "cpu", pinned=True)
         self.values = self.array.numpy()
-        self.there = wp.Event(device)
+        self.copied = wp.Event(device)
 
 
 class _ReadBacks(threading.local):
-    """Those of this thread that nobody waits for, by device."""
+    """Unused read-backs of this thread, by device."""
 
     def __init__(self) -> None:
-        self.free: defaultdict[str, list[_ReadBack]] = defaultdict(list)
+        self.unused: defaultdict[str, list[_ReadBack]] = defaultdict(list)
 
 
 _read_backs = _ReadBacks()
 
 
 def _fetch_last(values: wp.array) -> Callable[[], int]:
-    """Have the last of ``values`` (n,) int64 brought here; what is returned, to be called once, waits for it."""
+    """Start the download of the last of ``values`` (n,) int64; the returned function, to be called once, waits for
+    it."""
     device = device_of(values)
     if device.is_cpu:
         return lambda: int(values.numpy()[-1])
-    free = _read_backs.free[device.alias]
-    read_back = free.pop() if free else _ReadBack(device)
+    unused = _read_backs.unused[device.alias]
+    read_back = unused.pop() if unused else _ReadBack(device)
     wp.copy(read_back.array, values, src_offset=len(values) - 1, count=1)
-    device.stream.record_event(read_back.there)
+    device.stream.record_event(read_back.copied)
 
     def last() -> int:
-        wp.synchronize_event(read_back.there)
+        wp.synchronize_event(read_back.copied)
         number = int(read_back.values[0])
-        free.append(read_back)
+        unused.append(read_back)
         return number
 
     return last
 
 
 def _too_many(cloud: GaussianCloud, view: Any, slot_end: np.ndarray) -> UserError:
-    """Why there are so many tiles: a Gaussian that is not finite, or Gaussians that are too large."""
+    """Return the error for too many tiles: a Gaussian that is not finite, or Gaussians that are too large."""
     bad = np.flatnonzero(np.diff(slot_end, prepend=0) >= int(NOT_FINITE))
     if len(bad) == 0:
         return UserError(
@@ -153,6 +160,6 @@ def _too_many(cloud: GaussianCloud, view: Any, slot_end: np.ndarray) -> UserErro
             " than 2^30; render a smaller image or fewer Gaussians"
         )
     finite = {name: bool(np.isfinite(getattr(cloud, name).numpy()[bad[0]]).all()) for name in _ATTRIBUTES}
-    # Finite coefficients may still sum to a colour that is not.
+    # Finite coefficients may still sum to a non-finite colour.
     attribute = next((name for name, is_finite in finite.items() if not is_finite), "sh")
     return UserError(f"render: {attribute} of Gaussian {bad[0]} is not finite; repair or remove it")

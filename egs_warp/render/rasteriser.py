@@ -1,4 +1,4 @@
-"""The renderer on one page: project, list, composite (Kerbl et al. 2023, in Warp kernels).
+"""The renderer: project, list, composite (Kerbl et al. 2023, in Warp kernels).
 
 See docs/concepts/renderer.md.
 """
@@ -34,23 +34,30 @@ def render_gaussians(
     mask: np.ndarray | None = None,
     threads: int | None = None,
 ) -> RenderedImage:
-    """Picture of ``cloud`` through ``camera``, on the device of the cloud.
+    """Render ``cloud`` through ``camera``, on the device of the cloud.
 
-    ``background`` is one colour, or an image (H, W, 3) of this camera's size. ``antialiased`` dims each splat by what
-    the 0.3 px low-pass adds to its area. ``geometry`` adds median depth, its splats and normals. ``mask``, one bool for
-    each tile of 16 x 16 pixels from the top left, leaves tiles out: they show the background alone. ``threads`` (a CPU
-    only) defaults to the available cores; the picture does not depend on it.
-    Raises ``UserError`` for non-finite Gaussians, which it names, for an impossible camera and for a background or mask
-    of another size.
+    Args:
+        cloud: Gaussians.
+        camera: camera.
+        background: one colour, or an image (H, W, 3) of this camera's size.
+        antialiased: dim each splat by the factor by which the 0.3 px low-pass increases its area.
+        geometry: add median depth, its splats and normals.
+        mask: one bool for each tile of 16 x 16 pixels from the top left; tiles that are False show the background
+            alone.
+        threads: CPU threads, by default the available cores; the image does not depend on it.
+
+    Raises:
+        UserError: a Gaussian is not finite (the message names it), the camera is invalid, or background or mask have
+            another size.
     """
     threads = threads or available_threads()
-    given = {"background": background, "antialiased": antialiased, "mask": mask, "threads": threads}
-    begun = enqueue_image(cloud, camera, **given)
+    arguments = {"background": background, "antialiased": antialiased, "mask": mask, "threads": threads}
+    pending = enqueue_image(cloud, camera, **arguments)
     with translate_out_of_memory(cloud, camera):
-        begun = begun.result()
+        pending = pending.result()
         if geometry:
-            return add_geometry(begun.image, cloud, begun.projected, begun.lists, begun.view, threads=threads)
-    return begun.image
+            return add_geometry(pending.image, cloud, pending.projected, pending.lists, pending.view, threads=threads)
+    return pending.image
 
 
 def enqueue_image(
@@ -62,23 +69,28 @@ def enqueue_image(
     mask: np.ndarray | None = None,
     threads: int | None = None,
 ) -> PendingImage:
-    """The picture of ``render_gaussians`` on its way, for which nobody has waited: to be ``settled``."""
+    """Queue the image of ``render_gaussians`` without waiting; ``PendingImage.result`` waits for it."""
     threads = threads or available_threads()
     view = view_from_camera(camera)
     with translate_out_of_memory(cloud, camera):
         behind = background_of(background, camera, cloud.device)
-        drawn = tile_mask_array(mask, camera, cloud.device)
+        tile_mask = tile_mask_array(mask, camera, cloud.device)
         projected = project(cloud, view, antialiased=antialiased, threads=threads)
-        return PendingImage(projected, view, background=behind, threads=threads, drawn=drawn)
+        return PendingImage(projected, view, background=behind, threads=threads, tile_mask=tile_mask)
 
 
 def render_views(
     cloud: GaussianCloud, cameras: Sequence[Camera], *, backgrounds: Sequence[Any] | None = None, **options: Any
 ) -> list[RenderedImage]:
-    """One picture of ``cloud`` for each camera; the options are those of ``render_gaussians``.
+    """Render one image of ``cloud`` for each camera, with the options of ``render_gaussians``.
 
-    ``backgrounds`` has one for each camera, where ``background`` is one for all. Raises ``UserError`` where their
-    numbers differ.
+    Args:
+        cloud: Gaussians.
+        cameras: cameras.
+        backgrounds: one for each camera, instead of one ``background`` for all.
+
+    Raises:
+        UserError: the numbers of backgrounds and cameras differ.
     """
     if backgrounds is None:
         return [render_gaussians(cloud, camera, **options) for camera in cameras]
@@ -95,20 +107,20 @@ def render_views(
 
 @contextmanager
 def translate_out_of_memory(cloud: GaussianCloud, camera: Camera) -> Iterator[None]:
-    """Turn a failed allocation into a ``UserError`` that says how much there was to render."""
+    """Convert a failed allocation to a ``UserError`` that gives the number of Gaussians and the size of the image."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:
         device = cloud.device
-        # A failure inside Warp's own scratch memory comes under many names.
+        # A failure to allocate Warp's own scratch memory has many messages.
         full = device.is_cuda and device.free_memory < 0.05 * device.total_memory
         if isinstance(error, RuntimeError) and not (full or re.search("alloc|out of mem", str(error), re.IGNORECASE)):
             raise
         if device.is_cuda:
-            # The failure leaves a mark in CUDA's state, which Warp's next scan would take for its own.
+            # The error stays in CUDA's state, where Warp's next scan would report it as its own.
             with suppress(RuntimeError):
-                mark = wp.zeros(1, dtype=wp.int32, device=device)
-                wp.utils.array_scan(mark, mark)
+                dummy = wp.zeros(1, dtype=wp.int32, device=device)
+                wp.utils.array_scan(dummy, dummy)
         raise UserError(
             f"render: {cloud.count} Gaussians at {camera.width} x {camera.height} do not fit into the memory of"
             f" {cloud.device}; render a smaller image, fewer Gaussians, or on another device"
@@ -120,7 +132,8 @@ def _is_finite_number(value: Any) -> bool:
 
 
 def tile_mask_array(mask: np.ndarray | None, camera: Camera, device: Device) -> wp.array | None:
-    """``mask`` (tile rows, tile columns) bool as ``TileLists`` wants it. Raises ``UserError`` for another shape."""
+    """Return ``mask`` (tile rows, tile columns) bool as ``TileLists.tile_mask``. Raises ``UserError`` for another shape
+    or type."""
     if mask is None:
         return None
     values, shape = np.asarray(mask), (-(-camera.height // TILE_SIDE), -(-camera.width // TILE_SIDE))
@@ -138,7 +151,7 @@ def _flat_background(colour: tuple[float, float, float]) -> Background:
 
 
 def background_of(background: Any, camera: Camera, device: Device) -> Background:
-    """From a colour or an image (H, W, 3). Raises ``UserError`` for anything else."""
+    """Return the background for a colour or an image (H, W, 3). Raises ``UserError`` for anything else."""
     shape = (camera.height, camera.width)
     if isinstance(background, tuple) and len(background) == 3 and all(map(_is_finite_number, background)):
         return _flat_background(background)

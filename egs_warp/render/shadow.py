@@ -1,4 +1,4 @@
-"""The soft shadow that Gaussians cast straight down on a plane, as one camera sees it."""
+"""Soft shadow that Gaussians cast straight down on a plane, as one camera sees it."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from egs_warp.launching import empty, launch_cached, launch_rows, zeros
 from egs_warp.render.projection import view_from_camera
 
 _LAYERS = ((0.0, 0.08, 0.02), (0.08, 0.3, 0.06), (0.3, 2.0, 0.13))
-"""From and to this height over the plane, and the width of the blur, all in body heights."""
-_LEAST_BLUR = 0.6
-"""Texels."""
-_TAPS = 4.0
-"""Standard deviations that a blur reaches."""
+"""Height range over the plane and blur width of each layer, relative to the body height."""
+_MIN_BLUR = 0.6
+"""Smallest standard deviation of a blur, texels."""
+_BLUR_REACH = 4.0
+"""Radius of a blur kernel, standard deviations."""
 _MAP = int(kernels.TEXELS)
 
 
 def shadow_blur_radius(body: GaussianCloud) -> float:
-    """World units: by how much the shadow of ``body`` is blurred to show none of its Gaussians, the median of their
+    """Return the blur radius, world units, that hides single Gaussians in the shadow of ``body``: the median of their
     middle standard deviations."""
     return float(np.exp(np.median(np.median(body.log_scales.numpy(), axis=1))))
 
 
 class ContactShadow:
-    """The ground, and what a body takes of its light. Each Gaussian hides as much of it as its opacity and its broad
-    side say; shadows of high ones are wider and paler.
+    """The ground as one camera sees it, and the shadow of a body on it.
 
-    Arrays lie on the device that is told, a row of pixels after the other.
+    Each Gaussian casts a shadow by its opacity and the area of its broad side; shadows of higher Gaussians are wider
+    and paler. Arrays are on ``device``, in row-major order of the pixels.
     """
 
     def __init__(
@@ -48,9 +48,16 @@ class ContactShadow:
         height: float = 0.0,
         depth: np.ndarray | None = None,
     ) -> None:
-        """``centre`` (3,) and ``reach`` (world units) bound the part of the plane that can be in shadow; ``grain`` (see
-        ``grain_of``) and ``height`` (world units) are the body's, 0 where only the ground is looked at; ``depth``
-        (H, W) is the z-depth of the uneven ground that it falls on, 0 where that is the plane.
+        """Compute the ground point of every pixel.
+
+        Args:
+            camera: camera.
+            plane: ground.
+            centre, reach: (3,) and radius of the disc that can be in shadow, world units.
+            device: device of the arrays.
+            grain: blur radius of the body, see ``shadow_blur_radius``; 0 without a body.
+            height: height of the body, world units; 0 without a body.
+            depth: (H, W) z-depth of the uneven ground that receives the shadow, 0 where that is the plane.
         """
         self.camera, self.device = camera, device
         edges = height * np.array([layer[:2] for layer in _LAYERS])
@@ -63,9 +70,9 @@ class ContactShadow:
         self.depth = empty(count, wp.float32, device)
         """(H W,) z-depth of the plane, 0 where a pixel's ray does not meet it from above."""
         self.flat = empty(count, wp.vec2, device)
-        """(H W,) place on the plane along its ``tangents``, world units from the centre."""
+        """(H W,) position on the plane along its ``tangents``, world units from the centre."""
         self.fade = empty(count, wp.float32, device)
-        """(H W,) 1 around the centre, 0 from ``reach`` on and beside the plane."""
+        """(H W,) 1 around the centre, 0 from ``reach`` on and outside the plane."""
         self.pixel = empty(count, wp.float32, device)
         """(H W,) size of a pixel on the plane, world units."""
         self.lift = empty(count, wp.float32, device)
@@ -73,59 +80,60 @@ class ContactShadow:
         self._texels = empty(count, wp.vec2, device)
         self._ground = _ground(plane, centre, reach)
         uneven = np.zeros(count) if depth is None else depth.ravel()
-        seen = wp.array(uneven, dtype=wp.float32, device=device)
-        self._rows(
+        surface_depth = wp.array(uneven, dtype=wp.float32, device=device)
+        self._launch(
             kernels.ground_kernel,
             count,
-            [view_from_camera(camera), self._ground, wp.vec3(*(camera.centre - centre).tolist()), seen],
+            [view_from_camera(camera), self._ground, wp.vec3(*(camera.centre - centre).tolist()), surface_depth],
             [self.depth, self.flat, self.fade, self.pixel, self.lift, self._texels],
         )
 
     def cover(self, body: GaussianCloud, strength: wp.array) -> wp.array:
-        """(H W,) float32, 0 to about 0.5 times ``strength`` (H W,): how much light the Gaussians of ``body`` take."""
+        """Return (H W,) float32, the opacity of the shadow of ``body``: 0 to about 0.5, times ``strength`` (H W,)."""
         cover = empty(len(strength), wp.float32, self.device)
-        self._rows(kernels.cover_kernel, len(strength), [self._shade(body), self._texels, strength], [cover])
+        self._launch(kernels.shadow_opacity_kernel, len(strength), [self._shade(body), self._texels, strength], [cover])
         return cover
 
     def _shade(self, body: GaussianCloud) -> wp.array:
-        """(texels, texels) float32 seen from above."""
+        """Return the shadow map (texels, texels) float32, seen from above."""
         shape = (len(_LAYERS), _MAP, _MAP)
-        hidden = zeros(shape, wp.int64, self.device)
-        # One after the other on a CPU, whose threads may not add to one texel at once.
+        coverage = zeros(shape, wp.int64, self.device)
+        # One thread on a CPU, where concurrent additions to one texel are not atomic.
         launch_cached(
-            kernels.hide_ground_kernel,
+            kernels.coverage_kernel,
             body.count,
             inputs=[self._ground, self._layers, body.means, body.log_scales, body.opacity_logits],
-            outputs=[hidden],
+            outputs=[coverage],
             device=self.device,
         )
-        there, back = empty(shape, wp.float32, self.device), empty(shape, wp.float32, self.device)
+        layers, scratch = empty(shape, wp.float32, self.device), empty(shape, wp.float32, self.device)
         count = int(np.prod(shape))
-        self._rows(kernels.hidden_shares_kernel, count, [hidden], [there])
-        self._blurred(there, back, self._grain)
-        self._rows(kernels.covered_kernel, count, [], [there])
-        self._blurred(there, back, self._blur)
+        self._launch(kernels.unpack_coverage_kernel, count, [coverage], [layers])
+        self._blur_layers(layers, scratch, self._grain)
+        self._launch(kernels.opacity_kernel, count, [], [layers])
+        self._blur_layers(layers, scratch, self._blur)
         shade = empty(shape[1:], wp.float32, self.device)
-        # Far layers see more of the sky past the object, so they darken less.
-        paleness = wp.vec3(*(0.5 - 1.4 * blur for _, _, blur in _LAYERS))
-        self._rows(kernels.darkest_kernel, _MAP * _MAP, [there, paleness], [shade])
+        # Higher layers block less of the sky, so they darken less.
+        max_opacity = wp.vec3(*(0.5 - 1.4 * blur for _, _, blur in _LAYERS))
+        self._launch(kernels.combine_layers_kernel, _MAP * _MAP, [layers, max_opacity], [shade])
         return shade
 
-    def _blurred(self, layers: wp.array, scratch: wp.array, taps: list[wp.array]) -> None:
+    def _blur_layers(self, layers: wp.array, scratch: wp.array, taps: list[wp.array]) -> None:
         """Blur ``layers`` in place by the ``taps`` of each."""
         occupied = empty(len(_LAYERS) * _MAP, wp.bool, self.device)
         for source, target in ((layers, scratch), (scratch, layers)):
-            self._rows(kernels.occupied_rows_kernel, len(occupied), [source], [occupied])
-            self._rows(kernels.blur_kernel, source.size, [source, occupied, *taps], [target])
+            self._launch(kernels.occupied_rows_kernel, len(occupied), [source], [occupied])
+            self._launch(kernels.blur_kernel, source.size, [source, occupied, *taps], [target])
 
-    def _rows(self, kernel: Any, count: int, inputs: list[Any], outputs: list[wp.array]) -> None:
+    def _launch(self, kernel: Any, count: int, inputs: list[Any], outputs: list[wp.array]) -> None:
         launch_rows(kernel, count, inputs=inputs, outputs=outputs, device=self.device)
 
 
 def _taps(widths: np.ndarray, device: wp.Device) -> list[wp.array]:
-    """Of blurs ``widths`` (layers,) texels wide the weights (layers, taps) from the middle on, and how many count."""
-    sigmas = np.maximum(widths, _LEAST_BLUR)
-    reach = np.minimum(np.ceil(_TAPS * sigmas), _MAP - 1).astype(np.int32)
+    """Return the weights (layers, taps) of Gaussian blurs of ``widths`` (layers,) texels, from the centre on, and the
+    number of taps of each."""
+    sigmas = np.maximum(widths, _MIN_BLUR)
+    reach = np.minimum(np.ceil(_BLUR_REACH * sigmas), _MAP - 1).astype(np.int32)
     taps = np.exp(-0.5 * (np.arange(reach.max() + 1) / sigmas[:, None]) ** 2)
     taps *= np.arange(taps.shape[1]) <= reach[:, None]
     taps /= 2.0 * taps.sum(axis=1, keepdims=True) - taps[:, :1]

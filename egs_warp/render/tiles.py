@@ -1,4 +1,4 @@
-"""The Gaussians of every tile, from front to back."""
+"""Tile lists: the Gaussians of every tile, from front to back."""
 
 from __future__ import annotations
 
@@ -25,18 +25,19 @@ _KEY_BITS = 32
 
 @dataclass(frozen=True)
 class TileLists:
-    """Which Gaussians meet which tile of 16 x 16 pixels; tiles are numbered row by row."""
+    """Gaussians that meet each tile of 16 x 16 pixels; tiles are numbered row by row."""
 
     tile_start: wp.array
     """(tiles + 1,) int32: tile t holds the intersections from tile_start[t] to tile_start[t + 1] - 1."""
     gaussian_from_intersection: wp.array
     """(at least tile_start[-1],) int32, nearest first within a tile; equal depths in index order."""
     slot_from_intersection: wp.array
-    """(at least tile_start[-1],) int32: place of the same pair when pairs are numbered Gaussian by Gaussian."""
+    """(at least tile_start[-1],) int32, slot of the same pair: its number when pairs are numbered Gaussian by
+    Gaussian."""
     tile_work: np.ndarray | None
-    """(tiles,) number of intersections, on a CPU; to share the tiles out between threads."""
+    """(tiles,) number of intersections, on a CPU, to distribute the tiles over threads."""
     tile_mask: wp.array | None = None
-    """(tiles,) int32: 0 for tiles that show the background alone; None draws all."""
+    """(tiles,) int32, 0 for tiles that show the background alone; None renders all."""
 
     @property
     def tile_count(self) -> int:
@@ -47,8 +48,8 @@ class TileLists:
 def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int, guess: bool = False) -> TileLists:
     """Sort the visible Gaussians by depth and list them for every tile that they reach (exact ellipse-tile test).
 
-    To ``guess`` is not to wait, on a GPU, for the number of pairs where pictures lately had few; ``lists_fit`` then
-    says whether there was room for them.
+    With ``guess``, a GPU does not wait for the number of pairs if recent images had few; ``lists_fit`` then tells if
+    the guessed capacity was large enough.
     """
     columns = -(-view.width // TILE_SIDE)
     rows = -(-view.height // TILE_SIDE)
@@ -59,14 +60,14 @@ def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int, 
 
 
 def lists_fit(lists: TileLists, projected: ProjectedGaussians) -> bool:
-    """Whether the pairs had room in ``lists``, made by a guess; where not, the lists are empty."""
+    """Return True if the pairs fit into ``lists``, whose capacity was guessed; if not, the lists are empty."""
     pairs = projected.slot_count
     _update_guess(device_of(lists.tile_start), pairs)
     return pairs <= len(lists.gaussian_from_intersection)
 
 
 def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, threads: int) -> TileLists:
-    """Counting sort in chunks of the depth order, side by side: no pair is compared."""
+    """Build the lists by a counting sort in chunks of the depth order, in parallel and without comparing pairs."""
     device = device_of(projected.ellipse)
     pairs = projected.slot_count
     slot_counts = np.diff(projected.slot_end.numpy(), prepend=0)
@@ -81,7 +82,7 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
 
     # Near Gaussians reach more tiles than far ones: chunks have the same number of pairs, not of Gaussians.
     chunks = min(8 + 4 * threads, max(1, visible_count // 256)) if threads > 1 else 1
-    # One Gaussian in eight tells well enough.
+    # One Gaussian in eight is a sufficient sample.
     pairs_done = np.cumsum(slot_counts[by_depth[:visible_count:8]])
     inner = 8 * np.searchsorted(pairs_done, np.arange(1, chunks) * (pairs_done[-1] / chunks)) if chunks > 1 else []
     edges = np.concatenate([[0], inner, [visible_count]]).astype(np.int32)
@@ -107,16 +108,15 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
 
 
 def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, guess: bool = False) -> TileLists:
-    """Radix sort of all (tile, Gaussian) pairs by tile and the leading bits of depth;
-    32 bits sort twice as fast as 64.
-    """
+    """Build the lists by a radix sort of all (tile, Gaussian) pairs by tile and the leading bits of depth; 32-bit keys
+    sort twice as fast as 64-bit keys."""
     device = device_of(projected.ellipse)
     count = projected.slot_end.shape[0]
-    # Memory for about as many pairs as lately: it is taken while the GPU projects, before their number is known.
+    # Allocate for the expected number of pairs while the GPU projects, before the number is known.
     expected = _expected.get(device.alias, 0)
-    room = _lists_for(expected, tiles, device)
-    if guess and room is not None and expected <= _MOST_GUESSED:
-        pairs = len(room.gaussians)
+    buffers = _lists_for(expected, tiles, device)
+    if guess and buffers is not None and expected <= _MAX_GUESSED_PAIRS:
+        pairs = len(buffers.gaussians)
     else:
         pairs = projected.slot_count
         _update_guess(device, pairs)
@@ -124,59 +124,59 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, g
         return TileLists(
             zeros(tiles + 1, wp.int32, device), empty(1, wp.int32, device), empty(1, wp.int32, device), None
         )
-    if room is None or len(room.gaussians) < pairs:
-        room = _lists_for(pairs, tiles, device)
-        assert room is not None
-    keys, scratch = room.keys, room.scratch
+    if buffers is None or len(buffers.gaussians) < pairs:
+        buffers = _lists_for(pairs, tiles, device)
+        assert buffers is not None
+    keys, scratch = buffers.keys, buffers.scratch
     nearest, farthest = (int(np.float32(z).view(np.int32)) for z in (view.near, view.far))
     depth_bits = max((farthest - nearest).bit_length(), 1)
     tile_bits = tiles.bit_length()
-    kept_bits = min(depth_bits, _KEY_BITS - tile_bits)
+    depth_key_bits = min(depth_bits, _KEY_BITS - tile_bits)
     launch_cached(
         emit_tiles_kernel,
         count,
         inputs=[
-            *(view.width, view.height, pairs, nearest, depth_bits - kept_bits, kept_bits),
+            *(view.width, view.height, pairs, nearest, depth_bits - depth_key_bits, depth_key_bits),
             *(projected.slot_end, projected.ellipse, projected.falloff, projected.colour_depth),
         ],
         outputs=[keys, scratch],
         device=device,
     )
     if pairs > _LARGE_SORT:
-        # The sort takes scratch memory inside Warp, which does not report a failure: see first whether there is any.
+        # Warp does not report a failed allocation of the sort's scratch memory: test beforehand that there is enough.
         empty((pairs, 2), wp.int32, device)
-    wp.utils.radix_sort_pairs(keys, scratch, pairs, end_bit=kept_bits + tile_bits)
+    wp.utils.radix_sort_pairs(keys, scratch, pairs, end_bit=depth_key_bits + tile_bits)
     launch_cached(
         finish_lists_kernel,
         pairs + 1,
-        inputs=[pairs, kept_bits, keys, scratch, projected.colour_depth],
-        outputs=[room.tile_start, room.gaussians, room.slots],
+        inputs=[pairs, depth_key_bits, keys, scratch, projected.colour_depth],
+        outputs=[buffers.tile_start, buffers.gaussians, buffers.slots],
         device=device,
     )
-    return TileLists(room.tile_start, room.gaussians, room.slots, None)
+    return TileLists(buffers.tile_start, buffers.gaussians, buffers.slots, None)
 
 
-_MOST_GUESSED = 2_000_000
-"""Expected pairs up to which it takes less time to sort some room that stays empty than to wait for their number."""
+_MAX_GUESSED_PAIRS = 2_000_000
+"""Expected number of pairs up to which sorting unused capacity takes less time than waiting for their number."""
 
 
 def _update_guess(device: wp.Device, pairs: int) -> None:
-    """What to expect next: views change, so the most of late, which is slowly forgotten."""
-    lately = _expected.get(device.alias, 0) * 15 // 16
-    _expected[device.alias] = max(pairs, lately) if pairs <= _LARGE_SORT else 0
+    """Update the expected number of pairs: the recent maximum, with slow decay."""
+    previous = _expected.get(device.alias, 0) * 15 // 16
+    _expected[device.alias] = max(pairs, previous) if pairs <= _LARGE_SORT else 0
 
 
 _expected: dict[str, int] = {}
-"""Number of pairs to expect next, by device."""
+"""Expected number of pairs of the next image, by device."""
 
 
 @dataclass(frozen=True)
 class _PairBuffers:
-    """Memory for the lists of so many pairs, and to make them in."""
+    """Buffers for the lists of some number of pairs, with scratch."""
 
     keys: wp.array
     scratch: wp.array
-    """Slots, room to sort them, and the Gaussian of each slot."""
+    """Slots, space to sort them, and the Gaussian of each slot."""
     tile_start: wp.array
     gaussians: wp.array
     slots: wp.array
@@ -186,7 +186,7 @@ def _lists_for(pairs: int, tiles: int, device: wp.Device) -> _PairBuffers | None
     if pairs == 0:
         return None
     pairs = grow_capacity(pairs)
-    # Two pieces: what the lists are made in goes at once.
+    # Two allocations, so that the scratch is released first.
     return _PairBuffers(
         *empty_pooled(device, (2 * pairs, wp.uint32), (3 * pairs, wp.int32)),
         *empty_pooled(device, (tiles + 1, wp.int32), (pairs, wp.int32), (pairs, wp.int32)),

@@ -1,4 +1,4 @@
-"""Eq. (14) and the peers of Table 1: every way of carrying agrees where it must, and differs where it should."""
+"""Eq. (14) and the baselines of Table 1: all methods agree where they must, and differ where they should."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_every_method_is_exact_for_a_rotation(method: DeformationMethod, device:
     (result,) = deform_with_method(cloud, mesh, [mesh.nodes @ turn.T + [1.0, 2.0, 3.0]], method=method)
     np.testing.assert_allclose(result.means.numpy(), cloud.means.numpy() @ turn.T + [1, 2, 3], atol=2e-5)
     np.testing.assert_allclose(covariances(result), turn @ covariances(cloud) @ turn.T, atol=2e-6)
-    # Band 1 turns with the object: the coefficients are (-y, z, -x) of one vector.
+    # Band 1 rotates with the object: the coefficients are (-y, z, -x) of one vector.
     vector = np.stack([-cloud.sh.numpy()[:, 3], -cloud.sh.numpy()[:, 1], cloud.sh.numpy()[:, 2]], axis=1)
     after = np.stack([-result.sh.numpy()[:, 3], -result.sh.numpy()[:, 1], result.sh.numpy()[:, 2]], axis=1)
     np.testing.assert_allclose(after, np.einsum("ij,njc->nic", turn, vector), atol=2e-5)
@@ -30,7 +30,7 @@ def test_every_method_is_exact_for_a_rotation(method: DeformationMethod, device:
     [DeformationMethod.MEAN_GRADIENT, DeformationMethod.LOCAL_TETRAHEDRON, DeformationMethod.BIDIRECTIONAL_NO_SPLIT],
 )
 def test_volume_methods_are_exact_for_a_shear(method: DeformationMethod, device: str) -> None:
-    """Eq. (14): under an affine motion Sigma' = F Sigma F^T for every method that looks into the volume."""
+    """Eq. (14): under an affine motion Sigma' = F Sigma F^T for every method that uses volumetric F."""
     mesh, cloud = box(), random_cloud(200, degree=0, device=device)
     gradient = np.array([[1.2, 0.5, 0.0], [0.0, 0.8, 0.2], [0.1, 0.0, 1.0]])
     (result,) = deform_with_method(cloud, mesh, [mesh.nodes @ gradient.T], method=method)
@@ -38,7 +38,7 @@ def test_volume_methods_are_exact_for_a_shear(method: DeformationMethod, device:
 
 
 def test_only_splitting_follows_a_bend() -> None:
-    """Eq. (14)-(17): of a needle bent onto a circle, the mass of only the split one lies on the circle."""
+    """Eq. (14)-(17): for a needle bent onto a circle, only the split one keeps its mass on the circle."""
     mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
     cloud = GaussianCloud.from_numpy(
         np.array([[2.0, 0.2, 0.2]]),
@@ -65,7 +65,7 @@ def test_only_splitting_follows_a_bend() -> None:
 
 
 def test_gaussians_bound_to_a_surface_within_the_cage_follow_it_and_not_the_cages_faces(device: str) -> None:
-    """SuGaR: under a shear of the cage Gaussians on a level sheet get the sheet's own in-plane map, its normal, and no
+    """SuGaR: under a shear of the cage, Gaussians on a level sheet get the sheet's own in-plane map and normal, and no
     change of thickness."""
     mesh = box()
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)

@@ -1,4 +1,4 @@
-"""Eq. (14) to (16): Gaussians carried by the cage."""
+"""Eq. (14) to (16): Gaussians deformed by the cage."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.support.properties import examples
 
 
 def colours(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """(n, 3) linear colour seen along unit ``direction`` (n, 3), as the INRIA renderer evaluates it."""
+    """Return (n, 3) linear colour in the unit ``direction`` (n, 3), as the INRIA renderer evaluates it."""
     x, y, z = direction.T
     basis = [
         0.28209479177387814 + 0 * x,
@@ -50,7 +50,8 @@ def colours(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_a_turned_cage_turns_shape_and_colour_exactly(device: str, degree: int) -> None:
-    """Eq. (14), (15): under a rotation the covariance turns, and every band of colour seen from a turned eye stays."""
+    """Eq. (14), (15): under a rotation the covariance rotates, and every band of colour is unchanged for a viewer that
+    rotates with it."""
     mesh, cloud = box(), random_cloud(300, degree=degree, device=device)
     turn = Rotation.from_rotvec([0.7, -2.1, 0.4]).as_matrix()
     result = deform(cloud, embed_gaussians(cloud, mesh), mesh.nodes @ turn.T + [3.0, 1.0, -2.0])
@@ -65,7 +66,8 @@ def test_a_turned_cage_turns_shape_and_colour_exactly(device: str, degree: int) 
 
 
 def test_colour_turns_exactly_where_euler_angles_are_arbitrary(device: str) -> None:
-    """Eq. (15): turns about z alone, by half a turn about axes across it, by nothing, and by nearly each of them."""
+    """Eq. (15): rotations about z alone, by 180 degrees about horizontal axes, the identity, and nearly each of
+    them."""
     half = [np.pi * np.array([np.cos(a), np.sin(a), 0.0]) for a in (0.0, 0.5 * np.pi, 1.1)]
     near = np.array([1e-9, -3e-5, 2e-4])
     vectors = np.array(
@@ -93,8 +95,8 @@ def test_colour_turns_exactly_where_euler_angles_are_arbitrary(device: str) -> N
 
 
 def test_turning_the_object_is_turning_the_camera(device: str) -> None:
-    """Eq. (15): the picture of the turned object is that of the object seen by a camera turned the other way, to 1e-4
-    in linear colour, with bands 1 to 3 at full strength."""
+    """Eq. (15): the image of the rotated object equals that of the object from the inversely rotated camera, to 1e-4 in
+    linear colour, with bands 1 to 3 at full strength."""
     mesh, cloud = box(), random_cloud(300, degree=3, device=device)
     turn = Rotation.from_rotvec([0.7, -2.1, 0.4]).as_matrix()
     turned = deform(cloud, embed_gaussians(cloud, mesh), mesh.nodes @ turn.T).cloud
@@ -105,14 +107,14 @@ def test_turning_the_object_is_turning_the_camera(device: str) -> None:
     ]
     difference = np.abs(pictures[0] - pictures[1])
     assert pictures[0].max() - pictures[0].min() > 0.5
-    # A splat that is cut at 1/255 in one picture and just not in the other differs by more; it is one in ten thousand.
+    # A splat that is cut at 1/255 in only one of the images differs by more; this is one in ten thousand.
     assert np.percentile(difference, 99.9) < 1e-4
     assert difference.max() < 4e-3 * np.abs(pictures[0]).max()
 
 
 def test_an_affine_cage_carries_flat_splats_exactly(device: str) -> None:
     """Eq. (14), (15): Sigma' = F Sigma F^T to float32, for scales from e^-16 to a quarter of the body; det R = +1, and
-    axes matched in order and sign to the carried ones."""
+    axes match the deformed ones in order and sign."""
     mesh, rng = box((5, 5, 5)), np.random.default_rng(3)
     count = 400
     cloud = GaussianCloud.from_numpy(
@@ -145,12 +147,12 @@ def test_an_affine_cage_carries_flat_splats_exactly(device: str) -> None:
 
 
 def tets_of(embedding: GaussianEmbedding) -> np.ndarray:
-    """(n, 7) of the mean and of the ends of the six arms."""
+    """Return (n, 7) tetrahedra of the mean and of the ends of the six arms."""
     return np.asarray(embedding.points.tets.numpy(), np.int32).reshape(-1, 7)
 
 
 def by_arms(cloud: GaussianCloud, embedding: GaussianEmbedding, positions: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) Eq. (14), (F+ + F-)/2 from the carried ends of the arms, in float64."""
+    """Return (n, 3, 3) (F+ + F-)/2 of Eq. (14) from the deformed ends of the arms, in float64."""
     nodes = np.asarray(embedding.points.nodes.numpy(), np.int32)
     weights = np.asarray(embedding.points.weights.numpy(), np.float64)
     ends = np.einsum("pk,pki->pi", weights, positions[nodes]).reshape(-1, 7, 3)
@@ -161,8 +163,8 @@ def by_arms(cloud: GaussianCloud, embedding: GaussianEmbedding, positions: np.nd
 
 
 def test_arms_go_where_their_ends_go(device: str) -> None:
-    """Eq. (14): (F+ + F-)/2 from the carried ends, in float64, gives the carried covariance: for ends in the same
-    tetrahedron, in the next one and beyond, where the cage is bent and shaken."""
+    """Eq. (14): (F+ + F-)/2 from the deformed ends, in float64, gives the deformed covariance, for ends in the same
+    tetrahedron, in the next one and farther, where the cage is bent and perturbed."""
     mesh, cloud = box((4, 4, 4)), random_cloud(400, degree=0, scale=0.15, device=device)
     rng = np.random.default_rng(2)
     positions = bent(mesh.nodes, 1.0) + 0.02 * rng.normal(size=mesh.nodes.shape)
@@ -172,7 +174,7 @@ def test_arms_go_where_their_ends_go(device: str) -> None:
     sigma = gradient @ covariances(cloud) @ gradient.transpose(0, 2, 1)
     shared = (mesh.tets[tets][:, 1:, :, None] == mesh.tets[tets][:, :1, None, :]).any(axis=3).sum(axis=2)
     assert (shared == 4).any() and (shared == 3).any() and (shared < 3).any()
-    # An arm too short for a difference of float32 positions takes the middle of the two gradients instead.
+    # An arm too short for a difference of float32 positions uses the mean of the two gradients instead.
     exact = (np.linalg.det(gradient) > 0.05) & ~((shared < 3) & (arms < 2e-3)).any(axis=1)
     assert exact.mean() > 0.9
     error = np.abs(covariances(result) - sigma).max(axis=(1, 2)) / np.abs(sigma).max(axis=(1, 2))
@@ -180,8 +182,8 @@ def test_arms_go_where_their_ends_go(device: str) -> None:
 
 
 def test_colour_turns_with_the_mean_of_the_arms(device: str) -> None:
-    """Eq. (15): where a Gaussian reaches into other tetrahedra it turns by the polar rotation of (F+ + F-)/2, by SciPy,
-    which is not that of the tetrahedron of its middle."""
+    """Eq. (15): a Gaussian that reaches into other tetrahedra rotates by the polar rotation of (F+ + F-)/2 (SciPy's),
+    which differs from that of the tetrahedron of its mean."""
     mesh, cloud = box((4, 4, 4)), random_cloud(400, degree=0, scale=0.15, device=device)
     positions = bent(mesh.nodes, 1.0) + 0.01 * np.random.default_rng(2).normal(size=mesh.nodes.shape)
     embedding = embed_gaussians(cloud, mesh)
@@ -201,14 +203,15 @@ def test_colour_turns_with_the_mean_of_the_arms(device: str) -> None:
 
 
 def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
-    """Eq. (16): a needle whose two arms are bent by 40 degrees reads 40, not half; one across it reads nothing."""
+    """Eq. (16): a needle whose two arms are bent by 40 degrees measures 40, not half; one across the bend measures
+    nothing."""
     mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
     scales = np.log([[0.4, 0.004, 0.004], [0.004, 0.05, 0.004], [0.4, 0.4 / 3, 0.004]])
     means = np.tile([2.0, 0.2, 0.2], (3, 1))
     cloud = GaussianCloud.from_numpy(
         means, np.tile([1, 0, 0, 0], (3, 1)), scales, np.zeros(3), np.zeros((3, 1, 3)), device=device
     )
-    # A chord over the arc of one arm (1.2 m) turns by half that arc on each side: 1.2 / radius in all.
+    # A chord over the arc of one arm (1.2 m) rotates by half that arc on each side: 1.2 / radius in all.
     radius = 1.2 / np.radians(40.0)
     deformer = Deformer(cloud, embed_gaussians(cloud, mesh, gamma=3.0))
     measure = deformer.measure_bend([mesh.nodes, bent(mesh.nodes, radius)])
@@ -225,7 +228,7 @@ def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
 @pytest.mark.parametrize("along", [0, 1, 2])
 @pytest.mark.parametrize("quarters", [0, 1])
 def test_a_bend_about_any_axis_of_a_needle_is_read(device: str, along: int, quarters: int) -> None:
-    """Eq. (16): 40 degrees whichever of its axes is the long one and whichever of the others it is bent about."""
+    """Eq. (16): 40 degrees for each choice of the long axis and of the axis of bending."""
     mesh, radius = box((24, 2, 2), (4.0, 0.4, 0.4)), 1.2 / np.radians(40.0)
     # Axis ``along`` lies in x, the one after it in y, or in z after a quarter turn about x.
     frame = Rotation.from_rotvec([0.5 * np.pi * quarters, 0.0, 0.0]).as_matrix() @ np.roll(np.eye(3), along, axis=1)
@@ -250,8 +253,9 @@ def test_a_bend_about_any_axis_of_a_needle_is_read(device: str, along: int, quar
     reach=st.sampled_from([0.0, 0.5, 30.0]),
 )
 def test_no_spike_and_no_nan_whatever_the_cage_does(seed: int, noise: float, flatten: float, reach: float) -> None:
-    """Eq. (14): inverted and flattened tetrahedra, far ends, means far outside, scales from e^-16 to a quarter of the
-    body: all finite, proper rotations, and no Gaussian is stretched more than the matter around it allows."""
+    """Eq. (14): for inverted and flattened tetrahedra, far ends, means far outside and scales from e^-16 to a quarter
+    of the body, results are finite with proper rotations, and no Gaussian is stretched more than the material around it
+    allows."""
     rng = np.random.default_rng(seed)
     mesh, count = box((2, 2, 2)), 60
     cloud = GaussianCloud.from_numpy(
@@ -281,7 +285,7 @@ def test_no_spike_and_no_nan_whatever_the_cage_does(seed: int, noise: float, fla
     stretch = np.linalg.svd(edges @ np.linalg.inv(rest_edges))[1][:, 0]
     around = stretch[np.asarray(embedding.points.tets.numpy(), np.int32).reshape(count, 7)].max(axis=1)
     grown = np.exp(result.cloud.log_scales.numpy().max(axis=1) - cloud.log_scales.numpy().max(axis=1))
-    # Columns are held to 1.5 times the stretch; three of them can conspire to sqrt(3) times that.
+    # Columns are limited to 1.5 times the stretch; three of them can add up to sqrt(3) times that.
     assert (grown <= 1.5 * np.sqrt(3.0) * around + 1e-3).all()
     weights = embedding.points.weights.numpy().reshape(count, 7, 4)[:, 0]
     far = (weights.min(axis=1) < -1.0) | (weights.max(axis=1) > 2.0)
@@ -291,7 +295,8 @@ def test_no_spike_and_no_nan_whatever_the_cage_does(seed: int, noise: float, fla
 
 
 def test_the_mean_goes_where_the_mass_goes(device: str) -> None:
-    """Eq. (14) and beyond: the carried mean of a long Gaussian is the mean of its carried mass, sampled here."""
+    """Eq. (14) and second order: the deformed mean of a long Gaussian is the mean of its deformed mass, sampled
+    here."""
     mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
     scales = np.array([0.3, 0.02, 0.03])
     cloud = GaussianCloud.from_numpy(
@@ -311,9 +316,10 @@ def test_the_mean_goes_where_the_mass_goes(device: str) -> None:
 
 
 def test_scale_and_rotation_do_not_flicker() -> None:
-    """Eq. (15): under a slow twist by 360 degrees with stretch, axes keep their order and move a little every frame."""
+    """Eq. (15): under a slow twist by 360 degrees with stretch, axes keep their order and move little in every
+    frame."""
     mesh, cloud = box(), random_cloud(200, degree=0)
-    # Twice the stretch apart: nearer ones may rightly swap as fast as they please.
+    # Scales differ by twice the stretch; closer ones may swap at any speed.
     scales = np.random.default_rng(1).permuted(np.tile(np.log([0.06, 0.03, 0.01]), (200, 1)), axis=1)
     cloud = GaussianCloud.from_numpy(
         cloud.means.numpy(),
@@ -341,7 +347,7 @@ def test_a_wrong_number_of_nodes_is_refused() -> None:
 
 
 def test_far_outside_nothing_bends_or_stretches(device: str) -> None:
-    """Eq. (14), (16): a Gaussian that floats far from the cage goes with the nearest tetrahedron as a rigid body."""
+    """Eq. (14), (16): a Gaussian far from the cage moves rigidly with the nearest tetrahedron."""
     mesh = box()
     cloud = random_cloud(50, degree=0, device=device)
     far = GaussianCloud.from_numpy(
@@ -363,7 +369,7 @@ def test_far_outside_nothing_bends_or_stretches(device: str) -> None:
 @pytest.mark.cuda
 @pytest.mark.parametrize("count", [1, 31, 1000])
 def test_one_pass_on_cuda_equals_two_on_the_cpu(count: int) -> None:
-    """Eq. (14), (15): shape and degree 3 colour in one kernel, for counts that leave the last warp part empty."""
+    """Eq. (14), (15): shape and degree 3 colour in one kernel, for counts that leave the last warp partly empty."""
     mesh, cloud = box((6, 6, 6)), random_cloud(count)
     positions = bent(mesh.nodes, 1.0)
     expected = deform(cloud, embed_gaussians(cloud, mesh), positions)
@@ -375,14 +381,13 @@ def test_one_pass_on_cuda_equals_two_on_the_cpu(count: int) -> None:
 
 
 def turns_of(count: int, seed: int) -> np.ndarray:
-    """(count, 3, 3) random rotations."""
+    """Return (count, 3, 3) random rotations."""
     return Rotation.from_quat(np.random.default_rng(seed).normal(size=(count, 4))).as_matrix()
 
 
 def test_the_rotation_of_a_map_that_flattens_is_that_of_its_plane(device: str) -> None:
-    """Eq. (15): of F with a singular value that is zero, or nearly, the polar decomposition by SciPy's SVD with
-    det = +1, in any order of the other two.
-    """
+    """Eq. (15): for F with a singular value that is zero, or nearly, the rotation is that of SciPy's SVD with det = +1,
+    in any order of the other two."""
     stretches = [(1.0, 0.4, 0.0), (1.0, 0.0, 0.4), (0.4, 1.0, 0.0), (0.0, 0.4, 1.0), (0.4, 0.0, 1.0), (0.0, 1.0, 0.4)]
     stretches += [(1.0, 1e-9, 0.3), (0.3, 1.0, -0.05), (-0.05, 0.3, 1.0), (0.9, -0.02, 0.4)]
     for turned in (False, True):
@@ -398,7 +403,7 @@ def test_the_rotation_of_a_map_that_flattens_is_that_of_its_plane(device: str) -
 
 
 def test_of_a_map_onto_a_line_the_rotation_takes_that_line_along(device: str) -> None:
-    """F = s u v^T, along each axis and aslant: proper, and R v = u."""
+    """F = s u v^T, along each axis and obliquely: the rotation is proper, and R v = u."""
     slanted = np.random.default_rng(5).normal(size=(6, 2, 3))
     lines = np.concatenate([[(a, b) for a in np.eye(3) for b in np.eye(3)], slanted])
     u, v = np.swapaxes(lines / np.linalg.norm(lines, axis=2, keepdims=True), 0, 1)
@@ -413,7 +418,7 @@ def test_of_a_map_onto_a_line_the_rotation_takes_that_line_along(device: str) ->
 
 
 def test_axes_keep_their_order(device: str) -> None:
-    """Of the six orders of a frame's columns the one whose columns are best aligned with the carried, by trying."""
+    """The order of a frame's columns is the best aligned of all six."""
     count = 200
     frames = turns_of(count, 4)
     carried = np.random.default_rng(10).normal(size=(count, 3, 3))
@@ -428,7 +433,7 @@ def test_axes_keep_their_order(device: str) -> None:
 
 
 def test_axes_keep_the_side_that_they_were_carried_to(device: str) -> None:
-    """Of the four choices of signs with det = +1 the one whose columns lie nearest to the carried ones, by trying."""
+    """The signs are the closest to the reference of the four choices with det = +1."""
     count, random = 200, np.random.default_rng(9)
     frames = turns_of(count, 3)
     orders = np.array([random.permutation(3) for _ in range(count)])

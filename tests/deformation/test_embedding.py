@@ -13,7 +13,7 @@ from egs_warp.geometry.tetmesh import TetMesh
 
 
 def blob(seed: int = 0, count: int = 60) -> TetMesh:
-    """A box with a bite taken out, so that it is not convex."""
+    """Return a box with a cut-out, so that it is not convex."""
     rng = np.random.default_rng(seed)
     grid = np.stack(np.meshgrid(*[np.linspace(0, 1, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)
     nodes = np.concatenate([grid, rng.uniform(0.05, 0.95, (count, 3))])
@@ -27,7 +27,7 @@ def blob(seed: int = 0, count: int = 60) -> TetMesh:
 
 
 def distance_to_triangles(corners: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """(F,) distance from p to triangles (F, 3, 3), by the plane and the three edges."""
+    """Return (F,) the distance from p to triangles (F, 3, 3), by the plane and the three edges."""
     edges = np.roll(corners, -1, axis=1) - corners
     normal = np.cross(edges[:, 0], edges[:, 1])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -40,7 +40,7 @@ def distance_to_triangles(corners: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def brute_force(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All tetrahedra tried for every point: weights (P, T, 4), least weight (P, T), distance (P, T)."""
+    """Test all tetrahedra for every point: weights (P, T, 4), smallest weight (P, T), distance (P, T)."""
     x = mesh.nodes[mesh.tets]
     system = np.concatenate([x.transpose(0, 2, 1), np.ones((len(x), 1, 4))], axis=1)
     right = np.concatenate([points, np.ones((len(points), 1))], axis=1)
@@ -92,7 +92,8 @@ def test_weights_reproduce_points_and_shared_faces_take_the_lowest_tet(device: s
 
 @pytest.mark.parametrize("off", [0.0, 30.0])
 def test_the_nearest_faces_are_those_of_brute_force(off: float, device: str) -> None:
-    """Of the cage's own surface and of a level sheet within it, from inside and outside, far from the origin too."""
+    """Nearest faces of the cage's own surface and of a level sheet within it equal brute force, from inside and
+    outside, and far from the origin."""
     mesh = blob(seed=4)
     mesh = TetMesh(mesh.nodes + np.array([off, -2.0 * off, 0.3]), mesh.tets)
     cage = CageLocator(mesh, device=device)

@@ -1,4 +1,4 @@
-"""A capture in the frame of its body: shapes, sizes and colours go with it."""
+"""A capture in the frame of its body: shapes, sizes and colours transform with it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_shapes_turn_and_grow_with_the_frame(degree: int) -> None:
     np.testing.assert_array_equal(moved.opacity_logits.numpy(), cloud.opacity_logits.numpy())
     np.testing.assert_allclose(moved.sh.numpy()[:, 0], cloud.sh.numpy()[:, 0], atol=1e-6)
     if degree:
-        # Band 1 is a vector (y, z, x): it turns as directions do.
+        # Band 1 is a vector (y, z, x): it rotates as directions do.
         before, after = (one.sh.numpy()[:, 1:4].astype(np.float64)[:, [2, 0, 1]] for one in (cloud, moved))
         signs = np.array([-1.0, -1.0, 1.0])[:, None]
         np.testing.assert_allclose(signs * after, np.einsum("ij,njc->nic", axes, signs * before), atol=1e-5)

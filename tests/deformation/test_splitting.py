@@ -26,7 +26,7 @@ from tests.support.deformation_scenes import bent, box, covariances, random_clou
 
 
 def bar_cloud(count: int = 200, *, device: str = "cpu") -> GaussianCloud:
-    """Needles and discs in the bar of ``box((24, 2, 2), (4, .4, .4))``."""
+    """Return needles and discs in the bar of ``box((24, 2, 2), (4, .4, .4))``."""
     rng = np.random.default_rng(0)
     return GaussianCloud.from_numpy(
         rng.uniform([0.8, 0.05, 0.05], [3.2, 0.35, 0.35], (count, 3)),
@@ -63,8 +63,8 @@ def test_children_keep_mean_and_covariance(rule: SplitRule, device: str) -> None
 
 
 def profile_error(opacity: float, rule: SplitRule, tilt: float) -> float:
-    """Largest difference, over the opacity, between the pictures of a round needle and of its children. The needle's
-    axis makes the angle ``tilt`` with the line of sight; its thickness is 0.3 of its length."""
+    """Return the largest difference, over the opacity, between the images of a round needle and of its children. The
+    axis of the needle makes the angle ``tilt`` with the line of sight; its thickness is 0.3 of its length."""
     offsets, shrink = child_layout(rule)
     peaks = child_opacities(np.array([opacity]), rule)[0]
     x = np.linspace(-4.0, 4.0, 401)
@@ -80,8 +80,8 @@ def profile_error(opacity: float, rule: SplitRule, tilt: float) -> float:
 
 @pytest.mark.parametrize("opacity", [0.05, 0.2, 0.5, 0.8, 0.9, 0.99])
 def test_a_split_is_hard_to_see_from_the_side_and_from_the_end(opacity: float) -> None:
-    """Eq. (17): side-on the picture changes by at most 8 % of the opacity; end-on by a third for a faint one; the
-    paper's two humps change it by a third and more side-on."""
+    """Eq. (17): side-on the image changes by at most 8 % of the opacity, end-on by a third for a faint one; the paper's
+    two children change it by a third and more side-on."""
     side, end = (profile_error(opacity, SplitRule.MEASURED, tilt) for tilt in (np.pi / 2, 0.0))
     assert side < 0.08
     assert end < 0.33
@@ -89,7 +89,7 @@ def test_a_split_is_hard_to_see_from_the_side_and_from_the_end(opacity: float) -
 
 
 def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
-    """Eq. (16): after splitting, what is still bent is small or at the depth limit, and the misfit has shrunk."""
+    """Eq. (16): after splitting, the remaining bend is small or at the depth limit, and the fit error has decreased."""
     mesh, cloud = box((24, 2, 2), (4.0, 0.4, 0.4)), bar_cloud()
     frames = [mesh.nodes, bent(mesh.nodes, 1.0)]
     embedding = embed_gaussians(cloud, mesh)
@@ -97,7 +97,7 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
     result = split_for_motion(cloud, embedding, frames, max_growth=20.0)
     after = Deformer(result.cloud, result.embedding).measure_bend(frames)
     visible = result.cloud.opacities() > 0.01
-    # Ends of tilted needles stick out of the bar, where a misfit is that of the extrapolation.
+    # Ends of tilted needles stick out of the bar, where the fit error is that of the extrapolation.
     within, before_within = (e.points.inside.numpy().reshape(-1, 7).all(axis=1) for e in (result.embedding, embedding))
     assert within.mean() > 0.5
     assert after.fit_error[visible & within].max() < 0.6 * before.fit_error[before_within].max()
@@ -108,7 +108,8 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
 
 
 def test_where_not_all_can_be_split_the_worst_are() -> None:
-    """Those with the largest misfit, of those that would be split without a cap."""
+    """With a limit on the count, those with the largest fit error are split, among those that would be split without a
+    limit."""
     mesh, cloud = box((24, 2, 2), (4.0, 0.4, 0.4)), bar_cloud()
     embedding = embed_gaussians(cloud, mesh)
     bend = Deformer(cloud, embedding).measure_bend([bent(mesh.nodes, 1.5)])
@@ -125,7 +126,8 @@ def test_where_not_all_can_be_split_the_worst_are() -> None:
 
 
 def test_what_was_split_three_times_is_left() -> None:
-    """Whatever its bend; others are split once more, and count it."""
+    """A Gaussian at the depth limit is not split, however bent; others are split once more, and their depth
+    increases."""
     mesh, cloud = box((24, 2, 2), (4.0, 0.4, 0.4)), bar_cloud()
     embedding = embed_gaussians(cloud, mesh)
     bend = Deformer(cloud, embedding).measure_bend([bent(mesh.nodes, 1.5)])
@@ -139,7 +141,7 @@ def test_what_was_split_three_times_is_left() -> None:
 
 
 def test_an_affine_motion_splits_nothing() -> None:
-    """Eq. (16): no bend under stretch, shear and turn, and the very same arrays come back."""
+    """Eq. (16): stretch, shear and rotation do not bend, and the same arrays are returned."""
     mesh, cloud = box((4, 4, 4)), random_cloud(300)
     gradient = np.array([[0.0, -1.3, 0.2], [0.9, 0.0, 0.1], [0.0, 0.3, 1.2]])
     embedding = embed_gaussians(cloud, mesh)
@@ -148,8 +150,8 @@ def test_an_affine_motion_splits_nothing() -> None:
 
 
 def test_nothing_pops_in_an_animation_that_splits() -> None:
-    """Eq. (17): over a bend that grows, frames of the cloud that was split for the motion follow each other as smoothly
-    as those of the unsplit one; a cloud that is split in the middle of it is caught by the same measure."""
+    """Eq. (17): over a growing bend, frames of the cloud split for the motion change as smoothly as those of the
+    unsplit one; the same measure detects a cloud that is split in the middle."""
     mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
     cloud = bar_cloud()
     frames = [bent(mesh.nodes, 4.0 / angle) for angle in np.linspace(1.0, 1.02, 17)]
@@ -165,7 +167,7 @@ def test_nothing_pops_in_an_animation_that_splits() -> None:
             render_gaussians(Deformer(*each).deform(nodes).cloud, camera).colour.numpy()
             for each, nodes in zip(clouds, frames, strict=True)
         ]
-        # What a motion at even speed would make of two frames is taken off: compensation to first order.
+        # Subtract the change of a uniform motion between two frames: compensation to first order.
         change = np.stack([a - 2.0 * b + c for a, b, c in zip(pictures, pictures[1:], pictures[2:], strict=False)])
         return np.sqrt((change**2).mean(axis=(1, 2, 3)))
 
@@ -174,7 +176,7 @@ def test_nothing_pops_in_an_animation_that_splits() -> None:
 
     before, after = (cloud, embedding), (split.cloud, split.embedding)
     unsplit, ahead, midway = (jerks([*[before] * n, *[after] * (17 - n)]) for n in (17, 0, 8))
-    # Two splats of equal depth that change places, as splats do, make 1.5 of one frame here.
+    # Two splats of equal depth that swap their order change one frame by a factor of 1.5 here.
     assert worst(unsplit) < 2.0
     assert worst(ahead) < 2.0
     assert worst(midway) > 5.0
@@ -182,7 +184,7 @@ def test_nothing_pops_in_an_animation_that_splits() -> None:
 
 @pytest.mark.data
 def test_a_split_at_rest_cannot_be_seen(data_dir: Path) -> None:
-    """Eq. (17): PSNR of split against unsplit at rest is at least 45 dB on a real capture that a bend has split."""
+    """Eq. (17): the PSNR of split against unsplit at rest is at least 45 dB on a real capture that a bend has split."""
     cloud = read_capture(data_dir / "objects" / "plush_dog.ply", device="cpu").cloud
     means = cloud.means.numpy().astype(float)
     lower, upper = np.percentile(means, [0.5, 99.5], axis=0)
@@ -204,9 +206,9 @@ def test_a_split_at_rest_cannot_be_seen(data_dir: Path) -> None:
 
 
 def test_children_are_as_opaque_as_the_rules_say() -> None:
-    """Eq. (17): the paper's two share the mass, sigma^2 of each 1 - 2 / pi, peaks at most 0.99; of the measured three
-    none is more opaque than the parent, the middle one more than the outer ones, all more with the parent.
-    """
+    """Eq. (17): the paper's two children share the mass, with sigma^2 = 1 - 2 / pi each and peaks of at most 0.99. Of
+    the measured three none is more opaque than the parent, the middle one is more opaque than the outer ones, and all
+    increase with the parent."""
     opacities = np.linspace(0.0, 1.0, 401)
     pair = child_opacities(opacities, SplitRule.PAPER)
     peaks = 0.5 * opacities / np.sqrt(1.0 - 2.0 / np.pi)

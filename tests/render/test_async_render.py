@@ -1,4 +1,4 @@
-"""Pictures that are made beside what else goes on."""
+"""Asynchronous rendering."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ from egs_warp.render.rasteriser import enqueue_image, render_gaussians
 
 
 def test_what_is_taken_is_what_is_drawn_at_once(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One after the other, the last of them with too little room at first; nothing where nothing was begun."""
+    """Results equal those of blocking renders, in order, also when the last guess was too small; without a submit there
+    is no result."""
     cloud = pawn(gaussian_count=3000, device=device).cloud
     eyes = np.array([[1.0, -3.0, 1.0], [-2.0, -1.0, 2.0], [0.0, 3.0, 0.5]])
     cameras = [Camera.look_at(eye, np.array([0.0, 0.0, 0.5]), np.eye(3)[2], width=67, height=45) for eye in eyes]
     expected = [render_gaussians(cloud, camera).colour_srgb8() for camera in cameras]
     assert len({picture.tobytes() for picture in expected}) == len(eyes)
-    ahead = AsyncRenderer(67, 45, cloud.device)
+    renderer = AsyncRenderer(67, 45, cloud.device)
     wp.synchronize()
-    assert ahead.result() is None
+    assert renderer.result() is None
     for camera, picture in zip(cameras[:2], expected, strict=False):
-        ahead.submit(partial(enqueue_image, cloud, camera))
-        np.testing.assert_array_equal(ahead.result(), picture)
-    begun: list[compositing.PendingImage] = []
+        renderer.submit(partial(enqueue_image, cloud, camera))
+        np.testing.assert_array_equal(renderer.result(), picture)
+    pending: list[compositing.PendingImage] = []
 
     def empty() -> compositing.PendingImage:
-        """Lists that are empty, as they are where there was no room."""
-        begun.append(enqueue_image(cloud, cameras[2]))
-        begun[-1].image.colour.zero_()
-        return begun[-1]
+        """Queue an image and clear it, as if its guessed capacity had been too small."""
+        pending.append(enqueue_image(cloud, cameras[2]))
+        pending[-1].image.colour.zero_()
+        return pending[-1]
 
     monkeypatch.setattr(compositing, "lists_fit", lambda lists, projected: False)
-    ahead.submit(empty)
-    np.testing.assert_array_equal(ahead.result(), expected[2])
-    assert ahead.result() is None
+    renderer.submit(empty)
+    np.testing.assert_array_equal(renderer.result(), expected[2])
+    assert renderer.result() is None

@@ -19,7 +19,8 @@ NAMES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
 
 def clear_scene(seed: int = 1) -> tuple[dict[str, np.ndarray], Camera]:
-    """Soft splats wider than the picture, at separate depths and with colours off zero: no jump is near."""
+    """Return soft splats wider than the image, at separate depths and with colours off zero, so that no discontinuity
+    is near."""
     random = np.random.default_rng(seed)
     count = 7
     values = {
@@ -114,9 +115,8 @@ def many_splats(count: int = 800) -> tuple[dict[str, np.ndarray], Camera]:
 
 
 def test_directional_derivative_of_a_crowded_scene(device: str) -> None:
-    """Hundreds of overlapping splats with early stops:
-    moving all of them downhill changes the twin's loss as predicted.
-    """
+    """A step along the gradient changes the float64 twin's loss as predicted, for hundreds of overlapping splats with
+    early stops."""
     values, camera = many_splats(300)
     got = gradients(values, camera, device)
     random = np.random.default_rng(3)
@@ -152,7 +152,8 @@ def test_cuda_gradients_match_the_cpu_and_repeat() -> None:
 
 @pytest.mark.cuda
 def test_work_is_queued_on_torchs_stream() -> None:
-    """The inputs are still being written on a side stream when the picture is asked for."""
+    """The image is queued on torch's stream: its inputs are still being written on a side stream at the time of the
+    call."""
     values, camera = many_splats()
     tensors = [torch.tensor(values[name], dtype=torch.float32, device="cuda") for name in NAMES]
     expected = render_torch(*tensors, camera=camera).colour
@@ -182,7 +183,8 @@ def test_a_picture_without_gradients_has_the_same_bits(device: str) -> None:
 
 
 def test_pictures_wait_for_their_gradients_while_others_are_made(device: str) -> None:
-    """Memory that nobody holds is given again: what a picture's gradients need must be held as long as the picture."""
+    """Two images are rendered before either backward pass: memory that the gradients need must not be reused
+    meanwhile."""
     values, camera = many_splats()
     nearer = replace(camera, translation=camera.translation - [0.0, 0.0, 0.8])
 
@@ -202,7 +204,7 @@ def test_pictures_wait_for_their_gradients_while_others_are_made(device: str) ->
 
 
 def test_tiles_left_out_show_the_background_and_give_no_gradient(device: str) -> None:
-    """As if the loss did not look at them; gsplat's masks are of the same tiles."""
+    """Gradients are those of a loss without the masked tiles; gsplat's masks have the same tiles."""
     values, camera = many_splats()
     mask = np.random.default_rng(5).random((5, 6)) < 0.5
     pixels = torch.tensor(np.kron(mask, np.ones((16, 16), bool))[:70, :90], device=device)
@@ -243,7 +245,7 @@ def test_pixels_share_memory_and_bad_tensors_are_named() -> None:
 
 
 def test_screen_positions_get_their_gradient_where_asked_for(device: str) -> None:
-    """Moving every splat by one pixel is moving the principal point: the sums are the camera's."""
+    """Moving every splat by one pixel moves the principal point: the sums equal the camera's gradient."""
     values, camera = clear_scene()
     tensors = [torch.tensor(values[name], dtype=torch.float32, device=device, requires_grad=True) for name in NAMES]
     screen = torch.zeros((len(values["means"]), 2), device=device, requires_grad=True)
@@ -266,7 +268,8 @@ def test_screen_positions_get_their_gradient_where_asked_for(device: str) -> Non
     "case", ["none visible", "covers all", "one pixel", "inside", "opaque", "clear", "tiny", "flat"]
 )
 def test_odd_cases_have_finite_gradients(device: str, case: str) -> None:
-    """Nothing seen gives exact zeros; nothing odd gives NaN or infinity, in the mode that divides by the area too."""
+    """Invisible scenes give exactly zero gradients; degenerate ones give no NaN or infinity, also in the antialiased
+    mode, which divides by the area."""
     values, camera = clear_scene()
     values = {name: value.copy() for name, value in values.items()}
     if case == "none visible":

@@ -1,4 +1,4 @@
-"""The shadow of the animated object: only where the floor is seen, and softly."""
+"""Shadow of the animated object: soft, and only where the floor is visible."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def placed(source: GaussianCloud, means: np.ndarray) -> GaussianCloud:
 
 
 def parts() -> tuple[GaussianCloud, GaussianCloud]:
-    """A flattened ball, and the floor under it."""
+    """Return a flattened ball and the floor under it."""
     cloud, truth = ball_on_floor()
     ball = cloud.subset(truth)
     return placed(ball, ball.means.numpy() * [1.0, 1.0, 0.1]), cloud.subset(~truth)
@@ -54,7 +54,8 @@ def square(values: Any) -> np.ndarray:
 
 
 def test_the_shadow_falls_where_the_floor_is_seen() -> None:
-    """Darker under the body, unchanged elsewhere and on what hides the floor; softer and paler from above."""
+    """The image is darker under the body and unchanged elsewhere and on what hides the floor; higher bodies cast
+    softer, paler shadows."""
     body, floor = parts()
     bare, dark = (over_scene(floor, body, shadow=shadow) for shadow in (False, True))
     ground = on_ground(body)
@@ -72,8 +73,8 @@ def test_the_shadow_falls_where_the_floor_is_seen() -> None:
 
 
 def test_the_shadow_lies_on_an_uneven_floor_without_an_edge() -> None:
-    """Half of a floor that stands 3 % of the reach above the fitted plane, as sheets do, bears nearly the same shadow;
-    at a terrace too high for it the shadow ends, but not from one pixel to the next."""
+    """The half of a floor that is 3 % of the reach above the fitted plane, as cloths are, receives nearly the same
+    shadow. At a terrace too high for it the shadow ends, but not within one pixel."""
     body, flat = parts()
     darkness = []
     for step in (0.0, 0.06, 0.4):
@@ -88,13 +89,13 @@ def test_the_shadow_lies_on_an_uneven_floor_without_an_edge() -> None:
 
 
 def blurred(values: np.ndarray, sigma: float) -> np.ndarray:
-    """As long a kernel as reaches four standard deviations."""
+    """Return ``values`` blurred by a kernel that reaches four standard deviations."""
     size = 2 * int(np.ceil(4.0 * sigma)) + 1
     return cv2.GaussianBlur(values, (size, size), sigma)
 
 
 def darkness(body: GaussianCloud, plane: Plane, centre: np.ndarray, reach: float, height: float) -> np.ndarray:
-    """The shadow once more: bins, OpenCV's blur, and each pixel's ray."""
+    """Compute the shadow by an independent reference: histogram, OpenCV's blur, and each pixel's ray."""
     means, scales = body.means.numpy(), np.sort(np.exp(body.log_scales.numpy()), axis=1)
     texel, tangents, shade = 2.0 * reach / 192, np.stack(plane.tangents()), np.zeros((192, 192))
     hidden = body.opacities() * 2.0 * np.pi * scales[:, 1] * scales[:, 2] / texel**2
@@ -117,7 +118,8 @@ def darkness(body: GaussianCloud, plane: Plane, centre: np.ndarray, reach: float
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
 def test_it_is_what_bins_blurs_and_rays_make(tilt: float, device: str) -> None:
-    """On level and tilted ground, for a body of other heights and sizes of Gaussians, seen wholly and in part."""
+    """The shadow equals the reference on level and tilted ground, for bodies of other heights and Gaussian sizes,
+    visible wholly and in part."""
     plane = Plane(np.array([np.sin(tilt), 0.0, np.cos(tilt)]), 0.1)
     random, (ball, _) = np.random.default_rng(3), parts()
     body = GaussianCloud.from_numpy(
@@ -138,7 +140,7 @@ def test_it_is_what_bins_blurs_and_rays_make(tilt: float, device: str) -> None:
 
 
 def test_a_floor_has_lines_and_ends_in_the_sky() -> None:
-    """Lines a cell apart, nothing of it from the reach on; without a shadow it is the same under a body."""
+    """Lines are one cell apart and end at the reach; without a shadow the floor is the same under a body."""
     body, _ = parts()
     ground = on_ground(body)
     picture = grid_floor(ground, cell=0.5, shadow=False).background(body).numpy()
@@ -150,7 +152,7 @@ def test_a_floor_has_lines_and_ends_in_the_sky() -> None:
 
 
 def test_levels_are_clipped_and_halves_go_to_the_even_one() -> None:
-    """As NumPy has it."""
+    """Quantisation equals NumPy's clip and rint."""
     import warp as wp
 
     colour = np.linspace(-0.2, 1.2, 3 * 7 * 511, dtype=np.float32).reshape(7, 511, 3)

@@ -51,7 +51,7 @@ def camera_of(width: int = 67, height: int = 45, **changes: float) -> Camera:
 
 
 def assert_same(image: object, twin: dict[str, np.ndarray], *, near_cut: float = 2e-3) -> None:
-    """Equal to rounding, but for the few pixels where a splat at its alpha cut of 1/255 comes or goes."""
+    """Assert equality to rounding, except for the few pixels where a splat is at its alpha cut of 1/255."""
     for name in ("colour", "alpha", "depth"):
         got, expected = getattr(image, name).numpy(), twin[name]
         off = np.abs(got - expected) / np.maximum(1.0, np.abs(expected))
@@ -83,7 +83,7 @@ def test_antialiased_mode_and_background_image(device: str) -> None:
 
 
 def test_long_thin_splats_do_not_cancel(device: str) -> None:
-    """Needles of 1000 : 1 on the screen, where the usual conic form in float32 loses every digit."""
+    """Needles of 1000 : 1 on the screen match the twin; the usual conic form in float32 would lose every digit."""
     values = random_scene(60, seed=5)
     values["log_scales"] = np.tile([1.0, -7.0, -9.0], (60, 1))
     camera = camera_of(200, 160)
@@ -109,7 +109,7 @@ def test_opacity_zero_and_one(device: str) -> None:
 
 
 def test_tiny_scales_show_as_the_low_pass(device: str) -> None:
-    """A Gaussian of scale e^-10 covers what the 0.3 px low-pass gives it: 2 pi 0.3 opacity square pixels of alpha."""
+    """A Gaussian of scale e^-10 covers the area of the 0.3 px low-pass: 2 pi 0.3 opacity square pixels of alpha."""
     values = one_splat(log_scales=[[-10.0] * 3], opacity_logits=[8.0])
     camera = camera_of(64, 64)
     image = render_gaussians(cloud_of(values, device), camera)
@@ -195,7 +195,7 @@ def test_several_cameras_and_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.cuda
 def test_a_full_gpu_refuses_and_works_again() -> None:
-    """240 million pairs want 8 GB where 600 MB are left."""
+    """240 million pairs need 8 GB where 600 MB are free."""
     torch = pytest.importorskip("torch")
     values = random_scene(200_000, coefficients=1, log_scale=3.0)
     values["opacity_logits"][:] = 2.0
@@ -231,7 +231,7 @@ def test_rotating_the_object_equals_rotating_the_camera(device: str) -> None:
 
 
 def test_depth_of_a_half_opaque_plane_is_the_planes_depth(device: str) -> None:
-    """Flat, half-opaque splats in the plane z = 0 seen at a slant: the depth is that of the plane, Eq. (18)."""
+    """Flat, half-opaque splats in the plane z = 0, viewed at a slant, have the depth of the plane, Eq. (18)."""
     grid = np.stack(np.meshgrid(np.arange(-4, 4, 0.05), np.arange(-4, 4, 0.05)), -1).reshape(-1, 2)
     count = len(grid)
     values = {
@@ -254,7 +254,7 @@ def test_depth_of_a_half_opaque_plane_is_the_planes_depth(device: str) -> None:
 
 
 def test_sh_signs_follow_the_inria_convention(device: str) -> None:
-    """One coefficient at a time, seen from a known direction."""
+    """Each coefficient alone gives the expected colour in a known direction."""
     camera = camera_of(9, 9)
     direction = (-EYE / np.linalg.norm(EYE))[None]
     basis = sh_basis(direction)[0]
@@ -312,10 +312,9 @@ def test_impossible_cameras_and_backgrounds_are_refused() -> None:
 
 @pytest.mark.parametrize("spread", [1.0, 1e-5])
 def test_sorted_lists_equal_counted_ones(spread: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A GPU sorts pairs and a CPU counts them: tile by tile the same Gaussians in the same order, equal depths by
-    index.
+    """Sorting (GPU) and counting (CPU) give the same Gaussians in the same order for each tile, equal depths by index.
 
-    With a spread of 1e-5 hundreds of Gaussians of each tile share the leading bits of depth that are sorted by.
+    With a spread of 1e-5, hundreds of Gaussians of each tile share the leading depth bits of the sort key.
     """
     values = random_scene(3000, coefficients=1, seed=12)
     camera = camera_of(200, 150)
@@ -327,7 +326,7 @@ def test_sorted_lists_equal_counted_ones(spread: float, monkeypatch: pytest.Monk
     tiles = 13 * 10
     counted = [_lists_by_counting(projected, view, tiles, threads) for threads in (1, 2, 3)]
     pairs = projected.slot_count
-    # With no guess, with one that leaves room, and with one that leaves none.
+    # With no guess, with one that is large enough, and with one that is too small.
     monkeypatch.setattr("egs_warp.render.tiles._expected", {"cpu": pairs})
     guessed = _lists_by_sorting(projected, view, tiles, guess=True)
     assert lists_fit(guessed, projected) and len(guessed.gaussian_from_intersection) > pairs

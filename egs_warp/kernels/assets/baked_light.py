@@ -1,4 +1,5 @@
-"""Baked light for the built-in scenes: ambient occlusion and a soft key light against the scene's own triangles."""
+"""Baked light of the built-in scenes: ambient occlusion and a soft key light, traced against the scene's own
+triangles."""
 
 import warp as wp
 
@@ -7,7 +8,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def fibonacci_cosine_direction(index: int, count: int, turn: float) -> wp.vec3:
-    """Direction ``index`` of ``count`` about +z, distributed by the cosine; ``turn`` spins the pattern (radians)."""
+    """Return direction ``index`` of ``count`` about +z, cosine-distributed; ``turn`` (rad) rotates the pattern."""
     u = (float(index) + 0.5) / float(count)
     angle = 2.39996323 * float(index) + turn
     radius = wp.sqrt(u)
@@ -33,15 +34,21 @@ def bake_light_kernel(
     ground_out: wp.array[float],
     light_out: wp.array[float],
 ):
-    """Per point: the cosine-weighted share of the hemisphere that sees sky, that sees lit ground, and the visible
-    share of the key light (a disc of half-angle tangent ``light_softness``). ``reach`` is the length of ambient rays
-    and the distance over which the ground counts as shaded by the object above it."""
+    """Compute the light at each point.
+
+    Args:
+        reach: length of the ambient rays, and the distance over which the object above darkens the ground.
+        light_softness: tangent of the half-angle of the key light's disc.
+        sky_out: cosine-weighted fraction of the hemisphere in which the sky is visible.
+        ground_out: likewise, lit ground.
+        light_out: visible fraction of the key light.
+    """
     i = wp.tid()
     n = wp.normalize(normals[i])
     helper = wp.where(wp.abs(n[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
     t = wp.normalize(wp.cross(helper, n))
     b = wp.cross(n, t)
-    # Clear of the triangles, which cut the corners of creases.
+    # Offset from the triangles, which cut the corners of creases.
     start = points[i] + n * (reach * 0.018)
     height = wp.dot(points[i], up) - ground_height
     turn = float(i) * 1.7
@@ -68,11 +75,11 @@ def bake_light_kernel(
     light = wp.normalize(light_direction)
     light_t = wp.normalize(wp.cross(wp.vec3(0.31, 0.17, -0.93), light))
     light_b = wp.cross(light, light_t)
-    seen = wp.float32(0.0)
+    visible = wp.float32(0.0)
     for k in range(light_rays):
         radius = light_softness * wp.sqrt((float(k) + 0.5) / float(light_rays))
         angle = 2.39996323 * float(k) + turn
         direction = wp.normalize(light + light_t * (radius * wp.cos(angle)) + light_b * (radius * wp.sin(angle)))
         if wp.dot(direction, n) > 0.0 and not wp.mesh_query_ray_anyhit(mesh, start, direction, 1.0e4 * reach):
-            seen += 1.0
-    light_out[i] = seen / float(light_rays)
+            visible += 1.0
+    light_out[i] = visible / float(light_rays)

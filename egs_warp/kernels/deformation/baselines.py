@@ -1,4 +1,7 @@
-"""Other ways to carry Gaussians with a cage, to compare with: surface-bound, one gradient, a small tetrahedron each."""
+"""Baseline deformations of Gaussians by a cage: bound to a surface, one gradient, a small tetrahedron each.
+
+Host code: ``egs_warp/deformation/baselines.py``.
+"""
 
 import warp as wp
 
@@ -13,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def interpolated(corners: wp.vec4i, weights: Vec4, positions: wp.array[Vec3]) -> Vec3:
-    """Eq. (2) read backwards: the point with these weights."""
+    """Return the point with barycentric ``weights``, the inverse of Eq. (2)."""
     return (
         weights[0] * positions[corners[0]]
         + weights[1] * positions[corners[1]]
@@ -29,7 +32,7 @@ def double(v: wp.vec3) -> Vec3:
 
 @wp.func
 def local_corner(j: wp.int32) -> Vec3:
-    """Corner j of a regular tetrahedron around the origin: alternate corners of the cube of side 2."""
+    """Return corner j of a regular tetrahedron around the origin: alternate corners of the cube of side 2."""
     one = real(1.0)
     if j == 0:
         return Vec3(one, one, one)
@@ -41,9 +44,13 @@ def local_corner(j: wp.int32) -> Vec3:
 
 
 @wp.func
-def local_lengths(log_scales: wp.vec3, reach: real, least: real) -> Vec3:
+def local_lengths(log_scales: wp.vec3, reach: real, min_length: real) -> Vec3:
     s = exponential(log_scales)
-    return Vec3(wp.max(reach * real(s[0]), least), wp.max(reach * real(s[1]), least), wp.max(reach * real(s[2]), least))
+    return Vec3(
+        wp.max(reach * real(s[0]), min_length),
+        wp.max(reach * real(s[1]), min_length),
+        wp.max(reach * real(s[2]), min_length),
+    )
 
 
 @wp.kernel
@@ -54,38 +61,37 @@ def local_tetrahedron_kernel(
     rotations: wp.array[wp.vec4],
     log_scales: wp.array[wp.vec3],
     reach: real,
-    least: real,
+    min_length: real,
     # Out:
     corners_out: wp.array[Vec3],
 ):
-    """Corners of each Gaussian's own tetrahedron, rows 4 i .. 4 i + 3."""
+    """Compute the corners of each Gaussian's own tetrahedron, rows 4 i .. 4 i + 3 of the output."""
     row = first_row + wp.tid()
-    lengths = local_lengths(log_scales[row], reach, least)
+    lengths = local_lengths(log_scales[row], reach, min_length)
     for j in range(4):
         corner = wp.cw_mul(local_corner(j), lengths)
         corners_out[4 * row + j] = double(means[row]) + axes_from_quaternion(rotations[row]) * corner
 
 
 @wp.kernel
-def carry_local_tetrahedron_kernel(
+def deform_with_tetrahedron_kernel(
     first_row: wp.int32,
     # In:
     rotations: wp.array[wp.vec4],
     log_scales: wp.array[wp.vec3],
     corners: wp.array[Vec3],
     reach: real,
-    least: real,
+    min_length: real,
     # Out:
     means_out: wp.array[wp.vec3],
     rotations_out: wp.array[wp.vec4],
     log_scales_out: wp.array[wp.vec3],
-    turns_out: wp.array[wp.vec4],
+    polar_rotations_out: wp.array[wp.vec4],
 ):
-    """F from the corners of each Gaussian's own tetrahedron,
-    which the cage has carried (VR-GS, two-level embedding).
-    """
+    """Deform each Gaussian by the F of its own tetrahedron, whose corners the cage has deformed (VR-GS, two-level
+    embedding)."""
     row = first_row + wp.tid()
-    lengths = local_lengths(log_scales[row], reach, least)
+    lengths = local_lengths(log_scales[row], reach, min_length)
     centre = Vec3()
     moments = Mat33()
     for j in range(4):
@@ -96,11 +102,13 @@ def carry_local_tetrahedron_kernel(
     stretched = single_matrix(moments * wp.diag(Vec3(one / lengths[0], one / lengths[1], one / lengths[2])))
     axes = rotation_from_quaternion(rotations[row])
     means_out[row] = single(centre)
-    write_gaussian(row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, turns_out)
+    write_gaussian(
+        row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, polar_rotations_out
+    )
 
 
 @wp.kernel
-def carry_gradient_kernel(
+def deform_with_gradient_kernel(
     first_row: wp.int32,
     # In:
     rotations: wp.array[wp.vec4],
@@ -114,24 +122,26 @@ def carry_gradient_kernel(
     means_out: wp.array[wp.vec3],
     rotations_out: wp.array[wp.vec4],
     log_scales_out: wp.array[wp.vec3],
-    turns_out: wp.array[wp.vec4],
+    polar_rotations_out: wp.array[wp.vec4],
 ):
-    """One F, that of the tetrahedron which holds the mean (PhysGaussian)."""
+    """Deform each Gaussian by one F, that of the tetrahedron that contains the mean (PhysGaussian)."""
     row = first_row + wp.tid()
     axes = rotation_from_quaternion(rotations[row])
     means_out[row] = single(interpolated(nodes[row], weights[row], positions))
     stretched = affine_of(cage, tet_from_mean[row]).gradient * axes
-    write_gaussian(row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, turns_out)
+    write_gaussian(
+        row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, polar_rotations_out
+    )
 
 
 @wp.func
 def triangle_frame(a: Vec3, b: Vec3, c: Vec3) -> Mat33:
-    """Two edges and the unit normal."""
+    """Return the matrix of two edges and the unit normal of a triangle."""
     return wp.matrix_from_cols(b - a, c - a, wp.normalize(wp.cross(b - a, c - a)))
 
 
 @wp.kernel
-def carry_surface_kernel(
+def deform_with_surface_kernel(
     first_row: wp.int32,
     # In:
     means: wp.array[wp.vec3],
@@ -145,9 +155,10 @@ def carry_surface_kernel(
     means_out: wp.array[wp.vec3],
     rotations_out: wp.array[wp.vec4],
     log_scales_out: wp.array[wp.vec3],
-    turns_out: wp.array[wp.vec4],
+    polar_rotations_out: wp.array[wp.vec4],
 ):
-    """F of the nearest surface triangle, whose thickness does not change (SuGaR: Gaussians bound to triangles)."""
+    """Deform each Gaussian by the F of the nearest surface triangle, whose thickness does not change (SuGaR: Gaussians
+    bound to triangles)."""
     row = first_row + wp.tid()
     f = faces[face_from_gaussian[row]]
     before = triangle_frame(rest[f[0]], rest[f[1]], rest[f[2]])
@@ -156,4 +167,6 @@ def carry_surface_kernel(
     axes = rotation_from_quaternion(rotations[row])
     means_out[row] = single(positions[f[0]] + gradient * (double(means[row]) - rest[f[0]]))
     stretched = single_matrix(gradient) * axes
-    write_gaussian(row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, turns_out)
+    write_gaussian(
+        row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, polar_rotations_out
+    )

@@ -1,4 +1,4 @@
-"""The carried cage, and where it takes the arms of each Gaussian (Eq. 14)."""
+"""Affine maps of the deformed cage, and the deformed arms of each Gaussian (Eq. 14)."""
 
 import warp as wp
 
@@ -37,7 +37,7 @@ def single_matrix(m: Mat33) -> wp.mat33:
 #endif
 """)
 def load_row(rows: wp.array[wp.vec4], row: wp.int32) -> wp.vec4:
-    """``rows[row]`` in one 16-byte load, which Warp's own indexing makes four of."""
+    """Return ``rows[row]`` by one 16-byte load; Warp's own indexing makes four."""
     ...
 
 
@@ -49,23 +49,22 @@ def load_row(rows: wp.array[wp.vec4], row: wp.int32) -> wp.vec4:
 #endif
 """)
 def store_row(rows: wp.array[wp.vec4], row: wp.int32, value: wp.vec4):
-    """``rows[row] = value`` in one 16-byte store."""
+    """Set ``rows[row] = value`` by one 16-byte store."""
     ...
 
 
 @wp.struct
 class CageMaps:
-    """The affine map x0' + F (x - x0) of each tetrahedron, and the rotation of F. Arrays in a struct, since eight
-    functions pass them on."""
+    """Affine map x0' + F (x - x0) of each tetrahedron, and the rotation of F."""
 
     maps: wp.array[wp.vec4]
-    """(3 T,) rows of F, each with one coordinate of x0' behind it: all that most arms ask for, close together."""
+    """(3 T,) rows of F, each followed by one coordinate of x0'. Most arms read only this."""
     frames: wp.array[wp.vec4]
-    """(2 T,) x0; R_polar as w, x, y, z."""
+    """(2 T,) x0; R_polar as a quaternion w, x, y, z."""
 
 
 @wp.kernel
-def carry_tets_kernel(
+def update_maps_kernel(
     first_row: wp.int32,
     # In:
     positions: wp.array[Vec3],
@@ -75,7 +74,7 @@ def carry_tets_kernel(
     # Out:
     cage_out: CageMaps,
 ):
-    """Each tetrahedron's map and rotation for node ``positions``."""
+    """Compute the map and rotation of each tetrahedron for node ``positions``."""
     t = first_row + wp.tid()
     corners = tets[t]
     x0 = positions[corners[0]]
@@ -91,7 +90,7 @@ def carry_tets_kernel(
 
 @wp.struct
 class Affine:
-    """x -> moved + gradient (x - start)."""
+    """Affine map x -> moved + gradient (x - start)."""
 
     gradient: wp.mat33
     start: wp.vec3
@@ -112,8 +111,8 @@ def affine_of(cage: CageMaps, tet: wp.int32) -> Affine:
 
 
 @wp.func
-def turn_of_tet(cage: CageMaps, tet: wp.int32) -> wp.vec4:
-    """R_polar as w, x, y, z."""
+def rotation_of_tet(cage: CageMaps, tet: wp.int32) -> wp.vec4:
+    """Return R_polar of a tetrahedron as a quaternion w, x, y, z."""
     return load_row(cage.frames, 2 * tet + 1)
 
 
@@ -123,9 +122,8 @@ def image(map: Affine, point: wp.vec3) -> wp.vec3:
 
 
 RIGID = wp.constant(wp.float32(3.0))
-"""Share of the first arm that marks a Gaussian far outside the cage,
-which is not stretched but only turned and moved.
-"""
+"""Value of ``inside_fractions[0]`` that marks a Gaussian far outside the cage, which is moved rigidly and not
+stretched."""
 
 
 SixTets = wp.types.vector(length=6, dtype=wp.int32)
@@ -139,25 +137,25 @@ def exponential(v: wp.vec3) -> wp.vec3:
 
 @wp.func
 def reach_of(arms: wp.array2d[wp.float32], row: wp.int32, axis: wp.int32, scale: wp.float32) -> wp.float32:
-    """Distance between the ends of an axis; gradients jump between tetrahedra, and over a much shortened arm the jump
-    is no derivative."""
+    """Return the distance between the two ends of an axis, at least three standard deviations. Gradients jump between
+    tetrahedra; over a much shortened arm such a jump would not approximate a derivative."""
     return wp.max(arms[row, axis] + arms[row, 3 + axis], 3.0 * scale)
 
 
 @wp.struct
 class ArmPlan:
-    """What ``carried_arms`` wants to know about each of n Gaussians, once for all frames. Arrays of one value a
-    Gaussian: threads side by side read side by side."""
+    """Frame-independent input of ``deform_arms`` for n Gaussians. The arrays have one value per Gaussian in their last
+    dimension, for contiguous access by neighbouring threads."""
 
     mean_tets: wp.array[wp.int32]
-    """(n,) tetrahedron of the mean; its one's complement if the Gaussian is not simply carried by that tetrahedron."""
+    """(n,) tetrahedron of the mean t, or -1 - t for a Gaussian that needs more than the map of that tetrahedron."""
     end_tets: wp.array2d[wp.int32]
-    """(6, n)"""
+    """(6, n) tetrahedron of each arm's end."""
     inside_fractions: wp.array2d[wp.float32]
-    """(6, n) share of each arm that lies in the tetrahedron of the mean; less than 0: minus the length of an arm whose
-    end has nothing to do with that tetrahedron, so that one must look where the end has gone."""
+    """(6, n) fraction of each arm inside the tetrahedron of the mean. A negative value is minus the arm length, for a
+    longer arm that ends elsewhere, whose deformed end is needed itself."""
     smoothing_lengths: wp.array2d[wp.float32]
-    """(3, n) metres: s_k^2 over the reach of both arms."""
+    """(3, n) m, s_k^2 over the reach of both arms."""
 
 
 @wp.kernel
@@ -171,14 +169,16 @@ def plan_arms_kernel(
     arms: wp.array2d[wp.float32],
     tets: wp.array[wp.vec4i],
     inverse_edges: wp.array[Mat33],
-    least_bridge: wp.float32,
+    min_bridge: wp.float32,
     # Out:
     plan_out: ArmPlan,
 ):
-    """The motion is continuous and linear in each tetrahedron. So an arm that goes from the tetrahedron of the mean
-    (gradient F) through a face into the next one (gradient G) is carried to (u F + (1 - u) G) r per length, u the share
-    of it before the face: no difference of positions, which for a tiny arm would be mostly rounding. A longer arm that
-    ends elsewhere has a negative share.
+    """Precompute ``ArmPlan``.
+
+    The motion is continuous and linear in each tetrahedron. So an arm that goes from the tetrahedron of the mean
+    (gradient F) through a face into the next one (gradient G) is deformed to (u F + (1 - u) G) r per length, where u is
+    the fraction before the face. This avoids a difference of positions, which for a tiny arm would be mostly rounding.
+    A longer arm that ends elsewhere gets a negative fraction.
     """
     row = first_row + wp.tid()
     mean_tet = point_tets[7 * row]
@@ -191,15 +191,15 @@ def plan_arms_kernel(
         if tet != mean_tet:
             straddles = wp.bool(True)
             others = tets[tet]
-            apart = wp.int32(0)
+            unshared_count = wp.int32(0)
             opposite = wp.int32(0)
             for j in range(4):
                 c = corners[j]
                 if c != others[0] and c != others[1] and c != others[2] and c != others[3]:
-                    apart += 1
+                    unshared_count += 1
                     opposite = j
             share = wp.float32(0.5)
-            if apart == 1:
+            if unshared_count == 1:
                 axis = k % 3
                 direction = Vec3(axes[0, axis], axes[1, axis], axes[2, axis])
                 slopes = inverse_edges[mean_tet] * direction
@@ -208,11 +208,11 @@ def plan_arms_kernel(
                     slope = slopes[opposite - 1]
                 if k >= 3:
                     slope = -slope
-                height = weights[7 * row][opposite]
-                drop = -slope * real(arms[row, k])
-                if drop > real(0.0):
-                    share = wp.float32(wp.clamp(height / drop, real(0.0), real(1.0)))
-            elif arms[row, k] > least_bridge:
+                weight = weights[7 * row][opposite]
+                weight_drop = -slope * real(arms[row, k])
+                if weight_drop > real(0.0):
+                    share = wp.float32(wp.clamp(weight / weight_drop, real(0.0), real(1.0)))
+            elif arms[row, k] > min_bridge:
                 share = -arms[row, k]
         plan_out.end_tets[k, row] = tet
         plan_out.inside_fractions[k, row] = share
@@ -238,19 +238,19 @@ def deform_arm(
     max_stretch: wp.float32,
     cage: CageMaps,
 ) -> wp.vec3:
-    """Where one arm along ``axis`` has gone, per length: a column of D_s D_m^-1 R (Eq. 14). ``through`` is F axis.
+    """Return the deformed arm along ``axis``, per length: a column of D_s D_m^-1 R (Eq. 14). ``through`` is F axis.
 
-    An arm that bridges a gap between two limbs can be stretched far more than the matter at either end. That is a
-    spike: its length is held to ``max_stretch`` times the larger stretch at its two ends.
+    An arm that bridges a gap between two limbs can be stretched far more than the material at either end, which would
+    show as a spike. So its length is limited to ``max_stretch`` times the larger stretch at its two ends.
     """
     if tet == mean_tet:
         return through
     end = affine_of(cage, tet)
-    there = end.gradient * axis
+    end_arm = end.gradient * axis
     if share >= 0.0:
-        return share * through + (1.0 - share) * there
-    result = there - (image(end, mean) - moved_mean) / share
-    limit = max_stretch * wp.max(wp.length(through), wp.length(there))
+        return share * through + (1.0 - share) * end_arm
+    result = end_arm - (image(end, mean) - moved_mean) / share
+    limit = max_stretch * wp.max(wp.length(through), wp.length(end_arm))
     length = wp.length(result)
     if length > limit:
         result = result * (limit / length)
@@ -259,7 +259,7 @@ def deform_arm(
 
 @wp.struct
 class DeformedArms:
-    """Columns of F+ R and F- R, and the carried mean."""
+    """Columns of F+ R and F- R, and the deformed mean."""
 
     plus: wp.mat33
     minus: wp.mat33
@@ -267,16 +267,16 @@ class DeformedArms:
     """F R of the tetrahedron of the mean."""
     mean: wp.vec3
     tet: wp.int32
-    """That tetrahedron."""
+    """Tetrahedron of the mean."""
     straddles: wp.bool
-    """Otherwise F+ and F- are F."""
+    """True if F+ and F- differ from F."""
 
 
 @wp.func
 def deform_arms(
     gaussian: wp.int32, mean: wp.vec3, axes: wp.mat33, max_stretch: wp.float32, cage: CageMaps, plan: ArmPlan
 ) -> DeformedArms:
-    """F+ R and F- R of Eq. (14)."""
+    """Compute F+ R and F- R of Eq. (14), and the deformed mean."""
     code = plan.mean_tets[gaussian]
     result = DeformedArms()
     result.tet = wp.where(code < 0, -1 - code, code)
@@ -285,18 +285,18 @@ def deform_arms(
     ends = SixTets()
     shares = SixShares()
     if result.straddles:
-        # All at once: on a GPU, loads that wait for each other take most of the time.
+        # Issue all loads first: on a GPU, dependent loads take most of the time.
         for k in range(6):
             ends[k] = plan.end_tets[k, gaussian]
             shares[k] = plan.inside_fractions[k, gaussian]
         if shares[0] == RIGID:
-            around.gradient = rotation_from_quaternion(turn_of_tet(cage, result.tet))
+            around.gradient = rotation_from_quaternion(rotation_of_tet(cage, result.tet))
             result.straddles = wp.bool(False)
     result.mean = image(around, mean)
     result.through = around.gradient * axes
     result.plus = result.through
     result.minus = result.through
-    # Most Gaussians are small and lie in one tetrahedron, whose gradient is then the answer.
+    # Most Gaussians are small and lie in one tetrahedron; F+ and F- are then its gradient.
     if result.straddles:
         t = result.tet
         m = result.mean

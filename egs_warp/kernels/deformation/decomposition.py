@@ -1,23 +1,25 @@
-"""Small matrices in float32: one-sided Jacobi, polar rotations, frames whose axes keep their order and sign."""
+"""Decompositions of 3x3 matrices in float32: one-sided Jacobi, polar rotations, frames with matched axis order and
+signs."""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
 MAX_SWEEPS = wp.constant(8)
-ORTHOGONAL = wp.constant(wp.float32(1.0e-6))
-REGULAR = wp.constant(wp.float32(1.0e-3))
+ORTHOGONALITY_TOLERANCE = wp.constant(wp.float32(1.0e-6))
+MIN_RELATIVE_DETERMINANT = wp.constant(wp.float32(1.0e-3))
 
 
 @wp.func
 def rotation_from_quaternion(q: wp.vec4) -> wp.mat33:
-    """Rotation matrix [r1 r2 r3] of a w, x, y, z quaternion."""
+    """Return the rotation matrix [r1 r2 r3] of a w, x, y, z quaternion."""
     return wp.quat_to_matrix(wp.normalize(wp.quat(q[1], q[2], q[3], q[0])))
 
 
 @wp.func
 def quaternion_from_rotation(m: wp.mat33) -> wp.vec4:
-    """w, x, y, z of a rotation matrix, from the largest of the four; without an index, which would cost memory."""
+    """Return the quaternion w, x, y, z of a rotation matrix, computed from its largest component. Branches replace a
+    variable index, which would move the matrix to local memory."""
     xx = m[0, 0]
     yy = m[1, 1]
     zz = m[2, 2]
@@ -46,18 +48,18 @@ class Pair:
     va: wp.vec3
     vb: wp.vec3
     sine: wp.float32
-    """Of the angle they have turned by last."""
+    """Sine of the angle of the last rotation."""
 
 
 @wp.func
 def orthogonal_pair(a: wp.vec3, b: wp.vec3, va: wp.vec3, vb: wp.vec3) -> Pair:
-    """The rotation that makes ``a`` and ``b`` orthogonal, applied to them and to ``va`` and ``vb``."""
+    """Apply the rotation that makes ``a`` and ``b`` orthogonal to them and to ``va`` and ``vb``."""
     aa = wp.dot(a, a)
     bb = wp.dot(b, b)
     ab = wp.dot(a, b)
     cosine = wp.float32(1.0)
     sine = wp.float32(0.0)
-    if ab * ab > ORTHOGONAL * ORTHOGONAL * aa * bb:
+    if ab * ab > ORTHOGONALITY_TOLERANCE * ORTHOGONALITY_TOLERANCE * aa * bb:
         cot = (bb - aa) / (2.0 * ab)
         tangent = wp.where(cot >= 0.0, 1.0, -1.0) / (wp.abs(cot) + wp.sqrt(1.0 + cot * cot))
         cosine = 1.0 / wp.sqrt(1.0 + tangent * tangent)
@@ -73,7 +75,7 @@ def orthogonal_pair(a: wp.vec3, b: wp.vec3, va: wp.vec3, vb: wp.vec3) -> Pair:
 
 @wp.struct
 class Columns:
-    """A 3x3 matrix by columns, and the rotation that has been applied to it from the right."""
+    """3x3 matrix by columns, and the rotation that has been applied to it from the right."""
 
     a: wp.vec3
     b: wp.vec3
@@ -85,10 +87,11 @@ class Columns:
 
 @wp.func
 def orthogonal_columns(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> Columns:
-    """One-sided Jacobi: M V with orthogonal columns (left singular vectors times singular values), and V, det V = +1.
+    """Return M V with orthogonal columns (left singular vectors times singular values), and V with det V = +1, by
+    one-sided Jacobi.
 
     Each column keeps its own relative precision, so float32 is enough for splats whose scales differ by e^10, and each
-    column moves no further from where it was than it must.
+    column stays as close as possible to its original direction.
     """
     m = Columns()
     m.a = a
@@ -124,14 +127,14 @@ def unit_or(v: wp.vec3, otherwise: wp.vec3) -> wp.vec3:
 
 @wp.func
 def perpendicular(u: wp.vec3) -> wp.vec3:
-    """Some unit vector perpendicular to the unit vector ``u``."""
+    """Return a unit vector perpendicular to the unit vector ``u``."""
     helper = wp.where(wp.abs(u[0]) < 0.6, wp.vec3(1.0, 0.0, 0.0), wp.vec3(0.0, 1.0, 0.0))
     return wp.normalize(wp.cross(u, helper))
 
 
 @wp.func
 def unit_pair(a: wp.vec3, b: wp.vec3) -> wp.mat33:
-    """Right-handed frame [a/|a|, b/|b|, a x b] of two orthogonal columns, either of which may have no length."""
+    """Return the right-handed frame [a/|a|, b/|b|, a x b] of two orthogonal columns, either of which may be zero."""
     first = wp.length_sq(a) >= wp.length_sq(b)
     longer = unit_or(wp.where(first, a, b), wp.where(first, wp.vec3(1.0, 0.0, 0.0), wp.vec3(0.0, 1.0, 0.0)))
     shorter = wp.where(first, b, a)
@@ -148,9 +151,10 @@ def unit_pair(a: wp.vec3, b: wp.vec3) -> wp.mat33:
 
 @wp.func
 def proper_frame(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.mat33:
-    """Unit columns along orthogonal ones; the shortest follows from the two others, so that det = +1 always.
+    """Return unit columns along orthogonal ones; the shortest is the cross product of the others, so that det = +1
+    always.
 
-    The two others are picked by comparison: threads that branched would wait for each other.
+    The other two are selected by comparison instead of branches, which would diverge on a GPU.
     """
     aa = wp.length_sq(a)
     bb = wp.length_sq(b)
@@ -170,48 +174,49 @@ def proper_frame(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.mat33:
 
 @wp.func
 def rotation_part(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.mat33:
-    """Rotation of the polar decomposition of [a b c], det = +1; for an inverted matrix, the rotation nearest to it."""
+    """Return the rotation of the polar decomposition of [a b c], det = +1; for an inverted matrix, the nearest
+    rotation."""
     m = orthogonal_columns(a, b, c)
     return proper_frame(m.a, m.b, m.c) * wp.transpose(wp.matrix_from_cols(m.va, m.vb, m.vc))
 
 
 @wp.func
-def match_columns(frame: wp.mat33, carried: wp.mat33) -> wp.vec3i:
-    """Which column of ``frame`` belongs to each column of ``carried``: the permutation of greatest total alignment."""
-    d = wp.transpose(carried) * frame
+def match_columns(frame: wp.mat33, reference: wp.mat33) -> wp.vec3i:
+    """Return the column of ``frame`` for each column of ``reference``: the permutation of greatest total alignment."""
+    d = wp.transpose(reference) * frame
     best = wp.vec3i(0, 1, 2)
-    most = wp.abs(d[0, 0]) + wp.abs(d[1, 1]) + wp.abs(d[2, 2])
+    best_total = wp.abs(d[0, 0]) + wp.abs(d[1, 1]) + wp.abs(d[2, 2])
     total = wp.abs(d[0, 1]) + wp.abs(d[1, 0]) + wp.abs(d[2, 2])
-    if total > most:
-        most = total
+    if total > best_total:
+        best_total = total
         best = wp.vec3i(1, 0, 2)
     total = wp.abs(d[0, 0]) + wp.abs(d[1, 2]) + wp.abs(d[2, 1])
-    if total > most:
-        most = total
+    if total > best_total:
+        best_total = total
         best = wp.vec3i(0, 2, 1)
     total = wp.abs(d[0, 2]) + wp.abs(d[1, 1]) + wp.abs(d[2, 0])
-    if total > most:
-        most = total
+    if total > best_total:
+        best_total = total
         best = wp.vec3i(2, 1, 0)
     total = wp.abs(d[0, 1]) + wp.abs(d[1, 2]) + wp.abs(d[2, 0])
-    if total > most:
-        most = total
+    if total > best_total:
+        best_total = total
         best = wp.vec3i(1, 2, 0)
     total = wp.abs(d[0, 2]) + wp.abs(d[1, 0]) + wp.abs(d[2, 1])
-    if total > most:
+    if total > best_total:
         best = wp.vec3i(2, 0, 1)
     return best
 
 
 @wp.func
 def rotation_of(m: wp.mat33) -> wp.mat33:
-    """``rotation_part`` of a matrix with det > 0, by Newton's iteration X <- (g X + X^-T / g) / 2 (Higham 1986) where
-    that is safe: half the work."""
+    """Return the ``rotation_part`` of a matrix with det > 0, by Newton's iteration X <- (g X + X^-T / g) / 2 (Higham
+    1986) where that is safe; it takes half the work."""
     a = column(m, 0)
     b = column(m, 1)
     c = column(m, 2)
     size = wp.dot(a, a) + wp.dot(b, b) + wp.dot(c, c)
-    if wp.dot(wp.cross(a, b), c) < REGULAR * size * wp.sqrt(size):
+    if wp.dot(wp.cross(a, b), c) < MIN_RELATIVE_DETERMINANT * size * wp.sqrt(size):
         return rotation_part(a, b, c)
     step = wp.int32(0)
     while step < MAX_SWEEPS:
@@ -231,7 +236,7 @@ def rotation_of(m: wp.mat33) -> wp.mat33:
         b = nb
         c = nc
         step += 1
-        # The error squares itself with every step: the next one would move by 1e-8.
+        # Convergence is quadratic: the next step would change the columns by 1e-8.
         if moved < 1.0e-8:
             step = MAX_SWEEPS
     return wp.matrix_from_cols(a, b, c)
@@ -239,19 +244,20 @@ def rotation_of(m: wp.mat33) -> wp.mat33:
 
 @wp.func
 def select_column(m: wp.mat33, k: wp.int32) -> wp.vec3:
-    """Column k, by comparison: an index that is not known in advance would put the matrix into memory."""
+    """Return column k, selected by comparison: a variable index would move the matrix to local memory."""
     return wp.where(k == 0, column(m, 0), wp.where(k == 1, column(m, 1), column(m, 2)))
 
 
 @wp.func
-def align_signs(frame: wp.mat33, order: wp.vec3i, carried: wp.mat33) -> wp.mat33:
-    """Columns of ``frame`` in that order, turned to the side of ``carried``; the least aligned one makes det = +1."""
+def align_signs(frame: wp.mat33, order: wp.vec3i, reference: wp.mat33) -> wp.mat33:
+    """Return the columns of ``frame`` in that order, with the signs of ``reference``; the least aligned one is flipped
+    if needed for det = +1."""
     a = select_column(frame, order[0])
     b = select_column(frame, order[1])
     c = select_column(frame, order[2])
-    da = wp.dot(a, column(carried, 0))
-    db = wp.dot(b, column(carried, 1))
-    dc = wp.dot(c, column(carried, 2))
+    da = wp.dot(a, column(reference, 0))
+    db = wp.dot(b, column(reference, 1))
+    dc = wp.dot(c, column(reference, 2))
     a = wp.where(da < 0.0, -a, a)
     b = wp.where(db < 0.0, -b, b)
     c = wp.where(dc < 0.0, -c, c)

@@ -1,4 +1,4 @@
-"""Carry Gaussians with the cage (Eq. 14, 15), measure how much each is bent (Eq. 16)."""
+"""Deform Gaussians with the cage (Eq. 14, 15) and measure how much each is bent (Eq. 16)."""
 
 import warp as wp
 
@@ -11,8 +11,8 @@ from egs_warp.kernels.deformation.cage_maps import (
     exponential,
     load_row,
     reach_of,
+    rotation_of_tet,
     store_row,
-    turn_of_tet,
 )
 from egs_warp.kernels.deformation.decomposition import (
     align_signs,
@@ -30,7 +30,7 @@ from egs_warp.kernels.deformation.decomposition import (
 
 wp.set_module_options({"enable_backward": False})
 
-LEAST_SCALE = wp.constant(wp.float32(1.0e-12))
+MIN_SCALE = wp.constant(wp.float32(1.0e-12))
 
 
 @wp.struct
@@ -40,19 +40,20 @@ class DeformedShape:
 
 
 @wp.func
-def deform_shape(stretched: wp.mat33, scales: wp.vec3, carried: wp.mat33) -> DeformedShape:
-    """Eq. (15) for ``stretched`` = F R: the SVD of F R S, its axes matched in order and sign to R_polar r_i."""
+def deform_shape(stretched: wp.mat33, scales: wp.vec3, reference: wp.mat33) -> DeformedShape:
+    """Compute Eq. (15) for ``stretched`` = F R: the SVD of F R S, its axes matched in order and sign to R_polar r_i
+    (``reference``)."""
     factor = scaled_columns(stretched, scales)
     m = orthogonal_columns(column(factor, 0), column(factor, 1), column(factor, 2))
     frame = proper_frame(m.a, m.b, m.c)
     columns = wp.matrix_from_cols(m.a, m.b, m.c)
-    order = match_columns(frame, carried)
+    order = match_columns(frame, reference)
     result = DeformedShape()
-    result.rotation = quaternion_from_rotation(align_signs(frame, order, carried))
+    result.rotation = quaternion_from_rotation(align_signs(frame, order, reference))
     result.log_scales = wp.vec3(
-        wp.log(wp.max(wp.length(select_column(columns, order[0])), LEAST_SCALE)),
-        wp.log(wp.max(wp.length(select_column(columns, order[1])), LEAST_SCALE)),
-        wp.log(wp.max(wp.length(select_column(columns, order[2])), LEAST_SCALE)),
+        wp.log(wp.max(wp.length(select_column(columns, order[0])), MIN_SCALE)),
+        wp.log(wp.max(wp.length(select_column(columns, order[1])), MIN_SCALE)),
+        wp.log(wp.max(wp.length(select_column(columns, order[2])), MIN_SCALE)),
     )
     return result
 
@@ -65,14 +66,14 @@ def write_gaussian(
     scales: wp.vec3,
     rotations_out: wp.array[wp.vec4],
     log_scales_out: wp.array[wp.vec3],
-    turns_out: wp.array[wp.vec4],
+    polar_rotations_out: wp.array[wp.vec4],
 ):
-    """Shape and turn of Eq. (15) for ``stretched`` = F R."""
-    carried = rotation_part(column(stretched, 0), column(stretched, 1), column(stretched, 2))
-    shape = deform_shape(stretched, scales, carried)
+    """Write the shape and polar rotation of Eq. (15) for ``stretched`` = F R."""
+    reference = rotation_part(column(stretched, 0), column(stretched, 1), column(stretched, 2))
+    shape = deform_shape(stretched, scales, reference)
     rotations_out[row] = shape.rotation
     log_scales_out[row] = shape.log_scales
-    turns_out[row] = quaternion_from_rotation(carried * wp.transpose(axes))
+    polar_rotations_out[row] = quaternion_from_rotation(reference * wp.transpose(axes))
 
 
 @wp.struct
@@ -93,10 +94,12 @@ def deform_gaussian(
     cage: CageMaps,
     plan: ArmPlan,
 ) -> DeformedGaussian:
-    """F = (F+ + F-)/2 (Eq. 14), or the F of the mean's tetrahedron where det F <= 0, then Eq. (15).
+    """Deform a Gaussian by F = (F+ + F-)/2 (Eq. 14), or by the F of the mean's tetrahedron where det F <= 0, then Eq.
+    (15).
 
-    The mean goes where the Gaussian's mass goes, to second order (beyond the paper, which carries the mean as a point):
-    E[x(m + sum z_k s_k r_k)] = x(m) + sum s_k^2 x_kk / 2, and x_kk is seen from the difference of the two arms.
+    The mean follows the mean of the Gaussian's mass to second order (beyond the paper, which deforms the mean as a
+    point): E[x(m + sum z_k s_k r_k)] = x(m) + sum s_k^2 x_kk / 2, where x_kk is estimated from the difference of the
+    two arms.
     """
     axes = rotation_from_quaternion(rotation)
     scales = exponential(log_scales)
@@ -104,9 +107,8 @@ def deform_gaussian(
     result = DeformedGaussian()
     result.mean = both.mean
     stretched = both.through
-    # Alone in one tetrahedron, far outside, or where F is turned inside out: the rotation of that tetrahedron, found
-    # once for all.
-    own = wp.bool(True)
+    # Inside one tetrahedron, far outside, or where F is inverted: use the precomputed rotation of the tetrahedron.
+    is_affine = wp.bool(True)
     if both.straddles:
         bulge = wp.vec3(0.0)
         for k in range(3):
@@ -115,10 +117,10 @@ def deform_gaussian(
         average = 0.5 * (both.plus + both.minus)
         if wp.determinant(average) > 0.0:
             stretched = average
-            own = wp.bool(False)
+            is_affine = wp.bool(False)
     turned = wp.mat33()
-    if own:
-        result.turn = turn_of_tet(cage, both.tet)
+    if is_affine:
+        result.turn = rotation_of_tet(cage, both.tet)
         turned = rotation_from_quaternion(result.turn) * axes
     else:
         turned = rotation_of(stretched)
@@ -143,9 +145,9 @@ def deform_kernel(
     means_out: wp.array[wp.vec3],
     rotations_out: wp.array[wp.vec4],
     log_scales_out: wp.array[wp.vec3],
-    turns_out: wp.array[wp.vec4],
+    polar_rotations_out: wp.array[wp.vec4],
 ):
-    """Each Gaussian as the cage has carried it (Eq. 14, 15)."""
+    """Deform each Gaussian with the cage (Eq. 14, 15)."""
     row = first_row + wp.tid()
     result = deform_gaussian(
         row,
@@ -159,7 +161,7 @@ def deform_kernel(
     means_out[row] = result.mean
     store_row(rotations_out, row, result.rotation)
     log_scales_out[row] = result.log_scales
-    store_row(turns_out, row, result.turn)
+    store_row(polar_rotations_out, row, result.turn)
 
 
 @wp.func
@@ -169,7 +171,7 @@ def angle_between(a: wp.vec3, b: wp.vec3) -> wp.float32:
 
 @wp.func
 def bend_frame(side: wp.mat33, scales: wp.vec3) -> wp.mat33:
-    """Eigenframe of Sigma'+- that stays defined where scales are equal: the rotation part of [F R] S^2.
+    """Return an eigenframe of Sigma'+- that stays defined where scales are equal: the rotation part of [F R] S^2.
 
     It differs from the eigenframe by terms of order (s_j/s_i)^2 where s_i >> s_j, follows the long axes and not the
     short ones, and does not spin freely in the plane of a round disc, as eigenvectors do.
@@ -196,11 +198,12 @@ def measure_bend_kernel(
     curl_out: wp.array[wp.vec3],
     error_out: wp.array[wp.vec3],
 ):
-    """The most of each measure so far: the angle of Eq. (16), and, along each axis, how far the motion is from affine.
+    """Update the maximum of each measure: the angle of Eq. (16) and, along each axis, the deviation of the motion from
+    affine.
 
-    With arms reaching L on both sides of axis k, the second derivative of the motion along axes k and j is about
-    (F_k+ - F_k-) r_j / 2L; ``curl`` is the angle between the two vectors F_k+- r_j, the largest over j, and ``error``
-    the displacement that F leaves out at one standard deviation along both axes.
+    With arms reaching L on both sides of axis k, the second derivative of the motion along axes k and j is about (F_k+
+    - F_k-) r_j / 2L. ``curl`` is the angle between the two vectors F_k+- r_j, the largest over j. ``error`` is the
+    displacement that F leaves out at one standard deviation along both axes.
     """
     row = first_row + wp.tid()
     if plan.mean_tets[row] < 0 and plan.inside_fractions[0, row] == RIGID:
@@ -221,17 +224,17 @@ def measure_bend_kernel(
         f_minus = affine_of(cage, plan.end_tets[3 + k, row]).gradient * axes
         reach = reach_of(arms, row, k, scales[k])
         for j in range(3):
-            # Along the axis itself the ends' own positions are known; across it only the gradients at the ends are.
+            # Along the axis the positions of the ends are known; across it only their gradients are.
             a = wp.where(j == k, column(both.plus, k), column(f_plus, j))
             b = wp.where(j == k, column(both.minus, k), column(f_minus, j))
-            missed = scales[k] * scales[j] * wp.length(a - b) / reach
+            axis_error = scales[k] * scales[j] * wp.length(a - b) / reach
             angle = wp.degrees(angle_between(a, b))
-            # The mixed derivative is the same both ways round; the longer baseline sees it better.
+            # The mixed derivative is symmetric; the longer baseline measures it better.
             if scales[j] > scales[k]:
-                missed = 0.0
-            # An axis too short to be seen bends nothing.
-            if missed > 0.25 * error[k]:
+                axis_error = 0.0
+            # An axis too short to be visible does not count.
+            if axis_error > 0.25 * error[k]:
                 curl[k] = wp.max(curl[k], angle)
-            error[k] = wp.max(error[k], missed)
+            error[k] = wp.max(error[k], axis_error)
     curl_out[row] = curl
     error_out[row] = error

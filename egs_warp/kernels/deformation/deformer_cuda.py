@@ -1,7 +1,8 @@
-"""Eq. (14), (15) and the turn of degree 3 colour on CUDA: one thread a Gaussian, one pass over memory.
+"""Eq. (14), (15) and the rotation of degree 3 colour on CUDA: one thread per Gaussian, one pass over memory.
 
-Rows of colour are 192 bytes long. A warp moves its 32 rows through shared memory in whole 16-byte pieces, side by side:
-read row by row, every load would touch 32 cache lines. CUDA C++ only for that; the mathematics is that of the CPU.
+Rows of colour are 192 bytes long. A warp moves its 32 rows through shared memory in contiguous 16-byte pieces; read row
+by row, every load would touch 32 cache lines. CUDA C++ is used only for these copies; the mathematics is that of the
+CPU.
 """
 
 import warp as wp
@@ -16,12 +17,12 @@ BLOCK = 128
 
 
 @wp.func_native("""
-    // 13 float4 a row: an odd stride keeps both ways of access free of bank conflicts.
+    // 13 float4 a row: an odd stride avoids bank conflicts in both access patterns.
     __shared__ float4 space[128 * 13];
     return reinterpret_cast<uint64_t>(space + (threadIdx.x >> 5) * 32 * 13);
 """)
 def warp_space() -> wp.uint64:
-    """Shared memory for the 32 rows of a warp."""
+    """Return the address of shared memory for the 32 rows of a warp."""
     ...
 
 
@@ -33,7 +34,7 @@ def warp_space() -> wp.uint64:
 #if __CUDA_ARCH__ >= 800
     const unsigned first = static_cast<unsigned>(__cvta_generic_to_shared(space));
 #endif
-    // 96 pieces are 8 rows: the place of piece e, e + e / 12, is that of e - 96 and 104.
+    // 96 pieces are 8 rows: piece e is at e + e / 12, which is 104 past piece e - 96.
     const int at[3] = {lane + lane / 12, lane + 32 + (lane + 32) / 12, lane + 64 + (lane + 64) / 12};
     #pragma unroll
     for (int i = 0; i < 12; ++i) {
@@ -49,7 +50,7 @@ def warp_space() -> wp.uint64:
     }
 """)
 def fetch_colour(address: wp.uint64, sh: wp.array2d[wp.vec3], row: wp.int32, count: wp.int32):
-    """Begin to read the rows of the warp; since Ampere, without waiting for them."""
+    """Start to read the rows of the warp, asynchronously since Ampere."""
     ...
 
 
@@ -73,7 +74,7 @@ def fetch_colour(address: wp.uint64, sh: wp.array2d[wp.vec3], row: wp.int32, cou
     return result;
 """)
 def load_colour(address: wp.uint64) -> Colour:
-    """Row ``row`` of ``sh``; every thread of the warp must call."""
+    """Return this thread's row of the colours fetched by ``fetch_colour``; every thread of the warp must call."""
     ...
 
 
@@ -94,7 +95,7 @@ def load_colour(address: wp.uint64) -> Colour:
         if (32 * i + lane < limit) __stcs(target + 32 * i + lane, space[at[i % 3] + 104 * (i / 3)]);
 """)
 def store_colour(address: wp.uint64, sh: wp.array2d[wp.vec3], row: wp.int32, count: wp.int32, value: Colour):
-    """``sh[row] = value``; every thread of the warp must call."""
+    """Set ``sh[row] = value``; every thread of the warp must call."""
     ...
 
 
@@ -113,19 +114,19 @@ def deform_with_colour_kernel(
     means_out: wp.array[wp.vec3],
     rotations_out: wp.array[wp.vec4],
     log_scales_out: wp.array[wp.vec3],
-    turns_out: wp.array[wp.vec4],
+    polar_rotations_out: wp.array[wp.vec4],
     sh_out: wp.array2d[wp.vec3],
 ):
-    """``deform_kernel`` and ``rotate_sh_kernel`` in one; launched over whole blocks."""
+    """Do the work of ``deform_kernel`` and ``rotate_sh_kernel`` in one pass; launched over whole blocks."""
     row = wp.tid()
     space = warp_space()
     fetch_colour(space, sh, row, count)
-    mine = wp.min(row, count - 1)
+    clamped_row = wp.min(row, count - 1)
     result = deform_gaussian(
-        mine,
-        means[mine],
-        load_row(rotations, mine),
-        log_scales[mine],
+        clamped_row,
+        means[clamped_row],
+        load_row(rotations, clamped_row),
+        log_scales[clamped_row],
         max_stretch,
         cage,
         plan,
@@ -134,7 +135,7 @@ def deform_with_colour_kernel(
         means_out[row] = result.mean
         store_row(rotations_out, row, result.rotation)
         log_scales_out[row] = result.log_scales
-        store_row(turns_out, row, result.turn)
+        store_row(polar_rotations_out, row, result.turn)
     colour = rotate_sh(load_colour(space), result.turn, 3)
     store_colour(space, sh_out, row, count, colour)
 

@@ -16,7 +16,7 @@ MAX_ARM_LENGTHS = wp.constant(10)
 
 @wp.func
 def barycentric_weights(corner: Vec3, inverse_edges: Mat33, point: Vec3) -> Vec4:
-    """Weights of ``point`` on a tetrahedron's corners (Eq. 2), of sum 1.
+    """Return the weights of ``point`` on a tetrahedron's corners (Eq. 2), of sum 1.
 
     ``inverse_edges`` is the inverse of [x1-x0, x2-x0, x3-x0].
     """
@@ -31,7 +31,7 @@ def least_weight(weights: Vec4) -> real:
 
 @wp.func
 def closest_on_triangle(a: Vec3, b: Vec3, c: Vec3, point: Vec3) -> Vec3:
-    """Closest point of a triangle (Ericson, Real-Time Collision Detection, 5.1.5: by Voronoi regions)."""
+    """Return the closest point of a triangle (Ericson, Real-Time Collision Detection, 5.1.5: by Voronoi regions)."""
     ab = b - a
     ac = c - a
     ap = point - a
@@ -64,7 +64,8 @@ def closest_on_triangle(a: Vec3, b: Vec3, c: Vec3, point: Vec3) -> Vec3:
 
 @wp.func
 def distance_to_tet(x0: Vec3, x1: Vec3, x2: Vec3, x3: Vec3, weights: Vec4, point: Vec3) -> real:
-    """Distance from a point outside a tetrahedron; only faces that the point lies beyond can be nearest."""
+    """Return the distance of a point outside a tetrahedron; only faces with the point on their outer side can be
+    nearest."""
     nearest = real(1.0e300)
     if weights[0] < real(0.0):
         nearest = wp.min(nearest, wp.length(point - closest_on_triangle(x1, x2, x3, point)))
@@ -100,10 +101,11 @@ def locate(
     boxes: wp.uint64,
     surface: wp.uint64,
 ) -> wp.vec2i:
-    """Index of the tetrahedron that contains the point, or of the nearest one, and whether it is inside (1 or 0).
+    """Return the index of the tetrahedron that contains the point, or of the nearest one, and 1 if it is inside, else
+    0.
 
-    Among several tetrahedra that contain the point, the lowest index is taken. Among several that are equally near (the
-    point faces a shared edge or node), the one from which the weights extrapolate least, then the lowest index.
+    Among several tetrahedra that contain the point, the lowest index is returned. Among several at equal distance (the
+    point faces a shared edge or node), the one whose weights extrapolate least, then the lowest index.
     """
     coarse = single(point)
 
@@ -177,20 +179,22 @@ def locate_points_kernel(
     weights_out: wp.array[Vec4],
     inside_out: wp.array[wp.bool],
 ):
-    """Tetrahedron and barycentric weights of each point (Eq. 2); ``nodes`` and all boxes are relative to ``origin``."""
+    """Compute the tetrahedron and barycentric weights of each point (Eq. 2); ``nodes`` and all boxes are relative to
+    ``origin``."""
     row = first_row + wp.tid()
     point = points[row] - origin
-    found = locate(point, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
-    tet = found[0]
+    location = locate(point, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
+    tet = location[0]
     tets_out[row] = tet
     nodes_out[row] = tets[tet]
     weights_out[row] = barycentric_weights(nodes[tets[tet][0]], inverse_edges[tet], point)
-    inside_out[row] = found[1] == 1
+    inside_out[row] = location[1] == 1
 
 
 @wp.func
 def axes_from_quaternion(q: wp.vec4) -> Mat33:
-    """Rotation matrix [r1 r2 r3] of a w, x, y, z quaternion; normalised in float64, as float32 storage is not exact."""
+    """Return the rotation matrix [r1 r2 r3] of a w, x, y, z quaternion, normalised in float64, as float32 storage is
+    not exact."""
     d = Vec4(real(q[0]), real(q[1]), real(q[2]), real(q[3]))
     d = d / wp.length(d)
     w = d[0]
@@ -231,10 +235,10 @@ def embed_gaussians_kernel(
     inside_out: wp.array[wp.bool],
     arms_out: wp.array2d[wp.float32],
 ):
-    """Point k of Gaussian i is row 7 i + k: the mean, three ends m + arm r_j, three ends m - arm r_j (Eq. 3).
+    """Embed the seven points of each Gaussian: the mean, three ends m + arm r_j, three ends m - arm r_j (Eq. 3).
 
-    An arm whose end would need weights outside [-1, 2] is shortened until it does not. An arm for which no length will
-    do (the mean itself lies far outside) takes the tetrahedron of the mean.
+    Point k of Gaussian i is row 7 i + k. An arm whose end would need weights outside [-1, 2] is shortened until it does
+    not. If no length suffices (the mean itself lies far outside), the arm uses the tetrahedron of the mean.
     """
     row = first_row + wp.tid()
     gaussian = row // 7
@@ -242,9 +246,9 @@ def embed_gaussians_kernel(
     m = means[gaussian]
     mean = Vec3(real(m[0]), real(m[1]), real(m[2])) - origin
     point = mean
-    found = wp.vec2i(0, 0)
+    location = wp.vec2i(0, 0)
     if k == 0:
-        found = locate(point, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
+        location = locate(point, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
     else:
         axis = (k - 1) % 3
         axes = axes_from_quaternion(rotations[gaussian])
@@ -256,24 +260,24 @@ def embed_gaussians_kernel(
         searching = wp.bool(True)
         while searching:
             point = mean + real(arm) * direction
-            found = locate(point, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
-            weights = barycentric_weights(nodes[tets[found[0]][0]], inverse_edges[found[0]], point)
+            location = locate(point, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
+            weights = barycentric_weights(nodes[tets[location[0]][0]], inverse_edges[location[0]], point)
             greatest = wp.max(wp.max(weights[0], weights[1]), wp.max(weights[2], weights[3]))
             searching = least_weight(weights) < real(-1.0) or greatest > real(2.0)
             attempt += 1
             if searching:
                 if attempt == MAX_ARM_LENGTHS or real(arm) * ARM_SHORTENING < least_arm:
-                    found = locate(mean, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
-                    found[1] = 0
+                    location = locate(mean, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
+                    location[1] = 0
                     searching = wp.bool(False)
                 else:
                     arm = arm * wp.float32(ARM_SHORTENING)
         arms_out[gaussian, k - 1] = arm
-    tet = found[0]
+    tet = location[0]
     tets_out[row] = tet
     nodes_out[row] = tets[tet]
     weights_out[row] = barycentric_weights(nodes[tets[tet][0]], inverse_edges[tet], point)
-    inside_out[row] = found[1] == 1
+    inside_out[row] = location[1] == 1
 
 
 @wp.kernel
@@ -286,7 +290,7 @@ def interpolate_points_kernel(
     # Out:
     points_out: wp.array[Vec3],
 ):
-    """Position of each embedded point (Eq. 2) for node positions ``positions``."""
+    """Compute the position of each embedded point (Eq. 2) for node positions ``positions``."""
     row = first_row + wp.tid()
     n = nodes[row]
     w = weights[row]
@@ -304,8 +308,8 @@ def nearest_face_kernel(
     # Out:
     faces_out: wp.array[wp.int32],
 ):
-    """The surface triangle nearest to each point."""
+    """Find the surface triangle nearest to each point."""
     row = first_row + wp.tid()
     point = points[row] - single(origin)
-    found = wp.mesh_query_point_no_sign(surface, point, wp.length(point) + 2.0 * wp.float32(extent))
-    faces_out[row] = wp.where(found.result, found.face, 0)
+    location = wp.mesh_query_point_no_sign(surface, point, wp.length(point) + 2.0 * wp.float32(extent))
+    faces_out[row] = wp.where(location.result, location.face, 0)

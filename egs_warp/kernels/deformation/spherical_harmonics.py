@@ -1,8 +1,8 @@
-"""Rotate the colour of Gaussians: real spherical harmonics of bands 1 to 3 in the INRIA sign convention.
+"""Rotation of the colour of Gaussians: real spherical harmonics of bands 1 to 3 in the INRIA sign convention.
 
-A rotation is one about z, one about y, and one about z again; that about y is one about z between quarter turns about
-x. About z, the coefficients of orders m and -m turn as a pair; a quarter turn about x mixes few (Pinchon and Hoggan
-2007). Half the work of a full matrix for each band, and no matrix to make.
+A rotation is decomposed into rotations about z, y and z. A rotation about y is one about z between quarter turns about
+x. About z, the coefficients of orders m and -m rotate as a pair; a quarter turn about x mixes few (Pinchon and Hoggan
+2007). This takes half the work of a full matrix for each band, and no matrix is formed.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 Mat53 = wp.types.matrix(shape=(5, 3), dtype=wp.float32)
 Mat73 = wp.types.matrix(shape=(7, 3), dtype=wp.float32)
 Colour = wp.types.matrix(shape=(16, 3), dtype=wp.float32)
-"""All coefficients of degree 3, a row each."""
+"""All coefficients of degree 3, one row each."""
 
 TINY = wp.constant(wp.float32(1.0e-18))
 S34 = wp.constant(wp.float32(np.sqrt(3 / 4)))
@@ -24,7 +24,8 @@ S1516 = wp.constant(wp.float32(np.sqrt(15 / 16)))
 
 @wp.func
 def rotate_band_1(c: wp.mat33, turn: wp.mat33) -> wp.mat33:
-    """Coefficients 1 to 3, a row each, after the rotation ``turn``: the linear function w.d with w = (-c3, -c1, c2)."""
+    """Return coefficients 1 to 3, one row each, after the rotation ``turn``: the linear function w.d with w = (-c3,
+    -c1, c2)."""
     w = wp.mat33(-c[2, 0], -c[2, 1], -c[2, 2], -c[0, 0], -c[0, 1], -c[0, 2], c[1, 0], c[1, 1], c[1, 2])
     w = turn * w
     return wp.mat33(-w[1, 0], -w[1, 1], -w[1, 2], w[2, 0], w[2, 1], w[2, 2], -w[0, 0], -w[0, 1], -w[0, 2])
@@ -32,7 +33,7 @@ def rotate_band_1(c: wp.mat33, turn: wp.mat33) -> wp.mat33:
 
 @wp.struct
 class EulerAngles:
-    """A rotation as three, about z, y and z, in the order in which they are made: cosine and sine of each."""
+    """Cosine and sine of the angles of successive rotations about z, y and z."""
 
     first: wp.vec2
     tilt: wp.vec2
@@ -41,7 +42,8 @@ class EulerAngles:
 
 @wp.func
 def euler_from_quaternion(q: wp.vec4) -> EulerAngles:
-    """Euler angles of the unit quaternion w, x, y, z. Where one is arbitrary, every choice is right to rounding."""
+    """Return the Euler angles of the unit quaternion w, x, y, z. Where one is arbitrary, every choice is right to
+    rounding."""
     along = wp.sqrt(q[0] * q[0] + q[3] * q[3])
     across = wp.sqrt(q[1] * q[1] + q[2] * q[2])
     half_sum = wp.vec2(1.0, 0.0)
@@ -62,19 +64,20 @@ def euler_from_quaternion(q: wp.vec4) -> EulerAngles:
 
 
 @wp.func
-def doubled(t: wp.vec2) -> wp.vec2:
+def double_angle(t: wp.vec2) -> wp.vec2:
     return wp.vec2(t[0] * t[0] - t[1] * t[1], 2.0 * t[0] * t[1])
 
 
 @wp.func
-def added(t: wp.vec2, u: wp.vec2) -> wp.vec2:
+def angle_sum(t: wp.vec2, u: wp.vec2) -> wp.vec2:
     return wp.vec2(t[0] * u[0] - t[1] * u[1], t[0] * u[1] + t[1] * u[0])
 
 
 @wp.func
 def band_2_about_z(c: Mat53, t: wp.vec2) -> Mat53:
-    """After a rotation about z by the angle of cosine and sine ``t``: orders m and -m turn by m times it."""
-    t2 = doubled(t)
+    """Return the coefficients after a rotation about z by the angle of cosine and sine ``t``: orders m and -m rotate by
+    m times it."""
+    t2 = double_angle(t)
     result = Mat53()
     result[0] = t2[0] * c[0] + t2[1] * c[4]
     result[1] = t[0] * c[1] + t[1] * c[3]
@@ -86,9 +89,8 @@ def band_2_about_z(c: Mat53, t: wp.vec2) -> Mat53:
 
 @wp.func
 def rotate_band_2(c: Mat53, turns: EulerAngles) -> Mat53:
-    """Coefficients 4 to 8, a row each, after the rotation.
-    That about y is one about z between quarter turns about x.
-    """
+    """Return coefficients 4 to 8, one row each, after the rotation. The rotation about y is one about z between quarter
+    turns about x."""
     f = band_2_about_z(c, turns.first)
     g = Mat53()
     g[0] = f[3]
@@ -107,9 +109,9 @@ def rotate_band_2(c: Mat53, turns: EulerAngles) -> Mat53:
 
 @wp.func
 def band_3_about_z(c: Mat73, t: wp.vec2) -> Mat73:
-    """As ``band_2_about_z``."""
-    t2 = doubled(t)
-    t3 = added(t2, t)
+    """Return the coefficients of band 3 after a rotation about z, as ``band_2_about_z``."""
+    t2 = double_angle(t)
+    t3 = angle_sum(t2, t)
     result = Mat73()
     result[0] = t3[0] * c[0] + t3[1] * c[6]
     result[1] = t2[0] * c[1] + t2[1] * c[5]
@@ -123,7 +125,7 @@ def band_3_about_z(c: Mat73, t: wp.vec2) -> Mat73:
 
 @wp.func
 def rotate_band_3(c: Mat73, turns: EulerAngles) -> Mat73:
-    """Coefficients 9 to 15, a row each, after the rotation; as ``turned_band_2``."""
+    """Return coefficients 9 to 15, one row each, after the rotation, as ``rotate_band_2``."""
     f = band_3_about_z(c, turns.first)
     g = Mat73()
     g[0] = S38 * f[5] - S58 * f[3]
@@ -146,7 +148,7 @@ def rotate_band_3(c: Mat73, turns: EulerAngles) -> Mat73:
 
 @wp.func
 def rotate_sh(c: Colour, q: wp.vec4, degree: wp.int32) -> Colour:
-    """Coefficients up to that degree after the rotation ``q`` (w, x, y, z); band 0 stays."""
+    """Return the coefficients up to ``degree`` after the rotation ``q`` (w, x, y, z); band 0 is unchanged."""
     result = c
     turns = euler_from_quaternion(q)
     if degree >= 1:
@@ -183,7 +185,7 @@ def rotate_sh_kernel(
     # Out:
     sh_out: wp.array2d[wp.vec3],
 ):
-    """Coefficients of each Gaussian's colour after the rotation ``turns`` (w, x, y, z); band 0 is left alone."""
+    """Rotate the coefficients of each Gaussian's colour by ``turns`` (w, x, y, z); band 0 is not written."""
     row = first_row + wp.tid()
     count = (degree + 1) * (degree + 1)
     # Each coefficient is read once: a row is 192 bytes, and neighbouring threads share no cache line.

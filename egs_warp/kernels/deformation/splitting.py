@@ -1,4 +1,4 @@
-"""Replace Gaussians by several smaller ones in the rest configuration (Eq. 17)."""
+"""Kernel that replaces Gaussians by several smaller ones in the rest configuration (Eq. 17)."""
 
 import warp as wp
 
@@ -23,8 +23,11 @@ def split_kernel(
     log_scales_out: wp.array[wp.vec3],
     sh_out: wp.array2d[wp.vec3],
 ):
-    """Row by row a copy of Gaussian ``parents``, or, where ``axes`` is not -1, its child ``offsets`` standard
-    deviations along that axis, whose own standard deviation is ``shrink`` times smaller there."""
+    """Write a copy of Gaussian ``parents[row]``, or, where ``axes[row]`` is not -1, one of its children.
+
+    A child lies ``offsets`` standard deviations along that axis, and its standard deviation there is ``shrink`` times
+    that of the parent.
+    """
     row = first_row + wp.tid()
     parent = parents[row]
     axis = axes[row]

@@ -1,21 +1,24 @@
-"""Patch search and voting on one picture: the inner loops of texture synthesis."""
+"""Patch search and voting on one image: the inner loops of texture synthesis.
+
+Host code: ``egs_warp/inpainting/patch_synthesis.py``.
+"""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
 RADIUS = 3
-"""Patches are 7 x 7."""
+"""Radius of a patch, pixels: patches are 7 x 7."""
 
 
 @wp.struct
 class Match:
-    """How well one patch explains another."""
+    """Match of one patch to another."""
 
     cost: wp.float32
-    """Weighted mean of the squared colour difference that is left after the shift."""
+    """Weighted mean of the squared colour difference after the shift."""
     shift: wp.vec3
-    """Colour to be added to the source."""
+    """Colour that is added to the source."""
 
 
 @wp.func
@@ -27,9 +30,8 @@ def compare(
     source: wp.vec2i,
     shift_limit: wp.float32,
 ) -> Match:
-    """The patch around ``source`` as an explanation of the one at (row, column),
-    each pixel counted by its confidence.
-    """
+    """Return the match of the patch around ``source`` to the one at (row, column), with each pixel weighted by its
+    confidence."""
     weight = wp.float32(0.0)
     sum = wp.vec3()
     squares = wp.float32(0.0)
@@ -54,7 +56,7 @@ def compare(
 
 @wp.func
 def is_set(flags: wp.array2d[wp.int32], place: wp.vec2i) -> wp.bool:
-    """Whether ``place`` is inside the picture and flagged."""
+    """Return True if ``place`` is inside the image and flagged."""
     if place[0] < 0 or place[0] >= flags.shape[0] or place[1] < 0 or place[1] >= flags.shape[1]:
         return False
     return flags[place[0], place[1]] == 1
@@ -79,8 +81,11 @@ def search_kernel(
     cost_out: wp.array2d[wp.float32],
     shift_out: wp.array2d[wp.vec3],
 ):
-    """One round of PatchMatch (Barnes et al. 2009): try what the neighbours at ``stride`` found, then random places in
-    windows that halve. All read the last round, so that the result does not depend on order."""
+    """Run one round of PatchMatch (Barnes et al. 2009).
+
+    Each target tests the matches of its neighbours at ``stride``, then random positions in windows that halve. All read
+    the results of the last round, so the output does not depend on the order.
+    """
     i = first_row + wp.tid()
     row = targets[i][0]
     column = targets[i][1]
@@ -93,12 +98,12 @@ def search_kernel(
         r = row + dr
         c = column + dc
         if is_set(is_target, wp.vec2i(r, c)):
-            found = source_from_target[r, c]
-            candidate = wp.vec2i(found[0] - dr, found[1] - dc)
+            neighbour_source = source_from_target[r, c]
+            candidate = wp.vec2i(neighbour_source[0] - dr, neighbour_source[1] - dc)
             if is_set(is_source, candidate):
-                tried = compare(image, confidence, row, column, candidate, shift_limit)
-                if tried.cost < best.cost:
-                    best = tried
+                candidate_match = compare(image, confidence, row, column, candidate, shift_limit)
+                if candidate_match.cost < best.cost:
+                    best = candidate_match
                     best_source = candidate
     state = wp.rand_init(seed, i)
     reach = wp.int32(random_reach)
@@ -107,9 +112,9 @@ def search_kernel(
             best_source[0] + wp.randi(state, -reach, reach + 1), best_source[1] + wp.randi(state, -reach, reach + 1)
         )
         if is_set(is_source, candidate):
-            tried = compare(image, confidence, row, column, candidate, shift_limit)
-            if tried.cost < best.cost:
-                best = tried
+            candidate_match = compare(image, confidence, row, column, candidate, shift_limit)
+            if candidate_match.cost < best.cost:
+                best = candidate_match
                 best_source = candidate
         reach = reach // 2
     source_from_target_out[row, column] = best_source
@@ -132,8 +137,8 @@ def vote_kernel(
     # Out:
     colour_out: wp.array[wp.vec3],
 ):
-    """Each pixel of the hole: the mean of what every patch over it says, the better ones counting more (Wexler et al.
-    2007)."""
+    """Compute each pixel of the hole as the weighted mean of the patches over it; better matches weigh more (Wexler et
+    al. 2007)."""
     i = first_row + wp.tid()
     row = holes[i][0]
     column = holes[i][1]

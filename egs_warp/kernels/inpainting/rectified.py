@@ -1,4 +1,4 @@
-"""Colour of Gaussians as seen from several directions at once."""
+"""Mean colour of Gaussians over several viewing directions."""
 
 import warp as wp
 
@@ -15,7 +15,8 @@ def mean_colour_kernel(
     # Out:
     colour_out: wp.array[wp.vec3],
 ):
-    """Mean over unit viewing ``directions`` (from the camera) of each Gaussian's colour, before it is clipped."""
+    """Compute the mean of each Gaussian's colour over unit viewing ``directions`` (from the camera), before
+    clipping."""
     g = wp.tid()
     colour = wp.vec3()
     for k in range(directions.shape[0]):

@@ -1,7 +1,8 @@
-"""The dual active-set method of Goldfarb and Idnani (1983) for a program whose Hessian is the identity.
+"""Dual active-set method of Goldfarb and Idnani (1983) for a QP whose Hessian is the identity, as native CPU code.
 
-min 1/2 z^T z subject to l <= free + R z <= u, rows R of length 1. In the multipliers p >= 0 of the rows that hold, each
-in the direction of its side s, z = R^T (s p), so all that is needed of R are its products with itself.
+min 1/2 z^T z subject to l <= free + R z <= u, with rows R of length 1. The solution is z = R^T (s p), where p >= 0 are
+the multipliers of the active rows and s = +1 or -1 the sides at which they are active. So only the inner products of
+the rows are needed, not R itself. Host code: ``egs_warp/locomotion/active_set.py``.
 """
 
 import warp as wp
@@ -13,64 +14,64 @@ from egs_warp.precision import Vec4, real
 wp.set_module_options({"enable_backward": False})
 
 FOUND, INFEASIBLE, NUMERICAL_FAILURE = wp.constant(0), wp.constant(1), wp.constant(2)
-"""How a search ends: at the optimum, where no point satisfies the bounds, or led by rounding to neither."""
+"""Status of a solve: optimum found, no point satisfies the bounds, or numerical failure."""
 
 _ROUNDS = wp.constant(3)
-"""In which rows are let go and held by all that is wrong at once, before one at a time."""
+"""Rounds that add and drop all wrong rows at once, before rows are exchanged one at a time."""
 REFINEMENTS = wp.constant(4)
-"""In which multipliers that were carried along are found anew."""
+"""Restarts of the dual iterations with recomputed multipliers, which removes accumulated rounding."""
 WRONG_SIGN_TOLERANCE = wp.constant(real(1e-9))
-"""Of the largest multiplier: sign of one that holds its row from the wrong side."""
+"""A multiplier below minus this fraction of the largest multiplier has the wrong sign."""
 REDUNDANCY_TOLERANCE = wp.constant(real(1e-12))
-"""Rows that repeat each other leave the matrix of their products singular."""
+"""Added to the diagonal of the products of active rows, which are singular where rows repeat each other."""
 BOUND_TOLERANCE = wp.constant(real(1e-7))
-"""From its bound: a row that the others keep from there."""
+"""Distance from its bound above which an active row counts as not satisfied, because it depends on the others."""
 DEPENDENCE_TOLERANCE = wp.constant(real(1e-9))
-"""Of a row's square: what of it lies outside of the rows that hold, if it follows from them."""
+"""A row depends on the active rows if its part orthogonal to them is below this fraction of its squared length."""
 
 
 @wp.struct
 class Program:
-    """What is given. Columns of matrices lie by fours, which a processor takes at once, zeros after the last. Rows of
-    zeros without bounds may follow."""
+    """Input of a solve. Vectors over rows are padded with zeros to a multiple of four, the width of a SIMD vector. Rows
+    of zeros without bounds may follow the program's own."""
 
     constraints: WhitenedConstraints
-    """The rows R, n unknowns wide, and their products with each other."""
+    """Rows R (m, n) and their inner products."""
     values_at_origin: wp.array[Vec4]
-    """(m,) by fours, the rows at z = 0."""
+    """(m,) in vectors of four, row values at z = 0."""
     lower: wp.array[real]
     upper: wp.array[real]
     slack: wp.array[real]
-    """(m,) by how much a row may break its bounds."""
+    """(m,) amount by which a row may violate its bounds."""
     cost_limit: wp.array[real]
-    """(1,) cost z^T z / 2 beyond which no point is looked for."""
+    """(1,) cost z^T z / 2 above which the program counts as infeasible."""
 
 
 @wp.struct
 class ActiveSetState:
-    """Where the search is."""
+    """State of a solve."""
 
     side: wp.array[int]
-    """(m,) of rows that hold: 1 at the lower bound, -1 at the upper; else 0."""
+    """(m,) 1 for a row active at its lower bound, -1 at its upper bound, 0 for an inactive row."""
     active: wp.array[int]
-    """(n,) those rows, in the order in which they have joined."""
+    """(n,) indices of the active rows, in the order in which they were added."""
     multipliers: wp.array[real]
-    """(n,) their multipliers."""
+    """(n,) multipliers of the active rows."""
     factor: wp.array2d[real]
-    """(n, n) lower triangle L of their products, each in the direction of its side."""
+    """(n, n) lower Cholesky factor L of the inner products of the active rows, each row times its side."""
     values: wp.array[Vec4]
-    """(m,) all rows, by fours."""
+    """(m,) in vectors of four, values of all rows at the current z."""
     rates: wp.array[real]
-    """(n,) by how much each multiplier falls for one of the row that joins."""
+    """(n,) decrease of each multiplier per unit of the entering row's multiplier."""
     solved_products: wp.array[real]
-    """(n,) L^-1 of the products of the row that joins."""
+    """(n,) L^-1 times the inner products of the entering row with the active rows."""
     orthogonal_part: wp.array[Vec4]
-    """(n,) by fours: what of the row that joins lies outside of those that hold."""
+    """(n,) in vectors of four, part of the entering row that is orthogonal to the active rows."""
 
 
 @wp.func
 def bound_of(program: Program, search: ActiveSetState, row: int):
-    """The bound that ``row`` is held at."""
+    """Return the bound at which ``row`` is active."""
     if search.side[row] > 0:
         return program.lower[row]
     return program.upper[row]
@@ -78,13 +79,13 @@ def bound_of(program: Program, search: ActiveSetState, row: int):
 
 @wp.func
 def value_of(search: ActiveSetState, row: int):
-    """Where ``row`` is."""
+    """Return the value of ``row`` at the current z."""
     return search.values[row / 4][row % 4]
 
 
 @wp.func
 def product_of(program: Program, row: int, other: int):
-    """Of two rows."""
+    """Return the inner product of two rows."""
     return program.constraints.products[row, other / 4][other % 4]
 
 
@@ -110,7 +111,7 @@ def product_of(program: Program, row: int, other: int):
             if (k < i) {
                 row[k] = value / by[k];
             } else {
-                value += redundant;
+                value += shift;
                 if (!(value > 0.0)) return 0;
                 row[i] = __builtin_sqrt(value);
             }
@@ -121,15 +122,16 @@ def product_of(program: Program, row: int, other: int):
         elsewhere="return 0;",
     )
 )
-def factored(
+def factorize(
     products: wp.array2d[Vec4],
     active: wp.array[wp.int32],
     side: wp.array[wp.int32],
     count: wp.int32,
-    redundant: real,
+    shift: real,
     factor: wp.array2d[real],
 ) -> wp.int32:
-    """The first ``count`` rows of the factor; whether their products have one."""
+    """Factorize the products of the first ``count`` active rows, plus ``shift`` on the diagonal. Return 1, or 0 if they
+    are not positive definite."""
     ...
 
 
@@ -151,7 +153,7 @@ def factored(
     )
 )
 def solve_lower(factor: wp.array2d[real], count: wp.int32, x: wp.array[real]):
-    """x <- L^-1 x."""
+    """Compute x <- L^-1 x."""
     ...
 
 
@@ -172,13 +174,13 @@ def solve_lower(factor: wp.array2d[real], count: wp.int32, x: wp.array[real]):
     )
 )
 def solve_upper(factor: wp.array2d[real], count: wp.int32, x: wp.array[real]):
-    """x <- L^-T x, row by row of L as it lies in memory."""
+    """Compute x <- L^-T x, traversing L row by row for contiguous access."""
     ...
 
 
 @wp.func
 def fetch_active_products(program: Program, search: ActiveSetState, count: int, row: int):
-    """The products of the active rows and of ``row``."""
+    """Compute the products of the active rows and of ``row`` (-1: none) with all rows, unless they are cached."""
     reduced = program.constraints
     fetch_products(
         reduced.minimum.shape[0], search.active, count, row, reduced.rows, reduced.columns, reduced.products,
@@ -197,13 +199,13 @@ def fetch_active_products(program: Program, search: ActiveSetState, count: int, 
     )
 )
 def axpy_values(products: wp.array2d[Vec4], row: wp.int32, by: real, at: wp.array[Vec4]):
-    """See ``move_rows``."""
+    """Add ``by`` times the products of ``row`` with all rows to the values ``at``."""
     ...
 
 
 @wp.func
 def move_rows_by(program: Program, search: ActiveSetState, row: int, by: real):
-    """All rows where the multiplier of ``row`` is greater ``by``."""
+    """Update all row values for a change ``by`` of the multiplier of ``row``."""
     axpy_values(program.constraints.products, row, by, search.values)
 
 
@@ -212,8 +214,8 @@ def move_rows_by(program: Program, search: ActiveSetState, row: int, by: real):
         """
     const int wide = rows.strides[0] / 8;
     const double* const Z = (const double*)rows.data;
-    double* const to = (double*)outside.data;
-    for (int c = 0; c < wide; c += 4) *(v4*)(to + c) = towards * *(const v4*)(Z + row * wide + c);
+    double* const to = (double*)orthogonal_part.data;
+    for (int c = 0; c < wide; c += 4) *(v4*)(to + c) = direction * *(const v4*)(Z + row * wide + c);
     for (int i = 0; i < count; ++i) {
         const int other = active.data[i];
         const double share = side.data[other] * rates.data[i];
@@ -229,33 +231,33 @@ def move_rows_by(program: Program, search: ActiveSetState, row: int, by: real):
 def orthogonal_norm2(
     rows: wp.array2d[Vec4],
     row: wp.int32,
-    towards: real,
+    direction: real,
     active: wp.array[wp.int32],
     side: wp.array[wp.int32],
     rates: wp.array[real],
     count: wp.int32,
-    outside: wp.array[Vec4],
+    orthogonal_part: wp.array[Vec4],
 ) -> real:
-    """Of ``row``, in the direction that it is held ``towards``, what lies outside of those that hold, and its
-    square."""
+    """Write the part of ``direction * row`` orthogonal to the active rows to ``orthogonal_part``; return its squared
+    length."""
     ...
 
 
 @wp.func_native(
     on_cpu(
         """
-    const double* const place = (const double*)at.data;
-    int found = -1;
-    double most = 0.0;
+    const double* const values = (const double*)at.data;
+    int result = -1;
+    double max_violation = 0.0;
     for (int i = 0; i < side.shape[0]; ++i) {
-        const double below = lower.data[i] - place[i], above = place[i] - upper.data[i];
-        const double breach = (below > above ? below : above) - slack.data[i];
-        if (side.data[i] == 0 && breach > most) {
-            most = breach;
-            found = i;
+        const double below = lower.data[i] - values[i], above = values[i] - upper.data[i];
+        const double violation = (below > above ? below : above) - slack.data[i];
+        if (side.data[i] == 0 && violation > max_violation) {
+            max_violation = violation;
+            result = i;
         }
     }
-    return found;
+    return result;
 """,
         elsewhere="return -1;",
     )
@@ -263,13 +265,16 @@ def orthogonal_norm2(
 def most_violated(
     lower: wp.array[real], upper: wp.array[real], slack: wp.array[real], side: wp.array[wp.int32], at: wp.array[Vec4]
 ) -> wp.int32:
-    """Of the rows without a side the one that breaks its bounds most, -1 where none does."""
+    """Return the inactive row that violates its bounds most, or -1 if none does."""
     ...
 
 
 @wp.func
 def solve_active(program: Program, search: ActiveSetState):
-    """How many rows have a side, held at their bounds; -1 where that has no numbers."""
+    """Solve for z with the rows that have a side at their bounds; return the number of active rows.
+
+    Returns -1 if there are more active rows than unknowns or their products are not positive definite.
+    """
     count = int(0)
     for quad in range(search.values.shape[0]):
         search.values[quad] = program.values_at_origin[quad]
@@ -281,7 +286,7 @@ def solve_active(program: Program, search: ActiveSetState):
             count += 1
     fetch_active_products(program, search, count, -1)
     if (
-        factored(program.constraints.products, search.active, search.side, count, REDUNDANCY_TOLERANCE, search.factor)
+        factorize(program.constraints.products, search.active, search.side, count, REDUNDANCY_TOLERANCE, search.factor)
         == 0
     ):
         return -1
@@ -299,15 +304,18 @@ def solve_active(program: Program, search: ActiveSetState):
 
 @wp.func
 def drop_wrong_sign(program: Program, search: ActiveSetState, count: int):
-    """How many rows lose their side: those that pull the wrong way, or that the others keep from their bounds."""
-    most = real(0.0)
+    """Deactivate rows whose multiplier has the wrong sign or that miss their bound; return their number."""
+    max_multiplier = real(0.0)
     for i in range(count):
-        most = wp.max(most, wp.abs(search.multipliers[i]))
+        max_multiplier = wp.max(max_multiplier, wp.abs(search.multipliers[i]))
     wrong = int(0)
     for i in range(count):
         row = search.active[i]
-        missed = wp.abs(value_of(search, row) - bound_of(program, search, row))
-        if search.multipliers[i] < -WRONG_SIGN_TOLERANCE * most or missed > BOUND_TOLERANCE + program.slack[row]:
+        residual = wp.abs(value_of(search, row) - bound_of(program, search, row))
+        if (
+            search.multipliers[i] < -WRONG_SIGN_TOLERANCE * max_multiplier
+            or residual > BOUND_TOLERANCE + program.slack[row]
+        ):
             search.side[row] = 0
             wrong += 1
     return wrong
@@ -315,28 +323,29 @@ def drop_wrong_sign(program: Program, search: ActiveSetState, count: int):
 
 @wp.func
 def violation_of(program: Program, search: ActiveSetState, row: int):
-    """By how much more than it may ``row`` breaks its bounds, negative where it does not."""
+    """Return by how much ``row`` violates its bounds beyond its slack; negative if it does not."""
     at = value_of(search, row)
     return wp.max(program.lower[row] - at, at - program.upper[row]) - program.slack[row]
 
 
 @wp.func
 def add_violated(program: Program, search: ActiveSetState):
-    """How many rows without a side break their bounds; they are given one."""
-    broken = int(0)
+    """Activate all inactive rows that violate their bounds; return their number."""
+    added = int(0)
     for row in range(search.side.shape[0]):
         if search.side[row] == 0 and violation_of(program, search, row) > real(0.0):
             search.side[row] = wp.where(value_of(search, row) < program.lower[row], 1, -1)
-            broken += 1
-    return broken
+            added += 1
+    return added
 
 
 @wp.func
 def crash_start(program: Program, search: ActiveSetState):
-    """How many rows are held, all of which pull the right way."""
+    """Reduce the guess to a dual feasible active set, where no multiplier has the wrong sign; return the number of
+    active rows."""
     count = solve_active(program, search)
     if count < 0:
-        # From where nothing holds there always is a way.
+        # The empty active set is always dual feasible.
         for row in range(search.side.shape[0]):
             search.side[row] = 0
         return solve_active(program, search)
@@ -351,7 +360,7 @@ def crash_start(program: Program, search: ActiveSetState):
 
 @wp.func
 def drop_constraint(search: ActiveSetState, count: int, place: int):
-    """Let go of the active row at ``place``; Givens rotations bring its column of the factor into the others."""
+    """Drop the active row at ``values``; Givens rotations merge its column of the factor into the others."""
     search.side[search.active[place]] = 0
     left = count - 1
     for i in range(place, left):
@@ -369,79 +378,82 @@ def drop_constraint(search: ActiveSetState, count: int, place: int):
         search.factor[j, j] = length
         for i in range(j + 1, left):
             below = search.factor[i + 1, j + 1]
-            beside = search.solved_products[i]
-            search.factor[i, j] = c * below + s * beside
-            search.solved_products[i] = c * beside - s * below
+            merged = search.solved_products[i]
+            search.factor[i, j] = c * below + s * merged
+            search.solved_products[i] = c * merged - s * below
 
 
 @wp.func
 def add_constraint(program: Program, search: ActiveSetState, active: int, row: int):
-    """How many rows are active when ``row`` is held beside them, less those whose pull ends on the way; -1 where no
-    point satisfies it beside those, -2 where rounding leaves no way."""
+    """Add constraint ``row`` to the active set, dropping constraints whose multiplier reaches zero before the step
+    ends.
+
+    Returns: number of active constraints; -1 if the constraints are inconsistent; -2 on numerical failure.
+    """
     count = int(active)
     sign = int(-1)
     bound = program.upper[row]
     if value_of(search, row) < program.lower[row]:
         sign = 1
         bound = program.lower[row]
-    towards = real(sign)
+    direction = real(sign)
     fetch_active_products(program, search, 0, row)
     square = product_of(program, row, row)
-    pull = real(0.0)
+    multiplier = real(0.0)
     while True:
         for i in range(count):
             other = search.active[i]
-            value = towards * real(search.side[other]) * product_of(program, row, other)
+            value = direction * real(search.side[other]) * product_of(program, row, other)
             search.solved_products[i] = value
         solve_lower(search.factor, count, search.solved_products)
         for i in range(count):
             search.rates[i] = search.solved_products[i]
         solve_upper(search.factor, count, search.rates)
-        apart = orthogonal_norm2(
+        orthogonal_square = orthogonal_norm2(
             program.constraints.rows,
             row,
-            towards,
+            direction,
             search.active,
             search.side,
             search.rates,
             count,
             search.orthogonal_part,
         )
-        part = real(wp.inf)
-        first = int(-1)
+        dual_step = real(wp.inf)
+        blocking = int(-1)
         for i in range(count):
             rate = search.rates[i]
             if rate > real(0.0):
-                ends = wp.max(search.multipliers[i], real(0.0)) / rate
-                if ends < part:
-                    part = ends
-                    first = i
-        whole = real(wp.inf)
-        # As many rows as unknowns leave nothing outside, whatever rounding says.
-        if apart > DEPENDENCE_TOLERANCE * square and count < search.active.shape[0]:
-            whole = towards * (bound - value_of(search, row)) / apart
-        step = wp.min(whole, part)
-        if not apart < real(wp.inf):
+                zero_step = wp.max(search.multipliers[i], real(0.0)) / rate
+                if zero_step < dual_step:
+                    dual_step = zero_step
+                    blocking = i
+        primal_step = real(wp.inf)
+        # With as many active rows as unknowns the orthogonal part is zero, up to rounding.
+        if orthogonal_square > DEPENDENCE_TOLERANCE * square and count < search.active.shape[0]:
+            primal_step = direction * (bound - value_of(search, row)) / orthogonal_square
+        step = wp.min(primal_step, dual_step)
+        if not orthogonal_square < real(wp.inf):
             return -2
         if not step < real(wp.inf):
             return -1
-        pull += step
-        if whole < real(wp.inf):
-            move_rows_by(program, search, row, towards * step)
+        multiplier += step
+        if primal_step < real(wp.inf):
+            move_rows_by(program, search, row, direction * step)
             for i in range(count):
                 other = search.active[i]
                 move_rows_by(program, search, other, -real(search.side[other]) * search.rates[i] * step)
         for i in range(count):
             search.multipliers[i] = search.multipliers[i] - step * search.rates[i]
-        if whole <= part:
+        if primal_step <= dual_step:
             for i in range(count):
                 search.factor[count, i] = search.solved_products[i]
-            search.factor[count, count] = wp.sqrt(apart + REDUNDANCY_TOLERANCE)
+            search.factor[count, count] = wp.sqrt(orthogonal_square + REDUNDANCY_TOLERANCE)
             search.active[count] = row
-            search.multipliers[count] = pull
+            search.multipliers[count] = multiplier
             search.side[row] = sign
             return count + 1
-        drop_constraint(search, count, first)
+        drop_constraint(search, count, blocking)
         count -= 1
     return count
 
@@ -463,7 +475,8 @@ def cost_of(program: Program, search: ActiveSetState, count: int):
 
 @wp.func
 def dual_iterations(program: Program, search: ActiveSetState, active: int, pivots: int):
-    """From rows that all pull the right way; how the search ends. What is broken most joins first."""
+    """Run the dual iterations from a dual feasible active set, adding the max_violation violated row first; return the
+    status."""
     count = int(active)
     for _ in range(pivots):
         row = most_violated(program.lower, program.upper, program.slack, search.side, search.values)
@@ -481,7 +494,7 @@ def dual_iterations(program: Program, search: ActiveSetState, active: int, pivot
 
 @wp.func
 def find_optimum(program: Program, pivots: int, search: ActiveSetState):
-    """See ``optimum_kernel``."""
+    """Solve from the guess ``search.side``, as described at ``optimum_kernel``; return the status."""
     for _ in range(_ROUNDS):
         count = solve_active(program, search)
         if count < 0:
@@ -493,7 +506,7 @@ def find_optimum(program: Program, pivots: int, search: ActiveSetState):
         ended = dual_iterations(program, search, count, pivots)
         if ended != FOUND:
             return ended
-        # Once more without what rounding has carried along.
+        # Solve again from the active set alone, without the accumulated rounding.
         count = solve_active(program, search)
         if count < 0:
             continue
@@ -512,17 +525,23 @@ def optimum_kernel(
     ended: wp.array[int],
     point: wp.uint64,
 ):
-    """From ``search.side``, a guess, to the optimum; how it ended, and where there is one how many rows hold it and
-    the ``point`` x, n numbers at an address. One thread of a CPU.
+    """Solve the program from the guessed active set ``search.side``, with one CPU thread.
 
-    The guessed rows are held at their bounds, which is one system of linear equations in their multipliers; rows that
-    pull the wrong way are let go, rows that break their bounds are held instead. Where that goes on for long, rows that
-    break their bounds join one at a time, at the dual's best step: that ends.
+    First the guessed rows are set to their bounds, which is one linear system in their multipliers. Rows with
+    multipliers of the wrong sign are dropped and violated rows are added, all at once. If that does not end within a
+    few rounds, the dual method adds the max_violation violated row one at a time, which terminates.
+
+    Args:
+        program: the QP.
+        pivots: maximum number of dual iterations.
+        search: state; ``side`` is the guess on entry and the active set at the end.
+        ended: (2,) status, and the number of active rows if the optimum was result.
+        point: address of the n numbers x of the optimum, written only if it was result.
     """
     ended[0] = find_optimum(program, pivots, search)
     ended[1] = 0
     if ended[0] != FOUND:
-        # What holds then says nothing: more rows than there are unknowns may have a side.
+        # The active set is meaningless then: more rows than unknowns may have a side.
         return
     count = int(0)
     for row in range(search.side.shape[0]):

@@ -1,10 +1,10 @@
 """OSQP's operator splitting for dense quadratic programs (Stellato, Banjac, Goulart, Bemporad and Boyd 2020, "OSQP: an
 operator splitting solver for quadratic programs").
 
-min 1/2 x^T P x + q^T x subject to l <= A x <= u, many programs at once: a block of threads for each on a GPU, one
-thread on a CPU, with the same mathematics. K = P + sigma I + A^T diag(rho) A is inverted whenever rho changes, so that
-an iteration has only products with matrices, in which threads do not wait for each other: the triangular solves of a
-factor would have them wait for each unknown. Constants are the defaults that OSQP documents.
+min 1/2 x^T P x + q^T x subject to l <= A x <= u, for many programs at once: one thread block per program on a GPU, one
+thread on a CPU, with the same mathematics. K = P + sigma I + A^T diag(rho) A is inverted whenever rho changes, so an
+iteration consists of matrix-vector products. Triangular solves with a factor would synchronise the threads once per
+unknown instead. Constants are the defaults that OSQP documents. Host code: ``egs_warp/locomotion/admm.py``.
 """
 
 import warp as wp
@@ -16,7 +16,7 @@ from egs_warp.kernels.locomotion.scaled_programs import (
     Programs,
     Scaled,
     equilibrate,
-    memory_of,
+    program_view,
     write_scaled,
 )
 from egs_warp.precision import real
@@ -25,31 +25,31 @@ wp.set_module_options({"enable_backward": False})
 
 SOLVED, INEXACT, LIMIT = wp.constant(0), wp.constant(1), wp.constant(2)
 INFEASIBLE, DOUBTFUL = wp.constant(3), wp.constant(4)
-"""How iterations end, see ``AdmmEnding``."""
+"""Status of the iterations, see ``AdmmStatus``."""
 BLOCK = 256
-"""Threads of a program on a GPU."""
+"""Threads per program on a GPU."""
 CHECK = wp.constant(25)
-"""Iterations between two looks at the residuals."""
+"""Iterations between two evaluations of the residuals."""
 
 _SIGMA = wp.constant(real(1e-6))
-_OVER = wp.constant(real(1.6))
-"""alpha, relaxation beyond a whole step."""
-_LEAST_RHO, _MOST_RHO = wp.constant(real(1e-6)), wp.constant(real(1e6))
-_HELD, _STIFFER = wp.constant(real(1e-4)), wp.constant(real(1e3))
-"""Room between the bounds of a row that counts as an equation, and by how much its rho is larger."""
-_OTHER_RHO = wp.constant(real(5.0))
-"""By how much another rho is better that is worth another inverse."""
-_CERTAIN = wp.constant(real(1e-4))
-"""Of the multipliers' last change: accuracy of a certificate."""
-_LOOSE = wp.constant(real(10.0))
-"""Times the accuracy: what is told apart at the last iteration."""
-_NOTHING = wp.constant(real(1e-30))
-"""Added to what is divided by."""
+_ALPHA = wp.constant(real(1.6))
+"""alpha, the over-relaxation factor."""
+_MIN_RHO, _MAX_RHO = wp.constant(real(1e-6)), wp.constant(real(1e6))
+_EQUALITY_GAP, _EQUALITY_RHO_FACTOR = wp.constant(real(1e-4)), wp.constant(real(1e3))
+"""A row with bounds closer than the first value counts as an equation; its rho is multiplied by the second value."""
+_RHO_UPDATE_FACTOR = wp.constant(real(5.0))
+"""Factor by which a better rho must differ to be worth another inverse."""
+_CERTIFICATE_TOLERANCE = wp.constant(real(1e-4))
+"""Accuracy of an infeasibility certificate, relative to the last change of the multipliers."""
+_LOOSE_FACTOR = wp.constant(real(10.0))
+"""Factor on the accuracies for the inexact statuses, tested at the last iteration."""
+_TINY = wp.constant(real(1e-30))
+"""Added to denominators."""
 
 
 @wp.struct
 class Residuals:
-    """What is missed, and how large the terms of each are."""
+    """Residuals, and the magnitudes of the terms of each."""
 
     primal: real
     primal_size: real
@@ -57,15 +57,15 @@ class Residuals:
     dual_size: real
     gap: real
     gap_size: real
-    """In the program's own units."""
+    """In the units of the unscaled program."""
     ratio: real
-    """Of the scaled primal to the scaled dual residual, each in the size of its terms."""
+    """Ratio of the scaled primal to the scaled dual residual, each relative to the magnitude of its terms."""
 
 
 @wp.func
 def product(matrix: wp.array2d[real], transposed: wp.array2d[real], row: int, vector: wp.array[real], count: int):
-    """Of a ``row`` of ``count`` entries with ``vector``. Threads side by side read numbers side by side, a thread alone
-    reads one after another."""
+    """Return the product of ``row`` of the matrix (``count`` entries) with ``vector``. Both layouts are given: threads
+    of a block read adjacent numbers of the transpose, a single thread reads the row contiguously."""
     value = real(0.0)
     if wp.block_dim() == 1:
         for i in range(count):
@@ -78,15 +78,15 @@ def product(matrix: wp.array2d[real], transposed: wp.array2d[real], row: int, ve
 
 @wp.func
 def invert(lane: int, rho: real, own: Scaled):
-    """rho of each row, and the inverse of K by sweeps over its diagonal, which leave a symmetric matrix symmetric and
-    end at minus the inverse (Goodnight 1979); K is positive definite, so no pivot need be looked for."""
+    """Set rho of each row and compute minus the inverse of K, by sweeps over its diagonal (Goodnight 1979), which keep
+    a symmetric matrix symmetric. K is positive definite, so no pivoting is needed."""
     n = own.variables
     for i in range(lane, own.row_count, wp.block_dim()):
         row_rho = rho
-        if own.upper[i] - own.lower[i] < _HELD:
-            row_rho = _STIFFER * rho
+        if own.upper[i] - own.lower[i] < _EQUALITY_GAP:
+            row_rho = _EQUALITY_RHO_FACTOR * rho
         elif own.lower[i] == real(-wp.inf) and own.upper[i] == real(wp.inf):
-            row_rho = _LEAST_RHO
+            row_rho = _MIN_RHO
         own.rho[i] = row_rho
     sync_block()
     for entry in range(lane, n * n, wp.block_dim()):
@@ -101,54 +101,56 @@ def invert(lane: int, rho: real, own: Scaled):
     for pivot in range(n):
         sync_block()
         for j in range(lane, n, wp.block_dim()):
-            own.slope[j] = own.inverse[pivot, j]
+            own.variable_scratch[j] = own.inverse[pivot, j]
         sync_block()
-        scale = real(1.0) / own.slope[pivot]
+        scale = real(1.0) / own.variable_scratch[pivot]
         for entry in range(lane, n * n, wp.block_dim()):
             i = entry / n
             j = entry - i * n
             if i == pivot and j == pivot:
                 own.inverse[i, j] = -scale
             elif i == pivot:
-                own.inverse[i, j] = scale * own.slope[j]
+                own.inverse[i, j] = scale * own.variable_scratch[j]
             elif j == pivot:
-                own.inverse[i, j] = scale * own.slope[i]
+                own.inverse[i, j] = scale * own.variable_scratch[i]
             else:
-                own.inverse[i, j] = own.inverse[i, j] - scale * own.slope[i] * own.slope[j]
+                own.inverse[i, j] = own.inverse[i, j] - scale * own.variable_scratch[i] * own.variable_scratch[j]
     sync_block()
 
 
 @wp.func
 def iterate(lane: int, own: Scaled):
-    """One iteration. The next x' is looked for as a step from this one: where the residuals are small, so is what the
-    inverse's rounding adds."""
+    """Run one iteration. It computes the step to the next x' instead of x' itself, so that the rounding of the inverse
+    shrinks with the residuals."""
     n = own.variables
     m = own.row_count
     for i in range(lane, m, wp.block_dim()):
-        own.push[i] = own.y[i] + own.rho[i] * (own.at[i] - own.z[i])
+        own.row_scratch[i] = own.y[i] + own.rho[i] * (own.row_values[i] - own.z[i])
     sync_block()
     for j in range(lane, n, wp.block_dim()):
-        own.slope[j] = own.q[j] + product(own.P, own.P, j, own.x, n) + product(own.columns, own.rows, j, own.push, m)
+        own.variable_scratch[j] = (
+            own.q[j] + product(own.P, own.P, j, own.x, n) + product(own.columns, own.rows, j, own.row_scratch, m)
+        )
     sync_block()
     for j in range(lane, n, wp.block_dim()):
-        own.step[j] = product(own.inverse, own.inverse, j, own.slope, n)
+        own.step[j] = product(own.inverse, own.inverse, j, own.variable_scratch, n)
     sync_block()
     for j in range(lane, n, wp.block_dim()):
-        own.x[j] = own.x[j] + _OVER * own.step[j]
+        own.x[j] = own.x[j] + _ALPHA * own.step[j]
     for i in range(lane, m, wp.block_dim()):
-        move = product(own.rows, own.columns, i, own.step, n)
-        wish = _OVER * (own.at[i] + move) + (real(1.0) - _OVER) * own.z[i] + own.y[i] / own.rho[i]
-        own.at[i] = own.at[i] + _OVER * move
-        own.z[i] = wp.min(wp.max(wish, own.lower[i]), own.upper[i])
-        pull = own.rho[i] * (wish - own.z[i])
-        own.change[i] = pull - own.y[i]
-        own.y[i] = pull
+        row_step = product(own.rows, own.columns, i, own.step, n)
+        target = _ALPHA * (own.row_values[i] + row_step) + (real(1.0) - _ALPHA) * own.z[i] + own.y[i] / own.rho[i]
+        own.row_values[i] = own.row_values[i] + _ALPHA * row_step
+        own.z[i] = wp.min(wp.max(target, own.lower[i]), own.upper[i])
+        multiplier = own.rho[i] * (target - own.z[i])
+        own.change[i] = multiplier - own.y[i]
+        own.y[i] = multiplier
     sync_block()
 
 
 @wp.func
 def residuals(lane: int, cost: real, own: Scaled):
-    """Of the conditions of the optimum, and of its objective to the dual's."""
+    """Compute the residuals of the optimality conditions and the duality gap."""
     n = own.variables
     m = own.row_count
     primal = real(0.0)
@@ -157,16 +159,16 @@ def residuals(lane: int, cost: real, own: Scaled):
     scaled_primal_size = real(0.0)
     support = real(0.0)
     for i in range(lane, m, wp.block_dim()):
-        # Anew: what iterations carry along gathers rounding.
-        at = product(own.rows, own.columns, i, own.x, n)
-        own.at[i] = at
-        size = wp.max(wp.abs(at), wp.abs(own.z[i]))
-        missed = wp.abs(at - own.z[i])
-        scaled_primal = wp.max(scaled_primal, missed)
+        # Recompute A' x': the iterations accumulate rounding in it.
+        row_values = product(own.rows, own.columns, i, own.x, n)
+        own.row_values[i] = row_values
+        size = wp.max(wp.abs(row_values), wp.abs(own.z[i]))
+        residual = wp.abs(row_values - own.z[i])
+        scaled_primal = wp.max(scaled_primal, residual)
         scaled_primal_size = wp.max(scaled_primal_size, size)
-        primal = wp.max(primal, missed / own.weight[i])
-        primal_size = wp.max(primal_size, size / own.weight[i])
-        # Multipliers that push at a bound that is none are exactly zero.
+        primal = wp.max(primal, residual / own.row_scale[i])
+        primal_size = wp.max(primal_size, size / own.row_scale[i])
+        # The multiplier of an infinite bound is exactly zero.
         if own.y[i] > real(0.0):
             support += own.upper[i] * own.y[i]
         elif own.y[i] < real(0.0):
@@ -178,68 +180,71 @@ def residuals(lane: int, cost: real, own: Scaled):
     square = real(0.0)
     linear = real(0.0)
     for j in range(lane, n, wp.block_dim()):
-        bent = product(own.P, own.P, j, own.x, n)
-        pushed = product(own.columns, own.rows, j, own.y, m)
-        square += own.x[j] * bent
+        Px = product(own.P, own.P, j, own.x, n)
+        Aty = product(own.columns, own.rows, j, own.y, m)
+        square += own.x[j] * Px
         linear += own.x[j] * own.q[j]
-        size = wp.max(wp.max(wp.abs(bent), wp.abs(pushed)), wp.abs(own.q[j]))
-        missed = wp.abs(bent + own.q[j] + pushed)
-        scaled_dual = wp.max(scaled_dual, missed)
+        size = wp.max(wp.max(wp.abs(Px), wp.abs(Aty)), wp.abs(own.q[j]))
+        residual = wp.abs(Px + own.q[j] + Aty)
+        scaled_dual = wp.max(scaled_dual, residual)
         scaled_dual_size = wp.max(scaled_dual_size, size)
-        dual = wp.max(dual, missed / own.stretch[j])
-        dual_size = wp.max(dual_size, size / own.stretch[j])
-    found = Residuals()
-    found.primal = block_max(primal)
-    found.primal_size = block_max(primal_size)
-    found.dual = block_max(dual) / cost
-    found.dual_size = block_max(dual_size) / cost
+        dual = wp.max(dual, residual / own.column_scale[j])
+        dual_size = wp.max(dual_size, size / own.column_scale[j])
+    result = Residuals()
+    result.primal = block_max(primal)
+    result.primal_size = block_max(primal_size)
+    result.dual = block_max(dual) / cost
+    result.dual_size = block_max(dual_size) / cost
     square = sum_of_block(square)
     linear = sum_of_block(linear)
     support = sum_of_block(support)
-    found.gap = wp.abs(square + linear + support) / cost
-    found.gap_size = wp.max(wp.max(wp.abs(square), wp.abs(linear)), wp.abs(support)) / cost
-    primal_part = block_max(scaled_primal) / (block_max(scaled_primal_size) + _NOTHING)
-    dual_part = block_max(scaled_dual) / (block_max(scaled_dual_size) + _NOTHING)
-    found.ratio = primal_part / (dual_part + _NOTHING)
-    return found
+    result.gap = wp.abs(square + linear + support) / cost
+    result.gap_size = wp.max(wp.max(wp.abs(square), wp.abs(linear)), wp.abs(support)) / cost
+    primal_part = block_max(scaled_primal) / (block_max(scaled_primal_size) + _TINY)
+    dual_part = block_max(scaled_dual) / (block_max(scaled_dual_size) + _TINY)
+    result.ratio = primal_part / (dual_part + _TINY)
+    return result
 
 
 @wp.func
-def within(found: Residuals, accuracy: real):
-    """Whether nothing is missed by more than ``accuracy``, of 1 and of the terms."""
+def is_within(result: Residuals, accuracy: real):
+    """Return True if all residuals are at most ``accuracy``, absolute plus relative to their terms."""
     return (
-        found.primal <= accuracy * (real(1.0) + found.primal_size)
-        and found.dual <= accuracy * (real(1.0) + found.dual_size)
-        and found.gap <= accuracy * (real(1.0) + found.gap_size)
+        result.primal <= accuracy * (real(1.0) + result.primal_size)
+        and result.dual <= accuracy * (real(1.0) + result.dual_size)
+        and result.gap <= accuracy * (real(1.0) + result.gap_size)
     )
 
 
 @wp.func
 def is_infeasible(lane: int, accuracy: real, own: Scaled):
-    """Whether the last change d of the multipliers certifies that no point satisfies the bounds: A^T d = 0, while
+    """Return True if the last change d of the multipliers certifies that no point satisfies the bounds: A^T d = 0 and
     u^T d+ + l^T d- < 0."""
     norm = real(0.0)
     support = real(0.0)
     for i in range(lane, own.row_count, wp.block_dim()):
         change = own.change[i]
-        # No multiplier pushes at a bound that is none.
+        # An infinite bound has no multiplier.
         if own.upper[i] == real(wp.inf):
             change = wp.min(change, real(0.0))
         if own.lower[i] == real(-wp.inf):
             change = wp.max(change, real(0.0))
-        own.push[i] = change
-        norm = wp.max(norm, own.weight[i] * wp.abs(change))
+        own.row_scratch[i] = change
+        norm = wp.max(norm, own.row_scale[i] * wp.abs(change))
         if change > real(0.0):
             support += own.upper[i] * change
         elif change < real(0.0):
             support += own.lower[i] * change
     norm = block_max(norm)
     support = sum_of_block(support)
-    left = real(0.0)
+    dual_residual = real(0.0)
     for j in range(lane, own.variables, wp.block_dim()):
-        left = wp.max(left, wp.abs(product(own.columns, own.rows, j, own.push, own.row_count)) / own.stretch[j])
-    left = block_max(left)
-    return norm > _NOTHING and support < real(0.0) and left <= accuracy * norm
+        dual_residual = wp.max(
+            dual_residual,
+            wp.abs(product(own.columns, own.rows, j, own.row_scratch, own.row_count)) / own.column_scale[j],
+        )
+    dual_residual = block_max(dual_residual)
+    return norm > _TINY and support < real(0.0) and dual_residual <= accuracy * norm
 
 
 @wp.kernel(grid_stride=False)
@@ -254,57 +259,67 @@ def admm_kernel(
     iterates: Iterates,
     # Out:
     ended: wp.array[int],
-    taken: wp.array[int],
+    iteration_counts: wp.array[int],
 ):
-    """From ``iterates`` to the optimum of each program: how it ended, and the iterations that it took, at most
-    ``iterations``. ``passes`` equilibrate; rho may change every ``adapt`` iterations, a multiple of ``CHECK``. A block
-    a program."""
+    """Solve each program from ``iterates``, which hold the last iterates on return. One block per program.
+
+    Args:
+        programs: k programs.
+        accuracy: absolute and relative tolerance of the residuals.
+        iterations: maximum number of iterations.
+        passes: equilibration passes.
+        adapt: iterations between two updates of rho, a multiple of ``CHECK``.
+        memory: scratch.
+        iterates: x, multipliers and rho.
+        ended: (k,) status.
+        iteration_counts: (k,) number of iterations.
+    """
     program = wp.tid() / wp.block_dim()
     lane = wp.tid() - program * wp.block_dim()
-    own = memory_of(program, programs, memory)
+    own = program_view(program, programs, memory)
     n = own.variables
     m = own.row_count
     cost = equilibrate(lane, programs.P[program], programs.q[program], programs.A[program], passes, own)
     write_scaled(lane, programs.P[program], programs.q[program], programs.A[program], cost, own)
     for j in range(lane, n, wp.block_dim()):
-        own.x[j] = iterates.x[program, j] / own.stretch[j]
+        own.x[j] = iterates.x[program, j] / own.column_scale[j]
     sync_block()
     for i in range(lane, m, wp.block_dim()):
-        own.lower[i] = own.weight[i] * programs.lower[program, i]
-        own.upper[i] = own.weight[i] * programs.upper[program, i]
-        own.y[i] = cost * iterates.y[program, i] / own.weight[i]
-        own.at[i] = product(own.rows, own.columns, i, own.x, n)
-        own.z[i] = own.at[i]
+        own.lower[i] = own.row_scale[i] * programs.lower[program, i]
+        own.upper[i] = own.row_scale[i] * programs.upper[program, i]
+        own.y[i] = cost * iterates.y[program, i] / own.row_scale[i]
+        own.row_values[i] = product(own.rows, own.columns, i, own.x, n)
+        own.z[i] = own.row_values[i]
     rho = iterates.rho[program]
     invert(lane, rho, own)
-    end = int(LIMIT)
-    last = int(0)
-    while last < iterations:
+    status = int(LIMIT)
+    iteration = int(0)
+    while iteration < iterations:
         iterate(lane, own)
-        last += 1
-        if last % CHECK == 0 or last == iterations:
-            found = residuals(lane, cost, own)
-            if within(found, accuracy):
-                end = SOLVED
+        iteration += 1
+        if iteration % CHECK == 0 or iteration == iterations:
+            result = residuals(lane, cost, own)
+            if is_within(result, accuracy):
+                status = SOLVED
                 break
-            if is_infeasible(lane, _CERTAIN, own):
-                end = INFEASIBLE
+            if is_infeasible(lane, _CERTIFICATE_TOLERANCE, own):
+                status = INFEASIBLE
                 break
-            if last == iterations:
-                if within(found, _LOOSE * accuracy):
-                    end = INEXACT
-                elif is_infeasible(lane, _LOOSE * _CERTAIN, own):
-                    end = DOUBTFUL
-            elif last % adapt == 0:
-                better = wp.min(wp.max(rho * wp.sqrt(found.ratio), _LEAST_RHO), _MOST_RHO)
-                if better > _OTHER_RHO * rho or _OTHER_RHO * better < rho:
+            if iteration == iterations:
+                if is_within(result, _LOOSE_FACTOR * accuracy):
+                    status = INEXACT
+                elif is_infeasible(lane, _LOOSE_FACTOR * _CERTIFICATE_TOLERANCE, own):
+                    status = DOUBTFUL
+            elif iteration % adapt == 0:
+                better = wp.min(wp.max(rho * wp.sqrt(result.ratio), _MIN_RHO), _MAX_RHO)
+                if better > _RHO_UPDATE_FACTOR * rho or _RHO_UPDATE_FACTOR * better < rho:
                     rho = better
                     invert(lane, rho, own)
     for j in range(lane, n, wp.block_dim()):
-        iterates.x[program, j] = own.stretch[j] * own.x[j]
+        iterates.x[program, j] = own.column_scale[j] * own.x[j]
     for i in range(lane, m, wp.block_dim()):
-        iterates.y[program, i] = own.weight[i] * own.y[i] / cost
+        iterates.y[program, i] = own.row_scale[i] * own.y[i] / cost
     if lane == 0:
         iterates.rho[program] = rho
-        ended[program] = end
-        taken[program] = last
+        ended[program] = status
+        iteration_counts[program] = iteration

@@ -1,5 +1,6 @@
-"""Dense algebra by all threads of a block on a GPU, and by one thread on a CPU: what they have written is seen by all
-of them after each of these. All threads call.
+"""Dense linear algebra for all threads of a block on a GPU, or one thread on a CPU.
+
+All threads of the block call each function. After a call, what it wrote is visible to all threads.
 """
 
 import warp as wp
@@ -23,8 +24,11 @@ _THREADS = """
 
 
 def by_block(body: str) -> str:
-    """``body``, which may use ``WAIT``, and that this is thread ``lane`` of ``lanes``, ``own`` of the ``WIDE`` in its
-    ``warp`` of ``warps``."""
+    """Return C++ code that runs ``body`` on both kinds of device.
+
+    ``body`` may use ``WAIT`` (barrier), ``lane`` (thread index) of ``lanes``, and ``own`` (index in the warp) of
+    ``WIDE`` in ``warp`` of ``warps``.
+    """
     return f"{_THREADS}{body}\n#undef WAIT\n"
 
 
@@ -36,7 +40,7 @@ def by_block(body: str) -> str:
 #endif
 """)
 def lane_of_block() -> int:
-    """Which of the block's threads this is."""
+    """Return the index of this thread in its block."""
     ...
 
 
@@ -45,9 +49,9 @@ def lane_of_block() -> int:
     double* const C = to.data;
     const double *const A = one.data, *const B = other.data;
     const int cs = to.strides[0] / 8, bs = other.strides[0] / 8;
-    const int as = turned ? 1 : one.strides[0] / 8, ak = turned ? one.strides[0] / 8 : 1;
+    const int as = transpose ? 1 : one.strides[0] / 8, ak = transpose ? one.strides[0] / 8 : 1;
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
-    // A warp makes 16 x 32 entries at once, eight by eight, of four products each.
+    // A warp computes a tile of 16 x 32 entries, in 8 x 8 fragments with four products each.
     constexpr int DOWN = 2, ACROSS = 4;
     const int across = (columns + 8 * ACROSS - 1) / (8 * ACROSS), down = (rows + 8 * DOWN - 1) / (8 * DOWN);
     const int quad = own >> 2, place = own & 3;
@@ -68,13 +72,13 @@ def lane_of_block() -> int:
             for (int k = 0; k < ACROSS; ++k) sum[i][k][0] = sum[i][k][1] = 0.0;
         #pragma unroll 4
         for (int s = 0; s < inner; s += 4) {
-            const bool there = s + place < inner;
-            const int at = there ? s + place : 0;
+            const bool valid = s + place < inner;
+            const int at = valid ? s + place : 0;
             double left[DOWN], right[ACROSS];
             #pragma unroll
-            for (int i = 0; i < DOWN; ++i) left[i] = there ? a[i][at * ak] : 0.0;
+            for (int i = 0; i < DOWN; ++i) left[i] = valid ? a[i][at * ak] : 0.0;
             #pragma unroll
-            for (int k = 0; k < ACROSS; ++k) right[k] = there ? b[k][at * bs] : 0.0;
+            for (int k = 0; k < ACROSS; ++k) right[k] = valid ? b[k][at * bs] : 0.0;
             #pragma unroll
             for (int i = 0; i < DOWN; ++i)
                 #pragma unroll
@@ -124,10 +128,12 @@ def gemm_add(
     rows: int,
     columns: int,
     inner: int,
-    turned: int,
+    transpose: int,
 ) -> None:
-    """``to`` (rows, columns) += ``one`` (rows, inner), or the transpose of that (inner, rows) if ``turned``, times
-    ``other`` (inner, columns)."""
+    """Compute ``to`` (rows, columns) += A ``other`` (inner, columns).
+
+    A is ``one`` (rows, inner), or the transpose of ``one`` (inner, rows) if ``transpose`` is nonzero.
+    """
     ...
 
 
@@ -146,21 +152,22 @@ def gemm_add(
             place += i < warp ? sums[i] : 0;
             total += sums[i];
         }
-        if (marked && place < room) found.data[place] = base + lane;
+        if (marked && place < capacity) indices.data[place] = base + lane;
         WAIT;
     }
 #else
     for (int i = 0; i < count; ++i)
         if (marks.data[i] != 0) {
-            if (total < room) found.data[total] = i;
+            if (total < capacity) indices.data[total] = i;
             ++total;
         }
 #endif
     return total;
 """)
 )
-def compact_indices(marks: wp.array[int], count: int, room: int, found: wp.array[int]) -> int:
-    """How many of ``count`` marks are not zero; where they are, in their order, as many as there is ``room`` for."""
+def compact_indices(marks: wp.array[int], count: int, capacity: int, indices: wp.array[int]) -> int:
+    """Write the indices of the nonzero ``marks`` to ``indices``, in order and up to ``capacity``; return the number of
+    nonzero marks."""
     ...
 
 
@@ -171,9 +178,9 @@ def compact_indices(marks: wp.array[int], count: int, room: int, found: wp.array
     __shared__ int places[32];
     auto larger = [&]() {
         #pragma unroll
-        for (int away = 16; away > 0; away >>= 1) {
-            const double theirs = __shfl_xor_sync(0xffffffffu, value, away);
-            const int other = __shfl_xor_sync(0xffffffffu, place, away);
+        for (int offset = 16; offset > 0; offset >>= 1) {
+            const double theirs = __shfl_xor_sync(0xffffffffu, value, offset);
+            const int other = __shfl_xor_sync(0xffffffffu, place, offset);
             if (theirs > value || (theirs == value && other < place)) { value = theirs; place = other; }
         }
     };
@@ -189,7 +196,7 @@ def compact_indices(marks: wp.array[int], count: int, room: int, found: wp.array
 """)
 )
 def argmax_of_block(value: real, place: int) -> wp.vec2d:
-    """The largest of the threads' values, and its place, the first of those where several are as large."""
+    """Return the largest of the threads' values and its ``place``, the lowest place where several values are equal."""
     ...
 
 
@@ -203,16 +210,16 @@ _ROWS_BY_VECTOR = """
         }
         #pragma unroll 4
         for (int k = own; k < columns; k += WIDE) {
-            const double by = given.data[k];
+            const double by = vector.data[k];
             #pragma unroll
             for (int t = 0; t < 4; ++t) value[t] += row[t][k] * by;
         }
 #if defined(__CUDA_ARCH__)
-        for (int away = 16; away > 0; away >>= 1)
-            for (int t = 0; t < 4; ++t) value[t] += __shfl_xor_sync(0xffffffffu, value[t], away);
+        for (int offset = 16; offset > 0; offset >>= 1)
+            for (int t = 0; t < 4; ++t) value[t] += __shfl_xor_sync(0xffffffffu, value[t], offset);
 #endif
         for (int t = 0; t < 4 && i + t < rows; ++t)
-            if (own == 0) made.data[i + t] = value[t];
+            if (own == 0) out.data[i + t] = value[t];
     }
     WAIT;
 """
@@ -224,8 +231,8 @@ _ROWS_BY_VECTOR = """
     const int stride = matrix.strides[0] / 8;
 {_ROWS_BY_VECTOR}""")
 )
-def multiply(matrix: wp.array2d[real], rows: int, columns: int, given: wp.array[real], made: wp.array[real]) -> None:
-    """``made`` (rows,) = ``matrix`` (rows, columns) times ``given`` (columns,)."""
+def multiply(matrix: wp.array2d[real], rows: int, columns: int, vector: wp.array[real], out: wp.array[real]) -> None:
+    """Compute ``out`` (rows,) = ``matrix`` (rows, columns) ``vector`` (columns,)."""
     ...
 
 
@@ -240,10 +247,11 @@ def multiply_at(
     stride: int,
     rows: int,
     columns: int,
-    given: wp.array[real],
-    made: wp.array[real],
+    vector: wp.array[real],
+    out: wp.array[real],
 ) -> None:
-    """The same of a matrix that begins there among ``numbers``, its rows so far apart."""
+    """Compute the same product for a matrix stored in ``numbers`` from index ``begin`` on, with rows ``stride`` numbers
+    apart."""
     ...
 
 
@@ -253,19 +261,19 @@ def multiply_at(
 #if defined(__CUDA_ARCH__)
     const int chunks = (columns + 31) / 32, groups = warps / chunks;
     if (groups > 1) {
-        // Of each column several warps have some rows.
+        // Several warps share the rows of each column.
         __shared__ double parts[1024];
         const int c = warp % chunks * 32 + own, group = warp / chunks;
         double sum = 0.0;
         if (group < groups && c < columns)
             #pragma unroll 8
-            for (int k = group; k < rows; k += groups) sum += matrix.data[k * stride + c] * given.data[k];
+            for (int k = group; k < rows; k += groups) sum += matrix.data[k * stride + c] * vector.data[k];
         parts[lane] = sum;
         WAIT;
         for (int k = lane; k < columns; k += lanes) {
             double value = parts[k];
             for (int other = 1; other < groups; ++other) value += parts[other * chunks * 32 + k];
-            made.data[k] = value;
+            out.data[k] = value;
         }
         WAIT;
         return;
@@ -276,17 +284,17 @@ def multiply_at(
         const double* at = matrix.data + c;
         int k = 0;
         for (; k + 4 <= rows; k += 4, at += 4 * stride)
-            for (int t = 0; t < 4; ++t) some[t] += at[t * stride] * given.data[k + t];
-        for (; k < rows; ++k, at += stride) some[0] += *at * given.data[k];
-        made.data[c] = (some[0] + some[1]) + (some[2] + some[3]);
+            for (int t = 0; t < 4; ++t) some[t] += at[t * stride] * vector.data[k + t];
+        for (; k < rows; ++k, at += stride) some[0] += *at * vector.data[k];
+        out.data[c] = (some[0] + some[1]) + (some[2] + some[3]);
     }
     WAIT;
 """)
 )
 def multiply_transposed(
-    matrix: wp.array2d[real], rows: int, columns: int, given: wp.array[real], made: wp.array[real]
+    matrix: wp.array2d[real], rows: int, columns: int, vector: wp.array[real], out: wp.array[real]
 ) -> None:
-    """``made`` (columns,) = the transpose of ``matrix`` (rows, columns) times ``given`` (rows,)."""
+    """Compute ``out`` (columns,) = transpose of ``matrix`` (rows, columns) times ``vector`` (rows,)."""
     ...
 
 
@@ -307,8 +315,8 @@ def multiply_transposed(
             }
         }
 #if defined(__CUDA_ARCH__)
-        for (int away = 16; away > 0; away >>= 1)
-            for (int t = 0; t < 4; ++t) square[t] += __shfl_xor_sync(0xffffffffu, square[t], away);
+        for (int offset = 16; offset > 0; offset >>= 1)
+            for (int t = 0; t < 4; ++t) square[t] += __shfl_xor_sync(0xffffffffu, square[t], offset);
 #endif
         for (int t = 0; t < 4 && i + t < rows; ++t)
             if (own == 0) {
@@ -328,15 +336,20 @@ def normalize_rows(
     rows: int,
     lengths: wp.array[real],
 ) -> None:
-    """Rows of which three of a ``matrix`` (k, columns), ``parts`` (rows, 3), have ``shares`` (rows, 3): these over the
-    rows' ``lengths`` (rows,), which are 1 for those of zeros."""
+    """Scale rows to length 1, where each row is a linear combination of three rows of ``matrix`` (k, columns).
+
+    Args:
+        parts: (rows, 3) indices of the matrix rows of each row.
+        shares: (rows, 3) their coefficients, divided by the length of the row in place.
+        lengths: (rows,) original lengths, 1 for rows of zeros.
+    """
     ...
 
 
 @wp.func
 def apply_factor(
-    root: wp.array2d[real], count: int, given: wp.array[real], between: wp.array[real], made: wp.array[real]
+    root: wp.array2d[real], count: int, vector: wp.array[real], between: wp.array[real], out: wp.array[real]
 ):
-    """``made`` (count,) = U U^T ``given`` (count,), U^T of it ``between``."""
-    multiply_transposed(root, count, count, given, between)
-    multiply(root, count, count, between, made)
+    """Compute ``out`` (count,) = U U^T ``vector``, where U is ``root``; U^T ``vector`` is left in ``between``."""
+    multiply_transposed(root, count, count, vector, between)
+    multiply(root, count, count, between, out)

@@ -1,6 +1,7 @@
-"""Elimination and roots of inverses by all threads of a block on a GPU, by one thread on a CPU.
+"""Gaussian elimination and Cholesky factors of inverses, for all threads of a block on a GPU or one thread on a CPU.
 
-Eight unknowns at a time: their block on the diagonal is one warp's, in registers, what comes of it everybody's.
+Both proceed in blocks of eight unknowns. One warp processes the diagonal block in registers; all threads apply it to
+the rest.
 """
 
 import warp as wp
@@ -11,18 +12,18 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 _TAKE_OFF = """
-    // to[rows][columns] -= left[rows][some] top[some][columns], of at most eight parts, a tile of four by four at a
-    // time; of a half only what lies right of the diagonal.
+    // to[rows][columns] -= left[rows][some] top[some][columns] with some <= 8, in tiles of 4 x 4; if half, only the
+    // part right of the diagonal.
     auto take_off = [&](double* to, int stride, int rows, int columns, const double* left, int by_row, int by_part,
                         const double* top, int top_stride, int some, bool half) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
-        // By a warp 8 x 16 at a time: of eight parts no other product is as quick.
+        // A warp computes 8 x 16 entries at a time, the fastest shape for an inner dimension of eight.
         const int across = (columns + 15) / 16, down = (rows + 7) / 8, quad = own >> 2, place = own & 3;
         for (int tile = warp; tile < across * down; tile += warps) {
             const int r = tile / across * 8 + quad, begin = tile % across * 16;
             if (half && begin + 15 < r - quad) continue;
             const double* const from = left + (r < rows ? r : rows - 1) * by_row;
-            double one[2], other[2][2], made[2][2];
+            double one[2], other[2][2], out[2][2];
             #pragma unroll
             for (int s = 0; s < 2; ++s) {
                 const int p = place + 4 * s;
@@ -38,20 +39,20 @@ _TAKE_OFF = """
                 #pragma unroll
                 for (int t = 0; t < 2; ++t) {
                     const int c = begin + 8 * k + 2 * place + t;
-                    made[k][t] = r < rows && c < columns ? to[r * stride + c] : 0.0;
+                    out[k][t] = r < rows && c < columns ? to[r * stride + c] : 0.0;
                 }
             #pragma unroll
             for (int s = 0; s < 2; ++s)
                 #pragma unroll
                 for (int k = 0; k < 2; ++k)
                     asm volatile("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 {%0,%1},{%2},{%3},{%0,%1};"
-                                 : "+d"(made[k][0]), "+d"(made[k][1]) : "d"(one[s]), "d"(other[s][k]));
+                                 : "+d"(out[k][0]), "+d"(out[k][1]) : "d"(one[s]), "d"(other[s][k]));
             #pragma unroll
             for (int k = 0; k < 2; ++k)
                 #pragma unroll
                 for (int t = 0; t < 2; ++t) {
                     const int c = begin + 8 * k + 2 * place + t;
-                    if (r < rows && c < columns) to[r * stride + c] = made[k][t];
+                    if (r < rows && c < columns) to[r * stride + c] = out[k][t];
                 }
         }
 #else
@@ -98,20 +99,20 @@ _TAKE_OFF = """
     constexpr int B = 8;
     double* const M = matrix.data;
     const int stride = matrix.strides[0] / 8;
-    double least = 0.0;
-    for (int a = 0; a < unknowns; ++a) least += M[a * stride + a];
-    least *= singular / unknowns;
+    double min_pivot = 0.0;
+    for (int a = 0; a < unknowns; ++a) min_pivot += M[a * stride + a];
+    min_pivot *= singular / unknowns;
 #if defined(__CUDA_ARCH__)
     __shared__ double inverse[B][B];
-    __shared__ int good;
+    __shared__ int is_regular;
 #else
     double inverse[B][B];
-    int good = 1;
+    int is_regular = 1;
 #endif
     for (int begin = 0; begin < unknowns; begin += B) {
         const int end = begin + B < unknowns ? begin + B : unknowns, some = end - begin;
         if (warp == 0) {
-            // All of a warp do the same, in registers.
+            // All threads of the warp compute the same, in registers.
             double D[B][B];
             #pragma unroll
             for (int p = 0; p < B; ++p)
@@ -123,7 +124,7 @@ _TAKE_OFF = """
             bool there = true;
             #pragma unroll
             for (int p = 0; p < B; ++p) {
-                there = there && (wp::abs(D[p][p]) > least || begin + p >= end);
+                there = there && (wp::abs(D[p][p]) > min_pivot || begin + p >= end);
                 const double by = 1.0 / D[p][p];
                 D[p][p] = 1.0;
                 #pragma unroll
@@ -138,7 +139,7 @@ _TAKE_OFF = """
                     }
             }
             if (own == 0) {
-                good = there;
+                is_regular = there;
                 #pragma unroll
                 for (int p = 0; p < B; ++p)
                     #pragma unroll
@@ -146,16 +147,16 @@ _TAKE_OFF = """
             }
         }
         WAIT;
-        if (!good) return 0;
+        if (!is_regular) return 0;
         for (int c = end + lane; c < columns; c += lanes) {
-            double given[B];
+            double right[B];
             #pragma unroll
-            for (int p = 0; p < B; ++p) given[p] = begin + p < end ? M[(begin + p) * stride + c] : 0.0;
+            for (int p = 0; p < B; ++p) right[p] = begin + p < end ? M[(begin + p) * stride + c] : 0.0;
             #pragma unroll
             for (int p = 0; p < B; ++p) {
                 double value = 0.0;
                 #pragma unroll
-                for (int q = 0; q < B; ++q) value += inverse[p][q] * given[q];
+                for (int q = 0; q < B; ++q) value += inverse[p][q] * right[q];
                 if (begin + p < end) M[(begin + p) * stride + c] = value;
             }
         }
@@ -172,9 +173,15 @@ _TAKE_OFF = """
     )
 )
 def eliminate(matrix: wp.array2d[real], unknowns: int, columns: int, singular: real) -> int:
-    """Of a ``matrix`` (unknowns, columns) the right sides, behind the unknowns, become the solution, and what is before
-    them is lost; 0 where a pivot on the diagonal is smaller, of whatever sign, than a ``singular`` share of the
-    diagonal's mean."""
+    """Solve a linear system in place; right-hand sides follow the unknowns' columns in each row.
+
+    Args:
+        matrix: (unknowns, columns); on return the right-hand sides hold the solution, the other columns are
+            overwritten.
+        singular: smallest admissible pivot magnitude, as a fraction of the mean of the diagonal.
+
+    Returns: 1, or 0 if a pivot on the diagonal is too small.
+    """
     ...
 
 
@@ -187,19 +194,19 @@ def eliminate(matrix: wp.array2d[real], unknowns: int, columns: int, singular: r
     const int as = matrix.strides[0] / 8, us = root.strides[0] / 8;
 #if defined(__CUDA_ARCH__)
     __shared__ double R[B][B], by[B];
-    __shared__ int good;
+    __shared__ int is_regular;
 #else
     double R[B][B], by[B];
-    int good = 1;
+    int is_regular = 1;
 #endif
 #if defined(__CUDA_ARCH__)
     if (count <= 32) {
-        // A row is a warp's, a column each of its threads': one unknown after the other takes no longer than waiting.
-        __shared__ double rows[32][33], made[32][33];
+        // Each warp takes rows, each of its threads a column; one unknown at a time costs no more than the barriers.
+        __shared__ double rows[32][33], out[32][33];
         const int side = own < count ? own : count - 1;
         for (int r = warp; r < count; r += warps) {
             rows[r][own] = A[r * as + side];
-            made[r][own] = 0.0;
+            out[r][own] = 0.0;
         }
         WAIT;
         for (int j = 0; j < count; ++j) {
@@ -210,14 +217,14 @@ def eliminate(matrix: wp.array2d[real], unknowns: int, columns: int, singular: r
             }
             const double ahead = own > j ? rows[j][own] / pivot : 0.0;
             for (int r = warp; r < count; r += warps) {
-                if (r < j) made[r][own] -= made[r][j] * ahead;
-                else if (r == j) made[r][own] = own == j ? 1.0 : -ahead;
+                if (r < j) out[r][own] -= out[r][j] * ahead;
+                else if (r == j) out[r][own] = own == j ? 1.0 : -ahead;
                 else rows[r][own] -= rows[j][r] * ahead;
             }
             WAIT;
         }
         for (int r = warp; r < count; r += warps)
-            if (own < count) U[r * us + own] = made[r][own] * rsqrt(rows[own][own]);
+            if (own < count) U[r * us + own] = out[r][own] * rsqrt(rows[own][own]);
         WAIT;
         return 1;
     }
@@ -227,7 +234,7 @@ def eliminate(matrix: wp.array2d[real], unknowns: int, columns: int, singular: r
     for (int begin = 0; begin < count; begin += B) {
         const int end = begin + B < count ? begin + B : count, left = count - end;
         if (warp == 0) {
-            // R^T R of the block on the diagonal; all of a warp do the same, in registers.
+            // R^T R of the diagonal block; all threads of the warp compute the same, in registers.
             double S[B][B];
             #pragma unroll
             for (int p = 0; p < B; ++p)
@@ -255,10 +262,10 @@ def eliminate(matrix: wp.array2d[real], unknowns: int, columns: int, singular: r
                     for (int q = p; q < B; ++q) R[p][q] = S[p][q];
                 }
             }
-            if (own == 0) good = definite;
+            if (own == 0) is_regular = definite;
         }
         WAIT;
-        if (!good) return 0;
+        if (!is_regular) return 0;
         for (int item = lane; item < count; item += lanes) {
             double* const from = item < end ? U + item * us + begin : A + begin * as + item;
             const int step = item < end ? 1 : as;
@@ -287,6 +294,11 @@ def eliminate(matrix: wp.array2d[real], unknowns: int, columns: int, singular: r
     )
 )
 def inverse_cholesky(matrix: wp.array2d[real], count: int, root: wp.array2d[real]) -> int:
-    """``root`` U, an upper triangle (count, count), of A^-1 = U U^T for a symmetric ``matrix`` A (count, count), whose
-    upper triangle is read and lost; 0 where that is not definite."""
+    """Compute the upper triangular ``root`` U (count, count) with A^-1 = U U^T for a symmetric ``matrix`` A (count,
+    count).
+
+    The upper triangle of A is read and overwritten.
+
+    Returns: 1, or 0 if A is not positive definite.
+    """
     ...

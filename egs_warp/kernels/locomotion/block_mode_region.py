@@ -1,6 +1,8 @@
-"""The program of a piece of contact over activations alone, and the rows that say where it ends, by a block of threads.
+"""QP of one assignment of contact modes over the activations alone, and the rows that bound its region, for a thread
+block.
 
-What ``pieces`` and ``reduced_rows`` do by one thread of a CPU: see there, and docs/concepts/locomotion.md.
+These functions do what ``mode_region`` and ``whitened_constraints`` do with one CPU thread. See
+docs/concepts/locomotion.md.
 """
 
 import math
@@ -30,13 +32,13 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 CURRENT, NEXT, NEXT_SINGLE, WARM_START = 0, 1, 2, 3
-"""Modes that there is memory for, see ``Room``."""
+"""Slots of ``Workspace.kinds`` and ``Workspace.slips``."""
 ROW_TOLERANCE = wp.constant(real(1e-8))
-"""By which a row may leave its bounds, or times its length where that is more."""
+"""Amount by which a row may violate its bounds, times the length of the row where that is more than 1."""
 
-_HERE = wp.constant(CURRENT)
+_CURRENT = wp.constant(CURRENT)
 _FREE, _STICK, _SLIDE = wp.constant(FREE), wp.constant(STICK), wp.constant(SLIDE)
-_LEAVES, _SLIPS, _TURNS, _LANDS = (
+_TO_FREE, _TO_SLIDE, _TO_OTHER_DIRECTION, _TO_TOUCHING = (
     wp.constant(TO_FREE),
     wp.constant(TO_SLIDE),
     wp.constant(TO_OTHER_DIRECTION),
@@ -47,82 +49,85 @@ _Faces = wp.types.vector(CONE_FACES, real)
 _ANGLES = [2.0 * math.pi * face / CONE_FACES for face in range(CONE_FACES)]
 COSINES, SINES = (wp.constant(_Faces(*map(each, _ANGLES))) for each in (math.cos, math.sin))
 _FACE_COSINE = wp.constant(real(math.cos(math.pi / CONE_FACES)))
-_WEDGE_SINE, _WEDGE_COSINE = wp.constant(real(math.sin(SLIDE_SECTOR))), wp.constant(real(math.cos(SLIDE_SECTOR)))
-_SINGULAR, _BROKEN, _ROUNDING = (wp.constant(real(each)) for each in (DELASSUS_REGULARIZATION, BROKEN, ROUNDING))
+_SECTOR_SINE, _SECTOR_COSINE = wp.constant(real(math.sin(SLIDE_SECTOR))), wp.constant(real(math.cos(SLIDE_SECTOR)))
+_REGULARIZATION, _BROKEN, _ROUNDING = (wp.constant(real(each)) for each in (DELASSUS_REGULARIZATION, BROKEN, ROUNDING))
 _MIN_PIVOT = wp.constant(real(1e-10))
-"""Of the mean of the operator's diagonal."""
+"""Smallest admissible pivot, relative to the mean of the diagonal of the Delassus operator."""
 BOUND_PADDING = wp.constant(real(9e-6))
-"""By which bounds are moved apart, as by ``SplittingProgram``."""
+"""Amount by which bounds are relaxed, as in ``SplittingProgram``."""
 
 
 @wp.struct
 class Workspace:
-    """Scratch memory for m activations and n contacts at most. T forces are of contacts that touch, h of them are held,
-    v speeds say where a piece ends; its rows are m of the activations and k more."""
+    """Workspace for at most m activations and n contacts.
+
+    T counts force components of closed contacts and h those whose contact velocity is zero; v counts the contact
+    velocities that bound the region. The region has m rows of the activations and k of the contact modes.
+    """
 
     held_index: wp.array[int]
-    """(n,) of each contact that touches its first row among those that are held."""
+    """(n,) first row of each closed contact among the ``held_forces``."""
     closed_forces: wp.array[int]
-    """(T,) forces."""
+    """(T,) indices of the force components of closed contacts."""
     held_forces: wp.array[int]
-    """(h,) forces, whose contact velocities are held at zero."""
+    """(h,) indices of the force components whose contact velocities are zero."""
     speeds: wp.array[int]
-    """(v,) contact velocities."""
+    """(v,) indices of the contact velocities."""
     base_rows: wp.array2d[int]
-    """(k, 3) which of the T forces and v speeds a row is made of."""
+    """(k, 3) indices, among the T forces and v velocities, of the terms of a row."""
     coefficients: wp.array2d[real]
-    """(k, 3) and of how much."""
+    """(k, 3) their coefficients."""
     contact: wp.array[int]
     transition: wp.array[int]
-    """(k,) whose row it is, and what happens beyond."""
+    """(k,) contact of a row, and transition of that contact past the row."""
     first: wp.array[int]
-    """(n,) of each contact's rows,"""
+    """(n,) first row of each contact,"""
     next: wp.array[int]
-    """(k,) and which comes after each of them, -1 for none."""
+    """(k,) and the next row of the same contact, -1 for none."""
     equations: wp.array2d[real]
-    """(h, h + m + 1)."""
+    """(h, h + m + 1) linear system for the forces, with right-hand sides."""
     force_map: wp.array2d[real]
-    """(T + v, m + 1) by activations, the last column without any."""
+    """(T + v, m + 1) forces and velocities as affine functions of the activations, the constant in the last column."""
     cost_rows: wp.array2d[real]
-    """(m + T, T)."""
+    """(m + T, T) columns of the cost matrix; scratch of ``write_speeds``."""
     cost_products: wp.array2d[real]
-    """(m + T, m + 1)."""
+    """(m + T, m + 1) cost matrix times the affine map; scratch of ``write_speeds``."""
     cost: wp.array2d[real]
-    """(m, m)."""
+    """(m, m) Hessian of the cost of the activations."""
     root: wp.array2d[real]
-    """(m, m) of its inverse."""
+    """(m, m) upper triangular U with cost^-1 = U U^T."""
     slope: wp.array[real]
     """(m,)."""
     minimum: wp.array[real]
     """(m,)."""
     optimum: wp.array[real]
-    """(m,) the optimum."""
+    """(m,) optimum."""
     at_minimum: wp.array[real]
     at_start: wp.array[real]
     at_found: wp.array[real]
-    """(T + v,) the answers there, without the last column."""
+    """(T + v,) forces and velocities at the minimum, the start and the optimum, without the constant."""
     lengths: wp.array[real]
-    """(m + k,)."""
+    """(m + k,) lengths of the rows before scaling."""
     bounds: wp.array2d[real]
-    """(2, m + k) as they were given."""
+    """(2, m + k) lower and upper bounds before scaling."""
     values: wp.array[real]
     """(m + 3n,)."""
     multipliers: wp.array[real]
-    """(k,)."""
+    """(k,) multipliers of the rows of the modes."""
     kinds: wp.array2d[int]
-    """(4, n) of the piece that is solved, of the one onward of it, of that in which only one contact goes on, and of
-    the same beside the best."""
+    """(4, n) modes of the region being solved, past all its active bounds, past its strongest active bound only, and
+    the latter for the best region so far."""
     slips: wp.array3d[real]
-    """(4, n, 2)."""
+    """(4, n, 2) slip directions."""
     start: wp.array[real]
-    """(m,) activations from which the piece is entered."""
+    """(m,) activations from which the region is entered."""
     trial: wp.array[real]
     """(m + 3n,)."""
 
 
 @wp.struct
 class Program:
-    """What is told, one behind the other, and where each begins."""
+    """Packed QP and the offset of each of its parts."""
 
     packed: wp.array[real]
     m: int
@@ -140,269 +145,290 @@ class Program:
 
 
 @wp.func
-def count_of(program: Program, room: Workspace, kind: int):
-    """How many contacts move so."""
+def count_of(program: Program, workspace: Workspace, kind: int):
+    """Return the number of contacts in mode ``kind``."""
     count = int(0)
     for i in range(program.n):
-        if room.kinds[_HERE, i] == kind:
+        if workspace.kinds[_CURRENT, i] == kind:
             count += 1
     return count
 
 
 @wp.func
-def write_row(room: Workspace, before: int, row: int, contact: int, onward: int, parts: wp.vec3i, shares: wp.vec3d):
-    """One of those that say where the piece ends, behind the one ``before`` of the same contact; which it is."""
-    room.contact[row] = contact
-    room.transition[row] = onward
-    room.next[row] = -1
+def write_row(
+    workspace: Workspace, before: int, row: int, contact: int, transition: int, terms: wp.vec3i, coefficients: wp.vec3d
+):
+    """Write one row that bounds the region and append it to the rows of ``contact``, after row ``before`` (-1: none);
+    return its index."""
+    workspace.contact[row] = contact
+    workspace.transition[row] = transition
+    workspace.next[row] = -1
     if before >= 0:
-        room.next[before] = row
+        workspace.next[before] = row
     else:
-        room.first[contact] = row
+        workspace.first[contact] = row
     for t in range(3):
-        room.base_rows[row, t] = parts[t]
-        room.coefficients[row, t] = shares[t]
+        workspace.base_rows[row, t] = terms[t]
+        workspace.coefficients[row, t] = coefficients[t]
     return row
 
 
 @wp.func
-def list_contact_rows(program: Program, room: Workspace, sticks: int, slides: int):
-    """Which forces touch and are held, which speeds tell, and what the rows are made of."""
-    touches = 3 * (sticks + slides)
+def list_contact_rows(program: Program, workspace: Workspace, sticks: int, slides: int):
+    """List the forces of closed contacts, the velocities that bound the region, and the terms of all its rows."""
+    closed_count = 3 * (sticks + slides)
     mu = program.friction
     zero = real(0.0)
     for i in range(lane_of_block(), program.n, wp.block_dim()):
         before = wp.vec3i(0, 0, 0)
-        kind = room.kinds[_HERE, i]
+        kind = workspace.kinds[_CURRENT, i]
         for j in range(i):
-            other = room.kinds[_HERE, j]
+            other = workspace.kinds[_CURRENT, j]
             before[other] = before[other] + 1
         order = before[kind]
-        place = 3 * (before[1] + before[2])
-        held = 3 * before[1] + before[2]
+        closed_row = 3 * (before[1] + before[2])
+        held_row = 3 * before[1] + before[2]
         speed = 2 * before[2] + before[0]
-        room.held_index[i] = held
+        workspace.held_index[i] = held_row
         if kind == _FREE:
-            room.speeds[speed] = 3 * i
+            workspace.speeds[speed] = 3 * i
             row = 9 * sticks + 3 * slides + order
-            p = touches + speed
-            write_row(room, -1, row, i, _LANDS, wp.vec3i(p, p, p), wp.vec3d(real(1.0), zero, zero))
+            p = closed_count + speed
+            write_row(workspace, -1, row, i, _TO_TOUCHING, wp.vec3i(p, p, p), wp.vec3d(real(1.0), zero, zero))
         else:
             for t in range(3):
-                room.closed_forces[place + t] = 3 * i + t
-            room.held_forces[held] = 3 * i
-            parts = wp.vec3i(place, place + 1, place + 2)
+                workspace.closed_forces[closed_row + t] = 3 * i + t
+            workspace.held_forces[held_row] = 3 * i
+            terms = wp.vec3i(closed_row, closed_row + 1, closed_row + 2)
             row = order
             if kind == _SLIDE:
                 row += sticks
-            last = write_row(room, -1, row, i, _LEAVES, parts, wp.vec3d(real(1.0), zero, zero))
+            last = write_row(workspace, -1, row, i, _TO_FREE, terms, wp.vec3d(real(1.0), zero, zero))
             if kind == _STICK:
-                room.held_forces[held + 1] = 3 * i + 1
-                room.held_forces[held + 2] = 3 * i + 2
+                workspace.held_forces[held_row + 1] = 3 * i + 1
+                workspace.held_forces[held_row + 2] = 3 * i + 2
                 for face in range(_FACES):
                     row = sticks + slides + face * sticks + order
-                    share = wp.vec3d(mu * _FACE_COSINE, -COSINES[face], -SINES[face])
-                    last = write_row(room, last, row, i, _SLIPS, parts, share)
+                    coefficient = wp.vec3d(mu * _FACE_COSINE, -COSINES[face], -SINES[face])
+                    last = write_row(workspace, last, row, i, _TO_SLIDE, terms, coefficient)
             else:
-                room.speeds[speed] = 3 * i + 1
-                room.speeds[speed + 1] = 3 * i + 2
-                p = touches + speed
-                parts = wp.vec3i(p, p + 1, p + 1)
-                d0 = room.slips[_HERE, i, 0]
-                d1 = room.slips[_HERE, i, 1]
+                workspace.speeds[speed] = 3 * i + 1
+                workspace.speeds[speed + 1] = 3 * i + 2
+                p = closed_count + speed
+                terms = wp.vec3i(p, p + 1, p + 1)
+                d0 = workspace.slips[_CURRENT, i, 0]
+                d1 = workspace.slips[_CURRENT, i, 1]
                 for half in range(2):
                     side = real(1 - 2 * half)
                     row = 9 * sticks + slides + half * slides + order
-                    share = wp.vec3d(
-                        _WEDGE_SINE * d0 - side * _WEDGE_COSINE * d1,
-                        _WEDGE_SINE * d1 + side * _WEDGE_COSINE * d0,
+                    coefficient = wp.vec3d(
+                        _SECTOR_SINE * d0 - side * _SECTOR_COSINE * d1,
+                        _SECTOR_SINE * d1 + side * _SECTOR_COSINE * d0,
                         zero,
                     )
-                    last = write_row(room, last, row, i, _TURNS, parts, share)
+                    last = write_row(workspace, last, row, i, _TO_OTHER_DIRECTION, terms, coefficient)
     sync_block()
 
 
 @wp.func
-def solve_force_map(program: Program, room: Workspace, touches: int, holds: int):
-    """The forces that hold what is held, linear in the activations; 0 where that takes rows to be exchanged."""
+def solve_force_map(program: Program, workspace: Workspace, closed_count: int, held_count: int):
+    """Compute the forces that keep the held contact velocities at zero, as affine functions of the activations.
+
+    Returns: 1, or 0 if a pivot is too small; rows are not exchanged.
+    """
     lane = lane_of_block()
     m = program.m
-    width = holds + m + 1
-    for e in range(lane, holds * width, wp.block_dim()):
+    width = held_count + m + 1
+    for e in range(lane, held_count * width, wp.block_dim()):
         a = e / width
         c = e % width
-        row = program.rows + room.held_forces[a] * program.size
+        row = program.rows + workspace.held_forces[a] * program.size
         value = real(0.0)
-        if c < holds:
-            f = room.held_forces[c]
+        if c < held_count:
+            f = workspace.held_forces[c]
             i = f / 3
             value = program.packed[row + m + f]
-            if room.kinds[_HERE, i] == _SLIDE:
+            if workspace.kinds[_CURRENT, i] == _SLIDE:
                 value -= program.friction * (
-                    program.packed[row + m + f + 1] * room.slips[_HERE, i, 0]
-                    + program.packed[row + m + f + 2] * room.slips[_HERE, i, 1]
+                    program.packed[row + m + f + 1] * workspace.slips[_CURRENT, i, 0]
+                    + program.packed[row + m + f + 2] * workspace.slips[_CURRENT, i, 1]
                 )
-        elif c < holds + m:
-            value = -program.packed[row + c - holds]
+        elif c < held_count + m:
+            value = -program.packed[row + c - held_count]
         else:
-            value = -program.packed[program.offset + room.held_forces[a]]
-        room.equations[a, c] = value
+            value = -program.packed[program.offset + workspace.held_forces[a]]
+        workspace.equations[a, c] = value
     sync_block()
     mean = real(0.0)
-    for a in range(lane, holds, wp.block_dim()):
-        mean += wp.abs(room.equations[a, a]) / real(holds)
+    for a in range(lane, held_count, wp.block_dim()):
+        mean += wp.abs(workspace.equations[a, a]) / real(held_count)
     mean = sum_of_block(mean)
     sync_block()
-    for a in range(lane, holds, wp.block_dim()):
-        room.equations[a, a] = room.equations[a, a] + _SINGULAR * mean
+    for a in range(lane, held_count, wp.block_dim()):
+        workspace.equations[a, a] = workspace.equations[a, a] + _REGULARIZATION * mean
     sync_block()
-    if eliminate(room.equations, holds, width, _MIN_PIVOT) == 0:
+    if eliminate(workspace.equations, held_count, width, _MIN_PIVOT) == 0:
         return 0
-    for e in range(lane, touches * (m + 1), wp.block_dim()):
+    for e in range(lane, closed_count * (m + 1), wp.block_dim()):
         g = e / (m + 1)
         c = e % (m + 1)
-        f = room.closed_forces[g]
+        f = workspace.closed_forces[g]
         i = f / 3
         t = f % 3
-        a = room.held_index[i]
-        share = real(1.0)
-        if room.kinds[_HERE, i] == _STICK:
+        a = workspace.held_index[i]
+        coefficient = real(1.0)
+        if workspace.kinds[_CURRENT, i] == _STICK:
             a += t
         elif t > 0:
-            share = -program.friction * room.slips[_HERE, i, t - 1]
-        room.force_map[g, c] = share * room.equations[a, holds + c]
+            coefficient = -program.friction * workspace.slips[_CURRENT, i, t - 1]
+        workspace.force_map[g, c] = coefficient * workspace.equations[a, held_count + c]
     sync_block()
     return 1
 
 
 @wp.func
-def write_cost(program: Program, room: Workspace, touches: int):
-    """Over activations alone; what of the speeds tells where the piece ends."""
+def write_cost(program: Program, workspace: Workspace, closed_count: int):
+    """Compute the quadratic cost of the activations alone by eliminating the forces."""
     lane = lane_of_block()
     m = program.m
-    for e in range(lane, (m + touches) * touches, wp.block_dim()):
-        i = e / touches
-        g = e % touches
+    for e in range(lane, (m + closed_count) * closed_count, wp.block_dim()):
+        i = e / closed_count
+        g = e % closed_count
         row = i
         if i >= m:
-            row = m + room.closed_forces[i - m]
-        room.cost_rows[i, g] = program.packed[program.cost + row * program.size + m + room.closed_forces[g]]
-    for e in range(lane, (m + touches) * (m + 1), wp.block_dim()):
+            row = m + workspace.closed_forces[i - m]
+        workspace.cost_rows[i, g] = program.packed[program.cost + row * program.size + m + workspace.closed_forces[g]]
+    for e in range(lane, (m + closed_count) * (m + 1), wp.block_dim()):
         i = e / (m + 1)
         c = e % (m + 1)
         row = i
         if i >= m:
-            row = m + room.closed_forces[i - m]
+            row = m + workspace.closed_forces[i - m]
         value = real(0.0)
         if c < m:
             value = program.packed[program.cost + row * program.size + c]
-        room.cost_products[i, c] = value
+        workspace.cost_products[i, c] = value
     sync_block()
-    gemm_add(room.cost_products, room.cost_rows, room.force_map, m + touches, m + 1, touches, 0)
-    # Again by what contact answers, to the rows of the activations.
-    for e in range(lane, touches * (m + 1), wp.block_dim()):
+    gemm_add(
+        workspace.cost_products, workspace.cost_rows, workspace.force_map, m + closed_count, m + 1, closed_count, 0
+    )
+    # Add the transposed force map times the rows of the forces to the rows of the activations.
+    for e in range(lane, closed_count * (m + 1), wp.block_dim()):
         g = e / (m + 1)
         c = e % (m + 1)
-        room.equations[g, c] = room.cost_products[m + g, c]
+        workspace.equations[g, c] = workspace.cost_products[m + g, c]
     sync_block()
-    gemm_add(room.cost_products, room.force_map, room.equations, m, m + 1, touches, 1)
+    gemm_add(workspace.cost_products, workspace.force_map, workspace.equations, m, m + 1, closed_count, 1)
     for e in range(lane, m * m, wp.block_dim()):
         i = e / m
         k = e % m
-        room.cost[i, k] = real(0.5) * (room.cost_products[i, k] + room.cost_products[k, i])
+        workspace.cost[i, k] = real(0.5) * (workspace.cost_products[i, k] + workspace.cost_products[k, i])
     for i in range(lane, m, wp.block_dim()):
-        value = program.packed[program.slope + i] + room.cost_products[i, m]
-        for g in range(touches):
-            value += room.force_map[g, i] * program.packed[program.slope + m + room.closed_forces[g]]
-        room.slope[i] = value
+        value = program.packed[program.slope + i] + workspace.cost_products[i, m]
+        for g in range(closed_count):
+            value += workspace.force_map[g, i] * program.packed[program.slope + m + workspace.closed_forces[g]]
+        workspace.slope[i] = value
     sync_block()
 
 
 @wp.func
-def write_speeds(program: Program, room: Workspace, touches: int, speeds: int):
-    """Behind the answers of the forces."""
+def write_speeds(program: Program, workspace: Workspace, closed_count: int, speeds: int):
+    """Append the contact velocities that bound the region to ``force_map``."""
     lane = lane_of_block()
     m = program.m
-    for e in range(lane, speeds * touches, wp.block_dim()):
-        s = e / touches
-        g = e % touches
-        room.cost_rows[s, g] = program.packed[program.rows + room.speeds[s] * program.size + m + room.closed_forces[g]]
+    for e in range(lane, speeds * closed_count, wp.block_dim()):
+        s = e / closed_count
+        g = e % closed_count
+        workspace.cost_rows[s, g] = program.packed[
+            program.rows + workspace.speeds[s] * program.size + m + workspace.closed_forces[g]
+        ]
     for e in range(lane, speeds * (m + 1), wp.block_dim()):
         s = e / (m + 1)
         c = e % (m + 1)
-        value = program.packed[program.offset + room.speeds[s]]
+        value = program.packed[program.offset + workspace.speeds[s]]
         if c < m:
-            value = program.packed[program.rows + room.speeds[s] * program.size + c]
-        room.cost_products[s, c] = value
+            value = program.packed[program.rows + workspace.speeds[s] * program.size + c]
+        workspace.cost_products[s, c] = value
     sync_block()
-    gemm_add(room.cost_products, room.cost_rows, room.force_map, speeds, m + 1, touches, 0)
+    gemm_add(workspace.cost_products, workspace.cost_rows, workspace.force_map, speeds, m + 1, closed_count, 0)
     for e in range(lane, speeds * (m + 1), wp.block_dim()):
         s = e / (m + 1)
         c = e % (m + 1)
-        room.force_map[touches + s, c] = room.cost_products[s, c]
+        workspace.force_map[closed_count + s, c] = workspace.cost_products[s, c]
     sync_block()
 
 
 @wp.func
-def row_value(room: Workspace, row: int, values: wp.array[real]):
-    """What the ``values`` of the answers make of a row."""
+def row_value(workspace: Workspace, row: int, values: wp.array[real]):
+    """Return the value of a row, without its constant, from the ``values`` of forces and velocities."""
     value = real(0.0)
     for t in range(3):
-        value += room.coefficients[row, t] * values[room.base_rows[row, t]]
+        value += workspace.coefficients[row, t] * values[workspace.base_rows[row, t]]
     return value
 
 
 @wp.func
-def row_offset(room: Workspace, row: int, m: int):
-    """What it is without activations."""
+def row_offset(workspace: Workspace, row: int, m: int):
+    """Return the constant of a row, its value at zero activations."""
     value = real(0.0)
     for t in range(3):
-        value += room.coefficients[row, t] * room.force_map[room.base_rows[row, t], m]
+        value += workspace.coefficients[row, t] * workspace.force_map[workspace.base_rows[row, t], m]
     return value
 
 
 @wp.func
 def write_rows(
-    program: Program, room: Workspace, rows: UnitConstraints, begun: wp.array[real], answers: int, further: int
+    program: Program,
+    workspace: Workspace,
+    rows: UnitConstraints,
+    initial_values: wp.array[real],
+    map_rows: int,
+    mode_rows: int,
 ):
-    """In coordinates whose squares are costs, and how far the start is from the minimum."""
+    """Write the rows in whitened coordinates, scaled to length 1, and their bounds.
+
+    Args:
+        initial_values: (m + mode_rows,) written: row values at the start relative to the minimum.
+        map_rows: number of rows of ``force_map``.
+        mode_rows: number of rows of the contact modes.
+    """
     lane = lane_of_block()
     m = program.m
-    for e in range(lane, answers * m, wp.block_dim()):
+    for e in range(lane, map_rows * m, wp.block_dim()):
         rows.units[e / m, e % m] = real(0.0)
     for e in range(lane, m * m, wp.block_dim()):
-        rows.units[answers + e / m, e % m] = room.root[e / m, e % m]
-    for row in range(lane, m + further, wp.block_dim()):
+        rows.units[map_rows + e / m, e % m] = workspace.root[e / m, e % m]
+    for row in range(lane, m + mode_rows, wp.block_dim()):
         for t in range(3):
             if row < m:
-                rows.base_rows[row, t] = answers + row
+                rows.base_rows[row, t] = map_rows + row
                 rows.coefficients[row, t] = wp.where(t == 0, real(1.0), real(0.0))
             else:
-                rows.base_rows[row, t] = room.base_rows[row - m, t]
-                rows.coefficients[row, t] = room.coefficients[row - m, t]
+                rows.base_rows[row, t] = workspace.base_rows[row - m, t]
+                rows.coefficients[row, t] = workspace.coefficients[row - m, t]
     sync_block()
-    gemm_add(rows.units, room.force_map, room.root, answers, m, m, 0)
-    multiply(room.force_map, answers, m, room.minimum, room.at_minimum)
-    multiply(room.force_map, answers, m, room.start, room.at_start)
-    normalize_rows(rows.units, m, rows.base_rows, rows.coefficients, m + further, room.lengths)
-    for row in range(lane, m + further, wp.block_dim()):
-        length = room.lengths[row]
+    gemm_add(rows.units, workspace.force_map, workspace.root, map_rows, m, m, 0)
+    multiply(workspace.force_map, map_rows, m, workspace.minimum, workspace.at_minimum)
+    multiply(workspace.force_map, map_rows, m, workspace.start, workspace.at_start)
+    normalize_rows(rows.units, m, rows.base_rows, rows.coefficients, m + mode_rows, workspace.lengths)
+    for row in range(lane, m + mode_rows, wp.block_dim()):
+        length = workspace.lengths[row]
         free = real(0.0)
         start = real(0.0)
         if row < m:
-            free = room.minimum[row]
-            start = room.start[row]
-            room.bounds[0, row] = program.packed[program.lower + row] - BOUND_PADDING
-            room.bounds[1, row] = program.packed[program.upper + row] + BOUND_PADDING
+            free = workspace.minimum[row]
+            start = workspace.start[row]
+            workspace.bounds[0, row] = program.packed[program.lower + row] - BOUND_PADDING
+            workspace.bounds[1, row] = program.packed[program.upper + row] + BOUND_PADDING
         else:
-            free = row_value(room, row - m, room.at_minimum)
-            start = row_value(room, row - m, room.at_start)
-            least = -row_offset(room, row - m, m)
-            room.bounds[0, row] = wp.min(least, wp.max(start, least - _BROKEN)) - _ROUNDING - BOUND_PADDING
-            room.bounds[1, row] = real(wp.inf)
+            free = row_value(workspace, row - m, workspace.at_minimum)
+            start = row_value(workspace, row - m, workspace.at_start)
+            lower = -row_offset(workspace, row - m, m)
+            workspace.bounds[0, row] = wp.min(lower, wp.max(start, lower - _BROKEN)) - _ROUNDING - BOUND_PADDING
+            workspace.bounds[1, row] = real(wp.inf)
         rows.values_at_origin[row] = free / length
-        begun[row] = (start - free) / length
-        rows.lower[row] = room.bounds[0, row] / length
-        rows.upper[row] = room.bounds[1, row] / length
+        initial_values[row] = (start - free) / length
+        rows.lower[row] = workspace.bounds[0, row] / length
+        rows.upper[row] = workspace.bounds[1, row] / length
         rows.slack[row] = ROW_TOLERANCE * wp.max(real(1.0), length) / length
     sync_block()

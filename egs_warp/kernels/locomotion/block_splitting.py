@@ -1,8 +1,8 @@
-"""OSQP's iterations by all threads of a block, in coordinates whose squares are costs: they tell which rows hold an
-optimum (Stellato, Banjac, Goulart, Bemporad and Boyd 2020).
+"""OSQP iterations for all threads of a block, in coordinates with Hessian 1, which guess the active set of an optimum
+(Stellato, Banjac, Goulart, Bemporad and Boyd 2020).
 
-With P = 1 a step to the next z is a combination of rows, so it takes place in the multipliers of the k rows that are
-looked at: z = share z_0 + R^T sums.
+With P = 1, the step to the next z is a linear combination of rows. So the iterations run in the multipliers of the k
+selected rows: z = share z_0 + R^T sums.
 """
 
 import warp as wp
@@ -22,24 +22,24 @@ wp.set_module_options({"enable_backward": False})
 
 _ITERATIONS = wp.constant(15)
 _RHO = wp.constant(real(1.0))
-"""Both as in ``egs_warp/locomotion/operator_splitting.py``."""
+"""Iterations and rho, both as in ``egs_warp/locomotion/operator_splitting.py``."""
 _SIGMA = wp.constant(real(1e-6))
-_OVER = wp.constant(real(1.6))
-"""alpha, relaxation beyond a whole step. OSQP's defaults."""
+_ALPHA = wp.constant(real(1.6))
+"""sigma, and alpha, the over-relaxation factor: OSQP's defaults."""
 
 
 @wp.struct
 class Splitting:
-    """Where the iterations are."""
+    """State of the iterations."""
 
     rows: wp.array[real]
-    """(k,) R z."""
+    """(k,) R z of the selected rows."""
     projected: wp.array[real]
-    """(k,) what of that is within the bounds."""
+    """(k,) R z projected onto the bounds."""
     multipliers: wp.array[real]
     """(k,) multipliers."""
     sums: wp.array[real]
-    """(k,)."""
+    """(k,) coefficients of the rows in z."""
     right: wp.array[real]
     between: wp.array[real]
     step: wp.array[real]
@@ -51,65 +51,68 @@ class Splitting:
 
 
 @wp.func
-def iterate(rows: UnitConstraints, holding: ActiveSet, splitting: Splitting):
-    """From rows with a side, those that are looked at, to a guess of the rows that hold the optimum; the guess that
-    there is stays where they are more than there are unknowns, or have no factors."""
+def iterate(rows: UnitConstraints, state: ActiveSet, splitting: Splitting):
+    """Replace the guess ``state.side`` by the active set after a fixed number of OSQP iterations.
+
+    The iterations consider only rows with a side. If those outnumber the unknowns or cannot be factorized, the guess
+    stays.
+    """
     lane = lane_of_block()
     one = real(1.0)
-    count = compact_indices(holding.side, rows.count, rows.unknowns, holding.active)
+    count = compact_indices(state.side, rows.count, rows.unknowns, state.active)
     if count > rows.unknowns:
         return
-    gather_active(rows, holding, count, (one + _SIGMA) / _RHO)
-    if inverse_cholesky(holding.products, count, holding.root) == 0:
+    gather_active(rows, state, count, (one + _SIGMA) / _RHO)
+    if inverse_cholesky(state.products, count, state.root) == 0:
         return
     for i in range(lane, count, wp.block_dim()):
-        splitting.rows[i] = splitting.initial_values[holding.active[i]]
-        splitting.projected[i] = splitting.initial_values[holding.active[i]]
+        splitting.rows[i] = splitting.initial_values[state.active[i]]
+        splitting.projected[i] = splitting.initial_values[state.active[i]]
         splitting.multipliers[i] = real(0.0)
         splitting.sums[i] = real(0.0)
     share = real(1.0)
-    # Not a range, which would be written out.
-    done = int(0)
-    while done < _ITERATIONS:
-        done += 1
+    # Not a range loop, which Warp would unroll.
+    iteration = int(0)
+    while iteration < _ITERATIONS:
+        iteration += 1
         for i in range(lane, count, wp.block_dim()):
             splitting.right[i] = _SIGMA * splitting.rows[i] + (one + _SIGMA) * (
                 splitting.multipliers[i] / _RHO - splitting.projected[i]
             )
         sync_block()
-        apply_factor(holding.root, count, splitting.right, splitting.between, splitting.step)
+        apply_factor(state.root, count, splitting.right, splitting.between, splitting.step)
         for i in range(lane, count, wp.block_dim()):
-            row = holding.active[i]
+            row = state.active[i]
             nu = splitting.step[i]
-            near = splitting.projected[i]
-            push = splitting.multipliers[i]
-            ahead = near + (nu - push) / _RHO
-            splitting.rows[i] = _OVER * ahead + (one - _OVER) * splitting.rows[i]
+            projected = splitting.projected[i]
+            multiplier = splitting.multipliers[i]
+            target = projected + (nu - multiplier) / _RHO
+            splitting.rows[i] = _ALPHA * target + (one - _ALPHA) * splitting.rows[i]
             splitting.sums[i] = (
-                _OVER * (_SIGMA * splitting.sums[i] - nu) / (one + _SIGMA) + (one - _OVER) * (splitting.sums[i])
+                _ALPHA * (_SIGMA * splitting.sums[i] - nu) / (one + _SIGMA) + (one - _ALPHA) * (splitting.sums[i])
             )
-            relaxed = _OVER * ahead + (one - _OVER) * near
+            relaxed = _ALPHA * target + (one - _ALPHA) * projected
             free = rows.values_at_origin[row]
-            within = wp.clamp(relaxed + push / _RHO, rows.lower[row] - free, rows.upper[row] - free)
-            splitting.projected[i] = within
-            splitting.multipliers[i] = push + _RHO * (relaxed - within)
-        share = _OVER * _SIGMA * share / (one + _SIGMA) + (one - _OVER) * share
+            clamped = wp.clamp(relaxed + multiplier / _RHO, rows.lower[row] - free, rows.upper[row] - free)
+            splitting.projected[i] = clamped
+            splitting.multipliers[i] = multiplier + _RHO * (relaxed - clamped)
+        share = _ALPHA * _SIGMA * share / (one + _SIGMA) + (one - _ALPHA) * share
     sync_block()
-    multiply_transposed(holding.active_rows, count, rows.unknowns, splitting.sums, holding.z)
-    evaluate(rows, holding)
+    multiply_transposed(state.active_rows, count, rows.unknowns, splitting.sums, state.z)
+    evaluate(rows, state)
     for row in range(lane, rows.count, wp.block_dim()):
         splitting.all_multipliers[row] = real(0.0)
     sync_block()
     for i in range(lane, count, wp.block_dim()):
-        splitting.all_multipliers[holding.active[i]] = splitting.multipliers[i]
+        splitting.all_multipliers[state.active[i]] = splitting.multipliers[i]
     sync_block()
     for row in range(lane, rows.count, wp.block_dim()):
-        at = holding.values[row] + share * splitting.initial_values[row]
-        push = splitting.all_multipliers[row]
+        at = state.values[row] + share * splitting.initial_values[row]
+        multiplier = splitting.all_multipliers[row]
         side = int(0)
-        if at - rows.lower[row] < -push:
+        if at - rows.lower[row] < -multiplier:
             side = 1
-        elif rows.upper[row] - at < push:
+        elif rows.upper[row] - at < multiplier:
             side = -1
-        holding.side[row] = side
+        state.side[row] = side
     sync_block()

@@ -1,6 +1,6 @@
-"""The program of a piece of contact over activations alone, in vectors of four, on a CPU.
+"""QP of one assignment of contact modes over the activations alone, as native CPU code with vectors of four.
 
-See ``egs_warp/locomotion/contact_modes.py``.
+Host code: ``egs_warp/locomotion/contact_modes.py``.
 """
 
 import math
@@ -13,46 +13,48 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 FREE, STICK, SLIDE = 0, 1, 2
-"""How a contact moves."""
+"""Contact modes."""
 TO_FREE, TO_SLIDE, TO_OTHER_DIRECTION, TO_TOUCHING = 0, 1, 2, 3
-"""What it does beyond a row that says where a piece ends."""
+"""Mode transitions of a contact where a row that bounds the region becomes active."""
 CONE_FACES = 8
-"""Of the pyramid that stands in for the friction cone of a contact that sticks."""
+"""Faces of the pyramid that replaces the friction cone of a sticking contact."""
 SLIDE_SECTOR = math.radians(30.0)
-"""How far a contact that slides may turn from the way that its friction is taken against. Friction that stays where it
-was while a foot slides elsewhere pushes a body along that no ground would."""
+"""Largest angle, rad, between the slip of a sliding contact and the direction that its friction opposes. A fixed
+friction direction under a foot that slips elsewhere would propel the body unphysically."""
 DELASSUS_REGULARIZATION = 1e-7
-"""Of the mean of the operator's diagonal: more points than the cage can resolve leave it singular."""
+"""Diagonal shift of the Delassus operator, relative to the mean of its diagonal: more contacts than the cage can
+resolve make it singular."""
 ZERO_FORCE = 1e-9
-"""Body weights: what rounding leaves of the force of a contact that is open."""
+"""Normal force, body weights, up to which a contact counts as open."""
 CONE_FRACTION = 1.0 - 1e-6
-"""Of the cone's radius: a contact whose friction comes so near to it slides."""
+"""Fraction of the cone's radius from which the contact counts as sliding."""
 ZERO_SPEED = 1e-9
-"""Of sqrt(g H): tangential velocity without a direction."""
+"""Tangential speed, in units of sqrt(g H), below which the slip has no direction."""
 ACTIVE = 1e-3
-"""Multiplier, of the objective's value for a unit of the row, from which a bound is worth leaving."""
+"""Smallest multiplier of a bound that is worth crossing, relative to the objective per unit of the row."""
 GAIN = 5e-3
-"""Share of the objective by which a further piece has to lower it."""
+"""Smallest relative decrease of the objective for which the search goes on to the next region."""
 BROKEN = 0.02
-"""By which a start may break a row that its piece does not quite hold."""
+"""Amount by which the start may violate a row of its region."""
 ROUNDING = 1e-6
-"""Of a start that is the only point of its piece, as where contacts repeat each other."""
+"""Amount by which rows are relaxed, for a start that is the only point of its region, as where contacts repeat each
+other."""
 _NO_PIVOT = 1e-14
 _ANGLES = [2.0 * math.pi * face / CONE_FACES for face in range(CONE_FACES)]
 _NORMALS = ", ".join(f"{math.cos(math.pi / CONE_FACES)}, {-math.cos(angle)}, {-math.sin(angle)}" for angle in _ANGLES)
 
 
 def padded(count: int) -> int:
-    """Columns of a matrix by eights."""
+    """Round ``count`` up to a multiple of eight columns."""
     return -(-count // 8) * 8
 
 
 def scratch_size(activations: int, contacts: int) -> int:
-    """Numbers of scratch memory that a piece takes at most."""
+    """Return the maximum number of float64 that a region needs as scratch."""
     wide, touches = padded(activations + 1), 3 * contacts
-    met = activations + touches
+    row_count = activations + touches
     return (touches + 5) * wide + max(
-        (touches + 1) * (padded(touches) + wide), met * wide + (met + activations) * (touches + 1)
+        (touches + 1) * (padded(touches) + wide), row_count * wide + (row_count + activations) * (touches + 1)
     )
 
 
@@ -63,7 +65,7 @@ def scratch_size(activations: int, contacts: int) -> int:
     constexpr int FREE = {FREE}, STICK = {STICK}, SLIDE = {SLIDE}, FACES = {CONE_FACES};
     constexpr double SINGULAR = {DELASSUS_REGULARIZATION}, NO_PIVOT = {_NO_PIVOT};
     constexpr double WEDGE_SINE = {math.sin(SLIDE_SECTOR)}, WEDGE_COSINE = {math.cos(SLIDE_SECTOR)};
-    // What each face leaves of the normal force over the friction, and of the tangents.
+    // Coefficients of the normal force (times the friction) and of the tangential force in the distance to each face.
     const double sides[3 * FACES] = {{{_NORMALS}}};
 """
         + """
@@ -72,8 +74,8 @@ def scratch_size(activations: int, contacts: int) -> int:
     const double *const W = (const double*)rows, *const w = (const double*)offset;
     const int* const kinds = (const int*)kind;
     const double* const slips = (const double*)slip;
-    double* room = scratch.data;
-    auto take = [&](int count) { double* const taken = room; room += count; return taken; };
+    double* free_scratch = scratch.data;
+    auto take = [&](int count) { double* const block = free_scratch; free_scratch += count; return block; };
     int *const held = numbers.data, *const touching = held + 3 * n, *const pivots = touching + 3 * n;
     int *const place = pivots + 3 * n, holds = 0, touches = 0;
     for (int i = 0; i < n; ++i) {
@@ -81,7 +83,7 @@ def scratch_size(activations: int, contacts: int) -> int:
         for (int t = 0; t < 3 && kinds[i] != FREE; ++t) touching[touches++] = 3 * i + t;
         for (int t = 0; t < 3 && (kinds[i] == STICK || (kinds[i] == SLIDE && t == 0)); ++t) held[holds++] = 3 * i + t;
     }
-    // Forces: (what is held) (f) = -(what goes on without), the last column that of no activation.
+    // Forces: (held rows) (f) = -(held velocities without forces); the last column is the constant.
     double* const S = take((touches + 1) * wide);
     {
         const int right = (holds + 7) & ~7, stride = right + wide;
@@ -126,7 +128,7 @@ def scratch_size(activations: int, contacts: int) -> int:
             for (int s = 0; s < 2 && kinds[i] == SLIDE; ++s)
                 for (int c = 0; c < wide; ++c) to[(s + 1) * wide + c] = -friction * slips[2 * i + s] * from[c];
         }
-        room = M;
+        free_scratch = M;
     }
     double *const f = (double*)forces, *const f0 = (double*)forces_offset;
     for (int k = 0; k < 3 * n; ++k) {
@@ -137,7 +139,7 @@ def scratch_size(activations: int, contacts: int) -> int:
         f0[touching[g]] = S[g * wide + m];
         for (int c = 0; c < m; ++c) f[touching[g] * plain + c] = S[g * wide + c];
     }
-    // x = (0, offset) + (1, S) a: of P x the parts that meet it again, then its square.
+    // x = (0, offset) + (1, S) a: the rows of P x that are needed, then x^T P x.
     double* const X = take((m + touches) * wide);
     {
         double *const L = take((m + touches) * (touches + 1)), *const down = take(m * (touches + 1));
@@ -151,9 +153,9 @@ def scratch_size(activations: int, contacts: int) -> int:
         for (int i = 0; i < m; ++i)
             for (int g = 0; g < touches; ++g) down[i * touches + g] = -S[g * wide + i];
         take_off_all(X, wide, m, down, touches, X + m * wide, wide, wide, touches);
-        room = L;
+        free_scratch = L;
     }
-    double *const Q = (double*)piece_cost, *const s = (double*)piece_slope;
+    double *const Q = (double*)region_cost, *const s = (double*)region_slope;
     for (int i = 0; i < m; ++i) {
         s[i] = q[i] + X[i * wide + m];
         for (int k = 0; k <= i; ++k) Q[i * plain + k] = Q[k * plain + i] = 0.5 * (X[i * wide + k] + X[k * wide + i]);
@@ -161,7 +163,7 @@ def scratch_size(activations: int, contacts: int) -> int:
     }
     for (int g = 0; g < touches; ++g)
         for (int i = 0; i < m; ++i) s[i] += S[g * wide + i] * q[m + touching[g]];
-    // Where it ends: sign of forces, faces, ways of what slides, speeds of what is free.
+    // Bounds of the region: normal forces, cone faces, slip sectors, normal velocities of free contacts.
     double *A = (double*)bounds, *b = (double*)bounds_offset;
     auto write = [&](double by, const double* from) {
         for (int c = 0; c < m; ++c) A[c] += by * from[c];
@@ -171,9 +173,9 @@ def scratch_size(activations: int, contacts: int) -> int:
     for (int k = 0; k < total * plain; ++k) A[k] = 0.0;
     for (int k = 0; k < total; ++k) b[k] = 0.0;
     for (int i = 0; i < m; ++i, next()) A[i] = 1.0;
-    for (int kept = STICK; kept <= SLIDE; ++kept)
+    for (int mode = STICK; mode <= SLIDE; ++mode)
         for (int i = 0; i < n; ++i)
-            if (kinds[i] == kept) { write(1.0, S + place[i] * wide); next(); }
+            if (kinds[i] == mode) { write(1.0, S + place[i] * wide); next(); }
     for (int face = 0; face < FACES; ++face)
         for (int i = 0; i < n; ++i)
             if (kinds[i] == STICK) {
@@ -226,12 +228,13 @@ def mode_region_native(
     total: wp.int32,
     forces: wp.uint64,
     forces_offset: wp.uint64,
-    piece_cost: wp.uint64,
-    piece_slope: wp.uint64,
+    region_cost: wp.uint64,
+    region_slope: wp.uint64,
     bounds: wp.uint64,
     bounds_offset: wp.uint64,
 ) -> wp.int32:
-    """See ``piece_kernel``; whether there are forces."""
+    """Compute a mode region as described at ``mode_region_kernel``; return 1, or 0 if the forces cannot be solved
+    for."""
     ...
 
 
@@ -253,20 +256,36 @@ def mode_region_kernel(
     # Out:
     forces: wp.uint64,
     forces_offset: wp.uint64,
-    piece_cost: wp.uint64,
-    piece_slope: wp.uint64,
+    region_cost: wp.uint64,
+    region_slope: wp.uint64,
     bounds: wp.uint64,
     bounds_offset: wp.uint64,
-    there: wp.array[wp.int32],
+    is_solvable: wp.array[wp.int32],
 ) -> None:
-    """Of ``ContactPieces`` (``cost`` P, ``slope_of_cost`` q, ``rows``, ``offset``) with m ``activations`` and n
-    ``contacts``, the piece in which each moves as its ``kind`` (n,) of 32 bits says, along its ``slip`` (n, 2): what
-    contact answers, ``forces`` (3n, m) and ``forces_offset`` (3n,); ``piece_cost`` (m, m) and ``piece_slope`` (m,) of
-    activations alone; ``bounds`` (total, m) and ``bounds_offset`` (total,): the activations, then what is not negative
-    where the piece holds. Those that stick or slide leave, those that stick slip at each face, those that slide turn to
-    one side, and to the other, those that are free land. All are addresses, rows of m numbers ``padded``. ``numbers``
-    are 10 n, ``scratch`` is ``room_of``. One thread."""
-    there[0] = mode_region_native(
+    """Reduce a ``CoulombProgram`` to the region of one assignment of contact modes, with one thread.
+
+    Array arguments are addresses. Matrices over activations have rows of ``padded(m)`` numbers. The rows of ``bounds``
+    are the m activations, then quantities that are nonnegative in the region, in this order: normal forces of sticking,
+    then of sliding contacts; distances to each cone face of sticking contacts; slip of sliding contacts against one,
+    then the other edge of their sector; normal velocities of free contacts.
+
+    Args:
+        activations: number m.
+        contacts: number n.
+        friction: friction coefficient.
+        cost, slope_of_cost: P (m + 3n, m + 3n) and q (m + 3n,).
+        rows, offset: (3n, m + 3n) and (3n,), affine map to the contact velocities.
+        kind: (n,) int32 mode of each contact.
+        slip: (n, 2) slip direction of sliding contacts.
+        numbers: (10n,) int32 scratch.
+        scratch: (``scratch_size``,) scratch.
+        total: number of rows of ``bounds``.
+        forces, forces_offset: (3n, m) and (3n,), contact response.
+        region_cost, region_slope: (m, m) and (m,), quadratic cost of the activations.
+        bounds, bounds_offset: (total, m) and (total,).
+        is_solvable: (1,) 1, or 0 if the forces cannot be solved for.
+    """
+    is_solvable[0] = mode_region_native(
         activations, contacts, friction, cost, slope_of_cost, rows, offset, kind, slip, numbers, scratch, total, forces,
-        forces_offset, piece_cost, piece_slope, bounds, bounds_offset,
+        forces_offset, region_cost, region_slope, bounds, bounds_offset,
     )  # fmt: skip

@@ -1,6 +1,6 @@
-"""The search over pieces of contact in one launch: a block of threads on a GPU, one thread on a CPU.
+"""Search over contact modes in a single launch: one thread block on a GPU, one thread on a CPU.
 
-What ``contact_pieces`` does on a host: see there, and docs/concepts/locomotion.md.
+The host version is ``contact_modes.search_modes``. See docs/concepts/locomotion.md.
 """
 
 import warp as wp
@@ -39,78 +39,79 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 512
-"""Threads on a GPU."""
+"""Threads of the block on a GPU."""
 HEADER_SIZE = 8
-"""Numbers before those of the program, and before the point of the answer."""
+"""Numbers before the QP in the packed input, and before the point in the packed result."""
 
 _FREE, _STICK, _SLIDE = wp.constant(FREE), wp.constant(STICK), wp.constant(SLIDE)
-_LEAVES, _SLIPS = wp.constant(TO_FREE), wp.constant(TO_SLIDE)
-_HERE, _ONWARD = wp.constant(CURRENT), wp.constant(NEXT)
-_NEAREST, _BESIDE = wp.constant(NEXT_SINGLE), wp.constant(WARM_START)
+_TO_FREE, _TO_SLIDE = wp.constant(TO_FREE), wp.constant(TO_SLIDE)
+_CURRENT, _NEXT = wp.constant(CURRENT), wp.constant(NEXT)
+_NEXT_SINGLE, _WARM_START = wp.constant(NEXT_SINGLE), wp.constant(WARM_START)
 _HEADER = wp.constant(HEADER_SIZE)
 INFEASIBLE_COST = wp.constant(real(1e6))
-"""As on the host."""
-_ACTIVE, _GAIN, _SLOWEST = (wp.constant(real(each)) for each in (ACTIVE, GAIN, ZERO_SPEED))
+"""Cost above which a QP counts as infeasible, relative to the decrease of the objective from the origin to the
+unconstrained minimum; as on the host."""
+_ACTIVE, _GAIN, _ZERO_SPEED = (wp.constant(real(each)) for each in (ACTIVE, GAIN, ZERO_SPEED))
 
 
 @wp.func
-def crash_start(rows: UnitConstraints, holding: ActiveSet):
-    """How many rows the minimum without bounds breaks: they get a side."""
-    broken = real(0.0)
+def crash_start(rows: UnitConstraints, state: ActiveSet):
+    """Activate the rows that the unconstrained minimum violates; return their number."""
+    activated = real(0.0)
     for row in range(lane_of_block(), rows.count, wp.block_dim()):
         side = int(0)
         if rows.values_at_origin[row] < rows.lower[row]:
             side = 1
         elif rows.values_at_origin[row] > rows.upper[row]:
             side = -1
-        holding.side[row] = side
+        state.side[row] = side
         if side != 0:
-            broken += real(1.0)
-    broken = sum_of_block(broken)
+            activated += real(1.0)
+    activated = sum_of_block(activated)
     sync_block()
-    return int(broken)
+    return int(activated)
 
 
 @wp.func
-def count_violations(program: Program, room: Workspace, answers: int, further: int):
-    """How many rows the point that was found breaks."""
+def count_violations(program: Program, workspace: Workspace, map_rows: int, mode_rows: int):
+    """Return the number of rows that ``optimum`` violates."""
     m = program.m
-    multiply(room.force_map, answers, m, room.optimum, room.at_found)
-    missed = real(0.0)
-    for row in range(lane_of_block(), m + further, wp.block_dim()):
+    multiply(workspace.force_map, map_rows, m, workspace.optimum, workspace.at_found)
+    violations = real(0.0)
+    for row in range(lane_of_block(), m + mode_rows, wp.block_dim()):
         at = real(0.0)
         if row < m:
-            at = room.optimum[row]
+            at = workspace.optimum[row]
         else:
-            at = row_value(room, row - m, room.at_found)
-        slack = real(10.0) * ROW_TOLERANCE * wp.max(real(1.0), room.lengths[row])
-        if not (at > room.bounds[0, row] - slack and at < room.bounds[1, row] + slack):
-            missed += real(1.0)
-    missed = sum_of_block(missed)
+            at = row_value(workspace, row - m, workspace.at_found)
+        slack = real(10.0) * ROW_TOLERANCE * wp.max(real(1.0), workspace.lengths[row])
+        if not (at > workspace.bounds[0, row] - slack and at < workspace.bounds[1, row] + slack):
+            violations += real(1.0)
+    violations = sum_of_block(violations)
     sync_block()
-    return int(missed)
+    return int(violations)
 
 
 @wp.func
-def scatter_optimum(program: Program, room: Workspace, touches: int):
-    """What contact answers to the optimum within its bounds, and what all costs."""
+def scatter_optimum(program: Program, workspace: Workspace, closed_count: int):
+    """Write the optimum, clamped to its bounds, and the contact response to ``trial``; return the objective."""
     lane = lane_of_block()
     m = program.m
     for k in range(lane, program.size, wp.block_dim()):
         value = real(0.0)
         if k < m:
-            value = wp.clamp(room.optimum[k], program.packed[program.lower + k], program.packed[program.upper + k])
-        room.trial[k] = value
+            value = wp.clamp(workspace.optimum[k], program.packed[program.lower + k], program.packed[program.upper + k])
+        workspace.trial[k] = value
     sync_block()
-    multiply(room.force_map, touches, m, room.trial, room.at_found)
-    for g in range(lane, touches, wp.block_dim()):
-        room.trial[m + room.closed_forces[g]] = room.at_found[g] + room.force_map[g, m]
+    multiply(workspace.force_map, closed_count, m, workspace.trial, workspace.at_found)
+    for g in range(lane, closed_count, wp.block_dim()):
+        workspace.trial[m + workspace.closed_forces[g]] = workspace.at_found[g] + workspace.force_map[g, m]
     sync_block()
     size = program.size
-    multiply_at(program.packed, program.cost, size, size, size, room.trial, room.values)
+    multiply_at(program.packed, program.cost, size, size, size, workspace.trial, workspace.values)
     total = real(0.0)
     for k in range(lane, size, wp.block_dim()):
-        total += room.trial[k] * (real(0.5) * room.values[k] + program.packed[program.slope + k])
+        total += workspace.trial[k] * (real(0.5) * workspace.values[k] + program.packed[program.slope + k])
     total = sum_of_block(total)
     sync_block()
     return total + program.constant
@@ -118,7 +119,7 @@ def scatter_optimum(program: Program, room: Workspace, touches: int):
 
 @wp.func
 def normalized(first: real, second: real):
-    """Their direction, the first axis where they have none."""
+    """Return the unit vector of (``first``, ``second``), the first axis for a zero vector."""
     length = wp.sqrt(first * first + second * second)
     if length > real(0.0):
         return wp.vec2d(first / length, second / length)
@@ -126,178 +127,185 @@ def normalized(first: real, second: real):
 
 
 @wp.func
-def apply_transition(program: Program, room: Workspace, contact: int, onward: int, which: int):
-    """``contact`` goes ``onward`` in the modes ``which``."""
+def apply_transition(program: Program, workspace: Workspace, contact: int, transition: int, which: int):
+    """Apply ``transition`` to ``contact`` in the modes of slot ``which``."""
     m = program.m
-    if onward == _LEAVES:
-        room.kinds[which, contact] = _FREE
-    elif onward == _SLIPS:
-        way = normalized(-room.trial[m + 3 * contact + 1], -room.trial[m + 3 * contact + 2])
-        room.kinds[which, contact] = _SLIDE
-        room.slips[which, contact, 0] = way[0]
-        room.slips[which, contact, 1] = way[1]
+    if transition == _TO_FREE:
+        workspace.kinds[which, contact] = _FREE
+    elif transition == _TO_SLIDE:
+        direction = normalized(-workspace.trial[m + 3 * contact + 1], -workspace.trial[m + 3 * contact + 2])
+        workspace.kinds[which, contact] = _SLIDE
+        workspace.slips[which, contact, 0] = direction[0]
+        workspace.slips[which, contact, 1] = direction[1]
     else:
-        first = room.values[3 * contact + 1]
-        second = room.values[3 * contact + 2]
-        if wp.sqrt(first * first + second * second) > _SLOWEST:
-            way = normalized(first, second)
-            room.kinds[which, contact] = _SLIDE
-            room.slips[which, contact, 0] = way[0]
-            room.slips[which, contact, 1] = way[1]
+        first = workspace.values[3 * contact + 1]
+        second = workspace.values[3 * contact + 2]
+        if wp.sqrt(first * first + second * second) > _ZERO_SPEED:
+            direction = normalized(first, second)
+            workspace.kinds[which, contact] = _SLIDE
+            workspace.slips[which, contact, 0] = direction[0]
+            workspace.slips[which, contact, 1] = direction[1]
         else:
-            room.kinds[which, contact] = _STICK
+            workspace.kinds[which, contact] = _STICK
 
 
 @wp.func
-def find_next_modes(program: Program, room: Workspace, holding: ActiveSet, holds: int, further: int, objective: real):
-    """How many rows hold the optimum back: modes onward of all of them, and of the one that is pushed most alone."""
+def find_next_modes(
+    program: Program, workspace: Workspace, state: ActiveSet, active_count: int, mode_rows: int, objective: real
+):
+    """Write the modes past all bounds with a significant multiplier, and past the strongest of them alone.
+
+    Returns: number of those bounds.
+    """
     lane = lane_of_block()
     m = program.m
-    multiply_at(program.packed, program.rows, program.size, 3 * program.n, program.size, room.trial, room.values)
+    multiply_at(
+        program.packed, program.rows, program.size, 3 * program.n, program.size, workspace.trial, workspace.values
+    )
     for k in range(lane, 3 * program.n, wp.block_dim()):
-        room.values[k] = room.values[k] + program.packed[program.offset + k]
-    for row in range(lane, further, wp.block_dim()):
-        room.multipliers[row] = real(0.0)
+        workspace.values[k] = workspace.values[k] + program.packed[program.offset + k]
+    for row in range(lane, mode_rows, wp.block_dim()):
+        workspace.multipliers[row] = real(0.0)
     for i in range(lane, program.n, wp.block_dim()):
-        for which in range(_ONWARD, _BESIDE):
-            room.kinds[which, i] = room.kinds[_HERE, i]
-            room.slips[which, i, 0] = room.slips[_HERE, i, 0]
-            room.slips[which, i, 1] = room.slips[_HERE, i, 1]
+        for which in range(_NEXT, _WARM_START):
+            workspace.kinds[which, i] = workspace.kinds[_CURRENT, i]
+            workspace.slips[which, i, 0] = workspace.slips[_CURRENT, i, 0]
+            workspace.slips[which, i, 1] = workspace.slips[_CURRENT, i, 1]
     sync_block()
-    for i in range(lane, holds, wp.block_dim()):
-        row = holding.active[i]
+    for i in range(lane, active_count, wp.block_dim()):
+        row = state.active[i]
         if row >= m:
-            room.multipliers[row - m] = holding.multipliers[i] / room.lengths[row]
+            workspace.multipliers[row - m] = state.multipliers[i] / workspace.lengths[row]
     sync_block()
-    least = _ACTIVE * wp.max(wp.abs(objective), real(1e-9))
+    min_multiplier = _ACTIVE * wp.max(wp.abs(objective), real(1e-9))
     count = real(0.0)
-    most = real(0.0)
+    max_multiplier = real(0.0)
     place = int(-1)
-    for row in range(lane, further, wp.block_dim()):
-        if room.multipliers[row] > least:
+    for row in range(lane, mode_rows, wp.block_dim()):
+        if workspace.multipliers[row] > min_multiplier:
             count += real(1.0)
-            if room.multipliers[row] > most:
-                most = room.multipliers[row]
+            if workspace.multipliers[row] > max_multiplier:
+                max_multiplier = workspace.multipliers[row]
                 place = row
     count = sum_of_block(count)
-    found = argmax_of_block(most, place)
+    strongest_row = argmax_of_block(max_multiplier, place)
     for i in range(lane, program.n, wp.block_dim()):
-        # The most pushed one's word is the last.
-        strongest = least
+        # The row with the largest multiplier decides.
+        strongest = min_multiplier
         last = int(-1)
-        row = room.first[i]
+        row = workspace.first[i]
         while row >= 0:
-            if room.multipliers[row] > least and room.multipliers[row] >= strongest:
-                strongest = room.multipliers[row]
+            if workspace.multipliers[row] > min_multiplier and workspace.multipliers[row] >= strongest:
+                strongest = workspace.multipliers[row]
                 last = row
-            row = room.next[row]
+            row = workspace.next[row]
         if last >= 0:
-            apply_transition(program, room, i, room.transition[last], _ONWARD)
+            apply_transition(program, workspace, i, workspace.transition[last], _NEXT)
     if lane == 0 and count > real(0.0):
-        row = int(found[1])
-        apply_transition(program, room, room.contact[row], room.transition[row], _NEAREST)
+        row = int(strongest_row[1])
+        apply_transition(program, workspace, workspace.contact[row], workspace.transition[row], _NEXT_SINGLE)
     sync_block()
     return int(count)
 
 
 @wp.struct
 class ModeRegionResult:
-    """How a piece ended."""
+    """Result of ``solve_mode_region``."""
 
     ended: int
     objective: real
     active_count: int
-    """Rows that hold the optimum back."""
+    """Number of active bounds of the region with a significant multiplier."""
 
 
 @wp.func
-def solve_piece(
-    program: Program, room: Workspace, rows: UnitConstraints, holding: ActiveSet, splitting: Splitting, first: int
+def solve_mode_region(
+    program: Program, workspace: Workspace, rows: UnitConstraints, state: ActiveSet, splitting: Splitting, first: int
 ):
-    """That of the modes at hand, entered from the start; ``first`` is 1 as long as none is solved."""
+    """Solve the QP of the current modes, entered from ``start``. ``first`` is 1 until a region has been solved."""
     lane = lane_of_block()
     m = program.m
-    sticks = count_of(program, room, _STICK)
-    slides = count_of(program, room, _SLIDE)
+    sticks = count_of(program, workspace, _STICK)
+    slides = count_of(program, workspace, _SLIDE)
     frees = program.n - sticks - slides
-    touches = 3 * (sticks + slides)
+    closed_count = 3 * (sticks + slides)
     speeds = 2 * slides + frees
-    further = 9 * sticks + 3 * slides + frees
-    answers = touches + speeds
+    mode_rows = 9 * sticks + 3 * slides + frees
+    map_rows = closed_count + speeds
     solved = ModeRegionResult()
     solved.ended = INFEASIBLE
-    list_contact_rows(program, room, sticks, slides)
-    if solve_force_map(program, room, touches, 3 * sticks + slides) == 0:
+    list_contact_rows(program, workspace, sticks, slides)
+    if solve_force_map(program, workspace, closed_count, 3 * sticks + slides) == 0:
         solved.ended = NUMERICAL_FAILURE
         return solved
-    write_cost(program, room, touches)
-    write_speeds(program, room, touches, speeds)
-    if inverse_cholesky(room.cost, m, room.root) == 0:
+    write_cost(program, workspace, closed_count)
+    write_speeds(program, workspace, closed_count, speeds)
+    if inverse_cholesky(workspace.cost, m, workspace.root) == 0:
         solved.ended = NUMERICAL_FAILURE
         return solved
-    apply_factor(room.root, m, room.slope, room.values, room.minimum)
-    worth = real(0.0)
+    apply_factor(workspace.root, m, workspace.slope, workspace.values, workspace.minimum)
+    objective_drop = real(0.0)
     for c in range(lane, m, wp.block_dim()):
-        room.minimum[c] = -room.minimum[c]
-        worth -= real(0.5) * room.slope[c] * room.minimum[c]
-    worth = wp.max(sum_of_block(worth), real(1.0))
+        workspace.minimum[c] = -workspace.minimum[c]
+        objective_drop -= real(0.5) * workspace.slope[c] * workspace.minimum[c]
+    objective_drop = wp.max(sum_of_block(objective_drop), real(1.0))
     sync_block()
-    write_rows(program, room, rows, splitting.initial_values, answers, further)
+    write_rows(program, workspace, rows, splitting.initial_values, map_rows, mode_rows)
     rows.unknowns = m
-    rows.count = m + further
-    rows.base_count = m + answers
-    rows.cost_limit = INFEASIBLE_COST * worth
-    holds = int(0)
+    rows.count = m + mode_rows
+    rows.base_count = m + map_rows
+    rows.cost_limit = INFEASIBLE_COST * objective_drop
+    active_count = int(0)
     solved.ended = FOUND
-    if crash_start(rows, holding) > 0:
+    if crash_start(rows, state) > 0:
         if first == 1:
-            iterate(rows, holding, splitting)
-        solved.ended = find_optimum(rows, holding)
+            iterate(rows, state, splitting)
+        solved.ended = find_optimum(rows, state)
         if solved.ended != FOUND:
             return solved
-        multiply(room.root, m, m, holding.z, room.optimum)
-        held = real(0.0)
+        multiply(workspace.root, m, m, state.z, workspace.optimum)
+        active_rows = real(0.0)
         for row in range(lane, rows.count, wp.block_dim()):
-            if holding.side[row] != 0:
-                held += real(1.0)
-        holds = int(sum_of_block(held))
+            if state.side[row] != 0:
+                active_rows += real(1.0)
+        active_count = int(sum_of_block(active_rows))
     else:
         for c in range(lane, m, wp.block_dim()):
-            room.optimum[c] = real(0.0)
+            workspace.optimum[c] = real(0.0)
     sync_block()
     for c in range(lane, m, wp.block_dim()):
-        room.optimum[c] = room.optimum[c] + room.minimum[c]
+        workspace.optimum[c] = workspace.optimum[c] + workspace.minimum[c]
     sync_block()
-    missed = int(0)
-    if holds > 0:
-        missed = count_violations(program, room, answers, further)
-    if missed > 0:
+    violations = int(0)
+    if active_count > 0:
+        violations = count_violations(program, workspace, map_rows, mode_rows)
+    if violations > 0:
         solved.ended = NUMERICAL_FAILURE
         return solved
-    solved.objective = scatter_optimum(program, room, touches)
-    solved.active_count = find_next_modes(program, room, holding, holds, further, solved.objective)
+    solved.objective = scatter_optimum(program, workspace, closed_count)
+    solved.active_count = find_next_modes(program, workspace, state, active_count, mode_rows, solved.objective)
     return solved
 
 
 @wp.func
-def copy_modes(room: Workspace, n: int, source: int, target: int):
-    """The modes ``target`` are those of ``source`` then."""
+def copy_modes(workspace: Workspace, n: int, source: int, target: int):
+    """Copy the modes of slot ``source`` to slot ``target``."""
     for i in range(lane_of_block(), n, wp.block_dim()):
-        room.kinds[target, i] = room.kinds[source, i]
+        workspace.kinds[target, i] = workspace.kinds[source, i]
         for t in range(2):
-            room.slips[target, i, t] = room.slips[source, i, t]
+            workspace.slips[target, i, t] = workspace.slips[source, i, t]
     sync_block()
 
 
 @wp.func
-def unpack_program(told: wp.array[real]):
-    """What the header says of the numbers behind it."""
+def unpack_program(packed: wp.array[real]):
+    """Return the parts of the packed input according to its header."""
     program = Program()
-    program.packed = told
-    program.m = int(told[0])
-    program.n = int(told[1])
-    program.friction = told[2]
-    program.constant = told[3]
+    program.packed = packed
+    program.m = int(packed[0])
+    program.n = int(packed[1])
+    program.friction = packed[2]
+    program.constant = packed[3]
     program.size = program.m + 3 * program.n
     program.cost = _HEADER
     program.slope = program.cost + program.size * program.size
@@ -311,90 +319,97 @@ def unpack_program(told: wp.array[real]):
 @wp.kernel(launch_bounds=BLOCK)
 def mode_search_kernel(
     # In:
-    told: wp.array[real],
-    costly: real,
+    packed: wp.array[real],
+    restart_cost: real,
     # Scratch:
-    room: Workspace,
+    workspace: Workspace,
     rows: UnitConstraints,
-    holding: ActiveSet,
+    state: ActiveSet,
     splitting: Splitting,
     # Out:
     answer: wp.array[real],
     settled_out: wp.array[int],
 ):
-    """``search_pieces`` of what is ``told``: m, n, friction, the constant, the most programs, numbers that mean nothing
-    up to ``HEADER``; P, q, rows, offset, bounds of the activations; the activations of the start (m,), how each contact
-    moves there (n,), and its slip (n, 2). ``answer``: how it ended, programs, those without a solution among them, the
-    objective, whether there is a point; from ``HEADER`` on the point (m + 3n,). ``settled_out`` (1,) is 1 as soon as
-    one is found that is not ``costly``."""
+    """Run ``contact_modes.search_modes`` on packed input.
+
+    Args:
+        packed: m, n, friction, the constant, the maximum number of QPs, padding up to ``HEADER_SIZE``; P, q, rows,
+            offset, bounds of the activations; at the start the activations (m,), mode of each contact (n,), and slip
+            directions (n, 2).
+        restart_cost: objective below which no restart is needed.
+        workspace, rows, state, splitting: scratch.
+        answer: status, number of QPs, number of infeasible QPs, objective, 1 if there is a point; from ``HEADER_SIZE``
+            on the point (m + 3n,).
+        settled_out: (1,) set to 1 once a point with objective below ``restart_cost`` is found.
+    """
     lane = lane_of_block()
-    program = unpack_program(told)
+    program = unpack_program(packed)
     m = program.m
     n = program.n
     begin = program.upper + m
     sliding = real(0.0)
     for k in range(lane, m, wp.block_dim()):
-        room.start[k] = told[begin + k]
+        workspace.start[k] = packed[begin + k]
     for i in range(lane, n, wp.block_dim()):
-        kind = int(told[begin + m + i])
+        kind = int(packed[begin + m + i])
         if kind == _SLIDE:
             sliding += real(1.0)
             kind = _STICK
-        room.kinds[_HERE, i] = kind
+        workspace.kinds[_CURRENT, i] = kind
         for t in range(2):
-            room.slips[_HERE, i, t] = told[begin + m + n + 2 * i + t]
+            workspace.slips[_CURRENT, i, t] = packed[begin + m + n + 2 * i + t]
     sliding = sum_of_block(sliding)
     sync_block()
     count = int(0)
     infeasible = int(0)
-    there = int(0)
-    several = int(0)
-    nearest = int(0)
+    has_point = int(0)
+    has_several = int(0)
+    is_single = int(0)
     best = real(wp.inf)
     ended = FOUND
-    limit = int(told[4])
-    going = int(1)
-    while going == 1 and count < limit:
+    limit = int(packed[4])
+    continues = int(1)
+    while continues == 1 and count < limit:
         count += 1
-        going = 0
-        solved = solve_piece(program, room, rows, holding, splitting, 1 - there)
+        continues = 0
+        solved = solve_mode_region(program, workspace, rows, state, splitting, 1 - has_point)
         if solved.ended == NUMERICAL_FAILURE:
             ended = NUMERICAL_FAILURE
         elif solved.ended == INFEASIBLE:
             infeasible += 1
-            if there == 0 and infeasible == 1 and sliding > real(0.0):
-                # What slides is not held, then.
+            if has_point == 0 and infeasible == 1 and sliding > real(0.0):
+                # Retry with the slipping contacts free to slip.
                 for i in range(lane, n, wp.block_dim()):
-                    room.kinds[_HERE, i] = int(told[begin + m + i])
+                    workspace.kinds[_CURRENT, i] = int(packed[begin + m + i])
                 sync_block()
-                going = 1
-        elif there == 1 and solved.objective >= best:
-            # Together the contacts went too far; the one that is pushed most may still gain.
-            if several == 1 and nearest == 0:
-                copy_modes(room, n, _BESIDE, _HERE)
-                nearest = 1
-                going = 1
+                continues = 1
+        elif has_point == 1 and solved.objective >= best:
+            # All transitions together were too many; the strongest alone may still lower the objective.
+            if has_several == 1 and is_single == 0:
+                copy_modes(workspace, n, _WARM_START, _CURRENT)
+                is_single = 1
+                continues = 1
         else:
-            enough = there == 1 and best - solved.objective < _GAIN * wp.abs(best)
-            there = 1
+            is_small_gain = has_point == 1 and best - solved.objective < _GAIN * wp.abs(best)
+            has_point = 1
             best = solved.objective
-            if lane == 0 and best < costly:
+            if lane == 0 and best < restart_cost:
                 wp.atomic_max(settled_out, 0, 1)
             for k in range(lane, program.size, wp.block_dim()):
-                answer[_HEADER + k] = room.trial[k]
+                answer[_HEADER + k] = workspace.trial[k]
                 if k < m:
-                    room.start[k] = room.trial[k]
-            several = int(0)
+                    workspace.start[k] = workspace.trial[k]
+            has_several = int(0)
             if solved.active_count > 1:
-                several = 1
-            nearest = 0
-            copy_modes(room, n, _NEAREST, _BESIDE)
-            if solved.active_count > 0 and not enough:
-                copy_modes(room, n, _ONWARD, _HERE)
-                going = 1
+                has_several = 1
+            is_single = 0
+            copy_modes(workspace, n, _NEXT_SINGLE, _WARM_START)
+            if solved.active_count > 0 and not is_small_gain:
+                copy_modes(workspace, n, _NEXT, _CURRENT)
+                continues = 1
     if lane == 0:
         answer[0] = real(ended)
         answer[1] = real(count)
         answer[2] = real(infeasible)
         answer[3] = best
-        answer[4] = real(there)
+        answer[4] = real(has_point)

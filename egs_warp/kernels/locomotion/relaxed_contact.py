@@ -1,6 +1,6 @@
-"""The optimum of a step's program without complementarity: a block of threads on a GPU, one thread on a CPU.
+"""Optimum of a step's QP without complementarity: one thread block on a GPU, one thread on a CPU.
 
-What ``contact_pieces.solve_relaxed`` does on a host: see there, and docs/concepts/locomotion.md.
+The host version is ``contact_modes.solve_relaxed``. See docs/concepts/locomotion.md.
 """
 
 import warp as wp
@@ -26,37 +26,41 @@ from egs_warp.precision import Vec3, real
 
 wp.set_module_options({"enable_backward": False})
 
-_HEADER, _OF_FORCES = wp.constant(HEADER_SIZE), wp.constant(1 + CONE_FACES)
-_SINGULAR = wp.constant(real(DELASSUS_REGULARIZATION))
+_HEADER, _ROWS_PER_FORCE = wp.constant(HEADER_SIZE), wp.constant(1 + CONE_FACES)
+_REGULARIZATION = wp.constant(real(DELASSUS_REGULARIZATION))
 
 
 @wp.struct
 class Relaxed:
-    """Scratch memory for N = m + 3n unknowns, m activations and the forces of n contacts, at most. Of k = m + 10n rows
-    the first n are how fast contacts leave the ground, the next m the activations, then come the forces."""
+    """Scratch for at most N = m + 3n unknowns: m activations and the forces of n contacts.
+
+    The k = m + 10n rows are the n normal contact velocities, the m activations, then the components of the forces in
+    their cones.
+    """
 
     cost: wp.array2d[real]
-    """(N, N)."""
+    """(N, N) Hessian."""
     root: wp.array2d[real]
-    """(N, N) of its inverse."""
+    """(N, N) upper triangular U with cost^-1 = U U^T."""
     leaving: wp.array2d[real]
-    """(n, N) the first rows."""
+    """(n, N) rows of the normal contact velocities."""
     minimum: wp.array[real]
     found: wp.array[real]
     slope: wp.array[real]
     values: wp.array[real]
-    """(N,)."""
+    """(N,) unconstrained minimum, optimum, gradient, scratch."""
     speeds: wp.array[real]
-    """(n,)."""
+    """(n,) normal contact velocities."""
     lengths: wp.array[real]
-    """(k,)."""
+    """(k,) lengths of the rows before scaling."""
     bounds: wp.array2d[real]
-    """(2, k)."""
+    """(2, k) lower and upper bounds before scaling."""
 
 
 @wp.func
 def cone_component(friction: real, part: int):
-    """Of a force, what is not negative: the normal one, or what a face around the cone leaves."""
+    """Return the coefficients of a nonnegative component of a force: the normal force for ``part`` 0, else the distance
+    to a face of the friction pyramid."""
     if part == 0:
         return wp.vec3d(real(1.0), real(0.0), real(0.0))
     return wp.vec3d(friction, -COSINES[part - 1], -SINES[part - 1])
@@ -64,25 +68,27 @@ def cone_component(friction: real, part: int):
 
 @wp.func
 def diagonal_shift(program: Program):
-    """What is added to the diagonal of the cost."""
+    """Return the regularization of the diagonal of the cost."""
     mean = real(0.0)
     for i in range(lane_of_block(), program.size, wp.block_dim()):
         mean += program.packed[program.cost + i * (program.size + 1)] / real(program.size)
     mean = sum_of_block(mean)
     sync_block()
-    return _SINGULAR * mean
+    return _REGULARIZATION * mean
 
 
 @wp.func
-def write_root(program: Program, relaxed: Relaxed, added: real):
-    """Of the cost with so much ``added`` to its diagonal, and its minimum; by how much that is lower, -1 where there is
-    no root."""
+def write_root(program: Program, relaxed: Relaxed, shift: real):
+    """Compute ``root`` of the cost with ``shift`` on its diagonal, and the unconstrained minimum.
+
+    Returns: decrease of the objective from zero to the minimum, at least 1; -1 if the cost is not positive definite.
+    """
     lane = lane_of_block()
     size = program.size
     for e in range(lane, size * size, wp.block_dim()):
         value = program.packed[program.cost + e]
         if e % (size + 1) == 0:
-            value += added
+            value += shift
         relaxed.cost[e / size, e % size] = value
     for i in range(lane, size, wp.block_dim()):
         relaxed.slope[i] = program.packed[program.slope + i]
@@ -90,40 +96,40 @@ def write_root(program: Program, relaxed: Relaxed, added: real):
     if inverse_cholesky(relaxed.cost, size, relaxed.root) == 0:
         return real(-1.0)
     apply_factor(relaxed.root, size, relaxed.slope, relaxed.values, relaxed.minimum)
-    worth = real(0.0)
+    objective_drop = real(0.0)
     for i in range(lane, size, wp.block_dim()):
         relaxed.minimum[i] = -relaxed.minimum[i]
-        worth -= real(0.5) * relaxed.slope[i] * relaxed.minimum[i]
-    worth = wp.max(sum_of_block(worth), real(1.0))
+        objective_drop -= real(0.5) * relaxed.slope[i] * relaxed.minimum[i]
+    objective_drop = wp.max(sum_of_block(objective_drop), real(1.0))
     sync_block()
-    return worth
+    return objective_drop
 
 
 @wp.func
 def normal_velocities(program: Program, relaxed: Relaxed, point: wp.array[real]):
-    """How fast contacts leave the ground at the ``point``, but for the program's ``offset``."""
+    """Compute the normal contact velocities at ``point``, without the constant ``offset``."""
     multiply(relaxed.leaving, program.n, program.size, point, relaxed.speeds)
 
 
 @wp.func
 def row_value(program: Program, relaxed: Relaxed, row: int, point: wp.array[real]):
-    """What a row is at the ``point``, whose speeds were seen last."""
+    """Return the value of a row at ``point``; ``normal_velocities`` must have been called for it."""
     if row < program.n:
         return relaxed.speeds[row]
     k = row - program.n
     if k < program.m:
         return point[k]
     k -= program.m
-    share = cone_component(program.friction, k % _OF_FORCES)
+    coefficients = cone_component(program.friction, k % _ROWS_PER_FORCE)
     value = real(0.0)
     for t in range(3):
-        value += share[t] * point[program.m + 3 * (k / _OF_FORCES) + t]
+        value += coefficients[t] * point[program.m + 3 * (k / _ROWS_PER_FORCE) + t]
     return value
 
 
 @wp.func
-def write_rows(program: Program, relaxed: Relaxed, rows: UnitConstraints, begun: wp.array[real]):
-    """In coordinates whose squares are costs, from whose origin the search begins."""
+def write_rows(program: Program, relaxed: Relaxed, rows: UnitConstraints, initial_values: wp.array[real]):
+    """Write the rows in whitened coordinates, scaled to length 1, and their bounds; the search starts at the origin."""
     lane = lane_of_block()
     m = program.m
     n = program.n
@@ -137,60 +143,60 @@ def write_rows(program: Program, relaxed: Relaxed, rows: UnitConstraints, begun:
         rows.units[n + e / size, e % size] = relaxed.root[e / size, e % size]
     for row in range(lane, rows.count, wp.block_dim()):
         part = row
-        share = wp.vec3d(real(1.0), real(0.0), real(0.0))
+        coefficients = wp.vec3d(real(1.0), real(0.0), real(0.0))
         k = row - n - m
         if k >= 0:
-            part = n + m + 3 * (k / _OF_FORCES)
-            share = cone_component(program.friction, k % _OF_FORCES)
+            part = n + m + 3 * (k / _ROWS_PER_FORCE)
+            coefficients = cone_component(program.friction, k % _ROWS_PER_FORCE)
         for t in range(3):
             rows.base_rows[row, t] = wp.where(k >= 0, part + t, part)
-            rows.coefficients[row, t] = share[t]
+            rows.coefficients[row, t] = coefficients[t]
     sync_block()
     normalize_rows(rows.units, size, rows.base_rows, rows.coefficients, rows.count, relaxed.lengths)
     normal_velocities(program, relaxed, relaxed.minimum)
     for row in range(lane, rows.count, wp.block_dim()):
-        least = real(0.0)
-        most = real(wp.inf)
+        lower = real(0.0)
+        upper = real(wp.inf)
         if row < n:
-            least = -program.packed[program.offset + 3 * row]
+            lower = -program.packed[program.offset + 3 * row]
         elif row < n + m:
-            least = program.packed[program.lower + row - n]
-            most = program.packed[program.upper + row - n]
-        relaxed.bounds[0, row] = least - BOUND_PADDING
-        relaxed.bounds[1, row] = most + BOUND_PADDING
+            lower = program.packed[program.lower + row - n]
+            upper = program.packed[program.upper + row - n]
+        relaxed.bounds[0, row] = lower - BOUND_PADDING
+        relaxed.bounds[1, row] = upper + BOUND_PADDING
         length = relaxed.lengths[row]
         rows.values_at_origin[row] = row_value(program, relaxed, row, relaxed.minimum) / length
         rows.lower[row] = relaxed.bounds[0, row] / length
         rows.upper[row] = relaxed.bounds[1, row] / length
         rows.slack[row] = ROW_TOLERANCE * wp.max(real(1.0), length) / length
-        begun[row] = real(0.0)
+        initial_values[row] = real(0.0)
     sync_block()
 
 
 @wp.func
 def count_violations(program: Program, relaxed: Relaxed, count: int):
-    """How many rows the point that was found breaks."""
+    """Return the number of rows that the point ``relaxed.found`` violates."""
     normal_velocities(program, relaxed, relaxed.found)
-    missed = real(0.0)
+    violations = real(0.0)
     for row in range(lane_of_block(), count, wp.block_dim()):
         at = row_value(program, relaxed, row, relaxed.found)
         slack = real(10.0) * ROW_TOLERANCE * wp.max(real(1.0), relaxed.lengths[row])
         if not (at > relaxed.bounds[0, row] - slack and at < relaxed.bounds[1, row] + slack):
-            missed += real(1.0)
-    missed = sum_of_block(missed)
+            violations += real(1.0)
+    violations = sum_of_block(violations)
     sync_block()
-    return int(missed)
+    return int(violations)
 
 
 @wp.func
-def objective_at(program: Program, relaxed: Relaxed, added: real):
-    """What the point that was found costs."""
+def objective_at(program: Program, relaxed: Relaxed, shift: real):
+    """Return the objective at ``relaxed.found``."""
     size = program.size
     multiply_at(program.packed, program.cost, size, size, size, relaxed.found, relaxed.values)
     total = real(0.0)
     for k in range(lane_of_block(), size, wp.block_dim()):
         at = relaxed.found[k]
-        total += at * (real(0.5) * (relaxed.values[k] + added * at) + relaxed.slope[k])
+        total += at * (real(0.5) * (relaxed.values[k] + shift * at) + relaxed.slope[k])
     total = sum_of_block(total)
     sync_block()
     return total + program.constant
@@ -199,46 +205,51 @@ def objective_at(program: Program, relaxed: Relaxed, added: real):
 @wp.kernel(launch_bounds=BLOCK)
 def relaxed_qp_kernel(
     # In:
-    told: wp.array[real],
+    packed: wp.array[real],
     # Scratch:
     relaxed: Relaxed,
     rows: UnitConstraints,
-    holding: ActiveSet,
+    state: ActiveSet,
     splitting: Splitting,
     # Out:
     answer: wp.array[real],
 ):
-    """``solve_relaxed`` of what is ``told``, as ``search_kernel`` reads it. ``answer``: how it ended, the objective;
-    from ``HEADER`` on the activations (m,)."""
+    """Run ``contact_modes.solve_relaxed`` on packed input.
+
+    Args:
+        packed: packed input of ``mode_search_kernel``.
+        relaxed, rows, state, splitting: scratch.
+        answer: status and objective; from ``HEADER_SIZE`` on the activations (m,).
+    """
     lane = lane_of_block()
-    program = unpack_program(told)
+    program = unpack_program(packed)
     size = program.size
-    added = diagonal_shift(program)
-    worth = write_root(program, relaxed, added)
+    shift = diagonal_shift(program)
+    objective_drop = write_root(program, relaxed, shift)
     ended = NUMERICAL_FAILURE
-    if worth > real(0.0) and not is_cancelled(rows):
+    if objective_drop > real(0.0) and not is_cancelled(rows):
         rows.unknowns = size
-        rows.count = program.m + (1 + _OF_FORCES) * program.n
+        rows.count = program.m + (1 + _ROWS_PER_FORCE) * program.n
         rows.base_count = program.n + size
-        rows.cost_limit = INFEASIBLE_COST * worth
+        rows.cost_limit = INFEASIBLE_COST * objective_drop
         write_rows(program, relaxed, rows, splitting.initial_values)
         ended = FOUND
         for k in range(lane, size, wp.block_dim()):
             relaxed.found[k] = real(0.0)
         sync_block()
-        if crash_start(rows, holding) > 0:
-            iterate(rows, holding, splitting)
-            ended = find_optimum(rows, holding)
-            multiply(relaxed.root, size, size, holding.z, relaxed.found)
+        if crash_start(rows, state) > 0:
+            iterate(rows, state, splitting)
+            ended = find_optimum(rows, state)
+            multiply(relaxed.root, size, size, state.z, relaxed.found)
         for k in range(lane, size, wp.block_dim()):
             relaxed.found[k] = relaxed.found[k] + relaxed.minimum[k]
         sync_block()
     if ended == FOUND:
         if count_violations(program, relaxed, rows.count) > 0:
             ended = NUMERICAL_FAILURE
-        objective = objective_at(program, relaxed, added)
+        objective = objective_at(program, relaxed, shift)
         for k in range(lane, program.m, wp.block_dim()):
-            answer[_HEADER + k] = wp.clamp(relaxed.found[k], told[program.lower + k], told[program.upper + k])
+            answer[_HEADER + k] = wp.clamp(relaxed.found[k], packed[program.lower + k], packed[program.upper + k])
         if lane == 0:
             answer[1] = objective
     if lane == 0:
@@ -252,19 +263,26 @@ def pack_search_kernel(
     # In:
     activations: wp.array[real],
     forces: wp.array[Vec3],
-    settled: wp.array[int],
+    is_settled: wp.array[int],
     # Out:
-    told_out: wp.array[real],
+    packed_out: wp.array[real],
 ):
-    """A search from these ``activations`` (m,), to which contact answers ``forces`` (K,) newtons, in place of the one
-    that was told, or none if that is ``settled`` (1,); ``weight`` is newtons. m + K threads."""
+    """Replace the start of a packed search, or disable the search if ``is_settled``. Launch with m + K threads.
+
+    Args:
+        weight: body weight, N.
+        activations: (m,) new start.
+        forces: (K,) N, contact response to them.
+        is_settled: (1,) nonzero to set the maximum number of QPs to 0.
+        packed_out: packed input of ``mode_search_kernel``.
+    """
     k = wp.tid()
-    if k == 0 and settled[0] != 0:
-        told_out[4] = real(0.0)
-    program = unpack_program(told_out)
+    if k == 0 and is_settled[0] != 0:
+        packed_out[4] = real(0.0)
+    program = unpack_program(packed_out)
     begin = program.upper + program.m
     kinds = begin + program.m
     if k < program.m:
-        told_out[begin + k] = activations[k]
+        packed_out[begin + k] = activations[k]
     if k < program.n:
-        assemble_contact(told_out, kinds, kinds + program.n, k, forces[k] / weight, program.friction)
+        assemble_contact(packed_out, kinds, kinds + program.n, k, forces[k] / weight, program.friction)

@@ -1,6 +1,6 @@
-"""From where a step's program is made to where it is searched, and from the answer to the point that was found.
+"""Pack the QP of a step for ``mode_search_kernel``, and unpack its result, on the device.
 
-See ``egs_warp/locomotion/device_plan.py``; numbers are told as ``search_kernel`` reads them.
+Host code: ``egs_warp/locomotion/device_plan.py``. The packed layout is the one that ``mode_search_kernel`` documents.
 """
 
 import warp as wp
@@ -12,24 +12,30 @@ from egs_warp.precision import Vec3, real
 
 wp.set_module_options({"enable_backward": False})
 
-_HEADER, _FOUND = wp.constant(HEADER_SIZE), wp.constant(int(FOUND))
+_HEADER, _OPTIMUM_FOUND = wp.constant(HEADER_SIZE), wp.constant(int(FOUND))
 _FREE, _STICK, _SLIDE = wp.constant(FREE), wp.constant(STICK), wp.constant(SLIDE)
-_NOTHING, _NEARLY = wp.constant(real(ZERO_FORCE)), wp.constant(real(CONE_FRACTION))
+_ZERO_FORCE, _CONE_FRACTION = wp.constant(real(ZERO_FORCE)), wp.constant(real(CONE_FRACTION))
 
 
 @wp.func
-def assemble_contact(told: wp.array[real], kinds: int, slips: int, i: int, force: Vec3, friction: real):
-    """How contact ``i`` moves under its ``force``, body weights, which obeys Coulomb's law."""
-    pull = wp.sqrt(force[1] * force[1] + force[2] * force[2])
+def assemble_contact(packed: wp.array[real], kinds: int, slips: int, i: int, force: Vec3, friction: real):
+    """Write the mode and slip direction of contact ``i`` under its ``force``, which satisfies Coulomb's law.
+
+    Args:
+        packed: packed search input, written at the offsets ``kinds`` and ``slips``.
+        force: normal and tangential force, body weights.
+        friction: friction coefficient.
+    """
+    tangential = wp.sqrt(force[1] * force[1] + force[2] * force[2])
     kind = _FREE
-    if force[0] > _NOTHING:
+    if force[0] > _ZERO_FORCE:
         kind = _STICK
-        if pull >= _NEARLY * friction * force[0]:
+        if tangential >= _CONE_FRACTION * friction * force[0]:
             kind = _SLIDE
-    way = normalized(-force[1], -force[2])
-    told[kinds + i] = real(kind)
-    told[slips + 2 * i] = way[0]
-    told[slips + 2 * i + 1] = way[1]
+    slip_direction = normalized(-force[1], -force[2])
+    packed[kinds + i] = real(kind)
+    packed[slips + 2 * i] = slip_direction[0]
+    packed[slips + 2 * i + 1] = slip_direction[1]
 
 
 @wp.kernel
@@ -47,12 +53,25 @@ def assemble_qp_kernel(
     bounds: wp.array2d[real],
     forces: wp.array[Vec3],
     # Out:
-    told_out: wp.array[real],
+    packed_out: wp.array[real],
 ):
-    """The program of m activations and n contacts, of the K for which there are places: the cost's ``form``
-    (m + 3K + 1, m + 3K + 1), ``speeds`` (3K, m + 3K + 1) m/s of the contacts, ``shifts`` (K,) m/s, ``bounds`` (3, m) of
-    the activations and their start, and ``forces`` (K,) newtons that contact answers there. ``speed`` is sqrt(g H) m/s,
-    ``weight`` newtons, ``limit`` the most programs; (m + 6K + 1, m + 3K + 1) threads."""
+    """Pack the QP of m activations and n contacts; buffers have a capacity of K contacts.
+
+    Launch with (m + 6K + 1, m + 3K + 1) threads.
+
+    Args:
+        limit: maximum number of QPs that the search may solve.
+        speed: sqrt(g H), m/s, the unit of velocity.
+        weight: body weight, N, the unit of force.
+        counts: (1,) n.
+        frictions: (1,) friction coefficient.
+        form: (m + 3K + 1, m + 3K + 1) quadratic form of the cost.
+        speeds: (3K, m + 3K + 1) m/s, contact velocities as affine functions.
+        shifts: (K,) m/s, normal bias of each contact.
+        bounds: (3, m) lower and upper bounds of the activations, and their start.
+        forces: (K,) N, contact response to the start.
+        packed_out: packed search input.
+    """
     row, column = wp.tid()
     m = bounds.shape[1]
     n = counts[0]
@@ -64,32 +83,32 @@ def assemble_qp_kernel(
     if row < last:
         if row < size:
             if column < size:
-                told_out[_HEADER + row * size + column] = form[row, column]
+                packed_out[_HEADER + row * size + column] = form[row, column]
             elif column == last:
-                told_out[q + row] = form[row, last]
+                packed_out[q + row] = form[row, last]
     elif row < last + speeds.shape[0]:
         k = row - last
         if k < 3 * n:
             if column < size:
-                told_out[rows + k * size + column] = speeds[k, column] / speed
+                packed_out[rows + k * size + column] = speeds[k, column] / speed
             elif column == last:
-                told_out[offset + k] = speeds[k, last] / speed
+                packed_out[offset + k] = speeds[k, last] / speed
                 if k % 3 == 0:
-                    told_out[offset + k] = (speeds[k, last] + shifts[k / 3]) / speed
+                    packed_out[offset + k] = (speeds[k, last] + shifts[k / 3]) / speed
     else:
         begin = offset + 3 * n
         for part in range(3):
             if column < m:
-                told_out[begin + part * m + column] = bounds[part, column]
+                packed_out[begin + part * m + column] = bounds[part, column]
         kinds = begin + 3 * m
         if column < n:
-            assemble_contact(told_out, kinds, kinds + n, column, forces[column] / weight, frictions[0])
+            assemble_contact(packed_out, kinds, kinds + n, column, forces[column] / weight, frictions[0])
         if column == last:
-            told_out[0] = real(m)
-            told_out[1] = real(n)
-            told_out[2] = frictions[0]
-            told_out[3] = real(0.5) * form[last, last]
-            told_out[4] = real(limit)
+            packed_out[0] = real(m)
+            packed_out[1] = real(n)
+            packed_out[2] = frictions[0]
+            packed_out[3] = real(0.5) * form[last, last]
+            packed_out[4] = real(limit)
 
 
 @wp.kernel
@@ -101,7 +120,13 @@ def scatter_solution_kernel(
     # Out:
     x_out: wp.array[real],
 ):
-    """The point of the ``answer`` in ``x_out`` (m + 3K + 1,): zero where no contact is, 1 behind all."""
+    """Expand the point of the search result to capacity.
+
+    Args:
+        answer: packed search result.
+        m: number of activations.
+        x_out: (m + 3K + 1,) the point, zero for unused contacts, 1 in the last entry.
+    """
     k = wp.tid()
     size = m + 3 * counts[0]
     last = x_out.shape[0] - 1
@@ -118,13 +143,16 @@ def accept_search_kernel(
     # In:
     counts: wp.array[int],
     answer: wp.array[real],
-    costly: real,
+    restart_cost: real,
     # Out:
     settled_out: wp.array[int],
 ):
-    """1 if the ``answer`` is a point that costs so little that no other is sought, else 0; one that is in no contact
-    has no other."""
+    """Write 1 to ``settled_out`` if the search result is good enough that no restart is needed, else 0.
+
+    That is a point whose objective is below ``restart_cost``, or any point without contacts, where there is no other
+    region.
+    """
     settled = int(0)
-    if answer[0] == real(_FOUND) and answer[4] == real(1.0) and (counts[0] == 0 or answer[3] < costly):
+    if answer[0] == real(_OPTIMUM_FOUND) and answer[4] == real(1.0) and (counts[0] == 0 or answer[3] < restart_cost):
         settled = 1
     settled_out[0] = settled

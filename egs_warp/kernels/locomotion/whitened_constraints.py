@@ -1,6 +1,7 @@
-"""Rows of a quadratic program in coordinates whose squares are costs, and their products, in vectors of four, on a CPU.
+"""Constraints of a QP in whitened coordinates, where the Hessian is the identity, and their inner products, as native
+CPU code with vectors of four.
 
-See ``egs_warp/locomotion/active_set.py``.
+Host code: ``egs_warp/locomotion/active_set.py``.
 """
 
 import warp as wp
@@ -11,40 +12,43 @@ from egs_warp.precision import Vec4, real
 wp.set_module_options({"enable_backward": False})
 
 STEP = 32
-"""Rows by which the sizes differ that memory is kept for."""
+"""Granularity of the row capacity."""
 
 
 @wp.struct
 class WhitenedConstraints:
-    """Memory for m rows, a multiple of ``STEP``, of n unknowns, ``wide`` by eights: the program with Hessian
-    P = L D L^T and minimum x0 in coordinates z = D^1/2 L^T (x - x0)."""
+    """Constraints in coordinates z = D^1/2 L^T (x - x0) of a QP with Hessian P = L D L^T and minimum x0.
+
+    The capacity is m rows, a multiple of ``STEP``. n is the number of unknowns, ``wide`` is n rounded up to a multiple
+    of 8.
+    """
 
     lower: wp.array2d[real]
-    """(n, wide) L, its diagonal of ones not among them."""
+    """(n, wide) L; its unit diagonal is not stored."""
     upper: wp.array2d[real]
-    """(n, wide) its transpose."""
+    """(n, wide) transpose of L."""
     roots: wp.array[real]
     """(n,) D^-1/2."""
     minimum: wp.array[real]
     """(n,) x0."""
     rows: wp.array2d[Vec4]
-    """(m, wide / 4) by z, each of length 1 or 0."""
+    """(m, wide / 4) rows over z, each of length 1 or 0."""
     columns: wp.array2d[real]
-    """(n, m) the same."""
+    """(n, m) transpose of ``rows``."""
     free: wp.array[real]
-    """(m,) the rows, as they were given, at x0."""
+    """(m,) values of the original rows at x0."""
     lengths: wp.array[real]
-    """(m,) by z, 1 for those without any."""
+    """(m,) lengths of the rows over z before scaling, 1 for rows of zeros."""
     products: wp.array2d[Vec4]
-    """(m, m / 4) of the rows by z, those that are known."""
+    """(m, m / 4) inner products of the scaled rows, computed on demand."""
     has_products: wp.array[wp.int32]
-    """(m,) whether a row's products are there."""
+    """(m,) 1 if the products of a row have been computed."""
     scratch: wp.array[real]
-    """(``room_of``,)."""
+    """(``room_of``,) scratch."""
 
 
 def room_of(unknowns: int, wide: int) -> int:
-    """Numbers of scratch memory."""
+    """Return the number of float64 of scratch."""
     return 16 * wide + 512 * (wide // 16 + 1) + unknowns
 
 
@@ -53,10 +57,10 @@ def room_of(unknowns: int, wide: int) -> int:
         FRONT_ELIMINATION
         + """
     const int wide = lower.strides[0] / 8, tall = columns.strides[0] / 8, blocks = (n + BLOCK - 1) / BLOCK;
-    const double *const P = (const double*)hessian, *const q = (const double*)slope, *const A = (const double*)given;
+    const double *const P = (const double*)hessian, *const q = (const double*)slope, *const A = (const double*)matrix;
     double *const L = lower.data, *const U = upper.data, *const x = minimum.data, *const Z = (double*)rows.data;
     double *const T = scratch.data, *const inverses = T + BLOCK * wide;
-    double *const turned = inverses + BLOCK * BLOCK * blocks, *const reciprocals = turned + BLOCK * BLOCK * blocks;
+    double *const flipped = inverses + BLOCK * BLOCK * blocks, *const reciprocals = flipped + BLOCK * BLOCK * blocks;
     for (int i = 0; i < n; ++i) {
         for (int k = 0; k <= i; ++k) L[i * wide + k] = P[i * hessian_stride + k];
         for (int k = i + 1; k < wide; ++k) L[i * wide + k] = 0.0;
@@ -81,19 +85,19 @@ def room_of(unknowns: int, wide: int) -> int:
     for (int b = 0; b < blocks; ++b)
         for (int i = 0; i < BLOCK; ++i)
             for (int k = 0; k < BLOCK; ++k)
-                turned[(b * BLOCK + k) * BLOCK + i] = -inverses[(b * BLOCK + i) * BLOCK + k];
+                flipped[(b * BLOCK + k) * BLOCK + i] = -inverses[(b * BLOCK + i) * BLOCK + k];
     for (int i = 0; i < tall; i += 4) {
         double* const z = Z + i * wide;
         for (int t = 0; t < 4; ++t) {
             double at = 0.0;
-            const double* const a = A + (long long)(i + t) * given_stride;
-            const int there = i + t < m ? n : 0;
-            for (int c = 0; c < there; ++c) z[t * wide + c] = a[c];
-            for (int c = there; c < wide; ++c) z[t * wide + c] = 0.0;
+            const double* const a = A + (long long)(i + t) * matrix_stride;
+            const int valid = i + t < m ? n : 0;
+            for (int c = 0; c < valid; ++c) z[t * wide + c] = a[c];
+            for (int c = valid; c < wide; ++c) z[t * wide + c] = 0.0;
             v4 sum = 0.0;
             int c = 0;
-            for (; c + 4 <= there; c += 4) sum += *(const v4*)(a + c) * *(const v4*)(x + c);
-            for (; c < there; ++c) at += a[c] * x[c];
+            for (; c + 4 <= valid; c += 4) sum += *(const v4*)(a + c) * *(const v4*)(x + c);
+            for (; c < valid; ++c) at += a[c] * x[c];
             free.data[i + t] = at + ((sum[0] + sum[1]) + (sum[2] + sum[3]));
             known.data[i + t] = 0;
         }
@@ -107,7 +111,7 @@ def room_of(unknowns: int, wide: int) -> int:
             }
             for (int c = 0; c < some; c += 8)
                 take_off(own + c, own + BLOCK + c, own + 2 * BLOCK + c, own + 3 * BLOCK + c, z + b, z + wide + b,
-                         z + 2 * wide + b, z + 3 * wide + b, turned + b * BLOCK + c, BLOCK, some);
+                         z + 2 * wide + b, z + 3 * wide + b, flipped + b * BLOCK + c, BLOCK, some);
             for (int t = 0; t < 4; ++t)
                 for (int c = 0; c < some; ++c) z[t * wide + b + c] = own[t * BLOCK + c];
         }
@@ -137,8 +141,8 @@ def whiten_native(
     hessian: wp.uint64,
     hessian_stride: wp.int32,
     slope: wp.uint64,
-    given: wp.uint64,
-    given_stride: wp.int32,
+    matrix: wp.uint64,
+    matrix_stride: wp.int32,
     lower: wp.array2d[real],
     upper: wp.array2d[real],
     roots: wp.array[real],
@@ -150,7 +154,8 @@ def whiten_native(
     known: wp.array[wp.int32],
     scratch: wp.array[real],
 ) -> wp.int32:
-    """See ``reduce_kernel``; whether the Hessian is definite."""
+    """Whiten the constraints as described at ``reduce_kernel``; return 1, or 0 if the Hessian is not positive
+    definite."""
     ...
 
 
@@ -159,25 +164,25 @@ def whiten_native(
         """
     const int wide = rows.strides[0] / 8, tall = columns.strides[0] / 8;
     const double* const Z = (const double*)rows.data;
-    double *const minus = scratch.data, *const made = (double*)products.data;
+    double *const minus = scratch.data, *const out = (double*)products.data;
     int some = 0, which[4];
     for (int i = 0; i <= count; ++i) {
         const int row = i < count ? active.data[i] : further;
         if (row >= 0 && !known.data[row]) {
             known.data[row] = 1;
             for (int c = 0; c < wide; ++c) minus[some * wide + c] = -Z[row * wide + c];
-            for (int c = 0; c < tall; ++c) made[row * tall + c] = 0.0;
+            for (int c = 0; c < tall; ++c) out[row * tall + c] = 0.0;
             which[some++] = row;
         }
         if (some == 4)
             for (int c = 0; c < tall; c += 8)
-                take_off(made + which[0] * tall + c, made + which[1] * tall + c, made + which[2] * tall + c,
-                         made + which[3] * tall + c, minus, minus + wide, minus + 2 * wide, minus + 3 * wide,
+                take_off(out + which[0] * tall + c, out + which[1] * tall + c, out + which[2] * tall + c,
+                         out + which[3] * tall + c, minus, minus + wide, minus + 2 * wide, minus + 3 * wide,
                          columns.data + c, tall, n);
         else if (i == count)
             for (int s = 0; s < some; ++s)
                 for (int c = 0; c < tall; c += 8)
-                    take_off_one(made + which[s] * tall + c, minus + s * wide, columns.data + c, tall, n);
+                    take_off_one(out + which[s] * tall + c, minus + s * wide, columns.data + c, tall, n);
         if (some == 4) some = 0;
     }
 """
@@ -194,8 +199,8 @@ def fetch_products(
     known: wp.array[wp.int32],
     scratch: wp.array[real],
 ):
-    """Of the first ``count`` rows in ``active`` and a ``further`` one, -1 for none, with all rows, where they are not
-    known yet."""
+    """Compute the products of the first ``count`` rows in ``active``, and of row ``further`` (-1: none), with all rows.
+    Cached products are not recomputed."""
     ...
 
 
@@ -207,7 +212,7 @@ def fetch_products(
     for (int c = 0; c < n; ++c) to[c] = 0.0;
     for (int i = 0; i < count; ++i) {
         const int row = active.data[i];
-        const double by = side.data[row] > 0 ? pulls.data[i] : -pulls.data[i];
+        const double by = side.data[row] > 0 ? multipliers.data[i] : -multipliers.data[i];
         const double* const z = (const double*)rows.data + row * wide;
         for (int c = 0; c < n; ++c) to[c] += by * z[c];
     }
@@ -227,12 +232,11 @@ def write_point(
     rows: wp.array2d[Vec4],
     active: wp.array[wp.int32],
     side: wp.array[wp.int32],
-    pulls: wp.array[real],
+    multipliers: wp.array[real],
     count: wp.int32,
     point: wp.uint64,
 ):
-    """The x, n numbers at an address, that the ``pulls`` of ``active`` rows hold, each in the direction of its
-    ``side``."""
+    """Write x, n numbers at the address ``point``, from the ``multipliers`` of the ``active`` rows and their sides."""
     ...
 
 
@@ -242,17 +246,29 @@ def reduce_kernel(
     hessian: wp.uint64,
     hessian_stride: wp.int32,
     slope: wp.uint64,
-    given: wp.uint64,
-    given_stride: wp.int32,
+    matrix: wp.uint64,
+    matrix_stride: wp.int32,
     rows: wp.int32,
     # Out:
     reduced_out: WhitenedConstraints,
     definite: wp.array[wp.int32],
 ) -> None:
-    """Of min 1/2 x^T P x + q^T x (``hessian``, ``slope``) and so many ``rows`` A (``given``), at addresses, with
-    strides in numbers; P is read below the diagonal. One thread."""
+    """Whiten min 1/2 x^T P x + q^T x with constraint rows A, with one thread.
+
+    Array arguments other than the outputs are addresses, strides count numbers.
+
+    Args:
+        hessian: P (n, n), of which the lower triangle is read.
+        hessian_stride: row stride of P.
+        slope: q (n,).
+        matrix: A (rows, n).
+        matrix_stride: row stride of A.
+        rows: number of rows.
+        reduced_out: whitened constraints.
+        definite: (1,) 1, or 0 if P is not positive definite.
+    """
     definite[0] = whiten_native(
-        reduced_out.minimum.shape[0], rows, hessian, hessian_stride, slope, given, given_stride, reduced_out.lower,
+        reduced_out.minimum.shape[0], rows, hessian, hessian_stride, slope, matrix, matrix_stride, reduced_out.lower,
         reduced_out.upper, reduced_out.roots, reduced_out.minimum, reduced_out.rows, reduced_out.columns,
         reduced_out.free, reduced_out.lengths, reduced_out.has_products, reduced_out.scratch,
     )  # fmt: skip

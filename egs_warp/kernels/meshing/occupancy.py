@@ -1,11 +1,11 @@
-"""Occupancy of a lattice of points by Gaussians, and which of its empty points are enclosed."""
+"""Occupancy of a lattice of points by Gaussians, and its enclosed empty points."""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
 OPACITY_UNIT = wp.constant(1024)
-"""Opacities are summed as integers of 1/1024, so that the order of atomic additions does not matter."""
+"""Opacities are summed as integer multiples of 1/1024, so that the order of atomic additions has no effect."""
 
 
 @wp.kernel
@@ -23,9 +23,9 @@ def splat_occupancy_kernel(
 ):
     """Add each Gaussian's opacity to the lattice points within its 2-sigma ellipsoid, blurred by the lattice.
 
-    ``origin`` is lattice point (0, 0, 0); the lattice's axes are the cloud's own. Sigmas are capped at ``max_sigma``:
-    huge faint strays must not fill the air. Without the blur of 0.45 spacings flat Gaussians would slip between the
-    points; with it each reaches one.
+    ``origin`` is lattice point (0, 0, 0); the lattice's axes are the cloud's own. Sigmas are limited to ``max_sigma``,
+    so that huge faint outliers do not fill empty space. The blur of 0.45 spacings makes every Gaussian reach a point;
+    without it flat ones would fall between the points.
     """
     i = wp.tid()
     amount = int(float(OPACITY_UNIT) / (1.0 + wp.exp(-opacity_logits[i])) + 0.5)
@@ -47,7 +47,7 @@ def splat_occupancy_kernel(
         2.0 * wp.sqrt(covariance[1, 1]) / spacing,
         2.0 * wp.sqrt(covariance[2, 2]) / spacing,
     )
-    # A stray mean may lie so far outside that its lattice index overflows.
+    # The lattice index of a distant outlier would overflow.
     for axis in range(3):
         if not (centre[axis] + reach[axis] >= 0.0 and centre[axis] - reach[axis] <= float(opacity_sum_out.shape[axis])):
             return
@@ -73,8 +73,8 @@ def enclosed_kernel(
     # Out:
     filled_out: wp.array3d[wp.uint8],
 ):
-    """Fill the empty points from which at least ``min_hits`` of the 26 lattice directions meet the object or the
-    ground, which is everything below layer 0. Unlike a flood fill this stands small holes in the capture."""
+    """Fill the empty points from which at least ``min_hits`` of the 26 lattice directions hit the object or the ground,
+    which is everything below layer 0. Unlike a flood fill this tolerates small holes in the capture."""
     x, y, z = wp.tid()
     if occupied[x, y, z] != wp.uint8(0):
         filled_out[x, y, z] = wp.uint8(1)
@@ -117,7 +117,7 @@ def inside_mesh_kernel(
     # Out:
     inside_out: wp.array[wp.uint8],
 ):
-    """Whether each point lies inside ``mesh`` (about one unit in size), or within 1e-4 of its surface."""
+    """Write 1 for each point inside ``mesh`` (about one unit in size), or within 1e-4 of its surface."""
     i = wp.tid()
     p = points[i]
     query = wp.mesh_query_point_sign_winding_number(mesh, p, 4.0)

@@ -1,4 +1,7 @@
-"""What is behind a moving object: the ground as one camera sees it, and the object's soft shadow on it."""
+"""Kernels of the backdrop: the ground as one camera sees it, and the object's soft shadow on it.
+
+Host code: ``egs_warp/render/backdrop.py`` and ``egs_warp/render/shadow.py``.
+"""
 
 import warp as wp
 
@@ -7,48 +10,47 @@ from egs_warp.kernels.render.projection import View
 wp.set_module_options({"enable_backward": False})
 
 TEXELS = wp.constant(192)
-"""Along a side of the map of the shadow."""
+"""Texels along a side of the shadow map."""
 LAYERS = wp.constant(3)
-"""Of what casts it, by height."""
-_FIXED = wp.constant(wp.float32(2.0**20))
-"""Hidden shares are summed as whole numbers of this fineness: in whatever order a GPU adds them, the sum is the same.
-"""
-_MOST_HIDDEN = wp.constant(wp.float32(1e6))
-"""Of one texel by one Gaussian."""
-_FLATTEST = wp.constant(wp.float32(0.05))
-"""Sine of the angle at which a ray meets the ground, below which a pixel is taken for no longer."""
-_SHORTEST = wp.constant(wp.float32(1e-9))
+"""Layers of the shadow map, by the height of the Gaussians that cast it."""
+_FIXED_POINT_SCALE = wp.constant(wp.float32(2.0**20))
+"""Fixed-point scale of the coverage sums; integer sums do not depend on the order of a GPU's atomic additions."""
+_MAX_COVERAGE = wp.constant(wp.float32(1e6))
+"""Largest coverage of one texel by one Gaussian."""
+_MIN_GRAZING_SINE = wp.constant(wp.float32(0.05))
+"""Smallest sine of the angle between ray and ground that is used in the size of a pixel on the ground."""
+_EPSILON = wp.constant(wp.float32(1e-9))
 
 
 @wp.struct
 class Ground:
-    """A plane, and which part of it matters. World units."""
+    """Plane, and the disc of it that is shaded, in world units."""
 
     normal: wp.vec3
     first: wp.vec3
     second: wp.vec3
-    """Unit vectors along it."""
+    """Orthogonal unit vectors in the plane."""
     centre: wp.vec3
-    """Of the part that matters."""
+    """Centre of the disc."""
     rise: wp.float32
     """Height of the centre over the plane."""
     reach: wp.float32
-    """From the centre to where that part ends."""
+    """Radius of the disc."""
 
 
 @wp.struct
 class Layers:
-    """Heights between which Gaussians cast one layer of the shadow each, world units."""
+    """Height range of the Gaussians of each shadow layer, world units."""
 
     low: wp.vec3
     high: wp.vec3
-    paleness: wp.vec3
-    """How dark each layer may be."""
+    max_opacity: wp.vec3
+    """Largest opacity of each layer."""
 
 
 @wp.func
 def texel_of(ground: Ground, away: wp.vec3) -> wp.vec2:
-    """Where on the map lies what is straight below a point ``away`` from the centre, in texels from its corner."""
+    """Return the map position, in texels from the corner, straight below a point at ``away`` from the centre."""
     side = 0.5 * wp.float32(TEXELS)
     across = wp.vec2(wp.dot(away, ground.first), wp.dot(away, ground.second)) / ground.reach
     return wp.vec2((across[0] + 1.0) * side, (across[1] + 1.0) * side)
@@ -61,7 +63,7 @@ def ground_kernel(
     view: View,
     ground: Ground,
     eye: wp.vec3,
-    seen: wp.array[wp.float32],
+    surface_depth: wp.array[wp.float32],
     # Out:
     depth_out: wp.array[wp.float32],
     flat_out: wp.array[wp.vec2],
@@ -70,10 +72,20 @@ def ground_kernel(
     lift_out: wp.array[wp.float32],
     texel_out: wp.array[wp.vec2],
 ):
-    """Of every pixel, with the camera ``eye`` from the centre: z-depth of the plane, 0 where its ray does not meet it
-    from above; where that is, along the plane from the centre; how much of it shows, 1 at the centre and 0 from
-    ``reach`` on; the size of a pixel there; and height over the plane and place on the map of what is ``seen`` at a
-    z-depth, of the plane where that is 0."""
+    """Compute the ground point of every pixel.
+
+    Args:
+        view: camera.
+        ground: plane and disc.
+        eye: camera centre relative to the centre of the disc.
+        surface_depth: z-depth of the visible surface, 0 where that is the plane.
+        depth_out: z-depth of the plane, 0 where the ray does not meet it from above.
+        flat_out: position on the plane relative to the centre, along its axes.
+        fade_out: 1 at the centre, 0 from ``reach`` on.
+        pixel_out: size of a pixel on the plane.
+        lift_out: height of the visible surface over the plane.
+        texel_out: map position below the visible surface.
+    """
     tid = wp.tid() + first_row
     u = wp.float32(tid % view.width) + 0.5
     v = wp.float32(tid / view.width) + 0.5
@@ -81,19 +93,19 @@ def ground_kernel(
     slope = wp.dot(ray, ground.normal)
     above = wp.dot(eye, ground.normal) + ground.rise
     depth = wp.float32(0.0)
-    if slope < -_SHORTEST and above > 0.0:
+    if slope < -_EPSILON and above > 0.0:
         depth = -above / slope
     place = eye + depth * ray
     flat = wp.vec2(wp.dot(place, ground.first), wp.dot(place, ground.second))
     fade = wp.float32(0.0)
     if depth > 0.0:
         fade = wp.clamp(1.6 - 1.6 * wp.length(flat) / ground.reach, 0.0, 1.0)
-    if seen[tid] > 0.0:
-        place = eye + seen[tid] * ray
+    if surface_depth[tid] > 0.0:
+        place = eye + surface_depth[tid] * ray
     depth_out[tid] = depth
     flat_out[tid] = flat
     fade_out[tid] = fade
-    pixel_out[tid] = wp.max(depth / view.fx / wp.max(-slope / wp.length(ray), _FLATTEST), _SHORTEST)
+    pixel_out[tid] = wp.max(depth / view.fx / wp.max(-slope / wp.length(ray), _MIN_GRAZING_SINE), _EPSILON)
     lift_out[tid] = wp.dot(place, ground.normal) + ground.rise
     texel_out[tid] = texel_of(ground, place)
 
@@ -112,20 +124,20 @@ def grid_kernel(
     # Out:
     colour_out: wp.array[wp.vec3],
 ):
-    """A floor with lines ``cell`` apart that fades into the sky."""
+    """Draw a floor with lines ``cell`` apart that fades into the sky."""
     tid = wp.tid() + first_row
     across = flat[tid]
     nearest = wp.float32(1e30)
     for axis in range(2):
-        share = across[axis] / cell + 0.5
-        nearest = wp.min(nearest, wp.abs(share - wp.floor(share) - 0.5) * cell)
+        cell_position = across[axis] / cell + 0.5
+        nearest = wp.min(nearest, wp.abs(cell_position - wp.floor(cell_position) - 0.5) * cell)
     on_line = wp.clamp(1.0 - nearest / (1.2 * pixel[tid]), 0.0, 1.0)
     colour = floor + on_line * (line - floor)
     colour_out[tid] = sky + fade[tid] * (colour - sky)
 
 
 @wp.kernel
-def hide_ground_kernel(
+def coverage_kernel(
     # In:
     ground: Ground,
     layers: Layers,
@@ -133,9 +145,10 @@ def hide_ground_kernel(
     log_scales: wp.array[wp.vec3],
     opacity_logits: wp.array[wp.float32],
     # Out:
-    hidden: wp.array3d[wp.int64],
+    coverage: wp.array3d[wp.int64],
 ):
-    """Each Gaussian hides as much of its texel as its opacity and its broad side say; (layers, rows, columns)."""
+    """Add the coverage of each Gaussian, its opacity times the area of its broad side, to its texel of (layers, rows,
+    columns)."""
     g = wp.tid()
     away = means[g] - ground.centre
     height = wp.max(wp.dot(away, ground.normal) + ground.rise, 0.0)
@@ -148,26 +161,26 @@ def hide_ground_kernel(
     broad = s[0] + s[1] + s[2] - wp.min(s[0], wp.min(s[1], s[2]))
     side = 2.0 * ground.reach / wp.float32(TEXELS)
     area = 2.0 * wp.pi * wp.exp(wp.min(broad, 80.0)) / (side * side)
-    share = wp.min(area / (1.0 + wp.exp(-opacity_logits[g])), _MOST_HIDDEN)
+    amount = wp.min(area / (1.0 + wp.exp(-opacity_logits[g])), _MAX_COVERAGE)
     for layer in range(LAYERS):
         if height >= layers.low[layer] and height < layers.high[layer]:
-            wp.atomic_add(hidden, layer, row, column, wp.int64(share * _FIXED + 0.5))
+            wp.atomic_add(coverage, layer, row, column, wp.int64(amount * _FIXED_POINT_SCALE + 0.5))
 
 
 @wp.kernel
-def hidden_shares_kernel(
+def unpack_coverage_kernel(
     first_row: wp.int32,
     # In:
-    hidden: wp.array3d[wp.int64],
+    coverage: wp.array3d[wp.int64],
     # Out:
-    share_out: wp.array3d[wp.float32],
+    coverage_out: wp.array3d[wp.float32],
 ):
-    """Back from whole numbers."""
+    """Convert the coverage from fixed point to float."""
     tid = wp.tid() + first_row
     layer = tid / (TEXELS * TEXELS)
     row = (tid / TEXELS) % TEXELS
     column = tid % TEXELS
-    share_out[layer, row, column] = wp.float32(hidden[layer, row, column]) / _FIXED
+    coverage_out[layer, row, column] = wp.float32(coverage[layer, row, column]) / _FIXED_POINT_SCALE
 
 
 @wp.kernel
@@ -178,7 +191,7 @@ def occupied_rows_kernel(
     # Out:
     occupied_out: wp.array[wp.bool],
 ):
-    """Whether a row of a layer has anything in it."""
+    """Write True for each row of a layer that has a nonzero texel."""
     tid = wp.tid() + first_row
     occupied = wp.bool(False)
     for column in range(TEXELS):
@@ -198,15 +211,17 @@ def blur_kernel(
     # Out:
     out: wp.array3d[wp.float32],
 ):
-    """Along columns, written the other way round, so that twice makes a blur in both directions: each layer by its
-    ``taps``, that of the middle first, as far as it ``reach``es. What lies beyond the rim is mirrored."""
+    """Blur along the columns and write the transpose, so that two calls blur in both directions.
+
+    Each layer uses its ``taps``, the centre first, up to ``reach``. Texels outside the map are mirrored at its edge.
+    """
     tid = wp.tid() + first_row
     layer = tid / (TEXELS * TEXELS)
     row = (tid / TEXELS) % TEXELS
     column = tid % TEXELS
     total = taps[layer, 0] * source[layer, row, column]
-    furthest = wp.where(occupied[layer * TEXELS + row], reach[layer], 0)
-    for k in range(1, furthest + 1):
+    row_reach = wp.where(occupied[layer * TEXELS + row], reach[layer], 0)
+    for k in range(1, row_reach + 1):
         left = wp.abs(column - k)
         right = column + k
         if right >= TEXELS:
@@ -216,12 +231,12 @@ def blur_kernel(
 
 
 @wp.kernel
-def covered_kernel(
+def opacity_kernel(
     first_row: wp.int32,
     # In and out:
     layers: wp.array3d[wp.float32],
 ):
-    """What is hidden many times over is covered once."""
+    """Convert coverage to opacity, 1 - exp(-coverage)."""
     tid = wp.tid() + first_row
     layer = tid / (TEXELS * TEXELS)
     row = (tid / TEXELS) % TEXELS
@@ -230,43 +245,43 @@ def covered_kernel(
 
 
 @wp.kernel
-def darkest_kernel(
+def combine_layers_kernel(
     first_row: wp.int32,
     # In:
-    covered: wp.array3d[wp.float32],
-    paleness: wp.vec3,
+    opacity: wp.array3d[wp.float32],
+    max_opacity: wp.vec3,
     # Out:
     shade_out: wp.array2d[wp.float32],
 ):
-    """The darkest of the layers."""
+    """Combine the layers by their maximum."""
     tid = wp.tid() + first_row
     row = tid / TEXELS
     column = tid % TEXELS
     shade = wp.float32(0.0)
     for layer in range(LAYERS):
-        shade = wp.max(shade, covered[layer, row, column] * paleness[layer])
+        shade = wp.max(shade, opacity[layer, row, column] * max_opacity[layer])
     shade_out[row, column] = shade
 
 
 @wp.func
 def shade_at(shade: wp.array2d[wp.float32], row: wp.int32, column: wp.int32) -> wp.float32:
-    """0 beyond the map."""
+    """Return the shade of a texel, 0 outside the map."""
     if row < 0 or row >= TEXELS or column < 0 or column >= TEXELS:
         return wp.float32(0.0)
     return shade[row, column]
 
 
 @wp.kernel
-def cover_kernel(
+def shadow_opacity_kernel(
     first_row: wp.int32,
     # In:
     shade: wp.array2d[wp.float32],
     texel: wp.array[wp.vec2],
     strength: wp.array[wp.float32],
     # Out:
-    cover_out: wp.array[wp.float32],
+    shadow_opacity_out: wp.array[wp.float32],
 ):
-    """How much of the light the shadow takes from every pixel, between the middles of four texels."""
+    """Compute the shadow opacity of every pixel by bilinear interpolation of the map."""
     tid = wp.tid() + first_row
     cover = wp.float32(0.0)
     if strength[tid] > 0.0:
@@ -279,18 +294,18 @@ def cover_kernel(
         upper = wp.lerp(shade_at(shade, row, column), shade_at(shade, row, column + 1), right)
         lower = wp.lerp(shade_at(shade, row + 1, column), shade_at(shade, row + 1, column + 1), right)
         cover = strength[tid] * wp.lerp(upper, lower, below)
-    cover_out[tid] = cover
+    shadow_opacity_out[tid] = cover
 
 
 @wp.kernel
 def dim_kernel(
     first_row: wp.int32,
     # In:
-    bare: wp.array[wp.vec3],
+    unshadowed: wp.array[wp.vec3],
     cover: wp.array[wp.float32],
     # Out:
     colour_out: wp.array[wp.vec3],
 ):
-    """A picture with the shadow on it."""
+    """Darken an image by the shadow."""
     tid = wp.tid() + first_row
-    colour_out[tid] = (1.0 - cover[tid]) * bare[tid]
+    colour_out[tid] = (1.0 - cover[tid]) * unshadowed[tid]

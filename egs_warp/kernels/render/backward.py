@@ -1,7 +1,9 @@
-"""Backward pass of the projection, written by hand: (Gaussian, tile) pairs to Gaussians and to the camera's pose.
+"""Backward pass of the projection, written by hand: gradients from (Gaussian, tile) pairs to Gaussians and to the
+camera pose.
 
-Every sum has one owner and a fixed order: no atomics, the same bits on every run. The equations are those of
-``projection`` read from the last to the first; ``by_x`` is the gradient of the loss by x.
+Every sum has one thread and a fixed order: there are no atomics, and every run gives the same bits. The equations are
+those of ``projection`` in reverse order; ``by_x`` is the gradient of the loss by x. Host code:
+``egs_warp/render/backward.py``.
 """
 
 import warp as wp
@@ -21,7 +23,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class SplatGradient:
-    """By a splat on the screen, whose -ln(alpha / opacity) = a u^2 + v dy^2 with u = dx + shear dy."""
+    """Gradient by a splat on the screen, whose -ln(alpha / opacity) = a u^2 + v dy^2 with u = dx + shear dy."""
 
     log_opacity: wp.float32
     a: wp.float32
@@ -33,8 +35,8 @@ class SplatGradient:
 
 
 @wp.struct
-class SeenGradient:
-    """By a Gaussian as the camera sees it."""
+class CameraSpaceGradient:
+    """Gradient by a Gaussian in camera space."""
 
     screen: wp.vec2
     log_opacity: wp.float32
@@ -53,10 +55,10 @@ def splat_gradient(
     v: wp.float32,
     shear: wp.float32,
 ) -> SplatGradient:
-    """Sum over a Gaussian's tiles of what ``composite_backward_tile_kernel`` left there.
+    """Sum the moments that ``composite_backward_tile_kernel`` wrote over a Gaussian's tiles.
 
-    With k = alpha dL/dalpha, ``moments[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, by depth, 0) and
-    (by colour, 0).
+    With k = alpha dL/dalpha, ``moments[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, by depth, 0) and (by
+    colour, 0).
     """
     first_row = wp.vec4()
     second_row = wp.vec4()
@@ -83,26 +85,27 @@ def splat_gradient(
 
 
 @wp.func
-def covariance_gradient(of: ScreenCovariance, by: SplatGradient, antialiased: wp.int32) -> wp.vec3:
-    """By xx, yy and xy, of a = yy / (2 det), shear = -xy / yy, v = 1 / (2 yy) and the area's loss to the low-pass."""
-    inv_det = 1.0 / of.determinant
-    by_xx = -0.5 * by.a * (of.yy * inv_det) * (of.yy * inv_det)
+def covariance_gradient(covariance: ScreenCovariance, by: SplatGradient, antialiased: wp.int32) -> wp.vec3:
+    """Return the gradient by xx, yy and xy, through a = yy / (2 det), shear = -xy / yy, v = 1 / (2 yy) and the opacity
+    factor of the low-pass."""
+    inv_det = 1.0 / covariance.determinant
+    by_xx = -0.5 * by.a * (covariance.yy * inv_det) * (covariance.yy * inv_det)
     by_yy = (
-        -0.5 * by.a * (of.xy * inv_det) * (of.xy * inv_det)
-        + by.shear * of.xy / (of.yy * of.yy)
-        - 0.5 * by.v / (of.yy * of.yy)
+        -0.5 * by.a * (covariance.xy * inv_det) * (covariance.xy * inv_det)
+        + by.shear * covariance.xy / (covariance.yy * covariance.yy)
+        - 0.5 * by.v / (covariance.yy * covariance.yy)
     )
-    by_xy = by.a * (of.yy * inv_det) * (of.xy * inv_det) - by.shear / of.yy
-    if antialiased != 0 and of.sharp_determinant > 1.0e-12 * of.determinant:
-        inv_sharp = 1.0 / of.sharp_determinant
-        by_xx += 0.5 * by.log_opacity * (of.sharp_yy * inv_sharp - of.yy * inv_det)
-        by_yy += 0.5 * by.log_opacity * (of.sharp_xx * inv_sharp - of.xx * inv_det)
-        by_xy += by.log_opacity * of.xy * (inv_det - inv_sharp)
+    by_xy = by.a * (covariance.yy * inv_det) * (covariance.xy * inv_det) - by.shear / covariance.yy
+    if antialiased != 0 and covariance.sharp_determinant > 1.0e-12 * covariance.determinant:
+        inv_sharp = 1.0 / covariance.sharp_determinant
+        by_xx += 0.5 * by.log_opacity * (covariance.sharp_yy * inv_sharp - covariance.yy * inv_det)
+        by_yy += 0.5 * by.log_opacity * (covariance.sharp_xx * inv_sharp - covariance.xx * inv_det)
+        by_xy += by.log_opacity * covariance.xy * (inv_det - inv_sharp)
     return wp.vec3(by_xx, by_yy, by_xy)
 
 
 @wp.func
-def seen_gradient(
+def camera_space_gradient(
     view: View,
     antialiased: wp.int32,
     p: wp.vec3,
@@ -111,8 +114,9 @@ def seen_gradient(
     moments: wp.array2d[wp.vec4],
     first_slot: wp.int32,
     end_slot: wp.int32,
-) -> SeenGradient:
-    """Through the screen covariance and ``screen_axes``, for a Gaussian at the camera-space point ``p``."""
+) -> CameraSpaceGradient:
+    """Propagate the gradient through the screen covariance and ``screen_axes``, for a Gaussian at the camera-space
+    point ``p``."""
     row_x, row_y = screen_axes(view, p, q, log_scale)
     covariance = screen_covariance(row_x, row_y)
     a = 0.5 * covariance.yy / covariance.determinant
@@ -144,7 +148,7 @@ def seen_gradient(
     by_y = fy * by_splat.centre[1]
     by_z = by_splat.depth - inv_z * (wp.dot(by_axis_x, axis_x) + wp.dot(by_axis_y, axis_y))
     by_z -= inv_z * (by_x * p[0] + by_y * p[1])
-    # Where the slope is held at the image's edge it does not depend on the point.
+    # A slope clamped at the image's edge does not depend on the point.
     if tx == slope_x:
         by_tx = -fx * wp.dot(by_axis_x, forward) * inv_z
         by_x += by_tx
@@ -154,7 +158,7 @@ def seen_gradient(
         by_y += by_ty
         by_z -= by_ty * slope_y
 
-    by = SeenGradient()
+    by = CameraSpaceGradient()
     by.screen = by_splat.centre
     by.log_opacity = by_splat.log_opacity
     by.log_scale = wp.cw_mul(by_row_x, row_x) + wp.cw_mul(by_row_y, row_y)
@@ -166,7 +170,7 @@ def seen_gradient(
 
 @wp.func
 def quaternion_gradient(q: wp.vec4, by_rotation: wp.mat33) -> wp.vec4:
-    """Gradient by an unnormalised quaternion w, x, y, z, from the gradient by its rotation matrix."""
+    """Return the gradient by an unnormalised quaternion w, x, y, z, from the gradient by its rotation matrix."""
     length = wp.length(q)
     if length == 0.0:
         return wp.vec4()
@@ -186,8 +190,8 @@ def quaternion_gradient(q: wp.vec4, by_rotation: wp.mat33) -> wp.vec4:
 
 
 @wp.func
-def unclamped(raw: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
-    """Gradient by the SH sum, whose colour of at least 0 is max(sum + 0.5, 0)."""
+def clamp_gradient(raw: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
+    """Return the gradient by the SH sum, of which the colour is max(sum + 0.5, 0)."""
     return wp.vec3(
         wp.where(raw[0] > -0.5, by_colour[0], 0.0),
         wp.where(raw[1] > -0.5, by_colour[1], 0.0),
@@ -197,7 +201,8 @@ def unclamped(raw: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
 
 @wp.func
 def offset_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, offset: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
-    """By the vector from the camera's centre to the mean, which only its direction's colour depends on."""
+    """Return the gradient by the vector from the camera's centre to the mean, through the colour, which depends on its
+    direction."""
     distance = wp.length(offset)
     direction = offset / distance
     by_direction = sh_direction_gradient(sh, g, direction, by_colour)
@@ -224,7 +229,7 @@ def project_backward_kernel(
     by_opacity_logit_out: wp.array[wp.float32],
     by_sh_out: wp.array2d[wp.vec3],
 ):
-    """Gradient by one Gaussian; zero where it reaches no tile."""
+    """Compute the gradient by the attributes of one Gaussian; zero where it reaches no tile."""
     g = wp.tid() + first
     slot = first_slot_of(slot_end, g)
     end = wp.int32(slot_end[g])
@@ -239,17 +244,17 @@ def project_backward_kernel(
     mean = means[g]
     q = rotations[g]
     p = view.rotation * mean + view.translation
-    by = seen_gradient(view, antialiased, p, q, log_scales[g], moments, slot, end)
-    turn = wp.transpose(view.rotation)
-    by_rotation_out[g] = quaternion_gradient(q, turn * by.axes)
+    by = camera_space_gradient(view, antialiased, p, q, log_scales[g], moments, slot, end)
+    camera_axes = wp.transpose(view.rotation)
+    by_rotation_out[g] = quaternion_gradient(q, camera_axes * by.axes)
     by_log_scale_out[g] = by.log_scale
     by_opacity_logit_out[g] = by.log_opacity / (1.0 + wp.exp(opacity_logits[g]))
 
     offset = mean - view.centre
     direction = wp.normalize(offset)
-    by_colour = unclamped(sh_sum(sh, g, sh.shape[1], direction), by.colour)
+    by_colour = clamp_gradient(sh_sum(sh, g, sh.shape[1], direction), by.colour)
     write_sh_gradient(by_sh_out, g, direction, by_colour)
-    by_mean_out[g] = turn * by.point + offset_gradient(sh, g, offset, by_colour)
+    by_mean_out[g] = camera_axes * by.point + offset_gradient(sh, g, offset, by_colour)
 
 
 @wp.kernel
@@ -269,9 +274,9 @@ def pose_backward_kernel(
     by_pose_rotation_out: wp.array[wp.mat33],
     by_pose_translation_out: wp.array[wp.vec3],
 ):
-    """What is seldom asked: by one Gaussian's place on the screen, and its part of the gradient by the camera's pose.
+    """Compute the gradient by one Gaussian's screen position, and its part of the gradient by the camera pose.
 
-    Outputs not wanted are empty arrays.
+    Outputs that are not wanted are empty arrays.
     """
     g = wp.tid() + first
     slot = first_slot_of(slot_end, g)
@@ -283,12 +288,12 @@ def pose_backward_kernel(
         mean = means[g]
         q = rotations[g]
         p = view.rotation * mean + view.translation
-        by = seen_gradient(view, antialiased, p, q, log_scales[g], moments, slot, end)
+        by = camera_space_gradient(view, antialiased, p, q, log_scales[g], moments, slot, end)
         by_screen = by.screen
         offset = mean - view.centre
-        by_colour = unclamped(sh_sum(sh, g, sh.shape[1], wp.normalize(offset)), by.colour)
+        by_colour = clamp_gradient(sh_sum(sh, g, sh.shape[1], wp.normalize(offset)), by.colour)
         by_offset = offset_gradient(sh, g, offset, by_colour)
-        # The camera's centre -R^T t carries the colour's share.
+        # The colour depends on the camera's centre -R^T t.
         by_rotation = (
             by.axes * wp.transpose(rotation_matrix(q))
             + wp.outer(by.point, mean)

@@ -1,7 +1,7 @@
-"""The C++ of compositing on a CPU: one thread for a tile, eight pixels of a row at a time.
+"""C++ code of compositing on a CPU: one thread per tile, eight pixels of a row at a time.
 
-Written in vectors of eight, which Clang maps to what the processor has. Which half rows of a tile an ellipse reaches is
-found for eight rows at once; those that are full are left out.
+It uses vectors of eight, which Clang maps to the SIMD instructions of the processor. The half rows of a tile that an
+ellipse reaches are computed for eight rows at once; half rows whose pixels are all opaque are skipped.
 """
 
 from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP
@@ -13,12 +13,12 @@ _SHARED += """
     typedef int i8 __attribute__((ext_vector_type(8)));
     typedef bool b8 __attribute__((ext_vector_type(8)));
     constexpr float LOG2_E = 1.4426950408889634f;
-    // Code that is compiled at run time fetches its constants at every use, unless they are read from memory once.
-    volatile float kept[] = {-100.0f, 1.32764720e-3f, 9.67554133e-3f, 5.55071327e-2f, 2.40221197e-1f, 6.93146967e-1f,
+    // The run-time compiler reloads literal constants at every use; reading them from memory once avoids that.
+    volatile float pool[] = {-100.0f, 1.32764720e-3f, 9.67554133e-3f, 5.55071327e-2f, 2.40221197e-1f, 6.93146967e-1f,
                              LIMIT, CUT, STOP, 0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f};
-    const f8 least = kept[0], p5 = kept[1], p4 = kept[2], p3 = kept[3], p2 = kept[4], p1 = kept[5];
-    const f8 limit = kept[6], cut = kept[7], stopped = kept[8], none = kept[9], one = kept[10];
-    const f8 steps = {kept[9], kept[10], kept[11], kept[12], kept[13], kept[14], kept[15], kept[16]};
+    const f8 least = pool[0], p5 = pool[1], p4 = pool[2], p3 = pool[3], p2 = pool[4], p1 = pool[5];
+    const f8 limit = pool[6], cut = pool[7], stopped = pool[8], none = pool[9], one = pool[10];
+    const f8 steps = {pool[9], pool[10], pool[11], pool[12], pool[13], pool[14], pool[15], pool[16]};
     // 2^x for x <= 0 to 8e-8: 2^whole times the polynomial nearest to 2^part, part in [-1/2, 1/2].
     auto power_of_two = [&](f8 x) -> f8 {
         #pragma clang fp contract(fast)
@@ -39,7 +39,7 @@ _SHARED += """
         __builtin_memcpy(&bits, &set, 1);
         return bits;
     };
-    // Half rows are numbered down the left half, then down the right one; pixels by half rows. Bits: those not full.
+    // Half rows are numbered down the left half, then down the right one; pixels by half rows. Bits: not yet opaque.
     const int tile_width = width - left < 16 ? width - left : 16;
     const int tile_height = height - top < 16 ? height - top : 16;
     const unsigned inside_rows = 0xFFFFu >> (16 - tile_height);
@@ -50,27 +50,27 @@ _SHARED += """
 
 _EACH_HALF = """
         if (i + 8 < end) {
-            const int soon = gaussians.data[i + 8];
-            __builtin_prefetch(ellipse.data + soon);
-            __builtin_prefetch(falloff.data + soon);
-            __builtin_prefetch(colour_depth.data + soon);
+            const int next_id = gaussians.data[i + 8];
+            __builtin_prefetch(ellipse.data + next_id);
+            __builtin_prefetch(falloff.data + next_id);
+            __builtin_prefetch(colour_depth.data + next_id);
         }
         const wp::vec4 e = ellipse.data[id];
         const wp::vec2 f = falloff.data[id];
         const wp::vec4 c = colour_depth.data[id];
         const float x = e[0] - (float)left - 0.5f, y = e[1] - (float)top - 0.5f;
         const float steep = e[2] * LOG2_E, over_a = 1.0f / e[2];
-        // Of each half row: where it begins, from the middle of the ellipse there. Of each row: log2 of alpha there.
+        // begins: start of each half row from the centre of the ellipse there. tops: log2 of alpha there, per row.
         alignas(32) float begins[32], tops[16], down[16];
         unsigned reached = 0;
         for (int rows = 0; rows < 16; rows += 8) {
             const f8 dy = steps + ((float)rows - y);
             const f8 at_row = f[1] - f[0] * dy * dy;
-            const f8 room = at_row + LOG_255;
-            const f8 reach = __builtin_elementwise_sqrt((room > none ? room : none) * over_a) + 1.0e-3f;
+            const f8 margin = at_row + LOG_255;
+            const f8 reach = __builtin_elementwise_sqrt((margin > none ? margin : none) * over_a) + 1.0e-3f;
             const f8 middle = x - e[3] * dy;
             const f8 first = middle - reach, last = middle + reach;
-            const i8 level = room > -1.0e-3f;
+            const i8 level = margin > -1.0e-3f;
             reached |= bits_of(level & (first <= 7.0f) & (last >= none)) << rows;
             reached |= bits_of(level & (first <= 15.0f) & (last >= 8.0f)) << (16 + rows);
             *(f8*)(begins + rows) = -middle;
@@ -92,7 +92,7 @@ _EACH_HALF = """
 FORWARD = (
     _SHARED
     + """
-    // Transmittance; zero outside of the image, negative once a pixel is full.
+    // Transmittance; zero outside the image, negative once a pixel is opaque.
     alignas(64) float passing[256], red[256], green[256], blue[256], far[256];
     for (int i = 0; i < 256; ++i) {
         passing[i] = column_of(i) < tile_width && row_of(i) < tile_height ? 1.0f : 0.0f;
@@ -153,8 +153,8 @@ BACKWARD = (
 """
     + _EACH_HALF
     + """
-            const i8 drawn = hit & ~stop;
-            const f8 weight = drawn ? before * alpha : none;
+            const i8 blended = hit & ~stop;
+            const f8 weight = blended ? before * alpha : none;
             const f8 left_over = stop ? none : (hit ? after : before);
             *(f8*)(passing + at) = left_over;
             const f8 red = *(f8*)(by_red + at), green = *(f8*)(by_green + at), blue = *(f8*)(by_blue + at);
@@ -163,7 +163,7 @@ BACKWARD = (
             const f8 behind = *(f8*)(rest + at) - weight * value;
             *(f8*)(rest + at) = behind;
             const f8 free = alpha * (before * value - behind / (one - alpha));
-            const f8 slope = (drawn & (raw <= limit)) ? free : none;
+            const f8 slope = (blended & (raw <= limit)) ? free : none;
             const f8 moment = slope * u;
             const float dy = down[half & 15];
             sums[0] += slope;

@@ -1,8 +1,9 @@
-"""The CUDA C++ of compositing: one block of 256 threads for a tile, one warp for each of its 8 x 4 pixel parts.
+"""CUDA C++ code of compositing: one block of 256 threads per tile, one warp for each of its eight parts of 8 x 4
+pixels.
 
-Splats pass through shared memory in batches. The thread that loads a splat also finds which of the eight parts its
-ellipse reaches, and each warp then visits only its own. CUDA C++ because Warp's tile functions offer neither ballots
-nor per-warp control flow; Warp compiles it at run time like every other kernel.
+Splats pass through shared memory in batches. The thread that loads a splat also computes which of the eight parts its
+ellipse reaches, and each warp then visits only its own splats. The code is CUDA C++ because Warp's tile functions offer
+neither ballots nor per-warp control flow; Warp compiles it at run time like every other kernel.
 """
 
 from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP
@@ -11,7 +12,7 @@ from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP
 _SHARED = CUTOFFS_IN_CPP
 _SHARED += """
     constexpr float LOG2_E = 1.4426950408889634f;
-    // Which of the eight parts (two columns by four rows of 8 x 4 pixels) does an ellipse reach?
+    // Bit mask of the eight parts (two columns by four rows of 8 x 4 pixels) that an ellipse reaches.
     auto parts_of = [](float mx, float my, float a, float shear, float v, float cut) -> unsigned {
         // mx, my relative to the first pixel centre of the tile.
         unsigned mask = 0;
@@ -33,7 +34,7 @@ _SHARED += """
     };
 """
 
-# All splats of the tile pass through shared memory, 256 at a time; ``group`` walks those there by 32s.
+# All splats of the tile pass through shared memory, 256 at a time; ``group`` iterates over them by 32.
 _BATCHES = """
     __shared__ float4 s_shape[256];
     __shared__ float4 s_colour[256];
@@ -54,7 +55,7 @@ _BATCHES = """
         return f.y - f.x * dy * dy - shape.z * u * u;
     };
     bool open = inside;
-    // The loads of the next batch are under way while this one is blended.
+    // The loads of the next batch are in flight while this one is blended.
     float4 next_shape, next_colour;
     float2 next_falloff;
     auto fetch = [&](int i) {
@@ -105,7 +106,7 @@ FORWARD = (
             if (!__any_sync(0xffffffffu, open)) break;
             unsigned mine_here = __ballot_sync(0xffffffffu, (s_parts[group + lane] >> part) & 1u);
             while (mine_here) {
-                // Four splats' alphas are worked out side by side: one alone would wait for every step of its own.
+                // The alphas of four splats are computed together, which hides the latency of each step.
                 int chosen[4];
                 float alphas[4];
                 #pragma unroll
@@ -171,7 +172,7 @@ BACKWARD = (
             unsigned visited = 0;
             while (todo && __any_sync(0xffffffffu, open)) {
                 int chosen = 0;
-                // Two splats' alphas side by side, as in the forward pass.
+                // The alphas of two splats together, as in the forward pass.
                 while (todo && chosen < 7) {
                     int pair[2];
                     float raw[2];
@@ -236,7 +237,7 @@ BACKWARD = (
                         q[8] = fmaf(w, by.y, q[8]);
                         q[9] = fmaf(w, by.z, q[9]);
                     }
-                    // The pixels of a row stand at u, u + 1, ...
+                    // The pixels of a row are at u, u + 1, ...
                     q[1] = fmaf(u, q[0], by_column);
                     q[3] = fmaf(u, q[1] + by_column, by_square);
                     q[2] = q[0] * dy;

@@ -1,9 +1,12 @@
-"""Tiles to pixels, and back: what blends is in ``composite_cpu`` and ``composite_cuda``."""
+"""Kernels of compositing and of its backward pass.
+
+The blending code is in ``composite_cpu`` and ``composite_cuda``. Host code: ``egs_warp/render/compositing.py``.
+"""
 
 import warp as wp
 
 from egs_warp.kernels.render import composite_cpu, composite_cuda
-from egs_warp.kernels.render.ellipse import TILE, TILE_PIXELS, is_drawn
+from egs_warp.kernels.render.ellipse import TILE, TILE_PIXELS, is_tile_enabled
 from egs_warp.kernels.render.pixel_gradients import pixel_gradient
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -37,7 +40,7 @@ def composite_tile(
     alpha_out: wp.array2d[wp.float32],
     depth: wp.array2d[wp.float32],
 ):
-    """Front-to-back blend of one tile by its thread (CPU) or block (CUDA)."""
+    """Blend one tile from front to back, by its thread (CPU) or block (CUDA)."""
     ...
 
 
@@ -58,7 +61,7 @@ def composite_backward_tile(
     remaining: wp.array[wp.float32],
     moments: wp.array2d[wp.vec4],
 ):
-    """Gradient sums of one tile's splats (CPU); the same walk and rounding as ``composite_tile``."""
+    """Sum the gradients of one tile's splats (CPU), in the order and with the rounding of ``composite_tile``."""
     ...
 
 
@@ -79,7 +82,8 @@ def composite_backward_block(
     remaining: wp.float32,
     moments: wp.array2d[wp.vec4],
 ):
-    """Gradient sums of one tile's splats by its block (CUDA); the same walk and rounding as ``composite_tile``.
+    """Sum the gradients of one tile's splats by its block (CUDA), in the order and with the rounding of
+    ``composite_tile``.
 
     ``sum_gradient`` and ``remaining`` are those of the thread's own pixel.
     """
@@ -93,7 +97,7 @@ def composite_tile_kernel(
     width: wp.int32,
     height: wp.int32,
     tile_start: wp.array[wp.int32],
-    drawn: wp.array[wp.int32],
+    tile_mask: wp.array[wp.int32],
     gaussian_from_intersection: wp.array[wp.int32],
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
@@ -105,12 +109,12 @@ def composite_tile_kernel(
     alpha_out: wp.array2d[wp.float32],
     depth_out: wp.array2d[wp.float32],
 ):
-    """One thread composites one tile (CPU), or one block of ``TILE_PIXELS`` threads (CUDA)."""
+    """Composite one tile by one thread (CPU), or by one block of ``TILE_PIXELS`` threads (CUDA)."""
     tile = (wp.tid() + first) / wp.block_dim()
     columns = (width + TILE - 1) / TILE
     start = tile_start[tile]
     end = start
-    if is_drawn(drawn, tile):
+    if is_tile_enabled(tile_mask, tile):
         end = tile_start[tile + 1]
     composite_tile(
         width,
@@ -138,7 +142,7 @@ def composite_backward_tile_kernel(
     width: wp.int32,
     height: wp.int32,
     tile_start: wp.array[wp.int32],
-    drawn: wp.array[wp.int32],
+    tile_mask: wp.array[wp.int32],
     gaussian_from_intersection: wp.array[wp.int32],
     slot_from_intersection: wp.array[wp.int32],
     ellipse: wp.array[wp.vec4],
@@ -149,7 +153,7 @@ def composite_backward_tile_kernel(
     # Out:
     moments_out: wp.array2d[wp.vec4],
 ):
-    """One thread walks one tile again and sums each splat's gradient over its pixels.
+    """Sum each splat's gradient over the pixels of one tile, by one thread.
 
     With k = alpha dL/dalpha per pixel, ``moments_out[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, by
     depth, 0) and (by colour, 0).
@@ -157,7 +161,7 @@ def composite_backward_tile_kernel(
     tile = wp.tid() + first
     columns = (width + TILE - 1) / TILE
     right = width
-    if not is_drawn(drawn, tile):
+    if not is_tile_enabled(tile_mask, tile):
         right = (tile % columns) * TILE
     composite_backward_tile(
         right,
@@ -183,7 +187,7 @@ def composite_backward_block_kernel(
     width: wp.int32,
     height: wp.int32,
     tile_start: wp.array[wp.int32],
-    drawn: wp.array[wp.int32],
+    tile_mask: wp.array[wp.int32],
     gaussian_from_intersection: wp.array[wp.int32],
     slot_from_intersection: wp.array[wp.int32],
     ellipse: wp.array[wp.vec4],
@@ -198,12 +202,12 @@ def composite_backward_block_kernel(
     # Out:
     moments_out: wp.array2d[wp.vec4],
 ):
-    """A block of 256 threads does for one tile what ``composite_backward_tile_kernel`` does with one."""
+    """Do the work of ``composite_backward_tile_kernel`` for one tile by a block of 256 threads."""
     tile = wp.tid() / TILE_PIXELS
     columns = (width + TILE - 1) / TILE
     left = (tile % columns) * TILE
     top = (tile / columns) * TILE
-    # A warp has 8 x 4 pixels; two such parts stand side by side.
+    # A warp has 8 x 4 pixels; two such parts make the width of a tile.
     i = wp.tid() % TILE_PIXELS
     part = i / 32
     column = left + (part % 2) * 8 + i % 8
@@ -211,7 +215,7 @@ def composite_backward_block_kernel(
     by_sums = wp.vec4()
     remaining = wp.float32(0.0)
     right = width
-    if not is_drawn(drawn, tile):
+    if not is_tile_enabled(tile_mask, tile):
         right = left
     if column < right and row < height:
         by_sums, remaining = pixel_gradient(

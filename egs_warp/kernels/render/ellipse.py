@@ -1,4 +1,4 @@
-"""Screen ellipses: constants of the splatting model, a splat's alpha, and the exact ellipse-tile test."""
+"""Screen ellipses: constants of the splatting model, the alpha of a splat, and the exact ellipse-tile test."""
 
 import math
 
@@ -13,14 +13,14 @@ _TRANSMITTANCE_STOP = 1.0e-4
 LOW_PASS = wp.constant(wp.float32(0.3))
 """Variance in square pixels added to every screen-space covariance."""
 ALPHA_CUT = wp.constant(wp.float32(_ALPHA_CUT))
-"""A splat does not touch pixels where its alpha would be smaller."""
+"""Alpha below which a splat does not affect a pixel."""
 LOG_255 = wp.constant(wp.float32(-math.log(_ALPHA_CUT)))
 ALPHA_LIMIT = wp.constant(wp.float32(_ALPHA_LIMIT))
 """Largest alpha of one splat; above it no gradient flows."""
 TRANSMITTANCE_STOP = wp.constant(wp.float32(_TRANSMITTANCE_STOP))
-"""A splat that would bring the transmittance here or lower is not drawn, and ends the pixel."""
+"""A splat that would bring the transmittance to this value or lower is not blended, and ends the pixel."""
 TILE = wp.constant(16)
-"""Side of a square tile in pixels."""
+"""Side of a square tile, pixels."""
 TILE_PIXELS = wp.constant(256)
 
 CUTOFFS_IN_CPP = f"""
@@ -30,12 +30,13 @@ CUTOFFS_IN_CPP = f"""
     constexpr float LIMIT = {_ALPHA_LIMIT}f;
     constexpr float STOP = {_TRANSMITTANCE_STOP}f;
 """
-"""The same for compositing in C++."""
+"""C++ constants of the same values, for compositing."""
 
 
 @wp.func
 def pixel_of_thread(thread: wp.int32, width: wp.int32) -> wp.vec2i:
-    """Column and row of the pixel of a thread, ``TILE_PIXELS`` threads to a tile; it may lie outside of the picture."""
+    """Return column and row of the pixel of a thread, with ``TILE_PIXELS`` threads per tile; it may lie outside the
+    image."""
     tile = thread / TILE_PIXELS
     i = thread % TILE_PIXELS
     columns = (width + TILE - 1) / TILE
@@ -43,14 +44,14 @@ def pixel_of_thread(thread: wp.int32, width: wp.int32) -> wp.vec2i:
 
 
 @wp.func
-def is_drawn(drawn: wp.array[wp.int32], tile: wp.int32) -> bool:
-    """Whether a tile is to be drawn; an empty array says so of all."""
-    return drawn.shape[0] == 0 or drawn[tile] != 0
+def is_tile_enabled(tile_mask: wp.array[wp.int32], tile: wp.int32) -> bool:
+    """Return True if a tile is rendered; an empty mask enables all tiles."""
+    return tile_mask.shape[0] == 0 or tile_mask[tile] != 0
 
 
 @wp.func
 def splat_alpha(ellipse: wp.vec4, falloff: wp.vec2, pixel: wp.vec2i) -> wp.float32:
-    """What one splat hides of a pixel's middle, at most ``ALPHA_LIMIT``."""
+    """Return the alpha of one splat at a pixel's centre, at most ``ALPHA_LIMIT``."""
     dy = wp.float32(pixel[1]) + 0.5 - ellipse[1]
     u = wp.float32(pixel[0]) + 0.5 - ellipse[0] + ellipse[3] * dy
     return wp.min(wp.exp(falloff[1] - falloff[0] * dy * dy - ellipse[2] * u * u), ALPHA_LIMIT)
@@ -58,7 +59,7 @@ def splat_alpha(ellipse: wp.vec4, falloff: wp.vec2, pixel: wp.vec2i) -> wp.float
 
 @wp.func
 def tile_rows(ellipse: wp.vec4, falloff: wp.vec2, height: wp.int32) -> wp.vec2i:
-    """First and last tile row with a pixel centre inside the ellipse's height; first > last if none."""
+    """Return the first and last tile row with a pixel centre inside the ellipse's height; first > last if none."""
     reach = wp.sqrt((falloff[1] + LOG_255) / falloff[0])
     first = wp.int32(wp.ceil(wp.max(ellipse[1] - reach - 0.5, 0.0)))
     last = wp.int32(wp.floor(wp.min(ellipse[1] + reach - 0.5, wp.float32(height - 1))))
@@ -69,7 +70,8 @@ def tile_rows(ellipse: wp.vec4, falloff: wp.vec2, height: wp.int32) -> wp.vec2i:
 
 @wp.func
 def tile_columns(ellipse: wp.vec4, falloff: wp.vec2, row: wp.int32, width: wp.int32, height: wp.int32) -> wp.vec2i:
-    """First and last tile column that the ellipse reaches within a tile row; exact, because the ellipse is convex."""
+    """Return the first and last tile column that the ellipse reaches within a tile row. The test is exact, because the
+    ellipse is convex."""
     cut = falloff[1] + LOG_255
     top = wp.float32(row * TILE) + 0.5 - ellipse[1]
     bottom = wp.float32(wp.min(row * TILE + TILE, height)) - 0.5 - ellipse[1]

@@ -1,4 +1,4 @@
-"""What is seldom asked of a picture: median depth and normals."""
+"""Kernels of the optional outputs of an image: median depth and normals."""
 
 import warp as wp
 
@@ -6,7 +6,7 @@ from egs_warp.kernels.render.ellipse import (
     ALPHA_CUT,
     TILE_PIXELS,
     TRANSMITTANCE_STOP,
-    is_drawn,
+    is_tile_enabled,
     pixel_of_thread,
     splat_alpha,
 )
@@ -26,7 +26,7 @@ def splat_normals_kernel(
     # Out:
     normal_out: wp.array[wp.vec3],
 ):
-    """Thinnest axis of every Gaussian in camera axes, on the camera's side."""
+    """Compute the thinnest axis of every Gaussian in camera axes, pointing towards the camera."""
     g = wp.tid() + first
     s = log_scales[g]
     axis = wp.vec3(1.0, 0.0, 0.0)
@@ -46,7 +46,7 @@ def composite_geometry_kernel(
     width: wp.int32,
     height: wp.int32,
     tile_start: wp.array[wp.int32],
-    drawn: wp.array[wp.int32],
+    tile_mask: wp.array[wp.int32],
     gaussian_from_intersection: wp.array[wp.int32],
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
@@ -57,7 +57,7 @@ def composite_geometry_kernel(
     median_gaussian_out: wp.array[wp.int32],
     normal_out: wp.array[wp.vec3],
 ):
-    """One thread walks one pixel for what is seldom asked: where half of the light is stopped, and the mean normal."""
+    """Compute the median depth, its splat and the blended normal of one pixel, by one thread."""
     thread = wp.tid() + first
     pixel = pixel_of_thread(thread, width)
     if pixel[0] >= width or pixel[1] >= height:
@@ -68,7 +68,7 @@ def composite_geometry_kernel(
     passing = wp.float32(1.0)
     intersection = tile_start[tile]
     end = intersection
-    if is_drawn(drawn, tile):
+    if is_tile_enabled(tile_mask, tile):
         end = tile_start[tile + 1]
     while intersection < end:
         g = gaussian_from_intersection[intersection]

@@ -1,4 +1,4 @@
-"""From gradients of a picture to what its splats use up of them, pixel by pixel."""
+"""Gradients of an image by the weighted sums of each pixel."""
 
 import warp as wp
 
@@ -16,11 +16,12 @@ def pixel_gradient(
     alpha_gradient: wp.array2d[wp.float32],
     depth_gradient: wp.array2d[wp.float32],
 ) -> tuple[wp.vec4, wp.float32]:
-    """The gradient by a pixel's weighted sums, and the whole that splats from front to back use up.
+    """Return the gradient by a pixel's weighted sums, and the initial remaining sum for a front-to-back traversal.
 
     With s_i = (colour_i, depth_i) . gradient, the loss is linear in the weights w_i and the final transmittance T:
-    dL/dalpha_i = T_i s_i - (sum of w_j s_j over j > i + T dL/dT) / (1 - alpha_i). The bracket for i = 0 is what is
-    returned; walking from front to back then needs no second pass and no stored state. Empty arrays are zero gradients.
+    dL/dalpha_i = T_i s_i - (sum of w_j s_j over j > i + T dL/dT) / (1 - alpha_i). The remaining sum is that bracket
+    with all splats in the sum. The front-to-back traversal subtracts from it, so it needs no second pass and no stored
+    state. Empty arrays are zero gradients.
     """
     opaque = alpha[row, column]
     by_colour = wp.vec3()
@@ -53,7 +54,7 @@ def pixel_gradients_kernel(
     sum_gradient_out: wp.array[wp.vec4],
     remaining_out: wp.array[wp.float32],
 ):
-    """``pixel_gradient`` of every pixel (CPU; a GPU's compositor works it out itself)."""
+    """Compute ``pixel_gradient`` of every pixel (CPU only; the GPU compositor computes it itself)."""
     i = wp.tid() + first
     by_sums, remaining = pixel_gradient(
         i / colour.shape[1],

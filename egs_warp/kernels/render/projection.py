@@ -1,4 +1,7 @@
-"""Projection of 3D Gaussians to screen-space ellipses (EWA splatting; Kerbl et al. 2023)."""
+"""Projection of 3D Gaussians to screen-space ellipses (EWA splatting; Kerbl et al. 2023).
+
+Host code: ``egs_warp/render/projection.py``.
+"""
 
 import warp as wp
 
@@ -9,12 +12,12 @@ wp.set_module_options({"enable_backward": False})
 
 
 NOT_FINITE = wp.constant(wp.int64(2**36))
-"""Stands for the number of tiles of a Gaussian with a value that is not finite; more than any image has."""
+"""Tile count of a Gaussian with a non-finite value; more than any image has."""
 
 
 @wp.struct
 class View:
-    """One pinhole camera in single precision."""
+    """Pinhole camera in single precision."""
 
     rotation: wp.mat33
     translation: wp.vec3
@@ -33,7 +36,8 @@ class View:
 
 @wp.func
 def rotation_matrix(q: wp.vec4) -> wp.mat33:
-    """Rotation of the quaternion w, x, y, z, which is normalised first; identity for a zero one."""
+    """Return the rotation matrix of the quaternion w, x, y, z, which is normalised first; identity for a zero
+    quaternion."""
     length = wp.length(q)
     w = wp.float32(1.0)
     x = wp.float32(0.0)
@@ -59,10 +63,10 @@ def rotation_matrix(q: wp.vec4) -> wp.mat33:
 
 @wp.func
 def screen_axes(view: View, p: wp.vec3, q: wp.vec4, log_scale: wp.vec3) -> tuple[wp.vec3, wp.vec3]:
-    """Rows x and y of J W R S at the camera-space point ``p``: the screen covariance is their Gram matrix."""
+    """Return rows x and y of J W R S at the camera-space point ``p``; the screen covariance is their Gram matrix."""
     inv_z = 1.0 / p[2]
-    # As gsplat and Kerbl et al. do, the Jacobian is taken no further out than 15 % beyond the image: it grows without
-    # bound there.
+    # As in gsplat and Kerbl et al., the Jacobian is evaluated at most 15 % outside the image, where it grows without
+    # bound.
     tx = wp.clamp(p[0] * inv_z, view.slope_low[0], view.slope_high[0])
     ty = wp.clamp(p[1] * inv_z, view.slope_low[1], view.slope_high[1])
     axes = view.rotation * rotation_matrix(q)
@@ -77,7 +81,7 @@ def screen_axes(view: View, p: wp.vec3, q: wp.vec4, log_scale: wp.vec3) -> tuple
 
 @wp.struct
 class ScreenCovariance:
-    """Of one Gaussian on the screen, in square pixels: sharp as it is, and with the low-pass added."""
+    """Screen covariance of one Gaussian, square pixels: ``sharp_`` without, the others with the low-pass added."""
 
     sharp_xx: wp.float32
     sharp_yy: wp.float32
@@ -90,17 +94,19 @@ class ScreenCovariance:
 
 @wp.func
 def screen_covariance(row_x: wp.vec3, row_y: wp.vec3) -> ScreenCovariance:
-    """From the rows of ``screen_axes``."""
-    of = ScreenCovariance()
-    of.sharp_xx = wp.dot(row_x, row_x)
-    of.sharp_yy = wp.dot(row_y, row_y)
-    of.xy = wp.dot(row_x, row_y)
-    of.xx = of.sharp_xx + LOW_PASS
-    of.yy = of.sharp_yy + LOW_PASS
+    """Compute the screen covariance from the rows of ``screen_axes``."""
+    covariance = ScreenCovariance()
+    covariance.sharp_xx = wp.dot(row_x, row_x)
+    covariance.sharp_yy = wp.dot(row_y, row_y)
+    covariance.xy = wp.dot(row_x, row_y)
+    covariance.xx = covariance.sharp_xx + LOW_PASS
+    covariance.yy = covariance.sharp_yy + LOW_PASS
     # Cauchy-Binet: a sum of positive terms, exact where xx yy - xy^2 cancels.
-    of.sharp_determinant = wp.length_sq(wp.cross(row_x, row_y))
-    of.determinant = of.sharp_determinant + LOW_PASS * (of.sharp_xx + of.sharp_yy) + LOW_PASS * LOW_PASS
-    return of
+    covariance.sharp_determinant = wp.length_sq(wp.cross(row_x, row_y))
+    covariance.determinant = (
+        covariance.sharp_determinant + LOW_PASS * (covariance.sharp_xx + covariance.sharp_yy) + LOW_PASS * LOW_PASS
+    )
+    return covariance
 
 
 @wp.kernel
@@ -120,10 +126,10 @@ def project_kernel(
     colour_depth_out: wp.array[wp.vec4],
     tile_count_out: wp.array[wp.int64],
 ):
-    """Screen ellipse, falloff and colour of every Gaussian; a Gaussian that cannot show reaches no tile.
+    """Compute screen ellipse, falloff and colour of every Gaussian; an invisible Gaussian reaches no tile.
 
-    The ellipse is kept in its Cholesky form: with u = dx + shear dy, -ln(alpha / opacity) = a u^2 + v dy^2. Its terms
-    are all positive, where the usual conic cancels for long thin splats.
+    The ellipse is stored in Cholesky form: with u = dx + shear dy, -ln(alpha / opacity) = a u^2 + v dy^2. Its terms are
+    all positive, whereas the usual conic suffers cancellation for long thin splats.
     """
     g = wp.tid() + first
     mean = means[g]
@@ -131,7 +137,7 @@ def project_kernel(
     log_scale = log_scales[g]
     logit = opacity_logits[g]
     tile_count_out[g] = wp.int64(0)
-    # -inf is a legal logarithm of a flat Gaussian's scale, but the file readers never make one.
+    # -inf is a legal logarithm of a flat Gaussian's scale, but the file readers never return one.
     if not (wp.isfinite(mean) and wp.isfinite(q) and wp.isfinite(log_scale) and wp.isfinite(logit)):
         tile_count_out[g] = NOT_FINITE
         return
@@ -146,7 +152,7 @@ def project_kernel(
     if antialiased != 0:
         log_opacity = log_opacity + 0.5 * wp.log(wp.max(screen.sharp_determinant / screen.determinant, 1.0e-12))
     cut = log_opacity + LOG_255
-    # The reach is compared with the image before anything else is worked out: most Gaussians of a large scene end here.
+    # Compare the reach with the image first: most Gaussians of a large scene are rejected here.
     if cut <= 0.0 or not wp.isfinite(screen.determinant):
         return
     x = view.fx * p[0] / p[2] + view.cx

@@ -1,4 +1,4 @@
-"""Real spherical harmonics up to degree 3, INRIA's signs: a colour towards a direction, and its derivatives."""
+"""Real spherical harmonics up to degree 3 in INRIA's sign convention: colour in a direction, and its derivatives."""
 
 import warp as wp
 
@@ -19,7 +19,7 @@ C3B = wp.constant(wp.float32(1.445305721320277))
 
 @wp.func
 def sh_sum(sh: wp.array2d[wp.vec3], g: wp.int32, coefficients: wp.int32, d: wp.vec3) -> wp.vec3:
-    """Spherical harmonics of Gaussian ``g`` towards the unit direction ``d``, INRIA signs, without the +0.5."""
+    """Return the SH sum of Gaussian ``g`` in the unit direction ``d``, INRIA signs, without the +0.5."""
     x = d[0]
     y = d[1]
     z = d[2]
@@ -51,7 +51,8 @@ def sh_sum(sh: wp.array2d[wp.vec3], g: wp.int32, coefficients: wp.int32, d: wp.v
 
 @wp.func
 def sh_direction_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, d: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
-    """Gradient by the unit direction ``d`` towards Gaussian ``g``, as if its three numbers were free."""
+    """Return the gradient by the unit direction ``d`` towards Gaussian ``g``, with its three components taken as
+    independent."""
     x = d[0]
     y = d[1]
     z = d[2]
@@ -84,7 +85,7 @@ def sh_direction_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, d: wp.vec3, by_c
 
 @wp.func
 def write_sh_gradient(by_sh: wp.array2d[wp.vec3], g: wp.int32, d: wp.vec3, by_colour: wp.vec3):
-    """Put the gradient by the coefficients of Gaussian ``g`` into ``by_sh``."""
+    """Write the gradient by the coefficients of Gaussian ``g`` to ``by_sh``."""
     x = d[0]
     y = d[1]
     z = d[2]

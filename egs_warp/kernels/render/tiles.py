@@ -1,7 +1,8 @@
-"""The Gaussians of every tile from front to back.
+"""Kernels that list the Gaussians of every tile from front to back.
 
 A *slot* numbers the (Gaussian, tile) pairs Gaussian by Gaussian, row by row of tiles; an *intersection* numbers the
-same pairs tile by tile, nearest first. Gradients are written by slot, so that each Gaussian finds its own side by side.
+same pairs tile by tile, nearest first. Gradients are written by slot, so that those of one Gaussian are contiguous.
+Host code: ``egs_warp/render/tiles.py``.
 """
 
 import warp as wp
@@ -12,12 +13,12 @@ wp.set_module_options({"enable_backward": False})
 
 
 EMPTY_KEY = wp.constant(wp.uint32(0xFFFFFFFF))
-"""Sort key of room that no pair fills: behind every tile."""
+"""Sort key of unused capacity, larger than that of every tile."""
 
 
 @wp.func
 def first_slot_of(slot_end: wp.array[wp.int64], g: wp.int32) -> wp.int32:
-    """Where the tiles of Gaussian ``g`` begin."""
+    """Return the first slot of Gaussian ``g``."""
     slot = wp.int32(0)
     if g > 0:
         slot = wp.int32(slot_end[g - 1])
@@ -25,7 +26,7 @@ def first_slot_of(slot_end: wp.array[wp.int64], g: wp.int32) -> wp.int32:
 
 
 PREFETCH_DISTANCE = wp.constant(12)
-"""Gaussians in depth order lie anywhere in memory: so many are asked for before their turn."""
+"""Number of Gaussians to prefetch ahead, since Gaussians in depth order are scattered in memory."""
 
 
 @wp.func_native("""
@@ -36,7 +37,7 @@ PREFETCH_DISTANCE = wp.constant(12)
 #endif
 """)
 def prefetch_ellipse(slot_end: wp.array[wp.int64], ellipse: wp.array[wp.vec4], falloff: wp.array[wp.vec2], g: wp.int32):
-    """Have what ``count_tiles_kernel`` reads of Gaussian ``g`` brought to the CPU's cache."""
+    """Prefetch what ``count_tiles_kernel`` reads of Gaussian ``g`` into the CPU's cache."""
     ...
 
 
@@ -46,7 +47,7 @@ def prefetch_ellipse(slot_end: wp.array[wp.int64], ellipse: wp.array[wp.vec4], f
 #endif
 """)
 def prefetch_slots(slot_end: wp.array[wp.int64], g: wp.int32):
-    """Have what ``fill_tiles_kernel`` reads of Gaussian ``g`` brought to the CPU's cache."""
+    """Prefetch what ``fill_tiles_kernel`` reads of Gaussian ``g`` into the CPU's cache."""
     ...
 
 
@@ -65,7 +66,7 @@ def count_tiles_kernel(
     tile_from_slot_out: wp.array[wp.int32],
     count_out: wp.array2d[wp.int32],
 ):
-    """One thread walks one chunk of the Gaussians, from front to back, and counts them tile by tile (CPU)."""
+    """Count the Gaussians of one chunk, from front to back, by tile, with one thread (CPU)."""
     chunk = wp.tid() + first_chunk
     columns = (width + TILE - 1) / TILE
     last = chunk_start[chunk + 1] - 1
@@ -98,7 +99,7 @@ def fill_tiles_kernel(
     gaussian_from_intersection_out: wp.array[wp.int32],
     slot_from_intersection_out: wp.array[wp.int32],
 ):
-    """The same walk appends each Gaussian to its tiles; ``cursor_out`` begins where the chunk's part of a tile does."""
+    """Append each Gaussian of a chunk to its tiles; ``cursor_out`` starts at the chunk's first entry in each tile."""
     chunk = wp.tid() + first_chunk
     last = chunk_start[chunk + 1] - 1
     for rank in range(chunk_start[chunk], last + 1):
@@ -120,10 +121,10 @@ def emit_tiles_kernel(
     # In:
     width: wp.int32,
     height: wp.int32,
-    room: wp.int32,
+    capacity: wp.int32,
     nearest_bits: wp.int32,
     dropped_bits: wp.int32,
-    kept_bits: wp.int32,
+    depth_key_bits: wp.int32,
     slot_end: wp.array[wp.int64],
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
@@ -132,15 +133,16 @@ def emit_tiles_kernel(
     key_out: wp.array[wp.uint32],
     slot_and_gaussian_out: wp.array[wp.int32],
 ):
-    """Sort key (tile, then the leading bits of the depth) of every slot, its number, and from 2 ``room`` its Gaussian.
+    """Write the sort key (tile, then the leading bits of the depth) and the number of every slot, and its Gaussian at
+    offset 2 ``capacity``.
 
-    Where there is room for fewer pairs than there are, there are none.
+    If the pairs exceed the capacity, all keys are empty.
     """
     g = wp.tid()
     pair_count = slot_end[slot_end.shape[0] - 1]
-    fits = pair_count >= wp.int64(0) and pair_count <= wp.int64(room)
-    # Written side by side by neighbouring threads, which the loop below cannot do.
-    for i in range(g, room, slot_end.shape[0]):
+    fits = pair_count >= wp.int64(0) and pair_count <= wp.int64(capacity)
+    # Contiguous writes by neighbouring threads, which the loop below cannot do.
+    for i in range(g, capacity, slot_end.shape[0]):
         slot_and_gaussian_out[i] = i
         if not fits or wp.int64(i) >= pair_count:
             key_out[i] = EMPTY_KEY
@@ -152,31 +154,31 @@ def emit_tiles_kernel(
     columns = (width + TILE - 1) / TILE
     e = ellipse[g]
     f = falloff[g]
-    # Positive floats order as their bits do; counted from those of the near plane they need fewer.
+    # Positive floats sort by their bits; the difference to the near plane needs fewer bits.
     depth_key = wp.uint32((wp.cast(colour_depth[g][3], wp.int32) - nearest_bits) >> dropped_bits)
     rows = tile_rows(e, f, height)
     for row in range(rows[0], rows[1] + 1):
         span = tile_columns(e, f, row, width, height)
         for column in range(span[0], span[1] + 1):
-            key_out[slot] = (wp.uint32(row * columns + column) << wp.uint32(kept_bits)) | depth_key
-            slot_and_gaussian_out[2 * room + slot] = g
+            key_out[slot] = (wp.uint32(row * columns + column) << wp.uint32(depth_key_bits)) | depth_key
+            slot_and_gaussian_out[2 * capacity + slot] = g
             slot += 1
 
 
 @wp.func
-def tile_of_key(key: wp.uint32, kept_bits: wp.int32, tiles: wp.int32) -> wp.int32:
-    """Number of the tile; ``tiles`` for room that no pair fills."""
+def tile_of_key(key: wp.uint32, depth_key_bits: wp.int32, tiles: wp.int32) -> wp.int32:
+    """Return the tile of a key; ``tiles`` for unused capacity."""
     tile = tiles
     if key != EMPTY_KEY:
-        tile = wp.int32(key >> wp.uint32(kept_bits))
+        tile = wp.int32(key >> wp.uint32(depth_key_bits))
     return tile
 
 
 @wp.kernel
 def finish_lists_kernel(
     # In:
-    room: wp.int32,
-    kept_bits: wp.int32,
+    capacity: wp.int32,
+    depth_key_bits: wp.int32,
     key: wp.array[wp.uint32],
     slot_and_gaussian: wp.array[wp.int32],
     colour_depth: wp.array[wp.vec4],
@@ -185,24 +187,25 @@ def finish_lists_kernel(
     gaussian_from_intersection_out: wp.array[wp.int32],
     slot_from_intersection_out: wp.array[wp.int32],
 ):
-    """Start of each tile's run in the sorted pairs, and the exact order of the few whose leading depth bits are equal.
+    """Write the start of each tile's run in the sorted pairs, and order the few pairs whose leading depth bits are
+    equal.
 
-    Thread i fills the starts of the tiles after that of pair i-1 up to that of pair i.
+    Thread i writes the starts of the tiles after that of pair i-1 up to that of pair i.
     """
     i = wp.tid()
     tiles = tile_start_out.shape[0] - 1
     before = wp.int32(-1)
     if i > 0:
-        before = tile_of_key(key[i - 1], kept_bits, tiles)
-    here = tiles
-    if i < room:
-        here = tile_of_key(key[i], kept_bits, tiles)
-    if here < tiles:
+        before = tile_of_key(key[i - 1], depth_key_bits, tiles)
+    tile_here = tiles
+    if i < capacity:
+        tile_here = tile_of_key(key[i], depth_key_bits, tiles)
+    if tile_here < tiles:
         own = key[i]
         slot = slot_and_gaussian[i]
-        gaussians = 2 * room
+        gaussians = 2 * capacity
         g = slot_and_gaussian[gaussians + slot]
-        # Pairs of equal keys stand in the order of their slots, which is that of equal depths.
+        # The sort is stable: pairs of equal keys are in the order of their slots, the order of equal depths.
         place = i
         j = i - 1
         while j >= 0 and key[j] == own:
@@ -210,11 +213,11 @@ def finish_lists_kernel(
                 place -= 1
             j -= 1
         j = i + 1
-        while j < room and key[j] == own:
+        while j < capacity and key[j] == own:
             if colour_depth[slot_and_gaussian[gaussians + slot_and_gaussian[j]]][3] < colour_depth[g][3]:
                 place += 1
             j += 1
         gaussian_from_intersection_out[place] = g
         slot_from_intersection_out[place] = slot
-    for tile in range(before + 1, here + 1):
+    for tile in range(before + 1, tile_here + 1):
         tile_start_out[tile] = i

@@ -1,4 +1,4 @@
-"""Gaussians against a plane: how far they reach across it, and the half that stays on one side."""
+"""Extent of Gaussians across a plane, and truncation of Gaussians at a plane."""
 
 import warp as wp
 
@@ -22,7 +22,8 @@ def reach_kernel(
     axis_reach_out: wp.array[wp.float32],
     deviation_out: wp.array[wp.float32],
 ):
-    """Height of each mean over the plane, the largest |N.(s_i r_i)| (Eq. 20 over gamma) and the deviation along N."""
+    """Compute the height of each mean over the plane, the largest |N.(s_i r_i)| (Eq. 20 over gamma) and the standard
+    deviation along N."""
     row = first_row + wp.tid()
     along = wp.transpose(rotation_matrix(rotations[row])) * normal
     s = log_scales[row]
@@ -49,10 +50,10 @@ def half_space_kernel(
     log_scale_out: wp.array[wp.vec3],
     opacity_logit_out: wp.array[wp.float32],
 ):
-    """Mass, mean and covariance of what Gaussian ``source`` has on the side that the normal points to.
+    """Compute mass, mean and covariance of the part of Gaussian ``source`` on the side that the normal points to.
 
-    With A = R S and w = A^T N / sigma, Sigma - c Sigma N N^T Sigma / sigma^2 = A' A'^T for A' = A
-    (I - (1 - sqrt(1 - c)) w w^T): the factor is decomposed, because the square would lose flat splats.
+    With A = R S and w = A^T N / sigma, Sigma - c Sigma N N^T Sigma / sigma^2 = A' A'^T for A' = A (I - (1 - sqrt(1 -
+    c)) w w^T). The factor A' is decomposed, because the square would lose flat splats.
     """
     row = first_row + wp.tid()
     g = source[row]
@@ -63,9 +64,9 @@ def half_space_kernel(
     sigma = wp.length(w)
     w = w / sigma
     t = -(wp.dot(normal, means[g]) + offset) / sigma
-    kept = 0.5 * wp.erfc(t * 0.70710678)
+    mass_fraction = 0.5 * wp.erfc(t * 0.70710678)
     # The hazard pdf / (1 - cdf); far above the plane both tend to 0, far below to t.
-    hazard = wp.where(t < 6.0, 0.3989422804 * wp.exp(-0.5 * t * t) / wp.max(kept, 1.0e-9), t)
+    hazard = wp.where(t < 6.0, 0.3989422804 * wp.exp(-0.5 * t * t) / wp.max(mass_fraction, 1.0e-9), t)
     narrowed = wp.sqrt(wp.clamp(1.0 - hazard * (hazard - t), 1.0e-6, 1.0))
     mean_out[row] = means[g] + hazard * (turn * wp.cw_mul(scale, w))
     factor = (turn * wp.diag(scale)) * (wp.identity(n=3, dtype=wp.float32) - (1.0 - narrowed) * wp.outer(w, w))
@@ -81,7 +82,7 @@ def half_space_kernel(
         wp.log(wp.max(wp.length(m.b), 1.0e-20)),
         wp.log(wp.max(wp.length(m.c), 1.0e-20)),
     )
-    # Seen along the plane, mass is opacity times width.
+    # Viewed along the plane, mass is opacity times width.
     opacity = 1.0 / (1.0 + wp.exp(-opacity_logits[g]))
-    peak = wp.clamp(opacity * wp.min(kept / narrowed, 1.0), 1.0e-6, 0.999999)
+    peak = wp.clamp(opacity * wp.min(mass_fraction / narrowed, 1.0), 1.0e-6, 0.999999)
     opacity_logit_out[row] = wp.log(peak / (1.0 - peak))

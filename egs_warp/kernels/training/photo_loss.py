@@ -1,4 +1,8 @@
-"""A render in a photo's tone, its likeness to the photo, and the derivative of that: one thread a pixel."""
+"""Photo loss (L1 and SSIM) between a render with the photo's exposure and the photo, and its derivative: one thread per
+pixel.
+
+Host code: ``egs_warp/training/photo_loss.py``.
+"""
 
 import warp as wp
 
@@ -7,18 +11,18 @@ wp.set_module_options({"enable_backward": False})
 C1 = wp.constant(wp.float32(0.01 * 0.01))
 C2 = wp.constant(wp.float32(0.03 * 0.03))
 REACH = wp.constant(5)
-"""Pixels to each side of the window of 11."""
+"""Radius of the SSIM window of 11 pixels."""
 
 
 @wp.func
 def tone_of(tone: wp.array[wp.float32]) -> wp.mat33:
-    """The mixing part of the (3, 4) tone, row by row in memory."""
+    """Return the linear part of the (3, 4) colour transform, stored row by row."""
     return wp.mat33(tone[0], tone[1], tone[2], tone[4], tone[5], tone[6], tone[8], tone[9], tone[10])
 
 
 @wp.func
 def shift_of(tone: wp.array[wp.float32]) -> wp.vec3:
-    """The constant part of the tone."""
+    """Return the constant part of the colour transform."""
     return wp.vec3(tone[3], tone[7], tone[11])
 
 
@@ -38,7 +42,7 @@ def tone_kernel(
     front_out: wp.array[wp.vec3],
     off_out: wp.array[wp.float32],
 ):
-    """The two pictures to compare; ``front`` is what the tone is applied to, without the backdrop."""
+    """Compute the two images to compare; ``front`` is the render before the colour transform, without the backdrop."""
     p = first_row + wp.tid()
     m = tone_of(tone)
     b = shift_of(tone)
@@ -53,7 +57,7 @@ def tone_kernel(
     counts = wp.float32(1.0)
     if weight.shape[0] > 1:
         counts = weight[p]
-    # What does not count must not reach the windows of the similarity either.
+    # Pixels of weight zero must not enter the SSIM windows of others either.
     if counts <= 0.0:
         toned = photo
     off = toned - photo
@@ -76,7 +80,7 @@ def blur_products_kernel(
     bb_out: wp.array[wp.vec3],
     ab_out: wp.array[wp.vec3],
 ):
-    """Both pictures and their products, blurred along the rows."""
+    """Blur both images and their products along the rows."""
     p = first_row + wp.tid()
     column = p % width
     mean_a = wp.vec3(0.0)
@@ -119,7 +123,8 @@ def likeness_kernel(
     by_square_out: wp.array[wp.vec3],
     by_product_out: wp.array[wp.vec3],
 ):
-    """(1 - w) L1 + w (1 - SSIM) of a pixel, and the derivative of its SSIM by the blurred mean, square, product."""
+    """Compute the loss (1 - w) L1 + w (1 - SSIM) of a pixel, and the derivative of its SSIM by the blurred mean, square
+    and product."""
     p = first_row + wp.tid()
     row = p // width
     mean_a = wp.vec3(0.0)
@@ -170,7 +175,7 @@ def blur_derivatives_kernel(
     by_square_out: wp.array[wp.vec3],
     by_product_out: wp.array[wp.vec3],
 ):
-    """Along the rows: the window is its own mirror image, so the blur is its own transpose."""
+    """Blur the derivatives along the rows. The window is symmetric, so the blur is its own transpose."""
     p = first_row + wp.tid()
     column = p % width
     mean = wp.vec3(0.0)
@@ -207,7 +212,7 @@ def gradient_kernel(
     by_colour_out: wp.array[wp.vec3],
     by_alpha_out: wp.array[wp.float32],
 ):
-    """Derivative of the mean loss by the toned picture, the render's colour, and its alpha."""
+    """Compute the derivative of the mean loss by the transformed render, the render's colour, and its alpha."""
     p = first_row + wp.tid()
     row = p // width
     mean = wp.vec3(0.0)

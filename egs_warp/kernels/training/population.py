@@ -1,4 +1,7 @@
-"""What happens to every Gaussian at every step of training besides the step of Adam."""
+"""Updates of every Gaussian at every training step, other than Adam's.
+
+Host code: ``egs_warp/training/relocation.py``.
+"""
 
 import warp as wp
 
@@ -11,7 +14,7 @@ STEEPNESS = wp.constant(wp.float32(100.0))
 
 @wp.func
 def sigmoid(x: wp.float32) -> wp.float32:
-    """1 / (1 + exp(-x))."""
+    """Return 1 / (1 + exp(-x))."""
     return 1.0 / (1.0 + wp.exp(-x))
 
 
@@ -25,7 +28,7 @@ def pull_kernel(
     opacity_gradient_out: wp.array[wp.float32],
     scale_gradient_out: wp.array[wp.vec3],
 ):
-    """Add the derivatives of ``by_opacity`` times the opacities and ``by_scale`` times the scales."""
+    """Add the derivatives of ``by_opacity`` times the opacities and ``by_scale`` times the scales to the gradients."""
     n = first_row + wp.tid()
     opacity = sigmoid(opacity_logits[n])
     opacity_gradient_out[n] = opacity_gradient_out[n] + by_opacity * opacity * (1.0 - opacity)
@@ -44,10 +47,10 @@ def jitter_kernel(
     opacity_logits: wp.array[wp.float32],
     means_out: wp.array[wp.vec3],
 ):
-    """Move a mean by ``size`` times its covariance times ``noise``, the less the more opaque it is."""
+    """Move a mean by ``size`` times its covariance times ``noise``, less the more opaque it is."""
     n = first_row + wp.tid()
     gate = sigmoid(-STEEPNESS * (sigmoid(opacity_logits[n]) - faint))
-    # Above this the gate moves nothing that can be seen.
+    # A smaller gate has no visible effect.
     if gate > 1.0e-6:
         turn = rotation_from_quaternion(rotations[n])
         local = wp.transpose(turn) * noise[n]
