@@ -82,7 +82,7 @@ def _run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> 
             motion(text),
             pushes=read_pushes(PUSHES[cell]) if cell in PUSHES else (),
             get_up=cell == "get up",
-            longest=(LONGEST + 1.0) * unit,
+            max_seconds=(LONGEST + 1.0) * unit,
         )
     except (UserError, FileNotFoundError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         return {"success": False, "reason": f"stopped: {error}"}

@@ -43,7 +43,7 @@ def _distance(points: np.ndarray) -> np.ndarray:
 
 
 def _paint(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return linear albedo (n, 3) and gloss (n,): brown plastic, cream belly and snout, black eyes and nose, red scarf."""
+    """Return albedo (n, 3) and gloss (n,): brown plastic, cream belly and snout, black eyes and nose, red scarf."""
     side = _folded(points)
     x, y, z = points.T
     albedo = np.broadcast_to([0.42, 0.19, 0.07], (len(points), 3)) * (

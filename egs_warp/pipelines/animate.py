@@ -1,4 +1,4 @@
-"""The paper on one page: from a capture to a moving, rendered one."""
+"""End-to-end pipeline of a run: from a capture to its simulated and rendered motion."""
 
 from __future__ import annotations
 
@@ -32,34 +32,39 @@ from egs_warp.pipelines.plots import draw_plots
 from egs_warp.pipelines.progress import preparation_bar, simulation_bar
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import GaussianCounts, Report, report_of_run
-from egs_warp.pipelines.shot import LARGEST_SIDE, SMALLEST_SIDE, Shot
+from egs_warp.pipelines.shot import MAX_SIDE, MIN_SIDE, Shot
 from egs_warp.pipelines.simulated_run import check_frames, simulate
 
-LARGEST_FRICTION = 10.0
+MAX_FRICTION = 10.0
 
 
 @dataclass(frozen=True)
 class AnimateOptions:
-    """What a user may ask; lengths of targets are in body heights.
-    Targets hold for motions that do not say their own.
+    """Options of a run.
+
+    The targets apply to motions that do not specify their own.
     """
 
     distance: float | None = None
+    """Body heights; None is the default of the motion."""
     height: float | None = None
+    """Body heights; None is the default of the motion."""
     heading_degrees: float | None = None
+    """Degrees to the left; None is the default of the motion."""
     frames: int | None = None
-    """Pictures at 60 Hz, the first at rest; None: until the last motion has come to rest."""
+    """Frames at 60 Hz, the first at rest; None runs until the last motion has come to rest."""
     size: int = 512
-    """Pixels, both sides."""
+    """Width and height of the video, pixels."""
     seed: int = 0
-    """Written to the report; nothing in a jump is random, so it changes no result."""
+    """Written to the report. No computation is random, so it changes no result."""
     metres_per_unit: float | None = None
-    """None: such that the body is 1 m tall."""
+    """Length of one unit of the capture, m; None makes the body 1 m tall."""
     friction: float = 0.8
+    """Coulomb coefficient of the ground."""
     shadow: bool = True
-    """On the ground, under the object."""
+    """Draw a shadow on the ground under the object."""
     get_up: bool = True
-    """Whether a body that has fallen gets up and goes on."""
+    """If the body falls, get up and continue."""
 
     def __post_init__(self) -> None:
         for name, value in (("distance", self.distance), ("height", self.height)):
@@ -72,31 +77,31 @@ class AnimateOptions:
             span = f"from -{LARGEST_TURN:g} to {LARGEST_TURN:g}"
             raise ArgumentError("heading_degrees", f"give a number of degrees {span}", value=turn)
         check_frames(self.frames)
-        if not SMALLEST_SIDE <= self.size <= LARGEST_SIDE:
-            advice = f"give a number of pixels from {SMALLEST_SIDE} to {LARGEST_SIDE}"
+        if not MIN_SIDE <= self.size <= MAX_SIDE:
+            advice = f"give a number of pixels from {MIN_SIDE} to {MAX_SIDE}"
             raise ArgumentError("size", advice, value=self.size)
-        if not 0.0 <= self.friction <= LARGEST_FRICTION:
-            advice = f"give a Coulomb coefficient from 0 to {LARGEST_FRICTION:g}"
+        if not 0.0 <= self.friction <= MAX_FRICTION:
+            advice = f"give a Coulomb coefficient from 0 to {MAX_FRICTION:g}"
             raise ArgumentError("friction", advice, value=self.friction)
         if self.metres_per_unit is not None and not 1e-9 <= self.metres_per_unit <= 1e9:
-            # Single precision holds no lengths far beyond; ``make_body`` says which of these fit the body.
+            # Single precision does not represent other lengths; ``make_body`` checks which of these fit the body.
             advice = "give a positive number, from 1e-9 to 1e9"
             raise ArgumentError("metres_per_unit", advice, value=self.metres_per_unit)
 
     def targets(self) -> dict[str, float | None]:
-        """By the names that a script gives them."""
+        """Return the targets by the names that ``script`` uses."""
         return {"distance": self.distance, "height": self.height, "heading_degrees": self.heading_degrees}
 
 
 @dataclass(frozen=True)
 class RequestedOptions:
-    """Everything that was asked of a run, besides the capture and the motion; frame and units of the capture."""
+    """Requested options of a run besides the capture and the motion; frame and units of the capture."""
 
     options: AnimateOptions
     shot: Shot
     up: tuple[float, ...]
     plane: tuple[float, ...] | None
-    """nx, ny, nz, d."""
+    """Unit normal nx, ny, nz and offset d."""
     view_from: tuple[float, ...]
     gravity_up: tuple[float, ...]
     front: tuple[float, ...]
@@ -104,15 +109,18 @@ class RequestedOptions:
     beats: str | None
     style: str | None
     muscles: str | None
-    """Name of the file."""
+    """Name of the muscle file."""
     qp: str | None
     """Name of the QP solver."""
     solids: int
+    """Number of solids beside the ground."""
 
     def to_json(self) -> dict[str, Any]:
-        """``asked`` of the report; what was left to the program is null."""
-        given = {name: value or None for name, value in vars(self).items() if name not in ("options", "shot", "solids")}
-        return {**asdict(self.options), **self.shot.to_json(), **given, "solids": self.solids}
+        """Return ``asked`` of the report; options that were not given are null."""
+        values = {
+            name: value or None for name, value in vars(self).items() if name not in ("options", "shot", "solids")
+        }
+        return {**asdict(self.options), **self.shot.to_json(), **values, "solids": self.solids}
 
 
 def animate(
@@ -157,13 +165,13 @@ def animate(
     """
     options, shot = options or AnimateOptions(), shot or Shot()
     shot.check()
-    asked = script(motion, beats=beats, **options.targets())
-    asked.frames()  # reads the files that it names
-    acted = asked.style(style)
+    requested_motion = script(motion, beats=beats, **options.targets())
+    requested_motion.frames()  # Reads the files that the motions name.
+    jump_style = requested_motion.style(style)
     pushes = read_pushes(push) if push is not None else ()
     ffmpeg_program()
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
-        with preparation_bar(quiet=quiet) as begins:
+        with preparation_bar(quiet=quiet) as begin_stage:
             creature = make_creature(
                 cloud,
                 up=up,
@@ -177,33 +185,33 @@ def animate(
                 front=front,
                 seen_from=seen_from,
                 settings=settings,
-                progress=begins,
+                progress=begin_stage,
             )
         if front is None:
             notes = (*notes, creature.front.told(creature.frame))
         notes = (*notes, *capture_warnings(creature.cloud, creature.cage.mesh, creature.body.height))
-        with simulation_bar(quiet=quiet) as told:
+        with simulation_bar(quiet=quiet) as show_progress:
             performance = simulate(
                 creature,
-                asked,
+                requested_motion,
                 frames=options.frames,
-                style=acted,
+                style=jump_style,
                 pushes=pushes,
                 get_up=options.get_up,
                 parts=lambda: run.file(PARTS),
                 resume=_recorded(run),
-                progress=told,
+                progress=show_progress,
             )
-        # Whatever becomes of the film, the simulation is not lost.
+        # Saved first: an error while rendering does not lose the simulation.
         performance.trajectory.save(run.file("trajectory.npz"))
-        books = energy_balance(performance.trajectory)
-        draw_plots(run.file("plots.png"), performance.trajectory, books)
+        energy = energy_balance(performance.trajectory)
+        draw_plots(run.file("plots.png"), performance.trajectory, energy)
         with atomic_write(run.file("cage.vtu")) as temporary:
             creature.cage.mesh.write_vtu(temporary)
         film = draw_film(
             performance,
             run,
-            name=asked.name,
+            name=requested_motion.name,
             size=options.size,
             shot=shot,
             background=background,
@@ -211,9 +219,9 @@ def animate(
             shadow=options.shadow,
             quiet=quiet,
         )
-        made = RenderData.of(film.splats, film.camera, creature.muscles, performance.place.feet())
-        made.save(run.file(render_data.FILE))
-        asked_for = RequestedOptions(
+        render_data_of_run = RenderData.of(film.splats, film.camera, creature.muscles, performance.place.feet())
+        render_data_of_run.save(run.file(render_data.FILE))
+        requested = RequestedOptions(
             options,
             shot,
             up=_numbers(up),
@@ -229,20 +237,20 @@ def animate(
             solids=len(solids),
         )
         simulation = performance.simulation
-        behind = creature.placed(background) if background is not None else None
-        left = ground_coverage_warning(
-            simulation.trajectory.positions[-1], behind, creature.solids[0], creature.body.height
+        placed_background = creature.placed(background) if background is not None else None
+        coverage_warning = ground_coverage_warning(
+            simulation.trajectory.positions[-1], placed_background, creature.solids[0], creature.body.height
         )
-        notes = (*notes, *performance.cut_short(), *left)
+        notes = (*notes, *performance.cut_short(), *coverage_warning)
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
-            *(performance.sequence.done, books),
+            *(performance.sequence.done, energy),
             gaussians=GaussianCounts.of(creature, film.splats.count),
             drawing=film.milliseconds,
             source=source,
             notes=notes,
             seed=options.seed,
-            asked=asked_for.to_json(),
+            asked=requested.to_json(),
             ending=performance.ending,
         )
         report.write(run.file("report.json"))
@@ -252,7 +260,7 @@ def animate(
 
 
 def _recorded(run: RunFolder) -> Path | None:
-    """Where the steps are that a run which goes on has done already."""
+    """Return the folder with the finished steps of a resumed run; None if there are none."""
     folder = run.path / PARTS
     return folder if run.resumed and any(folder.glob("*.npz")) else None
 

@@ -1,4 +1,4 @@
-"""What happens to a run when the machine fails it: the simulation stays, nothing is half-written or mixed."""
+"""Failures of the machine during a run: the simulation is retained, and no file is partial or of another run."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_a_film_that_fails_leaves_the_simulation(
 def test_a_run_that_is_cut_off_leaves_its_steps(
     run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What was simulated is read from the parts; the next run moves them aside."""
+    """The simulated steps are read from the parts; the next run moves them aside."""
     monkeypatch.setattr("egs_warp.locomotion.recorder._STEPS_A_PART", 7)
     slid = slide()
 
@@ -104,7 +104,7 @@ def test_a_run_that_is_cut_off_leaves_its_steps(
             run(tmp_path)
     assert not finished(tmp_path) and sorted(os.listdir(tmp_path)) == [MANIFEST, PARTS]
     assert np.array_equal(read_trajectory(tmp_path / PARTS).positions, slid.trajectory().positions[:15])
-    with pytest.raises(UserError, match=r"the run was cut off; egs-warp resume .* goes on \(what it did is in"):
+    with pytest.raises(UserError, match=r"the run was cut off; egs-warp resume .* goes on \(its finished steps are in"):
         read_trajectory(tmp_path / "trajectory.npz")
     run(tmp_path, overwrite=True)
     assert sorted(os.listdir(tmp_path)) == sorted([*FILES, "earlier-1"])

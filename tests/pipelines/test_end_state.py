@@ -1,4 +1,4 @@
-"""How a run ended is in its report, its summary and its exit status, whatever the state; its files are all there."""
+"""The end state of a run is in its report, summary and exit status; all files exist in each state."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def entry(*, resting: bool = True, fell: str | None = None, got_up: bool = False
         (EndCause("tilted"), entry(), reached(), False, State.DONE, []),
         (
             *(EndCause("tilted", True), entry(resting=False), reached(), True, State.STOPPED),
-            ["stopped: the next step could not be solved, however short; this is all before it"],
+            ["stopped: the next step could not be solved, however short; the run ends before it"],
         ),
     ],
 )

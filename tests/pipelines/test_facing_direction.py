@@ -1,4 +1,4 @@
-"""Which way bodies face: by their mirror plane, and by what is before and behind."""
+"""The facing direction follows from the mirror plane, and from differences between front and back."""
 
 from __future__ import annotations
 
@@ -114,5 +114,5 @@ def test_front_is_as_given_along_the_ground(standing: PlacedCage) -> None:
 
 
 def test_a_front_that_points_up_is_refused_before_any_work(thing: BuiltInObject) -> None:
-    with pytest.raises(ArgumentError, match="front 0,0,-2: points up or down; give a way along the ground"):
+    with pytest.raises(ArgumentError, match="front 0,0,-2: points up or down; give a direction along the ground"):
         make_creature(thing.cloud, plane=thing.plane, front=np.array([0.0, 0.0, -2.0]))

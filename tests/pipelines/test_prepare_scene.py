@@ -1,4 +1,4 @@
-"""``animate SCENE --object``: slips are told first, nothing is lost, and a film comes out."""
+"""``animate SCENE --object``: invalid arguments are reported first, no file is lost, and a film is written."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monke
         else:
             nodes = ground.nodes().reshape(-1, 3)
             assert np.abs(told["ground"].heights(nodes)).max() < 1e-3
-    # Stiff: its own sag, 0.033 of its height on a coarse cage where 0.05 are asked, would hide a fall of 0.017.
+    # Stiff: its own sag, 0.033 of its height on a coarse cage where 0.05 is requested, would hide a fall of 0.017.
     creature = make_creature(prepared.object, ground=ground, sag=0.01, nodes=120)
     body, start = creature.body, creature.start.positions
     assert creature.geometry.field is not None
