@@ -219,7 +219,8 @@ def segment_scene(
         underside_notes = (f"its underside, which no view shows, was closed by {count} Gaussians",) if count else ()
     notes = (
         f"the object has {straddling_cloud.count} of {cloud.count} Gaussians;"
-        f" {int(segmentation.buried_mask.sum())} under it and {int(segmentation.floater_mask.sum())} floaters beside it were dropped",
+        f" {int(segmentation.buried_mask.sum())} under it and"
+        f" {int(segmentation.floater_mask.sum())} floaters beside it were dropped",
         f"{int((np.abs(heights) < reach).sum())} of the object's Gaussians straddled the plane: {_CLEARED[method]}"
         + (f" against {len(photographs)} photographs" if photographs and method is StraddlingPolicy.FINETUNE else ""),
         *underside_notes,

@@ -182,8 +182,8 @@ def test_what_a_gpu_has_no_room_for_is_done_in_halves(creature: Creature, monkey
     np.testing.assert_array_equal([one.trajectory.activations[0, 0] for one in made], [0.0, 1e-3, 2e-3, 3e-3])
     room = 0
     assert [one.error for one in simulate_many(creature, jobs[:2], worlds=2)] == [
-        "out of GPU memory with a single world; set worlds=0 to use worker processes: CUDA out of memory. Tried to allocate"
-        " 20.00 MiB"
+        "out of GPU memory with a single world; set worlds=0 to use worker processes: CUDA out of memory. Tried to"
+        " allocate 20.00 MiB"
     ] * 2
 
 
