@@ -50,6 +50,46 @@ _FRONT_GRID = np.pi / 2**12
 """Radians to which the facing direction is rounded, for the same reason."""
 _FOOT_HEIGHT = 0.1
 """Fraction of the height above uneven ground below which parts of the object may touch it."""
+MAX_FRICTION = 10.0
+"""Maximum Coulomb coefficient of ``CreatureOptions``."""
+
+
+@dataclass(frozen=True)
+class CreatureOptions:
+    """Options of ``make_creature``; vectors, planes and surfaces are in the frame and units of the capture."""
+
+    metres_per_unit: float | None = None
+    """Length of one unit of the capture, m; None makes the body 1 m tall."""
+    sag: float = DEFAULT_SAG
+    """Fraction of its height by which the body sags under its weight, which defines its stiffness. A body that its
+    weight would bend out of shape is made stiffer."""
+    nodes: int = 500
+    """Approximate number of cage nodes."""
+    muscles_file: Path | None = None
+    """Muscles (JSON, ``egs_warp.muscles.files``); None creates automatic ones."""
+    front: np.ndarray | None = None
+    """(3,) Direction in which the body faces and moves; None estimates it (``find_front``)."""
+    seen_from: np.ndarray | None = None
+    """(3,) Mean of the unit vectors from the object to the cameras of its photos, for the estimate of ``front``."""
+    friction: float = 0.8
+    """Coulomb coefficient of the ground, 0 to 10."""
+    ground: HeightField | None = None
+    """Ground that is not flat, in place of a plane."""
+    gravity_up: np.ndarray | None = None
+    """(3,) Direction against gravity; None is the normal of the ground, other directions make it a slope."""
+    solids: tuple[Solid, ...] = ()
+    """Steps and walls beside the ground."""
+    settings: LocomotionSettings | None = None
+    """Solver settings, such as the contact strategy and the QP solver; None is the default."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.friction <= MAX_FRICTION:
+            advice = f"give a Coulomb coefficient from 0 to {MAX_FRICTION:g}"
+            raise ArgumentError("friction", advice, value=self.friction)
+        if self.metres_per_unit is not None and not 1e-9 <= self.metres_per_unit <= 1e9:
+            # Single precision does not represent other lengths; ``make_body`` checks which of these fit the body.
+            advice = "give a positive number, from 1e-9 to 1e9"
+            raise ArgumentError("metres_per_unit", advice, value=self.metres_per_unit)
 
 
 @dataclass(frozen=True)
@@ -108,30 +148,26 @@ def make_creature(
     *,
     up: np.ndarray | None = None,
     plane: Plane | None = None,
-    metres_per_unit: float | None = None,
-    friction: float = 0.8,
-    sag: float = DEFAULT_SAG,
-    muscles_file: Path | None = None,
-    ground: HeightField | None = None,
-    solids: tuple[Solid, ...] = (),
-    gravity_up: np.ndarray | None = None,
-    front: np.ndarray | None = None,
-    seen_from: np.ndarray | None = None,
-    settings: LocomotionSettings | None = None,
-    nodes: int = 500,
+    options: CreatureOptions | None = None,
     progress: Callable[[str], object] = lambda stage: None,
 ) -> Creature:
-    """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,), or on
-    ``ground`` that is not flat.
+    """Create a creature from a capture of a single object, at rest on the ground.
 
-    All that is given is in the capture's frame and units; what is made is in the body's, so nothing hangs on how the
-    file lies. ``muscles_file``: see ``body_muscles``. ``solids`` are steps and walls beside the ground; ``gravity_up``
-    (3,) is against gravity if the ground is a slope. ``front`` (3,) is the way it faces and moves; else it is found
-    (``find_front``), with ``seen_from`` (3,), the mean of the unit vectors to the cameras of its photos, if these are
-    known. ``settings`` of its stepper choose the strategy for the contact
-    states and the QP solver. The body is as stiff as makes it sag by ``sag`` of its height; one that its weight would
-    bend out of shape is made stiffer. ``nodes``: of its cage, about. ``progress`` is told the name of each stage.
+    All arguments are in the frame and units of the capture; the result is in the frame of the body, so it does not
+    depend on the frame of the file. One of ``plane``, ``up`` and ``options.ground`` is required.
+
+    Args:
+        cloud: The capture.
+        up: (3,) Up; without a ``plane``, the ground is the base of the object, orthogonal to ``up``.
+        plane: Ground plane.
+        options: Body, muscles, ground and solver; None is the default.
+        progress: Called with the name of each stage as it starts.
+
+    Raises:
+        UserError: The ground is unknown or too steep, or the capture gives no body.
     """
+    options = options or CreatureOptions()
+    ground, gravity_up, front, sag = options.ground, options.gravity_up, options.front, options.sag
     if ground is not None:
         plane = plane_below(cloud, ground)
     normal = plane.normal if plane is not None else up
@@ -143,10 +179,10 @@ def make_creature(
     if front is not None:
         check_front(normal if gravity_up is None else gravity_up, front)
     progress("cage")
-    standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, nodes=nodes)
+    standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=options.metres_per_unit, nodes=options.nodes)
     progress("contact")
     device, frame, cage = str(cloud.device), standing.frame, standing.cage
-    solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in solids)
+    solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in options.solids)
     field = None
     if ground is not None:
         # The cage cannot deform to ground that is finer than its own edges.
@@ -157,18 +193,18 @@ def make_creature(
         (GROUND,),
         field=field,
         solids=solids,
-        friction=friction,
+        friction=options.friction,
         grid=_CONTACT_GRID * cage.height(GROUND),
         device=device,
     )
     against_gravity = None if gravity_up is None else frame.axes @ gravity_up
     progress("front")
-    facing = choose_front(standing, front, seen_from=seen_from)
+    facing = choose_front(standing, front, seen_from=options.seen_from)
     while True:
         progress("body and muscles")
         body = make_body(cage.mesh, GROUND, up=against_gravity, sag=sag, device=device)
-        muscles = body_muscles(body, muscles_file, frame)
-        stepper = LocomotionStepper(body, muscles, geometry, settings=settings, device=device)
+        muscles = body_muscles(body, options.muscles_file, frame)
+        stepper = LocomotionStepper(body, muscles, geometry, settings=options.settings, device=device)
         progress("stand")
         start = settle(stepper)
         if sag < MIN_SAG or _stands(stepper, start):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
 from egs_warp.motions.style import Style
 from egs_warp.pipelines.creature import Creature
-from egs_warp.pipelines.report import GaussianCounts, Report, report_of_run
+from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run
 from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
 
 RunSummary: TypeAlias = tuple[Report, np.ndarray, Trajectory]
@@ -76,7 +76,7 @@ class Job:
         )
         return report, simulation.frames, simulation.trajectory
 
-    def _requested_options(self) -> dict[str, Any]:
+    def _requested_options(self) -> dict[str, JsonValue]:
         """Return ``asked`` of the report."""
         return {
             "friction": self.friction,

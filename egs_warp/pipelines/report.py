@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -25,6 +25,8 @@ from egs_warp.version import __version__
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+JsonValue: TypeAlias = "bool | int | float | str | Sequence[JsonValue] | Mapping[str, JsonValue] | None"
+"""Value that can be written as JSON."""
 SCHEMA_VERSION = 1
 MECHANICS = ("warp-lang", "numpy", "scipy", "osqp", "pytetwild")
 """Packages on which the motion of a body depends."""
@@ -69,7 +71,7 @@ class MotionReport:
     notes: tuple[str, ...]
     """Notes for the user."""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, JsonValue]:
         """Return an element of ``motion``."""
         also = asdict(self.also_reached) if self.also_reached is not None else {}
         return {
@@ -182,7 +184,7 @@ class GaussianCounts:
         read, geometry = creature.cloud.count, creature.geometry
         return cls(read, read if drawn is None else drawn, geometry.excluded_count, geometry.excluded_opacity)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, JsonValue]:
         """Return ``gaussians`` of the report."""
         return {
             "in": self.read,
@@ -211,7 +213,7 @@ class Report:
     """Notes for the user."""
     device: str
     seed: int
-    asked: Mapping[str, Any] = field(default_factory=dict)
+    asked: Mapping[str, JsonValue] = field(default_factory=dict)
     """Requested options of the run, ready for JSON."""
     versions: Mapping[str, str] = field(default_factory=versions)
 
@@ -220,7 +222,7 @@ class Report:
         """State in which the run ended."""
         return State.worst(tuple(motion.state for motion in self.motion))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, JsonValue]:
         """Return the whole report, ready for JSON."""
         return {
             "schema": SCHEMA_VERSION,
@@ -292,7 +294,7 @@ def report_of_run(
     source: str,
     notes: Sequence[str],
     seed: int,
-    asked: Mapping[str, Any],
+    asked: Mapping[str, JsonValue],
     ending: EndCause | None = None,
 ) -> Report:
     """Create the report of a run.
@@ -341,7 +343,7 @@ def _motion_reports(trajectory: Trajectory, done: Sequence[MotionRecord], ending
     return tuple(reports)
 
 
-def write_report(path: Path, report: Mapping[str, Any]) -> None:
+def write_report(path: Path, report: Mapping[str, JsonValue]) -> None:
     """Write ``report`` as indented JSON, atomically."""
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(report, indent=2) + "\n")

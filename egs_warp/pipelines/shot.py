@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -18,6 +18,9 @@ from egs_warp.geometry.frames import box_corners
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from egs_warp.pipelines.report import JsonValue
 
 MIN_SIDE, MAX_SIDE = 16, 4096
 """Limits of the side of a film, pixels."""
@@ -66,7 +69,7 @@ class Shot:
         if self.camera not in list(CameraMove) and not self.camera.endswith(".json"):
             raise ArgumentError("camera", f"give {', '.join(CameraMove)} or a path.json", value=self.camera)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, JsonValue]:
         """Return the options for ``asked`` of the report."""
         options = {"camera": self.camera, "picture": self.size, "fps": self.fps, "colour": self.colour}
         return options | {"transparent": self.transparent}

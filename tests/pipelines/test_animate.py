@@ -20,7 +20,7 @@ from egs_warp.io.run_folder import MANIFEST
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.animate import AnimateOptions, animate
-from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.finished_run import PARTS, read_trajectory
 from egs_warp.pipelines.report import Report, verdict
 from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
@@ -28,7 +28,7 @@ from tests.support.disk_faults import fail_once
 from tests.support.slides import slide
 
 FILES = ["cage.vtu", "creature.npz", "jump.mp4", MANIFEST, "plots.png", "report.json", "sheet.png", "trajectory.npz"]
-OPTIONS = AnimateOptions(frames=2, size=32, friction=0.6)
+OPTIONS = AnimateOptions(frames=2, size=32, creature=CreatureOptions(friction=0.6))
 
 
 @cache
@@ -40,7 +40,7 @@ def thing() -> BuiltInObject:
 @pytest.fixture(scope="module")
 def performance() -> SimulatedRun:
     """Two pictures of a coarse pawn."""
-    creature = make_creature(thing().cloud, plane=thing().plane, friction=0.6, nodes=120)
+    creature = make_creature(thing().cloud, plane=thing().plane, options=CreatureOptions(friction=0.6, nodes=120))
     return simulate(creature, motion("jump"), frames=2)
 
 

@@ -57,7 +57,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
 def test_a_folder_belongs_to_one_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Remnants of a killed run are removed; an earlier run is rejected or moved aside; unfinished files are temporary."""
+    """Remnants of a killed run are removed; an earlier run is rejected or backed up; unfinished files are temporary."""
     photos, out = photos_of_noise(tmp_path / "photos"), tmp_path / "out"
     left = out / ".egs-pose-left"
     left.mkdir(parents=True)
