@@ -30,6 +30,8 @@ JsonValue: TypeAlias = "bool | int | float | str | Sequence[JsonValue] | Mapping
 SCHEMA_VERSION = 1
 MECHANICS = ("warp-lang", "numpy", "scipy", "osqp", "pytetwild")
 """Packages on which the motion of a body depends."""
+_KEYS = {"change": "gained", "target_error": "square_miss"}
+"""Fields of ``EnergyTotals`` and ``HopOutcome`` -> their keys in the report, whose schema is fixed."""
 NO_METADATA = "no metadata"
 """Version of a package that is missing, or was copied without its ``dist-info``."""
 
@@ -44,6 +46,10 @@ def versions(names: Sequence[str] = MECHANICS) -> dict[str, str]:
         "python": platform.python_version(),
         **{name: installed_version(name) or NO_METADATA for name in names},
     }
+
+
+def _with_keys(record: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
+    return {_KEYS.get(name, name): value for name, value in record.items()}
 
 
 def installed_version(name: str) -> str | None:
@@ -73,7 +79,7 @@ class MotionReport:
 
     def to_json(self) -> dict[str, JsonValue]:
         """Return an element of ``motion``."""
-        also = asdict(self.also_reached) if self.also_reached is not None else {}
+        also = _with_keys(asdict(self.also_reached)) if self.also_reached is not None else {}
         return {
             "name": self.name,
             "asked": dict(self.asked),
@@ -231,7 +237,7 @@ class Report:
             "asked": dict(self.asked),
             "motion": [motion.to_json() for motion in self.motion],
             "audit": asdict(self.audit),
-            "energy": asdict(self.energy),
+            "energy": _with_keys(asdict(self.energy)),
             "qp": asdict(self.qp),
             "timing": {stage: asdict(time) for stage, time in self.timing.items()},
             "cage": asdict(self.cage),

@@ -73,13 +73,15 @@ class TrainReport:
     def to_json(self) -> dict[str, Any]:
         """Return the whole report, ready for JSON, with both means under ``mean``."""
         means = ("held_out", "trained_on")
+        # ``misfit`` is the key of ``is_outlier`` in the schema.
+        scores = [{"misfit" if k == "is_outlier" else k: v for k, v in asdict(score).items()} for score in self.scores]
         values: dict[str, Any] = {}
         for name, value in asdict(self).items():
             if name in means:
                 values.setdefault("mean", {})[name] = value
             else:
                 values[name] = list(value) if isinstance(value, tuple) else value
-        return values
+        return {**values, "scores": scores}
 
     def write(self, path: Path) -> None:
         """Write the report atomically."""
