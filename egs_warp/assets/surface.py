@@ -38,12 +38,6 @@ class SurfaceSamples:
     spacing: float
     """Mean distance between neighbours, scene units."""
 
-    def concatenate(self, other: SurfaceSamples) -> SurfaceSamples:
-        """Return both sets, with the spacing of the first."""
-        return SurfaceSamples(
-            np.concatenate([self.points, other.points]), np.concatenate([self.normals, other.normals]), self.spacing
-        )
-
 
 @dataclass(frozen=True)
 class BakedLight:
