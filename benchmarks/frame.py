@@ -38,7 +38,7 @@ from egs_warp.assets import pawn
 from egs_warp.io import read_capture
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.simulated_run import simulate
 from egs_warp.render.async_render import AsyncRenderer
 from frame_time import Studio
@@ -68,7 +68,7 @@ def measure(asked: int, frames: int, *, device: str, seed: int) -> list[Row]:
     """A record of each step of the first ``frames`` of a jump; the kernels have been compiled and loaded, and a GPU's
     graphs recorded, before."""
     made = pawn(seed=seed, device=device)
-    creature = make_creature(made.cloud, plane=made.plane, nodes=asked)
+    creature = make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=asked))
     if device != "cpu":
         # Of each work the first time is as it is, the second is recorded.
         simulate(creature, motion("jump"), frames=frames)
@@ -79,7 +79,7 @@ def measure_pictures(asked: int, frames: int, *, device: str, seed: int) -> Row:
     """Milliseconds a frame of a jump with pictures, and of its stages: the step, what is waited for the bytes of the
     picture before, and to begin this one's."""
     made = pawn(gaussian_count=GAUSSIANS, seed=seed, device=device)
-    plain = make_creature(made.cloud, plane=made.plane, nodes=asked)
+    plain = make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=asked))
     stepper = _Watched(plain, SIZE)
     creature = replace(plain, stepper=stepper)
     for _ in range(2):

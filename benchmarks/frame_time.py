@@ -22,7 +22,7 @@ from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 from egs_warp.render.backdrop import grid_floor
 from egs_warp.render.compositing import PendingImage
 from egs_warp.render.rasteriser import enqueue_image, render_gaussians
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows: list[Row] = []
     for count in counts:
         made = pawn(gaussian_count=count, seed=options.seed, device=options.device)
-        creature = make_creature(made.cloud, plane=made.plane, nodes=NODES)
+        creature = make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=NODES))
         for size in SIZES:
             rows.append(measure(creature, size, repeats=5 if options.quick else 15))
             table.row(*rows[-1].values())

@@ -35,7 +35,7 @@ from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
 from egs_warp.segmentation.base_plane import find_base_plane
 from harness import Row, Table, flags, record, report, rows_of, timed, workers_flag
@@ -82,7 +82,7 @@ def _run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> 
             motion(text),
             pushes=read_pushes(PUSHES[cell]) if cell in PUSHES else (),
             get_up=cell == "get up",
-            longest=(LONGEST + 1.0) * unit,
+            max_seconds=(LONGEST + 1.0) * unit,
         )
     except (UserError, FileNotFoundError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         return {"success": False, "reason": f"stopped: {error}"}
@@ -137,9 +137,9 @@ def _body(name: str, captures: Path | None) -> Body:
 def creature_of(one: Body, nodes: int) -> Creature:
     """With a finer cage where so coarse a one falls apart."""
     try:
-        return make_creature(one.cloud, plane=one.plane, nodes=nodes)
+        return make_creature(one.cloud, plane=one.plane, options=CreatureOptions(nodes=nodes))
     except ArgumentError:
-        return make_creature(one.cloud, plane=one.plane, nodes=2 * nodes)
+        return make_creature(one.cloud, plane=one.plane, options=CreatureOptions(nodes=2 * nodes))
 
 
 def _moved(performance: SimulatedRun) -> np.ndarray:

@@ -32,7 +32,7 @@ from egs_warp.locomotion.batch import BatchStepper
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 from egs_warp.pipelines.simulated_run import simulate
 from harness import Row, Table, flags, record, report
 
@@ -186,7 +186,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = Table(nodes="d", worlds="d", steps_a_second="8.1f", halved="d", gib=".1f", apart="8.1e", **stages)
     made = pawn(seed=options.seed, device=options.device)
     for nodes in options.nodes:
-        creature = make_creature(made.cloud, plane=made.plane, nodes=nodes)
+        creature = make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=nodes))
         jump = recorded(creature, options.steps)
         for worlds in options.worlds:
             row = measure(

@@ -22,7 +22,7 @@ import numpy as np
 from egs_warp.assets import pawn
 from egs_warp.launching import available_threads
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 from egs_warp.pipelines.job import Job
 from egs_warp.pipelines.many import simulate_many
 from harness import Row, Table, flags, record, report
@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = Table(nodes="d", workers="d", steps="d", steps_a_second=".1f", of_first=".2f", loading=".1f", seconds=".0f")
     made = pawn(seed=options.seed, device=options.device)
     for nodes in options.nodes:
-        creature = make_creature(made.cloud, plane=made.plane, nodes=nodes)
+        creature = make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=nodes))
         # Kernels compile once, here, not in every worker.
         Job(motion("jump"), frames=3).run(creature)
         first = len(rows)

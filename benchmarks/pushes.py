@@ -18,7 +18,7 @@ from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.script import motion
 from egs_warp.motions.stand import StandOutcome
-from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 from egs_warp.pipelines.simulated_run import simulate
 from harness import Row, Table, flags, record, report, timed
 from sweep import bounds_broken
@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows: list[Row] = []
     for name in options.bodies[:1] if options.quick else options.bodies:
         made = scene(name, device=options.device)
-        creature = make_creature(made.object, plane=made.plane, nodes=options.nodes)
+        creature = make_creature(made.object, plane=made.plane, options=CreatureOptions(nodes=options.nodes))
         for kind in options.pushes[:1] if options.quick else options.pushes:
             (size, tried), milliseconds = timed(largest, creature, kind)
             rows.append({"body": name, "kind": kind, "largest": size, "tried": tried})

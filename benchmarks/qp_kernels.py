@@ -34,7 +34,7 @@ from egs_warp.locomotion.operator_splitting import AdmmSplitting, OperatorSplitt
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, QuadraticProgram, quadratic_program
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.simulated_run import simulate
 from harness import Row, Table, flags, report, timed
 
@@ -107,7 +107,7 @@ def recorded(body: Callable[..., Any], nodes: int, text: str, *, most: int, seed
     """The first ``most`` QPs of a motion, or all of them."""
     made = body(seed=seed, device="cpu")
     settings = LocomotionSettings(qp_solver=QpSolver.OSQP)
-    creature = make_creature(made.cloud, plane=made.plane, nodes=nodes, settings=settings)
+    creature = make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=nodes, settings=settings))
     with recording(f"{body.__name__} {text}", most) as programs:
         simulate(creature, motion(text))
     return programs

@@ -27,7 +27,7 @@ from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import write_png
 from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.facing_direction import mean_view
 from egs_warp.pipelines.film import draw_film
 from egs_warp.pipelines.ground_coverage import ground_coverage_warning
@@ -98,9 +98,9 @@ def film(
             make_creature,
             scene.object,
             plane=scene.plane,
-            ground=scene.ground,
-            seen_from=mean_view(cameras, scene.located.centre),
-            nodes=nodes,
+            options=CreatureOptions(
+                ground=scene.ground, seen_from=mean_view(cameras, scene.located.centre), nodes=nodes
+            ),
         )
         performance, seconds["animate"] = timed(simulate, creature, motion(asked.motion), frames=frames)
         made, seconds["film"] = timed(

@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -31,7 +31,7 @@ from egs_warp.io import read_capture
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.trajectory import Trajectory, measure
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import initial_stance, make_creature, place_cage
+from egs_warp.pipelines.creature import CreatureOptions, initial_stance, make_creature, place_cage
 from egs_warp.pipelines.simulated_run import simulate
 from harness import Row, Table, data_folder, flags, record, report, rows_of, timed, workers_flag
 
@@ -124,16 +124,17 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
     else:
         built_in = {"pawn": pawn, "figurine": figurine, "stool": stool}[case.body](seed=seed, device=device)
         subject = {"cloud": built_in.cloud, "plane": built_in.plane}
+    options = CreatureOptions(friction=case.friction, sag=case.sag)
     try:
         if case.height != 1.0:
-            subject["metres_per_unit"] = case.height * place_cage(**subject).frame.scale
+            options = replace(options, metres_per_unit=case.height * place_cage(**subject).frame.scale)
         if case.slope:
-            level = make_creature(**subject, friction=case.friction, sag=case.sag)
+            level = make_creature(**subject, options=options)
             ahead = initial_stance(level).ground.axes[0]
             angle = np.radians(case.slope)
             tilted = np.cos(angle) * GROUND.normal + np.sin(angle) * ahead
-            subject["gravity_up"] = level.frame.axes.T @ tilted
-        creature = make_creature(**subject, friction=case.friction, sag=case.sag)
+            options = replace(options, gravity_up=level.frame.axes.T @ tilted)
+        creature = make_creature(**subject, options=options)
         performance = simulate(creature, motion(case.motion), frames=frames, step=case.step, get_up=False)
     except (UserError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         return {"success": False, "reason": f"stopped: {error}"}

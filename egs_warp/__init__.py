@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from egs_warp.motions.script import Script, drive_script, motion
     from egs_warp.motions.style import Style, read_style
     from egs_warp.pipelines.animate import AnimateOptions, animate
-    from egs_warp.pipelines.creature import Creature, make_creature
+    from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
     from egs_warp.pipelines.job import Job
     from egs_warp.pipelines.many import JobResult, simulate_many
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
@@ -92,7 +92,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "motions.script": ("Script", "drive_script", "motion"),
     "motions.style": ("Style", "read_style"),
     "pipelines.animate": ("AnimateOptions", "animate"),
-    "pipelines.creature": ("Creature", "make_creature"),
+    "pipelines.creature": ("Creature", "CreatureOptions", "make_creature"),
     "pipelines.job": ("Job",),
     "pipelines.many": ("JobResult", "simulate_many"),
     "pipelines.simulated_run": ("SimulatedRun", "simulate"),
@@ -127,6 +127,7 @@ __all__ = [
     "Camera",
     "Click",
     "Creature",
+    "CreatureOptions",
     "Deformer",
     "Densification",
     "Drive",

@@ -19,17 +19,16 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     chosen = parser.parse_args(arguments)
     egs.use_device(chosen.device)
     built_in = egs.scene("pawn", device=chosen.device)
-    options = egs.AnimateOptions(frames=chosen.frames, size=chosen.size)
+    options = egs.AnimateOptions(
+        frames=chosen.frames, size=chosen.size, push=chosen.push, source="pawn", shot=egs.Shot(camera="follow")
+    )
     report = egs.animate(
         built_in.object,
         chosen.out,
         motion="stand 1, jump",
-        push=chosen.push,
         plane=built_in.plane,
         options=options,
-        shot=egs.Shot(camera="follow"),
         overwrite=True,
-        source="pawn",
     )
     print(report.summary())
     print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz into {chosen.out}")

@@ -23,17 +23,20 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     chosen = parser.parse_args(arguments)
     egs.use_device(chosen.device)
     built_in = egs.scene("pawn", device=chosen.device)
-    options = egs.AnimateOptions(frames=chosen.frames, size=chosen.size)
+    options = egs.AnimateOptions(
+        frames=chosen.frames,
+        size=chosen.size,
+        source="pawn",
+        creature=egs.CreatureOptions(front=np.array([1.0, 0.0, 0.0])),
+    )
     report = egs.animate(
         built_in.object,
         chosen.out,
         motion=f"hop x{chosen.hops}",
         plane=built_in.plane,
         background=built_in.background,
-        front=np.array([1.0, 0.0, 0.0]),
         options=options,
         overwrite=True,
-        source="pawn",
     )
     print(report.summary())
     print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz into {chosen.out}")

@@ -19,7 +19,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     chosen = parser.parse_args(arguments)
     egs.use_device(chosen.device)
     built_in = egs.scene("pawn", device=chosen.device)
-    options = egs.AnimateOptions(frames=chosen.frames, size=chosen.size)
+    options = egs.AnimateOptions(frames=chosen.frames, size=chosen.size, source="pawn")
     report = egs.animate(
         built_in.object,
         chosen.out,
@@ -27,7 +27,6 @@ def main(arguments: list[str] | None = None) -> egs.Report:
         plane=built_in.plane,
         options=options,
         overwrite=True,
-        source="pawn",
     )
     print(report.summary())
     print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz into {chosen.out}")

@@ -20,7 +20,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     chosen = parser.parse_args(arguments)
     egs.use_device(chosen.device)
     built_in = egs.scene("stool", device=chosen.device)
-    options = egs.AnimateOptions(frames=chosen.frames, size=chosen.size)
+    options = egs.AnimateOptions(frames=chosen.frames, size=chosen.size, source="stool")
     report = egs.animate(
         built_in.object,
         chosen.out,
@@ -28,7 +28,6 @@ def main(arguments: list[str] | None = None) -> egs.Report:
         plane=built_in.plane,
         options=options,
         overwrite=True,
-        source="stool",
     )
     print(report.summary())
     print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz into {chosen.out}")

@@ -74,7 +74,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("run")
     made = pawn(gaussian_count=6000)
-    options = AnimateOptions(frames=13, size=64)
+    options = AnimateOptions(frames=13, size=64, source="pawn")
     with coarse_cages(120):
-        animate(made.cloud, folder, plane=made.plane, options=options, source="pawn", quiet=True)
+        animate(made.cloud, folder, plane=made.plane, options=options, quiet=True)
     return folder

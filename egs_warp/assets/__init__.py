@@ -1,6 +1,6 @@
-"""Objects and rooms made by the package, to try the whole paper on: nothing to download.
+"""Built-in scenes, generated procedurally, on which the whole pipeline can be tried without a download.
 
-In: a name, a seed. Out: a cloud, its plane and cameras.
+In: a name and a seed. Out: a Gaussian cloud, its plane and a camera.
 """
 
 from egs_warp.assets.environments import SQUARE

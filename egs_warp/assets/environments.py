@@ -1,4 +1,4 @@
-"""What the built-in objects stand on: complete floors, with nothing on them."""
+"""Environments of the built-in objects: complete floors without the object."""
 
 from __future__ import annotations
 
@@ -25,14 +25,16 @@ SQUARE = 0.7
 
 
 def chess_board(*, squares: int = 8, seed: int = 1, device: str | None = None) -> GaussianCloud:
-    """A wooden board on z = 0 with a frame; the origin is the centre of a dark square of its first row, and the board
-    reaches ``squares`` squares along +x."""
+    """Create a wooden board with a frame on z = 0.
+
+    The origin is the centre of a dark square of the first row; the board has ``squares`` squares along +x.
+    """
     random = np.random.default_rng(seed)
     spacing = SQUARE / 18
     frame = 0.35
     low = np.array([-0.5 * SQUARE - frame, -0.5 * squares * SQUARE - frame])
     high = np.array([(squares - 0.5) * SQUARE + frame, 0.5 * squares * SQUARE + frame])
-    # The pawn's own row runs through the middle of the board; its squares keep their samples off the lines.
+    # The pawn's row is in the middle of the board. Without jitter no sample lies on a line between squares.
     shift = np.array([0.0, 0.5 * SQUARE])
     top = _level(low + shift, high + shift, spacing, random, jitter=0.0)
 
@@ -55,7 +57,7 @@ def chess_board(*, squares: int = 8, seed: int = 1, device: str | None = None) -
 
 
 def bedroom(*, seed: int = 1, device: str | None = None) -> GaussianCloud:
-    """Oak planks with a woven rug on z = 0, two walls with skirting at y = 2.4 and x = -2.6."""
+    """Create oak planks with a woven rug on z = 0, and two walls with skirting at y = 2.4 and x = -2.6."""
     random = np.random.default_rng(seed)
     spacing = 0.035
     floor = _level(np.array([-2.6, -2.4]), np.array([2.6, 2.4]), spacing, random)
@@ -91,7 +93,7 @@ def bedroom(*, seed: int = 1, device: str | None = None) -> GaussianCloud:
 
 
 def cloth_table(*, radius: float = 1.7, seed: int = 1, device: str | None = None) -> GaussianCloud:
-    """A round table under a checked cloth that hangs down in folds; its top is z = 0."""
+    """Create a round table under a checked cloth that hangs down in folds; its top is z = 0."""
     random = np.random.default_rng(seed)
     spacing = 0.03
     top = _level(np.full(2, -radius), np.full(2, radius), spacing, random)
@@ -113,7 +115,7 @@ def cloth_table(*, radius: float = 1.7, seed: int = 1, device: str | None = None
     skirt = SurfaceSamples(drape(angle, drop), normal / np.linalg.norm(normal, axis=1, keepdims=True), spacing)
 
     def paint(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # The cloth's own coordinates: on the skirt the pattern runs on by the length that hangs down.
+        # Coordinates in the cloth: on the skirt the pattern continues by the length that hangs down.
         flat = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
         stretch = np.minimum((np.minimum(flat, radius) - points[:, 2]) / flat, 3.0)
         u, v = points[:, 0] * stretch / 0.28, points[:, 1] * stretch / 0.28
@@ -126,7 +128,7 @@ def cloth_table(*, radius: float = 1.7, seed: int = 1, device: str | None = None
 
 
 def _grain(along: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Wood grain, 0 to 1, at positions along and across the fibre."""
+    """Return the wood grain, 0 to 1, at positions along and across the fibre."""
     ring = 7.0 * across + 0.5 * np.sin(1.7 * along + 2.0) + 0.22 * np.sin(4.1 * along + 9.0 * across)
     return np.clip(0.55 + 0.30 * np.sin(2 * np.pi * ring) + 0.15 * np.sin(2 * np.pi * (3.1 * ring + along)), 0.0, 1.0)
 
@@ -134,7 +136,7 @@ def _grain(along: np.ndarray, across: np.ndarray) -> np.ndarray:
 def _level(
     low: np.ndarray, high: np.ndarray, spacing: float, random: np.random.Generator, *, jitter: float = 0.25
 ) -> SurfaceSamples:
-    """Samples of a rectangle in z = 0, half a spacing off its edges."""
+    """Sample a rectangle in z = 0, starting half a spacing from its edges."""
     counts = np.rint((high - low) / spacing).astype(int)
     grid = np.indices(tuple(counts)).reshape(2, -1).T + 0.5
     flat = low + (high - low) / counts * (grid + random.uniform(-jitter, jitter, grid.shape))
@@ -146,7 +148,7 @@ def _level(
 def _wall(
     start: np.ndarray, end: np.ndarray, height: float, spacing: float, random: np.random.Generator
 ) -> SurfaceSamples:
-    """Samples of an upright wall from ``start`` to ``end`` (2,), facing right of that way."""
+    """Sample an upright wall from ``start`` to ``end`` (2,), with its normal to the right of that direction."""
     along = (end - start) / np.linalg.norm(end - start)
     flat = _level(np.zeros(2), np.array([np.linalg.norm(end - start), height]), spacing, random).points
     points = np.column_stack([start + flat[:, :1] * along, flat[:, 1]])
@@ -156,7 +158,7 @@ def _wall(
 def _paint_level(
     samples: SurfaceSamples, paint: Paint, random: np.random.Generator, device: str | None
 ) -> GaussianCloud:
-    """Gaussians of an unshadowed surface."""
+    """Create the Gaussians of a surface without shadows."""
     light = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
     rise = samples.normals[:, 2]
     baked = BakedLight(0.5 + 0.5 * rise, 0.5 - 0.5 * rise, np.clip(samples.normals @ light, 0.0, None))

@@ -13,7 +13,7 @@ _LOW, _HIGH = np.array([-0.46, -0.40, -0.06]), np.array([0.46, 0.40, 1.06])
 
 
 def figurine(*, gaussian_count: int = 22000, seed: int = 0, device: str | None = None) -> BuiltInObject:
-    """A bear one unit tall on the plane z = 0, facing -y; SH degree 3. Same arguments, same bits."""
+    """Create a bear one unit tall on the plane z = 0, facing -y; SH degree 3. Equal arguments give equal bits."""
     random = np.random.default_rng(seed)
     vertices, faces = surface_mesh(_distance, _LOW, _HIGH, 0.012)
     samples = even_samples(_distance, vertices, faces, gaussian_count, random)
@@ -23,7 +23,7 @@ def figurine(*, gaussian_count: int = 22000, seed: int = 0, device: str | None =
 
 
 def _folded(points: np.ndarray) -> np.ndarray:
-    """Left and right are the same."""
+    """Mirror ``points`` (n, 3) to x >= 0: the figure is symmetric."""
     return np.column_stack([np.abs(points[:, 0]), points[:, 1:]])
 
 
@@ -43,7 +43,7 @@ def _distance(points: np.ndarray) -> np.ndarray:
 
 
 def _paint(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Brown plastic, cream belly, snout and soles' edge, black eyes and nose, red scarf."""
+    """Return albedo (n, 3) and gloss (n,): brown plastic, cream belly and snout, black eyes and nose, red scarf."""
     side = _folded(points)
     x, y, z = points.T
     albedo = np.broadcast_to([0.42, 0.19, 0.07], (len(points), 3)) * (

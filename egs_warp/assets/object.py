@@ -1,4 +1,4 @@
-"""What a built-in object is."""
+"""The type of a built-in object, and the shading that all of them share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 
 KEY_LIGHT = np.array([-0.55, -0.62, 0.95])
-"""Towards the key light of every built-in scene."""
+"""(3,) Direction to the key light of every built-in scene, not normalized."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class BuiltInObject:
     cloud: GaussianCloud
     """Scene units."""
     plane: Plane
-    """What it rests on, scene units."""
+    """Ground plane, scene units."""
 
     @property
     def up(self) -> np.ndarray:
-        """(3,) unit."""
+        """(3,) Unit normal of the plane."""
         return self.plane.normal
 
 
@@ -47,11 +47,20 @@ def shade_gaussians(
     random: np.random.Generator,
     device: str | None = None,
 ) -> GaussianCloud:
-    """Gaussians of an object on z = 0: ``samples`` of its surface, its triangles for shadows, linear ``albedo`` (n, 3)
-    and ``gloss`` (n,) 0 to 1."""
+    """Create the Gaussians of an object on z = 0, with baked light.
+
+    Args:
+        samples: n samples of its surface.
+        vertices: (v, 3), scene units, of the mesh that casts shadows.
+        faces: (f, 3) triangles of that mesh.
+        albedo: (n, 3) linear.
+        gloss: (n,) 0 to 1.
+        random: Generator of the variation of the Gaussians.
+        device: Warp device; None is the current one.
+    """
     up = np.array([0.0, 0.0, 1.0])
     light = bake_light(samples, vertices, faces, up=up, light_direction=KEY_LIGHT, reach=0.35, device=device)
-    # The unseen underside sits a little inside, so that only its fuzz pokes through the plane.
+    # The hidden underside is moved a little inside, so that only the tails of its Gaussians cross the plane.
     lift = (
         0.22 * samples.spacing * np.clip(-samples.normals[:, 2:], 0.0, 1.0) * (samples.points[:, 2:] < samples.spacing)
     )

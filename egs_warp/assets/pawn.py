@@ -1,4 +1,4 @@
-"""A chess pawn, turned on a lathe from one profile, in warm lacquered wood."""
+"""A chess pawn of lacquered wood: the surface of revolution of one profile."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from egs_warp.geometry.plane import Plane
 
 _UP = np.array([0.0, 0.0, 1.0])
 
-# Cubic Bezier pieces (r, z) of the turned profile for a pawn one unit tall, from the centre of the base to the crown.
+# Cubic Bezier segments (r, z) of the profile of a pawn one unit tall, from the centre of the base to the top.
 _PROFILE = (
     ((0.000, 0.000), (0.090, 0.000), (0.180, 0.000), (0.268, 0.000)),
     ((0.268, 0.000), (0.284, 0.000), (0.292, 0.010), (0.292, 0.030)),
@@ -30,9 +30,9 @@ _HEAD_RADIUS = 0.174
 
 
 def pawn(*, gaussian_count: int = 22000, seed: int = 0, device: str | None = None) -> BuiltInObject:
-    """A pawn one unit tall on the plane z = 0; about ``gaussian_count`` Gaussians, SH degree 3.
+    """Create a pawn one unit tall on the plane z = 0 with about ``gaussian_count`` Gaussians, SH degree 3.
 
-    The same arguments give the same bits. Gaussians of the base and its rim straddle the plane as in a real capture.
+    Equal arguments give equal bits. Gaussians of the base and its rim straddle the plane as in a real capture.
     """
     random = np.random.default_rng(seed)
     samples = _turned_surface(gaussian_count, random)
@@ -43,7 +43,7 @@ def pawn(*, gaussian_count: int = 22000, seed: int = 0, device: str | None = Non
 
 
 def _profile(points_per_piece: int = 400) -> tuple[np.ndarray, np.ndarray]:
-    """Points (m, 2) as (r, z) along the outline and their arc length (m,)."""
+    """Return points (m, 2) as (r, z) along the outline, and their arc length (m,)."""
     t = np.linspace(0.0, 1.0, points_per_piece, endpoint=False)[:, None]
     pieces = [
         (1 - t) ** 3 * a + 3 * (1 - t) ** 2 * t * b + 3 * (1 - t) * t**2 * c + t**3 * d
@@ -61,7 +61,7 @@ def _profile(points_per_piece: int = 400) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _turned_surface(count: int, random: np.random.Generator) -> SurfaceSamples:
-    """Rings of evenly spaced points around the axis, slightly shaken so that no grid shows."""
+    """Sample rings of evenly spaced points around the axis, with a small jitter so that no grid is visible."""
     outline, arc = _profile()
     area = float(np.sum(np.pi * (outline[1:, 0] + outline[:-1, 0]) * np.diff(arc)))
     spacing = np.sqrt(area / count)
@@ -74,7 +74,7 @@ def _turned_surface(count: int, random: np.random.Generator) -> SurfaceSamples:
         s = np.clip((ring + 0.5 + random.uniform(-0.3, 0.3, around)) * arc[-1] / ring_count, 0.0, arc[-1])
         angle = 2.0 * np.pi * (np.arange(around) + random.uniform() + random.uniform(-0.3, 0.3, around)) / around
         r, z = np.interp(s, arc, outline[:, 0]), np.interp(s, arc, outline[:, 1])
-        # A central difference over a small stretch rounds the corners of the profile as sandpaper does.
+        # A central difference over 0.012 of the arc length rounds the corners of the profile.
         dr = np.interp(s + 0.006, arc, outline[:, 0]) - np.interp(s - 0.006, arc, outline[:, 0])
         dz = np.interp(s + 0.006, arc, outline[:, 1]) - np.interp(s - 0.006, arc, outline[:, 1])
         length = np.hypot(dr, dz)
@@ -84,7 +84,7 @@ def _turned_surface(count: int, random: np.random.Generator) -> SurfaceSamples:
 
 
 def _turned_mesh(rings: int = 160, around: int = 96) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of the pawn, for shadows only."""
+    """Return vertices (v, 3) and triangles (f, 3) of the pawn, used for shadows only."""
     outline, arc = _profile()
     s = np.linspace(0.0, arc[-1], rings)
     r, z = np.interp(s, arc, outline[:, 0]), np.interp(s, arc, outline[:, 1])
@@ -100,13 +100,13 @@ def _turned_mesh(rings: int = 160, around: int = 96) -> tuple[np.ndarray, np.nda
 
 
 def _wood(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Linear albedo (n, 3) and gloss (n,) of a boxwood whose year rings run up the piece, off its axis."""
+    """Return linear albedo (n, 3) and gloss (n,) of wood whose growth rings have a vertical axis beside the pawn's."""
     x, y, z = points.T
     wobble = 0.012 * np.sin(5.3 * z + 1.0) + 0.006 * np.sin(17.0 * z + 9.0 * x)
     ring_radius = np.hypot(x - 0.42 + wobble, y + 0.23 - 0.6 * wobble)
     rings = ring_radius / 0.034
     phase = rings - np.floor(rings)
-    # Late wood darkens slowly and stops at once, as year rings do; the edge is softened to what the Gaussians resolve.
+    # Late wood darkens slowly and ends abruptly, as growth rings do; the edge is softened to what Gaussians resolve.
     late = phase**3 * (1.0 - np.clip((phase - 0.88) / 0.12, 0.0, 1.0))
     fibre = 0.5 + 0.5 * np.sin(230.0 * np.arctan2(y + 0.23, x - 0.42) + 6.0 * np.sin(9.0 * z))
     tone = 1.0 - 0.85 * late - 0.10 * fibre - 0.05 * np.sin(3.1 * z + 7.0 * x)

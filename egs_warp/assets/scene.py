@@ -21,58 +21,58 @@ from egs_warp.geometry.plane import Plane
 
 @dataclass(frozen=True)
 class Scene:
-    """An object standing on its plane in a room. The object is one unit tall, or two long if it lies."""
+    """An object on its plane in an environment. The object is one unit tall, or two units long if it lies."""
 
     name: str
     object: GaussianCloud
     """Scene units."""
     background: GaussianCloud
-    """The whole room without the object: the truth for what inpainting must find under it."""
+    """The complete environment without the object, scene units: the reference for inpainting."""
     plane: Plane
-    """What the object stands on."""
+    """Ground plane under the object, scene units."""
     eye: np.ndarray
-    """(3,) suggested camera position."""
+    """(3,) Suggested camera position, scene units."""
     target: np.ndarray
-    """(3,) what it looks at."""
+    """(3,) Point at the centre of the image, scene units."""
 
     @property
     def up(self) -> np.ndarray:
-        """(3,) unit."""
+        """(3,) Unit normal of the plane."""
         return self.plane.normal
 
     def whole(self) -> tuple[GaussianCloud, np.ndarray]:
-        """Object and room as one capture, and which of its Gaussians (n,) bool are the object's."""
+        """Return object and environment as one capture, and the mask (n,) bool of the object's Gaussians."""
         mask = np.zeros(self.object.count + self.background.count, bool)
         mask[: self.object.count] = True
         return concatenate(self.object, self.background), mask
 
     def camera(self, *, width: int = 512, height: int = 512) -> Camera:
-        """The suggested camera."""
+        """Return the suggested camera for an image of ``width`` x ``height`` pixels."""
         return Camera.look_at(self.eye, self.target, self.up, width=width, height=height, vertical_fov_degrees=40.0)
 
 
-_MADE: Mapping[str, tuple[Callable[..., BuiltInObject], Callable[..., GaussianCloud], tuple, tuple]] = {
+_SCENES: Mapping[str, tuple[Callable[..., BuiltInObject], Callable[..., GaussianCloud], tuple, tuple]] = {
     "pawn": (pawn, chess_board, (1.2, -3.6, 1.7), (0.55, 0.0, 0.42)),
     "stool": (stool, bedroom, (1.5, -2.9, 1.75), (0.0, 0.1, 0.42)),
     "figurine": (figurine, cloth_table, (0.9, -3.0, 1.55), (0.0, 0.0, 0.40)),
     "snake": (snake, bedroom, (2.3, -2.3, 1.35), (0.0, -0.25, 0.1)),
 }
 
-BUILT_IN_SCENES: tuple[str, ...] = tuple(_MADE)
-"""Names that ``scene`` knows."""
+BUILT_IN_SCENES: tuple[str, ...] = tuple(_SCENES)
+"""Names that ``scene`` accepts."""
 
 
 def scene(name: str, *, seed: int = 0, device: str | None = None) -> Scene:
-    """A built-in scene by name; the same arguments give the same bits. Raises ``UserError`` for an unknown name."""
-    if name not in _MADE:
+    """Create the built-in scene ``name``. Equal arguments give equal bits. Raises ``UserError`` for an unknown name."""
+    if name not in _SCENES:
         raise UserError(f"scene {name!r} is unknown; built in are {', '.join(BUILT_IN_SCENES)}")
-    make_object, make_room, eye, target = _MADE[name]
-    thing = make_object(seed=seed, device=device)
+    make_object, make_environment, eye, target = _SCENES[name]
+    built = make_object(seed=seed, device=device)
     return Scene(
         name=name,
-        object=thing.cloud,
-        background=make_room(seed=seed + 1, device=device),
-        plane=thing.plane,
+        object=built.cloud,
+        background=make_environment(seed=seed + 1, device=device),
+        plane=built.plane,
         eye=np.array(eye),
         target=np.array(target),
     )

@@ -1,4 +1,4 @@
-"""A snake that lies in a shallow bend, its head a little raised."""
+"""A snake that lies in a shallow bend, with its head slightly raised."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _TAIL = 1.0
 
 
 def snake(*, gaussian_count: int = 22000, seed: int = 0, device: str | None = None) -> BuiltInObject:
-    """A snake two units long on the plane z = 0, facing -y; SH degree 3. Same arguments, same bits."""
+    """Create a snake two units long on the plane z = 0, facing -y; SH degree 3. Equal arguments give equal bits."""
     random = np.random.default_rng(seed)
     vertices, faces = surface_mesh(_distance, _LOW, _HIGH, 0.012)
     samples = even_samples(_distance, vertices, faces, gaussian_count, random)
@@ -24,12 +24,12 @@ def snake(*, gaussian_count: int = 22000, seed: int = 0, device: str | None = No
 
 
 def _bend(y: np.ndarray) -> np.ndarray:
-    """x of its middle line."""
+    """Return x of the centre line at ``y`` (n,)."""
     return 0.045 * np.sin(2.0 * np.pi * y / 1.3)
 
 
 def _straight(points: np.ndarray) -> np.ndarray:
-    """As if it lay along y."""
+    """Remove the bend from ``points`` (n, 3): the centre line becomes the y axis."""
     return points - np.outer(_bend(points[:, 1]), [1.0, 0.0, 0.0])
 
 
@@ -48,12 +48,12 @@ def _distance(points: np.ndarray) -> np.ndarray:
 
 
 def _folded(points: np.ndarray) -> np.ndarray:
-    """Left and right are the same."""
+    """Mirror ``points`` (n, 3) to x >= 0: the snake is symmetric."""
     return np.column_stack([np.abs(points[:, 0]), points[:, 1:]])
 
 
 def _paint(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Green back with dark-edged ochre saddles, cream belly, amber eyes with a slit."""
+    """Return albedo (n, 3) and gloss (n,): green back with dark-edged ochre saddles, cream belly, amber slit eyes."""
     straight = _straight(points)
     side = _folded(straight)
     x, y, z = straight.T

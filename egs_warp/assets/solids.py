@@ -1,4 +1,4 @@
-"""Objects modelled as signed distances, and even samples of their surface."""
+"""Signed distance functions of the built-in objects, and even samples of their zero level set."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Distance = Callable[[np.ndarray], np.ndarray]
 
 
 def rounded_box(points: np.ndarray, centre: np.ndarray, half: np.ndarray, radius: float) -> np.ndarray:
-    """Box of half sides ``half`` (3,) with edges rounded by ``radius``."""
+    """Return the distance to a box with half sides ``half`` (3,) and edges rounded by ``radius``."""
     q = np.abs(points - centre) - (np.asarray(half) - radius)
     outside = np.linalg.norm(np.maximum(q, 0.0), axis=1)
     return outside + np.minimum(q.max(axis=1), 0.0) - radius
@@ -24,27 +24,27 @@ def rounded_box(points: np.ndarray, centre: np.ndarray, half: np.ndarray, radius
 def tapered_rod(
     points: np.ndarray, start: np.ndarray, end: np.ndarray, start_radius: float, end_radius: float
 ) -> np.ndarray:
-    """Rod from ``start`` to ``end`` (3,) whose radius changes linearly, with round ends."""
+    """Return the distance to a rod from ``start`` to ``end`` (3,) with round ends and a linearly changing radius."""
     axis = np.asarray(end, float) - start
     t = np.clip((points - start) @ axis / (axis @ axis), 0.0, 1.0)
     return np.linalg.norm(points - start - t[:, None] * axis, axis=1) - (start_radius + t * (end_radius - start_radius))
 
 
 def ellipsoid(points: np.ndarray, centre: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """Ellipsoid; the distance is exact on the surface to first order."""
+    """Return the distance to an ellipsoid, exact to first order at the surface."""
     q = points - centre
     k0, k1 = np.linalg.norm(q / radii, axis=1), np.linalg.norm(q / np.square(radii), axis=1)
     return k0 * (k0 - 1.0) / np.maximum(k1, 1e-12)
 
 
 def smooth_union(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
-    """Union with a fillet of about ``width``."""
+    """Return the distance to the union of ``a`` and ``b``, with a fillet of about ``width``."""
     h = np.clip(0.5 + 0.5 * (b - a) / width, 0.0, 1.0)
     return b + (a - b) * h - width * h * (1.0 - h)
 
 
 def surface_mesh(distance: Distance, low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of the surface inside the box, by marching cubes: vertices (v, 3), faces (f, 3)."""
+    """Return vertices (v, 3) and triangles (f, 3) of the surface inside the box, by marching cubes."""
     counts = np.ceil((high - low) / step).astype(int) + 1
     lattice = low + step * np.indices(tuple(counts)).reshape(3, -1).T
     values = distance(lattice).reshape(counts)
@@ -55,11 +55,11 @@ def surface_mesh(distance: Distance, low: np.ndarray, high: np.ndarray, step: fl
 def even_samples(
     distance: Distance, vertices: np.ndarray, faces: np.ndarray, count: int, random: np.random.Generator
 ) -> SurfaceSamples:
-    """About ``count`` points spread evenly: drawn by area, pushed apart along the surface, put back onto it."""
+    """Sample ``count`` points evenly: draw them by area, then push them apart along the surface and project them."""
     corners = vertices[faces]
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     spacing = float(np.sqrt(areas.sum() / count))
-    # Stratified along the running area, so that no face is crowded from the start.
+    # Stratified along the cumulative area, so that no face is crowded at the start.
     drawn = np.searchsorted(np.cumsum(areas), areas.sum() * (np.arange(count) + random.uniform(size=count)) / count)
     u = random.uniform(size=(count, 2))
     u = np.where(u.sum(axis=1, keepdims=True) > 1.0, 1.0 - u, u)
@@ -79,6 +79,6 @@ def even_samples(
 
 
 def _gradient(distance: Distance, points: np.ndarray, step: float) -> np.ndarray:
-    """(m, 3) unit gradient by central differences over a stretch that rounds edges as sandpaper does."""
+    """Return the unit gradient (m, 3) by central differences; the large ``step`` rounds edges."""
     gradient = np.stack([distance(points + step * axis) - distance(points - step * axis) for axis in np.eye(3)], axis=1)
     return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)

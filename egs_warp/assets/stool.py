@@ -14,7 +14,7 @@ _SEAT = 0.56
 
 
 def stool(*, gaussian_count: int = 24000, seed: int = 0, device: str | None = None) -> BuiltInObject:
-    """A stool one unit tall on the plane z = 0, facing -y; SH degree 3. Same arguments, same bits."""
+    """Create a stool one unit tall on the plane z = 0, facing -y; SH degree 3. Equal arguments give equal bits."""
     random = np.random.default_rng(seed)
     vertices, faces = surface_mesh(_distance, _LOW, _HIGH, 0.012)
     samples = even_samples(_distance, vertices, faces, gaussian_count, random)
@@ -24,7 +24,7 @@ def stool(*, gaussian_count: int = 24000, seed: int = 0, device: str | None = No
 
 
 def _frame(points: np.ndarray) -> np.ndarray:
-    """Legs, seat board and back."""
+    """Return the distance to legs, seat board and back."""
     mirrored = np.abs(points[:, :2])
     folded = np.column_stack([mirrored, points[:, 2]])
     leg = tapered_rod(folded, np.array([0.30, 0.30, -0.06]), np.array([0.225, 0.225, _SEAT]), 0.040, 0.052)

@@ -1,4 +1,7 @@
-"""From a sampled surface to flat Gaussians with baked light: what every built-in object and room shares."""
+"""Flat Gaussians with baked light from samples of a surface, for built-in objects and environments.
+
+The ray tracing kernel is in ``egs_warp/kernels/assets/baked_light.py``.
+"""
 
 from __future__ import annotations
 
@@ -31,27 +34,21 @@ class SurfaceSamples:
     points: np.ndarray
     """(n, 3) float64, scene units."""
     normals: np.ndarray
-    """(n, 3) float64, unit, outward."""
+    """(n, 3) float64, unit vectors, outward."""
     spacing: float
-    """Distance between neighbours, scene units."""
-
-    def joined(self, other: SurfaceSamples) -> SurfaceSamples:
-        """Both sets, at the first one's spacing."""
-        return SurfaceSamples(
-            np.concatenate([self.points, other.points]), np.concatenate([self.normals, other.normals]), self.spacing
-        )
+    """Mean distance between neighbours, scene units."""
 
 
 @dataclass(frozen=True)
 class BakedLight:
-    """Light that reaches each sample, each 0 to 1, before the surface's own colour."""
+    """Light that reaches each sample, 0 to 1, before it is multiplied by the albedo."""
 
     sky: np.ndarray
-    """(n,) cosine-weighted share of the hemisphere that sees the sky."""
+    """(n,) Cosine-weighted fraction of the hemisphere that sees the sky."""
     ground: np.ndarray
-    """(n,) the same for lit ground."""
+    """(n,) Cosine-weighted fraction of the hemisphere that sees lit ground."""
     key: np.ndarray
-    """(n,) visible share of the key light times the cosine of incidence."""
+    """(n,) Visible fraction of the key light times the cosine of incidence."""
 
 
 def bake_light(
@@ -66,7 +63,19 @@ def bake_light(
     light_softness: float = 0.12,
     device: str | None = None,
 ) -> BakedLight:
-    """Trace ambient and key-light rays against (v, 3) vertices and (f, 3) faces and, if given, level ground."""
+    """Trace ambient and key-light rays against a mesh and level ground.
+
+    Args:
+        samples: n surface samples that receive light.
+        occluder_vertices: (v, 3) scene units.
+        occluder_faces: (f, 3) triangles.
+        up: (3,) unit vector.
+        light_direction: (3,) to the key light.
+        reach: Length of the ambient rays, and the distance over which the object shades the ground, scene units.
+        ground_height: Scene units along ``up``; None means no ground.
+        light_softness: Tangent of the half angle of the key light, which is a disc.
+        device: Warp device; None is the current one.
+    """
     mesh = wp.Mesh(
         points=wp.array(np.asarray(occluder_vertices, np.float32), dtype=wp.vec3, device=device),
         indices=wp.array(np.asarray(occluder_faces, np.int32).ravel(), dtype=wp.int32, device=device),
@@ -93,10 +102,10 @@ def bake_light(
         outputs=outputs,
         device=device,
     )
-    sky, ground, seen = (output.numpy().astype(np.float64) for output in outputs)
-    # Light that bounces between the walls of a crease, which single rays miss.
+    sky, ground, key_visible = (output.numpy().astype(np.float64) for output in outputs)
+    # Approximates light that bounces inside creases, which single rays miss.
     sky = 0.12 + 0.88 * sky
-    return BakedLight(sky, ground, seen * np.clip(samples.normals @ light, 0.0, None))
+    return BakedLight(sky, ground, key_visible * np.clip(samples.normals @ light, 0.0, None))
 
 
 def lit_colour(
@@ -107,13 +116,13 @@ def lit_colour(
     sky_colour: tuple[float, float, float] = (0.40, 0.45, 0.54),
     ground_colour: tuple[float, float, float] = (0.26, 0.20, 0.15),
 ) -> np.ndarray:
-    """Display colour (n, 3), 0 to 1, of linear ``albedo`` (n, 3) under the baked light."""
+    """Return the display colour (n, 3), 0 to 1, of the linear ``albedo`` (n, 3) under the baked light."""
     linear = albedo * (
         light.key[:, None] * np.array(key_colour)
         + light.sky[:, None] * np.array(sky_colour)
         + light.ground[:, None] * np.array(ground_colour)
     )
-    # A soft shoulder keeps lit parts from clipping to flat white.
+    # The soft shoulder prevents lit parts from clipping to white.
     return np.clip(1.0 - np.exp(-1.25 * linear), 0.0, 1.0) ** (1.0 / 2.2)
 
 
@@ -124,11 +133,16 @@ def sh_from_colour(
     *,
     lobe_colour: tuple[float, float, float] = (1.0, 0.95, 0.86),
 ) -> np.ndarray:
-    """Degree-3 coefficients (n, 16, 3): ``colour`` (n, 3) plus a smooth highlight seen by a viewer who stands along
-    ``lobe_directions`` (n, 3, from the surface), of peak ``lobe_strength`` (n,).
+    """Return SH coefficients of degree 3 (n, 16, 3): ``colour`` (n, 3) plus a smooth highlight.
 
     The lobe is zonal, with band weights 1, 0.9, 0.6, 0.25 of a delta: its negative ring stays below 6 % of the peak.
-    SH see the direction from the camera to the Gaussian, hence the minus sign.
+    SH are evaluated in the direction from the camera to the Gaussian, hence the minus sign.
+
+    Args:
+        colour: (n, 3) 0 to 1.
+        lobe_directions: (n, 3) unit vectors from the surface to a viewer at the peak of the highlight.
+        lobe_strength: (n,) peak of the highlight.
+        lobe_colour: Colour of the highlight.
     """
     x, y, z = (-lobe_directions).T
     xx, yy, zz = x * x, y * y, z * z
@@ -168,15 +182,15 @@ def sh_from_colour(
 
 
 def highlight_directions(normals: np.ndarray, light_direction: np.ndarray) -> np.ndarray:
-    """(n, 3) unit mirror directions of the key light."""
+    """Return the unit directions (n, 3) in which the surface mirrors the key light."""
     light = np.asarray(light_direction, float) / np.linalg.norm(light_direction)
     return 2.0 * (normals @ light)[:, None] * normals - light
 
 
 def quaternions_from_normals(normals: np.ndarray, spin: np.ndarray) -> np.ndarray:
-    """(n, 4) unit quaternions wxyz whose third axis is the normal, turned about it by ``spin`` (n,) radians."""
+    """Return unit quaternions (n, 4) wxyz whose third axis is the normal, rotated about it by ``spin`` (n,) radians."""
     x, y, z = normals.T
-    # Shortest turn from +z; the half-turn has no shortest one, so any horizontal axis serves.
+    # The shortest rotation from +z. For -z it is not unique; any horizontal axis is valid.
     tilt = np.stack([1.0 + z, -y, x, np.zeros_like(x)], axis=1)
     tilt[z < -1.0 + 1e-9] = [0.0, 1.0, 0.0, 0.0]
     tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
@@ -195,9 +209,18 @@ def flat_gaussians(
     thickness: float = 0.12,
     device: str | None = None,
 ) -> GaussianCloud:
-    """Gaussians lying on the surface; ``width`` and ``thickness`` are standard deviations in units of the spacing.
+    """Create Gaussians that lie on the surface.
 
-    Sizes, elongation, opacity and depth vary as an optimiser leaves them.
+    Sizes, elongation, opacity and depth vary as in an optimised capture.
+
+    Args:
+        samples: n surface samples.
+        sh: (n, k, 3) SH coefficients.
+        random: Generator of the variation.
+        opacity: Mean opacity, in logit space.
+        width: Standard deviation along the surface, in units of the spacing.
+        thickness: Standard deviation along the normal, in units of the spacing.
+        device: Warp device; None is the current one.
     """
     count = len(samples.points)
     depth = random.normal(0.0, 0.10, count).clip(-0.25, 0.25) * samples.spacing

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,7 @@ from egs_warp.errors import UserError
 if TYPE_CHECKING:
     from egs_warp.commands.scene_input import SceneInput
     from egs_warp.io.run_folder import RunFolder
+    from egs_warp.pipelines.animate import AnimateOptions
     from egs_warp.pipelines.prepare_scene import PreparedScene
     from egs_warp.pipelines.report import Report
 
@@ -143,8 +145,8 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
     for name in ("cameras", "view", "mask_model", "straddling", "inpainter", "trust", "no_inpaint"):
         if getattr(chosen, name) not in (None, False):
             raise UserError(f"--{name.replace('_', '-')}: needs --object, which says what to take out of a scene")
-    asked = _asked(chosen)
-    asked["shot"], behind = shot_of(chosen)
+    options = _options(chosen)
+    shot, behind = shot_of(chosen)
     ffmpeg_program()
     start_device(chosen.device)
     up = parse_up(chosen.up) if chosen.up is not None else None
@@ -162,13 +164,17 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
         report = animate(
             capture.cloud,
             run,
+            motion=chosen.motion,
             up=up,
             plane=plane,
-            ground=ground_of(chosen.plane, flat=chosen.flat),
             background=background,
-            view_from=view_from,
-            notes=notes,
-            **asked,
+            options=replace(
+                options,
+                shot=shot,
+                view_from=view_from,
+                notes=notes,
+                creature=replace(options.creature, ground=ground_of(chosen.plane, flat=chosen.flat)),
+            ),
         )
         run.finish()
     return report, f", {NAME}"
@@ -188,19 +194,18 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
         raise UserError("--background: with --object the rest of the scene is behind the object; leave one of them out")
     if chosen.inpainter is not None and chosen.no_inpaint:
         raise UserError("--inpainter: --no-inpaint leaves the floor as captured; leave one of them out")
-    asked = _asked(chosen)
-    asked["shot"] = shot
+    options = _options(chosen)
     ffmpeg_program()
     start_device(chosen.device)
     inpainter = chosen_inpainter(chosen)
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     given = read_scene(chosen)
-    options = SceneOptions(
+    scene_options = SceneOptions(
         clearing=clearing_of(chosen), flat=chosen.flat, inpaint=not chosen.no_inpaint, inpainter=inpainter
     )
     with run_folder(chosen.out, overwrite=chosen.overwrite, resume=chosen.resume) as run:
         run.begin_with(lambda: write_config(run.file(NAME), chosen, chosen.parser))
-        scene = given.prepared(options)
+        scene = given.prepared(scene_options)
         # Whatever goes wrong later, the minutes that these took are not lost.
         scene.write(run)
         pictures = _write_pictures(run, given, scene)
@@ -209,13 +214,20 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
         report = animate(
             scene.object,
             run,
+            motion=chosen.motion,
             plane=scene.plane,
-            ground=scene.ground,
             background=scene.background,
-            view_from=view_from if view_from is not None else viewing_directions(scene, given.cameras),
-            seen_from=mean_view(given.cameras, scene.located.centre),
-            notes=(*given.notes, *scene.notes),
-            **asked,
+            options=replace(
+                options,
+                shot=shot,
+                view_from=view_from if view_from is not None else viewing_directions(scene, given.cameras),
+                notes=(*given.notes, *scene.notes),
+                creature=replace(
+                    options.creature,
+                    ground=scene.ground,
+                    seen_from=mean_view(given.cameras, scene.located.centre),
+                ),
+            ),
         )
         run.finish()
     return report, ", ".join(["", NAME, "object.ply", "background.ply", "plane.json", *pictures])
@@ -244,20 +256,26 @@ def _write_pictures(run: RunFolder, given: SceneInput, scene: PreparedScene) -> 
     return list(pictures)
 
 
-def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
-    """What the flags say of the motion, as arguments of ``animate``.
-    Raises ``UserError`` for what can be told at once.
-    """
+def _options(chosen: argparse.Namespace) -> AnimateOptions:
+    """Return the options that the flags define without the capture. Raises ``UserError`` for invalid flags."""
     from egs_warp.contact.terrain import read_terrain
     from egs_warp.io.text import parse_json, read_text
     from egs_warp.locomotion.settings import LocomotionSettings
     from egs_warp.motions.push import read_pushes
     from egs_warp.motions.script import motion
     from egs_warp.pipelines.animate import AnimateOptions
+    from egs_warp.pipelines.creature import CreatureOptions
 
-    numbers = ("distance", "height", "heading_degrees", "frames", "seed", "metres_per_unit", "friction")
-    given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}
-    options = AnimateOptions(**given, shadow=not chosen.no_shadow, get_up=not chosen.no_get_up)
+    def given(*names: str) -> dict[str, Any]:
+        return {name: getattr(chosen, name) for name in names if getattr(chosen, name) is not None}
+
+    options = AnimateOptions(
+        **given("distance", "height", "heading_degrees", "beats", "style", "push", "frames", "seed"),
+        shadow=not chosen.no_shadow,
+        get_up=not chosen.no_get_up,
+        source=Path(chosen.capture).name,
+        creature=CreatureOptions(**given("metres_per_unit", "friction")),
+    )
     # The files of key frames are read, too.
     asked = motion(chosen.motion, beats=chosen.beats, **options.targets())
     asked.frames()
@@ -266,16 +284,12 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
         read_pushes(chosen.push)
     if chosen.muscles is not None:
         parse_json(read_text(chosen.muscles), chosen.muscles)
-    return {
-        "motion": chosen.motion,
-        "push": chosen.push,
-        "beats": chosen.beats,
-        "style": chosen.style,
-        "front": parse_direction("front", chosen.front) if chosen.front is not None else None,
-        "gravity_up": parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up is not None else None,
-        "muscles_file": chosen.muscles,
-        "solids": read_terrain(chosen.terrain) if chosen.terrain else (),
-        "settings": LocomotionSettings(qp_solver=chosen.qp),
-        "options": options,
-        "source": Path(chosen.capture).name,
-    }
+    creature = replace(
+        options.creature,
+        front=parse_direction("front", chosen.front) if chosen.front is not None else None,
+        gravity_up=parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up is not None else None,
+        muscles_file=chosen.muscles,
+        solids=read_terrain(chosen.terrain) if chosen.terrain else (),
+        settings=LocomotionSettings(qp_solver=chosen.qp),
+    )
+    return replace(options, creature=creature)

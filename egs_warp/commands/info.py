@@ -33,14 +33,14 @@ def _info(chosen: argparse.Namespace) -> int:
     from egs_warp.commands.scene_input import plane_of
     from egs_warp.errors import UserError
     from egs_warp.io import read_capture
-    from egs_warp.pipelines.animate import AnimateOptions
+    from egs_warp.pipelines.creature import CreatureOptions
     from egs_warp.pipelines.info import draw_info, inspect_capture
     from egs_warp.pipelines.progress import info_bar
 
     if chosen.plot is not None and chosen.plot.suffix.lower() != ".png":
         raise UserError(f"--plot {chosen.plot}: give the name of a .png")
     start_device("cpu")
-    options = AnimateOptions(metres_per_unit=chosen.metres_per_unit)
+    options = CreatureOptions(metres_per_unit=chosen.metres_per_unit)
     up = parse_up(chosen.up) if chosen.up is not None else None
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
     front = parse_direction("front", chosen.front) if chosen.front is not None else None

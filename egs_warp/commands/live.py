@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -88,8 +89,7 @@ def _session(chosen: argparse.Namespace) -> Session:
     from egs_warp.io.text import parse_json, read_text
     from egs_warp.locomotion.settings import LocomotionSettings
     from egs_warp.meshing.cage import check_nodes
-    from egs_warp.pipelines.animate import AnimateOptions
-    from egs_warp.pipelines.creature import make_creature
+    from egs_warp.pipelines.creature import CreatureOptions, make_creature
     from egs_warp.pipelines.progress import preparation_bar
     from egs_warp.web.feed import drawn_creature
     from egs_warp.web.presplit import presplit_gaussians
@@ -99,7 +99,7 @@ def _session(chosen: argparse.Namespace) -> Session:
     check_nodes(chosen.nodes)
     if chosen.muscles is not None:
         parse_json(read_text(chosen.muscles), chosen.muscles)
-    options = AnimateOptions(friction=chosen.friction, metres_per_unit=chosen.metres_per_unit)
+    options = CreatureOptions(friction=chosen.friction, metres_per_unit=chosen.metres_per_unit)
     up = parse_up(chosen.up) if chosen.up is not None else None
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
     front = parse_direction("front", chosen.front) if chosen.front is not None else None
@@ -112,13 +112,14 @@ def _session(chosen: argparse.Namespace) -> Session:
             capture.cloud,
             up=up,
             plane=plane,
-            ground=ground_of(chosen.plane, flat=False),
-            metres_per_unit=options.metres_per_unit,
-            friction=options.friction,
-            front=front,
-            muscles_file=chosen.muscles,
-            settings=LocomotionSettings(qp_solver=chosen.qp),
-            nodes=chosen.nodes,
+            options=replace(
+                options,
+                ground=ground_of(chosen.plane, flat=False),
+                front=front,
+                muscles_file=chosen.muscles,
+                settings=LocomotionSettings(qp_solver=chosen.qp),
+                nodes=chosen.nodes,
+            ),
             progress=begins,
         )
         begins("split")

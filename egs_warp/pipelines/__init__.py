@@ -1,4 +1,4 @@
-"""Whole ways on one page: scene to object, object to creature, creature to film (all of the paper's section 3).
+"""End-to-end pipelines: scene to object, object to creature, creature to film (section 3 of the paper).
 
-In: a capture and what is asked of it. Out: files, and records of what was found, planned and reached.
+In: a capture and options. Out: files, and records of the measured, planned and reached values.
 """

@@ -1,65 +1,76 @@
-"""The paper on one page: from a capture to a moving, rendered one."""
+"""End-to-end pipeline of a run: from a capture to its simulated and rendered motion."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from egs_warp.contact.terrain import Solid
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import ffmpeg_program
 from egs_warp.locomotion.ledger import energy_balance
-from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN
 from egs_warp.motions.script import motion as script
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.capture_warnings import capture_warnings
-from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.film import draw_film
 from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.ground_coverage import ground_coverage_warning
 from egs_warp.pipelines.plots import draw_plots
 from egs_warp.pipelines.progress import preparation_bar, simulation_bar
 from egs_warp.pipelines.render_data import RenderData
-from egs_warp.pipelines.report import GaussianCounts, Report, report_of_run
-from egs_warp.pipelines.shot import LARGEST_SIDE, SMALLEST_SIDE, Shot
+from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run
+from egs_warp.pipelines.shot import MAX_SIDE, MIN_SIDE, Shot
 from egs_warp.pipelines.simulated_run import check_frames, simulate
-
-LARGEST_FRICTION = 10.0
 
 
 @dataclass(frozen=True)
 class AnimateOptions:
-    """What a user may ask; lengths of targets are in body heights.
-    Targets hold for motions that do not say their own.
+    """Options of ``animate``.
+
+    The targets apply to motions that do not specify their own.
     """
 
     distance: float | None = None
+    """Body heights; None is the default of the motion."""
     height: float | None = None
+    """Body heights; None is the default of the motion."""
     heading_degrees: float | None = None
-    frames: int | None = None
-    """Pictures at 60 Hz, the first at rest; None: until the last motion has come to rest."""
-    size: int = 512
-    """Pixels, both sides."""
-    seed: int = 0
-    """Written to the report; nothing in a jump is random, so it changes no result."""
-    metres_per_unit: float | None = None
-    """None: such that the body is 1 m tall."""
-    friction: float = 0.8
-    shadow: bool = True
-    """On the ground, under the object."""
+    """Degrees to the left; None is the default of the motion."""
+    beats: str | None = None
+    """Beats of a dance: a tempo, or the name of a file (``egs_warp.motions.beats``)."""
+    style: str | None = None
+    """Style of jumps (``egs_warp.motions.style``)."""
+    push: str | None = None
+    """Pushes during the run (``egs_warp.motions.push``)."""
     get_up: bool = True
-    """Whether a body that has fallen gets up and goes on."""
+    """If the body falls, get up and continue."""
+    frames: int | None = None
+    """Frames at 60 Hz, the first at rest; None runs until the last motion has come to rest."""
+    size: int = 512
+    """Width and height of the video, pixels, if ``shot`` has no size."""
+    shadow: bool = True
+    """Draw a shadow on the ground under the object."""
+    view_from: np.ndarray | None = None
+    """(3,) Direction from the object to the camera, in the capture's frame; of several (n, 3) the best is chosen."""
+    shot: Shot = field(default_factory=Shot)
+    """Camera motion, size, frame rate and background colour of the video."""
+    creature: CreatureOptions = field(default_factory=CreatureOptions)
+    """Body, muscles, ground and solver."""
+    seed: int = 0
+    """Written to the report. No computation is random, so it changes no result."""
+    source: str = "capture"
+    """Name of the capture in the report."""
+    notes: tuple[str, ...] = ()
+    """Notes for the report, before those of the run."""
 
     def __post_init__(self) -> None:
         for name, value in (("distance", self.distance), ("height", self.height)):
@@ -72,47 +83,40 @@ class AnimateOptions:
             span = f"from -{LARGEST_TURN:g} to {LARGEST_TURN:g}"
             raise ArgumentError("heading_degrees", f"give a number of degrees {span}", value=turn)
         check_frames(self.frames)
-        if not SMALLEST_SIDE <= self.size <= LARGEST_SIDE:
-            advice = f"give a number of pixels from {SMALLEST_SIDE} to {LARGEST_SIDE}"
+        if not MIN_SIDE <= self.size <= MAX_SIDE:
+            advice = f"give a number of pixels from {MIN_SIDE} to {MAX_SIDE}"
             raise ArgumentError("size", advice, value=self.size)
-        if not 0.0 <= self.friction <= LARGEST_FRICTION:
-            advice = f"give a Coulomb coefficient from 0 to {LARGEST_FRICTION:g}"
-            raise ArgumentError("friction", advice, value=self.friction)
-        if self.metres_per_unit is not None and not 1e-9 <= self.metres_per_unit <= 1e9:
-            # Single precision holds no lengths far beyond; ``make_body`` says which of these fit the body.
-            advice = "give a positive number, from 1e-9 to 1e9"
-            raise ArgumentError("metres_per_unit", advice, value=self.metres_per_unit)
 
     def targets(self) -> dict[str, float | None]:
-        """By the names that a script gives them."""
+        """Return the targets by the names that ``script`` uses."""
         return {"distance": self.distance, "height": self.height, "heading_degrees": self.heading_degrees}
 
-
-@dataclass(frozen=True)
-class RequestedOptions:
-    """Everything that was asked of a run, besides the capture and the motion; frame and units of the capture."""
-
-    options: AnimateOptions
-    shot: Shot
-    up: tuple[float, ...]
-    plane: tuple[float, ...] | None
-    """nx, ny, nz, d."""
-    view_from: tuple[float, ...]
-    gravity_up: tuple[float, ...]
-    front: tuple[float, ...]
-    push: str | None
-    beats: str | None
-    style: str | None
-    muscles: str | None
-    """Name of the file."""
-    qp: str | None
-    """Name of the QP solver."""
-    solids: int
-
-    def to_json(self) -> dict[str, Any]:
-        """``asked`` of the report; what was left to the program is null."""
-        given = {name: value or None for name, value in vars(self).items() if name not in ("options", "shot", "solids")}
-        return {**asdict(self.options), **self.shot.to_json(), **given, "solids": self.solids}
+    def to_json(self, *, up: np.ndarray | None = None, plane: Plane | None = None) -> dict[str, JsonValue]:
+        """Return ``asked`` of the report, with ``up`` and ``plane`` of the run; what was not given is null."""
+        creature, solver = self.creature, self.creature.settings and self.creature.settings.qp_solver
+        view_from = None if self.view_from is None or np.asarray(self.view_from).ndim != 1 else self.view_from
+        return {
+            **self.targets(),
+            "frames": self.frames,
+            "size": self.size,
+            "seed": self.seed,
+            "metres_per_unit": creature.metres_per_unit,
+            "friction": creature.friction,
+            "shadow": self.shadow,
+            "get_up": self.get_up,
+            **self.shot.to_json(),
+            "up": _numbers(up),
+            "plane": None if plane is None else [*map(float, plane.normal), plane.offset],
+            "view_from": _numbers(view_from),
+            "gravity_up": _numbers(creature.gravity_up),
+            "front": _numbers(creature.front),
+            "push": self.push or None,
+            "beats": self.beats or None,
+            "style": self.style or None,
+            "muscles": None if creature.muscles_file is None else Path(creature.muscles_file).name,
+            "qp": None if solver is None else QpSolver(solver).value,
+            "solids": len(creature.solids),
+        }
 
 
 def animate(
@@ -120,129 +124,97 @@ def animate(
     out: Path | str | RunFolder,
     *,
     motion: str = "jump",
-    push: str | None = None,
-    beats: str | None = None,
-    style: str | None = None,
     up: np.ndarray | None = None,
     plane: Plane | None = None,
-    ground: HeightField | None = None,
     background: GaussianCloud | None = None,
-    view_from: np.ndarray | None = None,
-    muscles_file: Path | None = None,
-    solids: tuple[Solid, ...] = (),
-    gravity_up: np.ndarray | None = None,
-    front: np.ndarray | None = None,
-    seen_from: np.ndarray | None = None,
-    settings: LocomotionSettings | None = None,
     options: AnimateOptions | None = None,
-    shot: Shot | None = None,
-    source: str = "capture",
-    notes: tuple[str, ...] = (),
     overwrite: bool = False,
     resume: bool = False,
     quiet: bool = False,
 ) -> Report:
-    """Bring ``cloud`` (scene units) to life and write video, contact sheet, plots, report and trajectory into ``out``.
+    """Animate a capture, and write video, contact sheet, plots, report and trajectory into ``out``.
 
-    ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.motions.script``).
-    ``push``: what hits it meanwhile (``egs_warp.motions.push``); ``beats``: those of a dance, a tempo or a file;
-    ``style``: how it jumps (``egs_warp.motions.style``).
-    ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
-    the object to the camera, of several (n, 3) the best is chosen; ``shot``: how it is filmed. ``ground``,
-    ``muscles_file``, ``solids``, ``gravity_up``, ``front``, ``seen_from``, ``settings``: see ``make_creature``. Returns
-    what it wrote as ``report.json`` (docs/guide/report.md). A folder belongs to one run (``egs_warp.io.run_folder``):
-    one with an earlier run is refused, or that run moved aside (``overwrite``), or gone on with if it was cut off
-    (``resume``): with the same arguments to the same bits. Raises ``UserError`` for bad input, before any file of an
-    earlier run is touched.
+    A folder belongs to one run (``egs_warp.io.run_folder``): without ``overwrite`` or ``resume``, a folder with an
+    earlier run is rejected.
+
+    Args:
+        cloud: The capture of a single object, scene units.
+        out: Folder for the files.
+        motion: One motion, several in a row, or the name of a JSON script (``egs_warp.motions.script``).
+        up: (3,) Up in the capture's frame (``make_creature``).
+        plane: Ground plane in the capture's frame (``make_creature``).
+        background: Gaussians behind the object, in the capture's frame and units; None draws a plain floor.
+        options: Targets, video and creature; None is the default.
+        overwrite: Move an earlier run in ``out`` aside.
+        resume: Continue the interrupted run in ``out``; equal arguments give equal bits.
+        quiet: Show no progress bars.
+
+    Returns:
+        The contents of ``report.json`` (docs/guide/report.md).
+
+    Raises:
+        UserError: An argument is invalid; files of an earlier run are not touched.
     """
-    options, shot = options or AnimateOptions(), shot or Shot()
-    shot.check()
-    asked = script(motion, beats=beats, **options.targets())
-    asked.frames()  # reads the files that it names
-    acted = asked.style(style)
-    pushes = read_pushes(push) if push is not None else ()
+    options = options or AnimateOptions()
+    options.shot.check()
+    requested_motion = script(motion, beats=options.beats, **options.targets())
+    requested_motion.frames()  # Reads the files that the motions name.
+    jump_style = requested_motion.style(options.style)
+    pushes = read_pushes(options.push) if options.push is not None else ()
     ffmpeg_program()
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
-        with preparation_bar(quiet=quiet) as begins:
-            creature = make_creature(
-                cloud,
-                up=up,
-                plane=plane,
-                ground=ground,
-                metres_per_unit=options.metres_per_unit,
-                friction=options.friction,
-                muscles_file=muscles_file,
-                solids=solids,
-                gravity_up=gravity_up,
-                front=front,
-                seen_from=seen_from,
-                settings=settings,
-                progress=begins,
-            )
-        if front is None:
+        with preparation_bar(quiet=quiet) as begin_stage:
+            creature = make_creature(cloud, up=up, plane=plane, options=options.creature, progress=begin_stage)
+        notes = options.notes
+        if options.creature.front is None:
             notes = (*notes, creature.front.told(creature.frame))
         notes = (*notes, *capture_warnings(creature.cloud, creature.cage.mesh, creature.body.height))
-        with simulation_bar(quiet=quiet) as told:
+        with simulation_bar(quiet=quiet) as show_progress:
             performance = simulate(
                 creature,
-                asked,
+                requested_motion,
                 frames=options.frames,
-                style=acted,
+                style=jump_style,
                 pushes=pushes,
                 get_up=options.get_up,
                 parts=lambda: run.file(PARTS),
                 resume=_recorded(run),
-                progress=told,
+                progress=show_progress,
             )
-        # Whatever becomes of the film, the simulation is not lost.
+        # Saved first: an error while rendering does not lose the simulation.
         performance.trajectory.save(run.file("trajectory.npz"))
-        books = energy_balance(performance.trajectory)
-        draw_plots(run.file("plots.png"), performance.trajectory, books)
+        energy = energy_balance(performance.trajectory)
+        draw_plots(run.file("plots.png"), performance.trajectory, energy)
         with atomic_write(run.file("cage.vtu")) as temporary:
             creature.cage.mesh.write_vtu(temporary)
         film = draw_film(
             performance,
             run,
-            name=asked.name,
+            name=requested_motion.name,
             size=options.size,
-            shot=shot,
+            shot=options.shot,
             background=background,
-            view_from=view_from,
+            view_from=options.view_from,
             shadow=options.shadow,
             quiet=quiet,
         )
-        made = RenderData.of(film.splats, film.camera, creature.muscles, performance.place.feet())
-        made.save(run.file(render_data.FILE))
-        asked_for = RequestedOptions(
-            options,
-            shot,
-            up=_numbers(up),
-            plane=None if plane is None else (*_numbers(plane.normal), plane.offset),
-            view_from=_numbers(view_from if view_from is None or np.asarray(view_from).ndim == 1 else None),
-            gravity_up=_numbers(gravity_up),
-            front=_numbers(front),
-            push=push,
-            beats=beats,
-            style=style,
-            muscles=None if muscles_file is None else Path(muscles_file).name,
-            qp=None if settings is None or settings.qp_solver is None else QpSolver(settings.qp_solver).value,
-            solids=len(solids),
-        )
+        render_data_of_run = RenderData.of(film.splats, film.camera, creature.muscles, performance.place.feet())
+        render_data_of_run.save(run.file(render_data.FILE))
         simulation = performance.simulation
-        behind = creature.placed(background) if background is not None else None
-        left = ground_coverage_warning(
-            simulation.trajectory.positions[-1], behind, creature.solids[0], creature.body.height
+        placed_background = creature.placed(background) if background is not None else None
+        coverage_warning = ground_coverage_warning(
+            simulation.trajectory.positions[-1], placed_background, creature.solids[0], creature.body.height
         )
-        notes = (*notes, *performance.cut_short(), *left)
+        notes = (*notes, *performance.cut_short(), *coverage_warning)
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
-            *(performance.sequence.done, books),
+            *(performance.sequence.done, energy),
             gaussians=GaussianCounts.of(creature, film.splats.count),
             drawing=film.milliseconds,
-            source=source,
+            source=options.source,
             notes=notes,
             seed=options.seed,
-            asked=asked_for.to_json(),
+            asked=options.to_json(up=up, plane=plane),
             ending=performance.ending,
         )
         report.write(run.file("report.json"))
@@ -252,10 +224,10 @@ def animate(
 
 
 def _recorded(run: RunFolder) -> Path | None:
-    """Where the steps are that a run which goes on has done already."""
+    """Return the folder with the finished steps of a resumed run; None if there are none."""
     folder = run.path / PARTS
     return folder if run.resumed and any(folder.glob("*.npz")) else None
 
 
-def _numbers(vector: np.ndarray | None) -> tuple[float, ...]:
-    return () if vector is None else tuple(float(x) for x in vector)
+def _numbers(vector: np.ndarray | None) -> tuple[float, ...] | None:
+    return None if vector is None else tuple(float(x) for x in vector)

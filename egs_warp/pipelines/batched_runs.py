@@ -1,4 +1,4 @@
-"""Jobs whose activations are given, many at a time in one process on the creature's own device."""
+"""Batched runs: jobs with prescribed activations, many at a time in one process on the creature's device."""
 
 from __future__ import annotations
 
@@ -23,20 +23,23 @@ from egs_warp.pipelines.worker_pool import ProgressCallback, TaskResult, run_tas
 if TYPE_CHECKING:
     from egs_warp.locomotion.batch import BatchStepper
 
-MOST_WORLDS = 1024
-"""Side by side: more are hardly faster, and what they have done lies in memory until they end."""
-_SHARE = 0.4
-"""Of the free memory of a GPU that factors of matrices may take."""
-_WORTH = 2
-"""Jobs for each core of the machine from which on they end sooner side by side: on an H100 eight worlds of 253 nodes
-make 101 steps a second, one process 21."""
+MAX_WORLDS = 1024
+"""Jobs in one batch: larger batches are hardly faster, and their results stay in memory until they end."""
+_MEMORY_FRACTION = 0.4
+"""Fraction of the free memory of a GPU that matrix factors may use."""
+_MIN_JOBS_PER_CORE = 2
+"""Jobs for each core of the machine above which a batch is faster than worker processes: on an H100, eight worlds of
+253 nodes make 101 steps a second, one process makes 21."""
 
 
 def choose_batch_size(creature: Creature, jobs: int) -> int:
-    """How many of so many ``jobs`` to do side by side: as many as the creature's device has room for, and 0 where
-    workers do so few sooner, that device is a CPU, torch does not see it, or the ground is not flat."""
+    """Return the batch size for ``jobs`` batchable jobs: as many as fit on the creature's device.
+
+    Returns 0 if workers are faster for so few jobs, the device is a CPU, torch cannot use it, or the ground is not
+    flat.
+    """
     device = creature.body.assembly.device
-    if not device.is_cuda or creature.geometry.field is not None or jobs < _WORTH * available_threads():
+    if not device.is_cuda or creature.geometry.field is not None or jobs < _MIN_JOBS_PER_CORE * available_threads():
         return 0
     try:
         import torch
@@ -45,11 +48,11 @@ def choose_batch_size(creature: Creature, jobs: int) -> int:
     if not torch.cuda.is_available():
         return 0
     free, _ = torch.cuda.mem_get_info(str(device))
-    return min(MOST_WORLDS, int(_SHARE * free) // (72 * len(creature.body.mesh.nodes) ** 2))
+    return min(MAX_WORLDS, int(_MEMORY_FRACTION * free) // (72 * len(creature.body.mesh.nodes) ** 2))
 
 
 def is_batchable(job: Job) -> bool:
-    """Whether the job can be done beside others: its muscles do what is given, and nothing pushes it."""
+    """Return True if the job can run in a batch: its activations are prescribed, and nothing pushes the body."""
     return job.activations is not None and not job.pushes
 
 
@@ -58,162 +61,171 @@ def run_batched(
     jobs: Sequence[tuple[int, Job]],
     *,
     worlds: int,
-    told: Callable[[dict[int, tuple[int, int]]], object],
+    progress: Callable[[dict[int, tuple[int, int]]], object],
 ) -> Iterator[TaskResult]:
-    """The ``jobs``, each with its number, as each ends: so many ``worlds`` side by side, those of one length of step
-    together. ``told`` hears after each frame of each job in work how many it has done, and of how many."""
-    entered: list[_BatchJob] = []
+    """Run jobs in batches and yield each result when its batch ends. Jobs of one step size share batches.
+
+    Args:
+        creature: The creature of all jobs.
+        jobs: Number and job, in any order.
+        worlds: Maximum number of jobs in a batch.
+        progress: Called after each frame with, for each running job, its number and the frames done and expected.
+    """
+    batch_jobs: list[_BatchJob] = []
     for number, job in jobs:
-        kind, value = run_task(partial(_make_batch_job, creature, number), job, told)
+        kind, value = run_task(partial(_make_batch_job, creature, number), job, progress)
         if kind == "done":
-            entered.append(value)
+            batch_jobs.append(value)
         else:
             yield TaskResult(number, None, value, 1)
-    entered.sort(key=lambda one: (one.dt, one.number))
-    for _, alike in groupby(entered, key=lambda one: one.dt):
-        every = list(alike)
-        for first in range(0, len(every), worlds):
-            yield from _run_batch(creature, every[first : first + worlds], told)
+    batch_jobs.sort(key=lambda one: (one.dt, one.number))
+    for _, same_step in groupby(batch_jobs, key=lambda one: one.dt):
+        same_step_jobs = list(same_step)
+        for first in range(0, len(same_step_jobs), worlds):
+            yield from _run_batch(creature, same_step_jobs[first : first + worlds], progress)
 
 
 @dataclass(frozen=True)
 class _BatchJob:
-    """A job that can be done."""
+    """A job whose arguments are valid."""
 
     number: int
     job: Job
     friction: float
     dt: float
-    """Seconds of a step."""
+    """Step size, s."""
     per_frame: int
+    """Steps in a frame."""
     activations: np.ndarray
-    """(steps, M) metres, of whole frames."""
+    """(steps, M) m, for a whole number of frames."""
 
 
 def _make_batch_job(creature: Creature, number: int, job: Job, _: ProgressCallback) -> _BatchJob:
-    """Raises ``UserError`` for what cannot be done."""
-    assert job.activations is not None, "it fits"
+    """Return the job with checked arguments. Raises ``UserError`` if one is invalid."""
+    assert job.activations is not None, "the job is batchable"
     check_frames(job.frames)
     friction = creature.geometry.friction if job.friction is None else checked_friction(job.friction)
-    given = checked_activations(creature, job.activations, job.step)
+    activations = checked_activations(creature, job.activations, job.step)
     dt, per_frame = solver_steps(creature.body, job.step)
-    frames = len(given) // per_frame
+    frames = len(activations) // per_frame
     frames = frames if job.frames is None else min(frames, job.frames - 1)
-    return _BatchJob(number, job, friction, dt, per_frame, given[: frames * per_frame])
+    return _BatchJob(number, job, friction, dt, per_frame, activations[: frames * per_frame])
 
 
 def _run_batch(
-    creature: Creature, together: Sequence[_BatchJob], told: Callable[[dict[int, tuple[int, int]]], object]
+    creature: Creature, batch: Sequence[_BatchJob], progress: Callable[[dict[int, tuple[int, int]]], object]
 ) -> Iterator[TaskResult]:
-    """Step all, then tell of each. What there is no room for is done again in halves."""
+    """Run one batch and yield its results. If the memory does not suffice, run it as two smaller batches."""
     import torch
 
-    run, cramped = None, ""
+    run, memory_error = None, ""
     try:
-        run = _run(creature, together, told)
+        run = _run(creature, batch, progress)
     except torch.OutOfMemoryError as error:
-        cramped = " ".join(str(error).split())
-    # Past the except, whose traceback holds what there was no more room beside.
-    if run is None and len(together) == 1:
-        why = f"out of GPU memory beside nothing else; give worlds=0 for workers: {cramped}"
-        yield TaskResult(together[0].number, None, why, 1)
+        memory_error = " ".join(str(error).split())
+    # Outside the except block, whose traceback keeps the memory of the failed attempt allocated.
+    if run is None and len(batch) == 1:
+        why = f"out of GPU memory with a single world; set worlds=0 to use worker processes: {memory_error}"
+        yield TaskResult(batch[0].number, None, why, 1)
         return
     if run is None:
         torch.cuda.empty_cache()
-        half = len(together) // 2
-        yield from _run_batch(creature, together[:half], told)
-        yield from _run_batch(creature, together[half:], told)
+        half = len(batch) // 2
+        yield from _run_batch(creature, batch[:half], progress)
+        yield from _run_batch(creature, batch[half:], progress)
         return
-    for one, its, made, gone in zip(together, run.creatures, run.steps, run.lost, strict=True):
-        kind, value = run_task(partial(_outcome, its, made, gone), one.job, told)
+    for one, run_creature, steps, is_unsolvable in zip(batch, run.creatures, run.steps, run.is_unsolvable, strict=True):
+        kind, value = run_task(partial(_outcome, run_creature, steps, is_unsolvable), one.job, progress)
         yield TaskResult(one.number, *((value, None) if kind == "done" else (None, value)), 1)
 
 
 @dataclass(frozen=True)
 class _Run:
-    """What jobs have done side by side, each with a row."""
+    """Results of one batch, one entry a job."""
 
     creatures: list[Creature]
-    """On their own ground."""
+    """The creature on the ground of each job."""
     steps: list[list[list[StepReport]]]
-    """See ``_stepped``."""
-    lost: list[bool]
-    """Whether there is no standing on that ground."""
+    """Reports of each step of each job, as ``_run_steps`` returns them."""
+    is_unsolvable: list[bool]
+    """True if the creature cannot stand on the ground of the job."""
 
 
 def _run(
-    creature: Creature, together: Sequence[_BatchJob], told: Callable[[dict[int, tuple[int, int]]], object]
+    creature: Creature, batch: Sequence[_BatchJob], progress: Callable[[dict[int, tuple[int, int]]], object]
 ) -> _Run:
     from egs_warp.locomotion.batch import BatchStepper
 
     stepper = BatchStepper(
-        *(creature.body, creature.muscles, creature.geometry, [one.friction for one in together]),
+        *(creature.body, creature.muscles, creature.geometry, [one.friction for one in batch]),
         settings=creature.stepper.settings,
     )
-    starts = [creature.start] * len(together)
-    lost = [False] * len(together)
-    # On its own ground the creature stands already.
-    if any(one.job.friction is not None for one in together):
+    starts = [creature.start] * len(batch)
+    is_unsolvable = [False] * len(batch)
+    # On its own ground the creature already stands.
+    if any(one.job.friction is not None for one in batch):
         settled, failed = stepper.settle()
-        moved = [one.job.friction is not None for one in together]
-        starts = [there if anew else start for there, anew, start in zip(settled, moved, starts, strict=True)]
-        lost = [bool(gone) and anew for gone, anew in zip(failed.tolist(), moved, strict=True)]
+        has_friction = [one.job.friction is not None for one in batch]
+        starts = [new if changed else start for new, changed, start in zip(settled, has_friction, starts, strict=True)]
+        is_unsolvable = [bool(fail) and changed for fail, changed in zip(failed.tolist(), has_friction, strict=True)]
     creatures = [
         replace(creature, stepper=creature.stepper.with_friction(one.friction), start=start)
-        for one, start in zip(together, starts, strict=True)
+        for one, start in zip(batch, starts, strict=True)
     ]
-    return _Run(creatures, _stepped(stepper, together, creatures, told), lost)
+    return _Run(creatures, _run_steps(stepper, batch, creatures, progress), is_unsolvable)
 
 
-def _outcome(creature: Creature, made: list[list[StepReport]], lost: bool, job: Job, _: ProgressCallback) -> RunSummary:
-    if lost:
+def _outcome(
+    creature: Creature, steps: list[list[StepReport]], is_unsolvable: bool, job: Job, _: ProgressCallback
+) -> RunSummary:
+    if is_unsolvable:
         raise UnsolvableStepError(UNSOLVABLE)
-    return job.outcome(creature, job.run_on_ground(replace(creature, stepper=_ReplayStepper(creature.stepper, made))))
+    return job.outcome(creature, job.run_on_ground(replace(creature, stepper=_ReplayStepper(creature.stepper, steps))))
 
 
 class _ReplayStepper(LocomotionStepper):
-    """Of a run whose steps were made beside others: it tells them again, for the motion to measure."""
+    """Stepper that replays the reports of a batched run, so that the motion can measure them."""
 
-    def __init__(self, stepper: LocomotionStepper, made: list[list[StepReport]]) -> None:
+    def __init__(self, stepper: LocomotionStepper, steps: list[list[StepReport]]) -> None:
         vars(self).update(vars(stepper))
-        self._made = iter(made)
+        self._steps = iter(steps)
 
     def advance_with_activations(
         self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float
     ) -> tuple[BodyState, WarmStart, list[StepReport]]:
-        """The next step in its parts."""
-        done = next(self._made)
+        """Return state, warm start and reports of the next stored step."""
+        done = next(self._steps)
         if not done:
             raise UnsolvableStepError(UNSOLVABLE)
         return done[-1].state, WarmStart.from_report(done[-1]), done
 
 
-def _stepped(
+def _run_steps(
     stepper: BatchStepper,
-    together: Sequence[_BatchJob],
+    batch: Sequence[_BatchJob],
     creatures: Sequence[Creature],
-    told: Callable[[dict[int, tuple[int, int]]], object],
+    progress: Callable[[dict[int, tuple[int, int]]], object],
 ) -> list[list[list[StepReport]]]:
-    """Of each the reports of each of its steps; the last of one that cannot be solved has none."""
+    """Advance all jobs and return, for each job and step, its reports; a step that cannot be solved has none."""
     import torch
 
-    runs: list[list[list[StepReport]]] = [[] for _ in together]
+    runs: list[list[list[StepReport]]] = [[] for _ in batch]
     state = stepper.start([creature.start for creature in creatures])
-    longest, per_frame = max(len(one.activations) for one in together), together[0].per_frame
-    for number in range(longest):
-        asked = torch.tensor([len(together[world].activations) > number for world in state.worlds.tolist()])
-        state = state.gather(asked.nonzero().squeeze(1).to(stepper.device))
+    max_steps, per_frame = max(len(one.activations) for one in batch), batch[0].per_frame
+    for number in range(max_steps):
+        has_step = torch.tensor([len(batch[world].activations) > number for world in state.worlds.tolist()])
+        state = state.gather(has_step.nonzero().squeeze(1).to(stepper.device))
         if len(state.worlds) == 0:
             break
         worlds = state.worlds.tolist()
         for world in worlds:
             runs[world].append([])
-        given = np.stack([together[world].activations[number] for world in worlds])
-        state, done, _ = stepper.advance(state, given, together[0].dt)
+        activations = np.stack([batch[world].activations[number] for world in worlds])
+        state, done, _ = stepper.advance(state, activations, batch[0].dt)
         for step in done:
             for world, report in zip(step.worlds.tolist(), step.reports(), strict=True):
                 runs[world][-1].append(report)
         if (number + 1) % per_frame == 0:
             frame = (number + 1) // per_frame
-            told({together[w].number: (frame, len(together[w].activations) // per_frame) for w in worlds})
+            progress({batch[w].number: (frame, len(batch[w].activations) // per_frame) for w in worlds})
     return runs

@@ -1,4 +1,4 @@
-"""A finished run as one file: rest splats, cage, and where its nodes are. ``examples/read_bundle.py`` reads it."""
+"""Export of a finished run to one file: rest splats, cage and node positions. ``examples/read_bundle.py`` reads it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,17 @@ _SCHEMA = 1
 
 
 def export_bundle(run: FinishedRun, path: Path, *, every: int = 1, degree: int | None = None) -> None:
-    """Write one .npz (docs/guide/export.md). Raises ``UserError`` for another name."""
+    """Write ``run`` to one .npz file (docs/guide/export.md).
+
+    Args:
+        run: The run to export.
+        path: Name that ends in .npz.
+        every: Export each ``every``-th frame at 60 Hz.
+        degree: SH degree of the colours; None keeps that of the capture.
+
+    Raises:
+        UserError: ``path`` has another ending, or is a file of a run.
+    """
     if path.suffix.lower() != ENDING:
         raise UserError(f"{path}: give a name that ends in {ENDING}")
     check_no_file_of_a_run(path)

@@ -1,4 +1,4 @@
-"""What a user should know of a capture that becomes a body, though nothing stops it."""
+"""Warnings about a capture that can be animated but may give a poor body."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from scipy.spatial import KDTree
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 
-FEWEST_GAUSSIANS = 100
-"""Fewer leave most of a body to guesswork."""
-_APART = 0.15
-"""Body heights from the cage, at least an edge of it: fuzz and floaters that the cage leaves out are nearer."""
-_LEAST_SHARE = 0.01
-"""Of the opacity."""
+MIN_GAUSSIANS = 100
+"""With fewer, most of the body's shape is extrapolated."""
+_DETACHED_DISTANCE = 0.15
+"""Body heights from the cage, at least one cage edge: floaters that the cage excludes are nearer."""
+_MIN_DETACHED_SHARE = 0.01
+"""Fraction of the opacity that must be detached for a warning."""
 
 
 def capture_warnings(cloud: GaussianCloud, cage: TetMesh, height: float) -> tuple[str, ...]:
-    """One line for each: too few Gaussians for a body, parts of ``cloud`` that lie apart from its ``cage``.
+    """Return one line for each warning: too few Gaussians, or parts of ``cloud`` detached from its ``cage``.
 
-    ``cloud``, ``cage`` and ``height`` in the same unit and frame.
+    ``cloud``, ``cage`` and the body's ``height`` are in the same unit and frame.
     """
     notes = []
-    if cloud.count < FEWEST_GAUSSIANS:
+    if cloud.count < MIN_GAUSSIANS:
         notes.append(f"only {cloud.count} Gaussians: most of the body is guessed")
     distance, _ = KDTree(cage.nodes).query(cloud.means.numpy().astype(np.float64))
     opacity = cloud.opacities()
-    apart = distance > max(_APART * height, mean_edge_length(cage))
-    share = float(opacity[apart].sum() / max(opacity.sum(), 1e-300))
-    if share > _LEAST_SHARE:
+    is_detached = distance > max(_DETACHED_DISTANCE * height, mean_edge_length(cage))
+    share = float(opacity[is_detached].sum() / max(opacity.sum(), 1e-300))
+    if share > _MIN_DETACHED_SHARE:
         notes.append(
             f"{100 * share:.0f} % of the capture lies apart from the body, up to {distance.max() / height:.2g} body"
             " heights away, and moves with it as if they were one; cut other objects away first"

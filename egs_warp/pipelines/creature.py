@@ -1,4 +1,4 @@
-"""A capture with a body, muscles and a ground: what a motion moves."""
+"""The creature: a capture with a soft body, muscles and a ground, ready to be simulated."""
 
 from __future__ import annotations
 
@@ -34,51 +34,94 @@ from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
 from egs_warp.pipelines.facing_direction import Front, find_front
 from egs_warp.segmentation.base_plane import find_base_plane
 
-SMALLEST_SAG = 0.004
-"""A body is not made stiffer than this column's sag, whatever it bends."""
-STEEPEST_SLOPE = 45.0
-"""Degrees: nothing stands on a steeper one."""
+MIN_SAG = 0.004
+"""Fraction of the height: a body that its weight bends is made stiffer until its sag is below this."""
+MAX_SLOPE = 45.0
+"""Degrees; steeper ground is rejected."""
 _GROUND_SPACING = 0.5
-"""Edges of the cage between the nodes of uneven ground: points of contact are 0.4 apart."""
+"""Mean cage edges between the nodes of uneven ground: contact points are 0.4 of an edge apart."""
 _CAGE_BITS = 32
-"""Of the height, that the coordinates of the cage keep."""
+"""Bits to which the cage's coordinates are rounded, relative to the height."""
 _CONTACT_GRID = 2.0**-10
-"""Of the height: what points of contact are rounded to. A jump makes much of the last bit of a number, and a file's
-numbers change by theirs when the capture is turned or its unit is another one.
+"""Fraction of the height to which contact points are rounded. A jump is sensitive to the last bit of a number, and
+the last bits of a file change if the capture is rotated or its unit changes.
 """
 _FRONT_GRID = np.pi / 2**12
-"""Radians, what the front is rounded to, likewise."""
-_FOOT = 0.1
-"""Of the height over uneven ground: what is lower may stand on it."""
+"""Radians to which the facing direction is rounded, for the same reason."""
+_FOOT_HEIGHT = 0.1
+"""Fraction of the height above uneven ground below which parts of the object may touch it."""
+MAX_FRICTION = 10.0
+"""Maximum Coulomb coefficient of ``CreatureOptions``."""
+
+
+@dataclass(frozen=True)
+class CreatureOptions:
+    """Options of ``make_creature``; vectors, planes and surfaces are in the frame and units of the capture."""
+
+    metres_per_unit: float | None = None
+    """Length of one unit of the capture, m; None makes the body 1 m tall."""
+    sag: float = DEFAULT_SAG
+    """Fraction of its height by which the body sags under its weight, which defines its stiffness. A body that its
+    weight would bend out of shape is made stiffer."""
+    nodes: int = 500
+    """Approximate number of cage nodes."""
+    muscles_file: Path | None = None
+    """Muscles (JSON, ``egs_warp.muscles.files``); None creates automatic ones."""
+    front: np.ndarray | None = None
+    """(3,) Direction in which the body faces and moves; None estimates it (``find_front``)."""
+    seen_from: np.ndarray | None = None
+    """(3,) Mean of the unit vectors from the object to the cameras of its photos, for the estimate of ``front``."""
+    friction: float = 0.8
+    """Coulomb coefficient of the ground, 0 to 10."""
+    ground: HeightField | None = None
+    """Ground that is not flat, in place of a plane."""
+    gravity_up: np.ndarray | None = None
+    """(3,) Direction against gravity; None is the normal of the ground, other directions make it a slope."""
+    solids: tuple[Solid, ...] = ()
+    """Steps and walls beside the ground."""
+    settings: LocomotionSettings | None = None
+    """Solver settings, such as the contact strategy and the QP solver; None is the default."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.friction <= MAX_FRICTION:
+            advice = f"give a Coulomb coefficient from 0 to {MAX_FRICTION:g}"
+            raise ArgumentError("friction", advice, value=self.friction)
+        if self.metres_per_unit is not None and not 1e-9 <= self.metres_per_unit <= 1e9:
+            # Single precision does not represent other lengths; ``make_body`` checks which of these fit the body.
+            advice = "give a positive number, from 1e-9 to 1e9"
+            raise ArgumentError("metres_per_unit", advice, value=self.metres_per_unit)
 
 
 @dataclass(frozen=True)
 class Creature:
-    """A capture with a cage, a body, muscles and a ground, standing; metres, all in the body's own frame."""
+    """A capture with a cage, a body, muscles and a ground, at rest; metres, all in the frame of the body."""
 
     frame: BodyFrame
-    """Of the body, in the capture."""
+    """Frame of the body in the capture."""
     cloud: GaussianCloud
-    """The capture, in the order of its own."""
+    """The Gaussians of the capture, in their original order."""
     front: Front
-    """Which way it faces, and moves."""
+    """Direction in which the body faces and moves."""
     limbs: Limbs
-    """On which it stands."""
+    """Limbs on which the body stands."""
     cage: Cage
+    """Tetrahedral mesh around the Gaussians."""
     stepper: LocomotionStepper
-    """Body, muscles and contact."""
+    """Solver with body, muscles and contact."""
     start: BodyState
-    """At rest on the ground."""
+    """State at rest on the ground."""
     solids: tuple[Surface, ...]
-    """All that there is to stand on, the ground first."""
+    """Surfaces that the body can touch, the ground first."""
 
     def placed(self, cloud: GaussianCloud) -> GaussianCloud:
-        """Something else of the same capture, such as what is behind it, in the frame of the body."""
+        """Transform another cloud of the same capture, such as its background, to the frame of the body."""
         return to_body_frame(cloud, self.frame)
 
     def with_friction(self, friction: float) -> Creature:
-        """The same body on ground of another Coulomb coefficient, standing anew. Raises ``ArgumentError`` for one below
-        0."""
+        """Return the same body at rest on ground with another Coulomb coefficient.
+
+        Raises ``ArgumentError`` for a negative one.
+        """
         old = self.stepper
         geometry, device = replace(old.geometry, friction=checked_friction(friction)), str(old.body.assembly.device)
         stepper = LocomotionStepper(old.body, old.muscles, geometry, settings=old.settings, device=device)
@@ -91,12 +134,12 @@ class Creature:
 
     @property
     def muscles(self) -> MuscleSet:
-        """Its muscles."""
+        """The muscles of the body."""
         return self.stepper.muscles
 
     @property
     def geometry(self) -> ContactGeometry:
-        """Its contact points and planes."""
+        """Contact points, planes and friction."""
         return self.stepper.geometry
 
 
@@ -105,30 +148,26 @@ def make_creature(
     *,
     up: np.ndarray | None = None,
     plane: Plane | None = None,
-    metres_per_unit: float | None = None,
-    friction: float = 0.8,
-    sag: float = DEFAULT_SAG,
-    muscles_file: Path | None = None,
-    ground: HeightField | None = None,
-    solids: tuple[Solid, ...] = (),
-    gravity_up: np.ndarray | None = None,
-    front: np.ndarray | None = None,
-    seen_from: np.ndarray | None = None,
-    settings: LocomotionSettings | None = None,
-    nodes: int = 500,
+    options: CreatureOptions | None = None,
     progress: Callable[[str], object] = lambda stage: None,
 ) -> Creature:
-    """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,), or on
-    ``ground`` that is not flat.
+    """Create a creature from a capture of a single object, at rest on the ground.
 
-    All that is given is in the capture's frame and units; what is made is in the body's, so nothing hangs on how the
-    file lies. ``muscles_file``: see ``body_muscles``. ``solids`` are steps and walls beside the ground; ``gravity_up``
-    (3,) is against gravity if the ground is a slope. ``front`` (3,) is the way it faces and moves; else it is found
-    (``find_front``), with ``seen_from`` (3,), the mean of the unit vectors to the cameras of its photos, if these are
-    known. ``settings`` of its stepper choose the strategy for the contact
-    states and the QP solver. The body is as stiff as makes it sag by ``sag`` of its height; one that its weight would
-    bend out of shape is made stiffer. ``nodes``: of its cage, about. ``progress`` is told the name of each stage.
+    All arguments are in the frame and units of the capture; the result is in the frame of the body, so it does not
+    depend on the frame of the file. One of ``plane``, ``up`` and ``options.ground`` is required.
+
+    Args:
+        cloud: The capture.
+        up: (3,) Up; without a ``plane``, the ground is the base of the object, orthogonal to ``up``.
+        plane: Ground plane.
+        options: Body, muscles, ground and solver; None is the default.
+        progress: Called with the name of each stage as it starts.
+
+    Raises:
+        UserError: The ground is unknown or too steep, or the capture gives no body.
     """
+    options = options or CreatureOptions()
+    ground, gravity_up, front, sag = options.ground, options.gravity_up, options.front, options.sag
     if ground is not None:
         plane = plane_below(cloud, ground)
     normal = plane.normal if plane is not None else up
@@ -140,13 +179,13 @@ def make_creature(
     if front is not None:
         check_front(normal if gravity_up is None else gravity_up, front)
     progress("cage")
-    standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, nodes=nodes)
+    standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=options.metres_per_unit, nodes=options.nodes)
     progress("contact")
     device, frame, cage = str(cloud.device), standing.frame, standing.cage
-    solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in solids)
+    solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in options.solids)
     field = None
     if ground is not None:
-        # A cage gives way to nothing finer than it is itself.
+        # The cage cannot deform to ground that is finer than its own edges.
         field = frame.height_field(ground).coarser(_GROUND_SPACING * mean_edge_length(cage.mesh))
     geometry = contact_geometry(
         standing.gaussians,
@@ -154,65 +193,71 @@ def make_creature(
         (GROUND,),
         field=field,
         solids=solids,
-        friction=friction,
+        friction=options.friction,
         grid=_CONTACT_GRID * cage.height(GROUND),
         device=device,
     )
     against_gravity = None if gravity_up is None else frame.axes @ gravity_up
     progress("front")
-    faces = choose_front(standing, front, seen_from=seen_from)
+    facing = choose_front(standing, front, seen_from=options.seen_from)
     while True:
         progress("body and muscles")
         body = make_body(cage.mesh, GROUND, up=against_gravity, sag=sag, device=device)
-        muscles = body_muscles(body, muscles_file, frame)
-        stepper = LocomotionStepper(body, muscles, geometry, settings=settings, device=device)
+        muscles = body_muscles(body, options.muscles_file, frame)
+        stepper = LocomotionStepper(body, muscles, geometry, settings=options.settings, device=device)
         progress("stand")
         start = settle(stepper)
-        if sag < SMALLEST_SAG or _stands(stepper, start):
-            everything = (field or Solid((GROUND,)), *solids)
+        if sag < MIN_SAG or _stands(stepper, start):
+            surfaces = (field or Solid((GROUND,)), *solids)
             placed = to_body_frame(cloud, frame)
-            return Creature(frame, placed, faces, standing.limbs, cage, stepper, start, everything)
+            return Creature(frame, placed, facing, standing.limbs, cage, stepper, start, surfaces)
         sag *= 0.5
 
 
 def plane_below(cloud: GaussianCloud, ground: HeightField) -> Plane:
-    """The plane that ``ground`` tells its heights from, moved up or down to the lowest place under the object's
-    foot.
+    """Return the reference plane of ``ground``, moved to the lowest ground under the object's foot.
+
+    Raises ``ArgumentError`` if no part of ``cloud`` is above the ground.
     """
     means = cloud.means.numpy()[cloud.opacities() > 0.3].astype(np.float64)
     heights = ground.heights(means)
     if len(means) == 0 or not (heights > 0.0).any():
         raise ArgumentError("ground", "nothing of the object lies above it; check the plane", check=("plane",))
-    low = means[(heights > 0.0) & (heights < _FOOT * float(np.quantile(heights, 0.99)))]
+    low = means[(heights > 0.0) & (heights < _FOOT_HEIGHT * float(np.quantile(heights, 0.99)))]
     lift = float(ground.ground_height(low).min()) if len(low) else 0.0
     return Plane(ground.normal, ground.plane.offset - lift)
 
 
 def changed_creature(creature: Creature, *, friction: float, sag: float, muscles_file: Path | None) -> Creature:
-    """``creature`` with another friction and another stiffness, by its ``sag`` (``make_body``); cage and ground stay.
+    """Return ``creature`` at rest with another friction and stiffness; cage and ground stay the same.
 
-    Muscles change with the stiffness; it is made to stand anew.
+    Args:
+        creature: The creature to change.
+        friction: Coulomb coefficient.
+        sag: Fraction of its height by which the body sags, which defines the stiffness (``make_body``).
+        muscles_file: Muscles (``body_muscles``); the automatic ones depend on the stiffness.
     """
     device = str(creature.cloud.device)
     body, geometry = creature.body, replace(creature.geometry, friction=friction)
     up = -body.gravity / np.linalg.norm(body.gravity)
-    made = make_body(creature.cage.mesh, GROUND, up=up, sag=sag, device=device)
-    muscles = body_muscles(made, muscles_file, creature.frame)
-    stepper = LocomotionStepper(made, muscles, geometry, settings=creature.stepper.settings, device=device)
+    new_body = make_body(creature.cage.mesh, GROUND, up=up, sag=sag, device=device)
+    muscles = body_muscles(new_body, muscles_file, creature.frame)
+    stepper = LocomotionStepper(new_body, muscles, geometry, settings=creature.stepper.settings, device=device)
     return replace(creature, stepper=stepper, start=settle(stepper))
 
 
 @dataclass(frozen=True)
 class PlacedCage:
-    """A capture's cage, in metres and in the frame of the body."""
+    """The cage of a capture, in metres and in the frame of the body."""
 
     frame: BodyFrame
-    """Of the body, in the capture."""
+    """Frame of the body in the capture."""
     gaussians: GaussianCloud
-    """What the mechanics sees of the capture (``body_gaussians``)."""
+    """Gaussians that define the body (``body_gaussians``)."""
     cage: Cage
+    """Tetrahedral mesh around the Gaussians."""
     limbs: Limbs
-    """On which it stands, found where the capture shows them."""
+    """Limbs on which the body stands, detected in the captured solid."""
 
 
 def place_cage(
@@ -223,13 +268,18 @@ def place_cage(
     metres_per_unit: float | None = None,
     nodes: int = 500,
 ) -> PlacedCage:
-    """Find the body's own frame on ``plane``, or on its base square to ``up`` (3,), and make its cage there.
+    """Find the body's frame on its ground plane, and build its cage in that frame.
 
-    Without ``metres_per_unit`` the body is 1 m tall. The cage has about so many ``nodes``.
+    Args:
+        cloud: The capture.
+        up: (3,) Up in the capture; if there is no ``plane``, the ground is the object's base, orthogonal to ``up``.
+        plane: Ground plane in the capture.
+        metres_per_unit: Length of one unit of the capture, m; None makes the body 1 m tall.
+        nodes: Approximate number of cage nodes.
     """
     near, anchor = centred(cloud)
     if plane is None:
-        assert up is not None, "make_creature asks for one of both"
+        assert up is not None, "make_creature requires plane or up"
         plane = find_base_plane(near, up)
     else:
         plane = plane.moved(-anchor)
@@ -244,7 +294,7 @@ def place_cage(
 
 
 def _rounded(cage: Cage) -> Cage:
-    """Without the last bits of its coordinates, which hang on how large the capture's unit is."""
+    """Round the coordinates to ``_CAGE_BITS``: the last bits depend on the unit of the capture."""
     step = 2.0 ** (np.rint(np.log2(cage.height(GROUND))) - _CAGE_BITS)
     return replace(cage, mesh=TetMesh(step * np.rint(cage.mesh.nodes / step), cage.mesh.tets))
 
@@ -252,41 +302,50 @@ def _rounded(cage: Cage) -> Cage:
 def choose_front(
     standing: PlacedCage, front: np.ndarray | None = None, *, seen_from: np.ndarray | None = None
 ) -> Front:
-    """Which way it faces: ``front`` (3,) if that is given, else as ``find_front`` finds; ``front`` and ``seen_from`` as
-    in ``make_creature``."""
+    """Return the facing direction: ``front`` (3,) if given, otherwise the estimate of ``find_front``.
+
+    Args:
+        standing: The body.
+        front: (3,) Facing direction in the capture's frame.
+        seen_from: (3,) Mean of the unit vectors from the object to the cameras of its photos, in the capture's frame.
+    """
     axes = standing.frame.axes
     if front is None:
-        seen = None if seen_from is None else axes @ seen_from
+        seen_in_body_frame = None if seen_from is None else axes @ seen_from
         mesh = standing.cage.mesh
         lies = support_kind_of(mesh, mesh.nodes[:, 2], standing.limbs.count) is SupportKind.LYING
-        found = find_front(standing.gaussians, mesh, seen_from=seen, lengthwise=lies)
-        angle = _FRONT_GRID * np.rint(np.arctan2(found.direction[1], found.direction[0]) / _FRONT_GRID)
-        return replace(found, direction=np.array([np.cos(angle), np.sin(angle), 0.0]))
+        estimate = find_front(standing.gaussians, mesh, seen_from=seen_in_body_frame, lengthwise=lies)
+        angle = _FRONT_GRID * np.rint(np.arctan2(estimate.direction[1], estimate.direction[0]) / _FRONT_GRID)
+        return replace(estimate, direction=np.array([np.cos(angle), np.sin(angle), 0.0]))
     x, y, _ = axes @ front
     return Front(np.array([x, y, 0.0]) / np.hypot(x, y), None)
 
 
 def check_front(up: np.ndarray, front: np.ndarray) -> None:
-    """Raises ``ArgumentError`` where ``front`` (3,) points along ``up`` (3,)."""
+    """Raise ``ArgumentError`` if ``front`` (3,) is parallel to ``up`` (3,)."""
     if np.linalg.norm(np.cross(front, up)) < 1e-3 * np.linalg.norm(front) * np.linalg.norm(up):
         given = ",".join(f"{x:g}" for x in front)
-        raise ArgumentError("front", "points up or down; give a way along the ground", value=given)
+        raise ArgumentError("front", "points up or down; give a direction along the ground", value=given)
 
 
 def _check_slope(normal: np.ndarray, up: np.ndarray) -> None:
     slope = float(np.degrees(np.arccos(np.clip(normal @ up / np.linalg.norm(up), -1.0, 1.0))))
-    if slope > STEEPEST_SLOPE:
+    if slope > MAX_SLOPE:
         raise ArgumentError(
             "gravity_up",
-            f"that makes the ground a slope of {slope:.0f} degrees; give a direction at most {STEEPEST_SLOPE:g} degrees"
+            f"that makes the ground a slope of {slope:.0f} degrees; give a direction at most {MAX_SLOPE:g} degrees"
             f" from the ground's normal {','.join(f'{x:.3g}' for x in normal)}",
             value=",".join(f"{x:g}" for x in up),
         )
 
 
 def body_muscles(body: SoftBody, file: Path | None, frame: BodyFrame) -> MuscleSet:
-    """The muscles that ``file`` (JSON, ``egs_warp.muscles.files``) gives a body in its ``frame``; without one,
-    automatic ones.
+    """Return the muscles of a body: those of ``file`` (JSON, ``egs_warp.muscles.files``), otherwise automatic ones.
+
+    Args:
+        body: The soft body.
+        file: Muscles in the capture's frame and units; None creates automatic muscles.
+        frame: Frame of the body in the capture.
     """
     if file is not None:
         return read_muscles(file, body.mesh, body_weight=body.weight, frame=frame)
@@ -310,16 +369,19 @@ def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
 
 
 def checked_friction(friction: float) -> float:
-    """A Coulomb coefficient. Raises ``ArgumentError`` for one below 0."""
+    """Return the Coulomb coefficient ``friction``. Raises ``ArgumentError`` if it is negative or not finite."""
     if not 0.0 <= friction < np.inf:
         raise ArgumentError("friction", "give a Coulomb coefficient of at least 0", value=friction)
     return friction
 
 
 def initial_stance(creature: Creature, *, step: float | None = None, style: Style | None = None) -> Stance:
-    """Where the creature stands at the start, its front ahead.
+    """Return the stance of the creature at the start, with its front ahead.
 
-    ``step``: seconds that a solver step takes at most, see ``solver_steps``; ``style``: how it jumps.
+    Args:
+        creature: The creature.
+        step: Maximum step size, s (``solver_steps``); None is the default.
+        style: Style of jumps; None is the default.
     """
     body, start = creature.body, creature.start
     up = -body.gravity / np.linalg.norm(body.gravity)

@@ -1,4 +1,4 @@
-"""How a run and each of its motions ended: ``state`` of the report."""
+"""End state of a run and of each of its motions: ``state`` of the report."""
 
 from __future__ import annotations
 
@@ -9,17 +9,16 @@ from enum import Enum
 from egs_warp.locomotion.trajectory import MotionOutcome
 from egs_warp.motions.sequence import MotionRecord
 
-NO_PROGRESS = 0.1
-"""Of the asked distance or heading: a motion that has come to rest with less than a tenth has not done what it is for,
-whatever the reason."""
+MIN_PROGRESS = 0.1
+"""Minimum fraction of the requested distance or heading: a motion that ends with less has failed."""
 
 
 class State(Enum):
-    """How a motion ended; a run ends in the worst of those of its motions, these being in order."""
+    """End state of a motion, from best to worst; a run has the worst state of its motions."""
 
     DONE = "done"
     CUT_OFF = "cut off"
-    """The frames that were asked for, or that a motion may take, were over first."""
+    """The requested number of frames, or the maximum time of the motion, was reached first."""
     GOT_UP = "got up"
     """The body fell, which ended it, and has got up."""
     FALLEN = "fallen"
@@ -28,43 +27,54 @@ class State(Enum):
 
     @property
     def is_failure(self) -> bool:
-        """Whether it is told by the exit status."""
+        """True if the exit status reports it."""
         return self in (State.FALLEN, State.STOPPED)
 
     @classmethod
     def worst(cls, states: tuple[State, ...]) -> State:
-        """The last of them in the order above."""
+        """Return the worst of ``states``, ``DONE`` if there are none."""
         return max(states, key=list(cls).index, default=cls.DONE)
 
 
 @dataclass(frozen=True)
 class EndCause:
-    """What ended the last motion before its time."""
+    """Cause that ended the last motion early, if any."""
 
     fallen: str | None = None
-    """How a fall was told."""
+    """Description of a fall; None if the body has not fallen."""
     stopped: bool = False
-    """Whether a step could not be solved."""
+    """True if a step could not be solved."""
 
     def of(self, entry: MotionRecord, reached: MotionOutcome, *, last: bool) -> tuple[State, list[str]]:
-        """State of one of the motions that were begun, and why, for the user; ``last``: whether it was the last."""
+        """Return the state of a motion and notes for the user.
+
+        Args:
+            entry: Record of a motion that has started.
+            reached: Its measured outcome.
+            last: True for the last motion of the run.
+        """
         if last and self.stopped:
-            return State.STOPPED, ["stopped: the next step could not be solved, however short; this is all before it"]
+            return State.STOPPED, ["stopped: the next step could not be solved, however short; the run ends before it"]
         if entry.fell is not None:
-            state, then = (State.GOT_UP, "got up again") if entry.got_up else (State.FALLEN, "did not get up")
-            return state, [f"fallen: {entry.fell}; it {then}"]
+            state, outcome = (State.GOT_UP, "got up again") if entry.got_up else (State.FALLEN, "did not get up")
+            return state, [f"fallen: {entry.fell}; it {outcome}"]
         if last and self.fallen is not None:
             return State.FALLEN, [f"fallen: {self.fallen}"]
         if not entry.motion.is_at_rest:
             return State.CUT_OFF, []
-        missed = no_progress(entry.asked, reached)
-        return (State.FALLEN, [f"fallen: {missed}"]) if missed is not None else (State.DONE, [])
+        failure = no_progress(entry.asked, reached)
+        return (State.FALLEN, [f"fallen: {failure}"]) if failure is not None else (State.DONE, [])
 
 
-def no_progress(asked: Mapping[str, float], reached: MotionOutcome) -> str | None:
-    """What was ``asked`` (body heights, degrees) and next to nothing was ``reached`` of."""
+def no_progress(requested: Mapping[str, float], reached: MotionOutcome) -> str | None:
+    """Return a description of a target that was not approached, None if there is none.
+
+    Args:
+        requested: Targets by name, body heights and degrees.
+        reached: Measured outcome.
+    """
     for name, unit in (("distance", "body heights"), ("heading_degrees", "degrees")):
-        wanted, got = asked.get(name, 0.0), getattr(reached, name)
-        if abs(wanted) > 0.0 and abs(got) < NO_PROGRESS * abs(wanted):
-            return f"no progress, {name.partition('_')[0]} {got:.2g} of {wanted:g} {unit}"
+        target, value = requested.get(name, 0.0), getattr(reached, name)
+        if abs(target) > 0.0 and abs(value) < MIN_PROGRESS * abs(target):
+            return f"no progress, {name.partition('_')[0]} {value:.2g} of {target:g} {unit}"
     return None

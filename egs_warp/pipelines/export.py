@@ -1,4 +1,4 @@
-"""A finished run as files of other tools: numbered splat files, or one USD stage."""
+"""Export of a finished run to numbered splat files."""
 
 from __future__ import annotations
 
@@ -19,12 +19,15 @@ _Y_UP = BodyFrame(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def chosen_frames(run: FinishedRun, *, frame: int | None, every: int) -> np.ndarray:
-    """Indices of frames at 60 Hz: one, or ``every`` so many. Raises ``UserError`` for one that is not there."""
+    """Return the indices of the frames at 60 Hz to export: ``frame`` alone, or each ``every``-th frame.
+
+    Raises ``UserError`` if the run does not have ``frame`` or ``every`` is below 1.
+    """
     if every < 1:
         raise ArgumentError("every", "give a whole number of at least 1", value=every)
     if frame is None:
         return np.arange(0, len(run.steps), every)
-    return np.array([run.frame_number(frame, asked_by="frame")])
+    return np.array([run.frame_number(frame, argument="frame")])
 
 
 def export_splats(
@@ -37,15 +40,26 @@ def export_splats(
     degree: int | None = None,
     quiet: bool = False,
 ) -> list[Path]:
-    """Write ``frame0000.ply`` and so on into ``folder``, numbered at 60 Hz; returns the paths.
+    """Write ``frame0000.ply`` and so on into ``folder``, numbered at 60 Hz, and return the paths.
 
-    ``kind`` is one of ``WRITERS``. All but ``glb`` lie in the frame and units of the capture, so they fit what is left
-    of it; ``glb`` is in metres, y up, as glTF asks. Raises ``UserError`` for a frame that the run does not have, and
-    for a folder with other frames.
+    Files are in the frame and units of the capture, so that they fit its background; ``glb`` files are in metres with
+    y up, as glTF requires.
+
+    Args:
+        run: The run to export.
+        folder: Folder for the files.
+        kind: A key of ``WRITERS``.
+        frame: Export this frame alone; negative numbers count from the end.
+        every: Export each ``every``-th frame.
+        degree: SH degree of the colours; None keeps that of the capture.
+        quiet: Show no progress bar.
+
+    Raises:
+        UserError: The run does not have ``frame``, or ``folder`` has other frames.
     """
     ending, write = WRITERS[kind]
     frames = chosen_frames(run, frame=frame, every=every)
-    # Stills may lie together.
+    # Several single frames may be in one folder.
     paths = frame_paths(folder, frames, ending, alone=frame is None)
     deformer = run.deformer()
     place = _Y_UP if kind == "glb" else run.capture_frame

@@ -1,7 +1,7 @@
-"""Which way a body faces: along the upright plane that mirrors it best, to the side where its face is.
+"""Estimate of the direction in which a body faces: in its best vertical mirror plane, towards the side of its face.
 
-The body is looked at from all around. A face has more detail than the back of a head, a head leans out over the feet,
-the back of a chair away from its seat, and where photos are from one side only, they are of the front.
+The body is rendered from all around. A face has more detail than the back of a head, a head is ahead of the feet, the
+back of a chair is behind its seat, and photos from one side only usually show the front.
 """
 
 from __future__ import annotations
@@ -21,77 +21,86 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.render.rasteriser import render_gaussians
 
 _VIEWS = 24
-"""Pictures, evenly around; planes of symmetry are tried at half their angle."""
+"""Number of views, evenly around; mirror planes are tested at half their angular spacing."""
 _SIDE, _COARSE_SIDE = 128, 64
-"""Pixels, to look for detail and for symmetry."""
+"""Side of the pictures, pixels, for detail and for symmetry."""
 _ELEVATION = 0.2
-"""Of the way from the body to the camera, up to along the ground."""
+"""Vertical over horizontal component of the direction from the body to the camera."""
 _FOV_DEGREES = 20.0
-"""So narrow that a mirrored body gives nearly a mirrored picture."""
-_MOST_GAUSSIANS = 50_000
-"""More are thinned out, and widened: nothing so small is looked for."""
+"""Narrow, so that a mirrored body gives nearly a mirrored picture."""
+_MAX_GAUSSIANS = 50_000
+"""Above this number, Gaussians are subsampled and widened: small details do not matter."""
 _FINE, _SMOOTH = 0.01, 0.04
-"""Body heights: detail is what is lost from the one blur to the other."""
+"""Standard deviations of two blurs, body heights: detail is the difference between them."""
 _OFFSETS = np.arange(-6.0, 7.0, 1.5)
-"""Coarse pixels from the body's middle at which a plane of symmetry is tried."""
+"""Offsets from the body's centre at which mirror planes are tested, coarse pixels."""
 _OPAQUE = 0.8
+"""Coverage above which a pixel belongs to the body."""
 _SILHOUETTE = 0.5
-"""What covers counts beside its lightness, 0 to 1."""
+"""Weight of the coverage relative to the colours, 0 to 1."""
 _HIGH, _LOW = 0.7, 0.3
-"""Body heights: above is the head, below are the feet."""
-_PLATE = 2.7
-"""A head that is so much wider than deep is a back."""
+"""Body heights above which is the head, and below which are the feet."""
+_MAX_HEAD_ASPECT = 2.7
+"""Ratio of width to depth above which a head is taken for the back of a chair."""
 _SYMMETRY, _LEAN, _PHOTOS = 2.0, 1.5, 1.0
-"""Weights beside that of detail, 1: of the mirrored part of a picture, a body height of lean, all photos from one
-way."""
-_CLEAR = 0.4
-"""Score by which the front is ahead of the back: that of a face half as rich again in detail."""
+"""Weights of the symmetric fraction of a picture, of a lean of one body height, and of photos that are all from one
+direction; the weight of detail is 1."""
+_CLEAR_MARGIN = 0.4
+"""Difference of score between front and back for a clear result: that of a face with 1.5 times the detail."""
 
 
 @dataclass(frozen=True)
 class Front:
-    """Which way a body faces, and why."""
+    """Facing direction of a body, and the reason for it."""
 
     direction: np.ndarray
-    """(3,) unit, along the ground, in the frame of the body."""
+    """(3,) Unit vector along the ground, in the frame of the body."""
     reason: str | None
-    """Why, where it was found; None where it was given."""
+    """Explanation of an estimate; None if the direction was given."""
 
     def told(self, frame: BodyFrame) -> str:
-        """One line for the user of a capture that the body has this ``frame`` in."""
-        way = ",".join(f"{x:.2f}" for x in frame.axes.T @ self.direction)
-        return f"front is {way}, as given" if self.reason is None else f"front is taken to be {way} ({self.reason})"
+        """Return one line for the user; ``frame`` is that of the body in the capture."""
+        direction = ",".join(f"{x:.2f}" for x in frame.axes.T @ self.direction)
+        return (
+            f"front is {direction}, as given"
+            if self.reason is None
+            else f"front is taken to be {direction} ({self.reason})"
+        )
 
 
 def find_front(
     cloud: GaussianCloud, mesh: TetMesh, *, seen_from: np.ndarray | None = None, lengthwise: bool = False
 ) -> Front:
-    """Which way the body of ``cloud`` and cage ``mesh`` faces, both in its own frame.
+    """Estimate the facing direction of a body. Equal bodies give equal bits.
 
-    ``seen_from`` (3,) is the mean of the unit vectors to the cameras of its photos, in that frame: nothing if they go
-    all around. What lies along the ground faces ``lengthwise``. The same body gives the same bits.
+    Args:
+        cloud: Gaussians in the frame of the body.
+        mesh: Cage in the frame of the body.
+        seen_from: (3,) Mean of the unit vectors from the body to the cameras of its photos, in the frame of the body;
+            near zero if the cameras are all around.
+        lengthwise: Face along the longest horizontal axis, as a lying body does.
     """
     height = float(mesh.nodes[:, 2].max())
-    pictures, pixels = _look_around(cloud, mesh)
+    pictures, pixels = _render_views(cloud, mesh)
     mirrored = _symmetry(pictures)
     detail = np.array([_detail(picture, height * pixels) for picture in pictures])
     detail = 0.5 * detail + 0.25 * (np.roll(detail, 1) + np.roll(detail, -1))
     richer = np.log(np.maximum(detail, 1e-12) / np.maximum(np.roll(detail, _VIEWS // 2), 1e-12))
     angles = np.pi * np.arange(2 * _VIEWS) / _VIEWS
-    ways = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    lean = _lean(mesh) @ ways.T
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    lean = _lean(mesh) @ directions.T
     symmetric = np.tile(mirrored - np.median(mirrored), 2)
     richer = np.stack([richer, 0.5 * (richer + np.roll(richer, -1))], axis=1).ravel()
-    photos = np.zeros(len(ways)) if seen_from is None else seen_from[:2] @ ways.T
+    photos = np.zeros(len(directions)) if seen_from is None else seen_from[:2] @ directions.T
     score = _SYMMETRY * symmetric + richer + _LEAN * lean + _PHOTOS * photos
     length = _length(mesh)
-    along = length @ ways.T
-    allowed = np.abs(along) > np.abs(along).max() - 1e-9 if lengthwise else np.full(len(ways), True)
+    along = length @ directions.T
+    allowed = np.abs(along) > np.abs(along).max() - 1e-9 if lengthwise else np.full(len(directions), True)
     best = int(np.argmax(np.where(allowed, score, -np.inf)))
     if lengthwise:
         angle = np.arctan2(*(np.sign(along[best]) * length)[::-1])
     else:
-        # A parabola through the best and its neighbours.
+        # The maximum of a parabola through the best score and its neighbours.
         before, at, after = score[best - 1], score[best], score[(best + 1) % len(score)]
         angle = angles[best] + 0.5 * (before - after) / min(before - 2.0 * at + after, -1e-12) * np.pi / _VIEWS
     alike = f"the body is {100.0 * mirrored[best % _VIEWS]:.0f} % alike when mirrored along it"
@@ -103,31 +112,35 @@ def find_front(
     if abs(photos[best]) > 0.05:
         reasons.append(f"was photographed from {'there' if photos[best] > 0.0 else 'behind'}")
     ahead = float(score[best] - score[(best + _VIEWS) % len(score)])
-    sure = "clearly" if ahead > _CLEAR else "narrowly"
+    sure = "clearly" if ahead > _CLEAR_MARGIN else "narrowly"
     why = f"guessed: {', '.join(reasons)}; {sure} ahead of the back; if not, say which way is front"
     return Front(np.array([np.cos(angle), np.sin(angle), 0.0]), why)
 
 
 def _length(mesh: TetMesh) -> np.ndarray:
-    """(2,) unit, along the longest way through the body on the ground."""
+    """Return the unit vector (2,) along the body's longest horizontal principal axis."""
     middles, volumes = mesh.nodes[mesh.tets].mean(axis=1)[:, :2], mesh.volumes()
     arms = middles - np.average(middles, axis=0, weights=volumes)
     return np.linalg.eigh((arms * volumes[:, None]).T @ arms)[1][:, -1]
 
 
 def mean_view(cameras: Sequence[Camera], centre: np.ndarray) -> np.ndarray | None:
-    """(3,) mean of the unit vectors from ``centre`` (3,) to the ``cameras``; None where there are none."""
+    """Return the mean (3,) of the unit vectors from ``centre`` (3,) to the ``cameras``; None without cameras."""
     arms = np.array([camera.centre - centre for camera in cameras]).reshape(-1, 3)
     return (arms / np.linalg.norm(arms, axis=1, keepdims=True)).mean(axis=0) if len(arms) else None
 
 
-def _look_around(cloud: GaussianCloud, mesh: TetMesh) -> tuple[np.ndarray, float]:
-    """(views, H, W, 4) CIELAB over 100 and coverage of the body alone, and pixels a metre."""
+def _render_views(cloud: GaussianCloud, mesh: TetMesh) -> tuple[np.ndarray, float]:
+    """Render the body alone from all around.
+
+    Returns:
+        (views, H, W, 4) CIELAB / 100 and coverage, and the scale in pixels per metre.
+    """
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     means = cloud.means.numpy()
     slack = 0.02 * high[2]
     cloud = cloud.subset(np.flatnonzero(((means >= low - slack) & (means <= high + slack)).all(axis=1)))
-    step = -(-cloud.count // _MOST_GAUSSIANS)
+    step = -(-cloud.count // _MAX_GAUSSIANS)
     if step > 1:
         thinned = cloud.subset(np.arange(0, cloud.count, step))
         wider = thinned.log_scales.numpy() + np.float32(0.5 * np.log(step))
@@ -136,8 +149,8 @@ def _look_around(cloud: GaussianCloud, mesh: TetMesh) -> tuple[np.ndarray, float
     radius = float(np.linalg.norm(mesh.nodes - middle, axis=1).max())
     pictures = []
     for angle in 2.0 * np.pi * np.arange(_VIEWS) / _VIEWS:
-        way = np.array([np.cos(angle), np.sin(angle), _ELEVATION])
-        camera = ring_camera(way, middle, radius, GROUND.normal, size=_SIDE, vertical_fov_degrees=_FOV_DEGREES)
+        direction = np.array([np.cos(angle), np.sin(angle), _ELEVATION])
+        camera = ring_camera(direction, middle, radius, GROUND.normal, size=_SIDE, vertical_fov_degrees=_FOV_DEGREES)
         image = render_gaussians(cloud, camera, background=(0.0, 0.0, 0.0))
         cover = np.clip(image.alpha.numpy(), 0.0, 1.0)
         colour = np.clip(image.colour.numpy() / np.maximum(cover, 1e-3)[..., None], 0.0, 1.0)
@@ -147,8 +160,11 @@ def _look_around(cloud: GaussianCloud, mesh: TetMesh) -> tuple[np.ndarray, float
 
 
 def _symmetry(pictures: np.ndarray) -> np.ndarray:
-    """(views,) how much of the pictures (views, H, W, 4) is alike, 1 at most, when the body is mirrored in the upright
-    plane at each half of their angle: the view to the one side of the plane is then the mirrored view to the other."""
+    """Return the symmetry (views,), at most 1, of the pictures (views, H, W, 4) about each vertical mirror plane.
+
+    The planes are at half the angular spacing of the views. For a symmetric body, the view from one side of the plane
+    is the mirrored view from the other side.
+    """
     small = np.array([cv2.resize(p, (_COARSE_SIDE, _COARSE_SIDE), interpolation=cv2.INTER_AREA) for p in pictures])
     small[..., :3] *= small[..., 3:]
     small[..., 3] *= _SILHOUETTE
@@ -171,20 +187,25 @@ def _symmetry(pictures: np.ndarray) -> np.ndarray:
 
 
 def _detail(picture: np.ndarray, height: float) -> float:
-    """Root mean square over the body of what differs in a ``picture`` (H, W, 4) of a body ``height`` pixels high
-    between one blur and the next."""
+    """Return the RMS over the body of the difference between two blurs of ``picture`` (H, W, 4).
+
+    ``height`` is the height of the body in pixels.
+    """
     inside = cv2.erode((picture[..., 3] > _OPAQUE).astype(np.float32), np.ones((3, 3)))
 
     def blurred(sigma: float) -> np.ndarray:
         over = cv2.GaussianBlur(picture[..., :3] * inside[..., None], (0, 0), sigma * height)
         return over / np.maximum(cv2.GaussianBlur(inside, (0, 0), sigma * height), 1e-3)[..., None]
 
-    lost = (((blurred(_FINE) - blurred(_SMOOTH)) ** 2).sum(axis=2) * inside).sum()
-    return float(np.sqrt(lost / max(float(inside.sum()), 1.0)))
+    difference = (((blurred(_FINE) - blurred(_SMOOTH)) ** 2).sum(axis=2) * inside).sum()
+    return float(np.sqrt(difference / max(float(inside.sum()), 1.0)))
 
 
 def _lean(mesh: TetMesh) -> np.ndarray:
-    """(2,) body heights by which the head is ahead of the feet; of a back, as a chair has it, behind them."""
+    """Return the horizontal offset (2,) of the head from the feet, body heights.
+
+    If the upper part is a thin plate, such as the back of a chair, its offset counts backwards.
+    """
     middles, volumes, height = mesh.nodes[mesh.tets].mean(axis=1), mesh.volumes(), float(mesh.nodes[:, 2].max())
 
     def middle(part: np.ndarray) -> np.ndarray:
@@ -196,7 +217,7 @@ def _lean(mesh: TetMesh) -> np.ndarray:
     lean = (middle(head) - middle(feet)) / height
     arms = middles[head, :2] - middle(head)
     moments, axes = np.linalg.eigh((arms * volumes[head, None]).T @ arms)
-    if moments[1] > _PLATE**2 * max(moments[0], 1e-300):
+    if moments[1] > _MAX_HEAD_ASPECT**2 * max(moments[0], 1e-300):
         thin = axes[:, 0]
         return -(lean @ thin) * thin
     return lean

@@ -1,4 +1,4 @@
-"""A finished simulation, drawn: the capture carried by its cage, frame after frame, over what is behind it."""
+"""Rendering of a finished simulation: the capture, deformed by its cage, over its background in each frame."""
 
 from __future__ import annotations
 
@@ -29,19 +29,21 @@ from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.render.shadow import ContactShadow, shadow_blur_radius
 
 SHEET_FRAMES = 12
+"""Frames on the contact sheet."""
 SPLIT_KEY_FRAMES = 24
+"""Frames whose deformation decides which Gaussians are split."""
 
 
 @dataclass(frozen=True)
 class Film:
-    """What was drawn, and what it cost."""
+    """Gaussians and camera of a rendered film, and its cost."""
 
     splats: GaussianCloud
-    """What was drawn, at rest, splits among them."""
+    """Rendered Gaussians at rest, after splitting."""
     camera: Camera
-    """As it stands where it does not move."""
+    """Camera of the film; for a moving camera, the fixed one that it is derived from."""
     milliseconds: dict[str, list[float]]
-    """Of each frame, by stage; the splits, made once, are shared out among the frames."""
+    """ms of each frame, by stage; the time of the splitting is divided by the number of frames."""
 
 
 @dataclass(frozen=True)
@@ -49,14 +51,14 @@ class Frame:
     """One picture of a film."""
 
     image: RenderedImage
-    """Over what is behind it; over black where the shot is transparent."""
+    """The creature over its background; over black if the shot is transparent."""
     shade: wp.array | None
-    """(H, W) float32: how much the shadow hides of what will be behind it, where the shot is transparent."""
+    """(H, W) float32 opacity of the shadow; None unless the shot is transparent."""
     milliseconds: tuple[float, float]
-    """To deform and to render."""
+    """ms to deform and to render."""
 
     def picture(self) -> np.ndarray:
-        """(H, W, 3) uint8; of a transparent shot (H, W, 4), colours not multiplied by alpha."""
+        """Return the image (H, W, 3) uint8; for a transparent shot (H, W, 4) with straight alpha."""
         if self.shade is None:
             return self.image.colour_srgb8()
         alpha = self.image.alpha.numpy()
@@ -77,11 +79,19 @@ def draw_film(
     shadow: bool = True,
     quiet: bool = False,
 ) -> Film:
-    """Write ``name``.mp4 and sheet.png, ``size`` pixels both ways, into the folder of ``run``; a transparent ``shot``
-    is ``name``.mov.
+    """Render a simulated run and write its video and ``sheet.png`` into the folder of ``run``.
 
-    ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
-    the object to the camera, both in the capture's frame; of several (n, 3) the best is chosen.
+    Args:
+        performance: The simulated run.
+        run: Folder for the files.
+        name: Name of the video: ``name``.mp4, or ``name``.mov if ``shot`` is transparent.
+        size: Width and height of the video, pixels, if ``shot`` has no size.
+        shot: Camera, size, frame rate and background colour.
+        background: Gaussians behind the object, in the capture's frame and units; None draws a plain floor.
+        view_from: (3,) direction from the object to the camera, in the capture's frame; of several (n, 3) the best is
+            chosen.
+        shadow: Draw a shadow on the ground.
+        quiet: Show no progress bar.
     """
     creature, simulation = performance.creature, performance.simulation
     trajectory, shot = simulation.trajectory, shot or Shot()
@@ -89,7 +99,7 @@ def draw_film(
     scene = creature.placed(background) if background is not None else None
     camera = resized(performance.camera(size, view_from, scene=scene), *(shot.size or (size, size)))
     cameras = shot.cameras(camera, trajectory, steps)
-    # The whole motion is known, so what it will bend is split before the first frame, and nothing can pop.
+    # The whole motion is known, so Gaussians are split before the first frame and no frame shows a sudden change.
     started = time.perf_counter()
     keys = simulation.frames[:: max(1, len(simulation.frames) // SPLIT_KEY_FRAMES)]
     embedding = embed_gaussians(creature.cloud, creature.cage.mesh)
@@ -105,8 +115,8 @@ def draw_film(
         shadow=shadow,
     )
     milliseconds: dict[str, list[float]] = {"deform": [], "render": [], "encode": []}
-    kept: list[np.ndarray] = []
-    wanted = np.unique(np.linspace(0, len(steps) - 1, SHEET_FRAMES).round().astype(int))
+    sheet_images: list[np.ndarray] = []
+    sheet_indices = np.unique(np.linspace(0, len(steps) - 1, SHEET_FRAMES).round().astype(int))
     path = run.file(f"{name}.{'mov' if shot.transparent else 'mp4'}")
     with (
         _writer(path, cameras[0], shot) as video,
@@ -116,14 +126,14 @@ def draw_film(
             started = time.perf_counter()
             image = frame.picture()
             video.write(image)
-            if index in wanted:
-                kept.append(_over_white(image))
+            if index in sheet_indices:
+                sheet_images.append(_over_white(image))
             encoding = 1e3 * (time.perf_counter() - started)
             for stage, spent in zip(milliseconds, (*frame.milliseconds, encoding), strict=True):
                 milliseconds[stage].append(spent)
             bar.update()
-    labels = [f"{trajectory.time[steps[i]]:.2f} s" for i in wanted]
-    write_png(run.file("sheet.png"), contact_sheet(kept, 4, labels))
+    labels = [f"{trajectory.time[steps[i]]:.2f} s" for i in sheet_indices]
+    write_png(run.file("sheet.png"), contact_sheet(sheet_images, 4, labels))
     milliseconds["split"] = [splitting / len(steps)]
     return Film(split.cloud, camera, milliseconds)
 
@@ -138,21 +148,31 @@ def drawn_frames(
     scene: GaussianCloud | None = None,
     shadow: bool = True,
 ) -> Iterator[Frame]:
-    """A picture for each of ``steps`` (n,) of the trajectory through each of the n ``cameras``; what does not change
-    from one to the next is made once. ``scene`` lies in the body's frame.
+    """Render one frame for each step of the trajectory. The backdrop is reused while the camera stays the same.
+
+    Args:
+        deformer: Deforms the Gaussians with the cage.
+        trajectory: Node positions.
+        steps: (n,) indices of the states to render.
+        cameras: n cameras.
+        shot: Background colour and transparency.
+        scene: Gaussians behind the creature, in the frame of the body.
+        shadow: Draw a shadow on the ground.
     """
     path = np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
     grain, device = shadow_blur_radius(deformer.rest), deformer.rest.device
-    behind: Backdrop | None = None
+    setting: Backdrop | None = None
     for index, (step, camera) in enumerate(zip(steps, cameras, strict=True)):
         marks = [time.perf_counter()]
         deformed = deformer.deform(trajectory.positions[step])
         marks.append(time.perf_counter())
         cloud = deformed.cloud
-        if behind is None or camera is not cameras[index - 1]:
-            behind = _behind(path, trajectory.height, camera, scene, shot, grain=grain, shadow=shadow, device=device)
-        shade = behind.shadow_opacity(cloud) if shot.transparent else None
-        backdrop = behind.background(cloud) if shade is None else (0.0, 0.0, 0.0)
+        if setting is None or camera is not cameras[index - 1]:
+            setting = _backdrop_of(
+                path, trajectory.height, camera, scene, shot, grain=grain, shadow=shadow, device=device
+            )
+        shade = setting.shadow_opacity(cloud) if shot.transparent else None
+        backdrop = setting.background(cloud) if shade is None else (0.0, 0.0, 0.0)
         image = render_gaussians(cloud, camera, background=backdrop)
         wp.synchronize_device(cloud.device)
         marks.append(time.perf_counter())
@@ -171,7 +191,7 @@ def _over_white(image: np.ndarray) -> np.ndarray:
     return np.rint(alpha * image[..., :3] + 255.0 * (1.0 - alpha)).astype(np.uint8)
 
 
-def _behind(
+def _backdrop_of(
     path: np.ndarray,
     height: float,
     camera: Camera,
@@ -182,16 +202,27 @@ def _behind(
     shadow: bool,
     device: wp.Device,
 ) -> Backdrop:
-    """``path`` (F+1, 3) is that of the centre of mass of a body ``height`` tall."""
+    """Return the backdrop of a shot.
+
+    Args:
+        path: (F + 1, 3) m, path of the centre of mass.
+        height: Height of the body, m.
+        camera: Camera of the frame.
+        scene: Gaussians behind the creature, in the frame of the body.
+        shot: Background colour and transparency.
+        grain: Blur radius of the shadow.
+        shadow: Draw a shadow on the ground.
+        device: Warp device.
+    """
     com = path.mean(axis=0)
     centre = com * [1.0, 1.0, 0.0]
     reach = 2.2 * (height + float(np.linalg.norm(np.ptp(path, axis=0))))
-    plain = shot.transparent or shot.colour is not None
-    if scene is not None and not plain:
+    is_plain = shot.transparent or shot.colour is not None
+    if scene is not None and not is_plain:
         return captured_scene(
             scene, camera, GROUND, centre=centre, reach=reach, grain=grain, height=height, shadow=shadow
         )
     ground = ContactShadow(camera, GROUND, centre=centre, reach=reach, device=device, grain=grain, height=height)
-    if plain:
+    if is_plain:
         return plain_colour(ground, shot.colour or (0.0, 0.0, 0.0), shadow=shadow)
     return grid_floor(ground, cell=0.25 * height, shadow=shadow)

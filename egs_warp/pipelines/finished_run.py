@@ -1,4 +1,4 @@
-"""A finished run, read from its folder."""
+"""Finished runs, read from their folders."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.shot import nearest_steps
 
 PARTS = "trajectory.parts"
-"""Folder that takes the steps of a run as they are done; it goes when the run has finished."""
+"""Folder that receives the steps of a run while it is simulated; it is removed when the run has finished."""
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read a run's trajectory: its file, or the folder of parts of one that was cut off.
+    """Read a run's trajectory from its file, or from the folder of parts of an interrupted run.
 
-    Raises ``UserError`` where there is none, or another kind of file.
+    Raises ``UserError`` if the file is missing or is not a trajectory.
     """
     try:
         trajectory = Trajectory.load(path)
@@ -42,7 +42,7 @@ def read_trajectory(path: Path) -> Trajectory:
         if not path.is_dir() and (path.parent / PARTS).is_dir():
             raise UserError(
                 f"{path}: is missing, the run was cut off; egs-warp resume {path.parent} goes on"
-                f" (what it did is in {PARTS})"
+                f" (its finished steps are in {PARTS})"
             ) from error
         raise UserError(f"{path}: is missing; give the folder that egs-warp animate wrote") from error
     except READ_ERRORS as error:
@@ -52,20 +52,25 @@ def read_trajectory(path: Path) -> Trajectory:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A finished run."""
+    """Files of a finished run."""
 
     folder: Path
     trajectory: Trajectory
     creature: RenderData
     report: dict[str, Any]
     scene: GaussianCloud | None
-    """What is behind the creature, in its frame."""
+    """Gaussians behind the creature, in the frame of the body; None if there are none."""
 
     @classmethod
     def read(cls, folder: Path, *, background: Path | None = None) -> Self:
-        """Read the ``folder`` of a run; ``background`` is a capture behind it, else its own ``background.ply``.
+        """Read the ``folder`` of a run.
 
-        Raises ``UserError`` for a folder that is no run.
+        Args:
+            folder: Folder that ``egs-warp animate`` wrote.
+            background: Capture behind the creature; None uses ``background.ply`` of the folder, if it exists.
+
+        Raises:
+            UserError: ``folder`` has no finished run.
         """
         if not folder.is_dir():
             raise UserError(f"{folder}: is no folder; give the one that egs-warp animate wrote")
@@ -77,8 +82,8 @@ class FinishedRun:
         report = parse_json(read_text(folder / "report.json"), folder / "report.json")
         if not isinstance(report, dict):
             raise UserError(f"{folder / 'report.json'}: is no report; run egs-warp animate again, which writes it")
-        own = folder / "background.ply"
-        file = background or (own if own.is_file() else None)
+        own_background = folder / "background.ply"
+        file = background or (own_background if own_background.is_file() else None)
         scene = None
         if file is not None:
             t = trajectory
@@ -88,50 +93,49 @@ class FinishedRun:
 
     @property
     def title(self) -> str:
-        """Capture and motions."""
+        """Name of the capture and of its motions."""
         motions = self.report.get("motion", [])
         names = [str(m.get("name", "")) for m in motions if isinstance(m, dict)] if isinstance(motions, list) else []
         return " \u00b7 ".join(filter(None, [str(self.report.get("source", self.folder.name)), " \u2192 ".join(names)]))
 
     @cached_property
     def steps(self) -> np.ndarray:
-        """(n,) the step that is nearest to each frame at 60 Hz."""
+        """(n,) Step that is nearest to each frame at 60 Hz."""
         return nearest_steps(self.trajectory.time, FRAME_RATE)
 
-    def frame_number(self, frame: int, *, asked_by: str) -> int:
-        """From 0, of ``frame``, which may count from the end. Raises ``ArgumentError`` about the argument ``asked_by``
-        for one that is not there.
+    def frame_number(self, frame: int, *, argument: str) -> int:
+        """Return the number, from 0, of ``frame``, which counts from the end if it is negative.
+
+        Raises ``ArgumentError`` about ``argument`` if the run does not have that frame.
         """
         count = len(self.steps)
         if not -count <= frame < count:
             advice = f"the run has {count} frames; give 0 to {count - 1}, or -1 for the last"
-            raise ArgumentError(asked_by, advice, value=frame)
+            raise ArgumentError(argument, advice, value=frame)
         return frame % count
 
     @cached_property
     def mesh(self) -> TetMesh:
-        """The rest cage."""
+        """Cage at rest."""
         return TetMesh(self.trajectory.rest_positions, self.trajectory.tets)
 
     def deformer(self) -> Deformer:
-        """Carries the creature's splats to node positions of the trajectory, as the film did."""
+        """Create the deformer that moves the creature's Gaussians to node positions, as the film did."""
         return Deformer(self.creature.splats, embed_gaussians(self.creature.splats, self.mesh))
 
     @property
     def capture_frame(self) -> BodyFrame:
-        """Takes what lies in the body's frame to the capture's frame and units."""
+        """Transform from the frame of the body to the frame and units of the capture."""
         t = self.trajectory
         return BodyFrame(t.body_axes.T, -t.metres_per_unit * t.body_axes @ t.body_origin, 1.0 / t.metres_per_unit)
 
     def activations(self, step: int) -> np.ndarray:
-        """(M,) -1 to 1: what each muscle segment did on the way to the state after ``step`` steps, of the most that it
-        can.
-        """
+        """Return the activations (M,), -1 to 1 relative to their bounds, of the step that leads to state ``step``."""
         bounds = np.maximum(self.creature.muscle_bounds, 1e-12)
         return self.trajectory.activations[step - 1] / bounds if step > 0 else np.zeros(len(bounds))
 
     def contacts(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points, unit normals and forces on the body, each (C, 3), on the way to the state after ``step`` steps."""
+        """Return contact points (m), unit normals and forces on the body (N), (C, 3) each, of the step to ``step``."""
         t = self.trajectory
         # Step i leads to state i + 1.
         chosen = np.flatnonzero(t.contact_step == step - 1)

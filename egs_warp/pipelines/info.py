@@ -1,4 +1,4 @@
-"""What the program finds in a capture: up, front, base, feet, size, muscles, and what the body can be asked for."""
+"""Inspection of a capture: up, front, base, feet, size, muscles, and the motions that the body can perform."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _SIDE = 480
-"""Pixels of a picture of the capture."""
+"""Width and height of a picture of the capture, pixels."""
 _NEAR_GROUND = 0.01
-"""Body heights: what is so low at rest touches the ground."""
+"""Body heights below which a node at rest touches the ground."""
 _PALE = 0.82
-"""Grey of what is no limb."""
+"""Grey of parts that are not limbs."""
 _LINE = 68
-"""Characters of a line in the picture."""
+"""Characters in a line of the picture."""
 _MARGIN = 16
-"""Pixels."""
+"""Margin around the capture, pixels."""
 
 
 @dataclass(frozen=True)
 class BodyInfo:
-    """A capture as the program sees it, in the frame of its body, metres; at rest, not yet bent by its weight."""
+    """Properties of a capture in the frame of its body, metres; at rest, before it is deformed by its weight."""
 
     source: str
     standing: PlacedCage
@@ -59,37 +59,37 @@ class BodyInfo:
     base: SupportKind
     place: Stance
     feet: tuple[Foot, ...]
-    """As they are numbered: anticlockwise as seen from above, from straight ahead on."""
+    """Feet in the order of their numbers: anticlockwise seen from above, starting straight ahead."""
     notes: tuple[str, ...]
 
     def soles(self) -> np.ndarray:
-        """(feet, 3) middle of each sole: forward, left and up of the centre of mass's foot on the ground."""
+        """Return the centres of the soles (feet, 3) m, forward, left and up of the centre of mass on the ground."""
         local = self.place.ground.local(self.place.standing)
         return np.array([local[foot.sole].mean(axis=0) for foot in self.feet]).reshape(-1, 3)
 
     def motions(self) -> dict[str, str | None]:
-        """Why the body cannot do a motion, None where it can."""
-        return {name: self._refused(name) for name in MOTIONS}
+        """Return, for each motion, the reason why the body cannot perform it; None if it can."""
+        return {name: self._why_not(name) for name in MOTIONS}
 
-    def _refused(self, name: str) -> str | None:
+    def _why_not(self, name: str) -> str | None:
         kind = MOTIONS[name]
         if kind.file is not None:
             return None
-        asked = {value.name: value.default for value in kind.parameters}
+        defaults = {value.name: value.default for value in kind.parameters}
         try:
-            Script((MotionRequest(name, asked),)).check(self.place)
+            Script((MotionRequest(name, defaults),)).check(self.place)
         except UserError as error:
             return str(error).removeprefix(f"{name}: ")
         return None
 
     def lines(self) -> list[str]:
-        """For the terminal; lengths in body heights where no unit is named."""
+        """Return the lines for the terminal; lengths without a unit are in body heights."""
         frame, height = self.standing.frame, self.body.height
-        up, ahead = (_numbers(frame.axes.T @ way) for way in (GROUND.normal, self.front.direction))
+        up, ahead = (_numbers(frame.axes.T @ view) for view in (GROUND.normal, self.front.direction))
         plane = Plane(frame.axes[2], -float(frame.axes[2] @ frame.origin))
         size = np.ptp(self.place.ground.local(self.place.standing), axis=0) / height
         mesh, kinds = self.standing.cage.mesh, self._kinds()
-        found = [
+        lines = [
             f"capture  {self.source}: {self.standing.gaussians.count} Gaussians",
             f"up       {up}",
             f"ground   {_numbers(plane.normal, 4)},{plane.offset:.4g}",
@@ -100,16 +100,18 @@ class BodyInfo:
             f"stands   on {self._stands()}",
         ]
         for number, (foot, sole) in enumerate(zip(self.feet, self.soles() / height, strict=True), start=1):
-            found.append(f"  foot {number}: {_place(sole)}, leg {foot.length / height:.2f}{_foot_note(foot, height)}")
-        found.append(
+            lines.append(
+                f"  foot {number}: {_describe_position(sole)}, leg {foot.length / height:.2f}{_foot_note(foot, height)}"
+            )
+        lines.append(
             f"muscles  {self.muscles.fibre_count} fibres, {self.muscles.segment_count} segments"
             f" ({', '.join(f'{count} {kind.value}' for kind, count in kinds.items())})"
         )
         for name, why in self.motions().items():
             needs = MOTIONS[name].file
             can = f"yes, with {needs}" if needs is not None else "yes"
-            found.append(f"{name:<10} {can if why is None else f'no: {why}'}")
-        return [*found, *(f"note: {note}" for note in self.notes)]
+            lines.append(f"{name:<10} {can if why is None else f'no: {why}'}")
+        return [*lines, *(f"note: {note}" for note in self.notes)]
 
     def _kinds(self) -> dict[FibreKind, int]:
         return dict(Counter(self.muscles.fibre_kinds[fibre] for fibre in self.muscles.fibre_from_segment))
@@ -125,11 +127,11 @@ class BodyInfo:
 
 
 def _numbers(vector: np.ndarray, digits: int = 2) -> str:
-    # No minus before nothing.
+    # Avoids "-0.00".
     return ",".join(f"{x + 0.0:.{digits}f}" for x in np.round(vector, digits))
 
 
-def _place(sole: np.ndarray) -> str:
+def _describe_position(sole: np.ndarray) -> str:
     ahead, left, _ = sole
     along, aside = "ahead" if ahead >= 0.0 else "behind", "left" if left >= 0.0 else "right"
     return f"{abs(ahead):.2f} {along}, {abs(left):.2f} {aside}"
@@ -153,9 +155,22 @@ def inspect_capture(
     notes: tuple[str, ...] = (),
     progress: Callable[[str], object] = lambda stage: None,
 ) -> BodyInfo:
-    """What ``make_creature`` would find in a capture with the same arguments, without letting it stand.
+    """Determine the properties that ``make_creature`` finds in a capture, without the simulation that lets it stand.
 
-    Raises ``UserError`` as that does.
+    Args:
+        cloud: The capture.
+        source: Name of the capture.
+        up: (3,) Up in the capture's frame.
+        plane: Ground plane in the capture's frame; None finds the base of the object.
+        front: (3,) Facing direction in the capture's frame; None estimates it.
+        metres_per_unit: Length of one unit of the capture, m; None makes the body 1 m tall.
+        muscles_file: Muscles (``body_muscles``); None creates automatic ones.
+        nodes: Approximate number of cage nodes.
+        notes: Notes to append to.
+        progress: Called with the name of each stage as it starts.
+
+    Raises:
+        UserError: As ``make_creature``.
     """
     normal = plane.normal if plane is not None else up
     if front is not None and normal is not None:
@@ -201,15 +216,15 @@ def draw_info(path: Path, info: BodyInfo) -> None:
 
     Raises ``UserError`` if ``path`` cannot be written.
     """
-    # Takes a quarter of a second to import.
+    # Imported here because the import takes a quarter of a second.
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15.0, 10.0), layout="constrained")
     grid = figure.add_gridspec(2, 6)
     views = {"from the front": (1.0, 0.0), "from its left": (0.0, 1.0)}
-    for column, (title, way) in enumerate(views.items()):
+    for column, (title, view) in enumerate(views.items()):
         axes = figure.add_subplot(grid[0, 2 * column : 2 * column + 2])
-        _draw_capture(axes, info, np.array(way))
+        _draw_capture(axes, info, np.array(view))
         axes.set_title(title)
     _draw_base(figure.add_subplot(grid[0, 4:]), info)
     _draw_cage(figure.add_subplot(grid[1, :2]), info)
@@ -219,11 +234,11 @@ def draw_info(path: Path, info: BodyInfo) -> None:
         figure.savefig(temporary, dpi=100, format="png", facecolor="white")
 
 
-def _draw_capture(axes: Axes, info: BodyInfo, way: np.ndarray) -> None:
-    """The capture from ``way`` (2,), forward and left, with feet, ground and front drawn over it."""
+def _draw_capture(axes: Axes, info: BodyInfo, view: np.ndarray) -> None:
+    """Draw the capture seen from ``view`` (2,), forward and left, with feet, height and front over it."""
     ground, nodes, height = info.place.ground, info.place.standing, info.body.height
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
-    direction = np.array([*way, 0.12]) / np.hypot(1.0, 0.12) @ ground.axes
+    direction = np.array([*view, 0.12]) / np.hypot(1.0, 0.12) @ ground.axes
     radius = 1.1 * float(np.linalg.norm(nodes - middle, axis=1).max())
     camera = ring_camera(direction, middle, radius, GROUND.normal, size=_SIDE, vertical_fov_degrees=24.0)
     image = render_gaussians(info.standing.gaussians, camera, background=(1.0, 1.0, 1.0))
@@ -242,7 +257,7 @@ def _draw_capture(axes: Axes, info: BodyInfo, way: np.ndarray) -> None:
         axes.plot(*line.T, color=colour, linewidth=3.0, alpha=0.8)
         _number(axes, line[0], number + 1, colour)
     edge = nodes[:, 2].max() * GROUND.normal + middle * [1.0, 1.0, 0.0]
-    aside = ground.axes[1] * way[0] - ground.axes[0] * way[1]
+    aside = ground.axes[1] * view[0] - ground.axes[0] * view[1]
     reach = float(np.abs((nodes - middle) @ aside).max()) + 0.08 * height
     bar = pixels(np.stack([edge * [1.0, 1.0, 0.0], edge]) - reach * aside)
     axes.annotate("", bar[1], bar[0], arrowprops={"arrowstyle": "<->", "color": "0.3"})
@@ -250,7 +265,7 @@ def _draw_capture(axes: Axes, info: BodyInfo, way: np.ndarray) -> None:
     x, y = bar.mean(axis=0).tolist()
     axes.text(x, y, f"{units:.3g}", rotation=90, ha="right", va="center", color="0.3")
     seen = np.concatenate([pixels(nodes), bar])
-    if way[0] == 0.0:
+    if view[0] == 0.0:
         ahead = float(ground.local(nodes)[:, 0].max())
         arrow = pixels(ground.world(np.array([[ahead + 0.05 * height, 0.0, 0.0], [ahead + 0.35 * height, 0.0, 0.0]])))
         _arrow(axes, arrow, "front")
@@ -262,7 +277,7 @@ def _draw_capture(axes: Axes, info: BodyInfo, way: np.ndarray) -> None:
 
 
 def _draw_base(axes: Axes, info: BodyInfo) -> None:
-    """From above, front up: the outline of the body, the soles, the centre of mass."""
+    """Draw the outline of the body, the soles and the centre of mass from above, with the front upwards."""
     height = info.body.height
     local = info.place.ground.local(info.place.standing) / height
 
@@ -290,12 +305,12 @@ def _draw_base(axes: Axes, info: BodyInfo) -> None:
 
 
 def _fill(axes: Axes, points: np.ndarray, colour: str, *, alpha: float = 1.0) -> None:
-    """The hull of points (n, 2)."""
+    """Fill the convex hull of ``points`` (n, 2)."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
         corners = points[ConvexHull(points).vertices]
-    except (QhullError, ValueError):  # Fewer than three, or all in one line.
+    except (QhullError, ValueError):  # Fewer than three points, or collinear points.
         return
     axes.fill(*corners.T, color=colour, alpha=alpha, linewidth=0.0)
 
@@ -312,7 +327,7 @@ def _arrow(axes: Axes, line: np.ndarray, text: str) -> None:
 
 
 def _three_quarters(info: BodyInfo) -> np.ndarray:
-    """(3, 3) right, up and towards the eye that looks from ahead and the left."""
+    """Return the axes (3, 3) right, up and towards the viewer of a view from the front left."""
     eye = np.array([0.8, 0.6, 0.35])
     eye /= np.linalg.norm(eye)
     right = np.cross([0.0, 0.0, 1.0], eye)
@@ -363,8 +378,10 @@ def _draw_muscles(axes: Axes, info: BodyInfo) -> None:
     ends = muscles.end_points(info.place.standing) @ _three_quarters(info)[:2].T
     kinds = [muscles.fibre_kinds[fibre] for fibre in muscles.fibre_from_segment]
     for kind, count in info._kinds().items():
-        mine = [segment for segment, its in zip(muscles.segments, kinds, strict=True) if its is kind]
-        for number, (first, last) in enumerate(mine):
+        own_segments = [
+            segment for segment, segment_kind in zip(muscles.segments, kinds, strict=True) if segment_kind is kind
+        ]
+        for number, (first, last) in enumerate(own_segments):
             label = f"{kind.value} ({count})" if number == 0 else None
             axes.plot(
                 *ends[[first, last]].T, color=_KINDS[kind], linewidth=1.8, marker=".", markersize=4.0, label=label

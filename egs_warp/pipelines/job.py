@@ -1,10 +1,10 @@
-"""One run of a creature, as one of many."""
+"""A job: one run of a creature among many."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,35 +14,39 @@ from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
 from egs_warp.motions.style import Style
 from egs_warp.pipelines.creature import Creature
-from egs_warp.pipelines.report import GaussianCounts, Report, report_of_run
+from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run
 from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
 
 RunSummary: TypeAlias = tuple[Report, np.ndarray, Trajectory]
-"""Of a run: report, index into the trajectory's times for each frame of a video, and trajectory."""
+"""Report of a run, (n,) index into the trajectory's times for each frame of a video, and trajectory."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run: what ``simulate`` takes, under the same names, and the ground."""
+    """Arguments of one run: those of ``simulate``, under the same names, and the friction of the ground."""
 
     motion: Script
     friction: float | None = None
-    """Of the ground (``Creature.with_friction``), if not the creature's own."""
+    """Coulomb coefficient of the ground (``Creature.with_friction``); None keeps the creature's."""
     frames: int | None = None
+    """Frames at 60 Hz, the first at rest; None runs until the body has come to rest."""
     max_seconds: float | None = None
-    """Seconds."""
+    """Time limit of the motion, s; None is the motion's own limit."""
     step: float | None = None
-    """Seconds."""
+    """Maximum step size, s; None is the default."""
     style: Style | None = None
+    """Style of jumps; None is the default."""
     pushes: tuple[Push, ...] = ()
+    """Pushes during the run."""
     get_up: bool = True
+    """If the body falls, get up and continue."""
     activations: np.ndarray | None = None
-    """(steps, M) metres."""
+    """(steps, M) m, prescribed muscle activations; None lets the motion plan them."""
 
     def run(
         self, creature: Creature, *, progress: Callable[[int, int], object] = lambda done, expected: None
     ) -> SimulatedRun:
-        """The run alone, here."""
+        """Simulate the job in this process; ``progress`` is called with the frames done and expected."""
         if self.friction is not None:
             creature = creature.with_friction(self.friction)
         return self.run_on_ground(creature, progress=progress)
@@ -50,12 +54,14 @@ class Job:
     def run_on_ground(
         self, creature: Creature, *, progress: Callable[[int, int], object] = lambda done, expected: None
     ) -> SimulatedRun:
-        """The run of a ``creature`` that stands on its ground already."""
-        asked = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("motion", "friction")}
-        return simulate(creature, self.motion, **asked, progress=progress)
+        """Simulate the job with a ``creature`` that already stands on ground with the job's friction."""
+        options = {
+            name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("motion", "friction")
+        }
+        return simulate(creature, self.motion, **options, progress=progress)
 
     def outcome(self, creature: Creature, performance: SimulatedRun) -> RunSummary:
-        """What is told of the run: report, frames and trajectory."""
+        """Return report, frames and trajectory of the run."""
         simulation = performance.simulation
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
@@ -65,12 +71,19 @@ class Job:
             source="",
             notes=performance.cut_short(),
             seed=0,
-            asked=self._asked(),
+            asked=self._requested_options(),
             ending=performance.ending,
         )
         return report, simulation.frames, simulation.trajectory
 
-    def _asked(self) -> dict[str, Any]:
-        """``asked`` of the report."""
-        given = {name: getattr(self, name) for name in ("friction", "frames", "longest", "step", "get_up")}
-        return {**given, "pushes": len(self.pushes), "activations": self.activations is not None}
+    def _requested_options(self) -> dict[str, JsonValue]:
+        """Return ``asked`` of the report."""
+        return {
+            "friction": self.friction,
+            "frames": self.frames,
+            "longest": self.max_seconds,
+            "step": self.step,
+            "get_up": self.get_up,
+            "pushes": len(self.pushes),
+            "activations": self.activations is not None,
+        }

@@ -1,4 +1,4 @@
-"""The plane under the object of a scene, and the object on it."""
+"""Location of the plane under the object of a scene, and of the object on it."""
 
 from __future__ import annotations
 
@@ -26,54 +26,56 @@ from egs_warp.segmentation.table_top import planes_below, surface_around
 from egs_warp.segmentation.votes import votes_of_masks
 
 _PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
-"""Degrees: seen at a grazing angle, splats in front hide those behind, and the floor seems to lie higher."""
-_CLEAR_SUPPORT = 0.1
-"""Share of the visible surface: a plane as wide as this is no accident."""
-_TILT_DEGREES, _HELD_DEGREES = 25.0, 10.0
-"""What is level may be so far off an up that was guessed, or told by an axis; and off one that many cameras tell: a
-white desk that no photo could be matched on is a haze through which planes of any tilt can be laid.
+"""Degrees. At grazing angles, splats in front hide those behind, and the floor appears too high."""
+_MIN_SUPPORT = 0.1
+"""Fraction of the visible surface above which a plane is not a coincidence."""
+_MAX_TILT, _MAX_TILT_OF_CAMERAS = 25.0, 10.0
+"""Maximum tilt of a level plane against an up direction that is guessed or given, and against one that follows from
+many cameras. The second is small because a white desk without features is reconstructed as haze, to which planes of
+any tilt can be fitted.
 """
-_LEVEL_DEGREES, _CLEARLY_DEGREES = 5.0, 1.0
-"""What leans by more is doubted, and what leans by so much less is taken instead."""
+_LEVEL_TOLERANCE, _MIN_TILT_DIFFERENCE = 5.0, 1.0
+"""Tilt above which a plane is uncertain, and difference of tilt by which a replacement must be better."""
 _TOP = 0.995
-"""Quantile of the Gaussians' heights that is the object's."""
-_HIGHER = 0.7
-"""Of the way from a point down to the wide plane: a table top is higher than that."""
-_GOES_ON = 0.25
-"""Share of an object's surroundings in which what it stands on must go on: slabs and laps of real objects do in none or
-next to none, the cloth on the bonsai's narrow table in 0.4."""
-_HOVERING = 0.25
-"""Of an object's size: so high above the only plane below it, it may hang."""
+"""Quantile of the Gaussians' heights that is the height of the object."""
+_MAX_TABLE_DISTANCE = 0.7
+"""Maximum distance from a point down to a table top, as a fraction of its distance to the wide plane."""
+_MIN_SURROUNDING_SHARE = 0.25
+"""Fraction of an object's surroundings in which its support must continue. Horizontal parts of real objects reach
+about 0, the cloth on the narrow table of the bonsai scene reaches 0.4."""
+_MAX_HOVER = 0.25
+"""Fraction of its size by which an object may hang above the only plane below it."""
 _PLANE_SIDE = 400
-"""Pixels of the pictures that the plane is fitted to."""
+"""Longer side of the pictures to which the plane is fitted, pixels."""
 
 
 @dataclass(frozen=True)
 class LocatedPlane:
-    """The plane under the object, and where on it the object is."""
+    """The plane under the object, and the position of the object on it; scene units."""
 
     plane: Plane
     fit: PlaneFit | None
-    """None where the plane was given, or laid under the object."""
+    """None if the plane was given, or placed under the object."""
     centre: np.ndarray
-    """(3,) middle of the object."""
+    """(3,) Centre of the object."""
     size: float
-    """Scene units: diagonal of the object's bounding box."""
+    """Diagonal of the object's bounding box."""
     segmentation: Segmentation
     notes: tuple[str, ...]
+    """Notes for the user."""
     ground: HeightField | None = None
-    """What is there, scene units, where it is not flat."""
+    """Measured ground; None if it is flat."""
     in_sight: bool = True
-    """Whether views tell what the object stands on; else the plane was laid under it."""
+    """True if views show the support of the object; otherwise the plane was placed under it."""
 
     def known(self) -> PlaneRecord:
-        """What ``plane.json`` says of it."""
-        found = PlaneRecord(self.plane, centre=self.centre, size=self.size, ground=self.ground)
-        return found if self.fit is None else found.merged_with(known_of_fit(self.fit))
+        """Return the record for ``plane.json``."""
+        record = PlaneRecord(self.plane, centre=self.centre, size=self.size, ground=self.ground)
+        return record if self.fit is None else record.merged_with(known_of_fit(self.fit))
 
 
 def known_of_fit(fit: PlaneFit) -> PlaneRecord:
-    """What ``plane.json`` says of a fitted plane."""
+    """Return the record of a fitted plane for ``plane.json``."""
     return PlaneRecord(fit.plane, noise=fit.noise, inlier_share=fit.inlier_share, pixels=fit.pixel_count)
 
 
@@ -85,63 +87,75 @@ def locate_plane(
     up: np.ndarray | None = None,
     plane: Plane | None = None,
 ) -> LocatedPlane:
-    """The plane under the object, and the object on it.
+    """Find the plane under the object, and the object on it.
 
-    A coarse plane is sampled from the Gaussians (a table top goes before a wider floor), the object found on it, and
-    the plane then fitted to the depth rendered beside the object, through ``cameras`` or else a ring of steep ones;
-    then the object is found again. Where the cameras tell up, and what is rendered is not level (the haze over a white
-    desk), the plane is laid under the object instead. With ``plane`` given, only the object is sought.
+    A coarse plane is estimated from the Gaussians (a table top has priority over a wider floor), and the object is
+    segmented on it. The plane is then fitted to the depth rendered around the object, through ``cameras`` or a ring of
+    steep views, and the object is segmented again. If many cameras define up and the fitted plane is not level, as over
+    a white desk without features, the plane is placed under the object's lowest parts instead.
+
+    Args:
+        cloud: The capture.
+        spec: Specification of the object.
+        cameras: Cameras of the capture, if known.
+        up: (3,) Approximate up; None estimates it.
+        plane: The plane, if known; then only the object is segmented.
+
+    Raises:
+        UserError: There is no plane under the object, or no object.
     """
     notes: list[str] = []
     if plane is not None:
-        found = segment(cloud, plane, spec)
-        return LocatedPlane(plane, None, _middle(cloud, found), found.size, found, ())
-    tilt = _TILT_DEGREES
+        segmentation = segment(cloud, plane, spec)
+        return LocatedPlane(plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, ())
+    tilt = _MAX_TILT
     if up is None:
         up, reason, tilt = _up_of(cloud, cameras)
         notes.append(f"up is taken to be {','.join(f'{x:.2f}' for x in up)} ({reason}); if not, say which way is up")
-    coarse, found = _standing(cloud, spec, up, tilt)
-    centre = _middle(cloud, found)
-    radius = 0.75 * found.size
+    coarse, segmentation = _standing(cloud, spec, up, tilt)
+    centre = _middle(cloud, segmentation)
+    radius = 0.75 * segmentation.size
     if cameras:
         views = [downscale(camera, _PLANE_SIDE) for camera in cameras]
     else:
         level = centre - coarse.heights(centre) * coarse.normal
         views = ring_cameras(coarse, level, radius, count=9, elevations=_PLANE_ELEVATIONS, size=_PLANE_SIDE)
-    beside = ~found.background_mask
+    beside = ~segmentation.background_mask
     fit, failure = None, None
     try:
         fit = refine_plane(cloud, coarse, views, centre=centre, radius=radius, object_mask=beside)
     except UserError as error:
         failure = error
-    seen = coarse if fit is None else fit.plane
-    if tilt == _HELD_DEGREES and (fit is None or _lean(seen, up) > _LEVEL_DEGREES):
+    visible = coarse if fit is None else fit.plane
+    if tilt == _MAX_TILT_OF_CAMERAS and (fit is None or _lean(visible, up) > _LEVEL_TOLERANCE):
         with contextlib.suppress(UserError):
-            laid = resting_plane(cloud, beside, seen, up, degrees=tilt, size=found.size)
-            if fit is None or _lean(laid, up) < _lean(seen, up) - _CLEARLY_DEGREES:
-                return _fallback_plane(cloud, spec, laid, tuple(notes))
+            placed = resting_plane(cloud, beside, visible, up, degrees=tilt, size=segmentation.size)
+            if fit is None or _lean(placed, up) < _lean(visible, up) - _MIN_TILT_DIFFERENCE:
+                return _fallback_plane(cloud, spec, placed, tuple(notes))
         leaning = (
-            f"the plane leans by {_lean(seen, up):.0f} degrees if the cameras were held upright; look at plane.png"
+            f"the plane leans by {_lean(visible, up):.0f} degrees if the cameras were held upright; look at plane.png"
         )
         notes.append(leaning)
     if fit is None:
         assert failure is not None
         raise failure
-    found = segment(cloud, fit.plane, spec, hover=_HOVERING)
-    notes += _hovering(cloud, fit.plane, found)
+    segmentation = segment(cloud, fit.plane, spec, hover=_MAX_HOVER)
+    notes += _hovering(cloud, fit.plane, segmentation)
     notes.append(
         f"{_describe_plane(fit.plane)}: fits {fit.pixel_count} pixels "
         f"to {100 * fit.noise:.2f} % of depth, {100 * fit.inlier_share:.0f} % of them inliers"
     )
-    return LocatedPlane(fit.plane, fit, _middle(cloud, found), found.size, found, tuple(notes))
+    return LocatedPlane(fit.plane, fit, _middle(cloud, segmentation), segmentation.size, segmentation, tuple(notes))
 
 
 def _fallback_plane(cloud: GaussianCloud, spec: ObjectSpec, plane: Plane, notes: tuple[str, ...]) -> LocatedPlane:
-    """The object on the ``plane`` that was laid under it."""
-    found = remove_foot_remnants(cloud, plane, segment(cloud, plane, spec, hover=_HOVERING))
+    """Return the object on a ``plane`` that was placed under its lowest parts."""
+    segmentation = remove_foot_remnants(cloud, plane, segment(cloud, plane, spec, hover=_MAX_HOVER))
     where = _describe_plane(plane)
     note = f"{where}: laid under the object's lowest parts, as no view tells where the ground is; see plane.png"
-    return LocatedPlane(plane, None, _middle(cloud, found), found.size, found, (*notes, note), in_sight=False)
+    return LocatedPlane(
+        plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, (*notes, note), in_sight=False
+    )
 
 
 def _describe_plane(plane: Plane) -> str:
@@ -149,21 +163,31 @@ def _describe_plane(plane: Plane) -> str:
 
 
 def _lean(plane: Plane, up: np.ndarray) -> float:
-    """Degrees."""
+    """Return the angle between the plane's normal and ``up`` (3,), degrees."""
     return float(np.degrees(np.arccos(np.clip(plane.normal @ up / np.linalg.norm(up), -1.0, 1.0))))
 
 
 def with_measured_ground(
     cloud: GaussianCloud, located: LocatedPlane, spec: ObjectSpec, cameras: Sequence[Camera] = ()
 ) -> LocatedPlane:
-    """``located``, and where the ground is not flat, what is there, and the object down to it; or why not."""
+    """Measure the ground, and if it is not flat, segment the object again down to the measured ground.
+
+    Args:
+        cloud: The capture.
+        located: Result of ``locate_plane``.
+        spec: Specification of the object.
+        cameras: Cameras of the capture, if known.
+
+    Returns:
+        ``located``, with ``ground`` if it is not flat, and a note if the ground is rough but taken as flat.
+    """
     if not located.in_sight:
         return located
-    found = located.segmentation
-    means = cloud.means.numpy()[found.object_mask]
+    segmentation = located.segmentation
+    means = cloud.means.numpy()[segmentation.object_mask]
     height = float(np.quantile(located.plane.heights(means), _TOP))
     measured = measure_ground(
-        cloud, ~found.background_mask, located.plane, cameras=cameras, centre=located.centre, size=located.size
+        cloud, ~segmentation.background_mask, located.plane, cameras=cameras, centre=located.centre, size=located.size
     )
     rough, noise = (f"{100.0 * value / height:.1f} %" for value in (measured.roughness, measured.noise))
     if measured.is_flat(height):
@@ -172,7 +196,7 @@ def with_measured_ground(
         note = f"the ground seems rough by {rough} of the object's height, but views differ by {noise}: taken as flat"
         return replace(located, notes=(*located.notes, note))
     try:
-        found = segment(cloud, measured.field, spec, size=located.size)
+        segmentation = segment(cloud, measured.field, spec, size=located.size)
     except UserError as error:
         note = f"the ground is rough by {rough} of the object's height, but taken for flat ({error})"
         return replace(located, notes=(*located.notes, note))
@@ -182,76 +206,83 @@ def with_measured_ground(
     )
     return replace(
         located,
-        centre=_middle(cloud, found),
-        size=found.size,
-        segmentation=found,
+        centre=_middle(cloud, segmentation),
+        size=segmentation.size,
+        segmentation=segmentation,
         notes=(*located.notes, note),
-        ground=measured.touched_by(cloud.subset(found.object_mask), found.size),
+        ground=measured.touched_by(cloud.subset(segmentation.object_mask), segmentation.size),
     )
 
 
-def _hovering(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> tuple[str, ...]:
-    """What there is to say of an object that hangs in the air."""
-    lowest = float(np.quantile(plane.heights(cloud.means.numpy()[found.object_mask]), 0.002))
-    if lowest <= TOUCHING * found.size:
+def _hovering(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> tuple[str, ...]:
+    """Return a warning if the object hangs above the plane."""
+    lowest = float(np.quantile(plane.heights(cloud.means.numpy()[segmentation.object_mask]), 0.002))
+    if lowest <= TOUCHING * segmentation.size:
         return ()
     return (
-        f"its lowest part hangs {lowest / found.size:.2f} of its size above the plane; if parts are missing, say so",
+        f"its lowest part hangs {lowest / segmentation.size:.2f} of its size above the plane; check if parts are"
+        " missing",
     )
 
 
-def _middle(cloud: GaussianCloud, found: Segmentation) -> np.ndarray:
-    means = cloud.means.numpy()[found.object_mask].astype(np.float64)
+def _middle(cloud: GaussianCloud, segmentation: Segmentation) -> np.ndarray:
+    means = cloud.means.numpy()[segmentation.object_mask].astype(np.float64)
     return 0.5 * (np.quantile(means, 0.01, axis=0) + np.quantile(means, 0.99, axis=0))
 
 
 def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray, str, float]:
-    """(3,) up, why, and by how many degrees what is level may be off it."""
+    """Estimate up.
+
+    Returns:
+        (3,) up, the reason for it, and the maximum tilt of a level plane against it, degrees.
+    """
     if len(cameras) >= 3:
-        # Photographers hold cameras upright: the directions to the right span the level plane.
+        # Photographers hold cameras upright, so the image x axes span the level plane.
         rights = np.stack([camera.rotation[0] for camera in cameras])
         values, vectors = np.linalg.eigh(rights.T @ rights)
         ups = -np.stack([camera.rotation[1] for camera in cameras]).mean(axis=0)
         if values[0] < 0.1 * values[1]:
             axis = vectors[:, 0]
-            return axis * (1.0 if axis @ ups > 0 else -1.0), "the cameras are held upright", _HELD_DEGREES
-    return *guess_up(cloud), _TILT_DEGREES
+            return axis * (1.0 if axis @ ups > 0 else -1.0), "the cameras are held upright", _MAX_TILT_OF_CAMERAS
+    return *guess_up(cloud), _MAX_TILT
 
 
 def _standing(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, tilt: float) -> tuple[Plane, Segmentation]:
-    """A coarse plane, and the object on it: that of the capture's wide planes that is under the object, or a higher one
-    that only its surroundings show (a table top).
+    """Return a coarse plane and the object on it.
+
+    The plane is the wide plane of the capture that is under the object, or a higher one that is visible only around
+    the object, such as a table top.
     """
     everywhere = find_planes(cloud, up, tilt_degrees=tilt)
-    found, wide, failure = None, None, None
+    segmentation, wide, failure = None, None, None
     try:
         wide = _coarse_plane(cloud, spec, up, everywhere)
-        found = segment(cloud, wide, spec)
+        segmentation = segment(cloud, wide, spec)
     except UserError as error:
         failure = error
     if spec.point is not None or (failure is not None and spec.masks):
         point = _lowest_point(spec, up)
         point = point if point is not None else _low_point(cloud, spec, cloud.means.numpy(), up)
         for plane in planes_below(cloud, _level(up, everywhere), point):
-            if wide is not None and plane.heights(point) > _HIGHER * wide.heights(point):
+            if wide is not None and plane.heights(point) > _MAX_TABLE_DISTANCE * wide.heights(point):
                 break
             with contextlib.suppress(UserError):
                 standing = segment(cloud, plane, spec)
-                if surface_around(cloud, plane, standing) > _GOES_ON:
+                if surface_around(cloud, plane, standing) > _MIN_SURROUNDING_SHARE:
                     return plane, standing
-    if wide is not None and found is None:
-        # Where nothing higher is below it, it may hover: it comes down before it moves.
+    if wide is not None and segmentation is None:
+        # Without a higher plane below it, the object may hover; ``snap_to_plane`` moves it down later.
         with contextlib.suppress(UserError):
-            found = segment(cloud, wide, spec, hover=_HOVERING)
-    if wide is None or found is None:
+            segmentation = segment(cloud, wide, spec, hover=_MAX_HOVER)
+    if wide is None or segmentation is None:
         assert failure is not None
         raise failure
-    return wide, found
+    return wide, segmentation
 
 
 def _level(up: np.ndarray, everywhere: Sequence[FoundPlane]) -> np.ndarray:
-    """(3,) the widest plane tells up better than a guess does, and what objects stand on is level."""
-    return everywhere[0].plane.normal if everywhere and everywhere[0].support > _CLEAR_SUPPORT else up
+    """Return the normal (3,) of the widest plane if it is wide, otherwise ``up``: supports are level."""
+    return everywhere[0].plane.normal if everywhere and everywhere[0].support > _MIN_SUPPORT else up
 
 
 def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everywhere: Sequence[FoundPlane]) -> Plane:
@@ -271,7 +302,7 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everyw
     else:
         lowest = _lowest_point(spec, up)
         assert lowest is not None
-    planes = find_planes(searched, up, tilt_degrees=_LEVEL_DEGREES)
+    planes = find_planes(searched, up, tilt_degrees=_LEVEL_TOLERANCE)
     plane = plane_under(planes, lowest, tolerance=0.0, least_share=least_share)
     if plane is None and spec.masks and planes:
         raise UserError(
@@ -287,7 +318,7 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everyw
 
 
 def _lowest_point(spec: ObjectSpec, up: np.ndarray) -> np.ndarray | None:
-    """(3,) the point, or the lowest of the clicks on the object: its plane lies below all of them."""
+    """Return the lowest (3,) of the point and the clicks on the object, None without a point."""
     if spec.point is None:
         return None
     points = [spec.point, *(click.point for click in spec.clicks if click.inside)]
@@ -295,7 +326,7 @@ def _lowest_point(spec: ObjectSpec, up: np.ndarray) -> np.ndarray | None:
 
 
 def _low_point(cloud: GaussianCloud, spec: ObjectSpec, means: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """(3,) a place in the lower third of what the masks show; never below the object's foot."""
+    """Return a point (3,) in the lower third of the masked object, never below its foot."""
     votes = votes_of_masks(cloud, spec.masks)
     inside = votes.inside * (votes.share_inside() > 0.5) * (votes.share_seen() > 0.02)
     if inside.sum() <= 0.0:

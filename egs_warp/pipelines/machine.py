@@ -1,4 +1,4 @@
-"""What this machine offers to the package, and all kernels compiled before they are needed."""
+"""Inspection of the machine, and compilation of all kernels ahead of time."""
 
 from __future__ import annotations
 
@@ -27,73 +27,73 @@ OPTIONAL = {
     "usd-core": ("exports to USD", "egs-warp[usd]"),
     "ray": ("runs over the hosts of a cluster", "egs-warp[ray]"),
 }
-"""What each package that may be missing is for, and what installs it."""
+"""Purpose of each optional package, and the extra that installs it."""
 _ENCODERS = {"libx264": "mp4", "prores_ks": "ProRes 4444", "libvpx-vp9": "WebM with alpha"}
-_LITTLE_MEMORY = 2**31
-"""Bytes: a scene of half a million Gaussians and its body take about as much."""
-_THREADS_OF_A_BLOCK = 256
-"""Warp's own, on a GPU; a file of kernels that is launched with others says so by ``BLOCK``."""
+_MIN_FREE_MEMORY = 2**31
+"""Bytes that a scene of half a million Gaussians and its body need."""
+_BLOCK_SIZE = 256
+"""Warp's default on a GPU; a kernel file with another block size defines ``BLOCK``."""
 
 
 @dataclass(frozen=True)
 class DeviceFacts:
-    """One device of Warp."""
+    """Properties of one Warp device."""
 
     alias: str
     """``cpu``, ``cuda:0``, ..."""
     name: str
     free: int | None
-    """Bytes; None where the system does not tell."""
+    """Free memory, bytes; None if the system does not report it."""
     total: int | None
-    """Bytes."""
+    """Memory, bytes; None if the system does not report it."""
     compiled: int
-    """Files of kernels that lie in the cache, compiled for this device from these very sources."""
+    """Number of kernel files that are in the cache, compiled for this device from the current sources."""
     files: int
-    """Files of kernels that it can run."""
+    """Number of kernel files that the device can run."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What was found, and what is to be done about it."""
+    """Properties of the machine, its problems, and advice."""
 
     system: str
     versions: dict[str, str]
     optional: dict[str, str | None]
-    """Versions of ``OPTIONAL``; None where one is missing."""
+    """Versions of the packages in ``OPTIONAL``; None for a missing one."""
     driver: str | None
-    """Newest CUDA that NVIDIA's driver serves; None without a driver."""
+    """Newest CUDA version that NVIDIA's driver supports; None without a driver."""
     toolkit: str
-    """CUDA that Warp was built with."""
+    """CUDA version that Warp was built with."""
     cores: int
     devices: tuple[DeviceFacts, ...]
     cache: Path
     cache_bytes: int
     ffmpeg: str | None
     encoders: tuple[str, ...]
-    """Kinds of film that this ffmpeg writes."""
+    """Video formats that this ffmpeg can write."""
     problems: tuple[str, ...]
-    """Without a cure of these nothing works."""
+    """Problems that must be solved before anything works."""
     advice: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """For the terminal."""
-        said = [f"system   {self.system}, {self.cores} cores"]
-        said.append(f"versions {', '.join(f'{name} {number}' for name, number in self.versions.items())}")
-        there = [f"{name} {number}" if number else f"no {name}" for name, number in self.optional.items()]
-        said.append(f"optional {', '.join(there)}")
+        """Return the lines for the terminal."""
+        lines = [f"system   {self.system}, {self.cores} cores"]
+        lines.append(f"versions {', '.join(f'{name} {number}' for name, number in self.versions.items())}")
+        optional = [f"{name} {number}" if number else f"no {name}" for name, number in self.optional.items()]
+        lines.append(f"optional {', '.join(optional)}")
         driver = f"serves CUDA {self.driver}" if self.driver else "none"
-        said.append(f"driver   NVIDIA: {driver}; Warp was built with CUDA {self.toolkit}")
+        lines.append(f"driver   NVIDIA: {driver}; Warp was built with CUDA {self.toolkit}")
         for device in self.devices:
             memory = f"{_gib(device.free)} of {_gib(device.total)} GiB free"
-            said.append(f"device   {device.alias}: {device.name}, {memory}, kernels {device.compiled}/{device.files}")
-        said.append(f"cache    {self.cache} ({self.cache_bytes / 1e6:.0f} MB)")
-        said.append(f"ffmpeg   {self.ffmpeg or 'none'}{': ' if self.encoders else ''}{', '.join(self.encoders)}")
-        said += [f"problem  {line}" for line in self.problems]
-        return said + [f"to do    {line}" for line in self.advice]
+            lines.append(f"device   {device.alias}: {device.name}, {memory}, kernels {device.compiled}/{device.files}")
+        lines.append(f"cache    {self.cache} ({self.cache_bytes / 1e6:.0f} MB)")
+        lines.append(f"ffmpeg   {self.ffmpeg or 'none'}{': ' if self.encoders else ''}{', '.join(self.encoders)}")
+        lines += [f"problem  {line}" for line in self.problems]
+        return lines + [f"to do    {line}" for line in self.advice]
 
 
 def inspect_machine() -> Machine:
-    """Look at everything; call ``use_device`` before. Nothing is installed, compiled or written."""
+    """Inspect devices, versions, cache and ffmpeg. Call ``use_device`` first. Nothing is installed or written."""
     driver, toolkit = wp.get_cuda_driver_version(), wp.get_cuda_toolkit_version()
     devices = tuple(_device_facts(device) for device in wp.get_devices())
     cache = Path(wp.config.kernel_cache_dir or ".")
@@ -110,7 +110,7 @@ def inspect_machine() -> Machine:
     if len(devices) == 1:
         advice.append("everything runs on the CPU; for device cuda:0 give this machine an NVIDIA GPU and its driver")
     for device in devices:
-        if device.free is not None and device.free < _LITTLE_MEMORY:
+        if device.free is not None and device.free < _MIN_FREE_MEMORY:
             advice.append(f"{device.alias} has little free memory: end other programs, or give smaller captures")
     for name, (use, extra) in OPTIONAL.items():
         if optional[name] is None:
@@ -135,9 +135,9 @@ def inspect_machine() -> Machine:
 
 
 def compile_kernels(device: str, *, progress: Callable[[str, int, int], object] = lambda name, done, of: None) -> None:
-    """Compile every kernel of the package for ``device``, except those that lie in the cache.
+    """Compile every kernel of the package for ``device``, except those in the cache. Call ``use_device`` first.
 
-    ``progress`` is told each file before it begins, how many are done, and of how many. Call ``use_device`` before.
+    ``progress`` is called before each file with its name, the number of finished files, and the number of files.
     """
     target: wp.Device = wp.get_device(device)
     files = _kernel_files(target)
@@ -148,15 +148,15 @@ def compile_kernels(device: str, *, progress: Callable[[str, int, int], object] 
 
 
 def _kernel_files(device: wp.Device) -> list[Any]:
-    """Modules of kernels that ``device`` can run, by name."""
+    """Return the kernel modules that ``device`` can run, sorted by name."""
     names = sorted(found.name for found in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}."))
-    # What is written in CUDA is compiled for no CPU.
+    # Native CUDA code is not compiled for a CPU.
     files = [importlib.import_module(name) for name in names if device.is_cuda or not name.endswith("_cuda")]
     return [file for file in files if wp.get_module(file.__name__).kernels]
 
 
 def _block(file: Any, device: wp.Device) -> int:
-    return getattr(file, "BLOCK", _THREADS_OF_A_BLOCK) if device.is_cuda else 1
+    return getattr(file, "BLOCK", _BLOCK_SIZE) if device.is_cuda else 1
 
 
 def _device_facts(device: wp.Device) -> DeviceFacts:
@@ -173,7 +173,7 @@ def _device_facts(device: wp.Device) -> DeviceFacts:
 
 
 def _host_memory() -> tuple[int | None, int | None]:
-    """Bytes that a program may still take, and all; Linux only."""
+    """Return available and total memory of the host, bytes; None except on Linux."""
     try:
         lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
         free, total = (1024 * int(lines[name].split()[0]) for name in ("MemAvailable", "MemTotal"))

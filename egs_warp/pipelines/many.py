@@ -1,5 +1,4 @@
-"""One creature, many runs of it: side by side on a GPU, over processes of this machine, or over the hosts of a Ray
-cluster."""
+"""Many runs of one creature: in batches on a GPU, in processes of this machine, or on the hosts of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ from egs_warp.pipelines.batched_runs import choose_batch_size, is_batchable, run
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.end_state import State
 from egs_warp.pipelines.job import Job, RunSummary
-from egs_warp.pipelines.ray_pool import HERE, RayPool
+from egs_warp.pipelines.ray_pool import DEFAULT_ADDRESS, RayPool
 from egs_warp.pipelines.report import GaussianCounts, Report
 from egs_warp.pipelines.worker_pool import (
     ProcessPool,
@@ -33,30 +32,30 @@ from egs_warp.pipelines.worker_pool import (
 
 @dataclass(frozen=True)
 class JobResult:
-    """How a job ended."""
+    """Result of a job."""
 
     job: Job
     attempts: int
-    """How often it was begun: more than once where a worker was lost."""
+    """Number of attempts: more than one if a worker was lost."""
     error: str | None
-    """Why there is nothing else, in a line."""
+    """Reason in one line if the job failed; then there is no report and no trajectory."""
     report: Report | None
-    """As ``animate`` writes it."""
+    """The report, as ``animate`` writes it."""
     frames: np.ndarray
-    """(n,) index into the trajectory's times for each frame of a video at 60 Hz."""
+    """(n,) Index into the trajectory's times for each frame of a video at 60 Hz."""
     file: Path | None
-    """Where the trajectory was written, if that was asked for."""
+    """File of the trajectory, if a folder was given."""
     in_memory_trajectory: Trajectory | None
-    """The trajectory, otherwise."""
+    """The trajectory, if no folder was given."""
 
     @property
     def state(self) -> State | None:
-        """How the motion ended, None where it has not."""
+        """State of the run; None if the job failed."""
         return None if self.report is None else self.report.state
 
     @property
     def trajectory(self) -> Trajectory:
-        """Every solver step, read from its file where it lies in one. Raises ``UserError`` where there is none."""
+        """All solver steps, read from ``file`` if they are not in memory. Raises ``UserError`` if the job failed."""
         if self.in_memory_trajectory is None and self.file is None:
             raise UserError(f"job: it has no trajectory: {self.error}")
         return self.in_memory_trajectory if self.in_memory_trajectory is not None else Trajectory.load(self.file)  # pyright: ignore[reportArgumentType]
@@ -72,21 +71,31 @@ def simulate_many(
     ended: Callable[[int, JobResult], object] = lambda number, outcome: None,
     progress: Callable[[int, int], object] = lambda done, expected: None,
 ) -> tuple[JobResult, ...]:
-    """Run all ``jobs`` of one ``creature``, several at a time; the outcomes are in the order of the jobs. Each has the
-    bits of its run alone (``Job.perform``) on a machine of this kind, or, made side by side, its nodes within 1e-9 body
-    heights of those for 30 steps.
+    """Run all ``jobs`` of one ``creature``, several at a time.
 
-    ``worlds``: of the jobs whose activations are given and that nothing pushes, how many are made side by side in this
-    process, on the creature's device. If None, on a GPU as many as it has room for, up to 1,024, where there are two
-    or more for each core of this machine, and else none; none if 0.
-    All others go to workers.
+    In a worker process, a job gives the same bits as alone (``Job.run``) on a machine of the same kind. In a batch, its
+    nodes differ by less than 1e-9 body heights in the first 30 steps.
 
-    ``workers``: how many processes of this machine, as many as it has cores if None; ``"ray"``, or the address of a Ray
-    cluster, for its cores (docs/guide/many.md). Each is sent the creature once, and uses one core. A job whose worker
-    is lost is begun again, at most twice; one that ends in an error says so in its outcome, and the others go on.
-    ``out``: a folder for trajectories, ``job-0000.npz`` and so on, which then do not lie in memory. ``ended`` is told
-    the number of each job as it ends, from 0, and its outcome; ``progress`` after each frame how many are done, and how
-    many are expected in all by now. Raises ``UserError`` for workers that cannot be had.
+    Each worker receives the creature once and uses one core. A job whose worker is lost is run again, at most twice. A
+    job that fails has an error in its result; the others continue.
+
+    Args:
+        creature: The creature of all jobs.
+        jobs: The jobs.
+        workers: Number of processes on this machine; None is its number of cores; ``"ray"`` or the address of a Ray
+            cluster uses the cores of the cluster (docs/guide/many.md).
+        worlds: Batch size, in this process on the creature's device, of the jobs that have prescribed activations and
+            no pushes. None uses batches of up to 1,024 on a GPU if there are at least two such jobs for each core of
+            this machine. 0 uses no batches.
+        out: Folder for trajectories, ``job-0000.npz`` and so on, which are then not kept in memory.
+        ended: Called with number, from 0, and result of each job when it ends.
+        progress: Called after each frame with the number of finished frames and the number expected in total.
+
+    Returns:
+        The results in the order of the jobs.
+
+    Raises:
+        UserError: The workers cannot be started.
     """
     folder = None if out is None else Path(out)
     if folder is not None:
@@ -105,7 +114,7 @@ def simulate_many(
             jobs[task.number], task.attempts, task.error, report, frames, file, trajectory if file is None else None
         )
         outcomes[task.number] = outcome
-        counts.over(task.number)
+        counts.finish(task.number)
         ended(task.number, outcome)
     return tuple(outcome for outcome in outcomes if outcome is not None)
 
@@ -113,22 +122,24 @@ def simulate_many(
 def _run_jobs(
     creature: Creature, jobs: Sequence[Job], workers: int | str | None, worlds: int | None, counts: _FrameCounter
 ) -> Iterator[TaskResult]:
-    """The jobs as they end: first those side by side."""
+    """Run the jobs and yield each result when it is available, those of batches first."""
     if worlds is not None and worlds < 0:
-        raise ArgumentError("worlds", "give how many are made side by side, at least 0", value=worlds)
-    beside = [number for number, job in enumerate(jobs) if is_batchable(job)]
-    worlds = choose_batch_size(creature, len(beside)) if worlds is None else worlds
-    beside = beside if worlds > 0 else []
-    yield from run_batched(creature, [(number, jobs[number]) for number in beside], worlds=worlds, told=counts.all_told)
-    left = sorted(set(range(len(jobs))) - set(beside))
-    given = [jobs[number] for number in left]
+        raise ArgumentError("worlds", "give the number of jobs in a batch, at least 0", value=worlds)
+    batched = [number for number, job in enumerate(jobs) if is_batchable(job)]
+    worlds = choose_batch_size(creature, len(batched)) if worlds is None else worlds
+    batched = batched if worlds > 0 else []
+    yield from run_batched(
+        creature, [(number, jobs[number]) for number in batched], worlds=worlds, progress=counts.update_all
+    )
+    remaining = sorted(set(range(len(jobs))) - set(batched))
+    remaining_jobs = [jobs[number] for number in remaining]
 
-    def told(number: int, *values: Any) -> None:
-        counts.told(left[number], *values)
+    def update(number: int, *values: Any) -> None:
+        counts.update(remaining[number], *values)
 
-    if given:
-        for task in map_tasks(_RunJob(creature), given, workers=workers, told=told):
-            yield replace(task, number=left[task.number])
+    if remaining_jobs:
+        for task in map_tasks(_RunJob(creature), remaining_jobs, workers=workers, progress=update):
+            yield replace(task, number=remaining[task.number])
 
 
 def map_tasks(
@@ -136,21 +147,27 @@ def map_tasks(
     tasks: Sequence[Any],
     *,
     workers: int | str | None = None,
-    told: Callable[..., object] = lambda number, *values: None,
+    progress: Callable[..., object] = lambda number, *values: None,
 ) -> Iterator[TaskResult]:
-    """Each of ``tasks`` as ``work(task, tell)`` ends it, in whatever order; ``workers`` as in ``simulate_many``,
-    ``told`` gets the number of a task and what it tells.
+    """Call ``work(task, progress)`` for each task in worker processes and yield each result when it is available.
 
-    Raises ``UserError`` for workers that cannot be had.
+    Args:
+        work: The function; it must be picklable, like tasks and results.
+        tasks: The tasks.
+        workers: As in ``simulate_many``.
+        progress: Called with the number of a task and the values that it reports.
+
+    Raises:
+        UserError: The workers cannot be started.
     """
     if not tasks:
         return
-    yield from ended_tasks(_crew(work, workers, len(tasks)), tasks, told)
+    yield from ended_tasks(_create_pool(work, workers, len(tasks)), tasks, progress)
 
 
-def _crew(work: TaskFunction, workers: int | str | None, tasks: int) -> WorkerPool:
+def _create_pool(work: TaskFunction, workers: int | str | None, tasks: int) -> WorkerPool:
     if isinstance(workers, str):
-        if workers not in (HERE, "auto") and ":" not in workers:
+        if workers not in (DEFAULT_ADDRESS, "auto") and ":" not in workers:
             raise ArgumentError("workers", "give a number of processes, ray, or a Ray cluster's address", value=workers)
         return RayPool(work, tasks, workers)
     if workers is not None and workers < 1:
@@ -159,44 +176,44 @@ def _crew(work: TaskFunction, workers: int | str | None, tasks: int) -> WorkerPo
 
 
 class _RunJob:
-    """What a worker does with a job."""
+    """Task function that runs a job in a worker."""
 
     def __init__(self, creature: Creature) -> None:
         self._device = str(creature.cloud.device)
-        # A dot in place of its splats, which no motion sees.
+        # A single Gaussian in place of the capture, which no motion uses.
         dot = [np.zeros((1, *shape)) for shape in ((3,), (4,), (3,), (), (1, 3))]
         cloud = GaussianCloud.from_numpy(*dot, device=self._device)
-        # Read in the worker once it has said that Warp is to be quiet.
-        self._sent: bytes = pickle.dumps(replace(creature, cloud=cloud))
+        # Unpickled in the worker after ``use_device``, which makes Warp quiet.
+        self._pickled_creature: bytes = pickle.dumps(replace(creature, cloud=cloud))
         self._creature: Creature | None = None
 
-    def __call__(self, job: Job, tell: ProgressCallback) -> RunSummary:
+    def __call__(self, job: Job, progress: ProgressCallback) -> RunSummary:
         if self._creature is None:
             use_device(self._device)
-            self._creature = pickle.loads(self._sent)
-            assert self._creature is not None, "it was sent"
+            self._creature = pickle.loads(self._pickled_creature)
+            assert self._creature is not None, "the creature was sent"
         creature = self._creature
-        return job.outcome(creature, job.run(creature, progress=tell))
+        return job.outcome(creature, job.run(creature, progress=progress))
 
 
 class _FrameCounter:
-    """Frames of all jobs, done and expected; those not begun are expected to have as many as the others have."""
+    """Count of the frames of all jobs, done and expected; jobs not yet started count with the mean of the others."""
 
     def __init__(self, jobs: int, progress: Callable[[int, int], object]) -> None:
         self._jobs, self._progress = jobs, progress
-        self._known: dict[int, tuple[int, int]] = {}
+        self._frames: dict[int, tuple[int, int]] = {}
 
-    def told(self, number: int, done: int, expected: int) -> None:
-        """By a job, after a frame."""
-        self.all_told({number: (done, expected)})
+    def update(self, number: int, done: int, expected: int) -> None:
+        """Record the frames of one job."""
+        self.update_all({number: (done, expected)})
 
-    def all_told(self, told: dict[int, tuple[int, int]]) -> None:
-        """Likewise by several at a time."""
-        self._known |= told
-        done, expected = np.sum(list(self._known.values()), axis=0).tolist()
-        self._progress(done, round(expected * self._jobs / len(self._known)))
+    def update_all(self, frames: dict[int, tuple[int, int]]) -> None:
+        """Record the frames, done and expected, of several jobs."""
+        self._frames |= frames
+        done, expected = np.sum(list(self._frames.values()), axis=0).tolist()
+        self._progress(done, round(expected * self._jobs / len(self._frames)))
 
-    def over(self, number: int) -> None:
-        """Once a job has ended: with what it has done."""
-        done, _ = self._known.get(number, (0, 0))
-        self.told(number, done, done)
+    def finish(self, number: int) -> None:
+        """Record that a job has ended: its finished frames are all its frames."""
+        done, _ = self._frames.get(number, (0, 0))
+        self.update(number, done, done)

@@ -1,4 +1,4 @@
-"""Pictures that show whether a step from a scene to its parts has worked."""
+"""Pictures that show the results of plane search and segmentation for inspection."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from egs_warp.render.shadow import ContactShadow
 _BACKDROP = (0.55, 0.75, 0.55)
 _SIDE = 480
 _LINE = 22
-"""Pixels, for a line of words."""
+"""Height of a line of text, pixels."""
 
 
 def picture_cameras(plane: Plane, centre: np.ndarray, size: float, cameras: Sequence[Camera] = ()) -> list[Camera]:
-    """Four views: of the capture's own cameras above the plane, evenly picked, else of a ring."""
+    """Return four cameras: of the capture's ``cameras`` above the plane, evenly chosen, otherwise on a ring."""
     above = [camera for camera in cameras if plane.heights(camera.centre) > 0.0]
     if len(above) >= 4:
         return [downscale(above[len(above) * k // 4], _SIDE) for k in range(4)]
@@ -32,10 +32,17 @@ def picture_cameras(plane: Plane, centre: np.ndarray, size: float, cameras: Sequ
 def plane_picture(
     cloud: GaussianCloud, planes: Sequence[Plane], cameras: Sequence[Camera], *, centre: np.ndarray, size: float
 ) -> np.ndarray:
-    """(H, W, 3) uint8: the capture with a grid on each plane, in a colour of its own, faint where something stands
-    before it.
+    """Draw the capture with a coloured grid on each plane, faint where the capture hides it.
 
-    Ten lines to the ``size`` (scene units) of the object about ``centre`` (3,).
+    Args:
+        cloud: The capture.
+        planes: Planes, scene units.
+        cameras: One picture is drawn for each.
+        centre: (3,) Centre of the object.
+        size: Size of the object, scene units; the grid has ten lines in this length.
+
+    Returns:
+        (H, W, 3) uint8, a contact sheet.
     """
     frames = []
     for camera in cameras:
@@ -43,11 +50,12 @@ def plane_picture(
         picture = np.clip(image.colour.numpy(), 0.0, 1.0)
         depth = np.where(image.alpha.numpy() > 0.5, image.depth.numpy(), np.inf)
         for number, plane in enumerate(planes):
-            # Hues a golden section apart differ, however many.
+            # Hues at golden-ratio distances differ for any number of planes.
             colour = np.array(hsv_to_rgb((0.92 + 0.618 * number) % 1.0, 0.85, 0.95))
-            seen, cell = ContactShadow(camera, plane, centre=centre, reach=size, device=cloud.device), 0.1 * size
+            floor_grid, cell = ContactShadow(camera, plane, centre=centre, reach=size, device=cloud.device), 0.1 * size
             flat, pixel, ground = (
-                values.numpy().reshape(*depth.shape, -1) for values in (seen.flat, seen.pixel, seen.depth)
+                values.numpy().reshape(*depth.shape, -1)
+                for values in (floor_grid.flat, floor_grid.pixel, floor_grid.depth)
             )
             distance = np.abs((flat / cell + 0.5) % 1.0 - 0.5) * cell
             line = np.clip(1.6 - distance / pixel, 0.0, 1.0).max(axis=-1)
@@ -60,16 +68,25 @@ def plane_picture(
 
 def segmentation_picture(
     cloud: GaussianCloud,
-    thing: GaussianCloud,
+    object_cloud: GaussianCloud,
     background: GaussianCloud,
     cameras: Sequence[Camera],
     words: Sequence[str] = (),
 ) -> np.ndarray:
-    """(H, W, 3) uint8: rows of the capture, the object alone and the background alone; below them ``words``, a line
-    each.
+    """Draw rows of the capture, the object alone and the background alone, with lines of text below.
+
+    Args:
+        cloud: The capture.
+        object_cloud: The object.
+        background: The background.
+        cameras: Columns of the sheet.
+        words: Lines of text.
+
+    Returns:
+        (H, W, 3) uint8.
     """
     frames = [_bytes(render_gaussians(cloud, camera).colour.numpy()) for camera in cameras]
-    for part in (thing, background):
+    for part in (object_cloud, background):
         frames += [_bytes(render_gaussians(part, camera, background=_BACKDROP).colour.numpy()) for camera in cameras]
     labels = [""] * len(frames)
     for row, text in enumerate(("capture", "object", "background")):
@@ -77,7 +94,7 @@ def segmentation_picture(
     sheet = contact_sheet(frames, len(cameras), labels)
     if not words:
         return sheet
-    # As a cell of its own, so that lines may be as wide as the sheet.
+    # A separate sheet with one column, so that lines may be as wide as the whole sheet.
     strips = [np.full((_LINE, sheet.shape[1], 3), 255, np.uint8)] * len(words)
     return np.concatenate([sheet, contact_sheet(strips, 1, list(words))])
 

@@ -1,4 +1,4 @@
-"""Where a motion planned the centre of mass to be, beside where it was."""
+"""Planned path of the centre of mass, for comparison with the simulated one."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from egs_warp.motions.sequence import MotionSequence
 
 
 def planned_com(sequence: MotionSequence, body: SoftBody, trajectory: Trajectory) -> np.ndarray:
-    """(F+1, 3) metres, NaN where nothing was planned; no rows if nothing was at all.
+    """Return the planned centre of mass (F + 1, 3) m, NaN in states without a plan; no rows if no motion has one.
 
-    Jumps, hops and twists have a plan from the crouch to touch-down (a turn in several twists that of the first), made
-    before the first step; what they do follows the measured body instead.
+    Jumps, hops and twists have a plan from the crouch to touch-down, made before the first step; a turn in several
+    twists has that of the first. The motions themselves are controlled by the measured state.
     """
     path = np.full((len(trajectory.time), 3), np.nan)
     for entry, (first, last) in zip(sequence.done, sequence.spans(trajectory.time), strict=True):

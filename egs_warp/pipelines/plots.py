@@ -1,4 +1,4 @@
-"""``plots.png``: a run over time, by its trajectory and ledger."""
+"""``plots.png``: time series of a run, from its trajectory and energy balance."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ _FLOWS = {
     "lost by the integrator": ("lost_inertia", "lost_elastic", "lost_muscle", "lost_damping"),
     "spin given back": ("spin_inside", "spin_after"),
 }
-_LOUDEST = 99.0
-"""Percentile of the tensions at which their colours end."""
+_COLOUR_PERCENTILE = 99.0
+"""Percentile of the tensions at the end of the colour scale."""
 
 
-def draw_plots(path: Path, trajectory: Trajectory, ledger: EnergyBalance) -> None:
-    """Energies and their flows, the load on the ground, the centre of mass beside its plan, and the muscles' pull."""
-    # Takes a quarter of a second to import.
+def draw_plots(path: Path, trajectory: Trajectory, energy: EnergyBalance) -> None:
+    """Write plots of energies and flows, ground load, centre of mass with its plan, and muscle tension to ``path``."""
+    # Imported here because the import takes a quarter of a second.
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12.0, 12.0), layout="constrained")
     panels = figure.subplots(3, 2)
-    _draw_stored(panels[0, 0], trajectory, ledger)
-    _draw_flows(panels[0, 1], trajectory, ledger)
+    _draw_stored(panels[0, 0], trajectory, energy)
+    _draw_flows(panels[0, 1], trajectory, energy)
     _draw_load(panels[1, 0], trajectory)
-    _draw_residual(panels[1, 1], trajectory, ledger)
+    _draw_residual(panels[1, 1], trajectory, energy)
     _draw_centre(panels[2, 0], trajectory)
     _draw_muscles(panels[2, 1], trajectory)
     for axes in panels.flat:
@@ -56,22 +56,22 @@ def draw_plots(path: Path, trajectory: Trajectory, ledger: EnergyBalance) -> Non
         figure.savefig(temporary, dpi=100, format="png")
 
 
-def _draw_stored(axes: Axes, t: Trajectory, ledger: EnergyBalance) -> None:
+def _draw_stored(axes: Axes, t: Trajectory, energy: EnergyBalance) -> None:
     for name, label in _STORED.items():
-        values = getattr(ledger, name)
-        axes.plot(t.time, (values - (values[0] if name == "potential" else 0.0)) / ledger.energy_unit, label=label)
+        values = getattr(energy, name)
+        axes.plot(t.time, (values - (values[0] if name == "potential" else 0.0)) / energy.energy_unit, label=label)
     axes.set_title("Energy in the body, over m g H")
     axes.legend(fontsize="small")
 
 
-def _draw_flows(axes: Axes, t: Trajectory, ledger: EnergyBalance) -> None:
+def _draw_flows(axes: Axes, t: Trajectory, energy: EnergyBalance) -> None:
     total = np.zeros(len(t.time))
     for label, names in _FLOWS.items():
-        flow = np.concatenate([[0.0], np.sum([getattr(ledger, name) for name in names], axis=0).cumsum()])
+        flow = np.concatenate([[0.0], np.sum([getattr(energy, name) for name in names], axis=0).cumsum()])
         total += flow
-        axes.plot(t.time, flow / ledger.energy_unit, label=f"{label} {flow[-1] / ledger.energy_unit:+.2f}")
-    axes.plot(t.time, total / ledger.energy_unit, "k", linewidth=2.0, label="sum")
-    axes.plot(t.time, (ledger.stored - ledger.stored[0]) / ledger.energy_unit, "w--", linewidth=1.0, label="gained")
+        axes.plot(t.time, flow / energy.energy_unit, label=f"{label} {flow[-1] / energy.energy_unit:+.2f}")
+    axes.plot(t.time, total / energy.energy_unit, "k", linewidth=2.0, label="sum")
+    axes.plot(t.time, (energy.stored - energy.stored[0]) / energy.energy_unit, "w--", linewidth=1.0, label="gained")
     axes.set_title("Energy given and taken since the start, over m g H")
     axes.legend(fontsize="small", facecolor="0.85", ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.14))
 
@@ -87,12 +87,12 @@ def _draw_load(axes: Axes, t: Trajectory) -> None:
     axes.legend(fontsize="small")
 
 
-def _draw_residual(axes: Axes, t: Trajectory, ledger: EnergyBalance) -> None:
-    residual = np.abs(ledger.residual)
-    axes.stairs(np.maximum(residual, 1e-17), t.time, label="what a step misses", baseline=1e-17)
+def _draw_residual(axes: Axes, t: Trajectory, energy: EnergyBalance) -> None:
+    residual = np.abs(energy.residual)
+    axes.stairs(np.maximum(residual, 1e-17), t.time, label="residual of a step", baseline=1e-17)
     axes.axhline(AUDIT_LIMITS["energy_residual"], color="k", linestyle=":", label="bound")
     axes.set_yscale("log")
-    axes.set_title(f"Ledger: closes to {residual.max(initial=0.0):.1e} of m g H")
+    axes.set_title(f"Energy balance: closes to {residual.max(initial=0.0):.1e} of m g H")
     axes.legend(fontsize="small")
 
 
@@ -119,7 +119,7 @@ def _draw_muscles(axes: Axes, t: Trajectory) -> None:
     axes.set_ylabel("segment")
     if pull.size == 0:
         return
-    reach = max(float(np.percentile(np.abs(pull), _LOUDEST)), 1e-9)
+    reach = max(float(np.percentile(np.abs(pull), _COLOUR_PERCENTILE)), 1e-9)
     rows = np.arange(len(pull) + 1)
     mesh = axes.pcolormesh(t.time, rows, pull, cmap="RdBu_r", vmin=-reach, vmax=reach, rasterized=True)
     figure = axes.get_figure()

@@ -1,4 +1,4 @@
-"""Where photos were taken from: what ``egs-warp pose`` calls. The reconstruction is COLMAP's, by pycolmap."""
+"""Camera poses of photos (``egs-warp pose``), reconstructed by COLMAP through pycolmap."""
 
 from __future__ import annotations
 
@@ -25,28 +25,33 @@ from egs_warp.io.run_folder import check_run_folder, run_folder
 
 _PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 _MAX_EXHAUSTIVE = 400
-"""More photos than this are matched with their neighbours in the order of their names alone."""
+"""Above this number, photos are matched only with their neighbours in the order of their names."""
 _NEIGHBOURS = 20
-_LEAST_PHOTOS = 3
+"""Neighbours of a photo for sequential matching."""
+_MIN_PHOTOS = 3
 _CAMERA_MODEL = "SIMPLE_RADIAL"
 _WRITES = ("images", "sparse")
-_WORKPLACE = ".egs-pose-"
-_LOOKS_EACH_SECOND = 2.0
+"""Folders that a run writes."""
+_WORK_PREFIX = ".egs-pose-"
+"""Prefix of the temporary folder."""
+_POLL_RATE = 2.0
+"""Rate at which the progress is read, Hz."""
 
 
 @dataclass(frozen=True)
 class PoseResult:
-    """What the reconstruction gave."""
+    """Summary of a reconstruction."""
 
     photos: int
-    """That could be read."""
+    """Number of photos that could be read."""
     registered: int
-    """That have a pose."""
+    """Number of photos that have a pose."""
     without_pose: tuple[str, ...]
-    """Names of the rest."""
+    """Names of the photos without a pose."""
     unreadable: tuple[str, ...]
-    """Reasons, one a file."""
+    """Reasons why files could not be read, one a file."""
     points: int
+    """Number of triangulated points."""
     error: float
     """Mean reprojection error, pixels."""
 
@@ -62,25 +67,36 @@ def pose_photos(
     stage: Callable[[str], None] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> PoseResult:
-    """Find the poses of the photos in the folder ``source``, or of ``frames`` sharp frames of the video ``source``.
+    """Find the poses of the photos in a folder, or of sharp frames of a video.
 
-    ``out`` then holds ``images`` (upright: EXIF's turn is done) and COLMAP's ``sparse/0``: what ``train`` reads.
-    Features are found at no more than ``max_side`` pixels. The folder belongs to one run (``egs_warp.io.run_folder``);
-    an earlier one is moved aside with ``overwrite``. ``stage`` is called with what begins, ``progress`` with a
-    stage's name, how much of it is done, and of how much. Raises ``UserError`` where pycolmap is not installed, where
-    ``out`` has an earlier run or photos already or cannot be written, and where fewer than three photos can be posed.
+    ``out`` receives ``images`` (with the EXIF rotation applied) and COLMAP's ``sparse/0``, which ``train`` reads. The
+    folder belongs to one run (``egs_warp.io.run_folder``).
+
+    Args:
+        source: Folder of photos, or a video.
+        out: Folder of the run.
+        frames: Number of frames to choose from a video.
+        max_side: Longer side of the images in which features are detected, pixels.
+        seed: Seed of COLMAP.
+        overwrite: Move an earlier run in ``out`` aside.
+        stage: Called with a description of each stage as it starts.
+        progress: Called with the name of a stage, its finished and its total number of items.
+
+    Raises:
+        UserError: pycolmap is not installed, ``out`` has an earlier run or photos or cannot be written, or fewer than
+            three photos can be posed.
     """
     try:
         import pycolmap  # type: ignore[import-not-found]
     except ImportError as error:
         raise UserError("pose: pycolmap is not installed; pip install 'egs-warp[pose]'") from error
     source, say = Path(source), stage or (lambda _text: None)
-    tell = progress or (lambda _stage, _done, _of: None)
+    report = progress or (lambda _stage, _done, _of: None)
     is_video = source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES
     if not source.is_dir() and not is_video:
         raise UserError(f"{source}: neither a folder of photos nor a video ({', '.join(VIDEO_SUFFIXES)})")
     check_run_folder(out, overwrite=overwrite, writes=_WRITES)
-    with run_folder(out, command="pose", overwrite=overwrite) as run, _workplace(run.path) as work:
+    with run_folder(out, command="pose", overwrite=overwrite) as run, _work_folder(run.path) as work:
         images = work / "images"
         images.mkdir()
         say(f"choosing {frames} frames of {source}" if is_video else f"reading {source}")
@@ -91,16 +107,16 @@ def pose_photos(
         for reason in unreadable:
             say(f"left out {reason}")
         names = sorted(path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
-        if len(names) < _LEAST_PHOTOS:
-            raise UserError(f"{source}: {len(names)} photos that can be read; give at least {_LEAST_PHOTOS}")
+        if len(names) < _MIN_PHOTOS:
+            raise UserError(f"{source}: {len(names)} photos that can be read; give at least {_MIN_PHOTOS}")
         try:
             model = _reconstructed(
-                pycolmap, work, names, in_order=is_video, max_side=max_side, seed=seed, say=say, tell=tell
+                pycolmap, work, names, in_order=is_video, max_side=max_side, seed=seed, say=say, report=report
             )
         except RuntimeError as error:
-            # Of its database, where the disk is full.
-            reason = next(iter(str(error).splitlines()), "no reason told")
-            raise UserError(f"pose: COLMAP cannot go on ({reason}); is there room in {out}?") from error
+            # An error of its database, for example if the disk is full.
+            reason = next(iter(str(error).splitlines()), "no reason given")
+            raise UserError(f"pose: COLMAP cannot go on ({reason}); is there free space in {out}?") from error
         _write_model(model, work / "sparse" / "0", out)
         try:
             for part in _WRITES:
@@ -120,7 +136,7 @@ def pose_photos(
 
 
 def _write_model(model: Any, folder: Path, out: Path | str) -> None:
-    """Write it and read it again: on a full disk COLMAP leaves a part of it and keeps silent."""
+    """Write ``model`` and read it again: on a full disk COLMAP writes a part of it without an error."""
     folder.mkdir(parents=True)
     model.write_binary(str(folder))
     try:
@@ -133,19 +149,19 @@ def _write_model(model: Any, folder: Path, out: Path | str) -> None:
 
 
 @contextmanager
-def _workplace(folder: Path) -> Iterator[Path]:
-    """A folder for what is not finished, in the locked ``folder``; of killed runs it is taken away."""
-    for left in folder.glob(f"{_WORKPLACE}*"):
-        shutil.rmtree(left, ignore_errors=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=_WORKPLACE) as work:
+def _work_folder(folder: Path) -> Iterator[Path]:
+    """Create a temporary folder in the locked ``folder``, after removing those of killed runs."""
+    for remnant in folder.glob(f"{_WORK_PREFIX}*"):
+        shutil.rmtree(remnant, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=_WORK_PREFIX) as work:
         yield Path(work)
 
 
 def _copied(source: Path, images: Path) -> tuple[str, ...]:
-    """Put the photos below ``source`` into ``images``, upright; returns why others are not there."""
+    """Copy the photos below ``source`` upright to ``images``; return the reasons why files were left out."""
     unreadable = []
-    found = sorted(path for path in source.rglob("*") if path.suffix.lower() in _PHOTO_SUFFIXES and path.is_file())
-    for path in found:
+    paths = sorted(path for path in source.rglob("*") if path.suffix.lower() in _PHOTO_SUFFIXES and path.is_file())
+    for path in paths:
         if any(part.startswith(".") for part in path.relative_to(source).parts):
             continue
         target = images / path.relative_to(source)
@@ -155,17 +171,17 @@ def _copied(source: Path, images: Path) -> tuple[str, ...]:
         except UserError as error:
             unreadable.append(str(error))
             continue
-        turn = orientation(path)
-        if turn == 1:
+        exif_orientation = orientation(path)
+        if exif_orientation == 1:
             shutil.copyfile(path, target)
         else:
-            # Written without the tag: programs differ in whether they heed it.
-            _write_picture(target, apply_orientation(pixels, turn), quality=97)
+            # Written without the EXIF tag, which only some programs apply.
+            _write_picture(target, apply_orientation(pixels, exif_orientation), quality=97)
     return tuple(unreadable)
 
 
 def _write_picture(path: Path, pixels: np.ndarray, *, quality: int) -> None:
-    """(H, W, 3) uint8 BGR. OpenCV's own writer keeps silent about a full disk."""
+    """Write ``pixels`` (H, W, 3) uint8 BGR. OpenCV's writer does not report a full disk, so it is not used."""
     _, data = cv2.imencode(path.suffix.lower(), pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
     path.write_bytes(data.tobytes())
 
@@ -179,9 +195,20 @@ def _reconstructed(
     max_side: int,
     seed: int,
     say: Callable[[str], None],
-    tell: Callable[[str, int, int], None],
+    report: Callable[[str, int, int], None],
 ) -> Any:
-    """The largest model of the photos ``names`` in ``work/images``."""
+    """Reconstruct the photos ``names`` in ``work/images`` and return the largest model.
+
+    Args:
+        pycolmap: The module.
+        work: Temporary folder.
+        names: Paths of the photos below ``work/images``.
+        in_order: True for frames of a video, which are matched sequentially.
+        max_side: Longer side of the images in which features are detected, pixels.
+        seed: Seed of COLMAP.
+        say: Called with a description of each stage.
+        report: Called with the name of a stage, its finished and its total number of items.
+    """
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     pycolmap.set_random_seed(seed)
     images, database = work / "images", work / "database.db"
@@ -197,7 +224,7 @@ def _reconstructed(
     }
     mode = pycolmap.CameraMode.SINGLE if len(sizes) == 1 else pycolmap.CameraMode.PER_IMAGE
     say(f"finding features in {count} photos")
-    watch = _Watch(database, tell)
+    watch = _DatabaseWatch(database, report)
     with watch.count("features", "keypoints", count):
         pycolmap.extract_features(
             str(database),
@@ -220,47 +247,49 @@ def _reconstructed(
     say("finding poses")
     placed = 0
 
-    def one_more() -> None:
+    def report_pose() -> None:
         nonlocal placed
         placed += 1
-        tell("poses", min(placed + 2, count), count)
+        report("poses", min(placed + 2, count), count)
 
     models_folder = work / "models"
     models_folder.mkdir()
     mapping = pycolmap.IncrementalPipelineOptions()
     mapping.random_seed = seed
     models = pycolmap.incremental_mapping(
-        str(database), str(images), str(models_folder), mapping, next_image_callback=one_more
+        str(database), str(images), str(models_folder), mapping, next_image_callback=report_pose
     )
     if not models:
         raise UserError(
             "pose: no photo could be posed; take more photos that overlap, of something with texture, from places apart"
         )
     best = max(models.values(), key=lambda model: model.num_reg_images())
-    if best.num_reg_images() < _LEAST_PHOTOS:
+    if best.num_reg_images() < _MIN_PHOTOS:
         raise UserError(f"pose: only {best.num_reg_images()} photos could be posed; take more photos that overlap")
     return best
 
 
-class _Watch:
-    """Tells how far pycolmap is, which says nothing itself, by the rows of its database."""
+class _DatabaseWatch:
+    """Progress of pycolmap, which does not report it, from the number of rows of its database."""
 
-    def __init__(self, database: Path, tell: Callable[[str, int, int], None]) -> None:
+    def __init__(self, database: Path, report: Callable[[str, int, int], None]) -> None:
         self._database = database
-        self._tell = tell
+        self._report = report
 
-    def count(self, stage: str, table: str, expected: int) -> _Counting:
-        """A context in which the rows of ``table`` are told."""
-        return _Counting(self._database, table, lambda done: self._tell(stage, min(done, expected), expected))
+    def count(self, stage: str, table: str, expected: int) -> _RowCounter:
+        """Return a context that reports the rows of ``table`` while it is open."""
+        return _RowCounter(self._database, table, lambda done: self._report(stage, min(done, expected), expected))
 
 
-class _Counting:
-    def __init__(self, database: Path, table: str, tell: Callable[[int], None]) -> None:
+class _RowCounter:
+    """Context with a thread that counts the rows of a table at a fixed rate."""
+
+    def __init__(self, database: Path, table: str, report: Callable[[int], None]) -> None:
         self._query = f"select count(*) from {table}"
         self._database = database
-        self._tell = tell
+        self._report = report
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread = threading.Thread(target=self._poll, daemon=True)
 
     def __enter__(self) -> None:
         self._thread.start()
@@ -268,19 +297,19 @@ class _Counting:
     def __exit__(self, *_error: object) -> None:
         self._ended.set()
         self._thread.join()
-        self._once()
+        self._report_count()
 
-    def _look(self) -> None:
-        while not self._ended.wait(1.0 / _LOOKS_EACH_SECOND):
-            self._once()
+    def _poll(self) -> None:
+        while not self._ended.wait(1.0 / _POLL_RATE):
+            self._report_count()
 
-    def _once(self) -> None:
+    def _report_count(self) -> None:
         try:
             reader = sqlite3.connect(f"file:{self._database}?mode=ro", uri=True, timeout=0.1)
             try:
-                self._tell(int(reader.execute(self._query).fetchone()[0]))
+                self._report(int(reader.execute(self._query).fetchone()[0]))
             finally:
                 reader.close()
         except sqlite3.Error:
-            # Not made yet, or being written.
+            # The database does not exist yet, or is locked.
             return

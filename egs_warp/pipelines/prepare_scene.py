@@ -1,4 +1,4 @@
-"""From a capture of a scene to an object, the plane it stands on, and a background without it."""
+"""Preparation of a scene: from a capture to an object, its ground plane, and a background without the object."""
 
 from __future__ import annotations
 
@@ -39,70 +39,77 @@ _CLEARED = {
 
 
 _SOLID = 0.1
+"""Opacity above which a Gaussian counts for the lowest part of an object."""
 _HOVER_FRACTION = 0.03
-"""Of the object's size: what hangs higher above its plane does not stand there."""
+"""Fraction of its size above which the distance of an object to its plane means that it hovers."""
 
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """What may be chosen."""
+    """Options of ``prepare_scene``."""
 
     clearing: StraddlingPolicy | None = None
-    """None: fine-tuning where PyTorch is installed, else the static split."""
+    """Treatment of Gaussians that straddle the plane; None fine-tunes if PyTorch is installed, else splits them."""
     flat: bool = False
-    """Stand on the plane, whatever the ground is like."""
+    """Use the plane as ground, without measuring the ground."""
     inpaint: bool = True
+    """Fill the hole under the object in the background."""
     inpainter: Inpainter | None = None
-    """None: patch synthesis."""
+    """None uses patch synthesis."""
     clearing_options: StraddlingOptions = field(default_factory=StraddlingOptions)
+    """Options of ``clearing``."""
 
     @property
     def method(self) -> StraddlingPolicy:
-        """How the object is cleared of the plane."""
+        """Treatment of straddling Gaussians, with the default resolved."""
         return self.clearing or (StraddlingPolicy.FINETUNE if has_torch() else StraddlingPolicy.SPLIT)
 
     @property
     def stages(self) -> dict[str, bool]:
-        """Names of what ``prepare_scene`` will do, in its order, and whether all of it, training included."""
-        asked = {"plane": True, "ground": not self.flat, "segment": True, "inpaint": self.inpaint}
+        """Names of the stages of ``prepare_scene`` in order; True if a stage includes any training that it has."""
+        requested = {"plane": True, "ground": not self.flat, "segment": True, "inpaint": self.inpaint}
         whole = {"segment": self.method is StraddlingPolicy.FINETUNE, "inpaint": has_torch()}
-        return {name: whole.get(name, True) for name, wanted in asked.items() if wanted}
+        return {name: whole.get(name, True) for name, is_requested in requested.items() if is_requested}
 
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """A capture taken apart; scene units."""
+    """A capture that is separated into object and background; scene units."""
 
     object: GaussianCloud
-    """Clear of the plane."""
+    """The object, cleared of the plane."""
     background: GaussianCloud
-    """Without the object; with new floor where it stood, if that was asked for."""
+    """The capture without the object, inpainted if requested."""
     background_with_hole: GaussianCloud
     """The background before inpainting."""
     plane: Plane
+    """Ground plane under the object."""
     hole: Hole | None
-    """In the floor, under the object; None where it hangs above it."""
+    """Hole in the floor under the object; None if the object hangs above the floor."""
     located: LocatedPlane
+    """Details of the plane and of the segmentation."""
     notes: tuple[str, ...]
-    """What was found and done, for the user."""
+    """Notes on the stages, for the user."""
     filled: InpaintResult | None = None
-    """How the background got its new floor; None where it got none."""
+    """Result of the inpainting; None if there was none."""
 
     @property
     def ground(self) -> HeightField | None:
-        """What the object stands on where that is not flat."""
+        """Ground under the object if it is not flat, otherwise None."""
         return self.located.ground
 
     def write(self, out: Path | RunFolder, known: Sequence[PlaneRecord] = ()) -> None:
-        """``object.ply``, ``background.ply`` and ``plane.json`` into the folder ``out``, or as files of a run.
+        """Write ``object.ply``, ``background.ply`` and ``plane.json``.
 
-        ``known`` is what the file that gave the plane held; what is not found anew goes along.
+        Args:
+            out: A folder, or the folder of a run.
+            known: Records of the file that the plane was read from; facts that were not measured again are copied.
         """
-        place = out.file if isinstance(out, RunFolder) else out.joinpath
-        write_ply(place("object.ply"), self.object)
-        write_ply(place("background.ply"), self.background)
+        file_path = out.file if isinstance(out, RunFolder) else out.joinpath
+        write_ply(file_path("object.ply"), self.object)
+        write_ply(file_path("background.ply"), self.background)
         first = replace(self.located.known(), hole=self.hole.outline() if self.hole else None)
-        write_planes(place("plane.json"), [first.merged_with(known[0]) if known else first, *known[1:]])
+        write_planes(file_path("plane.json"), [first.merged_with(known[0]) if known else first, *known[1:]])
 
 
 def prepare_scene(
@@ -116,11 +123,20 @@ def prepare_scene(
     options: SceneOptions | None = None,
     progress: Callable[[str, float], None] = lambda stage, done: None,
 ) -> PreparedScene:
-    """Everything between a capture and its animation: plane, segmentation, clearing of the plane, inpainting.
+    """Separate a capture into object and background: plane, segmentation, clearing of the plane, inpainting.
 
-    ``cameras`` are the capture's own, if known; ``photographs`` of the whole scene take the place of renders in the
-    fine-tune at the plane; ``up`` (3,) is roughly up, and guessed if not given; ``progress`` is
-    told the name of each stage and the share of it that is done. Raises ``UserError`` as the stages do.
+    Args:
+        cloud: The capture.
+        spec: Specification of the object.
+        cameras: Cameras of the capture, if known.
+        photographs: Photos of the whole scene for the fine-tuning at the plane; None uses renders of the capture.
+        up: (3,) Approximate up; None estimates it.
+        plane: The ground plane; None finds it.
+        options: Options; None is the default.
+        progress: Called with the name of a stage and its finished fraction.
+
+    Raises:
+        UserError: A stage failed.
     """
     options = options or SceneOptions()
     progress("plane", 0.0)
@@ -129,11 +145,11 @@ def prepare_scene(
         progress("ground", 0.0)
         located = with_measured_ground(cloud, located, spec, cameras)
     progress("segment", 0.0)
-    thing, bare, notes = segment_scene(
+    object_cloud, background_with_hole, notes = segment_scene(
         cloud, located, options, photographs, progress=lambda done: progress("segment", done)
     )
-    thing, came_down = snap_to_plane(thing, located)
-    notes = (*notes, *came_down)
+    object_cloud, snap_notes = snap_to_plane(object_cloud, located)
+    notes = (*notes, *snap_notes)
     filled, hole = None, hole_under(cloud, located.plane, located.segmentation)
     if options.inpaint and hole is None:
         notes = (*notes, "the object hangs above the ground, which is whole under it")
@@ -145,15 +161,19 @@ def prepare_scene(
         from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
 
         chosen = InpaintOptions() if has_torch() else InpaintOptions(steps=0)
-        painted = lambda done: progress("inpaint", done)  # noqa: E731
+        show_inpainting = lambda done: progress("inpaint", done)  # noqa: E731
         try:
-            filled = inpaint(bare, hole, inpainter=options.inpainter, options=chosen, progress=painted)
+            filled = inpaint(
+                background_with_hole, hole, inpainter=options.inpainter, options=chosen, progress=show_inpainting
+            )
             notes = (*notes, *filled.notes)
         except UserError as error:
-            # A floor with a hole is worth more than no animation.
+            # A floor with a hole is acceptable; the animation must not fail because of it.
             notes = (*notes, f"the floor under the object was not filled ({error})")
-    background = bare if filled is None else filled.cloud
-    return PreparedScene(thing, background, bare, located.plane, hole, located, (*located.notes, *notes), filled)
+    background = background_with_hole if filled is None else filled.cloud
+    return PreparedScene(
+        object_cloud, background, background_with_hole, located.plane, hole, located, (*located.notes, *notes), filled
+    )
 
 
 def segment_scene(
@@ -164,68 +184,79 @@ def segment_scene(
     *,
     progress: Callable[[float], None] = lambda done: None,
 ) -> tuple[GaussianCloud, GaussianCloud, tuple[str, ...]]:
-    """Object, clear of the plane; background with a hole; and what there is to say. ``progress`` is told the share of
-    the fine-tune that is done.
+    """Separate the object and clear it of the plane.
+
+    Args:
+        cloud: The capture.
+        located: Plane and segmentation.
+        options: Options of the scene.
+        photographs: Photos of the whole scene for the fine-tuning; None uses renders.
+        progress: Called with the finished fraction of the fine-tuning.
+
+    Returns:
+        The object, the background with a hole, and notes for the user.
     """
-    found, method = located.segmentation, options.method
-    untouched, ground = cloud.subset(found.object_mask), located.ground
+    segmentation, method = located.segmentation, options.method
+    straddling_cloud, ground = cloud.subset(segmentation.object_mask), located.ground
     if ground is not None:
-        # Where the ground is the plane, what stands on it can be cleared of the plane.
-        untouched, photographs = _moved(untouched, ground.flatten), None
-    heights, reach = plane_extents(untouched, located.plane, options.clearing_options.reach)
-    if not found.background_mask.any():
+        # In coordinates in which the ground is the plane, the object can be cleared of the plane.
+        straddling_cloud, photographs = _moved(straddling_cloud, ground.flatten), None
+    heights, reach = plane_extents(straddling_cloud, located.plane, options.clearing_options.reach)
+    if not segmentation.background_mask.any():
         raise UserError("object: it is the whole capture, so there is no background; animate the capture itself")
-    thing = clear_plane(
-        untouched,
+    object_cloud = clear_plane(
+        straddling_cloud,
         located.plane,
         method,
         views=photographs or None,
-        surroundings=cloud.subset(~found.object_mask) if photographs else None,
+        surroundings=cloud.subset(~segmentation.object_mask) if photographs else None,
         options=options.clearing_options,
         progress=lambda step, _: progress((step + 1) / options.clearing_options.iterations),
     )
-    closed = ()
+    underside_notes = ()
     if ground is not None:
-        thing, count = with_underside(_moved(thing, ground.unflatten), ground, found.size)
-        closed = (f"its underside, which no view shows, was closed by {count} Gaussians",) if count else ()
+        object_cloud, count = with_underside(_moved(object_cloud, ground.unflatten), ground, segmentation.size)
+        underside_notes = (f"its underside, which no view shows, was closed by {count} Gaussians",) if count else ()
     notes = (
-        f"the object has {untouched.count} of {cloud.count} Gaussians; {int(found.buried_mask.sum())} under it and "
-        f"{int(found.floater_mask.sum())} floaters beside it were dropped",
+        f"the object has {straddling_cloud.count} of {cloud.count} Gaussians;"
+        f" {int(segmentation.buried_mask.sum())} under it and"
+        f" {int(segmentation.floater_mask.sum())} floaters beside it were dropped",
         f"{int((np.abs(heights) < reach).sum())} of the object's Gaussians straddled the plane: {_CLEARED[method]}"
         + (f" against {len(photographs)} photographs" if photographs and method is StraddlingPolicy.FINETUNE else ""),
-        *closed,
+        *underside_notes,
     )
-    return thing, cloud.subset(found.background_mask), notes
+    return object_cloud, cloud.subset(segmentation.background_mask), notes
 
 
-def snap_to_plane(thing: GaussianCloud, located: LocatedPlane) -> tuple[GaussianCloud, tuple[str, ...]]:
-    """``thing``, moved down onto its plane if it hangs above it, as a robot may that was captured afloat; and what to
-    say of that.
+def snap_to_plane(object_cloud: GaussianCloud, located: LocatedPlane) -> tuple[GaussianCloud, tuple[str, ...]]:
+    """Move the object down onto its plane if it hovers above it, as captures of robots may.
+
+    Returns:
+        The object, and a note if it was moved.
     """
     plane, size = located.plane, located.segmentation.size
-    lowest = float(np.quantile(plane.heights(thing.means.numpy()[thing.opacities() > _SOLID]), 0.002))
+    lowest = float(np.quantile(plane.heights(object_cloud.means.numpy()[object_cloud.opacities() > _SOLID]), 0.002))
     if located.ground is not None or lowest <= _HOVER_FRACTION * size:
-        return thing, ()
+        return object_cloud, ()
     note = f"the object hung {lowest / size:.2f} of its size above the ground, and was set down on it"
-    return _moved(thing, lambda means: means - lowest * plane.normal), (note,)
+    return _moved(object_cloud, lambda means: means - lowest * plane.normal), (note,)
 
 
 def _moved(cloud: GaussianCloud, to: Callable[[np.ndarray], np.ndarray]) -> GaussianCloud:
-    """``cloud`` with its means moved."""
+    """Return ``cloud`` with its means replaced by ``to(means)``."""
     means = to(cloud.means.numpy().astype(np.float64)).astype(np.float32)
     return replace(cloud, means=wp.array(means, dtype=wp.vec3, device=cloud.device))
 
 
 def viewing_directions(scene: PreparedScene, cameras: Sequence[Camera]) -> np.ndarray | None:
-    """(n, 3) from the object to where a picture is best taken: where the capture's own cameras were; None where it has
-    none above the plane.
+    """Return good viewing directions (n, 3), from the object to the camera; None without cameras above the plane.
 
-    Captures look best from where they were taken; of those cameras it is the half of middling height.
+    A capture has the best quality from its own cameras. Of these, the half with medium elevation is used.
     """
     normal, centre = scene.plane.normal, scene.located.centre
-    away = np.array([one.centre - centre for one in cameras if scene.plane.heights(one.centre) > 0.0]).reshape(-1, 3)
-    if len(away) == 0:
+    arms = np.array([one.centre - centre for one in cameras if scene.plane.heights(one.centre) > 0.0]).reshape(-1, 3)
+    if len(arms) == 0:
         return None
-    by_height = np.argsort(away @ normal / np.linalg.norm(away, axis=1), kind="stable")
-    quarter = len(away) // 4
-    return away[np.sort(by_height[quarter : len(away) - quarter])]
+    by_height = np.argsort(arms @ normal / np.linalg.norm(arms, axis=1), kind="stable")
+    quarter = len(arms) // 4
+    return arms[np.sort(by_height[quarter : len(arms) - quarter])]

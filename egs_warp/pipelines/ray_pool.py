@@ -1,4 +1,4 @@
-"""Workers that Ray runs, on this machine or on the hosts of a cluster (an optional extra)."""
+"""Worker pool on Ray, on this machine or on the hosts of a cluster (an optional extra)."""
 
 from __future__ import annotations
 
@@ -13,105 +13,114 @@ from typing import Any
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.pipelines.worker_pool import ONE_THREAD, Event, TaskFunction, attempt
 
-HERE = "ray"
-"""As an address: the Ray that this program is connected to, else that of ``RAY_ADDRESS``, else one for the time."""
-_LOOK = 0.5
-"""Seconds between looks at how far the workers are."""
+DEFAULT_ADDRESS = "ray"
+"""Address of the Ray that this program is connected to, else that of ``RAY_ADDRESS``, else of a temporary one."""
+_POLL_INTERVAL = 0.5
+"""Interval at which the progress of the workers is read, s."""
 
 
 class RayWorker:
-    """The life of a worker, as an actor; ``seen`` is asked for while ``run`` runs."""
+    """Ray actor that runs tasks; ``take_messages`` is called while ``run`` is running."""
 
     def __init__(self, work: bytes) -> None:
-        # Before anything is loaded that reads it. Ray itself sets OMP_NUM_THREADS to the cores that it gives.
+        # Set before any library reads it. Ray sets OMP_NUM_THREADS to the number of cores of the worker.
         os.environ.update(ONE_THREAD)
         self._work = pickle.loads(work)
-        self._told: list[tuple[Any, ...]] = []
+        self._messages: list[tuple[Any, ...]] = []
 
     def run(self, task: Any) -> bytes:
-        """What the work makes of ``task``, see ``attempt``."""
-        self._told = []
-        return attempt(self._work, task, lambda *values: self._told.append(values))
+        """Run ``task`` and return its pickled result (``attempt``)."""
+        self._messages = []
+        return attempt(self._work, task, lambda *values: self._messages.append(values))
 
-    def seen(self) -> list[tuple[Any, ...]]:
-        """What the task has told since this was asked last."""
-        told, self._told = self._told, []
-        return told
+    def take_messages(self) -> list[tuple[Any, ...]]:
+        """Return the progress messages of the task since the last call."""
+        messages, self._messages = self._messages, []
+        return messages
 
 
 class RayPool:
-    """Workers of a Ray cluster, each on one core; a Ray that was started for them ends with them."""
+    """Worker pool of a Ray cluster, one core a worker; a Ray instance that it has started ends with it."""
 
-    def __init__(self, work: TaskFunction, most: int, address: str = HERE) -> None:
-        """At most so many workers. Raises ``UserError`` where Ray is not installed, or not at the ``address``."""
+    def __init__(self, work: TaskFunction, max_workers: int, address: str = DEFAULT_ADDRESS) -> None:
+        """Connect to Ray.
+
+        Args:
+            work: The task function.
+            max_workers: Maximum number of workers.
+            address: Address of a Ray cluster, or ``DEFAULT_ADDRESS``.
+
+        Raises:
+            UserError: Ray is not installed, or does not answer at ``address``.
+        """
         self._ray = ray = _imported()
-        self._own = not ray.is_initialized()
-        if self._own:
-            place = os.environ.get("RAY_ADDRESS", "local") if address == HERE else address
-            options: dict[str, Any] = {"include_dashboard": False} if place == "local" else {}
+        self._owns_ray = not ray.is_initialized()
+        if self._owns_ray:
+            ray_address = os.environ.get("RAY_ADDRESS", "local") if address == DEFAULT_ADDRESS else address
+            options: dict[str, Any] = {"include_dashboard": False} if ray_address == "local" else {}
             try:
-                ray.init(place, log_to_driver=False, logging_level=logging.ERROR, **options)
+                ray.init(ray_address, log_to_driver=False, logging_level=logging.ERROR, **options)
             except (ConnectionError, ValueError, RuntimeError, OSError) as error:
                 line = " ".join(str(error).split())
                 raise ArgumentError("workers", f"no Ray answers there ({line})", value=address) from error
-        self.size = max(1, min(most, int(ray.cluster_resources().get("CPU", 1))))
-        # Two calls at a time: the task's, and that which asks how far it is.
-        self._kind = ray.remote(num_cpus=1, max_restarts=0, max_concurrency=2)(RayWorker)
+        self.size = max(1, min(max_workers, int(ray.cluster_resources().get("CPU", 1))))
+        # Two concurrent calls: the task, and the one that reads its progress.
+        self._actor_class = ray.remote(num_cpus=1, max_restarts=0, max_concurrency=2)(RayWorker)
         self._work = ray.put(pickle.dumps(work))
         self._actors: dict[int, Any] = {}
         self._running: dict[Any, int] = {}
-        self._looks: dict[Any, int] = {}
+        self._polls: dict[Any, int] = {}
 
     def begin(self, worker: int, task: Any) -> None:
-        """See ``Crew``."""
+        """Give a free worker a task; a worker that does not exist, or was lost, is started."""
         if worker not in self._actors:
-            self._actors[worker] = self._kind.remote(self._work)
+            self._actors[worker] = self._actor_class.remote(self._work)
         actor = self._actors[worker]
         self._running[actor.run.remote(task)] = worker
 
     def wait(self) -> Sequence[Event]:
-        """See ``Crew``."""
+        """Block until workers have sent messages or the polling interval has passed; return the messages."""
         ray = self._ray
-        pending = [*self._running, *self._looks]
-        ready, _ = ray.wait(pending, num_returns=1, timeout=_LOOK)
+        pending = [*self._running, *self._polls]
+        ready, _ = ray.wait(pending, num_returns=1, timeout=_POLL_INTERVAL)
         events: list[Event] = []
         for call in ready:
-            if call in self._looks:
-                worker = self._looks.pop(call)
-                # A worker that is lost is told by its task's call.
+            if call in self._polls:
+                worker = self._polls.pop(call)
+                # A lost worker is reported by the call of its task.
                 with contextlib.suppress(ray.exceptions.RayError):
-                    told = ray.get(call)
-                    events += [Event(worker, "told", values) for values in told[-1:]]
+                    messages = ray.get(call)
+                    events += [Event(worker, "progress", values) for values in messages[-1:]]
                 continue
             worker = self._running.pop(call)
-            # Of a task that is over nothing more is told.
-            self._looks = {look: other for look, other in self._looks.items() if other != worker}
+            # A finished task reports no more progress.
+            self._polls = {poll: other for poll, other in self._polls.items() if other != worker}
             try:
                 events.append(Event(worker, *pickle.loads(ray.get(call))))
             except ray.exceptions.RayError as error:
-                # One that only cannot be reached must not go on beside its successor.
+                # A worker that is only unreachable must not run concurrently with its successor.
                 with contextlib.suppress(Exception):
                     ray.kill(self._actors[worker])
                 del self._actors[worker]
                 events.append(Event(worker, "lost", str(error).strip().partition("\n")[0]))
         if not ready:
-            asked = set(self._looks.values())
-            free = [worker for worker in self._running.values() if worker not in asked]
-            self._looks |= {self._actors[worker].seen.remote(): worker for worker in free}
+            polled = set(self._polls.values())
+            free = [worker for worker in self._running.values() if worker not in polled]
+            self._polls |= {self._actors[worker].take_messages.remote(): worker for worker in free}
         return events
 
     def close(self) -> None:
-        """See ``Crew``."""
+        """End all workers, whatever they do."""
         for actor in self._actors.values():
             with contextlib.suppress(Exception):
                 self._ray.kill(actor)
         self._actors.clear()
-        if self._own:
+        if self._owns_ray:
             self._ray.shutdown()
 
 
 def _imported() -> ModuleType:
-    # A library does not call home for others.
+    # A library must not send usage statistics on behalf of its users.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         import ray

@@ -1,4 +1,4 @@
-"""``creature.npz``: what the pictures of a run were drawn from, so that a page can draw them again from any side."""
+"""``creature.npz``: Gaussians, muscles and camera of a run, from which a page can render it from any direction."""
 
 from __future__ import annotations
 
@@ -26,30 +26,33 @@ _CAMERA = ("rotation", "translation", "width", "height", "fx", "fy", "cx", "cy",
 
 @dataclass(frozen=True)
 class RenderData:
-    """Splats, muscles and camera of a run; metres, all in the frame of the body. P end points, M segments, F fibres."""
+    """Gaussians, muscles and camera of a run; metres, in the frame of the body.
+
+    P end points, N nodes, M segments, F fibres.
+    """
 
     splats: GaussianCloud
-    """At rest, after splitting: embedded in the rest cage of the trajectory they are drawn as the film draws them."""
+    """Gaussians at rest, after splitting; embedded in the rest cage of the trajectory, they give the film's images."""
     camera: Camera
-    """Of the film."""
+    """Camera of the film."""
     muscle_ends: sp.csr_matrix
-    """(P, N) end points are this times the node positions."""
+    """(P, N) Matrix that gives the end points from the node positions."""
     muscle_segments: np.ndarray
     """(M, 2) int32, end points of each segment."""
     muscle_bounds: np.ndarray
-    """(M,) metres: the most that ``activations`` of the trajectory can be."""
+    """(M,) m, bounds of ``activations`` of the trajectory."""
     fibre_from_segment: np.ndarray
-    """(M,) int32."""
+    """(M,) int32, fibre of each segment."""
     fibre_names: tuple[str, ...]
-    """(F,)"""
+    """(F,) Name of each fibre."""
     fibre_kinds: tuple[str, ...]
-    """(F,)"""
+    """(F,) Kind of each fibre (``FibreKind``)."""
     foot_from_node: np.ndarray
-    """(N,) int32: the foot whose sole a node belongs to, -1 for the rest."""
+    """(N,) int32, foot whose sole a node belongs to, -1 for other nodes."""
 
     @classmethod
     def of(cls, splats: GaussianCloud, camera: Camera, muscles: MuscleSet, feet: Sequence[Foot] = ()) -> RenderData:
-        """From what a film was drawn with, and what the body stands on."""
+        """Create the record from Gaussians and camera of a film, and muscles and feet of the body."""
         foot_from_node = np.full(muscles.node_count, -1, np.int32)
         for index, foot in enumerate(feet):
             foot_from_node[foot.sole] = index
@@ -66,7 +69,7 @@ class RenderData:
         )
 
     def save(self, path: Path) -> None:
-        """Write ``creature.npz`` (docs/guide/report.md); the same creature gives the same bytes."""
+        """Write ``creature.npz`` (docs/guide/report.md); equal creatures give equal bytes."""
         arrays: dict[str, Any] = {name: getattr(self.splats, name).numpy() for name in _SPLATS}
         arrays |= {f"camera_{name}": np.asarray(getattr(self.camera, name)) for name in _CAMERA}
         arrays |= {
@@ -93,7 +96,7 @@ class RenderData:
             real: dict[str, Any] = {name: float(camera[name]) for name in ("fx", "fy", "cx", "cy", "near", "far")}
             starts = arrays["muscle_end_starts"]
             rows = (arrays["muscle_end_weights"], arrays["muscle_end_nodes"], starts)
-            found = cls(
+            data = cls(
                 GaussianCloud.from_numpy(*(arrays[name] for name in _SPLATS), device=device),
                 Camera(**whole, **real, rotation=camera["rotation"], translation=camera["translation"]),
                 sp.csr_matrix(rows, shape=(len(starts) - 1, node_count)),
@@ -104,15 +107,15 @@ class RenderData:
                 tuple(map(str, arrays["fibre_kinds"])),
                 arrays["foot_from_node"],
             )
-            found._check(node_count)
+            data._check(node_count)
         except FileNotFoundError as error:
             raise UserError(f"{path}: is missing; run egs-warp animate again, which writes it") from error
         except READ_ERRORS as error:
             raise UserError(f"{path}: cannot be read ({error}); run egs-warp animate again, which writes it") from error
-        return found
+        return data
 
     def _check(self, node_count: int) -> None:
-        """Raise ``ValueError`` for what cannot be drawn."""
+        """Raise ``ValueError`` for values that cannot be rendered."""
         camera, ends = self.camera, self.muscle_ends
         ends.check_format()
         check_pixels(camera.width, camera.height, "its camera")
@@ -134,9 +137,9 @@ class RenderData:
             raise ValueError("muscle_end_weights are no weights")
 
 
-def _check_rows(name: str, values: np.ndarray, shape: tuple[int, ...], least: int, below: int) -> None:
-    """Raise ``ValueError`` for what are not whole numbers of this ``shape`` from ``least`` to ``below``, left out."""
+def _check_rows(name: str, values: np.ndarray, shape: tuple[int, ...], minimum: int, below: int) -> None:
+    """Raise ``ValueError`` unless ``values`` are integers of this ``shape``, from ``minimum`` to below ``below``."""
     if values.shape != shape or values.dtype.kind not in "iu":
         raise ValueError(f"{name} has shape {values.shape} of {values.dtype}")
-    if values.size and not least <= values.min() <= values.max() < below:
+    if values.size and not minimum <= values.min() <= values.max() < below:
         raise ValueError(f"{name} points at what is not there")

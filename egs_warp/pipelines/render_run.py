@@ -1,4 +1,4 @@
-"""The film of a finished run again: through any camera, at any size, in colour, depth or alpha."""
+"""Rendering of a finished run: through any camera, at any size, in colour, depth or alpha."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _MILLIMETRES = 1000.0
 
 
 class Show(Enum):
-    """What a picture shows of the creature."""
+    """Quantity that a picture shows."""
 
     COLOUR = "colour"
     DEPTH = "depth"
-    """Grey, white at the nearest of the whole film; as PNG 16 bits of millimetres, 0 where there is nothing."""
+    """Grey, white at the nearest depth of the whole film; in a PNG 16-bit millimetres, 0 outside the creature."""
     ALPHA = "alpha"
-    """Grey: how much light the creature keeps from what is behind it."""
+    """Grey: opacity of the creature."""
 
 
 def render_run(
@@ -43,11 +43,23 @@ def render_run(
     shadow: bool = True,
     quiet: bool = False,
 ) -> int:
-    """Write a video (.mp4, .mov, .webm), or a folder of PNGs where ``out`` has no ending; returns how many frames.
+    """Write a video, or a folder of PNGs, of a finished run. Equal arguments give equal pictures.
 
-    ``hold``: this frame at 60 Hz alone, and the camera goes around it once. The same arguments give the same pictures.
-    Raises ``UserError`` for a frame that the run does not have, a name or shot that does not fit the other, and a
-    folder that holds other frames, or for a file of a run.
+    Args:
+        run: The run.
+        out: Video (.mp4, .mov, .webm); a name without an ending is a folder of PNGs.
+        shot: Camera, size, frame rate and background.
+        show: Quantity to show.
+        hold: Show this frame at 60 Hz alone, while the camera moves around it once; None shows the motion.
+        shadow: Draw a shadow on the ground.
+        quiet: Show no progress bar.
+
+    Returns:
+        The number of frames.
+
+    Raises:
+        UserError: The run does not have the frame ``hold``, ``out`` does not support ``shot``, is a folder with other
+            frames, or is a file of a run.
     """
     folder = out.suffix == ""
     if not folder:
@@ -60,7 +72,7 @@ def render_run(
         steps = nearest_steps(t.time, shot.fps)
         cameras = shot.cameras(run.creature.camera, t, steps)
     else:
-        steps = np.full(turntable(shot.fps), run.steps[run.frame_number(hold, asked_by="turntable")])
+        steps = np.full(turntable(shot.fps), run.steps[run.frame_number(hold, argument="turntable")])
         base = resized(run.creature.camera, *(shot.size or (run.creature.camera.width, run.creature.camera.height)))
         cameras = around(base, t.positions[steps[:1]], count=len(steps))
     frames = drawn_frames(run.deformer(), t, steps, cameras, shot, scene=run.scene, shadow=shadow)
@@ -94,13 +106,15 @@ def _picture(frame: Frame, show: Show, near: float, far: float) -> np.ndarray:
 
 
 def _millimetres(frame: Frame) -> np.ndarray:
-    """(H, W) uint16, 0 where less than half of the light is kept."""
-    there = frame.image.alpha.numpy() > 0.5
-    return np.where(there, np.clip(np.rint(_MILLIMETRES * frame.image.depth.numpy()), 1, 65535), 0).astype(np.uint16)
+    """Return the depth (H, W) uint16 mm, 0 where the opacity is at most 0.5."""
+    is_opaque = frame.image.alpha.numpy() > 0.5
+    return np.where(is_opaque, np.clip(np.rint(_MILLIMETRES * frame.image.depth.numpy()), 1, 65535), 0).astype(
+        np.uint16
+    )
 
 
 def _depths(points: np.ndarray, cameras: Sequence[Camera]) -> tuple[float, float]:
-    """Least and greatest z-depth of the nodes ``points`` (n, 3) in any of the cameras."""
+    """Return the minimum and maximum z-depth of the box around ``points`` (n, 3) over all ``cameras``."""
     corners = box_corners(points.min(axis=0), points.max(axis=0))
     depths = np.concatenate([(corners - camera.centre) @ camera.rotation[2] for camera in cameras])
     if depths.max() <= 0.0:

@@ -1,4 +1,4 @@
-"""``report.json``: what was asked and reached, the audit, and what it cost. The schema is in docs/guide/report.md."""
+"""``report.json``: requested and reached values, audit and timing of a run. Schema: docs/guide/report.md."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -25,17 +25,21 @@ from egs_warp.version import __version__
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+JsonValue: TypeAlias = "bool | int | float | str | Sequence[JsonValue] | Mapping[str, JsonValue] | None"
+"""Value that can be written as JSON."""
 SCHEMA_VERSION = 1
 MECHANICS = ("warp-lang", "numpy", "scipy", "osqp", "pytetwild")
-"""Packages that decide how a body moves."""
+"""Packages on which the motion of a body depends."""
+_KEYS = {"change": "gained", "target_error": "square_miss"}
+"""Fields of ``EnergyTotals`` and ``HopOutcome`` -> their keys in the report, whose schema is fixed."""
 NO_METADATA = "no metadata"
-"""In place of the version of a package that is missing, or was copied without its ``dist-info``."""
+"""Version of a package that is missing, or was copied without its ``dist-info``."""
 
 
 def versions(names: Sequence[str] = MECHANICS) -> dict[str, str]:
-    """Of the package, Python and the packages ``names``, which the numbers depend on.
+    """Return the versions of this package, Python and the packages ``names``, on which the numbers depend.
 
-    One whose version is not known is told as ``NO_METADATA``: whoever asks has finished work, which must not be lost.
+    An unknown version is ``NO_METADATA`` and not an error, because the caller has finished work to save.
     """
     return {
         "egs-warp": __version__,
@@ -44,8 +48,12 @@ def versions(names: Sequence[str] = MECHANICS) -> dict[str, str]:
     }
 
 
+def _with_keys(record: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
+    return {_KEYS.get(name, name): value for name, value in record.items()}
+
+
 def installed_version(name: str) -> str | None:
-    """None where nothing tells it."""
+    """Return the version of an installed package; None if it is unknown."""
     try:
         return version(name)
     except PackageNotFoundError:
@@ -54,22 +62,24 @@ def installed_version(name: str) -> str | None:
 
 @dataclass(frozen=True)
 class MotionReport:
-    """One motion: asked, planned, reached."""
+    """Requested, planned and reached values of one motion."""
 
     name: str
     asked: Mapping[str, float]
-    """Lengths in body heights."""
+    """Requested values; lengths in body heights."""
     planned: DataclassInstance
-    """The record of its state machine."""
+    """Plan of its state machine."""
     reached: MotionOutcome
+    """Measured values that all motions have."""
     state: State
     also_reached: DataclassInstance | None
-    """The record of what only such a motion is measured by."""
+    """Measured values that only this kind of motion has."""
     notes: tuple[str, ...]
+    """Notes for the user."""
 
-    def to_json(self) -> dict[str, Any]:
-        """One element of ``motion``."""
-        also = asdict(self.also_reached) if self.also_reached is not None else {}
+    def to_json(self) -> dict[str, JsonValue]:
+        """Return an element of ``motion``."""
+        also = _with_keys(asdict(self.also_reached)) if self.also_reached is not None else {}
         return {
             "name": self.name,
             "asked": dict(self.asked),
@@ -80,7 +90,7 @@ class MotionReport:
         }
 
     def summary(self) -> list[str]:
-        """For the terminal."""
+        """Return the lines for the terminal."""
         reached = asdict(self.reached)
         pairs = [
             f"{name} {reached[name]:.3f}" + (f" of {self.asked[name]:g}" if name in self.asked else "")
@@ -95,16 +105,16 @@ class MotionReport:
 
 @dataclass(frozen=True)
 class QpCounts:
-    """Quadratic programs solved a frame."""
+    """Number of quadratic programs."""
 
     mean_per_frame: float
     worst_per_frame: int
     infeasible: int
-    """In all."""
+    """Number of infeasible programs in the run."""
 
     @classmethod
     def of(cls, reports: Sequence[StepReport], frames: np.ndarray) -> QpCounts:
-        """Of ``reports``; ``frames`` (n,) are indices into the trajectory's times."""
+        """Count the programs of ``reports``; ``frames`` (n,) are indices into the trajectory's times."""
         counts = np.array([0, *(report.qp_count for report in reports)])
         per_frame = np.diff(np.cumsum(counts)[frames]) if len(frames) > 1 else np.zeros(1)
         infeasible = int(sum(report.qp_infeasible for report in reports))
@@ -113,7 +123,7 @@ class QpCounts:
 
 @dataclass(frozen=True)
 class StageTime:
-    """Milliseconds a frame."""
+    """Time of one stage, ms per frame."""
 
     mean: float
     worst: float
@@ -122,8 +132,12 @@ class StageTime:
 def stage_times(
     reports: Sequence[StepReport], frames: np.ndarray, drawing: Mapping[str, Sequence[float]]
 ) -> dict[str, StageTime]:
-    """By stage; one that a frame does without takes it no time. ``drawing`` holds the milliseconds of each drawn frame
-    by stage.
+    """Return the time of each stage; a frame without a stage counts as 0.
+
+    Args:
+        reports: Reports of all steps.
+        frames: (n,) indices into the trajectory's times.
+        drawing: ms of each rendered frame, by stage.
     """
     spans = list(zip(frames[:-1], frames[1:], strict=True))
     spent: dict[str, np.ndarray] = {}
@@ -140,7 +154,7 @@ def stage_times(
 
 @dataclass(frozen=True)
 class CageFacts:
-    """The simulated mesh."""
+    """Properties of the simulated mesh."""
 
     nodes: int
     tets: int
@@ -151,7 +165,7 @@ class CageFacts:
 
 @dataclass(frozen=True)
 class MuscleFacts:
-    """The muscles."""
+    """Numbers of muscles."""
 
     fibres: int
     segments: int
@@ -159,24 +173,25 @@ class MuscleFacts:
 
 @dataclass(frozen=True)
 class GaussianCounts:
-    """Gaussians on their way from the capture to the pictures."""
+    """Numbers of Gaussians from the capture to the pictures."""
 
     read: int
-    """In the capture."""
+    """Gaussians in the capture."""
     drawn: int
-    """In the pictures; splitting has added the rest."""
+    """Gaussians in the pictures, after splitting."""
     left_out_of_contact: int
+    """Gaussians that are not used for contact."""
     left_out_of_contact_opacity: float
-    """Share of the opacity mass."""
+    """Fraction of the opacity of the Gaussians that are not used for contact."""
 
     @classmethod
     def of(cls, creature: Creature, drawn: int | None = None) -> GaussianCounts:
-        """Of pictures with so many ``drawn``; all of the capture, unsplit, if None."""
+        """Return the counts of a creature; ``drawn`` is the number in its pictures, None if there was no splitting."""
         read, geometry = creature.cloud.count, creature.geometry
         return cls(read, read if drawn is None else drawn, geometry.excluded_count, geometry.excluded_opacity)
 
-    def to_json(self) -> dict[str, Any]:
-        """``gaussians``."""
+    def to_json(self) -> dict[str, JsonValue]:
+        """Return ``gaussians`` of the report."""
         return {
             "in": self.read,
             "split": self.drawn - self.read,
@@ -188,7 +203,7 @@ class GaussianCounts:
 
 @dataclass(frozen=True)
 class Report:
-    """Everything that ``report.json`` says."""
+    """Contents of ``report.json``."""
 
     source: str
     """Name of the capture."""
@@ -201,20 +216,20 @@ class Report:
     muscles: MuscleFacts
     gaussians: GaussianCounts
     notes: tuple[str, ...]
-    """For the user."""
+    """Notes for the user."""
     device: str
     seed: int
-    asked: Mapping[str, Any] = field(default_factory=dict)
-    """Everything else that was asked."""
+    asked: Mapping[str, JsonValue] = field(default_factory=dict)
+    """Requested options of the run, ready for JSON."""
     versions: Mapping[str, str] = field(default_factory=versions)
 
     @property
     def state(self) -> State:
-        """How the run ended."""
+        """State in which the run ended."""
         return State.worst(tuple(motion.state for motion in self.motion))
 
-    def to_json(self) -> dict[str, Any]:
-        """The whole report, ready for JSON."""
+    def to_json(self) -> dict[str, JsonValue]:
+        """Return the whole report, ready for JSON."""
         return {
             "schema": SCHEMA_VERSION,
             "source": self.source,
@@ -222,7 +237,7 @@ class Report:
             "asked": dict(self.asked),
             "motion": [motion.to_json() for motion in self.motion],
             "audit": asdict(self.audit),
-            "energy": asdict(self.energy),
+            "energy": _with_keys(asdict(self.energy)),
             "qp": asdict(self.qp),
             "timing": {stage: asdict(time) for stage, time in self.timing.items()},
             "cage": asdict(self.cage),
@@ -235,11 +250,11 @@ class Report:
         }
 
     def write(self, path: Path) -> None:
-        """``report.json``, whole or not at all."""
+        """Write ``report.json`` atomically."""
         write_report(path, self.to_json())
 
     def summary(self) -> str:
-        """A few lines for the terminal."""
+        """Return a summary of a few lines for the terminal."""
         lines = [line for motion in self.motion for line in motion.summary()]
         lines.append(f"muscle work: {self.energy.muscle_work:.2f} of the energy that lifts the body by its height")
         lines.append(verdict(self.audit))
@@ -258,17 +273,17 @@ AUDIT_LIMITS = {
     "inverted_elements": 0,
     "newton_unconverged": 0,
 }
-"""Beyond these a run is not what the equations say (docs/guide/report.md)."""
+"""Upper limits of the audit; a run that exceeds one does not satisfy the equations (docs/guide/report.md)."""
 
 
-def verdict(found: Audit) -> str:
-    """One line: whether the run obeys its equations, and by how much not."""
-    values = asdict(found)
-    # Not "value > limit": NaN is beyond, too.
-    beyond = {name: value for name, value in values.items() if not value <= AUDIT_LIMITS[name]}
-    if beyond:
-        said = ", ".join(f"{name} {value:.2g} (at most {AUDIT_LIMITS[name]:g})" for name, value in beyond.items())
-        return f"audit: FAILED: {said}"
+def verdict(result: Audit) -> str:
+    """Return one line that says if the run satisfies its equations, with the residuals."""
+    values = asdict(result)
+    # Not "value > limit": NaN must fail, too.
+    exceeded = {name: value for name, value in values.items() if not value <= AUDIT_LIMITS[name]}
+    if exceeded:
+        failures = ", ".join(f"{name} {value:.2g} (at most {AUDIT_LIMITS[name]:g})" for name, value in exceeded.items())
+        return f"audit: FAILED: {failures}"
     return "audit: passed (" + ", ".join(f"{name} {value:.2g}" for name, value in values.items()) + ")"
 
 
@@ -285,13 +300,25 @@ def report_of_run(
     source: str,
     notes: Sequence[str],
     seed: int,
-    asked: Mapping[str, Any],
+    asked: Mapping[str, JsonValue],
     ending: EndCause | None = None,
 ) -> Report:
-    """Of the motions ``done`` on a ``trajectory`` with its ``books``; ``frames`` (n,) are indices into its times.
-    ``ending`` says what ended the last motion before its time.
+    """Create the report of a run.
 
-    ``gaussians`` are those of its pictures, ``drawing`` the milliseconds of each by stage.
+    Args:
+        creature: The creature.
+        trajectory: All states of the run.
+        steps: Reports of all steps.
+        frames: (n,) indices into the trajectory's times.
+        done: The motions that were started.
+        energy: Energy balance of ``trajectory``.
+        gaussians: Numbers of Gaussians.
+        drawing: ms of each rendered frame, by stage.
+        source: Name of the capture.
+        notes: Notes for the user.
+        seed: Seed of the run.
+        asked: Requested options.
+        ending: Cause that ended the last motion early.
     """
     mesh = creature.cage.mesh
     return Report(
@@ -322,7 +349,7 @@ def _motion_reports(trajectory: Trajectory, done: Sequence[MotionRecord], ending
     return tuple(reports)
 
 
-def write_report(path: Path, report: Mapping[str, Any]) -> None:
-    """Write ``report`` as indented JSON; the file appears whole or not at all."""
+def write_report(path: Path, report: Mapping[str, JsonValue]) -> None:
+    """Write ``report`` as indented JSON, atomically."""
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(report, indent=2) + "\n")

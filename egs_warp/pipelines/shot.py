@@ -1,11 +1,11 @@
-"""How a run is filmed: from where, how large, how often, over what."""
+"""Camera path, size, frame rate and background of a film."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -19,21 +19,25 @@ from egs_warp.io.text import parse_json, read_text
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 
-SMALLEST_SIDE, LARGEST_SIDE = 16, 4096
-"""Pixels of a film."""
-FASTEST = 1000.0
-_SMOOTH = 0.25
-"""Seconds: standard deviation of the window over which a camera that follows is slow."""
-_ROOM = 1.2
-"""Of a camera that follows: how much more than the body it holds."""
-_RIM = 0.06
-"""Of the shorter side of a picture: left free by a camera that goes around."""
-_TURNTABLE = 4.0
-"""Seconds of a turn about a body that is held."""
+if TYPE_CHECKING:
+    from egs_warp.pipelines.report import JsonValue
+
+MIN_SIDE, MAX_SIDE = 16, 4096
+"""Limits of the side of a film, pixels."""
+MAX_FPS = 1000.0
+"""Maximum frame rate, Hz."""
+_SMOOTHING_TIME = 0.25
+"""Standard deviation of the window that smooths the path of a following camera, s."""
+_FOLLOW_MARGIN = 1.2
+"""Ratio of the radius that a following camera shows to that of the body."""
+_ORBIT_MARGIN = 0.06
+"""Margin of an orbiting camera, as a fraction of the shorter side of a picture."""
+_TURNTABLE_TIME = 4.0
+"""Time of one orbit around a single frame, s."""
 
 
 class CameraMove(StrEnum):
-    """How a camera moves by itself."""
+    """Built-in camera motion."""
 
     FIXED = "fixed"
     FOLLOW = "follow"
@@ -42,41 +46,44 @@ class CameraMove(StrEnum):
 
 @dataclass(frozen=True)
 class Shot:
-    """What a user may ask of a film."""
+    """Options of a film."""
 
     camera: str = CameraMove.FIXED
-    """``fixed``, ``follow``, ``orbit`` (once around in the film), or the name of a JSON file with key cameras."""
+    """``fixed``, ``follow``, ``orbit`` (once around during the film), or the name of a JSON file with key cameras."""
     size: tuple[int, int] | None = None
-    """Pixels across and down; None: as the film's."""
+    """Width and height, pixels; None is the default of the film."""
     fps: float = FRAME_RATE
-    """Frames for one second of motion; each shows the nearest solver step."""
+    """Frames per second of motion; each shows the nearest solver step."""
     colour: tuple[float, float, float] | None = None
-    """0 to 1, behind the creature, its shadow on it; None: the scene, or a floor where there is none."""
+    """Background colour, 0 to 1, with the shadow on it; None shows the scene, or a floor without a scene."""
     transparent: bool = False
-    """Nothing behind the creature but its shadow."""
+    """Transparent background with only the shadow."""
 
     def __post_init__(self) -> None:
-        if self.size is not None and not all(SMALLEST_SIDE <= side <= LARGEST_SIDE for side in self.size):
+        if self.size is not None and not all(MIN_SIDE <= side <= MAX_SIDE for side in self.size):
             text = "x".join(map(str, self.size))
-            advice = f"give pixels from {SMALLEST_SIDE} to {LARGEST_SIDE}, as 512 or 640x360"
+            advice = f"give pixels from {MIN_SIDE} to {MAX_SIDE}, as 512 or 640x360"
             raise ArgumentError("size", advice, value=text)
-        if not 1.0 <= self.fps <= FASTEST:
-            raise ArgumentError("fps", f"give a number of frames a second from 1 to {FASTEST:g}", value=self.fps)
+        if not 1.0 <= self.fps <= MAX_FPS:
+            raise ArgumentError("fps", f"give a number of frames a second from 1 to {MAX_FPS:g}", value=self.fps)
         if self.camera not in list(CameraMove) and not self.camera.endswith(".json"):
             raise ArgumentError("camera", f"give {', '.join(CameraMove)} or a path.json", value=self.camera)
 
-    def to_json(self) -> dict[str, Any]:
-        """For the report."""
-        given = {"camera": self.camera, "picture": self.size, "fps": self.fps, "colour": self.colour}
-        return given | {"transparent": self.transparent}
+    def to_json(self) -> dict[str, JsonValue]:
+        """Return the options for ``asked`` of the report."""
+        options = {"camera": self.camera, "picture": self.size, "fps": self.fps, "colour": self.colour}
+        return options | {"transparent": self.transparent}
 
     def check(self) -> None:
-        """Raise ``UserError`` for a file of key cameras that cannot be read: before any long work."""
+        """Raise ``UserError`` if the file of key cameras cannot be read; call it before long computations."""
         if self.camera not in list(CameraMove):
             _keys(Path(self.camera))
 
     def cameras(self, camera: Camera, trajectory: Trajectory, steps: np.ndarray) -> list[Camera]:
-        """One for each of ``steps`` (n,); ``camera`` is the film's own. Raises ``UserError`` for a bad file of keys."""
+        """Return the camera of each of the ``steps`` (n,) of a trajectory.
+
+        ``camera`` is the default camera of the film. Raises ``UserError`` for an invalid file of key cameras.
+        """
         base = resized(camera, *self.size) if self.size is not None else camera
         if self.camera == CameraMove.FIXED:
             return [base] * len(steps)
@@ -88,18 +95,18 @@ class Shot:
 
 
 def nearest_steps(time: np.ndarray, fps: float) -> np.ndarray:
-    """(n,) the step that is nearest to each of ``fps`` frames a second, of steps that end at ``time`` (F + 1,) s."""
+    """Return the states (n,) nearest to each frame at ``fps`` Hz; ``time`` (F + 1,) s are the times of the states."""
     frames = np.arange(round(fps * (time[-1] - time[0])) + 1) / fps + time[0]
     return np.searchsorted(0.5 * (time[1:] + time[:-1]), frames)
 
 
 def turntable(fps: float) -> int:
-    """Frames of a turn about a body that is held."""
-    return max(2, round(_TURNTABLE * fps))
+    """Return the number of frames of one orbit around a single frame."""
+    return max(2, round(_TURNTABLE_TIME * fps))
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """``camera`` for pictures of ``width`` x ``height`` pixels that hold at least what its own hold."""
+    """Return ``camera`` for pictures of ``width`` x ``height`` pixels that show at least its field of view."""
     if (width, height) == (camera.width, camera.height):
         return camera
     scale = min(width / camera.width, height / camera.height)
@@ -115,8 +122,9 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 
 
 def around(camera: Camera, positions: np.ndarray, *, count: int | None = None) -> list[Camera]:
-    """``count`` cameras once around up (z) through the middle of ``positions`` (f, N, 3), as near as shows all of it
-    from every side; one for each frame if no count is given.
+    """Return cameras on a circle around the vertical axis through the centre of ``positions`` (f, N, 3).
+
+    They are as near as they can be while each shows all positions. There are ``count`` cameras, by default f.
     """
     points = positions.reshape(-1, 3)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -127,11 +135,11 @@ def around(camera: Camera, positions: np.ndarray, *, count: int | None = None) -
     distance = 0.5 * float(np.linalg.norm(high - low))
     for _ in range(200):
         eye = middle - distance * forward
-        turned = [_turned(_moved(camera, eye), middle, 2.0 * np.pi * k / count) for k in range(count)]
-        if all(_holds(one, corners) for one in turned[:: max(1, count // 32)]):
+        rotated = [_rotated(_moved(camera, eye), middle, 2.0 * np.pi * k / count) for k in range(count)]
+        if all(_shows(one, corners) for one in rotated[:: max(1, count // 32)]):
             break
         distance *= 1.05
-    return turned
+    return rotated
 
 
 def _following(camera: Camera, trajectory: Trajectory, steps: np.ndarray) -> list[Camera]:
@@ -140,9 +148,9 @@ def _following(camera: Camera, trajectory: Trajectory, steps: np.ndarray) -> lis
     path = np.einsum("n,fni->fi", masses, positions)
     reach = float(np.linalg.norm(positions - path[:, None], axis=2).max())
     rate = (len(steps) - 1) / max(float(trajectory.time[steps[-1]] - trajectory.time[steps[0]]), 1e-9)
-    smooth = gaussian_filter1d(path, _SMOOTH * rate, axis=0, mode="nearest") if len(path) > 1 else path
-    # What the slow camera lags behind must be in the picture, too.
-    reach = _ROOM * reach + float(np.linalg.norm(path - smooth, axis=1).max())
+    smooth = gaussian_filter1d(path, _SMOOTHING_TIME * rate, axis=0, mode="nearest") if len(path) > 1 else path
+    # The distance by which the smoothed camera path lags must be in the picture, too.
+    reach = _FOLLOW_MARGIN * reach + float(np.linalg.norm(path - smooth, axis=1).max())
     half = min(0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
     distance = reach / np.sin(np.arctan(half))
     return [_moved(camera, middle - distance * camera.rotation[2]) for middle in smooth]
@@ -152,26 +160,29 @@ def _moved(camera: Camera, eye: np.ndarray) -> Camera:
     return replace(camera, translation=-camera.rotation @ eye)
 
 
-def _turned(camera: Camera, middle: np.ndarray, angle: float) -> Camera:
-    """``camera`` gone round up through ``middle`` (3,) by ``angle`` radians."""
+def _rotated(camera: Camera, middle: np.ndarray, angle: float) -> Camera:
+    """Return ``camera`` rotated by ``angle`` radians about the vertical axis through ``middle`` (3,)."""
     c, s = np.cos(angle), np.sin(angle)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    eye = middle + turn @ (camera.centre - middle)
-    rotation = camera.rotation @ turn.T
+    rotation_z = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    eye = middle + rotation_z @ (camera.centre - middle)
+    rotation = camera.rotation @ rotation_z.T
     return replace(camera, rotation=rotation, translation=-rotation @ eye)
 
 
-def _holds(camera: Camera, points: np.ndarray) -> bool:
-    seen = points @ camera.rotation.T + camera.translation
-    if seen[:, 2].min() <= camera.near:
+def _shows(camera: Camera, points: np.ndarray) -> bool:
+    camera_points = points @ camera.rotation.T + camera.translation
+    if camera_points[:, 2].min() <= camera.near:
         return False
-    u, v = camera.fx * seen[:, 0] / seen[:, 2] + camera.cx, camera.fy * seen[:, 1] / seen[:, 2] + camera.cy
-    rim = _RIM * min(camera.width, camera.height)
+    u, v = (
+        camera.fx * camera_points[:, 0] / camera_points[:, 2] + camera.cx,
+        camera.fy * camera_points[:, 1] / camera_points[:, 2] + camera.cy,
+    )
+    rim = _ORBIT_MARGIN * min(camera.width, camera.height)
     return bool(min(u.min(), v.min()) > rim and u.max() < camera.width - rim and v.max() < camera.height - rim)
 
 
 def _through_keys(path: Path, camera: Camera, trajectory: Trajectory, steps: np.ndarray) -> list[Camera]:
-    """Cameras on a smooth line through the keys of ``path`` (docs/guide/film.md), before and after them at rest."""
+    """Return cameras on a spline through the keys of ``path`` (docs/guide/film.md), constant before and after them."""
     rows = _keys(path)
     frame = BodyFrame(trajectory.body_axes, trajectory.body_origin, trajectory.metres_per_unit)
     rows[:, 1:4], rows[:, 4:7] = frame.points(rows[:, 1:4]), frame.points(rows[:, 4:7])
@@ -199,7 +210,7 @@ def _through_keys(path: Path, camera: Camera, trajectory: Trajectory, steps: np.
 
 
 def _keys(path: Path) -> np.ndarray:
-    """(n, 8) time, eye, target, fov of each key, in the capture's frame and units."""
+    """Return time (s), eye, target and field of view (degrees) of each key (n, 8), in the capture's frame."""
     keys = parse_json(read_text(path), path)
     entries = keys.get("keys") if isinstance(keys, dict) else None
     if not isinstance(entries, list) or not entries:
@@ -211,7 +222,7 @@ def _keys(path: Path) -> np.ndarray:
 
 
 def _key(path: Path, number: int, entry: Any) -> list[float]:
-    """time, eye, target, fov."""
+    """Return time (s), eye, target and field of view (degrees) of a key. Raises ``UserError`` if it is invalid."""
     try:
         row = [entry["time"], *entry["eye"], *entry["target"], entry.get("fov", 30.0)]
         row = [float(value) for value in row]

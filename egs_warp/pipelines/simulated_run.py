@@ -1,4 +1,4 @@
-"""A creature moves: motions by name become what its body does."""
+"""Simulation of a creature: motions by name become a trajectory."""
 
 from __future__ import annotations
 
@@ -25,52 +25,52 @@ from egs_warp.pipelines.planned_path import planned_com
 from egs_warp.pipelines.time_estimate import RemainingFrames
 
 FILMED_FROM = (0.6, -1.0, 0.22)
-"""From the body to the camera of a film: ahead, left and up; it shows the face and the way."""
-_RISING = 120.0
-"""sqrt(H / g) that getting up may take in one run."""
-LEAST_FRAMES = 2
-"""Of a film; the first one is at rest."""
-MOST_FRAMES = 216_000
-"""Of a run that is told how many."""
-_STEEP = 0.9999
-"""Cosine to the vertical of a view from straight above or below."""
-_FROM_ABOVE = 0.5
-"""Up for one along the ground, in a scene, which has a floor to be seen."""
-_IN_THE_WAY = 0.7
-"""Cosine of the angle to a side of the film within which things stand between."""
-_MORE = 0.2
-"""Steradians, a tenth of a side: so much more in the way than on another side, as a few floaters are, does not
-matter."""
-_NEARER = 2.5
-"""Of the size of what is filmed: about how far away the camera is; what is further stands behind it."""
+"""Direction from the body to the camera of a film: ahead, left and up. It shows the face and the path ahead."""
+_MAX_GET_UP_TIME = 120.0
+"""Maximum total time for getting up in one run, in units of sqrt(H / g)."""
+MIN_FRAMES = 2
+"""Minimum number of frames; the first one is at rest."""
+MAX_FRAMES = 216_000
+"""Maximum number of frames that can be requested."""
+_VERTICAL_COSINE = 0.9999
+"""Cosine to the vertical above which a view is from straight above or below."""
+_SCENE_ELEVATION = 0.5
+"""Vertical over horizontal component of the view direction in a scene, so that its floor is visible."""
+_OCCLUSION_COSINE = 0.7
+"""Cosine of the angle to the view direction above which Gaussians may hide the body."""
+_OCCLUSION_TOLERANCE = 0.2
+"""Difference of occlusion that is ignored, sr: a tenth of a view, as a few floaters cause."""
+_OCCLUSION_DISTANCE = 2.5
+"""Approximate distance of the camera, in sizes of the filmed volume; Gaussians farther away are behind the camera."""
 
 
 @dataclass(frozen=True)
 class SimulatedRun:
-    """What a creature did."""
+    """Result of ``simulate``."""
 
     creature: Creature
     place: Stance
-    """Where it stood at the start."""
+    """Stance at the start."""
     sequence: MotionSequence
-    """The motions that it went through."""
+    """Motions of the run and their records."""
     simulation: RolloutResult
+    """Trajectory and reports of all steps."""
     fallen: str | None = None
-    """How it was told that the creature has fallen, if it has."""
+    """Description of the fall that ended the run; None if there was none."""
     pushes: tuple[Push, ...] = ()
-    """What was to hit it."""
+    """Pushes that were requested."""
 
     @property
     def ending(self) -> EndCause:
-        """How the last motion ended."""
+        """Cause that ended the last motion early, if any."""
         return EndCause(self.fallen, self.simulation.stopped)
 
     def cut_short(self) -> list[str]:
-        """What the end kept from being done, for the user."""
+        """Return notes for the user about motions and pushes that the end of the run prevented."""
         ended = self.fallen is not None or self.simulation.stopped
-        missed = [push.unapplied_note(float(self.trajectory.time[-1])) for push in self.pushes]
-        told = self.sequence.unstarted_note() if ended else self.sequence.unfinished_note()
-        return [*told, *(line for line in missed if line is not None)]
+        unapplied = [push.unapplied_note(float(self.trajectory.time[-1])) for push in self.pushes]
+        motion_note = self.sequence.unstarted_note() if ended else self.sequence.unfinished_note()
+        return [*motion_note, *(line for line in unapplied if line is not None)]
 
     @property
     def trajectory(self) -> Trajectory:
@@ -79,14 +79,18 @@ class SimulatedRun:
 
     @property
     def frames(self) -> np.ndarray:
-        """(n, N, 3) metres, in the frame of the body: the nodes of the cage in each frame of a video at 60 Hz."""
+        """(n, N, 3) m, cage nodes in each frame of a video at 60 Hz, in the frame of the body."""
         return self.trajectory.positions[self.simulation.frames]
 
     def camera(self, size: int, view_from: np.ndarray | None = None, *, scene: GaussianCloud | None = None) -> Camera:
-        """A fixed camera of ``size`` pixels both ways that holds the whole motion: ahead and to the right of it, or in
-        the direction ``view_from`` (3,) of the capture's frame; of several (n, 3), in the one nearest to that.
+        """Return a fixed camera that shows the whole motion, by default from ahead and to the right of the body.
 
-        Where the ``scene``, in the frame of the body, has much between, it goes round to the nearest clearer side.
+        Args:
+            size: Width and height of the image, pixels.
+            view_from: (3,) direction to the camera, in the capture's frame; of several (n, 3), the one nearest to the
+                default is used.
+            scene: Gaussians around the creature, in the frame of the body; if they hide the body in the default view,
+                the camera moves around it to the nearest clear side.
         """
         ground = self.place.ground
         local = ground.local(self.trajectory.positions).reshape(-1, 3)
@@ -95,14 +99,16 @@ class SimulatedRun:
         middle = 0.5 * (low + high)
         corners = box_corners(low, high)
         distance = float(np.linalg.norm(high - low))
-        direction = np.array(FILMED_FROM) if scene is None else self._clear_side(scene, middle, _NEARER * distance)
+        direction = (
+            np.array(FILMED_FROM) if scene is None else self._clear_side(scene, middle, _OCCLUSION_DISTANCE * distance)
+        )
         if view_from is not None:
-            ways = np.atleast_2d(view_from) @ (ground.axes @ self.creature.frame.axes).T
-            ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-            direction = ways[int(np.argmax(ways[:, :2] @ FILMED_FROM[:2]))]
+            directions = np.atleast_2d(view_from) @ (ground.axes @ self.creature.frame.axes).T
+            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+            direction = directions[int(np.argmax(directions[:, :2] @ FILMED_FROM[:2]))]
         direction /= np.linalg.norm(direction)
-        # From above or below, the way the body faces is up in the picture.
-        upwards = ground.axes[0] if abs(direction[2]) > _STEEP else ground.axes[2]
+        # In views from above or below, the front of the body is up in the picture.
+        upwards = ground.axes[0] if abs(direction[2]) > _VERTICAL_COSINE else ground.axes[2]
         for _ in range(60):
             camera = Camera.look_at(
                 ground.world(middle + distance * direction),
@@ -113,39 +119,42 @@ class SimulatedRun:
                 vertical_fov_degrees=30.0,
                 near=0.01 * distance,
             )
-            seen = ground.world(corners) @ camera.rotation.T + camera.translation
-            reach = np.abs(seen[:, :2] / seen[:, 2:]).max() * camera.fx / (0.5 * size)
-            if seen[:, 2].min() > 0 and reach < 0.86:
+            camera_points = ground.world(corners) @ camera.rotation.T + camera.translation
+            reach = np.abs(camera_points[:, :2] / camera_points[:, 2:]).max() * camera.fx / (0.5 * size)
+            if camera_points[:, 2].min() > 0 and reach < 0.86:
                 break
             distance *= 1.05
         return camera
 
     def _clear_side(self, scene: GaussianCloud, middle: np.ndarray, reach: float) -> np.ndarray:
-        """(3,) from ``middle`` (3,) to the camera, ground axes: of eight sides, from the usual one on, the nearest on
-        which what stands nearer than ``reach`` hides hardly more than on any."""
+        """Return the direction (3,) from ``middle`` (3,) to the camera, ground axes.
+
+        Of eight sides, it is the one nearest to the default whose occlusion by Gaussians nearer than ``reach`` (m)
+        exceeds the minimum by at most ``_OCCLUSION_TOLERANCE``.
+        """
         height = self.creature.body.height
         local = self.place.ground.local(scene.means.numpy().astype(np.float64)) - middle
-        away = np.linalg.norm(local, axis=1)
-        standing = (local[:, 2] > 0.1 * height - middle[2]) & (away > 1e-3 * height) & (away < reach)
-        broad = np.sort(scene.log_scales.numpy()[standing].astype(np.float64), axis=1)[:, 1:].sum(axis=1)
-        hidden = 2.0 * np.pi * scene.opacities()[standing] * np.exp(broad) / away[standing] ** 2
+        distances = np.linalg.norm(local, axis=1)
+        standing = (local[:, 2] > 0.1 * height - middle[2]) & (distances > 1e-3 * height) & (distances < reach)
+        log_areas = np.sort(scene.log_scales.numpy()[standing].astype(np.float64), axis=1)[:, 1:].sum(axis=1)
+        hidden = 2.0 * np.pi * scene.opacities()[standing] * np.exp(log_areas) / distances[standing] ** 2
         level = local[standing, :2]
         ahead, left, _ = FILMED_FROM
-        turns = np.exp(0.25j * np.pi * np.array([0, 1, -1, 2, -2, 3, -3, 4]))
-        sides = (ahead + 1j * left) * turns
-        ways = np.stack([sides.real, sides.imag], axis=1) / np.abs(sides)[:, None]
-        blocked = hidden @ (level @ ways.T > _IN_THE_WAY * np.linalg.norm(level, axis=1)[:, None])
-        first = int(np.flatnonzero(blocked <= blocked.min() + _MORE)[0])
-        return np.array([*ways[first], _FROM_ABOVE])
+        rotations = np.exp(0.25j * np.pi * np.array([0, 1, -1, 2, -2, 3, -3, 4]))
+        sides = (ahead + 1j * left) * rotations
+        directions = np.stack([sides.real, sides.imag], axis=1) / np.abs(sides)[:, None]
+        blocked = hidden @ (level @ directions.T > _OCCLUSION_COSINE * np.linalg.norm(level, axis=1)[:, None])
+        first = int(np.flatnonzero(blocked <= blocked.min() + _OCCLUSION_TOLERANCE)[0])
+        return np.array([*directions[first], _SCENE_ELEVATION])
 
 
 def check_frames(frames: int | None) -> None:
-    """Raise ``ArgumentError`` for a film without motion."""
-    if frames is not None and frames < LEAST_FRAMES:
-        advice = f"give a whole number of at least {LEAST_FRAMES}; the first picture is at rest"
+    """Raise ``ArgumentError`` for a number of frames that is too small or too large."""
+    if frames is not None and frames < MIN_FRAMES:
+        advice = f"give a whole number of at least {MIN_FRAMES}; the first picture is at rest"
         raise ArgumentError("frames", advice, value=frames)
-    if frames is not None and frames > MOST_FRAMES:
-        raise ArgumentError("frames", f"give at most {MOST_FRAMES}, which is an hour", value=frames)
+    if frames is not None and frames > MAX_FRAMES:
+        raise ArgumentError("frames", f"give at most {MAX_FRAMES}, which is an hour", value=frames)
 
 
 def simulate(
@@ -153,7 +162,7 @@ def simulate(
     motion: Script,
     *,
     frames: int | None = None,
-    longest: float | None = None,
+    max_seconds: float | None = None,
     step: float | None = None,
     style: Style | None = None,
     pushes: Sequence[Push] = (),
@@ -163,16 +172,26 @@ def simulate(
     resume: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, expected: None,
 ) -> SimulatedRun:
-    """Run ``motion`` for ``frames`` pictures at 60 Hz, the first of them at rest, or else until the body has come to
-    rest or fallen, or the motion is cut off.
+    """Simulate a motion.
 
-    ``longest``: seconds after which it is cut off, if that is earlier; ``step``: those of a solver step, if not the
-    usual; ``style``: how it jumps; ``pushes``: what hits it meanwhile; ``get_up``: whether a body that has fallen is to
-    get up and go on; ``activations`` (steps, M) metres: what muscles do in each solver step, whatever the motion would
-    have them do, which then only says what is measured; the run ends with the last of them. ``parts`` tells the folder
-    that takes the steps as they are done, ``resume`` is that of a run that was cut off and goes on. ``progress`` is
-    told after each frame how many are done, and how many are expected in all by now. Raises ``UserError`` for a motion
-    that the body cannot do, and a folder that another run has left.
+    Args:
+        creature: The creature at rest.
+        motion: The motion or motions.
+        frames: Number of frames at 60 Hz, the first at rest; None runs until the body has come to rest or fallen, or
+            the time limit is reached.
+        max_seconds: Time limit of the motion, s; None is the motion's own limit.
+        step: Maximum step size, s; None is the default.
+        style: Style of jumps; None is the default.
+        pushes: Pushes during the run.
+        get_up: If the body falls, get up and continue.
+        activations: (steps, M) m, prescribed muscle activations of each solver step. The motion then only defines what
+            is measured, and the run ends with the last row.
+        parts: Returns the folder that receives the finished steps; None writes none.
+        resume: Folder with the finished steps of an interrupted run to continue.
+        progress: Called after each frame with the number of finished frames and the number expected in total.
+
+    Raises:
+        UserError: The body cannot perform the motion, an argument is invalid, or ``resume`` belongs to another run.
     """
     check_frames(frames)
     if activations is not None:
@@ -181,32 +200,35 @@ def simulate(
     expected = motion.check(place)
     sequence = MotionSequence(place, motion.parts(creature.body.height))
     watch = FallMonitor(sequence, place, gets_up=get_up)
-    # A frame is as long as a step that is longer than it.
+    # A step may be longer than 1/60 s; then it is one frame.
     frame = max(1.0 / FRAME_RATE, step or 0.0)
-    limit = round(min(motion.frames(creature.body.height) / FRAME_RATE, longest or np.inf) / frame)
-    most = limit if frames is None else frames - 1
-    # What getting up takes comes on top.
-    rising = round(_RISING * creature.body.time_unit / frame) if get_up and frames is None else 0
+    limit = round(min(motion.frames(creature.body.height) / FRAME_RATE, max_seconds or np.inf) / frame)
+    max_frames = limit if frames is None else frames - 1
+    # The time for getting up is added to the limit.
+    get_up_frames = round(_MAX_GET_UP_TIME * creature.body.time_unit / frame) if get_up and frames is None else 0
 
-    def over() -> bool:
+    def is_over() -> bool:
         return watch.is_finished or watch.time + 1e-9 >= (limit - REST_FRAMES) * frame + watch.spent
 
-    outlook = RemainingFrames(sequence, expected, frame=frame, most=most)
+    remaining_frames = RemainingFrames(sequence, expected, frame=frame, max_frames=max_frames)
     simulation = roll_out(
         creature.stepper,
         creature.geometry,
         creature.start,
         watch,
-        frames=most + rising,
+        frames=max_frames + get_up_frames,
         step=step,
         place=creature.frame,
         parts=parts,
         resume=resume,
-        finished=lambda: frames is None and over(),
+        finished=lambda: frames is None and is_over(),
         kicks=PushKicks(place, pushes),
         activations=activations,
         progress=lambda last: progress(
-            last + 1, max(last + 1, outlook.frames(last + 1, finished=watch.is_finished)) if frames is None else most
+            last + 1,
+            max(last + 1, remaining_frames.frames(last + 1, finished=watch.is_finished))
+            if frames is None
+            else max_frames,
         ),
     )
     trajectory = simulation.trajectory
@@ -216,14 +238,16 @@ def simulate(
 
 
 def checked_activations(creature: Creature, activations: np.ndarray, step: float | None) -> np.ndarray:
-    """(steps, M) float64 metres. Raises ``ArgumentError`` for anything else, for too few of them, and for what a muscle
-    cannot do."""
-    count, least = creature.muscles.segment_count, solver_steps(creature.body, step)[1]
-    given = np.array(activations, dtype=np.float64)
-    if given.ndim != 2 or given.shape[1] != count or len(given) < least:
-        advice = f"give a row of {count} metres, one for each muscle, for each of at least {least} solver steps"
-        raise ArgumentError("activations", f"of shape {given.shape}; {advice}")
-    # Not "any beyond": NaN is beyond, too.
-    if not (np.abs(given) <= creature.muscles.bounds * (1.0 + 1e-9)).all():
-        raise ArgumentError("activations", "beyond what a muscle can do; keep each within its bounds (muscles.bounds)")
-    return given
+    """Return ``activations`` as (steps, M) float64 m.
+
+    Raises ``ArgumentError`` for another shape, fewer steps than a frame has, or values outside the muscles' bounds.
+    """
+    count, min_steps = creature.muscles.segment_count, solver_steps(creature.body, step)[1]
+    values = np.array(activations, dtype=np.float64)
+    if values.ndim != 2 or values.shape[1] != count or len(values) < min_steps:
+        advice = f"give a row of {count} metres, one for each muscle, for each of at least {min_steps} solver steps"
+        raise ArgumentError("activations", f"of shape {values.shape}; {advice}")
+    # Not "any above the bound": NaN must fail, too.
+    if not (np.abs(values) <= creature.muscles.bounds * (1.0 + 1e-9)).all():
+        raise ArgumentError("activations", "outside a muscle's bounds; keep each within muscles.bounds")
+    return values

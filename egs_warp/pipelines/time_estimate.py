@@ -1,4 +1,4 @@
-"""How long a run will be, told while it goes: for progress bars whose time left is to be believed."""
+"""Estimate of the number of frames of a run while it is simulated, for progress bars."""
 
 from __future__ import annotations
 
@@ -9,19 +9,31 @@ from egs_warp.motions.sequence import MotionSequence
 
 
 class RemainingFrames:
-    """Counts the frames to come of a sequence that ends at rest."""
+    """Estimate of the number of frames of a sequence that ends at rest."""
 
-    def __init__(self, sequence: MotionSequence, expected: Sequence[float], *, frame: float, most: int) -> None:
-        """``expected``: seconds that each motion takes; ``frame``: seconds of one; after ``most`` it is cut off."""
-        self._sequence, self._expected, self._frame, self._most = sequence, expected, frame, most
+    def __init__(self, sequence: MotionSequence, expected: Sequence[float], *, frame: float, max_frames: int) -> None:
+        """Create the estimate.
+
+        Args:
+            sequence: The motions.
+            expected: Expected time of each motion, s.
+            frame: Time of a frame, s.
+            max_frames: Number of frames after which the run is cut off.
+        """
+        self._sequence, self._expected, self._frame, self._max_frames = sequence, expected, frame, max_frames
         self._rested: int | None = None
 
     def frames(self, done: int, *, finished: bool) -> int:
-        """In all, once ``done`` are; ``finished``: whether the body lies or stands at rest for good."""
+        """Return the expected total number of frames.
+
+        Args:
+            done: Number of finished frames.
+            finished: True if the body has come to its final rest.
+        """
         if finished:
             self._rested = done if self._rested is None else self._rested
             last = self._rested + REST_FRAMES - 1
         else:
             left = self._sequence.time_left(done * self._frame, self._expected)
             last = done + round(left / self._frame) + REST_FRAMES
-        return min(last, self._most)
+        return min(last, self._max_frames)

@@ -1,6 +1,6 @@
-"""A capture from posed photos: what ``egs-warp train`` calls.
+"""Training of a capture from posed photos (``egs-warp train``).
 
-Imports torch, so import it only where something is trained.
+This module imports torch; import it only for training.
 """
 
 from __future__ import annotations
@@ -22,33 +22,34 @@ from egs_warp.training.outlier_views import is_outlier
 from egs_warp.training.posed_photos import ExcludedPhoto, backdrop_colour, laid_over, read_views
 
 _HOLD_OUT_EVERY = 8
-"""As published methods do: every eighth photo is judged on and not trained on."""
-_SH_TURNS = 10
-"""Parts of the steps; each of the first begins one more degree of SH."""
+"""Every eighth photo is used for evaluation and not for training, as in published methods."""
+_SH_STAGES = 10
+"""The SH degree is increased after each tenth of the iterations, until it is complete."""
 _FIRST_GAUSSIANS = 30_000
-"""Where neither points nor a cap say how many to begin with."""
+"""Initial number of Gaussians if there are no triangulated points and no maximum."""
 
 
 @dataclass(frozen=True)
 class PhotoScore:
-    """How well the capture shows one photo."""
+    """Image quality of the capture in the view of one photo."""
 
     name: str
     held_out: bool
     psnr: float
     """dB, of the render in the photo's exposure and white balance (one affine map of colours, fitted to the photo)."""
     ssim: float
-    """Mean structural similarity of the same, 11 x 11 Gaussian window."""
+    """Mean structural similarity of the same render, 11 x 11 Gaussian window."""
     plain_psnr: float
-    """dB, of the render as it is."""
+    """dB, of the render without that map."""
     plain_ssim: float
+    """Mean structural similarity of the render without that map."""
     is_outlier: bool = False
-    """It fits the other photos badly: its pose is wrong, or something moved. It is not counted in the means."""
+    """True if the photo does not fit the others: its pose is wrong, or something moved. The means exclude it."""
 
 
 @dataclass(frozen=True)
 class MeanScore:
-    """How well the capture shows several photos, each in its own exposure."""
+    """Mean image quality over several photos, each in its own exposure."""
 
     psnr: float
     """dB."""
@@ -57,26 +58,27 @@ class MeanScore:
 
 @dataclass(frozen=True)
 class TrainResult:
-    """What training from photos gave."""
+    """Result of training from photos."""
 
     cloud: GaussianCloud
+    """The trained capture."""
     losses: np.ndarray
-    """(iterations,) float64."""
+    """(iterations,) float64, loss of each iteration."""
     views: tuple[TrainingView, ...]
-    """Every photo as it is judged on: straightened, reduced and laid over the background."""
+    """Photos as used for evaluation: undistorted, downscaled and composited over the background."""
     photos: tuple[TrainingView, ...]
-    """The same with their alpha, where they have it."""
+    """The same photos with their alpha, if they have it."""
     cut_out: bool
-    """All photos have alpha: they were trained before random colours."""
+    """True if all photos have alpha; then they were trained over random colours."""
     scores: tuple[PhotoScore, ...]
-    """One for each of ``views``."""
+    """Score of each of ``views``."""
     background: tuple[float, float, float]
-    """The colour behind the capture."""
+    """Background colour, 0 to 1."""
     excluded: tuple[ExcludedPhoto, ...] = ()
-    """Photos that are not used, or no longer, and why."""
+    """Photos that were not used, or were excluded during the training, and the reasons."""
 
     def mean_score(self, *, held_out: bool) -> MeanScore | None:
-        """Of photos held out, or of those trained on, misfits apart; None where there are none."""
+        """Return the mean over the held-out or the training photos, without outliers; None if there are none."""
         chosen = [(s.psnr, s.ssim) for s in self.scores if s.held_out is held_out and not s.is_outlier]
         return MeanScore(*np.mean(chosen, axis=0).tolist()) if chosen else None
 
@@ -97,19 +99,31 @@ def train(
     progress: Callable[[int, float], None] | None = None,
     stage: Callable[[str], None] | None = None,
 ) -> TrainResult:
-    """Make a capture from the photos that ``posed`` (COLMAP, ``transforms.json`` or ``cameras.json``) points to.
+    """Train a capture from posed photos.
 
-    Photos larger than ``max_side`` pixels are reduced. Every eighth photo is held out and judged on. It begins with the
-    points triangulated from the photos where there are any, and ends with at most ``max_gaussians``; None takes as many
-    as the photos gain by. Each photo has an exposure and white balance of its own. Photos that cannot be used, or that
-    never fit the others, are left out and named.
+    Every eighth photo is held out for evaluation. The training starts from the triangulated points, if there are any.
+    Each photo has its own exposure and white balance. Photos that cannot be used, or that do not fit the others, are
+    excluded and named in the result. Photos with alpha or masks (``read_photo``) are trained over a random colour in
+    each step, so that no Gaussian can imitate the background.
 
-    Photos with alpha or masks (``read_photo``) are trained before a random colour each step, so that nothing can pass
-    for the backdrop. They are judged before ``background``; without one, it is white for those and the mean colour
-    along the photos' borders for others, so that no Gaussians are spent on a plain backdrop. ``checkpoint`` names a
-    file (.npz) that is written every half a minute and stays; with ``resume`` the training goes on from
-    it, with the same arguments on a CPU to the same bits. ``progress`` is called with each step's number and loss,
-    ``stage`` with what begins. Raises ``UserError`` where no photo can be used and for impossible options.
+    Args:
+        posed: COLMAP model, ``transforms.json`` or ``cameras.json``.
+        iterations: Number of optimiser steps.
+        max_gaussians: Maximum number of Gaussians; None adds Gaussians as long as the photos improve.
+        sh_degree: SH degree of the capture, 0 to 3.
+        background: Background colour, 0 to 1; None is white for photos with alpha, otherwise the mean colour at the
+            borders of the photos, so that no Gaussians are used for a plain background.
+        max_side: Larger photos are downscaled to this side, pixels; None keeps their size.
+        seed: Seed of the training.
+        device: Warp device; None is the current one.
+        threads: Number of threads; None is the default.
+        checkpoint: File (.npz) to which the state is written every half minute; it is not removed.
+        resume: Continue from ``checkpoint``; on a CPU, equal arguments give equal bits.
+        progress: Called with number and loss of each step.
+        stage: Called with a description of each stage as it starts.
+
+    Raises:
+        UserError: No photo can be used, or an option is out of range.
     """
     if iterations < 1 or (max_gaussians is not None and max_gaussians < 100) or not 0 <= sh_degree <= 3:
         raise UserError(
@@ -135,7 +149,7 @@ def train(
         background=None if cut_out else background,
         densification=Densification.RELOCATION,
         max_gaussians=max_gaussians,
-        sh_steps=max(1, iterations // _SH_TURNS),
+        sh_steps=max(1, iterations // _SH_STAGES),
         fit_exposure=True,
         exclude_outliers=True,
         seed=seed,
@@ -148,11 +162,11 @@ def train(
         score_photo(result.cloud, view, background, held_out=out, threads=threads)
         for view, out in zip(views, held_out, strict=True)
     ]
-    unfit = _unfit(scores) | {trained[number] for number in result.misfits}
+    outliers = _held_out_outliers(scores) | {trained[number] for number in result.misfits}
     left_out = list(photos.left_out)
-    for number in sorted(unfit):
+    for number in sorted(outliers):
         scores[number] = replace(scores[number], is_outlier=True)
-        left_out.append(ExcludedPhoto(views[number].name, _misfit(scores[number])))
+        left_out.append(ExcludedPhoto(views[number].name, _outlier_reason(scores[number])))
         say(f"left out {left_out[-1].name}: {left_out[-1].reason}")
     return TrainResult(
         *(result.cloud, result.losses, views, photos.views, cut_out, tuple(scores), background, tuple(left_out))
@@ -168,7 +182,7 @@ def _start(
     seed: int,
     device: str | None,
 ) -> GaussianCloud:
-    """The triangulated points, or Gaussians where the photos agree."""
+    """Return the initial cloud: from the triangulated points, otherwise from points on which the photos agree."""
     points = read_points(posed)
     if points is not None and len(points.positions) >= LEAST_POINTS:
         return cloud_from_points(points, count=max_gaussians, sh_degree=sh_degree, seed=seed, device=device)
@@ -184,7 +198,15 @@ def score_photo(
     held_out: bool,
     threads: int | None = None,
 ) -> PhotoScore:
-    """How well ``cloud`` shows the photo of ``view``, before and after its exposure and white balance are removed."""
+    """Compute the image quality of ``cloud`` in the view of a photo.
+
+    Args:
+        cloud: The capture.
+        view: The photo.
+        background: Background colour, 0 to 1.
+        held_out: True if the photo was not used for training.
+        threads: Number of threads; None is the default.
+    """
     picture = render_gaussians(cloud, view.camera, background=background, threads=threads).colour.numpy()
     known = None if view.weight is None else view.weight > 0
     plain, toned = np.clip(picture, 0, 1), np.clip(match_tone(view.image, picture, known), 0, 1)
@@ -198,12 +220,12 @@ def score_photo(
     )
 
 
-def _unfit(scores: list[PhotoScore]) -> set[int]:
-    """Numbers of the held-out photos that no capture would show: their errors lie far above those of the others."""
+def _held_out_outliers(scores: list[PhotoScore]) -> set[int]:
+    """Return the numbers of the held-out photos that are outliers: their errors are far above those of the others."""
     judged = [number for number, score in enumerate(scores) if score.held_out]
     errors = np.array([10.0 ** (-scores[number].psnr / 20.0) for number in judged])
     return {judged[i] for i in np.flatnonzero(is_outlier(errors))}
 
 
-def _misfit(score: PhotoScore) -> str:
+def _outlier_reason(score: PhotoScore) -> str:
     return f"it does not fit the other photos ({score.psnr:.1f} dB): its pose is wrong, or something has moved"

@@ -1,4 +1,4 @@
-"""``NAME.report.json`` of ``egs-warp train``: what was trained on, how well each photo is shown, and what it cost."""
+"""``NAME.report.json`` of ``egs-warp train``: photos, their scores, options and timing."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ if TYPE_CHECKING:
     from egs_warp.training.posed_photos import ExcludedPhoto
 
 _LAST_STEPS = 100
-"""Steps whose mean loss is the final one."""
+"""Number of last steps whose mean loss is the final loss."""
 
 
 @dataclass(frozen=True)
 class TrainReport:
-    """Everything that the report says."""
+    """Contents of the report."""
 
     photos: int
-    """Used, those held out included."""
+    """Number of photos used, including those held out."""
     left_out: tuple[ExcludedPhoto, ...]
     photo_size: tuple[int, int]
-    """Width and height of the first, pixels."""
+    """Width and height of the first photo, pixels."""
     gaussians: int
     iterations: int
     final_loss: float
     background: tuple[float, float, float]
     held_out: MeanScore | None
-    """None where no photo was held out."""
+    """Mean score of the held-out photos; None if there are none."""
     trained_on: MeanScore | None
     scores: tuple[PhotoScore, ...]
-    """Of each photo."""
+    """Score of each photo."""
     seconds: float
     frames_per_second: float
-    """Optimiser steps a second, the first apart."""
+    """Optimiser steps per second, without the first."""
     device: str
     seed: int
     sh_degree: int
@@ -49,7 +49,7 @@ class TrainReport:
     def of(
         cls, result: TrainResult, *, seconds: float, frames_per_second: float, device: str, seed: int, sh_degree: int
     ) -> TrainReport:
-        """Of what training gave, and how it was asked."""
+        """Create the report from the result and the options of a training."""
         photo = result.views[0].camera
         return cls(
             photos=len(result.views),
@@ -71,22 +71,24 @@ class TrainReport:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """The whole report, ready for JSON; both means under ``mean``."""
+        """Return the whole report, ready for JSON, with both means under ``mean``."""
         means = ("held_out", "trained_on")
-        said: dict[str, Any] = {}
+        # ``misfit`` is the key of ``is_outlier`` in the schema.
+        scores = [{"misfit" if k == "is_outlier" else k: v for k, v in asdict(score).items()} for score in self.scores]
+        values: dict[str, Any] = {}
         for name, value in asdict(self).items():
             if name in means:
-                said.setdefault("mean", {})[name] = value
+                values.setdefault("mean", {})[name] = value
             else:
-                said[name] = list(value) if isinstance(value, tuple) else value
-        return said
+                values[name] = list(value) if isinstance(value, tuple) else value
+        return {**values, "scores": scores}
 
     def write(self, path: Path) -> None:
-        """The report, whole or not at all."""
+        """Write the report atomically."""
         write_report(path, self.to_json())
 
     def summary(self) -> list[str]:
-        """For the terminal: a line for the photos held out, one for those trained on."""
+        """Return lines for the terminal: the means of held-out photos and of training photos."""
         means = {"held out": self.held_out, "trained on": self.trained_on}
         return [
             f"{which}: {mean.psnr:.2f} dB, SSIM {mean.ssim:.3f} in each photo's exposure"

@@ -1,4 +1,4 @@
-"""A finished run as one USD stage: splats, cage, muscles and contact forces, with time samples at 60 Hz."""
+"""Export of a finished run to a USD stage: splats, cage, muscles and contact forces, with time samples at 60 Hz."""
 
 from __future__ import annotations
 
@@ -21,17 +21,26 @@ from egs_warp.pipelines.finished_run import FinishedRun
 
 SPLATS, CAGE, MUSCLES, FORCES, SCENE = "splats", "cage", "muscles", "forces", "scene"
 _WIDTH = 0.004
-"""Metres: of the curves."""
+"""Width of the curves, m."""
 _WEIGHT_LENGTH = 0.5
-"""Body heights: length of the line of a force of one body weight."""
+"""Length of the line for a force of one body weight, body heights."""
 
 
 def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | None = None, quiet: bool = False) -> None:
-    """Write ``run`` to ``path`` (.usdc or .usda): metres, z up, 60 time codes a second.
+    """Write ``run`` to a USD file in metres, with z up and 60 time codes per second.
 
     Splats are a ParticleField3DGaussianSplat, which OpenUSD has since 26.03; the cage is a mesh, muscles and forces are
-    curves. ``degree`` keeps fewer bands of colour, which are most of the file.
-    Raises ``UserError`` where usd-core is not installed or too old.
+    curves.
+
+    Args:
+        run: The run to export.
+        path: Name that ends in .usdc or .usda.
+        every: Export each ``every``-th frame at 60 Hz.
+        degree: SH degree of the colours, which are most of the file; None keeps that of the capture.
+        quiet: Show no progress bar.
+
+    Raises:
+        UserError: usd-core is not installed or too old, or ``path`` has another ending.
     """
     Sdf, Usd, UsdGeom, UsdVol, Vt = _modules()
     if path.suffix not in (".usdc", ".usda"):
@@ -73,7 +82,7 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
             positions = t.positions[step]
             cloud = with_degree(deformer.deform(positions).cloud, degree)
             if index == 0:
-                # What is seen where time is not asked for, by validators too.
+                # The default value, which programs and validators read that do not specify a time.
                 _write_sample(splats, cloud, Usd.TimeCode.Default(), Vt)
             _write_sample(splats, cloud, code, Vt)
             _set_points(cage, positions, code, Vt)
@@ -96,7 +105,7 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
 
 @contextmanager
 def _system_errors() -> Iterator[None]:
-    """USD's own errors, as Python's where they tell of the system."""
+    """Convert errors of USD that are caused by the system to those of Python."""
     try:
         yield
     except RuntimeError as error:
@@ -141,7 +150,7 @@ def _set_points(shape: Any, points: np.ndarray, code: Any, Vt: Any, *, width: fl
 
 def _extent(points: np.ndarray, margin: float) -> np.ndarray:
     if len(points) == 0:
-        # USD's own extent of nothing.
+        # The empty extent of USD.
         return np.finfo(np.float32).max * np.array([[1.0] * 3, [-1.0] * 3], np.float32)
     return np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin]).astype(np.float32)
 
@@ -153,12 +162,12 @@ def _write_constant(splats: Any, cloud: GaussianCloud, Vt: Any) -> None:
     colours.SetMetadata("interpolation", "vertex")
     colours.SetMetadata("elementSize", cloud.sh.shape[1])
     if cloud.sh_degree == 0:
-        # A rotation leaves band 0 as it is.
+        # Band 0 is invariant under rotations, so it needs no time samples.
         _write_colours(splats, cloud, None, Vt)
 
 
 def _write_colours(splats: Any, cloud: GaussianCloud, code: Any, Vt: Any) -> None:
-    """Band 0 first, Gaussian after Gaussian."""
+    """Write the SH coefficients, band 0 first, Gaussian by Gaussian."""
     values = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(cloud.sh.numpy().reshape(-1, 3)))
     attribute = splats.GetRadianceSphericalHarmonicsCoefficientsAttr()
     attribute.Set(values) if code is None else attribute.Set(values, code)
@@ -167,7 +176,7 @@ def _write_colours(splats: Any, cloud: GaussianCloud, code: Any, Vt: Any) -> Non
 def _write_sample(splats: Any, cloud: GaussianCloud, code: Any, Vt: Any) -> None:
     means, scales = cloud.means.numpy(), np.exp(cloud.log_scales.numpy())
     splats.GetPositionsAttr().Set(Vt.Vec3fArray.FromNumpy(np.array(means)), code)
-    # USD's quaternions lie in memory as x, y, z, w.
+    # USD stores quaternions as x, y, z, w.
     rotations = np.ascontiguousarray(cloud.rotations.numpy()[:, [1, 2, 3, 0]])
     splats.GetOrientationsAttr().Set(Vt.QuatfArray.FromNumpy(rotations), code)
     splats.GetScalesAttr().Set(Vt.Vec3fArray.FromNumpy(scales), code)

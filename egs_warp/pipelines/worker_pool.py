@@ -1,4 +1,4 @@
-"""Tasks over processes that may die: each is begun again if its process was lost, and none that has ended is."""
+"""Pool of worker processes with retry: a task whose process is lost is run again, finished tasks are not."""
 
 from __future__ import annotations
 
@@ -21,55 +21,57 @@ from egs_warp.errors import UserError
 from egs_warp.launching import THREADS
 
 MAX_ATTEMPTS = 3
-"""A task whose process was lost as often has failed."""
+"""Number of lost processes after which a task has failed."""
 ONE_THREAD: dict[str, str] = dict.fromkeys(
     ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS", THREADS], "1"
 )
-"""Environment of a worker: those beside it have the other cores."""
+"""Environment of a worker, which uses one core."""
 ProgressCallback = Callable[..., object]
-"""What a task tells of itself as it goes on."""
+"""Function by which a task reports its progress."""
 TaskFunction = Callable[[Any, ProgressCallback], Any]
-"""What is done with each task; like tasks and results it can be pickled. It goes to each worker once."""
+"""Function that runs a task; like tasks and results, it is picklable. It is sent to each worker once."""
 _WINDOWS, _NEW_GROUP = sys.platform == "win32", 0x200
 _BEGIN = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); import {0}; {0}.serve()"
 
 
 @dataclass(frozen=True)
 class TaskResult:
-    """A task that is over."""
+    """Result of a task."""
 
     number: int
-    """From 0, in the order in which tasks were given."""
+    """Index of the task, from 0."""
     value: Any
-    """What the work returned; None where there is an error."""
+    """Return value of the task function; None if the task failed."""
     error: str | None
-    """Why there is no value, in a line."""
+    """Reason of a failure in one line; None if there is a value."""
     attempts: int
-    """How often it was begun: more than once where a worker was lost."""
+    """Number of attempts: more than one if a worker was lost."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """What a worker says."""
+    """Message of a worker."""
 
     worker: int
+    """Number of the worker."""
     kind: str
-    """``told``, ``done``, ``failed`` or ``lost``."""
+    """``progress``, ``done``, ``failed`` or ``lost``."""
     value: Any = None
-    """What was told, the result, or a line."""
+    """Values of a progress report, the result, or the reason of a failure in one line."""
 
 
 class WorkerPool(Protocol):
-    """Workers, by number; each has one task at a time."""
+    """Workers by number; each has one task at a time."""
 
     size: int
+    """Number of workers."""
 
     def begin(self, worker: int, task: Any) -> None:
-        """Give a free worker a task; a worker that is not there, or was lost, is started."""
+        """Give a free worker a task; a worker that does not exist, or was lost, is started."""
         ...
 
     def wait(self) -> Sequence[Event]:
-        """What workers have to say, as soon as one has."""
+        """Block until a worker has sent a message; return the messages."""
         ...
 
     def close(self) -> None:
@@ -77,47 +79,50 @@ class WorkerPool(Protocol):
         ...
 
 
-def ended_tasks(crew: WorkerPool, tasks: Sequence[Any], told: Callable[..., object]) -> Iterator[TaskResult]:
-    """Each of the ``tasks`` as it ends, in whatever order. ``told`` gets the number of a task and what it tells."""
+def ended_tasks(pool: WorkerPool, tasks: Sequence[Any], progress: Callable[..., object]) -> Iterator[TaskResult]:
+    """Run ``tasks`` on ``pool`` and yield each result when it is available.
+
+    ``progress`` is called with the number of a task and the values that it reports.
+    """
     waiting, runs = deque(range(len(tasks))), [0] * len(tasks)
     busy: dict[int, int] = {}
-    with closing(crew):
+    with closing(pool):
         while waiting or busy:
-            for worker in range(crew.size):
+            for worker in range(pool.size):
                 if waiting and worker not in busy:
                     number = busy[worker] = waiting.popleft()
                     runs[number] += 1
-                    crew.begin(worker, tasks[number])
-            for event in crew.wait():
+                    pool.begin(worker, tasks[number])
+            for event in pool.wait():
                 number = busy[event.worker]
-                if event.kind == "told":
-                    told(number, *event.value)
+                if event.kind == "progress":
+                    progress(number, *event.value)
                     continue
                 del busy[event.worker]
                 if event.kind == "lost" and runs[number] < MAX_ATTEMPTS:
-                    # Before all that have not been begun.
+                    # Before all tasks that have not been started.
                     waiting.appendleft(number)
                 elif event.kind == "lost":
-                    often = f"its worker was lost {MAX_ATTEMPTS} times, at last: {event.value}"
-                    yield TaskResult(number, None, often, runs[number])
+                    reason = f"its worker was lost {MAX_ATTEMPTS} times, finally: {event.value}"
+                    yield TaskResult(number, None, reason, runs[number])
                 else:
-                    good = event.kind == "done"
-                    yield TaskResult(number, *((event.value, None) if good else (None, event.value)), runs[number])
+                    is_done = event.kind == "done"
+                    yield TaskResult(number, *((event.value, None) if is_done else (None, event.value)), runs[number])
 
 
-def attempt(work: TaskFunction, task: Any, tell: ProgressCallback) -> bytes:
-    """Pickled: ``done`` and the result, or ``failed`` and a line."""
-    kind, value = run_task(work, task, tell)
+def attempt(work: TaskFunction, task: Any, progress: ProgressCallback) -> bytes:
+    """Run a task and return, pickled, ``done`` and the result, or ``failed`` and the reason in one line."""
+    kind, value = run_task(work, task, progress)
     try:
         return pickle.dumps((kind, value))
     except Exception as error:
         return pickle.dumps(("failed", f"what it returns cannot be sent: {error}"))
 
 
-def run_task(work: TaskFunction, task: Any, tell: ProgressCallback) -> tuple[str, Any]:
-    """``done`` and the result, or ``failed`` and a line."""
+def run_task(work: TaskFunction, task: Any, progress: ProgressCallback) -> tuple[str, Any]:
+    """Run a task and return ``done`` and the result, or ``failed`` and the reason in one line."""
     try:
-        return "done", work(task, tell)
+        return "done", work(task, progress)
     except UserError as error:
         return "failed", error.format_message()
     except Exception as error:
@@ -127,36 +132,36 @@ def run_task(work: TaskFunction, task: Any, tell: ProgressCallback) -> tuple[str
 
 @dataclass(frozen=True)
 class _Running:
-    """A worker's process."""
+    """Process of a worker."""
 
     process: subprocess.Popen[bytes]
     messages: queue.SimpleQueue[bytes | None]
-    """To be written to it; None is the last."""
+    """Messages to be sent to it; None ends the queue."""
 
 
 class ProcessPool:
-    """Workers on this machine, each a Python of its own on one thread.
+    """Pool of Python processes on this machine, one thread each.
 
-    They hear of no Ctrl-C, and end with this process, however it ends.
+    They do not receive Ctrl-C, and end with this process, however it ends.
     """
 
     def __init__(self, work: TaskFunction, size: int) -> None:
         self.size = size
         self._work = pickle.dumps(work)
         main = sys.modules["__main__"]
-        # What a script itself defines is found in another process only by running the script as a module.
+        # Functions that a script defines exist in another process only after the script was run there as a module.
         self._script = getattr(main, "__file__", None) if b"__main__" in self._work else None
         self._running: dict[int, _Running] = {}
         self._events: queue.SimpleQueue[tuple[int, Event]] = queue.SimpleQueue()
 
     def begin(self, worker: int, task: Any) -> None:
-        """See ``Crew``."""
+        """Give a free worker a task; a worker that does not exist, or was lost, is started."""
         if worker not in self._running:
             self._start(worker)
         self._running[worker].messages.put(pickle.dumps(task))
 
     def wait(self) -> Sequence[Event]:
-        """See ``Crew``."""
+        """Block until a worker has sent a message; return it."""
         while True:
             pid, event = self._events.get()
             running = self._running.get(event.worker)
@@ -166,7 +171,7 @@ class ProcessPool:
                 return [event]
 
     def close(self) -> None:
-        """See ``Crew``."""
+        """End all workers, whatever they do."""
         while self._running:
             self._end(self._running.popitem()[1])
 
@@ -176,7 +181,7 @@ class ProcessPool:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, **ONE_THREAD},
-            # In a group of its own the terminal's Ctrl-C does not reach it.
+            # In a separate process group, Ctrl-C of the terminal does not reach it.
             process_group=None if _WINDOWS else 0,
             creationflags=_NEW_GROUP if _WINDOWS else 0,
         )
@@ -187,10 +192,10 @@ class ProcessPool:
             threading.Thread(target=part, args=(worker, running), daemon=True).start()
 
     def _write(self, _: int, running: _Running) -> None:
-        """In a thread of its own: a worker that is still loading takes nothing yet."""
+        """Send the messages from a separate thread: a worker that is still loading does not read yet."""
         stream = running.process.stdin
-        assert stream is not None, "it was asked for"
-        # One that has died is told by the end of its output.
+        assert stream is not None, "stdin is a pipe"
+        # A dead worker is detected by the end of its output.
         with contextlib.suppress(OSError), stream:
             while (message := running.messages.get()) is not None:
                 stream.write(message)
@@ -198,16 +203,16 @@ class ProcessPool:
 
     def _listen(self, worker: int, running: _Running) -> None:
         process = running.process
-        assert process.stdout is not None, "it was asked for"
-        # Its end, in the midst of a message or not; a message that cannot be read is no better.
+        assert process.stdout is not None, "stdout is a pipe"
+        # The output may end within a message; an unreadable message is treated in the same way.
         with contextlib.suppress(Exception), process.stdout:
             while True:
                 kind, value = pickle.load(process.stdout)
                 self._events.put((process.pid, Event(worker, kind, value)))
         process.kill()
         status = process.wait()
-        how = f"it ended by signal {-status}" if status < 0 else f"it ended with status {status}"
-        self._events.put((process.pid, Event(worker, "lost", how)))
+        cause = f"it ended by signal {-status}" if status < 0 else f"it ended with status {status}"
+        self._events.put((process.pid, Event(worker, "lost", cause)))
 
     @staticmethod
     def _end(running: _Running) -> None:
@@ -217,35 +222,35 @@ class ProcessPool:
 
 
 def serve() -> None:
-    """The life of a worker of ``Processes``: messages come in by stdin and go out by what was stdout."""
+    """Run a worker of ``ProcessPool``: it receives messages on stdin and sends them on the original stdout."""
     out = os.fdopen(os.dup(1), "wb")
-    # Whatever else is printed goes where errors go, at once: a worker ends without a flush.
+    # Other output goes to stderr, line-buffered, because a worker ends without a flush.
     os.dup2(2, 1)
     sys.stdout = os.fdopen(1, "w", buffering=1, closefd=False)
     script = pickle.load(sys.stdin.buffer)
     if script is not None:
-        made = ModuleType("__mp_main__")
-        made.__dict__.update(runpy.run_path(script, run_name="__mp_main__"))
-        sys.modules["__main__"] = sys.modules["__mp_main__"] = made
+        main_module = ModuleType("__mp_main__")
+        main_module.__dict__.update(runpy.run_path(script, run_name="__mp_main__"))
+        sys.modules["__main__"] = sys.modules["__mp_main__"] = main_module
     work = pickle.load(sys.stdin.buffer)
     tasks: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    threading.Thread(target=_take, args=(sys.stdin.buffer, tasks), daemon=True).start()
+    threading.Thread(target=_receive_tasks, args=(sys.stdin.buffer, tasks), daemon=True).start()
 
-    def tell(*values: Any) -> None:
-        _say(out, pickle.dumps(("told", values)))
+    def progress(*values: Any) -> None:
+        _send(out, pickle.dumps(("progress", values)))
 
     while True:
-        _say(out, attempt(work, tasks.get(), tell))
+        _send(out, attempt(work, tasks.get(), progress))
 
 
-def _take(stream: IO[bytes], tasks: queue.SimpleQueue[Any]) -> None:
-    """Tasks as they come; the worker ends, whatever it does, when whoever gives them has ended."""
+def _receive_tasks(stream: IO[bytes], tasks: queue.SimpleQueue[Any]) -> None:
+    """Put received tasks into the queue; end this process as soon as the sender has ended."""
     with contextlib.suppress(EOFError, OSError, pickle.UnpicklingError):
         while True:
             tasks.put(pickle.load(stream))
     os._exit(0)
 
 
-def _say(out: IO[bytes], message: bytes) -> None:
+def _send(out: IO[bytes], message: bytes) -> None:
     out.write(message)
     out.flush()

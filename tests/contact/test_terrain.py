@@ -22,7 +22,7 @@ from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.report import AUDIT_LIMITS
 from tests.support.clouds import surface_cloud
 from tests.support.creatures import coarse_creature
@@ -93,7 +93,7 @@ def test_mistakes_of_a_terrain_file(tmp_path: Path, text: str, message: str) -> 
 def test_a_slope_that_nothing_stands_on_is_refused() -> None:
     thing = pawn(device="cpu")
     with pytest.raises(UserError) as error:
-        make_creature(thing.cloud, plane=thing.plane, gravity_up=np.array([1.0, 0.0, 0.5]))
+        make_creature(thing.cloud, plane=thing.plane, options=CreatureOptions(gravity_up=np.array([1.0, 0.0, 0.5])))
     assert str(error.value) == (
         "gravity_up 1,0,0.5: that makes the ground a slope of 63 degrees; give a direction at most 45 degrees from"
         " the ground's normal 0,0,1"
@@ -106,7 +106,7 @@ def test_a_solid_that_holds_the_body_is_named(tmp_path: Path) -> None:
     path = tmp_path / "t.json"
     path.write_text("[[[0, 1, 0, 9]], [[0, 0, 1, -3]]]")
     with pytest.raises(UserError) as error:
-        make_creature(thing.cloud, plane=thing.plane, solids=read_terrain(path))
+        make_creature(thing.cloud, plane=thing.plane, options=CreatureOptions(solids=read_terrain(path)))
     assert str(error.value) == (
         "solids: the body is inside number 2; inside is where n.x + d < 0 for every face [nx, ny, nz, d]:"
         " turn the signs of a face, or move the solid"

@@ -21,7 +21,7 @@ from egs_warp.motions.hop import Hop
 from egs_warp.motions.keyframes import Quantity
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
-from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.simulated_run import simulate
 from tests.support.runs import Run, coarse_block_run
 from tests.support.waves import wavy_ground
@@ -84,7 +84,7 @@ def run(script: str, **ground: Any) -> tuple[MotionSequence, list[MotionOutcome]
     Asserts the audit.
     """
     thing = pawn(device="cpu")
-    creature = make_creature(thing.cloud, plane=thing.plane, front=FORWARD, **ground)
+    creature = make_creature(thing.cloud, plane=thing.plane, options=CreatureOptions(front=FORWARD, **ground))
     performance = simulate(creature, motion(script))
     sequence, simulation = performance.sequence, performance.simulation
     trajectory = simulation.trajectory

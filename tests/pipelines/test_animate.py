@@ -1,4 +1,4 @@
-"""What happens to a run when the machine fails it: the simulation stays, nothing is half-written or mixed."""
+"""Failures of the machine during a run: the simulation is retained, and no file is partial or of another run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from egs_warp.io.run_folder import MANIFEST
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.animate import AnimateOptions, animate
-from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.finished_run import PARTS, read_trajectory
 from egs_warp.pipelines.report import Report, verdict
 from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
@@ -28,7 +28,7 @@ from tests.support.disk_faults import fail_once
 from tests.support.slides import slide
 
 FILES = ["cage.vtu", "creature.npz", "jump.mp4", MANIFEST, "plots.png", "report.json", "sheet.png", "trajectory.npz"]
-OPTIONS = AnimateOptions(frames=2, size=32, friction=0.6)
+OPTIONS = AnimateOptions(frames=2, size=32, creature=CreatureOptions(friction=0.6))
 
 
 @cache
@@ -40,7 +40,7 @@ def thing() -> BuiltInObject:
 @pytest.fixture(scope="module")
 def performance() -> SimulatedRun:
     """Two pictures of a coarse pawn."""
-    creature = make_creature(thing().cloud, plane=thing().plane, friction=0.6, nodes=120)
+    creature = make_creature(thing().cloud, plane=thing().plane, options=CreatureOptions(friction=0.6, nodes=120))
     return simulate(creature, motion("jump"), frames=2)
 
 
@@ -88,7 +88,7 @@ def test_a_film_that_fails_leaves_the_simulation(
 def test_a_run_that_is_cut_off_leaves_its_steps(
     run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What was simulated is read from the parts; the next run moves them aside."""
+    """The simulated steps are read from the parts; the next run moves them aside."""
     monkeypatch.setattr("egs_warp.locomotion.recorder._STEPS_A_PART", 7)
     slid = slide()
 
@@ -104,7 +104,7 @@ def test_a_run_that_is_cut_off_leaves_its_steps(
             run(tmp_path)
     assert not finished(tmp_path) and sorted(os.listdir(tmp_path)) == [MANIFEST, PARTS]
     assert np.array_equal(read_trajectory(tmp_path / PARTS).positions, slid.trajectory().positions[:15])
-    with pytest.raises(UserError, match=r"the run was cut off; egs-warp resume .* goes on \(what it did is in"):
+    with pytest.raises(UserError, match=r"the run was cut off; egs-warp resume .* goes on \(its finished steps are in"):
         read_trajectory(tmp_path / "trajectory.npz")
     run(tmp_path, overwrite=True)
     assert sorted(os.listdir(tmp_path)) == sorted([*FILES, "earlier-1"])

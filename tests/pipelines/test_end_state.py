@@ -1,10 +1,9 @@
-"""How a run ended is in its report, its summary and its exit status, whatever the state; its files are all there."""
+"""The end state of a run is in its report, summary and exit status; all files exist in each state."""
 
 from __future__ import annotations
 
 import json
 import os
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -18,10 +17,9 @@ from egs_warp.io import write_ply
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.trajectory import MotionOutcome
 from egs_warp.motions.fall_monitor import FallMonitor
-from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.end_state import EndCause, State
 from egs_warp.pipelines.finished_run import FinishedRun
-from tests.support.coarse import NODES
+from tests.support.coarse import NODES, coarse_maker
 
 
 def reached(distance: float = 0.0, turn: float = 0.0) -> MotionOutcome:
@@ -59,7 +57,7 @@ def entry(*, resting: bool = True, fell: str | None = None, got_up: bool = False
         (EndCause("tilted"), entry(), reached(), False, State.DONE, []),
         (
             *(EndCause("tilted", True), entry(resting=False), reached(), True, State.STOPPED),
-            ["stopped: the next step could not be solved, however short; this is all before it"],
+            ["stopped: the next step could not be solved, however short; the run ends before it"],
         ),
     ],
 )
@@ -80,7 +78,7 @@ def test_a_run_ends_in_the_worst_state_of_its_motions() -> None:
 def test_a_run_that_stops_or_falls_writes_all_of_its_files(
     after: int | str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", partial(make_creature, nodes=NODES))
+    monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", coarse_maker(NODES))
     advance, calls = LocomotionStepper.advance, iter(range(1000))
 
     def failing(*given: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Which way bodies face: by their mirror plane, and by what is before and behind."""
+"""The facing direction follows from the mirror plane, and from differences between front and back."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from egs_warp.errors import ArgumentError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.pipelines.creature import PlacedCage, choose_front, make_creature, place_cage
+from egs_warp.pipelines.creature import CreatureOptions, PlacedCage, choose_front, make_creature, place_cage
 from egs_warp.pipelines.facing_direction import Front, mean_view
 from tests.support.frames import Lying
 
@@ -114,5 +114,5 @@ def test_front_is_as_given_along_the_ground(standing: PlacedCage) -> None:
 
 
 def test_a_front_that_points_up_is_refused_before_any_work(thing: BuiltInObject) -> None:
-    with pytest.raises(ArgumentError, match="front 0,0,-2: points up or down; give a way along the ground"):
-        make_creature(thing.cloud, plane=thing.plane, front=np.array([0.0, 0.0, -2.0]))
+    with pytest.raises(ArgumentError, match="front 0,0,-2: points up or down; give a direction along the ground"):
+        make_creature(thing.cloud, plane=thing.plane, options=CreatureOptions(front=np.array([0.0, 0.0, -2.0])))

@@ -1,4 +1,4 @@
-"""A body that ends beyond the edge of what was captured of its ground is told of."""
+"""A warning reports a body that ends outside the captured ground."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_what_is_told() -> None:
         == ()
     )
     (line,) = ground_coverage_warning(box(1.6), TABLE, FLAT, 1.0)
-    assert line.startswith("it ends beyond the edge of the captured ground, in the air; ask for less distance")
+    assert line.startswith("it ends beyond the edge of the captured ground, in the air; choose a shorter distance")
     # In the air at the end, or without a scene, nothing is said; a scene without ground is all edge.
     assert (
         ground_coverage_warning(box(1.6, 0.3), TABLE, FLAT, 1.0)

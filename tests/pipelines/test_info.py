@@ -1,4 +1,4 @@
-"""What ``egs-warp info`` tells and draws."""
+"""Text and picture of ``egs-warp info``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.pipelines.info import BodyInfo, draw_info, inspect_capture
 
 COLOURS = {1: (0xD6, 0x27, 0x28), 2: (0x1F, 0x77, 0xB4), 3: (0x2C, 0xA0, 0x2C), 4: (0xFF, 0x7F, 0x0E)}
-"""Of the feet, as they are drawn."""
+"""Colours of the feet in the picture."""
 
 
 def seen(thing: BuiltInObject) -> BodyInfo:
@@ -108,7 +108,7 @@ def test_the_command_prints_the_lines_and_writes_the_picture(
     ("flags", "message"),
     [
         (["--plot", "info.jpg"], "--plot info.jpg: give the name of a .png"),
-        (["--up", "z", "--front", "0,0,1"], "--front 0,0,1: points up or down; give a way along the ground"),
+        (["--up", "z", "--front", "0,0,1"], "--front 0,0,1: points up or down; give a direction along the ground"),
         (["--metres-per-unit", "-1"], "--metres-per-unit -1.0: give a positive number"),
     ],
 )

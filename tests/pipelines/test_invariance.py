@@ -28,7 +28,7 @@ from egs_warp.segmentation.base_plane import find_base_plane
 from tests.support.frames import TURN, Lying
 
 WHERE_IT_LIES = {"body_axes", "body_origin", "metres_per_unit"}
-"""Of a trajectory: what says how the file lies."""
+"""Fields of a trajectory that depend on the frame of the file."""
 
 
 def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, RolloutResult]:
@@ -134,8 +134,8 @@ def test_trajectory_leads_back_to_the_capture(elsewhere: tuple[Lying, Creature, 
 
 
 LIMIT = 0.01
-"""Of distance and height. All of these have the very bits of the first; one of some 10,000 contact points rounded the
-other way may make another jump, by up to 2 %.
+"""Tolerance of distance and height. All of these cases give the same bits as the first; a single one of some 10,000
+contact points that is rounded differently may change the jump by up to 2 %.
 """
 CHANGES: dict[str, Callable[[Lying], Lying]] = {
     "x0.37": lambda thing: thing.scaled(0.37),
@@ -146,7 +146,7 @@ CHANGES: dict[str, Callable[[Lying], Lying]] = {
 
 
 def assert_same_jump(lying: Lying, other: Lying, *, by_up: bool = False) -> None:
-    """As far, as high, and the same in pictures at the end and where it was highest."""
+    """Assert equal distance and height, and equal pictures at the end and at the highest point."""
     (creature, first), (again, second) = (jump(one, by_up=by_up) for one in (lying, other))
     reached, its = measure(first.trajectory), measure(second.trajectory)
     for name in ("distance", "height"):

@@ -164,7 +164,7 @@ def test_side_by_side_each_is_as_alone(creature: Creature, tmp_path: Path) -> No
 
 
 def test_what_a_gpu_has_no_room_for_is_done_in_halves(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Memory for two worlds where four are asked for; then for none, which each of them tells in a line."""
+    """There is memory for two of four requested worlds; then for none, which each result reports in a line."""
     room, asked = 2, []
 
     class Cramped(BatchStepper):
@@ -182,13 +182,13 @@ def test_what_a_gpu_has_no_room_for_is_done_in_halves(creature: Creature, monkey
     np.testing.assert_array_equal([one.trajectory.activations[0, 0] for one in made], [0.0, 1e-3, 2e-3, 3e-3])
     room = 0
     assert [one.error for one in simulate_many(creature, jobs[:2], worlds=2)] == [
-        "out of GPU memory beside nothing else; give worlds=0 for workers: CUDA out of memory. Tried to allocate"
-        " 20.00 MiB"
+        "out of GPU memory with a single world; set worlds=0 to use worker processes: CUDA out of memory. Tried to"
+        " allocate 20.00 MiB"
     ] * 2
 
 
 def test_how_many_worlds_is_at_least_none(creature: Creature) -> None:
-    with pytest.raises(ArgumentError, match=r"^worlds -1: give how many are made side by side, at least 0$"):
+    with pytest.raises(ArgumentError, match=r"^worlds -1: give the number of jobs in a batch, at least 0$"):
         simulate_many(creature, [Job(motion("stand 1"))], worlds=-1)
 
 
@@ -201,7 +201,7 @@ def test_over_ray_it_has_the_same_bits(creature: Creature, monkeypatch: pytest.M
 
 
 def test_trajectories_may_lie_in_a_folder(creature: Creature, tmp_path: Path) -> None:
-    """As they end they are told, by their numbers."""
+    """The callback receives each result with its number."""
     ended: dict[int, JobResult] = {}
     jobs = [Job(motion("stand 1"), frames=count) for count in (4, 3)]
     made = simulate_many(
@@ -213,7 +213,7 @@ def test_trajectories_may_lie_in_a_folder(creature: Creature, tmp_path: Path) ->
 
 
 def test_a_creature_can_be_sent(creature: Creature) -> None:
-    """What is read from its pickle moves as it does, and has its splats."""
+    """A creature that is read from its pickle moves identically and has the same splats."""
     other: Creature = pickle.loads(pickle.dumps(creature))
     asked = motion("jump")
     assert same(simulate(other, asked, frames=5).trajectory, simulate(creature, asked, frames=5).trajectory)
@@ -232,7 +232,7 @@ def test_other_ground_is_that_of_a_creature_made_on_it(creature: Creature) -> No
 
 
 def test_activations_of_a_run_bring_it_about_again(creature: Creature) -> None:
-    """Of 10 recorded steps, nearly: a step that is held looks for its contact points from elsewhere."""
+    """10 recorded steps are nearly reproduced: with prescribed activations, contact points are selected differently."""
     first = simulate(creature, motion("jump"), frames=11)
     assert all(report.dt == first.simulation.reports[0].dt for report in first.simulation.reports)
     again = simulate(creature, motion("jump"), activations=first.trajectory.activations)
@@ -250,6 +250,6 @@ def test_activations_that_no_muscle_has_are_refused(creature: Creature) -> None:
         with pytest.raises(ArgumentError, match=rf"^activations: of shape .*; give a row of {count} metres"):
             simulate(creature, motion("jump"), activations=given)
     for given in (np.tile(1.01 * bounds, (5, 1)), np.full((5, count), np.nan)):
-        with pytest.raises(ArgumentError, match=r"^activations: beyond what a muscle can do; keep each within"):
+        with pytest.raises(ArgumentError, match=r"^activations: outside a muscle's bounds; keep each within"):
             simulate(creature, motion("jump"), activations=given)
     assert replace(Job(motion("jump")), frames=2).run(creature).frames.shape[0] == 2

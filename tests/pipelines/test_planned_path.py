@@ -19,7 +19,7 @@ from tests.support.stances import DT, block_place
 
 
 def standing(name: str, seconds: float) -> tuple[MotionSequence, Trajectory, np.ndarray]:
-    """A sequence that has begun with a body that never moves, its trajectory, and where it stands."""
+    """Return a started sequence of a body that never moves, its trajectory, and its position."""
     place = block_place()
     sequence = MotionSequence(place, motion(name).parts(place.body.height))
     sequence.objectives(BodyState(place.standing, np.zeros_like(place.standing)), None, DT)

@@ -57,7 +57,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
 def test_a_folder_belongs_to_one_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a killed one left goes; an earlier one is refused or moved aside; what is not finished has no final name."""
+    """Remnants of a killed run are removed; an earlier run is rejected or backed up; unfinished files are temporary."""
     photos, out = photos_of_noise(tmp_path / "photos"), tmp_path / "out"
     left = out / ".egs-pose-left"
     left.mkdir(parents=True)
@@ -88,7 +88,7 @@ def test_a_folder_belongs_to_one_run(
 def test_a_model_that_does_not_fit_on_the_disk_is_told(
     room: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """COLMAP keeps silent about it."""
+    """COLMAP does not report it."""
     reconstruct_by(monkeypatch, partial(model, room=room))
     out = tmp_path / "out"
     assert main(["pose", str(photos_of_noise(tmp_path / "photos")), "--out", str(out)]) == 1
@@ -99,7 +99,7 @@ def test_a_model_that_does_not_fit_on_the_disk_is_told(
 def test_what_colmap_cannot_do_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Such as a database on a disk that is full."""
+    """An example is a database on a full disk."""
 
     def fails(*_: object, **__: object) -> None:
         raise RuntimeError("No registered database factory succeeded.\nmore")

@@ -1,4 +1,4 @@
-"""``animate SCENE --object``: slips are told first, nothing is lost, and a film comes out."""
+"""``animate SCENE --object``: invalid arguments are reported first, no file is lost, and a film is written."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.inpainting.inpainters import OpenCvInpainter, OpenCvMethod
 from egs_warp.io import read_capture, write_ply
 from egs_warp.io.planes import read_planes
-from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene, viewing_directions
 from egs_warp.segmentation.clearance import StraddlingPolicy
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -145,12 +145,12 @@ def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monke
         line = ["animate", str(tmp_path / "object.ply"), "--plane", str(tmp_path / "plane.json"), *flag]
         assert main([*line, "--out", str(tmp_path / "out")]) == 2
         if flag:
-            assert told["ground"] is None
+            assert told["options"].creature.ground is None
         else:
             nodes = ground.nodes().reshape(-1, 3)
-            assert np.abs(told["ground"].heights(nodes)).max() < 1e-3
-    # Stiff: its own sag, 0.033 of its height on a coarse cage where 0.05 are asked, would hide a fall of 0.017.
-    creature = make_creature(prepared.object, ground=ground, sag=0.01, nodes=120)
+            assert np.abs(told["options"].creature.ground.heights(nodes)).max() < 1e-3
+    # Stiff: its own sag, 0.033 of its height on a coarse cage where 0.05 is requested, would hide a fall of 0.017.
+    creature = make_creature(prepared.object, options=CreatureOptions(ground=ground, sag=0.01, nodes=120))
     body, start = creature.body, creature.start.positions
     assert creature.geometry.field is not None
     # It touches the ground where it was captured, and sinks by 0.015; where the ground is not raised to it, it hangs

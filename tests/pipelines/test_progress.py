@@ -13,7 +13,7 @@ from egs_warp.segmentation.clearance import StraddlingPolicy
 
 
 def drawn(options: SceneOptions, monkeypatch: pytest.MonkeyPatch, told: list[tuple[float, str, float]]) -> list[str]:
-    """What stands on the screen after each of ``told``: seconds since the beginning, stage, share of it."""
+    """Return the screen line after each of ``told``: seconds since the start, stage, fraction of it."""
     clock = [1000.0]
     monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
     file, lines = io.StringIO(), []

@@ -1,4 +1,4 @@
-"""What the report sums up."""
+"""Sums in the report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from egs_warp.pipelines.report import StageTime, stage_times, versions
 
 
 def test_a_frame_without_a_stage_spends_no_time_in_it() -> None:
-    """Frames of two, one and one steps, of which only the last asks again."""
+    """Three frames of two, one and one steps, of which only the last replans."""
     spent = [{"foresee": 3.0}, {"foresee": 5.0}, {"foresee": 1.0}, {"foresee": 6.0, "again": 9.0}]
     steps = [cast(StepReport, SimpleNamespace(milliseconds=stages)) for stages in spent]
     timing = stage_times(steps, np.array([0, 2, 3, 4]), {"render": [2.0, 4.0], "split": []})

@@ -1,4 +1,4 @@
-"""What looks wrong about an object is said in words, and nothing where nothing does."""
+"""Warnings about the segmentation of an object, and none for a good one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The time left that a progress bar tells is the time that is left, within a factor of two."""
+"""The remaining time in a progress bar is right within a factor of two."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from egs_warp.pipelines.simulated_run import simulate
 from tests.support.live_sessions import coarse_pawn
 
 NEAR = 20
-"""Frames: what is left then is told in any case."""
+"""Number of last frames, in which the estimate is not tested."""
 
 
 def _told(text: str, frames: int | None = None) -> np.ndarray:
@@ -25,7 +25,7 @@ def _told(text: str, frames: int | None = None) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("text", ["jump", "hop x2 0.4 0.2", "twist 60", "twist 180", "walk 0.2", "jump 0 0.1, turn 30"])
 def test_what_is_left_is_told_within_a_factor_of_two(text: str) -> None:
-    """Of all frames but the last ones; a twist finds out in the air whether it takes another jump."""
+    """The last frames are excluded; a twist decides in the air if it needs another jump."""
     done, expected = _told(text).T
     count = len(done)
     far = done < count - NEAR

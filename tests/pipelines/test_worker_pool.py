@@ -1,4 +1,4 @@
-"""Tasks over processes, and over Ray where it is installed: what dies is begun again, what has ended is not."""
+"""Tasks over processes, and over Ray where it is installed: lost tasks are run again, finished ones are not."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.support import tasks
 
 ROOT = Path(__file__).parents[2]
 NO_RAY = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: egs-warp[ray]")
-AT_LAST = "its worker was lost 3 times, at last: it ended by signal 9"
+AT_LAST = "its worker was lost 3 times, finally: it ended by signal 9"
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,9 @@ def in_order(ended: list[TaskResult]) -> list[TaskResult]:
 def test_each_task_ends_once_and_an_error_is_its_own(workers: int | str) -> None:
     told: list[tuple[int, ...]] = []
     given = [0, 1, 2, 3, 4, 5, 6, 7]
-    ended = in_order(list(map_tasks(tasks.square, given, workers=workers, told=lambda *values: told.append(values))))
+    ended = in_order(
+        list(map_tasks(tasks.square, given, workers=workers, progress=lambda *values: told.append(values)))
+    )
     assert [one.number for one in ended] == given and {one.attempts for one in ended} == {1}
     assert [one.value for one in ended] == [0, 1, 4, None, None, None, 36, 49]
     errors = [one.error for one in ended]
@@ -62,14 +64,14 @@ def test_each_task_ends_once_and_an_error_is_its_own(workers: int | str) -> None
 
 
 def test_a_killed_workers_task_is_run_again_and_those_that_ended_are_not(workers: int | str, tmp_path: Path) -> None:
-    """Task 1 kills its worker once, 3 twice, 4 as often as it is begun: no other is begun twice or lost."""
+    """Task 1 kills its worker once, 3 twice, 4 at each attempt: no other task is run twice or lost."""
     work = tasks.Dying(tmp_path, {1: 1, 3: 2, 4: 99})
     ended = in_order(list(map_tasks(work, range(7), workers=workers)))
     assert [one.attempts for one in ended] == [1, 2, 1, 3, 3, 1, 1]
     assert [len((tmp_path / str(number)).read_text()) for number in range(7)] == [one.attempts for one in ended]
     assert [one.value for one in ended] == [0, 1, 2, 3, None, 5, 6]
     lost = ended[4].error
-    assert lost is not None and lost.startswith("its worker was lost 3 times, at last: ") and "\n" not in lost
+    assert lost is not None and lost.startswith("its worker was lost 3 times, finally: ") and "\n" not in lost
     assert workers == "ray" or lost == AT_LAST
 
 
@@ -118,7 +120,7 @@ def until(true: Callable[[], bool], seconds: float = 60.0) -> None:
 
 def lives(process: int) -> bool:
     try:
-        # One that has ended and that nobody has waited for is no longer at work.
+        # A zombie has ended, and only its parent has not read its status.
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
@@ -126,10 +128,10 @@ def lives(process: int) -> bool:
 
 SLEEPERS = """
     from egs_warp.commands.exit_handling import one_line_errors
-    from egs_warp.pipelines.many import farmed
+    from egs_warp.pipelines.many import map_tasks
     from tests.support.tasks import sleeping
     with one_line_errors("prog"):
-        list(farmed(sleeping, [sys.argv[1]] * 2, workers=2 if sys.argv[2] == "2" else "ray"))
+        list(map_tasks(sleeping, [sys.argv[1]] * 2, workers=2 if sys.argv[2] == "2" else "ray"))
 """
 
 
@@ -160,14 +162,14 @@ def test_what_a_script_defines_is_found(tmp_path: Path) -> None:
     script.write_text(
         textwrap.dedent(
             """
-            from egs_warp.pipelines.many import farmed
+            from egs_warp.pipelines.many import map_tasks
 
             def cube(task, tell):
                 print("heard")
                 return task**3
 
             if __name__ == "__main__":
-                print(sorted(one.value for one in farmed(cube, [1, 2, 3], workers=2)))
+                print(sorted(one.value for one in map_tasks(cube, [1, 2, 3], workers=2)))
             """
         )
     )

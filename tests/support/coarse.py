@@ -4,22 +4,32 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
+from dataclasses import replace
+from typing import Any
 from unittest.mock import patch
 
 from egs_warp.cli import main
-from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 
 NODES = 60
 """Where ``EGS_WARP_TEST_NODES`` does not say otherwise."""
 
 
+def coarse_maker(nodes: int) -> Callable[..., Creature]:
+    """Return ``make_creature`` with cages of about ``nodes`` nodes."""
+
+    def make_coarse_creature(*arguments: Any, options: CreatureOptions, **named: Any) -> Creature:
+        return make_creature(*arguments, options=replace(options, nodes=nodes), **named)
+
+    return make_coarse_creature
+
+
 @contextmanager
 def coarse_cages(nodes: int) -> Iterator[None]:
     """``animate`` gives bodies about ``nodes`` nodes."""
-    with patch("egs_warp.pipelines.animate.make_creature", partial(make_creature, nodes=nodes)):
+    with patch("egs_warp.pipelines.animate.make_creature", coarse_maker(nodes)):
         yield
 
 

@@ -18,7 +18,7 @@ from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import GroundFrame
 from egs_warp.muscles.muscle_set import automatic_muscles
-from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 from tests.support.meshes import UP
 from tests.support.stances import DT, FLOOR
 
@@ -27,7 +27,7 @@ from tests.support.stances import DT, FLOOR
 def coarse_pawn(*, friction: float = 0.8, device: str = "cpu") -> Creature:
     """The built-in pawn of few Gaussians, made by the package in a cage of about 50 nodes, once a process."""
     made = pawn(gaussian_count=3000, device=device)
-    return make_creature(made.cloud, plane=made.plane, nodes=50, friction=friction)
+    return make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=50, friction=friction))
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from egs_warp.assets.pawn import pawn
-from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 from egs_warp.web.feed import drawn_creature
 from egs_warp.web.messages import read_message
 from egs_warp.web.packets import Frame
@@ -19,7 +19,7 @@ from egs_warp.web.session import Session, SessionOptions
 def coarse_pawn() -> Creature:
     """About a hundred nodes."""
     made = pawn(gaussian_count=2000)
-    return make_creature(made.cloud, plane=made.plane, nodes=50)
+    return make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=50))
 
 
 def session_of(creature: Creature, takes: Path) -> Session:
