@@ -1,4 +1,4 @@
-"""A long body crawls: a wave of strides runs along it, and it comes where it is told, any way."""
+"""Crawl: a wave of strides runs along a long body, which reaches its target in any direction."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ def worm() -> CoarseCreature:
 
 @dataclass(frozen=True)
 class Crawled:
-    """What came of it."""
+    """Result of a crawl."""
 
     crawl: Crawl
     trajectory: Trajectory
     reports: list[StepReport]
     place: np.ndarray
-    """(3,) where it has come to."""
+    """(3,) planar pose at the end."""
 
 
 def crawled(route: Route) -> Crawled:
-    """Crawl until it rests."""
+    """Crawl until the body rests."""
     made = worm()
     crawl = Crawl(made.place, route)
     state, memory, reports = made.start, made.stepper.initial_memory(), []
@@ -48,9 +48,9 @@ def crawled(route: Route) -> Crawled:
         wishes = crawl.objectives(state, reports[-1] if reports else None, DT)
         state, memory, fresh = made.stepper.advance(state, memory, wishes, DT)
         reports += fresh
-        if crawl.resting:
+        if crawl.is_at_rest:
             break
-    assert crawl.resting and crawl.notes() == []
+    assert crawl.is_at_rest and crawl.notes() == []
     recorder = Recorder(made.stepper.body, made.stepper.muscles, made.stepper.geometry, made.start, 0.0, drag=0.0)
     recorder.add(reports)
     place = crawl._place_of(made.place.ground.local(state.positions))
@@ -66,7 +66,7 @@ def test_what_lies_along_the_ground_crawls() -> None:
 
 
 def test_a_stride_strains_it_by_no_more_than_it_may() -> None:
-    """The wave at its steepest; and every slice ends where the body is to be."""
+    """At the steepest point of the wave; and every section ends at the target of the body."""
     crawl = Crawl(worm().place, straight_route(5.0))
     crawl._to = np.array([crawl.pace.length, 0.0, 0.0])
     along_it, most = crawl._standing[:, 0], 0.0

@@ -42,7 +42,7 @@ def test_the_weight_goes_ahead_with_the_distance_and_stays_well_behind_the_toes(
 
 @pytest.mark.parametrize(("mesh", "soles"), [(coarse_stool(), 4), (None, 1)])
 def test_soles_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, soles: int) -> None:
-    """Each foot on legs, and the base of a body that has none: asked to go ahead and not aside."""
+    """The soles of feet on legs, and the base of other bodies, have forward and no sideways target velocities."""
     place = block_place(mesh)
     jump = Jump(place, JumpTarget(0.5, 0.3))
     jump.phase = JumpPhase.THRUST
@@ -55,8 +55,8 @@ def test_soles_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, soles: int
 
 
 def test_a_landing_that_may_fail_is_balanced_in_full() -> None:
-    """Asked little of while its capture point is near the middle of its feet, everything once that is at their edge;
-    next to nothing in the first step, in which the ground catches it."""
+    """Weights are low while the capture point is near the middle of the feet and full once it is at their edge; nearly
+    zero in the first step, in which the ground stops the fall."""
     place = block_place()
     weights = []
     for time, speed in ((1.0, 0.0), (1.0, 2.0), (0.0, 2.0)):
@@ -70,7 +70,7 @@ def test_a_landing_that_may_fail_is_balanced_in_full() -> None:
 
 
 def test_what_has_taken_off_takes_up_its_pose_gently() -> None:
-    """Next to nothing of it in the first step in the air, all of it 0.6 sqrt(H / g) later."""
+    """Nearly zero in the first step in the air, full weight 0.6 sqrt(H / g) later."""
     place = block_place()
     jump = Jump(place, JumpTarget(0.5, 0.3))
     jump.phase = JumpPhase.THRUST
@@ -86,8 +86,8 @@ def test_what_has_taken_off_takes_up_its_pose_gently() -> None:
 
 @pytest.mark.parametrize(("com_speed", "flat"), [(1.0, True), (-1.0, False)])
 def test_what_comes_up_to_its_feet_turns_until_they_are_flat(com_speed: float, flat: bool) -> None:
-    """Sheared back over a flat sole it is turned back in the mean, by half of the shear: as it comes up to its feet it
-    is not told to turn, for its sole would point up; as it falls back from them, it is told to come upright."""
+    """Sheared back over a flat sole, its mean rotation is back by half of the shear. While it moves towards its feet,
+    no rotation is requested, because its sole would point up; while it falls back from them, it turns upright."""
     place = block_place()
     height = place.standing[:, 2:] - place.standing[:, 2].min()
     sheared = place.standing + 0.1 * height / height.max() * [-1.0, 0.0, 0.0]
@@ -102,8 +102,8 @@ def test_what_comes_up_to_its_feet_turns_until_they_are_flat(com_speed: float, f
 
 @pytest.mark.parametrize("toes", [0.05, 0.2])
 def test_feet_come_down_so_far_ahead_that_the_body_stops_over_them(toes: float) -> None:
-    """Where the target lies too near to stop, the capture point is ahead of the middle of the feet by no more than its
-    share of what they reach ahead, however far they reach behind."""
+    """If the target is too near to stop, the capture point is ahead of the middle of the feet by at most its fraction
+    of their forward reach, however far they reach behind."""
     place = block_place()
     touching = place.contact_points[place.contact_points[:, 0] < toes + 1e-9]
     place = replace(place, contact_points=np.vstack([touching, [toes, 0.0, 0.0]]))

@@ -1,4 +1,4 @@
-"""Whole motions: what was asked is reached, and every audit bound holds; of a coarse block, and of the pawn (slow)."""
+"""Whole motions reach their targets within every bound of the audit; of a coarse block, and of the pawn (slow)."""
 
 from __future__ import annotations
 
@@ -125,10 +125,7 @@ def test_hops_land_on_their_squares(script: str, ground: dict) -> None:
 
 @pytest.mark.slow
 def test_the_head_follows_its_key_and_the_body_comes_to_rest(tmp_path: Path) -> None:
-    """The key asks for 0.05; measured on two cores, it is missed by 0.0002.
-
-    A body that only stands misses it by 0.05.
-    """
+    """The key is at 0.05; measured on two cores, its error is 0.0002. A body that only stands misses it by 0.05."""
     file = tmp_path / "keys.csv"
     file.write_text("time,part,quantity,x,y,z\n0.5,head,position,0.05,0,0\n")
     sequence, (reached,), (end,) = run(f"trajectory {file}")

@@ -96,7 +96,7 @@ def test_ways_are_asked_for_in_words(tmp_path: Path) -> None:
         ("turn 45 9", "('turn 45 9'): speed 9: give a number of times the usual from 0.3 to 1.6"),
         ("jump speed=2", "('jump speed=2'): 'speed' is unknown; jump takes distance, height"),
         ("trajectory", "('trajectory'): trajectory needs a file of key frames, as trajectory keys.json"),
-        ("hop x60, hop x60", "motion: 120 motions are asked for; at most 100 are done in a row"),
+        ("hop x60, hop x60", "motion: 120 motions are given; at most 100 are allowed"),
         ("jump x2 x3", "('jump x2 x3'): 'x3' is a second number of repeats; give one"),
         ("jump x" + 5000 * "9", "repeat inf; give a whole number from 1 to 100"),
         ("jump distance=1 distance=2", "distance is given twice; give it once"),

@@ -263,7 +263,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("balance: the margin of the footprint", "motions/stance.py"),
-            *("0.5 * SUPPORT_MARGIN * (seen.support[1]", "0.5 * (seen.support[1]"),
+            *("0.5 * SUPPORT_MARGIN * (measurement.support[1]", "0.5 * (measurement.support[1]"),
             "motions/test_stance.py::test_the_nearest_end_of_a_step_that_does_not_tip",
         ),
         (
@@ -283,7 +283,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("twist: the spin of the standing body, not of the crouched one", "motions/twist.py"),
-            *("return inertia @ spin_for_rotation(", "return seen.inertia @ spin_for_rotation("),
+            *("return inertia @ spin_for_rotation(", "return measurement.inertia @ spin_for_rotation("),
             "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
         ),
         (
