@@ -35,7 +35,7 @@ _ROUND_TIME = 3.0
 """Duration of a round, in sqrt(H / g): the time from one stride of a section to its next."""
 _CARRIED_FRACTION = 0.4
 """Fraction of a round in which a section is carried; in the rest it stands."""
-STRAIN = 0.12
+MAX_STRAIN = 0.12
 """Largest strain of the body in a stride."""
 _SIDE_STRIDE, _SIDE_ACCELERATION = 0.25, 0.3
 """Largest sideways stride, or motion of an end in a turn, in body heights, and the acceleration in g that it may take:
@@ -106,7 +106,7 @@ class Crawl:
         length = float(np.ptp(along))
         self._behind = (along.max() - along) / length
         """(N,) position along the body, from 0 at the front end to 1 at the back."""
-        stride = STRAIN * length * _CARRIED_FRACTION / (_MAX_SLOPE * (1.0 - _CARRIED_FRACTION))
+        stride = MAX_STRAIN * length * _CARRIED_FRACTION / (_MAX_SLOPE * (1.0 - _CARRIED_FRACTION))
         aside = _SIDE_STRIDE * body.height
         self.pace = StepLimits(stride, 2.0 * aside / length, side_fraction=min(aside / stride, 1.0), faces_travel=False)
         self.places = route(self.pace)
@@ -117,11 +117,11 @@ class Crawl:
         self._round = self._duration()
         """Seconds."""
         self._nearest, self._fruitless = np.inf, 0
-        self._began: float | None = None
+        self._round_start: float | None = None
         self.rounds = 0
-        self._over = False
-        self._calm = RestDetector(body)
-        self._resting = False
+        self._is_over = False
+        self._rest_detector = RestDetector(body)
+        self._is_resting = False
 
     @property
     def seconds(self) -> float:
@@ -136,7 +136,7 @@ class Crawl:
     @property
     def is_at_rest(self) -> bool:
         """True if the body lies still at the end of its route."""
-        return self._resting
+        return self._is_resting
 
     def plan_record(self) -> CrawlPlan:
         """Return the planned quantities of the motion."""
@@ -147,7 +147,7 @@ class Crawl:
 
     def notes(self) -> list[str]:
         """Return messages for the user about targets that were missed."""
-        if not self._over or self._missing(self._to) <= _ARRIVAL_TOLERANCE:
+        if not self._is_over or self._remaining_strides(self._to) <= _ARRIVAL_TOLERANCE:
             return []
         return [f"the body slid back as far as it moved forward, and gave up after {self.rounds} rounds"]
 
@@ -164,10 +164,10 @@ class Crawl:
         step."""
         body, axes, control, unit = self.body, self.ground.axes, self.control, self.body.time_unit
         local = self.ground.local(state.positions)
-        if not self._over and (self._began is None or state.time - self._began >= self._round - 1e-9):
+        if not self._is_over and (self._round_start is None or state.time - self._round_start >= self._round - 1e-9):
             self._plan_round(local, state.time)
-        assert self._began is not None
-        elapsed = state.time - self._began
+        assert self._round_start is not None
+        elapsed = state.time - self._round_start
         self._note_rest(axes @ body.centre_of_mass(state.velocities), state.time)
         before, after = self._pose(elapsed), self._pose(elapsed + dt)
         follow = min(control.follow / unit, 0.7 / dt)
@@ -175,21 +175,24 @@ class Crawl:
         swings = (carried > 0.0) & (carried < 1.0)
         com = body.centre_of_mass(local)
         com_velocity = body.centre_of_mass(after - before) / dt + follow * (body.centre_of_mass(before) - com)
-        spin = control.turn_rate / unit * self._turn(local, before) + self._turn(before, after) / dt
+        spin = (
+            control.turn_rate / unit * self._best_fit_rotation(local, before)
+            + self._best_fit_rotation(before, after) / dt
+        )
         pose = (after - before) / dt + follow * (before - local)
         return [
             centre_of_mass_velocity(body, com_velocity @ axes, control.com),
             AngularMomentumObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
             node_velocities(body, pose @ axes, control.pose),
             *([LoadObjective(np.flatnonzero(swings), control.unload)] if swings.any() else []),
-            *([self._hold(report, swings)] if report is not None else []),
+            *([self._no_slip_objective(report, swings)] if report is not None else []),
         ]
 
     def _plan_round(self, local: np.ndarray, time: float) -> None:
-        self._from = self._place_of(local)
-        self._to, self._over = self._aim()
-        self._began, self._round = time, self._duration()
-        self.rounds += not self._over
+        self._from = self._planar_pose(local)
+        self._to, self._is_over = self._aim()
+        self._round_start, self._round = time, self._duration()
+        self.rounds += not self._is_over
 
     def _duration(self) -> float:
         """Return the duration of this round in seconds; it is longer where sections move sideways."""
@@ -227,11 +230,11 @@ class Crawl:
         strides = float(np.hypot(ahead, aside / self.pace.side_fraction)) / self.pace.length
         return strides + abs(float(change[2])) / self.pace.turn
 
-    def _missing(self, place: np.ndarray) -> float:
+    def _remaining_strides(self, place: np.ndarray) -> float:
         """Return the number of strides from the planar pose ``place`` (3,) to the end of the route."""
         return self._stride_count(self.places[-1] - place)
 
-    def _place_of(self, local: np.ndarray) -> np.ndarray:
+    def _planar_pose(self, local: np.ndarray) -> np.ndarray:
         """Return the planar pose (3,) of the body with its nodes at ``local`` (N, 3). Its heading is unwrapped to the
         value nearest to the previous one."""
         com = self.body.centre_of_mass(local)
@@ -241,9 +244,9 @@ class Crawl:
         return np.array([*(com - self._centre)[:2], heading])
 
     def _note_rest(self, velocity: np.ndarray, time: float) -> None:
-        calm = self._calm.update(velocity, time)
+        calm = self._rest_detector.update(velocity, time)
         slow = bool(np.linalg.norm(velocity) <= REST_SPEED * self.body.speed_unit)
-        self._resting = (self._over and calm) or (self._resting and slow)
+        self._is_resting = (self._is_over and calm) or (self._is_resting and slow)
 
     def _carried(self, elapsed: float) -> np.ndarray:
         """Return the fraction (N,) of its stride that each node has completed ``elapsed`` seconds into a round."""
@@ -253,25 +256,25 @@ class Crawl:
     def _pose(self, elapsed: float) -> np.ndarray:
         """Return the target positions (N, 3) of the nodes ``elapsed`` seconds into a round, ground coordinates."""
         carried = self._carried(elapsed)[:, None]
-        pose = (1.0 - carried) * self._placed(self._from) + carried * self._placed(self._to)
+        pose = (1.0 - carried) * self._posed_nodes(self._from) + carried * self._posed_nodes(self._to)
         pose[:, 2:] += _LIFT * self.body.height * 4.0 * carried * (1.0 - carried)
         return pose
 
-    def _placed(self, place: np.ndarray) -> np.ndarray:
+    def _posed_nodes(self, place: np.ndarray) -> np.ndarray:
         """Return the nodes (N, 3) of the resting body moved to the planar pose ``place`` (3,), as in
         ``motions.route``."""
         turn = Rotation.from_rotvec([0.0, 0.0, place[2]]).as_matrix()
         moved = np.array([*place[:2], self._slope @ place[:2]])
         return self._centre + moved + (self._standing - self._centre) @ turn.T
 
-    def _hold(self, report: StepReport, swings: np.ndarray) -> Objective:
+    def _no_slip_objective(self, report: StepReport, swings: np.ndarray) -> Objective:
         """Return the objective that standing contacts do not slide."""
         contacts = report.contacts
         stands = ~swings[contacts.nearest_nodes]
         loads = np.where(stands, report.forces[:, 0], 0.0) / self.body.weight
         return no_slip_contacts(contacts, loads, self.control.hold)
 
-    def _turn(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    def _best_fit_rotation(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Return the (3,) best-fit rotation (Kabsch) from ``before`` (N, 3) to ``after`` (N, 3) as a rotation
         vector."""
         arms, aims = (x - self.body.centre_of_mass(x) for x in (before, after))

@@ -18,7 +18,7 @@ from egs_warp.motions.jump_plan import JumpTarget, height_of_flight, level_fligh
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import heading_between, sole_shares
 from egs_warp.motions.stand import Stand
-from egs_warp.motions.turn import RESERVE, largest_turn
+from egs_warp.motions.turn import MAX_TURN_FRACTION, largest_turn
 from egs_warp.motions.twist import TurnHeading
 
 MIN_HEIGHT, MAX_HEIGHT = 0.1, 0.6
@@ -27,7 +27,7 @@ PREFERRED_HEIGHT = 0.3
 """Preferred height of a jump, in body heights."""
 HOP_LENGTH = 0.15
 """Length of a small hop, in body heights."""
-TURN = np.radians(20.0)
+TWIST_ANGLE = np.radians(20.0)
 """Angle of a small twist to either side of the front, in radians."""
 BEAT_TOLERANCE = 0.04
 """Seconds: an event within this of its beat is on the beat."""
@@ -50,7 +50,7 @@ class _Landing:
     """True if the jump turns; other jumps land with the heading that they started with."""
 
 
-FIGURE = (
+MOVES = (
     _Landing("jump"),
     _Landing("hop ahead", forward=1.0),
     _Landing("hop back"),
@@ -158,13 +158,15 @@ class Dance:
         self._share = sole_shares(body, stance.ground, stance.standing)
         self._gravity = float(np.linalg.norm(body.gravity))
         # A landing is recorded at the end of its time step.
-        self._late, self._long = 0.0, 0.5 * stance.step
-        self._trial = self._jump(stance, _Landing("jump"), PREFERRED_HEIGHT * body.height, turn=0.0)
-        self._turn = TURN if RESERVE * largest_turn(self._trial, stance) >= 2.0 * TURN else 0.0
-        self._figure = tuple(landing for landing in FIGURE if self._turn > 0.0 or not landing.twists)
+        self._lead_error, self._flight_error = 0.0, 0.5 * stance.step
+        self._trial_jump = self._jump(stance, _Landing("jump"), PREFERRED_HEIGHT * body.height, turn=0.0)
+        self._turn = (
+            TWIST_ANGLE if MAX_TURN_FRACTION * largest_turn(self._trial_jump, stance) >= 2.0 * TWIST_ANGLE else 0.0
+        )
+        self._moves = tuple(landing for landing in MOVES if self._turn > 0.0 or not landing.twists)
         self._stand: Stand | None = Stand(stance)
-        self._done: list[_Step] = []
-        self._dancing: _Step | None = None
+        self._finished_steps: list[_Step] = []
+        self._current_step: _Step | None = None
         self._started: float | None = None
         self._next = self._aim(0.0)
         if self._next is None:
@@ -187,7 +189,7 @@ class Dance:
     @property
     def is_at_rest(self) -> bool:
         """True if no beat is left and the body is at rest."""
-        return self._next is None and self._dancing is None and (self._stand is None or self._stand.is_at_rest)
+        return self._next is None and self._current_step is None and (self._stand is None or self._stand.is_at_rest)
 
     def plan_record(self) -> DancePlan:
         """Return the planned quantities of the motion."""
@@ -234,24 +236,24 @@ class Dance:
         step."""
         self._started = state.time if self._started is None else self._started
         now = state.time - self._started
-        step = self._dancing
+        step = self._current_step
         if step is not None and report is not None:
             step.update(
                 now, touching=bool(report.forces[:, 0].sum() > _MIN_CONTACT_FORCE * self._start_stance.body.weight)
             )
         if step is not None and step.jump.is_at_rest:
-            self._learn(step)
-            self._done.append(step)
+            self._correct_timing(step)
+            self._finished_steps.append(step)
             stance = self._start_stance.moved_to(state.positions)
-            self._dancing, self._stand, self._next = None, Stand(stance), self._aim(now)
-        if self._next is not None and self._dancing is None:
+            self._current_step, self._stand, self._next = None, Stand(stance), self._aim(now)
+        if self._next is not None and self._current_step is None:
             span = self._next
             height = self._height(span.flight)
             # Start at the time step nearest to the planned start.
             if now + 0.5 * dt >= span.take_off - self._lead(height):
                 self._begin(state, now, span, height)
-        if self._dancing is not None:
-            return self._dancing.jump.objectives(state, report, dt)
+        if self._current_step is not None:
+            return self._current_step.jump.objectives(state, report, dt)
         assert self._stand is not None
         return self._stand.objectives(state, report, dt)
 
@@ -260,15 +262,15 @@ class Dance:
         return tuple(beat for beat in self._beats if beat not in met)
 
     def _steps(self) -> list[_Step]:
-        return self._done if self._dancing is None else [*self._done, self._dancing]
+        return self._finished_steps if self._current_step is None else [*self._finished_steps, self._current_step]
 
     def _begin(self, state: BodyState, now: float, span: Span, height: float) -> None:
-        landing = self._figure[len(self._done) % len(self._figure)]
+        landing = self._moves[len(self._finished_steps) % len(self._moves)]
         stance = self._start_stance.moved_to(state.positions)
         turned = heading_between(self._start_stance.standing, state.positions, self._share, self._start_stance.ground)
         jump = self._jump(stance, landing, height, turn=landing.turned * self._turn - turned)
         com = stance.body.centre_of_mass(state.positions)
-        self._dancing, self._next = _Step(span, landing.move, jump, now, com), None
+        self._current_step, self._next = _Step(span, landing.move, jump, now, com), None
 
     def _jump(self, stance: Stance, landing: _Landing, height: float, *, turn: float) -> Jump:
         """Return the jump from ``stance`` to ``landing``, ``height`` metres high, which turns by ``turn`` radians."""
@@ -287,7 +289,7 @@ class Dance:
         straight = Jump(stance, target, skips_settling=True)
         if not landing.twists:
             return straight
-        max_turn = RESERVE * largest_turn(straight, stance)
+        max_turn = MAX_TURN_FRACTION * largest_turn(straight, stance)
         return Jump(
             stance, target, skips_settling=True, facing=TurnHeading(stance, float(np.clip(turn, -max_turn, max_turn)))
         )
@@ -304,7 +306,7 @@ class Dance:
 
     def _lead(self, height: float) -> float:
         """Return the seconds from the first time step of a jump of ``height`` metres to its take-off."""
-        return self._trial.take_off_time(height) + self._late
+        return self._trial_jump.take_off_time(height) + self._lead_error
 
     def _flights(self) -> tuple[float, float]:
         """Return the shortest and the longest flight, s."""
@@ -314,17 +316,17 @@ class Dance:
 
     def _flight(self, height: float) -> float:
         """Return the flight time in seconds of a jump of ``height`` metres."""
-        return level_flight(height, self._start_stance.body.height, self._gravity) + self._long
+        return level_flight(height, self._start_stance.body.height, self._gravity) + self._flight_error
 
     def _height(self, flight: float) -> float:
         """Return the height in metres of the jump with this flight time, s."""
-        return height_of_flight(flight - self._long, self._start_stance.body.height, self._gravity)
+        return height_of_flight(flight - self._flight_error, self._start_stance.body.height, self._gravity)
 
-    def _learn(self, step: _Step) -> None:
+    def _correct_timing(self, step: _Step) -> None:
         """Correct the lead and the flight time of later jumps by half of the error of this one."""
         reached = step.flight()
         if reached is None:
             return
         took_off, landed = reached
-        self._late += 0.5 * (took_off - step.span.take_off)
-        self._long += 0.5 * (landed - took_off - step.span.flight)
+        self._lead_error += 0.5 * (took_off - step.span.take_off)
+        self._flight_error += 0.5 * (landed - took_off - step.span.flight)

@@ -93,11 +93,11 @@ class DrivenWalk(Walk):
             )
             places = places_so_far
             for _ in range(_PLANNED_STEPS):
-                places.append(self._next(places[-1], time / rate))
+                places.append(self._next_pose(places[-1], time / rate))
         self.places = np.array(places)
         self.gait = replace(self.gait, step_count=len(places) - 1)
 
-    def _next(self, place: np.ndarray, time: float) -> np.ndarray:
+    def _next_pose(self, place: np.ndarray, time: float) -> np.ndarray:
         unit, height = self.body.time_unit, self.body.height
         return integrate_command(place, self.command, time, self._pace, unit=unit, height=height)
 
@@ -214,14 +214,14 @@ class ScriptedDrive:
     """Drive with a prescribed sequence of commands."""
 
     def __init__(self, stance: Stance, plan: DrivePlan) -> None:
-        self._stance, self._plan, self._driven = stance, plan, LiveDrive(stance)
-        self._began: float | None = None
-        self._over = False
+        self._stance, self._plan, self._drive = stance, plan, LiveDrive(stance)
+        self._start_time: float | None = None
+        self._is_done = False
 
     @property
     def is_at_rest(self) -> bool:
         """True if all commands are done and the body stands at rest."""
-        return self._over and self._driven.is_at_rest
+        return self._is_done and self._drive.is_at_rest
 
     @property
     def expected_time(self) -> float:
@@ -249,8 +249,8 @@ class ScriptedDrive:
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
         step."""
-        self._began = state.time if self._began is None else self._began
-        elapsed = state.time - self._began
-        self._over = elapsed >= self._plan.seconds - 1e-9
-        self._driven.command = self._plan.at(elapsed)
-        return self._driven.objectives(state, report, dt)
+        self._start_time = state.time if self._start_time is None else self._start_time
+        elapsed = state.time - self._start_time
+        self._is_done = elapsed >= self._plan.seconds - 1e-9
+        self._drive.command = self._plan.at(elapsed)
+        return self._drive.objectives(state, report, dt)

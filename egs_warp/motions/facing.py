@@ -24,12 +24,18 @@ class HeadingPolicy(Protocol):
         ...
 
     def thrust_momentum(
-        self, pose: BalanceController, measurement: Measurement, upright: np.ndarray, *, left: float, flight_time: float
+        self,
+        controller: BalanceController,
+        measurement: Measurement,
+        upright: np.ndarray,
+        *,
+        left: float,
+        flight_time: float,
     ) -> np.ndarray:
         """Return the angular momentum (3,) in kg m^2/s for take-off.
 
         Args:
-            pose: controller of the body.
+            controller: controller of the body.
             measurement: measured body.
             upright: (3,) rotation vector to the landing pose without the heading change.
             left: time until take-off, s.
@@ -41,9 +47,9 @@ class HeadingPolicy(Protocol):
         """Return ``pose`` (3, 3) adapted to a body with angular ``momentum`` (3,), ``left`` seconds before it lands."""
         ...
 
-    def landed_heading(self, pose: BalanceController, positions: np.ndarray) -> float:
+    def landed_heading(self, controller: BalanceController, positions: np.ndarray) -> float:
         """Return the target heading of the landed body with its nodes at ``positions`` (N, 3), relative to the landing
-        frame of ``pose``."""
+        frame of ``controller``."""
         ...
 
 
@@ -58,7 +64,13 @@ class KeepHeading:
         """Do nothing: the heading does not change."""
 
     def thrust_momentum(
-        self, pose: BalanceController, measurement: Measurement, upright: np.ndarray, *, left: float, flight_time: float
+        self,
+        controller: BalanceController,
+        measurement: Measurement,
+        upright: np.ndarray,
+        *,
+        left: float,
+        flight_time: float,
     ) -> np.ndarray:
         """Return the angular momentum (3,) that only brings the body upright."""
         return measurement.inertia @ (upright / flight_time)
@@ -67,6 +79,6 @@ class KeepHeading:
         """Return ``pose`` unchanged."""
         return pose
 
-    def landed_heading(self, pose: BalanceController, positions: np.ndarray) -> float:
+    def landed_heading(self, controller: BalanceController, positions: np.ndarray) -> float:
         """Return 0."""
         return 0.0

@@ -81,14 +81,16 @@ class Follow:
         for key in self.keys:
             if key.part not in self.parts:
                 raise UserError(f"{key.where}: the body has no part {key.part!r}; it has {', '.join(self.parts)}")
-        self.pose = BalanceController(self.body, stance.ground, stance.standing, stance.contact_points, stance.friction)
+        self.controller = BalanceController(
+            self.body, stance.ground, stance.standing, stance.contact_points, stance.friction
+        )
         self.phase = FollowPhase.FOLLOW
         self._standing = stance.standing
         self._gravity = float(np.linalg.norm(self.body.gravity))
         self._rate = 6.0 * float(np.sqrt(self._gravity / self.body.height))
-        self._began: float | None = None
+        self._start_time: float | None = None
         self._end = max(key.time for key in self.keys)
-        self._calm = RestDetector(self.body)
+        self._rest_detector = RestDetector(self.body)
         self._restless = False
         self._reached: dict[int, np.ndarray] = {}
         self._turned = {name: np.zeros(3) for name in self.parts}
@@ -141,18 +143,18 @@ class Follow:
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
         step."""
-        if self._began is None:
-            self._began = state.time
-        elapsed = state.time - self._began
+        if self._start_time is None:
+            self._start_time = state.time
+        elapsed = state.time - self._start_time
         for index, key in enumerate(self.keys):
             if index not in self._reached and elapsed >= key.time - 0.5 * dt:
-                self._reached[index] = self._measured(key.part, key.quantity, state)
+                self._reached[index] = self._measure(key.part, key.quantity, state)
         self._advance_phase(state, elapsed)
         # Positions and orientations are held after the last key of their channel, velocities and momenta are not.
         ruling = [c for c in self.channels if c.quantity in _POSE_QUANTITIES or elapsed < c.times[-1] - 0.5 * dt]
         return [
             *self._standing_objectives(state, report, dt, {(channel.part, channel.quantity) for channel in ruling}),
-            *(self._keyed(channel, state, elapsed, dt) for channel in ruling),
+            *(self._key_objective(channel, state, elapsed, dt) for channel in ruling),
         ]
 
     def _advance_phase(self, state: BodyState, elapsed: float) -> None:
@@ -161,7 +163,7 @@ class Follow:
             self.phase = FollowPhase.HOLD
         if self.phase is not FollowPhase.HOLD:
             return
-        calm = self._calm.update(self.body.centre_of_mass(state.velocities), elapsed)
+        calm = self._rest_detector.update(self.body.centre_of_mass(state.velocities), elapsed)
         late = elapsed - self._end > MAX_HOLD_TIME * np.sqrt(self.body.height / self._gravity)
         if calm or late:
             self.phase, self._restless = FollowPhase.REST, not calm
@@ -169,13 +171,13 @@ class Follow:
     def _standing_objectives(
         self, state: BodyState, report: StepReport | None, dt: float, ruled: set[tuple[str, Quantity]]
     ) -> list[AnyObjective]:
-        measurement = self.pose.measure(state, report)
-        balance = np.array([*(measurement.foot_centre - self.pose.base_offset), self.pose.standing_height])
+        measurement = self.controller.measure(state, report)
+        balance = np.array([*(measurement.foot_centre - self.controller.base_offset), self.controller.standing_height])
         rules: list[AnyObjective] = []
         velocity = self._rate / 3.0 * (balance - measurement.com)
-        pose = self.pose.over_base(measurement.com, measurement.foot_centre, measurement.heading)
-        upright = self.pose.turn_towards(measurement, pose) * 0.7 * self._rate
-        velocity, spin = self.pose.balance_targets(measurement, velocity, upright, dt)
+        pose = self.controller.over_base(measurement.com, measurement.foot_centre, measurement.heading)
+        upright = self.controller.turn_towards(measurement, pose) * 0.7 * self._rate
+        velocity, spin = self.controller.balance_targets(measurement, velocity, upright, dt)
         if not {("body", Quantity.POSITION), ("body", Quantity.VELOCITY)} & ruled:
             rules.append(centre_of_mass_velocity(self.body, self.ground.axes.T @ velocity, self.weights.com))
         if not {("body", Quantity.ORIENTATION), ("body", Quantity.ANGULAR_MOMENTUM)} & ruled:
@@ -187,11 +189,11 @@ class Follow:
         rules.append(node_velocities(self.body, drift + self._rate * (arms - now), self.weights.pose))
         return rules
 
-    def _keyed(self, channel: Channel, state: BodyState, elapsed: float, dt: float) -> AnyObjective:
+    def _key_objective(self, channel: Channel, state: BodyState, elapsed: float, dt: float) -> AnyObjective:
         part, body, whole = self.parts[channel.part], self.body, channel.part == "body"
         axes = Coordinates(self.ground.axes, False)
         value, rate = channel.at(elapsed + dt)
-        now = self._measured(channel.part, channel.quantity, state)
+        now = self._measure(channel.part, channel.quantity, state)
         # Rounding may put the end of a time step just after its key, so the middle of the step selects the next key.
         weight = channel.weight_at(elapsed + 0.5 * dt)
         weight *= self.weights.com if channel.quantity in _LINEAR else self.weights.spin
@@ -211,7 +213,7 @@ class Follow:
             return AngularMomentumObjective(self.ground.axes.T @ momentum, weight)
         return part_angular_momentum(body, part, state, momentum, weight, axes)
 
-    def _measured(self, name: str, quantity: Quantity, state: BodyState) -> np.ndarray:
+    def _measure(self, name: str, quantity: Quantity, state: BodyState) -> np.ndarray:
         """Return the measured value (3,) of a quantity of the part ``name``, in its unit and in ground axes. A rotation
         is unwrapped relative to the last call."""
         part, axes, height = self.parts[name], self.ground.axes, self.body.height

@@ -10,7 +10,7 @@ import numpy as np
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.feet import Foot, foot_of_node
 
-_STANDS = 0.05
+_MIN_STANCE_LOAD = 0.05
 """Share of the weight above which a foot supports the body; below it, the foot is being set down or lifted."""
 
 
@@ -55,12 +55,12 @@ def footfalls(
     for index, one in enumerate(feet):
         mine = foot == index
         load = np.bincount(step[mine] - first, normal[mine], last - first)
-        way = np.stack(
+        slip_vector = np.stack(
             [np.bincount(step[mine] - first, normal[mine] * slid[mine, k], last - first) for k in range(3)], 1
         )
-        lengths = np.linalg.norm(way, axis=1) / np.where(load > 0.0, load, 1.0)
+        lengths = np.linalg.norm(slip_vector, axis=1) / np.where(load > 0.0, load, 1.0)
         middle = t.positions[first : last + 1, one.sole].mean(axis=1) @ flat
-        for begin, end in _runs(load > _STANDS * weight):
+        for begin, end in _runs(load > _MIN_STANCE_LOAD * weight):
             landings += begin > 0
             slip = max(slip, float(lengths[begin:end].sum()))
             stood = middle[begin + 1 : end + 1]

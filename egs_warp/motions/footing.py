@@ -14,10 +14,10 @@ from egs_warp.motions.feet import Foot
 from egs_warp.motions.pendulum import is_line
 from egs_warp.motions.sequence import Stance
 
-DOWN = 0.005
+LANDED_HEIGHT = 0.005
 """Height above the ground, in body heights, below which a foot at the end of its swing counts as landed even without
 load."""
-_BETWEEN = 0.3
+_AMBIGUOUS_FRACTION = 0.3
 """Fraction of the distance between two feet: contact points whose distances to both differ by less belong to neither.
 """
 
@@ -44,7 +44,9 @@ class FootholdPlanner:
         away = np.linalg.norm(points[:, None] - centres, axis=2)
         owner = np.argmin(away, axis=1)
         nearest, second = np.sort(away, axis=1)[:, :2].T
-        clear = second - nearest > _BETWEEN * np.linalg.norm(centres[owner] - centres[np.argsort(away)[:, 1]], axis=1)
+        clear = second - nearest > _AMBIGUOUS_FRACTION * np.linalg.norm(
+            centres[owner] - centres[np.argsort(away)[:, 1]], axis=1
+        )
         grips = []
         for index, arms in enumerate(self._arms):
             own = points[clear & (owner == index)] - centres[index]
@@ -81,7 +83,7 @@ class FootholdPlanner:
     def is_down(self, index: int, local: np.ndarray) -> bool:
         """Return True if foot ``index`` is on the ground, even if it carries no load."""
         sole = local[self._feet[index].sole].mean(axis=0)
-        return bool(sole[2] - self._on_ground(index, sole[:2], 0.0)[2] < DOWN * self._height)
+        return bool(sole[2] - self._on_ground(index, sole[:2], 0.0)[2] < LANDED_HEIGHT * self._height)
 
     def sole(self, index: int, footprint: np.ndarray) -> np.ndarray:
         """Return the nodes (k, 3) of the sole of foot ``index``, placed flat on its ``footprint`` (4,)."""

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 _STEPS = 16
 """Number of steps of the midpoint rule; accurate to 0.2 degrees for half a turn."""
-_EXACT = 1e-4
+_TOLERANCE = 1e-4
 """Tolerance of the root search for the spin."""
 
 
@@ -50,9 +50,9 @@ def spin_for_rotation(inertia: np.ndarray, upright: np.ndarray, turn: np.ndarray
     Returns:
         (3,) rad/s; the constant spin (upright + turn) / seconds if the root search fails.
     """
-    asked = Rotation.from_rotvec(turn) * Rotation.from_rotvec(upright)
+    target = Rotation.from_rotvec(turn) * Rotation.from_rotvec(upright)
     steady = (upright + turn) / seconds
-    found = root(
-        lambda spin: (asked * integrate_rotation(inertia, spin, seconds).inv()).as_rotvec(), steady, tol=_EXACT
+    solution = root(
+        lambda spin: (target * integrate_rotation(inertia, spin, seconds).inv()).as_rotvec(), steady, tol=_TOLERANCE
     )
-    return found.x if found.success else steady
+    return solution.x if solution.success else steady

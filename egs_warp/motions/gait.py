@@ -92,12 +92,12 @@ class Gait:
         return done + (elapsed - 0.5 * self.swing_time) / (self.swing_time + self.double_time)
 
     @property
-    def carried_from(self) -> float:
+    def transfer_start_time(self) -> float:
         """Time in a swing at which the foot starts to move forward, s."""
         return self.window[0] * self.swing_time
 
     @property
-    def carried_until(self) -> float:
+    def transfer_end_time(self) -> float:
         """Time in a swing at which the foot is over its next footprint, s."""
         return self.window[1] * self.swing_time
 

@@ -12,7 +12,7 @@ from egs_warp.motions.sequence import BodyMotion, Stance
 from egs_warp.motions.turn import Turn
 from egs_warp.motions.walk import Walk
 
-_LEAP = 0.3
+_JUMP_HEIGHT = 0.3
 """Height in body heights of the jump in which a ball turns about up."""
 
 
@@ -40,5 +40,5 @@ def turn_in_place(stance: Stance, angle: float, pace_length: float, *, speed: fl
     """Return the motion that turns the body by ``angle`` radians on the spot. A ball, which stands on a point, turns in
     a jump; other bodies turn as in ``move_along``."""
     if stance.base() is SupportKind.ROUND_BASE:
-        return Turn(stance, JumpTarget(0.0, _LEAP * stance.body.height), angle)
+        return Turn(stance, JumpTarget(0.0, _JUMP_HEIGHT * stance.body.height), angle)
     return move_along(stance, turn_route(angle), pace_length, speed=speed)

@@ -30,9 +30,9 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import RestDetector
 from egs_warp.motions.stand import Stand
 
-UPRIGHT = 15.0
+MAX_UPRIGHT_TILT = 15.0
 """Largest tilt in degrees of a body that has got up and stands at rest."""
-_TRIES = ((1.2, 0.1), (1.6, 0.1), (1.0, 0.05), (1.3, 0.2), (2.2, 0.1), (1.6, 0.2), (3.0, 0.15), (1.0, 0.15))
+_ATTEMPTS = ((1.2, 0.1), (1.6, 0.1), (1.0, 0.05), (1.3, 0.2), (2.2, 0.1), (1.6, 0.2), (3.0, 0.15), (1.0, 0.15))
 """For each attempt: its push relative to the one that would just suffice over ``_STROKE``, and the height in body
 heights by which the centre of mass aims above the top."""
 _STROKE = 0.35
@@ -58,8 +58,8 @@ _MIN_PUSH_DISTANCE = 0.1
 _MAX_LIE_TIME, _MAX_ROLL_TIME, _MAX_STRAIGHTEN_TIME = 6.0, 6.0, 10.0
 """Longest times in sqrt(H / g) to wait for rest while lying, to roll, and to come to rest on the feet."""
 _FAIL_TIME, _FAIL_RATE = 0.6, 0.05
-"""Time in sqrt(H / g) after which an attempt fails if the body rolls back faster than this rate, in radians per sqrt(H
-/ g)."""
+"""Time in sqrt(H / g) after which an attempt fails if the body rolls back, and the rate above which it does, in radians
+per sqrt(H / g)."""
 _MAX_BASE_TILT = 60.0
 """Tilt of the base in degrees beyond which the body does not stand."""
 
@@ -122,7 +122,7 @@ class _Roll:
 
 
 class GetUp:
-    """Push the body up and stand, or give up after the attempts of ``_TRIES``."""
+    """Push the body up and stand, or give up after the attempts of ``_ATTEMPTS``."""
 
     def __init__(self, stance: Stance, *, control: GetUpControl | None = None) -> None:
         """Create the motion.
@@ -146,7 +146,7 @@ class GetUp:
         self._base = np.flatnonzero(heights < heights.min() + _BASE_HEIGHT * body.height)
         if len(self._base) < 4:
             self._base = np.argsort(heights)[:8]
-        self._calm = RestDetector(body)
+        self._rest_detector = RestDetector(body)
         self.phase, self._entered = GetUpPhase.LIE, -1.0
         self.tries = 0
         self._push, self._margin = 0.0, 0.0
@@ -157,7 +157,7 @@ class GetUp:
     def is_at_rest(self) -> bool:
         """True if the body stands at rest, or has given up."""
         if self.phase is GetUpPhase.STAND:
-            return self._stand is not None and self._stand.is_at_rest and self._degrees < UPRIGHT
+            return self._stand is not None and self._stand.is_at_rest and self._degrees < MAX_UPRIGHT_TILT
         return self.phase is GetUpPhase.GIVEN_UP
 
     @property
@@ -172,7 +172,7 @@ class GetUp:
 
     def plan_record(self) -> GetUpPlan:
         """Return the largest number of attempts."""
-        return GetUpPlan(float(len(_TRIES)))
+        return GetUpPlan(float(len(_ATTEMPTS)))
 
     def planned_com(self, elapsed: float) -> None:
         """Return None: each attempt starts from the measured body."""
@@ -190,14 +190,14 @@ class GetUp:
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
         step."""
-        roll = self._measured(state, report)
+        roll = self._measure(state, report)
         self._advance(state, report, roll)
         if self.phase in (GetUpPhase.CATCH, GetUpPhase.STAND):
             assert self._stand is not None
             return self._stand.objectives(state, report, dt)
-        return self._rolling(state, roll, dt) if self.phase is GetUpPhase.ROLL else []
+        return self._roll_objectives(state, roll, dt) if self.phase is GetUpPhase.ROLL else []
 
-    def _measured(self, state: BodyState, report: StepReport | None) -> _Roll:
+    def _measure(self, state: BodyState, report: StepReport | None) -> _Roll:
         body, up, normal = self.body, self.ground.axes[2], self.ground.surface_normal
         x, com = state.positions, body.centre_of_mass(state.positions)
         angle, axis = self._tilt(x)
@@ -223,16 +223,16 @@ class GetUp:
         if self._entered < 0.0:
             self._entered = state.time
         elapsed = (state.time - self._entered) / self._unit
-        calm = self._calm.update(self.body.centre_of_mass(state.velocities), state.time)
+        calm = self._rest_detector.update(self.body.centre_of_mass(state.velocities), state.time)
         load = 0.0 if report is None else float(report.forces[:, 0].sum()) / self.body.weight
-        upright = self._degrees < UPRIGHT
+        upright = self._degrees < MAX_UPRIGHT_TILT
         if self.phase is GetUpPhase.LIE and (calm or elapsed > _MAX_LIE_TIME):
             if upright:
                 self._catch(state, GetUpPhase.STAND, 1.0)
-            elif self.tries == len(_TRIES):
+            elif self.tries == len(_ATTEMPTS):
                 self._enter(GetUpPhase.GIVEN_UP, state.time)
             else:
-                push, margin = _TRIES[self.tries]
+                push, margin = _ATTEMPTS[self.tries]
                 needed = max(roll.missing, 0.02 * self.body.height)
                 self._push = push * self.body.mass * self._gravity * needed / (roll.inertia * _STROKE)
                 self._margin = margin * self.body.height
@@ -278,7 +278,7 @@ class GetUp:
         turns = Rotation.from_rotvec(np.linspace(0.0, angle, max(int(np.degrees(angle) / 3.0), 2))[:, None] * axis)
         return float((-(turns.inv().apply(normal) @ arms.T).min(axis=1)).max())
 
-    def _rolling(self, state: BodyState, roll: _Roll, dt: float) -> list[AnyObjective]:
+    def _roll_objectives(self, state: BodyState, roll: _Roll, dt: float) -> list[AnyObjective]:
         """Return objectives for the centre of mass and the spin of a body that rolls about its edge as a whole, at the
         rate that takes it over the top. Once nothing pushes it any more, the rate is that of the free roll."""
         body, control, unit = self.body, self.control, self._unit

@@ -41,7 +41,7 @@ FORWARD_TIME_FRACTION = 0.7
 """Fraction of the time of a thrust in which the forward speed is reached."""
 MAX_FOOTHOLD_OFFSET = 0.4
 """Fraction of the footprint by which the foothold may differ from the capture point for the sake of the target."""
-CLEARANCE = 0.15
+STEP_CLEARANCE = 0.15
 """Clearance of the feet above a step, as a fraction of its height, before they swing forward."""
 APPROACH_RATE = 2.5
 """Rate at which the pose of the landing is approached, times the time left in the air; slow at first."""
@@ -64,11 +64,11 @@ TAKE_OFF_RELEASE_TIME = 0.6
 URGENT_CAPTURE_MARGIN = 0.5
 """Fraction of the distance from the middle of the feet to their edge: with its capture point beyond, a landing body is
 balanced with more than the usual weights."""
-SWING_WEIGHT, BASE_SWING = 5.0, 1.0
+SWING_WEIGHT, BASE_SWING_WEIGHT = 5.0, 1.0
 """Weights of the soles in the air, for feet on legs and for a base: the soles swing forward under a body that keeps its
 shape. From the pose alone they land 0.03 body heights short, and a body with little support in front falls over them. A
 base is stiff: with a weight of 5, a monkey's jump takes half as much work again and lands no better."""
-AIRBORNE_POSE_WEIGHT, BASE_AIRBORNE = 2.0, 0.3
+AIRBORNE_POSE_WEIGHT, BASE_AIRBORNE_POSE_WEIGHT = 2.0, 0.3
 """Weights of the pose in the air, where nothing else can be steered and the feet have to reach their target. The first
 is for bodies on legs and for bodies that turn in the air, whose rotation depends on their width; the second is for a
 base without a turn. With 2, the muscles of a pawn do work of 0.76 m g H in the air, with 0.3 they do 0.30, and it lands
@@ -106,7 +106,7 @@ class Jump:
             ground.origin + target.distance * ground.axes[0] + target.rise * ground.axes[2],
             ground.surface_normal,
         )
-        self.pose = BalanceController(body, ground, stance.standing, stance.contact_points, stance.friction)
+        self.controller = BalanceController(body, ground, stance.standing, stance.contact_points, stance.friction)
         self._landing = BalanceController(
             body,
             landing,
@@ -116,8 +116,8 @@ class Jump:
         )
         feet, posture = select_posture(stance)
         on_legs = posture is LeggedPosture
-        self._swing = SWING_WEIGHT if on_legs else BASE_SWING
-        self._airborne = AIRBORNE_POSE_WEIGHT if on_legs or self.facing.target_heading else BASE_AIRBORNE
+        self._swing = SWING_WEIGHT if on_legs else BASE_SWING_WEIGHT
+        self._airborne = AIRBORNE_POSE_WEIGHT if on_legs or self.facing.target_heading else BASE_AIRBORNE_POSE_WEIGHT
         base = np.flatnonzero(sole_shares(body, ground, stance.standing))
         self._soles = [
             BodyPart.of(body, "sole", sole) for sole in ([foot.sole for foot in feet] if on_legs else [base])
@@ -134,22 +134,22 @@ class Jump:
         self._entered = 0.0
         local = ground.local(stance.standing)
         self._start_com = body.centre_of_mass(local)
-        self._start_base = self._start_com[:2] + self.pose.base_offset
+        self._start_base = self._start_com[:2] + self.controller.base_offset
         self._last_pose = self._pose_before = np.eye(3)
         self._requested_velocity: np.ndarray | None = None
         self._flew = False
-        self._calm = RestDetector(body)
+        self._rest_detector = RestDetector(body)
         self._overran: list[JumpPhase] = []
 
     @property
     def ground(self) -> GroundFrame:
         """Reference frame of the motion: that of the start, from take-off on that of the landing."""
-        return self.pose.ground
+        return self.controller.ground
 
     @property
     def is_airborne(self) -> bool:
         """True if the reference frame is that of the landing."""
-        return self.pose is self._landing
+        return self.controller is self._landing
 
     @property
     def expected_time(self) -> float:
@@ -160,12 +160,12 @@ class Jump:
         return plan_jump(
             target,
             height=self.body.height,
-            com_height=self.pose.standing_height,
-            support_ahead=float(self.pose.support_high[0]),
+            com_height=self.controller.standing_height,
+            support_ahead=float(self.controller.support_high[0]),
             gravity=self.gravity,
             step=self._step,
             lean=min(LEAN_FRACTION * target.distance, self._max_lean),
-            friction=self.pose.friction,
+            friction=self.controller.friction,
             landing_time=self._landing_time,
             style=self._style,
         )
@@ -205,7 +205,7 @@ class Jump:
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
         step."""
-        measurement = self.pose.measure(state, report)
+        measurement = self.controller.measure(state, report)
         self.facing.update(measurement.heading + (self.facing.target_heading if self.is_airborne else 0.0))
         self._advance_phase(measurement, state.time, dt)
         elapsed = state.time - self._entered + dt
@@ -242,8 +242,8 @@ class Jump:
             # Poses are relative to the standing pose of the frame, which is rotated in the frame of the landing.
             rotation = self.ground.rotation_about_up(self.facing.target_heading)
             self._last_pose, self._pose_before = self._last_pose @ rotation.T, self._pose_before @ rotation.T
-            self.pose = self._landing
-        elif self.phase is JumpPhase.LAND and self._calm.update(measurement.velocity, time):
+            self.controller = self._landing
+        elif self.phase is JumpPhase.LAND and self._rest_detector.update(measurement.velocity, time):
             self.phase = JumpPhase.REST
 
     def _is_thrust_done(self, measurement: Measurement, dt: float) -> bool:
@@ -265,8 +265,8 @@ class Jump:
         if self.phase is JumpPhase.CROUCH:
             position, velocity = self.plan.crouch(self._start_com, elapsed)
         velocity = self._following(measurement, position, velocity, dt)
-        pose = self.pose.bent_over_base(position, self._start_base)
-        velocity, spin = self.pose.balance_targets(measurement, velocity, self._upright(measurement, pose), dt)
+        pose = self.controller.bent_over_base(position, self._start_base)
+        velocity, spin = self.controller.balance_targets(measurement, velocity, self._upright(measurement, pose), dt)
         return self._body_objectives(state, measurement, velocity, pose, spin, dt)
 
     def _thrust(self, state: BodyState, measurement: Measurement, elapsed: float, dt: float) -> list[AnyObjective]:
@@ -290,10 +290,10 @@ class Jump:
         short *= min(1.0, max_change / max(float(np.linalg.norm(short)), 1e-12))
         velocity = np.array([*(measurement.velocity[:2] + change + short), up])
         flat = self._base_of_landing() - LANDING_LEAN_FRACTION * np.array([self.plan.landing_lag, 0.0])
-        upright = self.pose.over_base(landing, flat, self.facing.heading)
-        standing = self.pose.bent_over_base(position, self._start_base, self.facing.heading)
+        upright = self.controller.over_base(landing, flat, self.facing.heading)
+        standing = self.controller.bent_over_base(position, self._start_base, self.facing.heading)
         spin = self._thrust_spin(measurement, upright, standing, elapsed, left, dt)
-        velocity, spin = self.pose.balance_targets(measurement, velocity, spin, dt)
+        velocity, spin = self.controller.balance_targets(measurement, velocity, spin, dt)
         self._requested_velocity = velocity[:2]
         return self._body_objectives(state, measurement, velocity, standing, spin, dt)
 
@@ -312,9 +312,9 @@ class Jump:
         ``landing`` (3, 3). The spin about up grows with the speed, because friction grows with the load.
         """
         up, inertia = self.ground.axes[2], measurement.inertia
-        upright = self.pose.turn_towards(measurement, landing)
+        upright = self.controller.turn_towards(measurement, landing)
         target_momentum = self.facing.thrust_momentum(
-            self.pose, measurement, upright, left=left, flight_time=self.plan.flight_time
+            self.controller, measurement, upright, left=left, flight_time=self.plan.flight_time
         )
         share = min(elapsed / self.plan.thrust_time, 1.0)
         momentum = share * target_momentum + (1.0 - share) * (inertia @ self._upright(measurement, standing))
@@ -327,7 +327,7 @@ class Jump:
     def _flight_objectives(self, state: BodyState, measurement: Measurement, dt: float) -> list[AnyObjective]:
         touch_down, left = self._touch_down(measurement, dt)
         heading = self.facing.heading - self.facing.target_heading
-        pose = self.pose.over_base(touch_down, self._foothold(state, measurement, touch_down, left), heading)
+        pose = self.controller.over_base(touch_down, self._foothold(state, measurement, touch_down, left), heading)
         # No force turns a body in the air; a foot that lags on the ground must not push any more.
         spin = np.linalg.solve(measurement.inertia, measurement.angular_momentum)
         pose = self.facing.airborne_pose(pose, measurement.angular_momentum, self.ground.axes[2], left)
@@ -344,21 +344,21 @@ class Jump:
         com, about = self.body.centre_of_mass(state.positions), Coordinates(np.eye(3), True)
 
         def swung(sole: BodyPart) -> AnyObjective:
-            offset = pose @ sole.centre(self.pose.arms) - (sole.centre(state.positions) - com)
+            offset = pose @ sole.centre(self.controller.arms) - (sole.centre(state.positions) - com)
             return part_velocity(self.body, sole, rate * offset, share * self._swing, about)
 
         return [swung(sole) for sole in self._soles]
 
     def _land(self, state: BodyState, measurement: Measurement, dt: float) -> list[AnyObjective]:
         rate = self.plan.landing_rate
-        goal = np.array([*(measurement.foot_centre - self.pose.base_offset), self._start_com[2]])
+        goal = np.array([*(measurement.foot_centre - self.controller.base_offset), self._start_com[2]])
         acceleration = rate**2 * (goal - measurement.com) - 2.0 * rate * measurement.velocity
         acceleration[2] = max(acceleration[2], -0.8 * self.gravity)
-        acceleration[:2] = self.pose.capture_acceleration(measurement, goal[:2])
+        acceleration[:2] = self.controller.capture_acceleration(measurement, goal[:2])
         velocity = measurement.velocity + dt * acceleration
-        heading = self.facing.landed_heading(self.pose, state.positions)
+        heading = self.facing.landed_heading(self.controller, state.positions)
         # Upright wherever the centre of mass is now: a pose that leans with it would not return.
-        pose = self.pose.over_base(
+        pose = self.controller.over_base(
             np.array([*goal[:2], measurement.com[2] + dt * velocity[2]]), measurement.foot_centre, heading
         )
         # While the body still moves towards its feet, it is rotated until the soles are flat, because a body on its
@@ -367,13 +367,13 @@ class Jump:
         ahead = goal[:2] - measurement.com[:2]
         closing = float(ahead @ measurement.velocity[:2]) / max(float(np.linalg.norm(ahead)), 1e-9 * self.body.height)
         approach = min(max(closing / (FLAT_SOLE_SPEED * self.body.speed_unit), 0.0), 1.0)
-        flat = self.pose.over_base(
+        flat = self.controller.over_base(
             np.array([*(goal[:2] - approach * ahead), measurement.com[2]]), measurement.foot_centre, heading
         )
         upright = self._ramp(state.time + dt, LANDING_RAMP_TIME) * self._upright(measurement, flat)
-        velocity, spin = self.pose.balance_targets(measurement, velocity, upright, dt)
+        velocity, spin = self.controller.balance_targets(measurement, velocity, upright, dt)
         # The ground stops the fall; afterwards low weights suffice for a body that comes to rest by itself.
-        urgent = (self.pose.capture_margin(measurement) - URGENT_CAPTURE_MARGIN) / (1.0 - URGENT_CAPTURE_MARGIN)
+        urgent = (self.controller.capture_margin(measurement) - URGENT_CAPTURE_MARGIN) / (1.0 - URGENT_CAPTURE_MARGIN)
         share = self._ramp_or_full(state.time + dt, LANDING_RAMP_TIME) * max(self.weights.landing, min(urgent, 1.0))
         return self._body_objectives(state, measurement, velocity, pose, spin, dt, share=share)
 
@@ -394,7 +394,7 @@ class Jump:
 
     def _upright(self, measurement: Measurement, pose: np.ndarray) -> np.ndarray:
         """Return the spin (3,) in rad/s that turns a standing body to ``pose`` (3, 3)."""
-        return self.pose.turn_towards(measurement, pose) * 4.0 / self._time_unit
+        return self.controller.turn_towards(measurement, pose) * 4.0 / self._time_unit
 
     def _sufficient_speed(self, measurement: Measurement, dt: float) -> float:
         """Return the upward speed in m/s at the end of this time step from which free flight reaches the target
@@ -408,7 +408,7 @@ class Jump:
 
     def _landing_com(self, position: np.ndarray) -> np.ndarray:
         """Return the target (3,) of the centre of mass at touch-down, in the frame of the start."""
-        ahead = self._base_of_landing()[0] - self.pose.base_offset[0] - self.plan.landing_lag
+        ahead = self._base_of_landing()[0] - self.controller.base_offset[0] - self.plan.landing_lag
         return np.array([ahead, position[1], self._start_com[2]])
 
     def _touch_down(self, measurement: Measurement, dt: float) -> tuple[np.ndarray, float]:
@@ -425,14 +425,14 @@ class Jump:
         otherwise the nearest point at which it can."""
         if (
             measurement.velocity[2] > 0.0
-            and self.ground.local(state.positions)[:, 2].min() < CLEARANCE * self.target.rise
+            and self.ground.local(state.positions)[:, 2].min() < STEP_CLEARANCE * self.target.rise
         ):
             # Feet that swing forward before they are higher than the step would strike it.
             return touch_down[:2] + measurement.foot_centre - measurement.com[:2]
         falling = max(left * self.gravity - measurement.velocity[2], 0.0)
-        capture_time = stopping_time(self.pose.standing_height, falling, self.gravity, self._landing_time)
-        capture = touch_down[:2] + measurement.velocity[:2] * capture_time + self.pose.base_offset
-        low, high = self.pose.support_low, self.pose.support_high
+        capture_time = stopping_time(self.controller.standing_height, falling, self.gravity, self._landing_time)
+        capture = touch_down[:2] + measurement.velocity[:2] * capture_time + self.controller.base_offset
+        low, high = self.controller.support_low, self.controller.support_high
         # The capture point stays within this fraction of the feet, wherever they land.
         return np.clip(self._start_base, capture - MAX_FOOTHOLD_OFFSET * high, capture - MAX_FOOTHOLD_OFFSET * low)
 
@@ -475,7 +475,7 @@ class Jump:
             weights = replace(weights, com=factor * weights.com, up=factor * weights.up, spin=factor * weights.spin)
         if left is not None:
             follow, weights = min(APPROACH_RATE / left, follow), replace(weights, pose=share * self._airborne)
-        return self.pose.objectives(
+        return self.controller.objectives(
             state,
             measurement,
             com_velocity=com_velocity,

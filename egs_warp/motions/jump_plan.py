@@ -37,7 +37,7 @@ _MAX_EXTENSION, _MAX_EXTENSION_FRACTION = 0.04, 0.25
 height of the jump."""
 SETTLE_TIME = 0.3
 """Time before the crouch starts, in sqrt(H / g)."""
-USUAL_LANDING, USUAL_LANDING_AHEAD = 0.7, 1.0
+USUAL_LANDING_TIME, USUAL_LANDING_TIME_PER_DISTANCE = 0.7, 1.0
 """Typical time from touch-down to rest in sqrt(H / g), and additional time per body height of jump distance (measured
 on the pawn)."""
 LANDING_TIME = 0.35
@@ -115,7 +115,7 @@ class JumpPlan:
 
     def expected_duration(self, distance: float, time_unit: float) -> float:
         """Return the seconds until a jump over ``distance`` body heights is at rest; ``time_unit`` is sqrt(H / g)."""
-        landing = USUAL_LANDING + USUAL_LANDING_AHEAD * distance
+        landing = USUAL_LANDING_TIME + USUAL_LANDING_TIME_PER_DISTANCE * distance
         return self.crouch_time + self.thrust_time + self.flight_time + (SETTLE_TIME + landing) * time_unit
 
     def take_off_time(self, step: float) -> float:

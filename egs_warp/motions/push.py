@@ -31,7 +31,7 @@ MAX_TIME = 600.0
 """Seconds."""
 HIT_HALF_HEIGHT = 0.25
 """Half height in body heights of the region of a body that a push hits."""
-_FORM = "such as 0.5 0.1 left; append 0.8 to hit at 0.8 of the height, or write 0.5-1.5 for 0.5 for a gust"
+_EXAMPLE = "such as 0.5 0.1 left; append 0.8 to hit at 0.8 of the height, or write 0.5-1.5 for 0.5 for a gust"
 
 
 @dataclass(frozen=True)
@@ -126,10 +126,10 @@ def _push(piece: str, where: str) -> Push:
     where = f"{where} ({piece!r})"
     words = piece.split()
     if len(words) not in (3, 4):
-        raise UserError(f"{where}: give a time, an impulse and a direction, {_FORM}")
+        raise UserError(f"{where}: give a time, an impulse and a direction, {_EXAMPLE}")
     times = re.fullmatch(r"([0-9.]+)(?:-([0-9.]+))?", words[0])
     if times is None:
-        raise UserError(f"{where}: time {words[0]!r}: give seconds, {_FORM}")
+        raise UserError(f"{where}: time {words[0]!r}: give seconds, {_EXAMPLE}")
     start = _number(times[1], "time", "seconds", 0.0, MAX_TIME, where)
     end = start if times[2] is None else _number(times[2], "time", "seconds", start, MAX_TIME, where)
     if words[2] not in DIRECTIONS:

@@ -66,72 +66,72 @@ def _target(values: Mapping[str, float], height: float) -> JumpTarget:
     return JumpTarget(values["distance"] * height, values["height"] * height)
 
 
-def _repeated(
+def _repeat_task(
     request: MotionRequest, values: Mapping[str, float], begin: Callable[[Stance], BodyMotion]
 ) -> list[MotionTask]:
     return [MotionTask(request.name, values, begin)] * request.repeat
 
 
-def _jumps(request: MotionRequest, height: float) -> list[MotionTask]:
+def _jump_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     target = _target(request.asked, height)
-    return _repeated(request, request.asked, lambda stance: Jump(stance, stance.landing(target)))
+    return _repeat_task(request, request.asked, lambda stance: Jump(stance, stance.landing(target)))
 
 
-def _hops(request: MotionRequest, height: float) -> list[MotionTask]:
+def _hop_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     target = _target(request.asked, height)
     return HopTargets(target.distance, target.height, request.repeat, request.asked).parts()
 
 
-def _turns(request: MotionRequest, height: float) -> list[MotionTask]:
+def _twist_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     target, turn = _target(request.asked, height), float(np.radians(request.asked["heading_degrees"]))
-    return _repeated(request, request.asked, lambda stance: Turn(stance, target, turn))
+    return _repeat_task(request, request.asked, lambda stance: Turn(stance, target, turn))
 
 
-def _walking(request: MotionRequest, values: Mapping[str, float], route: Route, height: float) -> list[MotionTask]:
+def _route_tasks(request: MotionRequest, values: Mapping[str, float], route: Route, height: float) -> list[MotionTask]:
     length = values.get("step_length", _STEP) * height
-    return _repeated(request, values, lambda stance: move_along(stance, route, length, speed=values["speed"]))
+    return _repeat_task(request, values, lambda stance: move_along(stance, route, length, speed=values["speed"]))
 
 
-def _walks(request: MotionRequest, height: float) -> list[MotionTask]:
-    return _walking(request, request.asked, straight_route(request.asked["distance"] * height), height)
+def _walk_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
+    return _route_tasks(request, request.asked, straight_route(request.asked["distance"] * height), height)
 
 
-def _walks_to(request: MotionRequest, height: float) -> list[MotionTask]:
+def _walk_to_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     goal = np.array([[request.asked["ahead"], request.asked["left"]]])
     values = {**request.asked, "distance": float(np.linalg.norm(goal))}
-    return _walking(request, values, path_route(goal * height), height)
+    return _route_tasks(request, values, path_route(goal * height), height)
 
 
-def _walks_along(request: MotionRequest, height: float) -> list[MotionTask]:
+def _walk_along_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     points = _path(request)
     values = {**request.asked, "distance": float(np.linalg.norm(points[-1]))}
-    return _walking(request, values, path_route(points * height), height)
+    return _route_tasks(request, values, path_route(points * height), height)
 
 
-def _turns_on_the_spot(request: MotionRequest, height: float) -> list[MotionTask]:
+def _turn_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     angle = float(np.radians(request.asked["heading_degrees"]))
     values, length = {**request.asked, "distance": 0.0}, _STEP * height
-    return _repeated(request, values, lambda stance: turn_in_place(stance, angle, length, speed=values["speed"]))
+    return _repeat_task(request, values, lambda stance: turn_in_place(stance, angle, length, speed=values["speed"]))
 
 
-def _stands(request: MotionRequest, height: float) -> list[MotionTask]:
+def _stand_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     seconds = request.asked["seconds"]
-    return _repeated(request, request.asked, lambda stance: StandFor(stance, seconds))
+    return _repeat_task(request, request.asked, lambda stance: StandFor(stance, seconds))
 
 
-def _gets_up(request: MotionRequest, height: float) -> list[MotionTask]:
-    return _repeated(request, request.asked, GetUp)
+def _get_up_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
+    return _repeat_task(request, request.asked, GetUp)
 
 
-def _runs(request: MotionRequest, height: float) -> list[MotionTask]:
+def _run_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     route, length = straight_route(request.asked["distance"] * height), LARGEST_TARGET * height
-    return _repeated(request, request.asked, lambda stance: move_along(stance, route, length, speed=_SPEED.maximum))
+    return _repeat_task(request, request.asked, lambda stance: move_along(stance, route, length, speed=_SPEED.maximum))
 
 
-def _dances(request: MotionRequest, height: float) -> list[MotionTask]:
+def _dance_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     beats = _beats(request)
     values = request.asked if request.file is None else {"beats": float(len(beats)), "duration": beats[-1]}
-    return _repeated(request, values, lambda stance: Dance(stance, beats))
+    return _repeat_task(request, values, lambda stance: Dance(stance, beats))
 
 
 def _beats(request: MotionRequest) -> tuple[float, ...]:
@@ -158,10 +158,10 @@ def _frames_of_walk(path_length: float, request: MotionRequest) -> int:
     return 170 + int(np.ceil(36 * path_length / _MIN_STEP / request.asked["speed"]))
 
 
-def _drives(request: MotionRequest, height: float) -> list[MotionTask]:
+def _drive_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     plan = _commands(request)
     values = {"commands": float(len(plan.commands)), "duration": plan.seconds}
-    return _repeated(request, values, lambda stance: ScriptedDrive(stance, plan))
+    return _repeat_task(request, values, lambda stance: ScriptedDrive(stance, plan))
 
 
 def _commands(request: MotionRequest) -> DrivePlan:
@@ -171,10 +171,10 @@ def _commands(request: MotionRequest) -> DrivePlan:
     return read_drive(request.file)
 
 
-def _follows(request: MotionRequest, height: float) -> list[MotionTask]:
+def _trajectory_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     keys = _keys(request)
     values = {"keys": float(len(keys)), "duration": max(key.time for key in keys)}
-    return _repeated(request, values, lambda stance: Follow(stance, keys))
+    return _repeat_task(request, values, lambda stance: Follow(stance, keys))
 
 
 def _keys(request: MotionRequest) -> tuple[Key, ...]:
@@ -199,11 +199,14 @@ def _length(name: str, default: float, *, is_exclusive: bool = False) -> Value:
 
 MOTIONS: Mapping[str, MotionKind] = {
     "jump": MotionKind(
-        (_length("distance", 0.5), _length("height", 0.2, is_exclusive=True)), _jumps, lambda request: 120, jumps=True
+        (_length("distance", 0.5), _length("height", 0.2, is_exclusive=True)),
+        _jump_tasks,
+        lambda request: 120,
+        jumps=True,
     ),
     "hop": MotionKind(
         (_length("distance", 0.7, is_exclusive=True), _length("height", 0.3, is_exclusive=True)),
-        _hops,
+        _hop_tasks,
         lambda request: 150,
         jumps=True,
     ),
@@ -213,7 +216,7 @@ MOTIONS: Mapping[str, MotionKind] = {
             _length("distance", 0.0),
             _length("height", 0.2, is_exclusive=True),
         ),
-        _turns,
+        _twist_tasks,
         lambda request: 480,
         jumps=True,
     ),
@@ -223,7 +226,7 @@ MOTIONS: Mapping[str, MotionKind] = {
             _STEP_LENGTH,
             _SPEED,
         ),
-        _walks,
+        _walk_tasks,
         lambda request: _frames_of_walk(abs(request.asked["distance"]), request),
     ),
     "walk to": MotionKind(
@@ -233,53 +236,53 @@ MOTIONS: Mapping[str, MotionKind] = {
             _STEP_LENGTH,
             _SPEED,
         ),
-        _walks_to,
+        _walk_to_tasks,
         lambda request: _frames_of_walk(
             _path_length(np.array([[request.asked["ahead"], request.asked["left"]]])), request
         ),
     ),
     "walk along": MotionKind(
         (_STEP_LENGTH, _SPEED),
-        _walks_along,
+        _walk_along_tasks,
         lambda request: _frames_of_walk(_path_length(_path(request)) + 2.0 * _TURN_PATH, request),
         file="a file of points, as walk along way.csv",
     ),
     "run": MotionKind(
         (Value("distance", 1.0, -LARGEST_TARGET, LARGEST_TARGET, "body heights"),),
-        _runs,
+        _run_tasks,
         lambda request: 170 + int(np.ceil(36 * abs(request.asked["distance"]) / _MIN_STEP)),
     ),
     "turn": MotionKind(
         (Value("heading_degrees", 90.0, -LARGEST_TURN, LARGEST_TURN, "degrees"), _SPEED),
-        _turns_on_the_spot,
+        _turn_tasks,
         lambda request: _frames_of_walk(_FULL_TURN_PATH * abs(request.asked["heading_degrees"]) / 360.0, request),
     ),
     "drive": MotionKind(
         (),
-        _drives,
+        _drive_tasks,
         lambda request: int(np.ceil(60.0 * _commands(request).seconds)) + _CLOSING_FRAMES,
         file="a file of speeds, as drive speeds.csv",
     ),
     "stand": MotionKind(
         (Value("seconds", 2.0, 0.0, 60.0, "seconds", is_exclusive=True),),
-        _stands,
+        _stand_tasks,
         lambda request: int(np.ceil(60.0 * request.asked["seconds"])) + _REST_FRAMES,
     ),
-    "get up": MotionKind((), _gets_up, lambda request: 900),
+    "get up": MotionKind((), _get_up_tasks, lambda request: 900),
     "dance": MotionKind(
         (
             Value("tempo", 90.0, 10.0, 400.0, "beats a minute"),
             Value("first", 1.0, 0.0, MAX_BEAT_TIME, "seconds"),
             Value("beats", 16.0, 2.0, MAX_BEATS, "beats", is_integer=True),
         ),
-        _dances,
+        _dance_tasks,
         lambda request: int(np.ceil(60.0 * _beats(request)[-1])) + _REST_FRAMES,
         jumps=True,
         beats=True,
     ),
     "trajectory": MotionKind(
         (),
-        _follows,
+        _trajectory_tasks,
         lambda request: int(np.ceil(60.0 * max(key.time for key in _keys(request)))) + TRAJECTORY_TAIL,
         file="a file of key frames, as trajectory keys.json",
     ),

@@ -80,7 +80,7 @@ class Roll:
         self._rest = body.mesh.nodes - body.centre_of_mass(body.mesh.nodes)
         com = stance.ground.local(body.centre_of_mass(stance.standing))
         self._start = com[:2]
-        self._sunk = self._radius(stance.standing) - self._over_ground(com)
+        self._compression = self._radius(stance.standing) - self._height_above_ground(com)
         self.places = route(StepLimits(_ROUTE_STEP * body.height, np.pi, side_fraction=1.0, faces_travel=False))
         check_route(stance, self.places)
         self.top_push = speed * _ACCELERATION * self._gravity
@@ -88,14 +88,14 @@ class Roll:
         self.table = VelocityProfile.from_path(
             self.places[:, :2], speed=speed * _SPEED * body.speed_unit, acceleration=self.top_push
         )
-        self._began: float | None = None
-        self._calm = RestDetector(body)
-        self._resting = False
+        self._start_time: float | None = None
+        self._rest_detector = RestDetector(body)
+        self._is_resting = False
 
     @property
     def is_at_rest(self) -> bool:
         """True if the body lies still at the end of its route."""
-        return self._resting
+        return self._is_resting
 
     @property
     def expected_time(self) -> float:
@@ -131,21 +131,21 @@ class Roll:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
         step."""
         body, axes, control = self.body, self.ground.axes, self.control
-        self._began = state.time if self._began is None else self._began
+        self._start_time = state.time if self._start_time is None else self._start_time
         local = self.ground.local(state.positions)
         com, moving = body.centre_of_mass(local), axes @ body.centre_of_mass(state.velocities)
-        elapsed = state.time - self._began
+        elapsed = state.time - self._start_time
         sample = self._profile_sample(com, elapsed, dt)
-        calm = self._calm.update(moving, state.time)
+        calm = self._rest_detector.update(moving, state.time)
         slow = bool(np.linalg.norm(moving) <= REST_SPEED * body.speed_unit)
-        self._resting = (calm and self._is_over(com, elapsed)) or (self._resting and slow)
+        self._is_resting = (calm and self._is_over(com, elapsed)) or (self._is_resting and slow)
         rate = _RATE / body.time_unit
         off = self._start + sample.position - com[:2]
         desired = sample.acceleration + 2.0 * rate * (sample.velocity - moving[:2]) + rate**2 * off
         inertia = body.inertia(state.positions)
         level = moving[:2] + dt * self._feasible_acceleration(desired, com, inertia, local, report)
-        radius = self._radius(state.positions) - self._sunk
-        climb = self._slope @ level + 6.0 / body.time_unit * (radius - self._over_ground(com))
+        radius = self._radius(state.positions) - self._compression
+        climb = self._slope @ level + 6.0 / body.time_unit * (radius - self._height_above_ground(com))
         velocity = np.array([*level, climb]) @ axes
         turning = np.cross(self.ground.surface_normal, velocity) / radius
         arms = state.positions - body.centre_of_mass(state.positions)
@@ -185,7 +185,7 @@ class Roll:
         Returns:
             (2,) m/s^2.
         """
-        height = max(self._over_ground(com), 0.2 * self.body.height)
+        height = max(self._height_above_ground(com), 0.2 * self.body.height)
         lever = height + 0.5 * (np.trace(inertia) - self.ground.axes[2] @ inertia @ self.ground.axes[2]) / (
             self.body.mass * height
         )
@@ -201,7 +201,7 @@ class Roll:
         pressed = com[:2] - uphill - lever / self._gravity * desired
         return (com[:2] - uphill - np.clip(pressed, middle - reach, middle + reach)) * self._gravity / lever
 
-    def _over_ground(self, com: np.ndarray) -> float:
+    def _height_above_ground(self, com: np.ndarray) -> float:
         """Return the height in metres of ``com`` (3,) above the ground, ground coordinates."""
         return float(com[2] - self._slope @ com[:2])
 

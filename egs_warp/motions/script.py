@@ -25,7 +25,7 @@ from egs_warp.motions.style import Style, read_style
 
 MOST_MOTIONS = 100
 _NAMES = ", ".join(MOTIONS)
-_FILE = "file of beats"
+_BEATS_FILE = "file of beats"
 """Key of the file of beats among the default values of a script."""
 
 
@@ -93,7 +93,7 @@ def motion(text: str, *, beats: str | None = None, **values: float | None) -> Sc
     defaults: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
     if beats is not None:
         beats_default = parse_beats(beats)
-        defaults |= {_FILE: beats_default} if isinstance(beats_default, Path) else beats_default
+        defaults |= {_BEATS_FILE: beats_default} if isinstance(beats_default, Path) else beats_default
     if text.strip().lower().endswith(".json") and "," not in text and len(text.split()) == 1:
         requests = _from_json(Path(text.strip()), defaults)
     else:
@@ -219,7 +219,7 @@ def _request(
     if file is not None and kind.file is None and not kind.beats:
         raise UserError(f"{where}: {kind.usage(name)}")
     if kind.beats and file is None and not values.keys() & known.keys():
-        file = defaults.get(_FILE)
+        file = defaults.get(_BEATS_FILE)
     if kind.beats and file is not None and values:
         raise UserError(f"{where}: {', '.join(values)} and the beats of {file} are both given; give one of them")
     resolved = {

@@ -24,9 +24,9 @@ from egs_warp.motions.style import Style
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-_ROLLED = 30.0
+_MIN_ROLL_ANGLE = 30.0
 """Degrees: a ball whose up axis has tilted by less than this has turned about up; otherwise it has rolled."""
-LATE = 0.03
+REMAINING_TIME_FRACTION = 0.03
 """Fraction of the elapsed time that is the estimate of the remaining time of a motion that takes longer than expected.
 """
 
@@ -80,7 +80,7 @@ class Stance:
         arms = self.standing - body.centre_of_mass(self.standing)
         turn = kabsch_rotation(body.node_mass, arms, positions - com)
         axes = self.ground.axes
-        if axes[2] @ turn @ axes[2] > np.cos(np.radians(_ROLLED)):
+        if axes[2] @ turn @ axes[2] > np.cos(np.radians(_MIN_ROLL_ANGLE)):
             axes = self.moved_to(positions).ground.axes
         normal = self.ground.surface_normal
         under = GroundFrame.on_plane(Plane(normal, -float(normal @ self.ground.origin)), axes[0], com, up=axes[2])
@@ -194,7 +194,7 @@ class MotionSequence:
         self._parts = list(parts)
         self._count = len(self._parts)
         self.done: list[MotionRecord] = []
-        self._dropped = self._rises = False
+        self._is_dropped = self._gets_up_next = False
         """True if a fall has ended the current motion; True if getting up is the next motion."""
 
     @property
@@ -204,14 +204,14 @@ class MotionSequence:
 
     @property
     def _resting(self) -> bool:
-        return bool(self.done) and (self._dropped or self.done[-1].motion.is_at_rest)
+        return bool(self.done) and (self._is_dropped or self.done[-1].motion.is_at_rest)
 
     def start_get_up(self, get_up: MotionTask, why: str) -> None:
         """End the current motion because the body has fallen, as ``why`` describes; ``get_up`` runs before the sequence
         continues."""
         self.done[-1].fell = why
         self._parts.insert(0, get_up)
-        self._dropped = self._rises = True
+        self._is_dropped = self._gets_up_next = True
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Return the objectives of the current motion for the time step of ``dt`` seconds from ``state``; start the
@@ -221,19 +221,19 @@ class MotionSequence:
             if stance.base() is SupportKind.ROUND_BASE:
                 self._stance = stance
             part = self._parts.pop(0)
-            self._dropped = self._rises = False
+            self._is_dropped = self._gets_up_next = False
             self.done.append(MotionRecord(part.name, part.asked, part.begin(stance), state.time))
         return self.done[-1].motion.objectives(state, report, dt)
 
     def time_left(self, time: float, expected: Sequence[float]) -> float:
         """Estimate the seconds from ``time`` until the last motion is at rest; ``expected`` are the durations of all
         motions, s."""
-        to_come = len(self._parts) - self._rises
+        to_come = len(self._parts) - self._gets_up_next
         later = sum(expected[len(expected) - to_come :])
         if not self.done or self._resting:
             return later
         past = time - self.done[-1].start_time
-        return later + max(self.done[-1].motion.expected_time - past, LATE * past)
+        return later + max(self.done[-1].motion.expected_time - past, REMAINING_TIME_FRACTION * past)
 
     def unfinished_note(self) -> list[str]:
         """Return messages for the user about motions that did not end or did not start."""

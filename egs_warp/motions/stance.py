@@ -23,7 +23,7 @@ from egs_warp.locomotion.stepper import StepReport
 
 SHEAR_BASIS = np.einsum("ki,j->kij", np.eye(3)[:2], np.eye(3)[2])
 """(2, 3, 3) change of a sheared pose per unit of lean forward and to the left."""
-_PINNED = 1e6
+_PIN_STIFFNESS = 1e6
 """Stiffness that pins a node, relative to the largest entry of the stiffness matrix."""
 SOLE_HEIGHT = 0.06
 """Body heights: nodes at most this far above a standing body's lowest node are its sole."""
@@ -342,7 +342,7 @@ class BalanceController:
         body, assembly, axes = self.body, self.body.assembly, self.ground.axes
         entries = assembly.hessian_entries(self._standing, projected=True)
         is_fixed = np.repeat(self._sole_share > 0.0, 3)
-        entries[assembly.diagonal_entries] += _PINNED * entries.max() * is_fixed
+        entries[assembly.diagonal_entries] += _PIN_STIFFNESS * entries.max() * is_fixed
         factors = MultifrontalLdl(assembly.upper_pattern, assembly.analysis)
         factors.update(entries)
         loads = np.stack([np.kron(body.node_mass, axis) for axis in axes[:2]], axis=1)

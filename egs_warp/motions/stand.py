@@ -46,19 +46,19 @@ class Stand:
             crouch: target height of the centre of mass as a fraction of its standing height.
         """
         self.body = stance.body
-        self.pose = BalanceController(
+        self.controller = BalanceController(
             stance.body, stance.ground, stance.standing, stance.contact_points, stance.friction
         )
         self._gravity = float(np.linalg.norm(stance.body.gravity))
         self._time_unit = float(np.sqrt(stance.body.height / self._gravity))
-        self._height = crouch * self.pose.standing_height
-        self._calm = RestDetector(stance.body)
-        self._resting = at_rest
+        self._height = crouch * self.controller.standing_height
+        self._rest_detector = RestDetector(stance.body)
+        self._is_resting = at_rest
 
     @property
     def is_at_rest(self) -> bool:
         """True if the body is at rest."""
-        return self._resting
+        return self._is_resting
 
     def notes(self) -> list[str]:
         """Return no messages: standing has no target."""
@@ -67,20 +67,20 @@ class Stand:
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
         step."""
-        measurement = self.pose.measure(state, report)
+        measurement = self.controller.measure(state, report)
         slow = bool(np.linalg.norm(measurement.velocity) <= REST_SPEED * np.sqrt(self._gravity * self.body.height))
-        self._resting = self._calm.update(measurement.velocity, state.time) or (self._resting and slow)
+        self._is_resting = self._rest_detector.update(measurement.velocity, state.time) or (self._is_resting and slow)
         rate = _RATE / self._time_unit
-        goal = np.array([*(measurement.foot_centre - self.pose.base_offset), self._height])
+        goal = np.array([*(measurement.foot_centre - self.controller.base_offset), self._height])
         acceleration = rate**2 * (goal - measurement.com) - 2.0 * rate * measurement.velocity
-        acceleration[:2] = self.pose.capture_acceleration(measurement, goal[:2])
+        acceleration[:2] = self.controller.capture_acceleration(measurement, goal[:2])
         acceleration[2] = max(acceleration[2], -0.8 * self._gravity)
         velocity = measurement.velocity + dt * acceleration
-        heading = self.pose.sole_heading(state.positions)
-        pose = self.pose.over_base(measurement.com + dt * velocity, measurement.foot_centre, heading)
-        upright = self.pose.turn_towards(measurement, pose) * 4.0 / self._time_unit
-        velocity, spin = self.pose.balance_targets(measurement, velocity, upright, dt)
-        return self.pose.objectives(
+        heading = self.controller.sole_heading(state.positions)
+        pose = self.controller.over_base(measurement.com + dt * velocity, measurement.foot_centre, heading)
+        upright = self.controller.turn_towards(measurement, pose) * 4.0 / self._time_unit
+        velocity, spin = self.controller.balance_targets(measurement, velocity, upright, dt)
+        return self.controller.objectives(
             state,
             measurement,
             com_velocity=velocity,
@@ -98,12 +98,12 @@ class StandFor:
     def __init__(self, stance: Stance, seconds: float) -> None:
         self.seconds, self._stand, self._stance = seconds, Stand(stance), stance
         self._started: float | None = None
-        self._over = False
+        self._is_over = False
 
     @property
     def is_at_rest(self) -> bool:
         """True if the time is over and the body is at rest."""
-        return self._over and self._stand.is_at_rest
+        return self._is_over and self._stand.is_at_rest
 
     @property
     def expected_time(self) -> float:
@@ -138,5 +138,5 @@ class StandFor:
         """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
         step."""
         self._started = state.time if self._started is None else self._started
-        self._over = state.time - self._started >= self.seconds - 1e-9
+        self._is_over = state.time - self._started >= self.seconds - 1e-9
         return self._stand.objectives(state, report, dt)

@@ -13,17 +13,17 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpPlan, JumpTarget
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.twist import AIRBORNE_SHARE, twist
+from egs_warp.motions.twist import AIRBORNE_FRACTION, twist
 
-TOLERANCE = np.radians(8.0)
+HEADING_TOLERANCE = np.radians(8.0)
 """Largest heading error in radians of a landing after which no further jump follows."""
 MAX_JUMPS = 5
-USUAL_JUMPS = 4.0 / 3.0
+EXPECTED_JUMPS = 4.0 / 3.0
 """Expected number of jumps for a turn that one jump should complete: a third of the landings miss by more than
-``TOLERANCE``, which takes another jump."""
-PYRAMID = 0.79
+``HEADING_TOLERANCE``, which takes another jump."""
+PYRAMID_FRICTION_RATIO = 0.79
 """Tangential force of a friction pyramid with four edges relative to Coulomb's cone, mean over all directions."""
-RESERVE = 0.8
+MAX_TURN_FRACTION = 0.8
 """Fraction of the largest possible turn that one jump requests."""
 
 
@@ -41,32 +41,32 @@ class Turn:
     def __init__(self, stance: Stance, target: JumpTarget, turn: float) -> None:
         self._stance, self._height = stance, target.height
         self._goal = stance.ground.origin + target.distance * stance.ground.axes[0]
-        self._left = turn
-        self._missing: float | None = None
+        self._remaining_turn = turn
+        self._remaining_after_jump: float | None = None
         """Predicted or measured remaining turn after the current jump, in radians; None before it is in the air."""
         first = twist(stance, target, turn)
-        self.max_turn_per_jump = RESERVE * largest_turn(first, stance)
+        self.max_turn_per_jump = MAX_TURN_FRACTION * largest_turn(first, stance)
         self._one_jump = abs(turn) <= self.max_turn_per_jump
-        self.jumps = [first if self._one_jump else twist(stance, target, self._share())]
+        self.jumps = [first if self._one_jump else twist(stance, target, self._next_turn())]
 
     @property
     def expected_time(self) -> float:
         """Expected duration in seconds of the jumps so far and those for the remaining turn."""
         before, at_once = len(self.jumps) - 1, self.max_turn_per_jump
-        if self._missing is None:
+        if self._remaining_after_jump is None:
             # The correction of a landing is a small turn, which succeeds.
-            count = before + (1.0 if before else USUAL_JUMPS) * max(abs(self._left) / at_once, 1.0)
+            count = before + (1.0 if before else EXPECTED_JUMPS) * max(abs(self._remaining_turn) / at_once, 1.0)
         else:
-            further = np.ceil(abs(self._missing) / at_once)
-            count = before + 1 + further * self._chance_of_another(abs(self._missing))
+            further = np.ceil(abs(self._remaining_after_jump) / at_once)
+            count = before + 1 + further * self._chance_of_another(abs(self._remaining_after_jump))
         return float(min(count, MAX_JUMPS)) * self.jumps[0].expected_time
 
     def _chance_of_another(self, missing: float) -> float:
         """Return the probability of another jump after a remaining turn of ``missing`` radians; in the air, the landing
         is uncertain."""
         if self.jumps[-1].phase is JumpPhase.FLIGHT:
-            return min(missing / (2.0 * TOLERANCE), 1.0)
-        return float(missing > TOLERANCE)
+            return min(missing / (2.0 * HEADING_TOLERANCE), 1.0)
+        return float(missing > HEADING_TOLERANCE)
 
     @property
     def is_at_rest(self) -> bool:
@@ -98,20 +98,24 @@ class Turn:
         step."""
         result = self.jumps[-1].objectives(state, report, dt)
         jump = self.jumps[-1]
-        self._missing = self._left - jump.facing.predicted_heading if jump.phase is JumpPhase.FLIGHT else None
+        self._remaining_after_jump = (
+            self._remaining_turn - jump.facing.predicted_heading if jump.phase is JumpPhase.FLIGHT else None
+        )
         if jump.phase in (JumpPhase.LAND, JumpPhase.REST):
             # The frame of a landed jump is rotated by the requested turn, so the heading of its feet in it is the
             # error.
-            self._missing = self._left - jump.facing.target_heading - jump.pose.sole_heading(state.positions)
-            if jump.is_at_rest and len(self.jumps) < MAX_JUMPS and abs(self._missing) > TOLERANCE:
-                self._left, self._missing = self._missing, None
+            self._remaining_after_jump = (
+                self._remaining_turn - jump.facing.target_heading - jump.controller.sole_heading(state.positions)
+            )
+            if jump.is_at_rest and len(self.jumps) < MAX_JUMPS and abs(self._remaining_after_jump) > HEADING_TOLERANCE:
+                self._remaining_turn, self._remaining_after_jump = self._remaining_after_jump, None
                 self.jumps.append(self._next_jump(state))
                 result = self.jumps[-1].objectives(state, report, dt)
         return result
 
-    def _share(self) -> float:
+    def _next_turn(self) -> float:
         """Return the turn in radians of one of the equal jumps that the remaining turn takes."""
-        return self._left / float(np.ceil(abs(self._left) / self.max_turn_per_jump))
+        return self._remaining_turn / float(np.ceil(abs(self._remaining_turn) / self.max_turn_per_jump))
 
     def _next_jump(self, state: BodyState) -> Jump:
         stance = self._stance.moved_to(state.positions)
@@ -121,7 +125,7 @@ class Turn:
             stance = stance.with_forward(offset)
         else:
             distance = 0.0
-        return twist(stance, JumpTarget(distance, self._height), self._share())
+        return twist(stance, JumpTarget(distance, self._height), self._next_turn())
 
 
 def largest_turn(jump: Jump, stance: Stance) -> float:
@@ -136,5 +140,5 @@ def largest_turn(jump: Jump, stance: Stance) -> float:
     # Points are denser at the rim of a sole; over a disc the mean distance is 2/3 of the radius.
     lever = min(float(np.linalg.norm(arms, axis=1).mean()), 2.0 / 3.0 * float(np.linalg.norm(arms, axis=1).max()))
     impulse = body.mass * (plan.speed_up + jump.gravity * plan.thrust_time)
-    rate = PYRAMID * stance.friction * lever * impulse / float(up @ body.inertia(stance.standing) @ up)
-    return rate * AIRBORNE_SHARE * plan.flight_time
+    rate = PYRAMID_FRICTION_RATIO * stance.friction * lever * impulse / float(up @ body.inertia(stance.standing) @ up)
+    return rate * AIRBORNE_FRACTION * plan.flight_time

@@ -13,13 +13,13 @@ from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import BalanceController, Measurement
 
-AIRBORNE_SHARE = 0.88
+AIRBORNE_FRACTION = 0.88
 """Fraction of the planned flight time in which the body is off the ground: it stretches before take-off and before
 landing."""
-SPARE_SPIN = 1.15
+SPIN_FACTOR = 1.15
 """Factor on the spin of the thrust: muscles fall short of the objective, and the wide body in the air turns more
 slowly."""
-SLIDE = np.radians(5.0)
+LANDING_SLIDE_ANGLE = np.radians(5.0)
 """Angle in radians by which the feet slide on while friction stops the spin on landing."""
 MAX_WIDTH = 1.15
 """Largest width of the body in the air relative to standing; 1 / ``MAX_WIDTH`` is the smallest."""
@@ -42,34 +42,44 @@ class TurnHeading:
         self.heading += float(np.remainder(heading - self.heading + np.pi, 2.0 * np.pi) - np.pi)
 
     def thrust_momentum(
-        self, pose: BalanceController, measurement: Measurement, upright: np.ndarray, *, left: float, flight_time: float
+        self,
+        controller: BalanceController,
+        measurement: Measurement,
+        upright: np.ndarray,
+        *,
+        left: float,
+        flight_time: float,
     ) -> np.ndarray:
         """Return the angular momentum (3,) in kg m^2/s with which the body in the air turns upright and by the
         remaining heading change.
 
         The body flies in about its standing shape, so the standing inertia applies, not that of the crouch.
         """
-        up, rotation = pose.ground.axes[2], measurement.rotation
+        up, rotation = controller.ground.axes[2], measurement.rotation
         inertia = rotation @ self._standing_inertia @ rotation.T
         momentum = float(up @ measurement.angular_momentum)
         spinning = momentum / float(up @ inertia @ up)
-        airborne = AIRBORNE_SHARE * flight_time + 0.5 * left
-        turn = SPARE_SPIN * self._left_to_turn() - 0.5 * left * spinning
+        airborne = AIRBORNE_FRACTION * flight_time + 0.5 * left
+        turn = SPIN_FACTOR * self._remaining_turn() - 0.5 * left * spinning
         return inertia @ spin_for_rotation(inertia, upright, turn * up, airborne)
 
     def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: float) -> np.ndarray:
         """Widen or narrow ``pose`` so that the present spin completes the remaining turn, as skaters do with their
         arms."""
-        to_turn, turning = self._left_to_turn(), float(up @ momentum) * left / float(up @ self._standing_inertia @ up)
+        to_turn, turning = self._remaining_turn(), float(up @ momentum) * left / float(up @ self._standing_inertia @ up)
         self.predicted_heading = self.heading + turning
         ratio = turning / to_turn if turning * to_turn > 0.0 else np.inf
         width = float(np.sqrt(np.clip(ratio, 1.0 / MAX_WIDTH**2, MAX_WIDTH**2)))
         return pose @ (width * np.eye(3) + (1.0 - width) * np.outer(up, up))
 
-    def landed_heading(self, pose: BalanceController, positions: np.ndarray) -> float:
+    def landed_heading(self, controller: BalanceController, positions: np.ndarray) -> float:
         """Return the heading of the feet: a missing turn is not corrected by a twisted stance."""
-        return pose.sole_heading(positions)
+        return controller.sole_heading(positions)
 
-    def _left_to_turn(self) -> float:
+    def _remaining_turn(self) -> float:
         """Return the remaining turn in radians until touch-down; the feet then slide on."""
-        return self.target_heading - np.sign(self.target_heading) * min(SLIDE, abs(self.target_heading)) - self.heading
+        return (
+            self.target_heading
+            - np.sign(self.target_heading) * min(LANDING_SLIDE_ANGLE, abs(self.target_heading))
+            - self.heading
+        )

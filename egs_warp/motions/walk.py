@@ -44,9 +44,9 @@ MAX_LAG = 0.5
 """Mean lag of the feet, in steps, beyond which a step is repeated."""
 MIN_STEP_LENGTH = 0.002
 """Smallest step length in body heights."""
-_SHIFT, _GATHER, _REST = 1.5, 3.0, 1.0
+_SHIFT_TIME, _GATHER_TIME, _REST_TIME = 1.5, 3.0, 1.0
 """Durations of the first and the last phase, and of standing afterwards, in sqrt(H / g)."""
-_PLAN_STEP, _PLANNED = 1.0 / 12.0, 8
+_PLAN_STEP, _PLANNED_PHASES = 1.0 / 12.0, 8
 """Time step of a plan in sqrt(H / g), and number of phases that it covers."""
 
 
@@ -191,14 +191,21 @@ class Walk:
         before, after = self._foot_targets(elapsed - dt), self._foot_targets(elapsed)
         pose = self._posture.pose(com, self._heading(elapsed - dt), before)
         next_pose = self._posture.pose(com + dt * com_velocity, self._heading(elapsed), after)
-        spin = control.turn_rate / self._time_unit * self._turn(local, pose) + self._turn(pose, next_pose) / dt
+        spin = (
+            control.turn_rate / self._time_unit * self._best_fit_rotation(local, pose)
+            + self._best_fit_rotation(pose, next_pose) / dt
+        )
         follow = min(control.follow / self._time_unit, 0.7 / dt)
         return [
             centre_of_mass_velocity(body, com_velocity @ axes, self._posture.com_weight),
             AngularMomentumObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
             node_velocities(body, follow * (next_pose - local) @ axes, control.pose),
             *(self._foot_objective(index, local, before, after, elapsed, dt) for index in self.swinging),
-            *(self._unload_objectives(index, elapsed) for index in self.swinging if elapsed < self.gait.carried_until),
+            *(
+                self._unload_objectives(index, elapsed)
+                for index in self.swinging
+                if elapsed < self.gait.transfer_end_time
+            ),
             *([self._no_slip_objectives(report, elapsed)] if report is not None else []),
         ]
 
@@ -207,7 +214,7 @@ class Walk:
             self._enter(WalkPhase.SHIFT, time, local)
         assert self._entered is not None
         elapsed, gait = time - self._entered + 1e-9, self.gait
-        if self.swinging and elapsed >= gait.carried_until:
+        if self.swinging and elapsed >= gait.transfer_end_time:
             loads = foot_loads(self.feet, report, self.body.weight)
             for index in self.swinging:
                 if loads[index] > MIN_FOOT_LOAD or (elapsed >= gait.swing_time and self._planner.is_down(index, local)):
@@ -269,11 +276,11 @@ class Walk:
     def _duration(self, phase: WalkPhase) -> float:
         """Return the duration of a phase in seconds."""
         return {
-            WalkPhase.SHIFT: _SHIFT * self._time_unit,
+            WalkPhase.SHIFT: _SHIFT_TIME * self._time_unit,
             WalkPhase.SWING: self.gait.swing_time,
             WalkPhase.STAND: self.gait.double_time,
-            WalkPhase.GATHER: (_GATHER + _REST) * self._time_unit,
-            WalkPhase.REST: _REST * self._time_unit,
+            WalkPhase.GATHER: (_GATHER_TIME + _REST_TIME) * self._time_unit,
+            WalkPhase.REST: _REST_TIME * self._time_unit,
         }[phase]
 
     def _has_landed(self, index: int, local: np.ndarray) -> None:
@@ -319,7 +326,7 @@ class Walk:
                 if phase is WalkPhase.SHIFT:
                     fractions = np.array([smooth(fraction) for fraction in fractions])
                 elif phase is WalkPhase.GATHER:
-                    fractions = np.array([smooth(fraction * (_GATHER + _REST)) for fraction in fractions])
+                    fractions = np.array([smooth(fraction * (_GATHER_TIME + _REST_TIME)) for fraction in fractions])
                 pressure = start + fractions[:, None] * (end - start)
             pieces.append(pressure)
         return PendulumPlan.from_pressure(np.concatenate(pieces), step, self._rate)
@@ -328,7 +335,7 @@ class Walk:
         """Yield the current and future phases, each with the centre of pressure (n, 2) every ``step`` seconds that is
         nearest to the planned centre of mass."""
         footprints, phase, swing = self._footprints.copy(), self.phase, self.swing
-        for _ in range(_PLANNED):
+        for _ in range(_PLANNED_PHASES):
             count = max(round(self._duration(phase) / step), 1)
             targets = np.array([self._com_at(self._progress(phase, swing, (k + 0.5) * step)) for k in range(count)])
             if phase is not WalkPhase.SWING:
@@ -364,7 +371,7 @@ class Walk:
         )
         pressed = nearest_in_hull(under, pressure + self.control.balance * off)
         self._target_pressure = pressed
-        if self.swinging and elapsed < self.gait.carried_until:
+        if self.swinging and elapsed < self.gait.transfer_end_time:
             left = max(self.gait.swing_time - elapsed, 0.0)
             caught = drift(off, pressed - pressure, float(np.exp(self._rate * left)))
             caught *= min(1.0, self._posture.capture_range / max(float(np.linalg.norm(caught)), 1e-12))
@@ -406,13 +413,13 @@ class Walk:
     def _no_slip_objectives(self, report: StepReport, elapsed: float) -> Objective:
         """Return the objective that standing feet do not slide, nor lifted feet before they move forward."""
         contacts = report.contacts
-        ahead = self.swinging if elapsed > self.gait.carried_from else ()
+        ahead = self.swinging if elapsed > self.gait.transfer_start_time else ()
         stands = ~np.isin(foot_of_contact(self.feet, contacts), ahead)
         return no_slip_contacts(
             contacts, np.where(stands, report.forces[:, 0], 0.0) / self.body.weight, self._posture.stance_weight
         )
 
-    def _turn(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    def _best_fit_rotation(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Return the (3,) best-fit rotation (Kabsch) from ``before`` (N, 3) to ``after`` (N, 3) as a rotation
         vector."""
         arms, aims = (x - self.body.centre_of_mass(x) for x in (before, after))

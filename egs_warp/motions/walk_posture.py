@@ -49,7 +49,7 @@ MIN_LEG_LENGTH = 0.2
 """Shortest legs in body heights; with shorter ones, a body moves as on a single base."""
 MAX_SEQUENTIAL_FEET = 4
 """Number of feet from which on several feet stand while one swings."""
-_SOLE = 0.02
+_SOLE_HEIGHT = 0.02
 """Body heights: nodes of a base at most this high are its sole."""
 _MAX_LEAN = 0.5
 """Largest lean: horizontal displacement per height."""
@@ -200,7 +200,7 @@ def select_posture(stance: Stance) -> tuple[tuple[Foot, ...], type[LeggedPosture
         return feet, RockingPosture
     if base in (SupportKind.LYING, SupportKind.ROUND_BASE):
         return (), RockingPosture
-    return split_base(standing[:, :2], heights, np.flatnonzero(heights < _SOLE * height), height), RockingPosture
+    return split_base(standing[:, :2], heights, np.flatnonzero(heights < _SOLE_HEIGHT * height), height), RockingPosture
 
 
 def _width(sole: np.ndarray) -> float:

@@ -14,7 +14,7 @@ from egs_warp.locomotion.objectives import LoadObjective
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory, measure
-from egs_warp.motions.crawl import STRAIN, Crawl
+from egs_warp.motions.crawl import MAX_STRAIN, Crawl
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.gait_selection import move_along, turn_in_place
 from egs_warp.motions.route import Route, path_route, straight_route
@@ -53,7 +53,7 @@ def crawled(route: Route) -> Crawled:
     assert crawl.is_at_rest and crawl.notes() == []
     recorder = Recorder(made.stepper.body, made.stepper.muscles, made.stepper.geometry, made.start, 0.0, drag=0.0)
     recorder.add(reports)
-    place = crawl._place_of(made.place.ground.local(state.positions))
+    place = crawl._planar_pose(made.place.ground.local(state.positions))
     return Crawled(crawl, recorder.trajectory(), reports, place)
 
 
@@ -76,8 +76,8 @@ def test_a_stride_strains_it_by_no_more_than_it_may() -> None:
         moved, rest = (pose - crawl._standing)[order, 0], along_it[order]
         apart = np.diff(rest) > 0.1
         most = max(most, float(np.abs(np.diff(moved)[apart] / np.diff(rest)[apart]).max()))
-    assert 0.7 * STRAIN < most < 1.01 * STRAIN
-    assert crawl._pose(crawl._round) == pytest.approx(crawl._placed(crawl._to))
+    assert 0.7 * MAX_STRAIN < most < 1.01 * MAX_STRAIN
+    assert crawl._pose(crawl._round) == pytest.approx(crawl._posed_nodes(crawl._to))
     assert crawl._pose(0.0) == pytest.approx(crawl._standing)
 
 

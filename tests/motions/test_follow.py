@@ -49,12 +49,12 @@ def test_each_quantity_is_measured_in_its_unit_along_forward_left_up(place: Stan
     omega = np.array([0.0, 2.0, 0.0])
     velocities = height * np.array([-0.5, 0.7, 0.0]) + np.cross(omega, positions - follow.parts[part].centre(positions))
     state = BodyState(positions, velocities)
-    assert np.allclose(follow._measured(part, Quantity.POSITION, state), [0.1, 0.2, 0.3])
-    assert np.allclose(follow._measured(part, Quantity.ORIENTATION, state), [0.0, 0.0, 30.0])
-    assert np.allclose(follow._measured(part, Quantity.VELOCITY, state), [0.7, 0.5, 0.0])
+    assert np.allclose(follow._measure(part, Quantity.POSITION, state), [0.1, 0.2, 0.3])
+    assert np.allclose(follow._measure(part, Quantity.ORIENTATION, state), [0.0, 0.0, 30.0])
+    assert np.allclose(follow._measure(part, Quantity.VELOCITY, state), [0.7, 0.5, 0.0])
     arms = positions[nodes] - follow.parts[part].centre(positions)
     spin = (body.node_mass[nodes, None] * np.cross(arms, np.cross(omega, arms))).sum(axis=0) / (body.mass * height**2)
-    assert np.allclose(follow._measured(part, Quantity.ANGULAR_MOMENTUM, state), [spin[1], -spin[0], spin[2]])
+    assert np.allclose(follow._measure(part, Quantity.ANGULAR_MOMENTUM, state), [spin[1], -spin[0], spin[2]])
 
 
 def test_a_position_key_asks_for_the_speed_of_its_curve(place: Stance) -> None:

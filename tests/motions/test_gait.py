@@ -74,6 +74,8 @@ def test_a_foot_is_steered_bit_by_bit_and_goes_ahead_only_when_it_is_up() -> Non
     times."""
     steered = [GAIT.steering_progress(s) for s in (0.0, 0.1, 0.2, 0.3, 1.0)]
     assert steered[0] == 0.0 and steered[3:] == [1.0, 1.0] and np.all(np.diff(steered[:4]) > 0.0)
-    assert GAIT.transfer_progress(GAIT.carried_from / GAIT.swing_time) == 0.0
-    assert GAIT.transfer_progress(GAIT.carried_until / GAIT.swing_time) == pytest.approx(1.0)
-    assert 0.0 < GAIT.transfer_progress(0.5 * (GAIT.carried_from + GAIT.carried_until) / GAIT.swing_time) < 1.0
+    assert GAIT.transfer_progress(GAIT.transfer_start_time / GAIT.swing_time) == 0.0
+    assert GAIT.transfer_progress(GAIT.transfer_end_time / GAIT.swing_time) == pytest.approx(1.0)
+    assert (
+        0.0 < GAIT.transfer_progress(0.5 * (GAIT.transfer_start_time + GAIT.transfer_end_time) / GAIT.swing_time) < 1.0
+    )

@@ -16,7 +16,7 @@ from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.fall_monitor import FallMonitor
-from egs_warp.motions.get_up import _TRIES, GetUp, GetUpPhase, lie_down
+from egs_warp.motions.get_up import _ATTEMPTS, GetUp, GetUpPhase, lie_down
 from egs_warp.motions.sequence import MotionSequence, MotionTask
 from egs_warp.motions.stand import Stand, StandFor
 from tests.support.creatures import CoarseCreature, coarse_creature
@@ -82,8 +82,8 @@ def test_it_turns_as_a_whole_about_the_edge_of_its_base() -> None:
 
 def test_each_try_pushes_otherwise() -> None:
     """No failed attempt is repeated unchanged."""
-    assert len(set(_TRIES)) == len(_TRIES) >= 3
-    assert all(push > 0.0 and in_hand > 0.0 for push, in_hand in _TRIES)
+    assert len(set(_ATTEMPTS)) == len(_ATTEMPTS) >= 3
+    assert all(push > 0.0 and in_hand > 0.0 for push, in_hand in _ATTEMPTS)
 
 
 def test_a_body_that_is_caught_is_held_low() -> None:
@@ -119,8 +119,8 @@ def test_it_gives_up_after_its_tries() -> None:
         get_up.objectives(replace(state, time=step * DT), None, DT)
         if get_up.is_at_rest:
             break
-    assert get_up.phase is GetUpPhase.GIVEN_UP and not get_up.up and get_up.tries == len(_TRIES)
-    assert get_up.notes() == [f"the body does not get up: it lies after {len(_TRIES)} tries"]
+    assert get_up.phase is GetUpPhase.GIVEN_UP and not get_up.up and get_up.tries == len(_ATTEMPTS)
+    assert get_up.notes() == [f"the body does not get up: it lies after {len(_ATTEMPTS)} tries"]
 
 
 @cache

@@ -10,7 +10,7 @@ import pytest
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
-from egs_warp.motions.jump import BASE_SWING, MAX_FOOTHOLD_OFFSET, Jump
+from egs_warp.motions.jump import BASE_SWING_WEIGHT, MAX_FOOTHOLD_OFFSET, Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget, stopping_time
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.twist import TurnHeading
@@ -29,7 +29,7 @@ def test_a_landing_frame_holds_the_landed_body(place: Stance) -> None:
     assert jump.phase is JumpPhase.FLIGHT and jump.is_airborne
     landed = moved(place, 0.8, np.array([0.5, 0.0, 0.1]))
     assert np.allclose(jump.ground.local(landed), start)
-    assert jump.pose.measure(BodyState(landed, 0 * landed), None).heading == pytest.approx(0.0, abs=1e-9)
+    assert jump.controller.measure(BodyState(landed, 0 * landed), None).heading == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(("distance", "lean"), [(0.0, 0.0), (0.3, 0.045), (2.0, 0.07)])
@@ -81,7 +81,7 @@ def test_what_has_taken_off_takes_up_its_pose_gently() -> None:
         swung = [one for one in asked if isinstance(one, Objective) and one.name == "sole velocity"]
         weights.append(swung[0].weight)
     assert jump.phase is JumpPhase.FLIGHT
-    assert 0.0 < weights[0] < 0.05 * BASE_SWING and weights[1] == BASE_SWING
+    assert 0.0 < weights[0] < 0.05 * BASE_SWING_WEIGHT and weights[1] == BASE_SWING_WEIGHT
 
 
 @pytest.mark.parametrize(("com_speed", "flat"), [(1.0, True), (-1.0, False)])
@@ -112,10 +112,10 @@ def test_feet_come_down_so_far_ahead_that_the_body_stops_over_them(toes: float) 
     state = BodyState(place.standing + [0.0, 0.0, 0.3], np.tile([speed, 0.0, -1.0], (len(place.standing), 1)), 0.01)
     jump.objectives(state, None, DT)
     assert jump.phase is JumpPhase.FLIGHT
-    seen = jump.pose.measure(state, None)
-    down = np.array([0.1, 0.0, jump.pose.standing_height])
+    seen = jump.controller.measure(state, None)
+    down = np.array([0.1, 0.0, jump.controller.standing_height])
     left = 0.1
-    stop = stopping_time(jump.pose.standing_height, left * 9.81 + 1.0, 9.81)
+    stop = stopping_time(jump.controller.standing_height, left * 9.81 + 1.0, 9.81)
     placed = jump._foothold(state, seen, down, left)  # pyright: ignore[reportPrivateUsage]
-    ahead = down[0] + stop * speed + jump.pose.base_offset[0] - placed[0]
+    ahead = down[0] + stop * speed + jump.controller.base_offset[0] - placed[0]
     assert ahead == pytest.approx(MAX_FOOTHOLD_OFFSET * toes)

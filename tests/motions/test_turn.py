@@ -19,7 +19,7 @@ from tests.support.stances import DT, moved
 def land(jump: Jump, state: BodyState) -> None:
     """Put a jump where it has landed and come to rest but for the last step."""
     jump.phase, jump._entered = JumpPhase.LAND, -100.0
-    jump.pose = jump._landing
+    jump.controller = jump._landing
 
 
 def test_a_turn_that_falls_short_is_made_up_where_it_began(place: Stance) -> None:

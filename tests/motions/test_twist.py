@@ -12,7 +12,7 @@ from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
 from egs_warp.motions.jump import FORWARD_TIME_FRACTION, Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.twist import AIRBORNE_SHARE, SLIDE, SPARE_SPIN, twist
+from egs_warp.motions.twist import AIRBORNE_FRACTION, LANDING_SLIDE_ANGLE, SPIN_FACTOR, twist
 from tests.support.meshes import box_mesh
 from tests.support.stances import DT, block_place, moved
 
@@ -48,7 +48,7 @@ def test_a_twist_asks_friction_for_the_spin_that_is_left(turn: float) -> None:
     asked = sign * np.array([yaw_asked(jump, state) for state in states])
     slope, start = np.polyfit(angles, asked, 1)
     assert np.allclose(asked, start + slope * angles, rtol=1e-6)
-    assert np.degrees(abs(turn) + start / slope) == pytest.approx(np.degrees(SLIDE), abs=1e-3)
+    assert np.degrees(abs(turn) + start / slope) == pytest.approx(np.degrees(LANDING_SLIDE_ANGLE), abs=1e-3)
     reserve = -slope * jump.plan.flight_time / inertia_about_up(place, place.standing)
     assert 1.1 < reserve < 1.7
     crouched = moved(place, float(sign * 0.6), np.zeros(3))
@@ -71,8 +71,8 @@ def test_a_twist_gathers_its_spin_as_the_speed_up_is_gathered(place: Stance) -> 
         velocities[:, 2] = risen * jump.plan.speed_up
         asked = yaw_asked(jump, BodyState(place.standing, velocities, 0.0))
         left = (1.0 - risen) * jump.plan.thrust_time
-        whole = inertia_about_up(place, place.standing) * (1.0 - SLIDE) * SPARE_SPIN
-        whole /= AIRBORNE_SHARE * jump.plan.flight_time + 0.5 * left
+        whole = inertia_about_up(place, place.standing) * (1.0 - LANDING_SLIDE_ANGLE) * SPIN_FACTOR
+        whole /= AIRBORNE_FRACTION * jump.plan.flight_time + 0.5 * left
         shares.append(asked / whole)
         assert shares[-1] == pytest.approx(DT / (FORWARD_TIME_FRACTION * left), rel=5e-3)
     assert shares[1] == pytest.approx(2.0 * shares[0], rel=5e-3)
@@ -83,7 +83,7 @@ def test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn(
     remaining time is L t / angle. The target shape is approached at one rate; at the spin that fits the standing shape,
     the target is zero."""
     turn, speed = 1.5, 2.5
-    left = turn - SLIDE
+    left = turn - LANDING_SLIDE_ANGLE
     time = 2.0 * speed / 9.81
     corners = [int(np.argmin(np.linalg.norm(place.standing - [x, x, 0.0], axis=1))) for x in (-0.2, 0.2)]
     arms = place.standing - place.body.centre_of_mass(place.standing)

@@ -278,7 +278,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("the largest turn: the pyramid of friction", "motions/turn.py"),
-            *("rate = PYRAMID * place.friction", "rate = place.friction"),
+            *("rate = PYRAMID_FRICTION_RATIO * stance.friction", "rate = stance.friction"),
             "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground",
         ),
         (
@@ -288,7 +288,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("twist: the time of flight", "motions/twist.py"),
-            *("airborne = AIRBORNE_SHARE * flight_time", "airborne = 2.0 * AIRBORNE_SHARE * flight_time"),
+            *("airborne = AIRBORNE_FRACTION * flight_time", "airborne = 2.0 * AIRBORNE_FRACTION * flight_time"),
             "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
         ),
         (
