@@ -109,10 +109,10 @@ class Crawl:
         stride = MAX_STRAIN * length * _CARRIED_FRACTION / (_MAX_SLOPE * (1.0 - _CARRIED_FRACTION))
         aside = _SIDE_STRIDE * body.height
         self.pace = StepLimits(stride, 2.0 * aside / length, side_fraction=min(aside / stride, 1.0), faces_travel=False)
-        self.places = route(self.pace)
-        check_route(stance, self.places)
-        self._next, self._from, self._to = 1, np.zeros(3), self.places[1]
-        """Index of the current goal in ``places``; planar poses of the body before and after this round."""
+        self.planar_poses = route(self.pace)
+        check_route(stance, self.planar_poses)
+        self._next, self._from, self._to = 1, np.zeros(3), self.planar_poses[1]
+        """Index of the current goal in ``planar_poses``; planar poses of the body before and after this round."""
         self._speed, self._length = speed, length
         self._round = self._duration()
         """Seconds."""
@@ -126,7 +126,7 @@ class Crawl:
     @property
     def seconds(self) -> float:
         """Duration of all rounds in seconds, if none slides back."""
-        return self._round * (len(self.places) - 1)
+        return self._round * (len(self.planar_poses) - 1)
 
     @property
     def expected_time(self) -> float:
@@ -140,7 +140,7 @@ class Crawl:
 
     def plan_record(self) -> CrawlPlan:
         """Return the planned quantities of the motion."""
-        return CrawlPlan(float(len(self.places) - 1), self.pace.length, self.seconds)
+        return CrawlPlan(float(len(self.planar_poses) - 1), self.pace.length, self.seconds)
 
     def planned_com(self, elapsed: float) -> None:
         """Return None: each round starts from the measured body."""
@@ -207,21 +207,21 @@ class Crawl:
     def _aim(self) -> tuple[np.ndarray, bool]:
         """Return the planar pose (3,) for the end of this round, and True if the crawl is over."""
         while (
-            self._next < len(self.places) - 1
-            and self._stride_count(self.places[self._next] - self._from) < _ADVANCE_DISTANCE
+            self._next < len(self.planar_poses) - 1
+            and self._stride_count(self.planar_poses[self._next] - self._from) < _ADVANCE_DISTANCE
         ):
             self._next += 1
-        missing = self._stride_count(self.places[self._next] - self._from)
-        left = missing + len(self.places) - 1 - self._next
+        missing = self._stride_count(self.planar_poses[self._next] - self._from)
+        left = missing + len(self.planar_poses) - 1 - self._next
         if left < self._nearest - _MIN_PROGRESS:
             self._nearest, self._fruitless = left, 0
         else:
             self._fruitless += 1
         over = (
-            self._next == len(self.places) - 1 and missing <= _ARRIVAL_TOLERANCE
+            self._next == len(self.planar_poses) - 1 and missing <= _ARRIVAL_TOLERANCE
         ) or self._fruitless > _MAX_FRUITLESS_ROUNDS
         share = 0.0 if over else min(1.0, 1.0 / max(missing, 1e-12))
-        return self._from + share * (self.places[self._next] - self._from), over
+        return self._from + share * (self.planar_poses[self._next] - self._from), over
 
     def _stride_count(self, change: np.ndarray) -> float:
         """Return the number of strides that a ``change`` of the planar pose (3,) takes."""
@@ -230,9 +230,9 @@ class Crawl:
         strides = float(np.hypot(ahead, aside / self.pace.side_fraction)) / self.pace.length
         return strides + abs(float(change[2])) / self.pace.turn
 
-    def _remaining_strides(self, place: np.ndarray) -> float:
-        """Return the number of strides from the planar pose ``place`` (3,) to the end of the route."""
-        return self._stride_count(self.places[-1] - place)
+    def _remaining_strides(self, planar_pose: np.ndarray) -> float:
+        """Return the number of strides from ``planar_pose`` (3,) to the end of the route."""
+        return self._stride_count(self.planar_poses[-1] - planar_pose)
 
     def _planar_pose(self, local: np.ndarray) -> np.ndarray:
         """Return the planar pose (3,) of the body with its nodes at ``local`` (N, 3). Its heading is unwrapped to the
@@ -260,11 +260,11 @@ class Crawl:
         pose[:, 2:] += _LIFT * self.body.height * 4.0 * carried * (1.0 - carried)
         return pose
 
-    def _posed_nodes(self, place: np.ndarray) -> np.ndarray:
-        """Return the nodes (N, 3) of the resting body moved to the planar pose ``place`` (3,), as in
+    def _posed_nodes(self, planar_pose: np.ndarray) -> np.ndarray:
+        """Return the nodes (N, 3) of the resting body moved to ``planar_pose`` (3,), as in
         ``motions.route``."""
-        turn = Rotation.from_rotvec([0.0, 0.0, place[2]]).as_matrix()
-        moved = np.array([*place[:2], self._slope @ place[:2]])
+        turn = Rotation.from_rotvec([0.0, 0.0, planar_pose[2]]).as_matrix()
+        moved = np.array([*planar_pose[:2], self._slope @ planar_pose[:2]])
         return self._centre + moved + (self._standing - self._centre) @ turn.T
 
     def _no_slip_objective(self, report: StepReport, swings: np.ndarray) -> Objective:

@@ -32,12 +32,12 @@ _MAX_SPEED_FACTOR = 1.6
 
 
 def integrate_command(
-    place: np.ndarray, command: Drive, time: float, pace: StepLimits, *, unit: float, height: float
+    planar_pose: np.ndarray, command: Drive, time: float, pace: StepLimits, *, unit: float, height: float
 ) -> np.ndarray:
-    """Return the planar pose (3,) ``time`` seconds after ``place`` (3,) under ``command``, at most one step away.
+    """Return the planar pose (3,) ``time`` seconds after ``planar_pose`` (3,) under ``command``, at most one step away.
 
     Args:
-        place: (3,) x and y in metres, heading in radians.
+        planar_pose: (3,) x and y in metres, heading in radians.
         command: velocity command.
         time: s.
         pace: limits of one step.
@@ -48,10 +48,10 @@ def integrate_command(
     share = 1.0 / max(duration * _effort(command, pace, height), 1.0)
     turn = share * duration * command.turn
     # The body moves along an arc; this is the direction of its chord.
-    middle = place[2] + 0.5 * turn
+    middle = planar_pose[2] + 0.5 * turn
     ahead, left = share * duration * height * np.array([command.forward, command.sideways * (pace.side_fraction > 0.0)])
     cos, sin = np.cos(middle), np.sin(middle)
-    return place + [cos * ahead - sin * left, sin * ahead + cos * left, turn]
+    return planar_pose + [cos * ahead - sin * left, sin * ahead + cos * left, turn]
 
 
 def _effort(command: Drive, pace: StepLimits, height: float) -> float:
@@ -72,17 +72,17 @@ class DrivenWalk(Walk):
     def _plan_swing(self, swing: int, local: np.ndarray) -> None:
         if self._mean_lag(local) > MAX_LAG:
             # Continue from where slipping feet have left the body.
-            self.places[min(swing, self.gait.step_count), :2] -= self._foothold_error(local).mean(axis=0)
+            self.planar_poses[min(swing, self.gait.step_count), :2] -= self._foothold_error(local).mean(axis=0)
         self._lay_places(swing)
 
     def _lay_places(self, swing: int) -> None:
         """Plan the planar poses from swing ``swing`` on; the pose of that index has been reached."""
-        places_so_far = list(self.places[: swing + 1])
+        places_so_far = list(self.planar_poses[: swing + 1])
         places_so_far += [places_so_far[-1]] * (swing + 1 - len(places_so_far))
         if self.command.is_zero:
             if swing >= self.gait.step_count and swing > 0:
                 return  # The feet are already closing.
-            places = places_so_far if swing > 0 else [*places_so_far, places_so_far[-1]]
+            planar_poses = places_so_far if swing > 0 else [*places_so_far, places_so_far[-1]]
         else:
             time = self._nominal_gait.swing_time + self._nominal_gait.double_time
             rate = self._speed_factor(time)
@@ -91,15 +91,15 @@ class DrivenWalk(Walk):
                 swing_time=self._nominal_gait.swing_time / rate,
                 double_time=self._nominal_gait.double_time / rate,
             )
-            places = places_so_far
+            planar_poses = places_so_far
             for _ in range(_PLANNED_STEPS):
-                places.append(self._next_pose(places[-1], time / rate))
-        self.places = np.array(places)
-        self.gait = replace(self.gait, step_count=len(places) - 1)
+                planar_poses.append(self._next_pose(planar_poses[-1], time / rate))
+        self.planar_poses = np.array(planar_poses)
+        self.gait = replace(self.gait, step_count=len(planar_poses) - 1)
 
-    def _next_pose(self, place: np.ndarray, time: float) -> np.ndarray:
+    def _next_pose(self, planar_pose: np.ndarray, time: float) -> np.ndarray:
         unit, height = self.body.time_unit, self.body.height
-        return integrate_command(place, self.command, time, self._pace, unit=unit, height=height)
+        return integrate_command(planar_pose, self.command, time, self._pace, unit=unit, height=height)
 
     def _speed_factor(self, time: float) -> float:
         """Return the speed relative to the nominal one that the command needs at the longest step."""

@@ -141,25 +141,23 @@ def support_kind_of(mesh: TetMesh, heights: np.ndarray, foot_count: int) -> Supp
     return SupportKind.ROUND_BASE if is_ball else SupportKind.SINGLE_BASE
 
 
-def order_counterclockwise(places: np.ndarray) -> np.ndarray:
-    """Return the order (feet,) of the feet at ``places`` (feet, 2), forward and left: counterclockwise as seen from
+def order_counterclockwise(positions: np.ndarray) -> np.ndarray:
+    """Return the order (feet,) of the feet at ``positions`` (feet, 2), forward and left: counterclockwise as seen from
     above, from straight ahead on."""
-    ahead, left = (places - places.mean(axis=0)).T
+    ahead, left = (positions - positions.mean(axis=0)).T
     return np.argsort((np.arctan2(left, ahead) + FIRST_FOOT_ANGLE) % (2.0 * np.pi))
 
 
-def split_base(
-    place_of_sole: np.ndarray, heights: np.ndarray, sole: np.ndarray, body_height: float
-) -> tuple[Foot, Foot]:
+def split_base(positions: np.ndarray, heights: np.ndarray, sole: np.ndarray, body_height: float) -> tuple[Foot, Foot]:
     """Split a base into its left and its right side, each without the nodes near the middle, as two feet.
 
     Args:
-        place_of_sole: (N, 2) m, coordinates of each node forward and to the left.
+        positions: (N, 2) m, coordinates of each node forward and to the left.
         heights: (N,) m, heights of the nodes above the ground.
         sole: (k,) indices of the nodes that stand on the ground.
         body_height: H, m.
     """
-    left = place_of_sole[:, 1]
+    left = positions[:, 1]
     middle = float(left[sole].mean())
     half = 0.5 * float(np.ptp(left[sole]))
     low = 1.0 - smooth_step(heights / (_SIDE_HEIGHT * body_height))

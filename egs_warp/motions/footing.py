@@ -60,11 +60,11 @@ class FootholdPlanner:
         """(F, 4) footholds at the start."""
         return np.column_stack([self.soles, np.zeros(len(self.soles))])
 
-    def nominal_foothold(self, place: np.ndarray, index: int) -> np.ndarray:
-        """Return the nominal foothold (4,) of foot ``index`` for the body at the planar pose ``place`` (3,), see
+    def nominal_foothold(self, planar_pose: np.ndarray, index: int) -> np.ndarray:
+        """Return the nominal foothold (4,) of foot ``index`` for the body at ``planar_pose`` (3,), see
         ``motions.route``."""
-        level = self._centre + place[:2] + _flat(place[2]) @ (self.soles[index, :2] - self._centre)
-        return self._on_ground(index, level, float(place[2]))
+        level = self._centre + planar_pose[:2] + _flat(planar_pose[2]) @ (self.soles[index, :2] - self._centre)
+        return self._on_ground(index, level, float(planar_pose[2]))
 
     def landed_foothold(self, index: int, local: np.ndarray, planned: float) -> np.ndarray:
         """Return the foothold (4,) of foot ``index`` for nodes at ``local`` (N, 3). Its heading is unwrapped to the

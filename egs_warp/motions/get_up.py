@@ -135,7 +135,7 @@ class GetUp:
             UserError: for a ball.
         """
         if stance.base() is SupportKind.ROUND_BASE:
-            raise UserError("get up: a ball lies any way up; walk or jump on")
+            raise UserError("get up: a ball cannot fall over; walk or jump instead")
         body = stance.body
         self._stance, self.body, self.ground = stance, body, stance.ground
         self.control = control or GetUpControl()

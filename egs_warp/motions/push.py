@@ -52,7 +52,7 @@ class Push:
             ("time", self.time, MAX_TIME),
             ("impulse", float(np.linalg.norm(self.impulse)), MAX_IMPULSE),
             ("height", self.height or 0.0, 1.0),
-            ("lasts", self.duration, MAX_TIME),
+            ("duration", self.duration, MAX_TIME),
         ):
             if not 0.0 <= value <= maximum:
                 raise ArgumentError(name, f"give a number from 0 to {maximum:g}", value=f"{value:g}")

@@ -81,12 +81,12 @@ class Roll:
         com = stance.ground.local(body.centre_of_mass(stance.standing))
         self._start = com[:2]
         self._compression = self._radius(stance.standing) - self._height_above_ground(com)
-        self.places = route(StepLimits(_ROUTE_STEP * body.height, np.pi, side_fraction=1.0, faces_travel=False))
-        check_route(stance, self.places)
+        self.planar_poses = route(StepLimits(_ROUTE_STEP * body.height, np.pi, side_fraction=1.0, faces_travel=False))
+        check_route(stance, self.planar_poses)
         self.top_push = speed * _ACCELERATION * self._gravity
         """m/s^2, acceleration and deceleration."""
         self.table = VelocityProfile.from_path(
-            self.places[:, :2], speed=speed * _SPEED * body.speed_unit, acceleration=self.top_push
+            self.planar_poses[:, :2], speed=speed * _SPEED * body.speed_unit, acceleration=self.top_push
         )
         self._start_time: float | None = None
         self._rest_detector = RestDetector(body)

@@ -11,12 +11,12 @@ MAX_STEP_HEIGHT = 0.03
 """Largest difference in body heights between the height of an obstacle or gap and that of the ground."""
 
 
-def check_route(stance: Stance, places: np.ndarray) -> None:
+def check_route(stance: Stance, planar_poses: np.ndarray) -> None:
     """Check that a route does not lead over a step of the ground.
 
     Args:
         stance: stance at the start.
-        places: (n, 3) planar poses of the route, see ``motions.route``.
+        planar_poses: (n, 3) planar poses of the route, see ``motions.route``.
 
     Raises:
         UserError: at the first step that is higher than ``MAX_STEP_HEIGHT``.
@@ -25,7 +25,7 @@ def check_route(stance: Stance, places: np.ndarray) -> None:
     start = ground.local(body.centre_of_mass(stance.standing))
     normal = ground.axes @ ground.surface_normal
     slope = -normal[:2] / normal[2]
-    for x, y, _ in places:
+    for x, y, _ in planar_poses:
         level = np.array([start[0] + x, start[1] + y, 0.0])
         level[2] = slope @ level[:2]
         rise = stance.surface_height_above(ground.world(level)) / body.height

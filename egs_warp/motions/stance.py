@@ -303,8 +303,8 @@ class BalanceController:
         if report is None or report.contacts.count == 0:
             return self._base(local) - self.base_offset + np.stack([self.support_low, self.support_high])
         contacts = report.contacts
-        places = np.einsum("cw,cwi->ci", contacts.weights, local[contacts.nodes])[:, :2]
-        return np.stack([places.min(axis=0), places.max(axis=0)])
+        points = np.einsum("cw,cwi->ci", contacts.weights, local[contacts.nodes])[:, :2]
+        return np.stack([points.min(axis=0), points.max(axis=0)])
 
     def _rotation(self, positions: np.ndarray) -> np.ndarray:
         arms = positions - self.body.centre_of_mass(positions)

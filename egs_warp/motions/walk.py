@@ -100,10 +100,10 @@ class Walk:
             raise UserError(
                 f"walk: friction {stance.friction:g} cannot turn the body about a side of its base; jump or hop"
             )
-        self.places = route(pace)
+        self.planar_poses = route(pace)
         """(P+1, 3) planar poses of the body before the first and after each step, see ``motions.route``."""
-        check_route(stance, self.places)
-        paces, lift, timing = len(self.places) - 1, self._posture.lift, self._posture.timing
+        check_route(stance, self.planar_poses)
+        paces, lift, timing = len(self.planar_poses) - 1, self._posture.lift, self._posture.timing
         self.gait = Gait.create(len(feet), paces, lift, timing, time_unit=self._time_unit / speed)
         self._pace = pace
         self._parts = [BodyPart.of(body, f"foot {index}", foot.sole) for index, foot in enumerate(feet)]
@@ -140,7 +140,7 @@ class Walk:
 
     def plan_record(self) -> WalkPlan:
         """Return the planned quantities of the walk."""
-        gait, paces = self.gait, np.diff(self.places, axis=0)
+        gait, paces = self.gait, np.diff(self.planar_poses, axis=0)
         length = float(np.linalg.norm(paces[:, :2], axis=1).max())
         return WalkPlan(float(gait.step_count), length, gait.swing_time, gait.double_time, gait.lift, self._stride())
 
@@ -149,7 +149,7 @@ class Walk:
         rounds = len(self.gait.groups)
         prints = np.array(
             [
-                [self._planner.nominal_foothold(place, foot)[:2] for place in self.places]
+                [self._planner.nominal_foothold(planar_pose, foot)[:2] for planar_pose in self.planar_poses]
                 for foot in range(len(self.feet))
             ]
         )
@@ -241,7 +241,7 @@ class Walk:
             and self._mean_lag(local) > MAX_LAG
             and swing < self.gait.step_count
         ):
-            self.places = np.insert(self.places, swing + 1, self.places[swing], axis=0)
+            self.planar_poses = np.insert(self.planar_poses, swing + 1, self.planar_poses[swing], axis=0)
             self.gait = replace(self.gait, step_count=self.gait.step_count + 1)
             self._repeated_steps += 1
 
@@ -260,8 +260,10 @@ class Walk:
 
     def _nominal_footholds(self, paces: Sequence[int]) -> np.ndarray:
         """Return the nominal position (F, 2) of each foot after its number of steps, ``paces``."""
-        places = [self.places[min(pace, self.gait.step_count)] for pace in paces]
-        return np.array([self._planner.nominal_foothold(place, foot)[:2] for foot, place in enumerate(places)])
+        planar_poses = [self.planar_poses[min(pace, self.gait.step_count)] for pace in paces]
+        return np.array(
+            [self._planner.nominal_foothold(planar_pose, foot)[:2] for foot, planar_pose in enumerate(planar_poses)]
+        )
 
     def _enter(self, phase: WalkPhase, time: float, local: np.ndarray) -> None:
         self.phase, self._entered = phase, time
@@ -287,7 +289,7 @@ class Walk:
         """Record that foot ``index`` has landed where it is."""
         self.swinging = tuple(foot for foot in self.swinging if foot != index)
         self._arrived_footholds[index] = self.gait.target_step(self.swing)
-        planned = float(self.places[self._arrived_footholds[index]][2])
+        planned = float(self.planar_poses[self._arrived_footholds[index]][2])
         self._footprints[index] = self._planner.landed_foothold(index, local, planned)
 
     def _progress(self, phase: WalkPhase, swing: int, elapsed: float) -> float:
@@ -305,7 +307,7 @@ class Walk:
         count = self.gait.step_count
         progress = min(max(progress, 0.0), float(count))
         k = min(int(progress), count - 1)
-        return self.places[k] + (progress - k) * (self.places[k + 1] - self.places[k])
+        return self.planar_poses[k] + (progress - k) * (self.planar_poses[k + 1] - self.planar_poses[k])
 
     def _heading(self, elapsed: float) -> float:
         return float(self._place_at(self._progress(self.phase, self.swing, elapsed))[2])
@@ -349,7 +351,7 @@ class Walk:
             under = self._planner.support_points(footprints, standing, self.control.planned_margin)
             yield phase, np.array([nearest_in_hull(under, target) for target in targets])
             for foot in lifted:
-                footprints[foot] = self._planner.nominal_foothold(self.places[self.gait.target_step(swing)], foot)
+                footprints[foot] = self._planner.nominal_foothold(self.planar_poses[self.gait.target_step(swing)], foot)
             phase = self._after_swing(swing)
 
     def _com_at(self, progress: float) -> np.ndarray:
@@ -387,7 +389,7 @@ class Walk:
         targets, gait = self._footprints.copy(), self.gait
         for index in self.swinging:
             progress = elapsed / gait.swing_time
-            goal = self._planner.nominal_foothold(self.places[gait.target_step(self.swing)], index)
+            goal = self._planner.nominal_foothold(self.planar_poses[gait.target_step(self.swing)], index)
             goal[:3] += [*self._sidestep, self._slope @ self._sidestep]
             targets[index] += gait.transfer_progress(progress) * (goal - self._footprints[index])
             # A foot without contact at the end of its swing reaches down.

@@ -87,19 +87,22 @@ def test_a_bad_file_is_told_in_a_line(tmp_path: Path, text: str, told: str) -> N
 def test_the_way_is_made_from_the_command_of_the_moment() -> None:
     """Past poses stay, future ones follow the command, and a zero command closes the feet."""
     walk = DrivenWalk(stool().place, Drive(0.1))
-    before = walk.places.copy()
+    before = walk.planar_poses.copy()
     assert (
         walk.gait.step_count == len(before) - 1 > 2 and np.all(np.diff(before[:, 0]) > 0.0) and not before[:, 2].any()
     )
     walk.command = Drive(0.1, 0.0, 0.1)
     walk._lay_places(2)
-    assert walk.places[:3] == pytest.approx(before[:3]) and walk.places[3, 2] > 0.0
+    assert walk.planar_poses[:3] == pytest.approx(before[:3]) and walk.planar_poses[3, 2] > 0.0
     walk.command = Drive()
     walk._lay_places(3)
-    assert len(walk.places) == 4 and walk.gait.swings == 3 + len(walk.gait.groups) - 1
+    assert len(walk.planar_poses) == 4 and walk.gait.swings == 3 + len(walk.gait.groups) - 1
     walk.command = Drive(-0.1)
     walk._lay_places(4)
-    assert walk.places[4] == pytest.approx(walk.places[3]) and walk.places[5, 0] < walk.places[4, 0]
+    assert (
+        walk.planar_poses[4] == pytest.approx(walk.planar_poses[3])
+        and walk.planar_poses[5, 0] < walk.planar_poses[4, 0]
+    )
 
 
 def test_it_goes_on_from_where_slipping_feet_have_left_it() -> None:
@@ -107,25 +110,25 @@ def test_it_goes_on_from_where_slipping_feet_have_left_it() -> None:
     last pose."""
     place = stool().place
     walk, standing = DrivenWalk(place, Drive(0.1)), place.ground.local(place.standing)
-    before, length = walk.places.copy(), walk.places[1, 0]
+    before, length = walk.planar_poses.copy(), walk.planar_poses[1, 0]
     walk._arrived_footholds = [2] * len(walk.feet)
     walk._plan_swing(2, standing + [before[2, 0], 0.0, 0.0])
-    assert walk.places[:5] == pytest.approx(before)
+    assert walk.planar_poses[:5] == pytest.approx(before)
     walk._plan_swing(2, standing + [before[1, 0], 0.0, 0.0])
-    assert np.array_equal(walk.places[:2], before[:2])
-    assert walk.places[2:5, 0] == pytest.approx(before[2:, 0] - length)
+    assert np.array_equal(walk.planar_poses[:2], before[:2])
+    assert walk.planar_poses[2:5, 0] == pytest.approx(before[2:, 0] - length)
     walk.command = Drive()
     walk._lay_places(3)
     walk.gait = replace(walk.gait, groups=((0,), (1, 2), (3,)))
-    walk._arrived_footholds, last = [3, 2, 2, 3], walk.places[3, 0]
+    walk._arrived_footholds, last = [3, 2, 2, 3], walk.planar_poses[3, 0]
     walk._plan_swing(4, standing)
-    assert len(walk.places) == 4 and walk.places[3, 0] < last
+    assert len(walk.planar_poses) == 4 and walk.planar_poses[3, 0] < last
 
 
 def test_a_quick_command_makes_the_gait_quicker() -> None:
     slow, quick = (DrivenWalk(stool().place, Drive(speed)) for speed in (0.02, 1.0))
     assert quick.gait.swing_time == pytest.approx(slow.gait.swing_time / 1.6)
-    longest = np.linalg.norm(np.diff(quick.places[:, :2], axis=0), axis=1)
+    longest = np.linalg.norm(np.diff(quick.planar_poses[:, :2], axis=0), axis=1)
     assert longest == pytest.approx(quick._pace.length)
 
 

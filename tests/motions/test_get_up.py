@@ -108,7 +108,7 @@ def test_a_body_that_stands_is_up() -> None:
 
 def test_a_ball_lies_any_way_up() -> None:
     ball = coarse_creature(ball_mesh(), forward=FORWARD, all_round=True)
-    with pytest.raises(UserError, match="get up: a ball lies any way up; walk or jump on"):
+    with pytest.raises(UserError, match="get up: a ball cannot fall over; walk or jump instead"):
         GetUp(ball.place)
 
 

@@ -179,7 +179,7 @@ def test_a_creature_is_pushed_while_it_stands_or_turns(script: str) -> None:
         ({"impulse": np.array([0.0, np.nan, 0.0])}, "impulse nan: give a number from 0 to 10"),
         ({"impulse": np.array([0.0, 8.0, 8.0])}, "impulse 11.3137: give a number from 0 to 10"),
         ({"height": 1.5}, "height 1.5: give a number from 0 to 1"),
-        ({"lasts": np.inf}, "lasts inf: give a number from 0 to 600"),
+        ({"duration": np.inf}, "duration inf: give a number from 0 to 600"),
     ],
 )
 def test_numbers_that_no_push_has_are_refused(numbers: dict[str, Any], said: str) -> None:

@@ -47,7 +47,9 @@ def test_a_run_is_the_quickest_walk_by_the_longest_paces(place: Stance) -> None:
     fast, usual = run.begin(place), walk.begin(place)
     assert isinstance(fast, Walk) and isinstance(usual, Walk)
     assert fast.gait.swing_time == pytest.approx(usual.gait.swing_time / 1.6)
-    assert fast.gait.step_count <= usual.gait.step_count and fast.places[-1] == pytest.approx(usual.places[-1])
+    assert fast.gait.step_count <= usual.gait.step_count and fast.planar_poses[-1] == pytest.approx(
+        usual.planar_poses[-1]
+    )
 
 
 def test_what_takes_no_numbers_says_so() -> None:

@@ -114,7 +114,7 @@ def test_a_body_on_two_legs_keeps_its_balance(route: Route) -> None:
     """Two paces ahead, and on the spot: it comes to its place, upright."""
     done = walked(strong(biped()), route, 0.06)
     assert isinstance(done.walk._posture, LeggedPosture) and len(done.walk.feet) == 2
-    reached, place = measure(done.trajectory), done.walk.places[-1]
+    reached, place = measure(done.trajectory), done.walk.planar_poses[-1]
     assert reached.distance * done.creature.place.body.height == pytest.approx(place[0], abs=0.012)
     assert reached.heading_degrees == pytest.approx(np.degrees(place[2]), abs=3.0) and reached.tilt_degrees < 4.0
     check_audit(done)
@@ -125,7 +125,7 @@ def test_a_body_on_two_legs_keeps_its_balance(route: Route) -> None:
 def test_a_block_waddles(route: Route) -> None:
     """It lifts one side of its base, turns about the other, and so on: it comes to its place, upright."""
     done = walked(strong(block_mesh()), route, 0.04)
-    body, reached, place = done.creature.place.body, measure(done.trajectory), done.walk.places[-1]
+    body, reached, place = done.creature.place.body, measure(done.trajectory), done.walk.planar_poses[-1]
     assert reached.distance * body.height == pytest.approx(place[0], abs=0.2 * 0.04)
     assert reached.heading_degrees == pytest.approx(np.degrees(place[2]), abs=3.0) and reached.tilt_degrees < 3.0
     assert done.air > 0.0 and done.fell.landings >= 2
@@ -149,16 +149,16 @@ def test_a_pace_that_slipping_feet_have_lost_is_made_again() -> None:
     the same place."""
     place = coarse_creature(block_mesh(), forward=AHEAD, settled=False).place
     walk = Walk(place, straight_route(0.12), 0.04)
-    standing, before, paces = place.ground.local(place.standing), walk.places.copy(), walk.gait.step_count
+    standing, before, paces = place.ground.local(place.standing), walk.planar_poses.copy(), walk.gait.step_count
     walk._arrived_footholds = [1, 1]
     pace = before[1, 0]
     assert walk._mean_lag(standing + [pace, 0.0, 0.0]) == pytest.approx(0.0, abs=1e-9)
     assert walk._mean_lag(standing) == pytest.approx(1.0)
     walk._plan_swing(1, standing + [0.8 * pace, 0.0, 0.0])
-    assert np.array_equal(walk.places, before) and not walk.notes()
+    assert np.array_equal(walk.planar_poses, before) and not walk.notes()
     walk._plan_swing(1, standing + [0.2 * pace, 0.0, 0.0])
-    assert walk.gait.step_count == paces + 1 and np.array_equal(np.delete(walk.places, 2, axis=0), before)
-    assert np.array_equal(walk.places[2], before[1]) and "1 pace" in walk.notes()[-1]
+    assert walk.gait.step_count == paces + 1 and np.array_equal(np.delete(walk.planar_poses, 2, axis=0), before)
+    assert np.array_equal(walk.planar_poses[2], before[1]) and "1 pace" in walk.notes()[-1]
 
 
 def test_the_plan_tells_what_the_legs_can_do() -> None:
@@ -185,7 +185,7 @@ def test_feet_go_to_where_they_belong_when_the_body_turns() -> None:
     place = coarse_creature(stool(), forward=AHEAD, settled=False).place
     walk = Walk(place, path_route(np.array([[0.2, 0.3]])), 0.1)
     standing, com = place.ground.local(place.standing), place.body.centre_of_mass(place.ground.local(place.standing))
-    for x, y, heading in walk.places:
+    for x, y, heading in walk.planar_poses:
         turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
         moved = (standing[:, :2] - com[:2]) @ turn.T + com[:2] + [x, y]
         for index, foot in enumerate(walk.feet):
