@@ -108,8 +108,10 @@ class Crawl:
         """(N,) position along the body, from 0 at the front end to 1 at the back."""
         stride = MAX_STRAIN * length * _CARRIED_FRACTION / (_MAX_SLOPE * (1.0 - _CARRIED_FRACTION))
         aside = _SIDE_STRIDE * body.height
-        self.pace = StepLimits(stride, 2.0 * aside / length, side_fraction=min(aside / stride, 1.0), faces_travel=False)
-        self.planar_poses = route(self.pace)
+        self.step_limits = StepLimits(
+            stride, 2.0 * aside / length, side_fraction=min(aside / stride, 1.0), faces_travel=False
+        )
+        self.planar_poses = route(self.step_limits)
         check_route(stance, self.planar_poses)
         self._next, self._from, self._to = 1, np.zeros(3), self.planar_poses[1]
         """Index of the current goal in ``planar_poses``; planar poses of the body before and after this round."""
@@ -140,7 +142,7 @@ class Crawl:
 
     def plan_record(self) -> CrawlPlan:
         """Return the planned quantities of the motion."""
-        return CrawlPlan(float(len(self.planar_poses) - 1), self.pace.length, self.seconds)
+        return CrawlPlan(float(len(self.planar_poses) - 1), self.step_limits.length, self.seconds)
 
     def planned_com(self, elapsed: float) -> None:
         """Return None: each round starts from the measured body."""
@@ -227,8 +229,8 @@ class Crawl:
         """Return the number of strides that a ``change`` of the planar pose (3,) takes."""
         cos, sin = np.cos(self._from[2]), np.sin(self._from[2])
         ahead, aside = cos * change[0] + sin * change[1], cos * change[1] - sin * change[0]
-        strides = float(np.hypot(ahead, aside / self.pace.side_fraction)) / self.pace.length
-        return strides + abs(float(change[2])) / self.pace.turn
+        strides = float(np.hypot(ahead, aside / self.step_limits.side_fraction)) / self.step_limits.length
+        return strides + abs(float(change[2])) / self.step_limits.turn
 
     def _remaining_strides(self, planar_pose: np.ndarray) -> float:
         """Return the number of strides from ``planar_pose`` (3,) to the end of the route."""

@@ -32,7 +32,7 @@ _MAX_SPEED_FACTOR = 1.6
 
 
 def integrate_command(
-    planar_pose: np.ndarray, command: Drive, time: float, pace: StepLimits, *, unit: float, height: float
+    planar_pose: np.ndarray, command: Drive, time: float, limits: StepLimits, *, unit: float, height: float
 ) -> np.ndarray:
     """Return the planar pose (3,) ``time`` seconds after ``planar_pose`` (3,) under ``command``, at most one step away.
 
@@ -40,24 +40,26 @@ def integrate_command(
         planar_pose: (3,) x and y in metres, heading in radians.
         command: velocity command.
         time: s.
-        pace: limits of one step.
+        limits: limits of one step.
         unit: time unit sqrt(H / g), s.
         height: body height H, m.
     """
     duration = time / unit
-    share = 1.0 / max(duration * _effort(command, pace, height), 1.0)
+    share = 1.0 / max(duration * _effort(command, limits, height), 1.0)
     turn = share * duration * command.turn
     # The body moves along an arc; this is the direction of its chord.
     middle = planar_pose[2] + 0.5 * turn
-    ahead, left = share * duration * height * np.array([command.forward, command.sideways * (pace.side_fraction > 0.0)])
+    ahead, left = (
+        share * duration * height * np.array([command.forward, command.sideways * (limits.side_fraction > 0.0)])
+    )
     cos, sin = np.cos(middle), np.sin(middle)
     return planar_pose + [cos * ahead - sin * left, sin * ahead + cos * left, turn]
 
 
-def _effort(command: Drive, pace: StepLimits, height: float) -> float:
+def _effort(command: Drive, limits: StepLimits, height: float) -> float:
     """Return the number of longest steps per sqrt(H / g) that a ``command`` needs."""
-    aside = command.sideways / pace.side_fraction if pace.side_fraction > 0.0 else 0.0
-    return height * float(np.hypot(command.forward, aside)) / pace.length + abs(command.turn) / pace.turn
+    aside = command.sideways / limits.side_fraction if limits.side_fraction > 0.0 else 0.0
+    return height * float(np.hypot(command.forward, aside)) / limits.length + abs(command.turn) / limits.turn
 
 
 class DrivenWalk(Walk):
@@ -99,11 +101,11 @@ class DrivenWalk(Walk):
 
     def _next_pose(self, planar_pose: np.ndarray, time: float) -> np.ndarray:
         unit, height = self.body.time_unit, self.body.height
-        return integrate_command(planar_pose, self.command, time, self._pace, unit=unit, height=height)
+        return integrate_command(planar_pose, self.command, time, self._step_limits, unit=unit, height=height)
 
     def _speed_factor(self, time: float) -> float:
         """Return the speed relative to the nominal one that the command needs at the longest step."""
-        effort = _effort(self.command, self._pace, self.body.height)
+        effort = _effort(self.command, self._step_limits, self.body.height)
         return float(np.clip(time / self.body.time_unit * effort, 1.0, _MAX_SPEED_FACTOR))
 
 
@@ -116,7 +118,7 @@ class DrivenCrawl(Crawl):
 
     def _aim(self) -> tuple[np.ndarray, bool]:
         unit, height = self.body.time_unit, self.body.height
-        aim = integrate_command(self._from, self.command, self._round, self.pace, unit=unit, height=height)
+        aim = integrate_command(self._from, self.command, self._round, self.step_limits, unit=unit, height=height)
         return aim, self.command.is_zero
 
 

@@ -16,13 +16,13 @@ _JUMP_HEIGHT = 0.3
 """Height in body heights of the jump in which a ball turns about up."""
 
 
-def move_along(stance: Stance, route: Route, pace_length: float, *, speed: float = 1.0) -> BodyMotion:
+def move_along(stance: Stance, route: Route, step_length: float, *, speed: float = 1.0) -> BodyMotion:
     """Return the motion that moves a body along a route.
 
     Args:
         stance: stance at the start.
         route: route to follow.
-        pace_length: length of the steps of a walk, m.
+        step_length: length of the steps of a walk, m.
         speed: relative to the nominal speed.
 
     Raises:
@@ -33,12 +33,12 @@ def move_along(stance: Stance, route: Route, pace_length: float, *, speed: float
         return Crawl(stance, route, speed=speed)
     if base is SupportKind.ROUND_BASE:
         return Roll(stance, route, speed=speed)
-    return Walk(stance, route, pace_length, speed=speed)
+    return Walk(stance, route, step_length, speed=speed)
 
 
-def turn_in_place(stance: Stance, angle: float, pace_length: float, *, speed: float = 1.0) -> BodyMotion:
+def turn_in_place(stance: Stance, angle: float, step_length: float, *, speed: float = 1.0) -> BodyMotion:
     """Return the motion that turns the body by ``angle`` radians on the spot. A ball, which stands on a point, turns in
     a jump; other bodies turn as in ``move_along``."""
     if stance.base() is SupportKind.ROUND_BASE:
         return Turn(stance, JumpTarget(0.0, _JUMP_HEIGHT * stance.body.height), angle)
-    return move_along(stance, turn_route(angle), pace_length, speed=speed)
+    return move_along(stance, turn_route(angle), step_length, speed=speed)

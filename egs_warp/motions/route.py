@@ -45,8 +45,8 @@ Route = Callable[[StepLimits], np.ndarray]
 def straight_route(distance: float) -> Route:
     """Return the route of ``distance`` metres forward in equal steps; backwards if it is negative."""
 
-    def planar_poses(pace: StepLimits) -> np.ndarray:
-        count = max(int(np.ceil(abs(distance) / pace.length - _ROUNDING)), 1)
+    def planar_poses(limits: StepLimits) -> np.ndarray:
+        count = max(int(np.ceil(abs(distance) / limits.length - _ROUNDING)), 1)
         return np.linspace([0.0, 0.0, 0.0], [distance, 0.0, 0.0], count + 1)
 
     return planar_poses
@@ -55,8 +55,8 @@ def straight_route(distance: float) -> Route:
 def turn_route(angle: float) -> Route:
     """Return the route that turns by ``angle`` radians on the spot, in equal steps."""
 
-    def planar_poses(pace: StepLimits) -> np.ndarray:
-        count = max(int(np.ceil(abs(angle) / pace.turn - _ROUNDING)), 1)
+    def planar_poses(limits: StepLimits) -> np.ndarray:
+        count = max(int(np.ceil(abs(angle) / limits.turn - _ROUNDING)), 1)
         return np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, angle], count + 1)
 
     return planar_poses
@@ -70,31 +70,31 @@ def path_route(points: np.ndarray) -> Route:
         UserError: when called, if the path takes more than ``MAX_STEPS`` steps.
     """
 
-    def planar_poses(pace: StepLimits) -> np.ndarray:
+    def planar_poses(limits: StepLimits) -> np.ndarray:
         poses = [np.zeros(3)]
         for number, point in enumerate(points):
-            near = _ROUNDING if number == len(points) - 1 else pace.length
+            near = _ROUNDING if number == len(points) - 1 else limits.length
             while np.linalg.norm(point - poses[-1][:2]) > near:
                 if len(poses) > MAX_STEPS:
                     raise UserError(f"walk: the path takes more than {MAX_STEPS} steps; choose a shorter one")
-                poses.append(_nearer(poses[-1], point, pace))
+                poses.append(_nearer(poses[-1], point, limits))
         return np.array(poses) if len(poses) > 1 else np.zeros((2, 3))
 
     return planar_poses
 
 
-def _nearer(planar_pose: np.ndarray, point: np.ndarray, pace: StepLimits) -> np.ndarray:
+def _nearer(planar_pose: np.ndarray, point: np.ndarray, limits: StepLimits) -> np.ndarray:
     """Return the planar pose (3,) one step after ``planar_pose`` (3,) towards ``point`` (2,)."""
     arm = point - planar_pose[:2]
-    if not pace.faces_travel:
+    if not limits.faces_travel:
         distance = float(np.linalg.norm(arm))
-        return np.array([*(planar_pose[:2] + min(1.0, pace.length / distance) * arm), planar_pose[2]])
+        return np.array([*(planar_pose[:2] + min(1.0, limits.length / distance) * arm), planar_pose[2]])
     off = np.arctan2(arm[1], arm[0]) - planar_pose[2]
-    turn = float(np.clip((off + np.pi) % (2.0 * np.pi) - np.pi, -pace.turn, pace.turn))
+    turn = float(np.clip((off + np.pi) % (2.0 * np.pi) - np.pi, -limits.turn, limits.turn))
     heading = planar_pose[2] + turn
     ahead = np.array([np.cos(heading), np.sin(heading)])
-    length = min(pace.length * (1.0 - abs(turn) / pace.turn), max(float(arm @ ahead), 0.0))
-    if float(np.linalg.norm(arm)) <= pace.length and abs(turn) < 0.5 * pace.turn:
+    length = min(limits.length * (1.0 - abs(turn) / limits.turn), max(float(arm @ ahead), 0.0))
+    if float(np.linalg.norm(arm)) <= limits.length and abs(turn) < 0.5 * limits.turn:
         return np.array([*point, heading])
     return np.array([*(planar_pose[:2] + length * ahead), heading])
 

@@ -58,7 +58,7 @@ class Walk:
         self,
         stance: Stance,
         route: Route,
-        pace_length: float,
+        step_length: float,
         *,
         speed: float = 1.0,
         control: WalkControl | None = None,
@@ -68,7 +68,7 @@ class Walk:
         Args:
             stance: stance at the start.
             route: route to follow.
-            pace_length: step length in metres; it is shortened to what the body can do.
+            step_length: step length in metres; it is shortened to what the body can do.
             speed: relative to the nominal speed.
             control: weights and gains.
 
@@ -94,18 +94,18 @@ class Walk:
         self._start_com = body.centre_of_mass(standing)
         self.gravity = float(np.linalg.norm(body.gravity))
         self._time_unit = float(np.sqrt(body.height / self.gravity))
-        self._requested_length = pace_length
-        pace = StepLimits(min(pace_length, self._posture.step_limits.length), self._posture.step_limits.turn)
-        if pace.length < MIN_STEP_LENGTH * body.height:
+        self._requested_length = step_length
+        limits = StepLimits(min(step_length, self._posture.step_limits.length), self._posture.step_limits.turn)
+        if limits.length < MIN_STEP_LENGTH * body.height:
             raise UserError(
                 f"walk: friction {stance.friction:g} cannot turn the body about a side of its base; jump or hop"
             )
-        self.planar_poses = route(pace)
+        self.planar_poses = route(limits)
         """(P+1, 3) planar poses of the body before the first and after each step, see ``motions.route``."""
         check_route(stance, self.planar_poses)
-        paces, lift, timing = len(self.planar_poses) - 1, self._posture.lift, self._posture.timing
-        self.gait = Gait.create(len(feet), paces, lift, timing, time_unit=self._time_unit / speed)
-        self._pace = pace
+        step_count, lift, timing = len(self.planar_poses) - 1, self._posture.lift, self._posture.timing
+        self.gait = Gait.create(len(feet), step_count, lift, timing, time_unit=self._time_unit / speed)
+        self._step_limits = limits
         self._parts = [BodyPart.of(body, f"foot {index}", foot.sole) for index, foot in enumerate(feet)]
         self._near_points = [np.flatnonzero(foot_of_node(feet) == index) for index in range(len(feet))]
         """Nodes that belong to each foot."""
@@ -122,7 +122,7 @@ class Walk:
         self._target_pressure: np.ndarray | None = None
         """(2,) m, last target of the centre of pressure."""
         self._late_swings = self._repeated_steps = 0
-        self._requested_steps = paces
+        self._requested_steps = step_count
         self._arrived_footholds = [0] * len(feet)
         """Step at whose planar pose each foot landed last."""
 
@@ -140,8 +140,8 @@ class Walk:
 
     def plan_record(self) -> WalkPlan:
         """Return the planned quantities of the walk."""
-        gait, paces = self.gait, np.diff(self.planar_poses, axis=0)
-        length = float(np.linalg.norm(paces[:, :2], axis=1).max())
+        gait, steps = self.gait, np.diff(self.planar_poses, axis=0)
+        length = float(np.linalg.norm(steps[:, :2], axis=1).max())
         return WalkPlan(float(gait.step_count), length, gait.swing_time, gait.double_time, gait.lift, self._stride())
 
     def _stride(self) -> float:
@@ -162,8 +162,8 @@ class Walk:
     def notes(self) -> list[str]:
         """Return messages for the user about shortened, repeated and late steps."""
         notes = []
-        if self._pace.length < self._requested_length:
-            requested, reached = self._requested_length / self.body.height, self._pace.length / self.body.height
+        if self._step_limits.length < self._requested_length:
+            requested, reached = self._requested_length / self.body.height, self._step_limits.length / self.body.height
             notes.append(
                 f"steps of {requested:.2f} body heights were requested; "
                 f"the body can make steps of {reached:.2f} at most"
@@ -247,7 +247,7 @@ class Walk:
 
     def _mean_lag(self, local: np.ndarray) -> float:
         """Return the mean lag of the feet behind their nominal footholds, in steps."""
-        ahead = self._nominal_footholds([pace + 1 for pace in self._arrived_footholds]) - self._nominal_footholds(
+        ahead = self._nominal_footholds([step + 1 for step in self._arrived_footholds]) - self._nominal_footholds(
             self._arrived_footholds
         )
         return float((self._foothold_error(local) * ahead).sum() / max((ahead**2).sum(), 1e-12))
@@ -258,9 +258,9 @@ class Walk:
             [local[foot.sole, :2].mean(axis=0) for foot in self.feet]
         )
 
-    def _nominal_footholds(self, paces: Sequence[int]) -> np.ndarray:
-        """Return the nominal position (F, 2) of each foot after its number of steps, ``paces``."""
-        planar_poses = [self.planar_poses[min(pace, self.gait.step_count)] for pace in paces]
+    def _nominal_footholds(self, steps: Sequence[int]) -> np.ndarray:
+        """Return the nominal position (F, 2) of each foot after its number of steps, ``steps``."""
+        planar_poses = [self.planar_poses[min(step, self.gait.step_count)] for step in steps]
         return np.array(
             [self._planner.nominal_foothold(planar_pose, foot)[:2] for foot, planar_pose in enumerate(planar_poses)]
         )

@@ -68,7 +68,7 @@ def test_what_lies_along_the_ground_crawls() -> None:
 def test_a_stride_strains_it_by_no_more_than_it_may() -> None:
     """At the steepest point of the wave; and every section ends at the target of the body."""
     crawl = Crawl(worm().place, straight_route(5.0))
-    crawl._to = np.array([crawl.pace.length, 0.0, 0.0])
+    crawl._to = np.array([crawl.step_limits.length, 0.0, 0.0])
     along_it, most = crawl._standing[:, 0], 0.0
     for elapsed in np.linspace(0.0, crawl._round, 60):
         pose = crawl._pose(float(elapsed))

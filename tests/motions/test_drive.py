@@ -129,7 +129,7 @@ def test_a_quick_command_makes_the_gait_quicker() -> None:
     slow, quick = (DrivenWalk(stool().place, Drive(speed)) for speed in (0.02, 1.0))
     assert quick.gait.swing_time == pytest.approx(slow.gait.swing_time / 1.6)
     longest = np.linalg.norm(np.diff(quick.planar_poses[:, :2], axis=0), axis=1)
-    assert longest == pytest.approx(quick._pace.length)
+    assert longest == pytest.approx(quick._step_limits.length)
 
 
 @pytest.mark.slow

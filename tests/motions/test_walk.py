@@ -158,7 +158,7 @@ def test_a_pace_that_slipping_feet_have_lost_is_made_again() -> None:
     assert np.array_equal(walk.planar_poses, before) and not walk.notes()
     walk._plan_swing(1, standing + [0.2 * pace, 0.0, 0.0])
     assert walk.gait.step_count == paces + 1 and np.array_equal(np.delete(walk.planar_poses, 2, axis=0), before)
-    assert np.array_equal(walk.planar_poses[2], before[1]) and "1 pace" in walk.notes()[-1]
+    assert np.array_equal(walk.planar_poses[2], before[1]) and "1 step" in walk.notes()[-1]
 
 
 def test_the_plan_tells_what_the_legs_can_do() -> None:
