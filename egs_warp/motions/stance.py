@@ -190,8 +190,8 @@ class BalanceController:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Project the requested velocities onto those that the feet can produce without tipping or slipping.
 
-        In a time step, the angular momentum about the feet, m h (v + angular_velocity_term), changes by the weight
-        times the distance from the centre of pressure to the centre of mass. Keeping the centre of pressure in the
+        The angular momentum about the feet, m h (v + angular_velocity_term), changes at a rate of the weight times the
+        horizontal distance from the centre of pressure to the centre of mass. Keeping the centre of pressure in the
         footprint bounds the sum of both terms; friction bounds the first.
 
         Args:
