@@ -51,7 +51,10 @@ from egs_warp.segmentation.clearance import StraddlingPolicy
         (["--metres-per-unit", "1e300"], "--metres-per-unit 1e+300: give a positive number, from 1e-9 to 1e9"),
         (["--plane", "0,0,0,1"], "give four finite numbers nx,ny,nz,d with a normal that is not zero"),
         (["--plane", "1,2"], "--plane 1,2: give four numbers nx,ny,nz,d"),
-        (["--push", "0.5 0.1 north"], "push 1 ('0.5 0.1 north'): unknown direction 'north'; give one of ahead, back, left"),
+        (
+            ["--push", "0.5 0.1 north"],
+            "push 1 ('0.5 0.1 north'): unknown direction 'north'; give one of ahead, back, left",
+        ),
         (["--push", "0.5 99 left"], "push 1 ('0.5 99 left'): impulse 99: give m sqrt(g H) from 0 to 10"),
         (["--device", "tpu"], "--device tpu: this machine has cpu"),
         (
