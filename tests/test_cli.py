@@ -51,7 +51,10 @@ from egs_warp.segmentation.clearance import StraddlingPolicy
         (["--metres-per-unit", "1e300"], "--metres-per-unit 1e+300: give a positive number, from 1e-9 to 1e9"),
         (["--plane", "0,0,0,1"], "give four finite numbers nx,ny,nz,d with a normal that is not zero"),
         (["--plane", "1,2"], "--plane 1,2: give four numbers nx,ny,nz,d"),
-        (["--push", "0.5 0.1 north"], "push 1 ('0.5 0.1 north'): unknown way 'north'; give one of ahead, back, left"),
+        (
+            ["--push", "0.5 0.1 north"],
+            "push 1 ('0.5 0.1 north'): unknown direction 'north'; give one of ahead, back, left",
+        ),
         (["--push", "0.5 99 left"], "push 1 ('0.5 99 left'): impulse 99: give m sqrt(g H) from 0 to 10"),
         (["--device", "tpu"], "--device tpu: this machine has cpu"),
         (
@@ -61,7 +64,7 @@ from egs_warp.segmentation.clearance import StraddlingPolicy
         (["--style", "floppy"], "--style: unknown word 'floppy'; give one of light, heavy, rubbery"),
         (["--style", "squash=3"], "style: squash 3: give a number of times the usual from 0.5 to 2"),
         (["--motion", "walk", "--style", "heavy"], "--style: nothing jumps in 'walk'"),
-        (["--beats", "90"], "--beats: no motion of 'jump' takes them; ask for a dance"),
+        (["--beats", "90"], "--beats: no motion of 'jump' takes beats; add a dance"),
         (["--motion", "dance", "--beats", "soon.csv"], "soon.csv: no such file"),
         (["--motion", "dance", "--beats", "90 soon"], "first soon: give a number of seconds from 0 to 600"),
         ([], "nothing.ply"),

@@ -56,7 +56,7 @@ def test_example_writes_its_files(tmp_path: Path, name: str, motion: str, asked:
     ("name", "flags", "message"),
     [
         ("crawl", ["--distance", "-99"], "crawl.py: motion 1 ('walk -99.0'): distance -99.0: give a number of"),
-        ("get_up", ["--push", "hard"], "get_up.py: push 1 ('hard'): give a time, an impulse and a way"),
+        ("get_up", ["--push", "hard"], "get_up.py: push 1 ('hard'): give a time, an impulse and a direction"),
         ("dance", ["--beats", "none.csv"], "dance.py: none.csv: no such file or folder"),
         ("walk", ["--distance", "99"], "walk.py: motion 1 ('walk 99.0 0.1'): distance 99.0: give a number of"),
         ("jump", ["--size", "0"], "jump.py: --size 0: give a number of pixels from 16 to 4096"),

@@ -1,4 +1,4 @@
-"""What a body is asked to do: jump, hop, twist, walk, key frames, scripts (section 4).
+"""Motions of a body: jump, hop, twist, walk, crawl, roll, dance, get up, key frames and scripts (section 4).
 
-In: a body's state at each step. Out: the objectives of the next one.
+A motion is a state machine. Each time step it turns the measured state of the body into the objectives of the step.
 """

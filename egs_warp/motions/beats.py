@@ -1,4 +1,4 @@
-"""Beats to dance to, and which two of them a jump leaves and comes back to the ground on."""
+"""Beats of a dance, and the choice of the two beats between which the next jump flies."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from pathlib import Path
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import read_text
 
-MOST_BEATS = 1000
-LATEST = 600.0
+MAX_BEATS = 1000
+MAX_BEAT_TIME = 600.0
 """Seconds."""
-_WAITING = 0.5
-"""Seconds of waiting for its take-off that are as bad as a flight so much off the easiest one."""
-_FINEST = 8
-"""Parts into which the way to a beat is divided at most."""
+_FLIGHT_TOLERANCE = 0.5
+"""Seconds: a flight that differs from the easiest one by this much costs as much as one second of waiting."""
+_MAX_DIVISION = 8
+"""Largest number of parts into which the interval before a beat is divided."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,10 @@ class Span:
 
     take_off: float
     touch_down: float
-    """On a beat."""
+    """Seconds, on a beat."""
     parts: int = 1
-    """1: the take-off is on a beat, too; else it is the last part of the way from the beat before, divided in so many.
-    """
+    """1 if the take-off is on a beat; otherwise the take-off is at the start of the last of ``parts`` equal parts of
+    the interval before the beat of the touch-down."""
 
     @property
     def flight(self) -> float:
@@ -37,14 +37,15 @@ class Span:
 
 
 def even_beats(tempo: float, first: float, count: int) -> tuple[float, ...]:
-    """Seconds of ``count`` beats, ``tempo`` a minute from ``first`` seconds on."""
+    """Return the times in seconds of ``count`` beats, ``tempo`` a minute, from ``first`` seconds on."""
     return tuple(first + 60.0 / tempo * k for k in range(count))
 
 
 def read_beats(path: Path) -> tuple[float, ...]:
-    """Seconds of the beats of a file: one a line, in its first column.
+    """Read the times of beats, in seconds: one beat per line, in the first column.
 
-    Raises ``UserError``, with the line, for what is no such file or goes back.
+    Raises:
+        UserError: with the line, for a malformed file or times that do not increase.
     """
     beats: list[float] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -54,25 +55,29 @@ def read_beats(path: Path) -> tuple[float, ...]:
         time = _number(word[0]) if word else math.nan
         where = f"{path}, line {number}: {line.strip()[:60]!r}"
         if math.isnan(time) and number == 1:
-            continue  # the names of the columns
-        if not 0.0 <= time <= LATEST:
-            raise UserError(f"{where}: give the seconds of a beat, from 0 to {LATEST:g}")
+            continue  # header line
+        if not 0.0 <= time <= MAX_BEAT_TIME:
+            raise UserError(f"{where}: give the time of a beat in seconds, from 0 to {MAX_BEAT_TIME:g}")
         if beats and time <= beats[-1]:
-            raise UserError(f"{where}: is not after {beats[-1]:g}, the beat before; give beats in their order")
+            raise UserError(f"{where}: is not after {beats[-1]:g}, the beat before; give beats in increasing order")
         beats.append(time)
     if not beats:
-        raise UserError(f"{path}: no beats; give lines of seconds")
-    if len(beats) > MOST_BEATS:
-        raise UserError(f"{path}: {len(beats)} beats; at most {MOST_BEATS} are danced to")
+        raise UserError(f"{path}: no beats; give one time in seconds per line")
+    if len(beats) > MAX_BEATS:
+        raise UserError(f"{path}: {len(beats)} beats; at most {MAX_BEATS} are allowed")
     return tuple(beats)
 
 
-def asked_beats(text: str) -> dict[str, str] | Path:
-    """What ``--beats`` gives: a tempo, with the seconds of its first beat behind it or not, by the names of a dance's
-    values, or a file."""
+def parse_beats(text: str) -> dict[str, str] | Path:
+    """Parse the value of ``--beats``: a tempo, optionally followed by the time of the first beat, or the path of a
+    file.
+
+    Returns:
+        The numbers by the names of a dance's parameters, or the path.
+    """
     words = text.replace(",", " ").split()
     if not words:
-        raise ArgumentError("beats", "nothing is given; give a file of seconds or a tempo, as 90")
+        raise ArgumentError("beats", "the value is empty; give a file of times in seconds or a tempo such as 90")
     if len(words) <= 2 and not math.isnan(_number(words[0])):
         return dict(zip(("tempo", "first"), words, strict=False))
     return Path(text.strip())
@@ -86,18 +91,25 @@ def next_span(
     flights: tuple[float, float],
     easiest: float,
 ) -> Span | None:
-    """The jump to come, that which goes on soonest for its ease; None if there is none left.
+    """Return the next jump, or None if no beat can be reached any more.
 
-    It lands on a beat later than ``after``, and leaves the ground on one, or where that would be too far before it, at
-    half, a quarter or an eighth of the way from the beat before. ``earliest`` tells when a flight of so many seconds
-    can begin; ``flights`` are the shortest and the longest, ``easiest`` the one that is liked best, seconds.
+    The jump lands on a beat later than ``after``. It leaves the ground on a beat or, where every beat is too early for
+    that, a half, a quarter or an eighth of the interval before the landing. Of all candidates, the cost ``wait +
+    |flight - easiest| / _FLIGHT_TOLERANCE`` is the lowest.
+
+    Args:
+        beats: times of the beats, increasing, s.
+        after: time after which the jump lands, s.
+        earliest: maps a flight time to the earliest possible take-off, s.
+        flights: shortest and longest flight, s.
+        easiest: preferred flight, s.
     """
     shortest, longest = flights
-    best, least = None, math.inf
+    best, lowest = None, math.inf
     for number, landing in enumerate(beats):
         if landing <= after:
             continue
-        if landing - longest > after + least:
+        if landing - longest > after + lowest:
             break
         gap = landing - beats[number - 1] if number else math.inf
         starts = [(start, 1) for start in beats[:number] if landing - longest <= start <= landing - shortest]
@@ -106,14 +118,14 @@ def next_span(
             starts = divided[:1]
         for start, parts in starts:
             flight = landing - start
-            cost = start - after + abs(flight - easiest) / _WAITING
-            if start >= earliest(flight) and cost < least:
-                best, least = Span(start, landing, parts), cost
+            cost = start - after + abs(flight - easiest) / _FLIGHT_TOLERANCE
+            if start >= earliest(flight) and cost < lowest:
+                best, lowest = Span(start, landing, parts), cost
     return best
 
 
 def _parts() -> list[int]:
-    return [2**k for k in range(1, _FINEST.bit_length())]
+    return [2**k for k in range(1, _MAX_DIVISION.bit_length())]
 
 
 def _number(word: str) -> float:

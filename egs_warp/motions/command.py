@@ -1,4 +1,4 @@
-"""Speeds that a body is steered by: ``Drive``, and a file of them over time."""
+"""Velocity commands for a live body: ``Drive``, and files of commands over time."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import read_text
 
 FASTEST = 2.0
-"""sqrt(g H), or radians in sqrt(H / g): more is a slip of the pen."""
-LONGEST = 60.0
-"""Seconds of a file."""
+"""Largest command, in sqrt(g H) or in radians per sqrt(H / g); larger values are rejected as typing errors."""
+MAX_TIME = 60.0
+"""Largest time in a file, s."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """How a body is to go from now on; it goes as fast as it can where that is less.
+    """Velocity command. A body that cannot move this fast moves as fast as it can.
 
-    Raises ``ArgumentError`` for what is no number or beyond 2.
+    Raises:
+        ArgumentError: for a value that is not a number or exceeds 2 in magnitude.
     """
 
     forward: float = 0.0
-    """sqrt(g H), the way it faces; backwards if negative."""
+    """Forward speed, sqrt(g H); negative is backwards."""
     sideways: float = 0.0
-    """sqrt(g H), to its left."""
+    """Speed to the left, sqrt(g H)."""
     turn: float = 0.0
-    """Radians in sqrt(H / g), to its left."""
+    """Turning rate to the left, radians per sqrt(H / g)."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -36,41 +37,46 @@ class Drive:
 
     @property
     def is_zero(self) -> bool:
-        """Whether it asks for nothing."""
+        """True if all speeds are zero."""
         return self.forward == self.sideways == self.turn == 0.0
 
 
 @dataclass(frozen=True)
 class DrivePlan:
-    """Commands one after the other, each until the next one's time; the last is to stand."""
+    """Sequence of commands, each valid until the time of the next; the last command is zero."""
 
     times: tuple[float, ...]
-    """Seconds from the start, growing."""
+    """Seconds from the start, increasing."""
     commands: tuple[Drive, ...]
 
     def __post_init__(self) -> None:
         before = -1.0
         for time in self.times:
-            if not (0.0 <= time <= LONGEST and time > before):
-                raise ArgumentError("time", f"give seconds that grow, from 0 to {LONGEST:g}", value=f"{time:g}")
+            if not (0.0 <= time <= MAX_TIME and time > before):
+                raise ArgumentError(
+                    "time", f"give increasing times in seconds, from 0 to {MAX_TIME:g}", value=f"{time:g}"
+                )
             before = time
         if not self.commands or not self.commands[-1].is_zero:
-            raise ArgumentError("commands", "the last one does not stand; end with 0,0,0")
+            raise ArgumentError("commands", "the last command is not zero; end with 0,0,0")
 
     def at(self, elapsed: float) -> Drive:
-        """What holds ``elapsed`` seconds after the start."""
+        """Return the command that is valid ``elapsed`` seconds after the start."""
         past = [command for time, command in zip(self.times, self.commands, strict=True) if time <= elapsed + 1e-9]
         return past[-1] if past else Drive()
 
     @property
     def seconds(self) -> float:
-        """Until it is told to stand for good."""
+        """Time of the last command, s."""
         return self.times[-1]
 
 
 def read_drive(path: Path) -> DrivePlan:
-    """Of a file of lines ``time,forward,sideways,turn``. Raises ``UserError``, with the line, for what is no such
-    file."""
+    """Read a file of lines ``time,forward,sideways,turn``.
+
+    Raises:
+        UserError: with the line, for a malformed file.
+    """
     times: list[float] = []
     commands: list[Drive] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -81,7 +87,7 @@ def read_drive(path: Path) -> DrivePlan:
             row = [float(word) for word in line.replace(",", " ").split()]
         except ValueError:
             if not times and not any(character.isdigit() for character in line):
-                continue  # the names of the columns
+                continue  # header line
             row = []
         if len(row) != 4:
             raise UserError(f"{where}: {line.strip()[:60]!r}: give four numbers, time,forward,sideways,turn")

@@ -1,7 +1,7 @@
-"""Crawl: a long body without feet goes by a wave of strides that runs along it, as a worm does.
+"""Crawl: a long body without feet moves by a wave of strides that runs along it, as a worm does.
 
-Each slice of it stands for most of a round and is then carried to its next place, a little after the slice before it.
-What is carried is unloaded, what stands holds the ground for it. See docs/concepts/motions.md.
+Each cross-section stands for most of a round and is then carried to its next position, shortly after the section in
+front of it. Carried nodes are unloaded; standing nodes hold the ground for them. See docs/concepts/motions.md.
 """
 
 from __future__ import annotations
@@ -31,53 +31,53 @@ from egs_warp.motions.route_check import check_route
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import REST_SPEED, RestDetector
 
-_ROUND = 3.0
-"""Of sqrt(H / g): how long a slice takes from one stride to the next."""
-_CARRIED = 0.4
-"""Part of a round in which a slice is carried; in the rest it stands."""
-STRAIN = 0.12
-"""The most that a stride stretches the body by."""
-_ASIDE, _GENTLE = 0.25, 0.3
-"""Body heights of a stride to the side, or of its ends in a turn, and the acceleration, in g, that it may take: harder,
-a round body would roll over."""
-_BEND = 5.77
-"""Largest second derivative of that way."""
-_STEEPEST = 1.875
-"""Largest slope of the way from 0 to 1 that a slice is carried in a time of 1."""
+_ROUND_TIME = 3.0
+"""Duration of a round, in sqrt(H / g): the time from one stride of a section to its next."""
+_CARRIED_FRACTION = 0.4
+"""Fraction of a round in which a section is carried; in the rest it stands."""
+MAX_STRAIN = 0.12
+"""Largest strain of the body in a stride."""
+_SIDE_STRIDE, _SIDE_ACCELERATION = 0.25, 0.3
+"""Largest sideways stride, or motion of an end in a turn, in body heights, and the acceleration in g that it may take:
+with more, a round body would roll over."""
+_MAX_CURVATURE = 5.77
+"""Largest second derivative of ``smooth``, the path from 0 to 1 in a time of 1."""
+_MAX_SLOPE = 1.875
+"""Largest slope of ``smooth``, the path from 0 to 1 in a time of 1."""
 _LIFT = 0.02
-"""Body heights by which a slice is lifted that is carried."""
-_THERE = 0.2
-"""Rounds: what is nearer than this to the end of the way is there."""
-_NEXT = 0.5
-"""Rounds from a place of the way at which it goes for the next."""
-_GAIN, _FRUITLESS = 0.2, 4
-"""Rounds: a round that brings the end of its way no nearer than this is fruitless; after so many in a row it gives
+"""Height to which a carried section is lifted, in body heights."""
+_ARRIVAL_TOLERANCE = 0.2
+"""Distance from the end of the route, in rounds, within which the body has arrived."""
+_ADVANCE_DISTANCE = 0.5
+"""Distance from a waypoint, in rounds, within which the body heads for the next waypoint."""
+_MIN_PROGRESS, _MAX_FRUITLESS_ROUNDS = 0.2, 4
+"""Smallest progress in rounds that counts, and the number of consecutive rounds without it after which the crawl gives
 up."""
 
 
 @dataclass(frozen=True)
 class CrawlPlan:
-    """Numbers of a crawl; metres, seconds."""
+    """Planned quantities of a crawl; metres, seconds."""
 
     rounds: float
     stride: float
-    """The longest of a slice."""
+    """Longest stride of a section, m."""
     seconds: float
 
 
 @dataclass(frozen=True)
 class CrawlOutcome:
-    """How a body crawled."""
+    """Measured result of a crawl."""
 
     rounds: float
-    """Waves that ran along it."""
+    """Number of waves that ran along the body."""
     stride: float
-    """Body heights that its middle came on in a round, in the mean."""
+    """Mean displacement of the centre of mass per round, in body heights."""
 
 
 @dataclass(frozen=True)
 class CrawlControl:
-    """Weights of the objectives; speeds are compared in sqrt(g H)."""
+    """Weights of the objectives; speeds are measured in units of sqrt(g H)."""
 
     com: float = 100.0
     spin: float = 2000.0
@@ -86,83 +86,90 @@ class CrawlControl:
     hold: float = 50.0
     turn_rate: float = 4.0
     follow: float = 8.0
-    """Of the pose, in sqrt(g / H)."""
+    """Rate in sqrt(g / H) at which the pose is approached."""
 
 
 class Crawl:
-    """Goes by rounds, each planned from where the last one has ended, until it is there."""
+    """Crawl along a route in rounds, each planned from the measured end of the previous one."""
 
-    def __init__(self, place: Stance, route: Route, *, speed: float = 1.0, control: CrawlControl | None = None) -> None:
-        """The body lies at ``place``; ``speed`` over the usual."""
-        body = place.body
-        self.body, self.ground, self.control = body, place.ground, control or CrawlControl()
-        normal = place.ground.axes @ place.ground.surface_normal
+    def __init__(
+        self, stance: Stance, route: Route, *, speed: float = 1.0, control: CrawlControl | None = None
+    ) -> None:
+        """Create the motion of the body that lies at ``stance``; ``speed`` is relative to the nominal speed."""
+        body = stance.body
+        self.body, self.ground, self.control = body, stance.ground, control or CrawlControl()
+        normal = stance.ground.axes @ stance.ground.surface_normal
         self._slope = -normal[:2] / normal[2]
-        self._standing = place.ground.local(place.standing)
+        self._standing = stance.ground.local(stance.standing)
         self._centre = body.centre_of_mass(self._standing)
         along = _slices(self._standing[:, :2])
         length = float(np.ptp(along))
         self._behind = (along.max() - along) / length
-        """(N,) from 0 at the front end to 1 at the back."""
-        stride = STRAIN * length * _CARRIED / (_STEEPEST * (1.0 - _CARRIED))
-        aside = _ASIDE * body.height
-        self.pace = StepLimits(stride, 2.0 * aside / length, side_fraction=min(aside / stride, 1.0), faces_travel=False)
-        self.places = route(self.pace)
-        check_route(place, self.places)
-        self._next, self._from, self._to = 1, np.zeros(3), self.places[1]
-        """Of ``places`` the one it goes to; the body's place before and after this round."""
+        """(N,) position along the body, from 0 at the front end to 1 at the back."""
+        stride = MAX_STRAIN * length * _CARRIED_FRACTION / (_MAX_SLOPE * (1.0 - _CARRIED_FRACTION))
+        aside = _SIDE_STRIDE * body.height
+        self.step_limits = StepLimits(
+            stride, 2.0 * aside / length, side_fraction=min(aside / stride, 1.0), faces_travel=False
+        )
+        self.planar_poses = route(self.step_limits)
+        check_route(stance, self.planar_poses)
+        self._next, self._from, self._to = 1, np.zeros(3), self.planar_poses[1]
+        """Index of the current goal in ``planar_poses``; planar poses of the body before and after this round."""
         self._speed, self._length = speed, length
         self._round = self._duration()
         """Seconds."""
         self._nearest, self._fruitless = np.inf, 0
-        self._began: float | None = None
+        self._round_start: float | None = None
         self.rounds = 0
-        self._over = False
-        self._calm = RestDetector(body)
-        self._resting = False
+        self._is_over = False
+        self._rest_detector = RestDetector(body)
+        self._is_resting = False
 
     @property
     def seconds(self) -> float:
-        """That all rounds take where none slides back."""
-        return self._round * (len(self.places) - 1)
+        """Duration of all rounds in seconds, if none slides back."""
+        return self._round * (len(self.planar_poses) - 1)
 
     @property
     def expected_time(self) -> float:
-        """Seconds, with what coming to rest takes."""
+        """Expected duration in seconds, including the time to come to rest."""
         return self.seconds + self.body.time_unit
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether it lies still at the end of its way."""
-        return self._resting
+        """True if the body lies still at the end of its route."""
+        return self._is_resting
 
     def plan_record(self) -> CrawlPlan:
-        """What it aims at."""
-        return CrawlPlan(float(len(self.places) - 1), self.pace.length, self.seconds)
+        """Return the planned quantities of the motion."""
+        return CrawlPlan(float(len(self.planar_poses) - 1), self.step_limits.length, self.seconds)
 
     def planned_com(self, elapsed: float) -> None:
-        """Nothing: it goes on from where it has come to."""
+        """Return None: each round starts from the measured body."""
 
     def notes(self) -> list[str]:
-        """What kept it from its target, for the user."""
-        if not self._over or self._missing(self._to) <= _THERE:
+        """Return messages for the user about targets that were missed."""
+        if not self._is_over or self._remaining_strides(self._to) <= _ARRIVAL_TOLERANCE:
             return []
-        return [f"it slid back as far as it came on, and gave up after {self.rounds} rounds"]
+        return [f"the body slid back as far as it moved forward, and gave up after {self.rounds} rounds"]
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> CrawlOutcome:
-        """What a round came to between two states of the trajectory."""
+        """Measure the mean displacement per round between two states of the trajectory."""
         ends = trajectory.positions[[first, last]]
-        gone = (self.body.centre_of_mass(ends[1]) - self.body.centre_of_mass(ends[0])) @ self.ground.axes[:2].T
-        return CrawlOutcome(float(self.rounds), float(np.linalg.norm(gone)) / self.body.height / max(self.rounds, 1))
+        displacement = (self.body.centre_of_mass(ends[1]) - self.body.centre_of_mass(ends[0])) @ self.ground.axes[:2].T
+        return CrawlOutcome(
+            float(self.rounds), float(np.linalg.norm(displacement)) / self.body.height / max(self.rounds, 1)
+        )
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
+        step."""
         body, axes, control, unit = self.body, self.ground.axes, self.control, self.body.time_unit
         local = self.ground.local(state.positions)
-        if not self._over and (self._began is None or state.time - self._began >= self._round - 1e-9):
+        if not self._is_over and (self._round_start is None or state.time - self._round_start >= self._round - 1e-9):
             self._plan_round(local, state.time)
-        assert self._began is not None
-        elapsed = state.time - self._began
+        assert self._round_start is not None
+        elapsed = state.time - self._round_start
         self._note_rest(axes @ body.centre_of_mass(state.velocities), state.time)
         before, after = self._pose(elapsed), self._pose(elapsed + dt)
         follow = min(control.follow / unit, 0.7 / dt)
@@ -170,102 +177,115 @@ class Crawl:
         swings = (carried > 0.0) & (carried < 1.0)
         com = body.centre_of_mass(local)
         com_velocity = body.centre_of_mass(after - before) / dt + follow * (body.centre_of_mass(before) - com)
-        spin = control.turn_rate / unit * self._turn(local, before) + self._turn(before, after) / dt
+        spin = (
+            control.turn_rate / unit * self._best_fit_rotation(local, before)
+            + self._best_fit_rotation(before, after) / dt
+        )
         pose = (after - before) / dt + follow * (before - local)
         return [
             centre_of_mass_velocity(body, com_velocity @ axes, control.com),
             AngularMomentumObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
             node_velocities(body, pose @ axes, control.pose),
             *([LoadObjective(np.flatnonzero(swings), control.unload)] if swings.any() else []),
-            *([self._hold(report, swings)] if report is not None else []),
+            *([self._no_slip_objective(report, swings)] if report is not None else []),
         ]
 
     def _plan_round(self, local: np.ndarray, time: float) -> None:
-        self._from = self._place_of(local)
-        self._to, self._over = self._aim()
-        self._began, self._round = time, self._duration()
-        self.rounds += not self._over
+        self._from = self._planar_pose(local)
+        self._to, self._is_over = self._aim()
+        self._round_start, self._round = time, self._duration()
+        self.rounds += not self._is_over
 
     def _duration(self) -> float:
-        """Seconds of this round: longer where slices go aside."""
+        """Return the duration of this round in seconds; it is longer where sections move sideways."""
         change, half = self._to - self._from, 0.5 * self._length
         aside = abs(np.cos(self._from[2]) * change[1] - np.sin(self._from[2]) * change[0]) + half * abs(change[2])
-        gentle = np.sqrt(_BEND * aside / (_GENTLE * np.linalg.norm(self.body.gravity))) / _CARRIED
-        return max(_ROUND * self.body.time_unit, float(gentle)) / self._speed
+        gentle = (
+            np.sqrt(_MAX_CURVATURE * aside / (_SIDE_ACCELERATION * np.linalg.norm(self.body.gravity)))
+            / _CARRIED_FRACTION
+        )
+        return max(_ROUND_TIME * self.body.time_unit, float(gentle)) / self._speed
 
     def _aim(self) -> tuple[np.ndarray, bool]:
-        """(3,) where the body is to be after this round, and whether it is there for good."""
-        while self._next < len(self.places) - 1 and self._paces(self.places[self._next] - self._from) < _NEXT:
+        """Return the planar pose (3,) for the end of this round, and True if the crawl is over."""
+        while (
+            self._next < len(self.planar_poses) - 1
+            and self._stride_count(self.planar_poses[self._next] - self._from) < _ADVANCE_DISTANCE
+        ):
             self._next += 1
-        missing = self._paces(self.places[self._next] - self._from)
-        left = missing + len(self.places) - 1 - self._next
-        if left < self._nearest - _GAIN:
+        missing = self._stride_count(self.planar_poses[self._next] - self._from)
+        left = missing + len(self.planar_poses) - 1 - self._next
+        if left < self._nearest - _MIN_PROGRESS:
             self._nearest, self._fruitless = left, 0
         else:
             self._fruitless += 1
-        over = (self._next == len(self.places) - 1 and missing <= _THERE) or self._fruitless > _FRUITLESS
+        over = (
+            self._next == len(self.planar_poses) - 1 and missing <= _ARRIVAL_TOLERANCE
+        ) or self._fruitless > _MAX_FRUITLESS_ROUNDS
         share = 0.0 if over else min(1.0, 1.0 / max(missing, 1e-12))
-        return self._from + share * (self.places[self._next] - self._from), over
+        return self._from + share * (self.planar_poses[self._next] - self._from), over
 
-    def _paces(self, change: np.ndarray) -> float:
-        """That a ``change`` of place (3,) takes."""
+    def _stride_count(self, change: np.ndarray) -> float:
+        """Return the number of strides that a ``change`` of the planar pose (3,) takes."""
         cos, sin = np.cos(self._from[2]), np.sin(self._from[2])
         ahead, aside = cos * change[0] + sin * change[1], cos * change[1] - sin * change[0]
-        way = float(np.hypot(ahead, aside / self.pace.side_fraction)) / self.pace.length
-        return way + abs(float(change[2])) / self.pace.turn
+        strides = float(np.hypot(ahead, aside / self.step_limits.side_fraction)) / self.step_limits.length
+        return strides + abs(float(change[2])) / self.step_limits.turn
 
-    def _missing(self, place: np.ndarray) -> float:
-        """Paces from ``place`` (3,) to the end of the way."""
-        return self._paces(self.places[-1] - place)
+    def _remaining_strides(self, planar_pose: np.ndarray) -> float:
+        """Return the number of strides from ``planar_pose`` (3,) to the end of the route."""
+        return self._stride_count(self.planar_poses[-1] - planar_pose)
 
-    def _place_of(self, local: np.ndarray) -> np.ndarray:
-        """(3,) where the nodes at ``local`` (N, 3) have the body, its heading by whole turns as near to the last as may
-        be."""
+    def _planar_pose(self, local: np.ndarray) -> np.ndarray:
+        """Return the planar pose (3,) of the body with its nodes at ``local`` (N, 3). Its heading is unwrapped to the
+        value nearest to the previous one."""
         com = self.body.centre_of_mass(local)
         turn = kabsch_rotation(self.body.node_mass, self._standing - self._centre, local - com)
         heading = float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
         heading += 2.0 * np.pi * round((self._to[2] - heading) / (2.0 * np.pi))
         return np.array([*(com - self._centre)[:2], heading])
 
-    def _note_rest(self, moving: np.ndarray, time: float) -> None:
-        calm = self._calm.update(moving, time)
-        slow = bool(np.linalg.norm(moving) <= REST_SPEED * self.body.speed_unit)
-        self._resting = (self._over and calm) or (self._resting and slow)
+    def _note_rest(self, velocity: np.ndarray, time: float) -> None:
+        calm = self._rest_detector.update(velocity, time)
+        slow = bool(np.linalg.norm(velocity) <= REST_SPEED * self.body.speed_unit)
+        self._is_resting = (self._is_over and calm) or (self._is_resting and slow)
 
     def _carried(self, elapsed: float) -> np.ndarray:
-        """(N,) part of its stride that each node has been carried ``elapsed`` seconds into a round."""
-        parts = (elapsed / self._round - (1.0 - _CARRIED) * self._behind) / _CARRIED
+        """Return the fraction (N,) of its stride that each node has completed ``elapsed`` seconds into a round."""
+        parts = (elapsed / self._round - (1.0 - _CARRIED_FRACTION) * self._behind) / _CARRIED_FRACTION
         return np.array([smooth(part) for part in parts])
 
     def _pose(self, elapsed: float) -> np.ndarray:
-        """(N, 3) where the nodes should be ``elapsed`` seconds into a round."""
+        """Return the target positions (N, 3) of the nodes ``elapsed`` seconds into a round, ground coordinates."""
         carried = self._carried(elapsed)[:, None]
-        pose = (1.0 - carried) * self._placed(self._from) + carried * self._placed(self._to)
+        pose = (1.0 - carried) * self._posed_nodes(self._from) + carried * self._posed_nodes(self._to)
         pose[:, 2:] += _LIFT * self.body.height * 4.0 * carried * (1.0 - carried)
         return pose
 
-    def _placed(self, place: np.ndarray) -> np.ndarray:
-        """(N, 3) the nodes as they lay, with the body at ``place`` (3,): see ``motions.route``."""
-        turn = Rotation.from_rotvec([0.0, 0.0, place[2]]).as_matrix()
-        moved = np.array([*place[:2], self._slope @ place[:2]])
+    def _posed_nodes(self, planar_pose: np.ndarray) -> np.ndarray:
+        """Return the nodes (N, 3) of the resting body moved to ``planar_pose`` (3,), as in
+        ``motions.route``."""
+        turn = Rotation.from_rotvec([0.0, 0.0, planar_pose[2]]).as_matrix()
+        moved = np.array([*planar_pose[:2], self._slope @ planar_pose[:2]])
         return self._centre + moved + (self._standing - self._centre) @ turn.T
 
-    def _hold(self, report: StepReport, swings: np.ndarray) -> Objective:
-        """What stands does not slide."""
+    def _no_slip_objective(self, report: StepReport, swings: np.ndarray) -> Objective:
+        """Return the objective that standing contacts do not slide."""
         contacts = report.contacts
         stands = ~swings[contacts.nearest_nodes]
         loads = np.where(stands, report.forces[:, 0], 0.0) / self.body.weight
         return no_slip_contacts(contacts, loads, self.control.hold)
 
-    def _turn(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """(3,) rotation vector that best carries ``before`` (N, 3) to ``after`` (N, 3)."""
+    def _best_fit_rotation(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Return the (3,) best-fit rotation (Kabsch) from ``before`` (N, 3) to ``after`` (N, 3) as a rotation
+        vector."""
         arms, aims = (x - self.body.centre_of_mass(x) for x in (before, after))
         return Rotation.from_matrix(kabsch_rotation(self.body.node_mass, arms, aims)).as_rotvec()
 
 
 def _slices(flat: np.ndarray) -> np.ndarray:
-    """(N,) metres along the length of points (N, 2) on the ground, growing ahead or, where it lies across, to the
-    left."""
+    """Return the coordinate (N,) in metres of points (N, 2) on the ground along their longest axis. It increases
+    forward or, if the body lies across, to the left."""
     middle = flat - flat.mean(axis=0)
     axis = np.linalg.svd(middle, full_matrices=False)[2][0]
     return middle @ (axis if axis.sum() > 0.0 else -axis)

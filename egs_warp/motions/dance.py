@@ -1,4 +1,4 @@
-"""Dance: small jumps that leave the ground and come back to it on the beats of a music (docs/motions/dance.md)."""
+"""Dance: small jumps that leave the ground and land again on the beats of a piece of music (docs/motions/dance.md)."""
 
 from __future__ import annotations
 
@@ -18,92 +18,92 @@ from egs_warp.motions.jump_plan import JumpTarget, height_of_flight, level_fligh
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import heading_between, sole_shares
 from egs_warp.motions.stand import Stand
-from egs_warp.motions.turn import RESERVE, largest_turn
+from egs_warp.motions.turn import MAX_TURN_FRACTION, largest_turn
 from egs_warp.motions.twist import TurnHeading
 
-LOWEST, HIGHEST = 0.1, 0.6
-"""Body heights: the jumps of a dance."""
-EASIEST = 0.3
-"""Body heights: the jump that is liked best."""
-AHEAD = 0.15
-"""Body heights: a small hop."""
-TURN = np.radians(20.0)
-"""A small twist, to either side of the front."""
-IN_TIME = 0.04
-"""Seconds: what lies no further from its beat is on it."""
-_ON_THE_SPOT = 0.02
-"""Body heights: a way that is no way."""
-_TOUCHING = 1e-6
-"""Of the weight: what the ground bears of a body that touches it."""
+MIN_HEIGHT, MAX_HEIGHT = 0.1, 0.6
+"""Lowest and highest jump of a dance, in body heights."""
+PREFERRED_HEIGHT = 0.3
+"""Preferred height of a jump, in body heights."""
+HOP_LENGTH = 0.15
+"""Length of a small hop, in body heights."""
+TWIST_ANGLE = np.radians(20.0)
+"""Angle of a small twist to either side of the front, in radians."""
+BEAT_TOLERANCE = 0.04
+"""Seconds: an event within this of its beat is on the beat."""
+_MIN_DISTANCE = 0.02
+"""Body heights: a shorter distance counts as a jump on the spot."""
+_MIN_CONTACT_FORCE = 1e-6
+"""Share of the weight that the ground supports when the body touches it."""
 
 
 @dataclass(frozen=True)
-class _Stance:
-    """Where a jump of the dance ends."""
+class _Landing:
+    """Move of the dance: where a jump ends and how it turns."""
 
     move: str
-    ahead: float = 0.0
-    """Small hops from where the dance began."""
+    forward: float = 0.0
+    """Distance from the start of the dance, in small hops."""
     turned: float = 0.0
-    """Small twists from the front."""
+    """Heading relative to the front, in small twists."""
     twists: bool = False
-    """Whether the jump turns; others land facing as they started."""
+    """True if the jump turns; other jumps land with the heading that they started with."""
 
 
-FIGURE = (
-    _Stance("jump"),
-    _Stance("hop ahead", ahead=1.0),
-    _Stance("hop back"),
-    _Stance("twist left", turned=1.0, twists=True),
-    _Stance("twist right", turned=-1.0, twists=True),
-    _Stance("twist ahead", twists=True),
+MOVES = (
+    _Landing("jump"),
+    _Landing("hop ahead", forward=1.0),
+    _Landing("hop back"),
+    _Landing("twist left", turned=1.0, twists=True),
+    _Landing("twist right", turned=-1.0, twists=True),
+    _Landing("twist ahead", twists=True),
 )
-"""Again and again. Each jump aims at its own stance, so that errors do not add up."""
+"""Moves of the dance, repeated in a cycle. Each jump has an absolute target, so that errors do not accumulate."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """The ground left or met again; seconds from the start of the dance."""
+    """Take-off or touch-down; seconds from the start of the dance."""
 
     event: str
-    """``take-off``, the end of the last step in which the ground bears the body, or ``touch-down``, that of the first
-    one in which it does again."""
+    """``take-off``, the end of the last time step with a contact force, or ``touch-down``, the end of the first one
+    with a contact force again."""
     move: str
     asked: float
-    """The beat, or a half, a quarter or an eighth of the way to it."""
+    """Target time: the beat, or a half, a quarter or an eighth of the interval before it."""
     reached: float
     error: float
-    """Reached less asked."""
+    """``reached`` - ``asked``."""
 
 
 @dataclass(frozen=True)
 class DanceOutcome:
-    """How well a dance kept time; seconds."""
+    """Timing errors of a dance; seconds."""
 
     events: tuple[Event, ...]
     worst_error: float
-    """The largest, early or late; 0 if there are no events."""
+    """Largest error, early or late; 0 if there are no events."""
     skipped: tuple[float, ...]
-    """Beats on which there was neither take-off nor touch-down, too near to the others."""
+    """Beats without take-off or touch-down, because they were too close to others."""
 
 
 @dataclass(frozen=True)
 class DancePlan:
-    """What a dance aims at."""
+    """Planned quantities of a dance."""
 
     beats: float
-    """How many there are."""
+    """Number of beats."""
     duration: float
-    """Seconds until the last one."""
+    """Time of the last beat, s."""
     shortest_flight: float
     longest_flight: float
     turn_degrees: float
-    """Of a small twist; 0 where friction gives none that would be seen."""
+    """Angle of a small twist; 0 if friction does not allow a visible one."""
 
 
 @dataclass
 class _Step:
-    """A jump of the dance."""
+    """One jump of the dance and its measured contact times."""
 
     span: Span
     move: str
@@ -111,16 +111,16 @@ class _Step:
     began: float
     """Seconds from the start of the dance."""
     start: np.ndarray
-    """(3,) metres: the centre of mass then."""
+    """(3,) m, centre of mass at that time."""
 
     def __post_init__(self) -> None:
         self._airborne: list[tuple[float, float]] = []
-        """From the last step on the ground to the first one on it again."""
+        """Flights: the end of the last step with contact, and of the first step with contact again, s."""
         self._left: float | None = None
         self._touched = self.began
 
-    def see(self, now: float, *, touching: bool) -> None:
-        """To be told at the end of every step."""
+    def update(self, now: float, *, touching: bool) -> None:
+        """Record the contact at the end of a time step; ``now`` is in seconds from the start of the dance."""
         if not touching:
             self._left = self._touched if self._left is None else self._left
             return
@@ -129,46 +129,52 @@ class _Step:
         self._left, self._touched = None, now
 
     def flight(self) -> tuple[float, float] | None:
-        """Seconds at which it left the ground and met it: what is brushed on the way is no landing."""
+        """Return the times of take-off and touch-down, those of the longest flight: brushing the ground in between is
+        no landing."""
         return max(self._airborne, key=lambda span: span[1] - span[0], default=None)
 
     def events(self) -> list[Event]:
-        """Asked and reached."""
+        """Return the take-off and the touch-down with their target and measured times."""
         reached = self.flight()
         if reached is None:
             return []
-        asked = (("take-off", self.span.take_off), ("touch-down", self.span.touch_down))
-        return [Event(name, self.move, time, now, now - time) for (name, time), now in zip(asked, reached, strict=True)]
+        targets = (("take-off", self.span.take_off), ("touch-down", self.span.touch_down))
+        return [
+            Event(name, self.move, time, now, now - time) for (name, time), now in zip(targets, reached, strict=True)
+        ]
 
 
 class Dance:
-    """Stands until it is time for the next jump, jumps so high that it lands on a beat, and aims anew from there."""
+    """Stand until the next jump is due, jump so high that it lands on a beat, and plan the next jump from there."""
 
-    def __init__(self, place: Stance, beats: Sequence[float]) -> None:
-        """``beats``: seconds from the start of the dance, in their order.
+    def __init__(self, stance: Stance, beats: Sequence[float]) -> None:
+        """Plan the first jump; ``beats`` are times in seconds from the start of the dance, increasing.
 
-        Raises ``UserError`` where it could not begin with any of them.
+        Raises:
+            UserError: if no beat can be reached.
         """
-        body = place.body
-        self._home, self._beats, self._step = place, tuple(beats), place.step
-        self._share = sole_shares(body, place.ground, place.standing)
+        body = stance.body
+        self._start_stance, self._beats, self._step = stance, tuple(beats), stance.step
+        self._share = sole_shares(body, stance.ground, stance.standing)
         self._gravity = float(np.linalg.norm(body.gravity))
-        # A landing is noted at the end of its step.
-        self._late, self._long = 0.0, 0.5 * place.step
-        self._trial = self._jump(place, _Stance("jump"), EASIEST * body.height, turn=0.0)
-        self._turn = TURN if RESERVE * largest_turn(self._trial, place) >= 2.0 * TURN else 0.0
-        self._figure = tuple(stance for stance in FIGURE if self._turn > 0.0 or not stance.twists)
-        self._stand: Stand | None = Stand(place)
-        self._done: list[_Step] = []
-        self._dancing: _Step | None = None
+        # A landing is recorded at the end of its time step.
+        self._lead_error, self._flight_error = 0.0, 0.5 * stance.step
+        self._trial_jump = self._jump(stance, _Landing("jump"), PREFERRED_HEIGHT * body.height, turn=0.0)
+        self._turn = (
+            TWIST_ANGLE if MAX_TURN_FRACTION * largest_turn(self._trial_jump, stance) >= 2.0 * TWIST_ANGLE else 0.0
+        )
+        self._moves = tuple(landing for landing in MOVES if self._turn > 0.0 or not landing.twists)
+        self._stand: Stand | None = Stand(stance)
+        self._finished_steps: list[_Step] = []
+        self._current_step: _Step | None = None
         self._started: float | None = None
         self._next = self._aim(0.0)
         if self._next is None:
             shortest, longest = self._flights()
             raise UserError(
                 f"dance: none of the {len(beats)} beats can be reached: before the first jump it takes "
-                f"{self._lead(EASIEST * body.height):.2f} s, and a jump spans {shortest:.2f} to {longest:.2f} s;"
-                " give later beats, or a slower tempo"
+                f"{self._lead(PREFERRED_HEIGHT * body.height):.2f} s, "
+                f"and a jump spans {shortest:.2f} to {longest:.2f} s; give later beats, or a slower tempo"
             )
         self._plan = DancePlan(
             float(len(beats)), self._beats[-1], *self._flights(), turn_degrees=float(np.degrees(self._turn))
@@ -176,34 +182,35 @@ class Dance:
 
     @property
     def expected_time(self) -> float:
-        """Seconds until it is at rest: it jumps as long as there are beats."""
-        body = self._home.body
+        """Expected duration in seconds: it dances until the last beat."""
+        body = self._start_stance.body
         return self._beats[-1] + float(np.sqrt(body.height / self._gravity))
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether there is no beat left, and the body calm."""
-        return self._next is None and self._dancing is None and (self._stand is None or self._stand.resting)
+        """True if no beat is left and the body is at rest."""
+        return self._next is None and self._current_step is None and (self._stand is None or self._stand.is_at_rest)
 
     def plan_record(self) -> DancePlan:
-        """What it aims at."""
+        """Return the planned quantities of the motion."""
         return self._plan
 
     def planned_com(self, elapsed: float) -> np.ndarray:
-        """(3,) metres from where the centre of mass stood: that of each jump, NaN in between."""
+        """Return the planned displacement (3,) of the centre of mass in metres: that of the current jump, NaN before
+        the first."""
         for step in reversed(self._steps()):
             if elapsed >= step.began:
                 return step.start - self._steps()[0].start + step.jump.planned_com(elapsed - step.began)
         return np.full(3, np.nan)
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> DanceOutcome:
-        """How well it kept time."""
+        """Return the timing errors."""
         events = tuple(event for step in self._steps() for event in step.events())
         worst = max((abs(event.error) for event in events), default=0.0)
         return DanceOutcome(events, worst, self._skipped())
 
     def notes(self) -> list[str]:
-        """How well it kept time, and what kept it from a beat, for the user."""
+        """Return messages for the user about the timing and about skipped beats."""
         steps = self._steps()
         events = [event for step in steps for event in step.events()]
         notes = [f"{step.move} to {step.span.touch_down:.2f} s: {note}" for step in steps for note in step.jump.notes()]
@@ -225,25 +232,28 @@ class Dance:
         return notes
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
+        step."""
         self._started = state.time if self._started is None else self._started
         now = state.time - self._started
-        step = self._dancing
+        step = self._current_step
         if step is not None and report is not None:
-            step.see(now, touching=bool(report.forces[:, 0].sum() > _TOUCHING * self._home.body.weight))
-        if step is not None and step.jump.resting:
-            self._learn(step)
-            self._done.append(step)
-            place = self._home.moved_to(state.positions)
-            self._dancing, self._stand, self._next = None, Stand(place), self._aim(now)
-        if self._next is not None and self._dancing is None:
+            step.update(
+                now, touching=bool(report.forces[:, 0].sum() > _MIN_CONTACT_FORCE * self._start_stance.body.weight)
+            )
+        if step is not None and step.jump.is_at_rest:
+            self._correct_timing(step)
+            self._finished_steps.append(step)
+            stance = self._start_stance.moved_to(state.positions)
+            self._current_step, self._stand, self._next = None, Stand(stance), self._aim(now)
+        if self._next is not None and self._current_step is None:
             span = self._next
             height = self._height(span.flight)
-            # To the nearest step.
+            # Start at the time step nearest to the planned start.
             if now + 0.5 * dt >= span.take_off - self._lead(height):
                 self._begin(state, now, span, height)
-        if self._dancing is not None:
-            return self._dancing.jump.objectives(state, report, dt)
+        if self._current_step is not None:
+            return self._current_step.jump.objectives(state, report, dt)
         assert self._stand is not None
         return self._stand.objectives(state, report, dt)
 
@@ -252,64 +262,71 @@ class Dance:
         return tuple(beat for beat in self._beats if beat not in met)
 
     def _steps(self) -> list[_Step]:
-        return self._done if self._dancing is None else [*self._done, self._dancing]
+        return self._finished_steps if self._current_step is None else [*self._finished_steps, self._current_step]
 
     def _begin(self, state: BodyState, now: float, span: Span, height: float) -> None:
-        stance = self._figure[len(self._done) % len(self._figure)]
-        place = self._home.moved_to(state.positions)
-        turned = heading_between(self._home.standing, state.positions, self._share, self._home.ground)
-        jump = self._jump(place, stance, height, turn=stance.turned * self._turn - turned)
-        com = place.body.centre_of_mass(state.positions)
-        self._dancing, self._next = _Step(span, stance.move, jump, now, com), None
+        landing = self._moves[len(self._finished_steps) % len(self._moves)]
+        stance = self._start_stance.moved_to(state.positions)
+        turned = heading_between(self._start_stance.standing, state.positions, self._share, self._start_stance.ground)
+        jump = self._jump(stance, landing, height, turn=landing.turned * self._turn - turned)
+        com = stance.body.centre_of_mass(state.positions)
+        self._current_step, self._next = _Step(span, landing.move, jump, now, com), None
 
-    def _jump(self, place: Stance, stance: _Stance, height: float, *, turn: float) -> Jump:
-        """From ``place`` to the ``stance``, ``height`` metres high, turning by ``turn`` radians."""
-        home, body = self._home, place.body
-        goal = self._share @ home.standing + stance.ahead * AHEAD * body.height * home.ground.axes[0]
-        way = goal - self._share @ place.standing
-        distance = float(np.linalg.norm(home.ground.axes[:2] @ way))
-        if distance > _ON_THE_SPOT * body.height:
-            place = place.with_forward(way)
+    def _jump(self, stance: Stance, landing: _Landing, height: float, *, turn: float) -> Jump:
+        """Return the jump from ``stance`` to ``landing``, ``height`` metres high, which turns by ``turn`` radians."""
+        start_stance, body = self._start_stance, stance.body
+        goal = (
+            self._share @ start_stance.standing
+            + landing.forward * HOP_LENGTH * body.height * start_stance.ground.axes[0]
+        )
+        offset = goal - self._share @ stance.standing
+        distance = float(np.linalg.norm(start_stance.ground.axes[:2] @ offset))
+        if distance > _MIN_DISTANCE * body.height:
+            stance = stance.with_forward(offset)
         else:
             distance = 0.0
         target = JumpTarget(distance, height)
-        straight = Jump(place, target, settled=True)
-        if not stance.twists:
+        straight = Jump(stance, target, skips_settling=True)
+        if not landing.twists:
             return straight
-        most = RESERVE * largest_turn(straight, place)
-        return Jump(place, target, settled=True, facing=TurnHeading(place, float(np.clip(turn, -most, most))))
+        max_turn = MAX_TURN_FRACTION * largest_turn(straight, stance)
+        return Jump(
+            stance, target, skips_settling=True, facing=TurnHeading(stance, float(np.clip(turn, -max_turn, max_turn)))
+        )
 
     def _aim(self, now: float) -> Span | None:
-        """The next jump of a body that stands ``now``."""
+        """Return the next jump of a body that stands at time ``now``."""
         return next_span(
             self._beats,
             now,
             earliest=lambda flight: now + self._lead(self._height(flight)) - 0.5 * self._step,
             flights=self._flights(),
-            easiest=self._flight(EASIEST * self._home.body.height),
+            easiest=self._flight(PREFERRED_HEIGHT * self._start_stance.body.height),
         )
 
     def _lead(self, height: float) -> float:
-        """Seconds from the first step of a jump of ``height`` metres to its take-off."""
-        return self._trial.take_off_time(height) + self._late
+        """Return the seconds from the first time step of a jump of ``height`` metres to its take-off."""
+        return self._trial_jump.take_off_time(height) + self._lead_error
 
     def _flights(self) -> tuple[float, float]:
-        """The shortest and the longest, seconds."""
-        return self._flight(LOWEST * self._home.body.height), self._flight(HIGHEST * self._home.body.height)
+        """Return the shortest and the longest flight, s."""
+        return self._flight(MIN_HEIGHT * self._start_stance.body.height), self._flight(
+            MAX_HEIGHT * self._start_stance.body.height
+        )
 
     def _flight(self, height: float) -> float:
-        """Seconds that a jump of ``height`` metres is off the ground."""
-        return level_flight(height, self._home.body.height, self._gravity) + self._long
+        """Return the flight time in seconds of a jump of ``height`` metres."""
+        return level_flight(height, self._start_stance.body.height, self._gravity) + self._flight_error
 
     def _height(self, flight: float) -> float:
-        """Metres: the jump that is off the ground for so many seconds."""
-        return height_of_flight(flight - self._long, self._home.body.height, self._gravity)
+        """Return the height in metres of the jump with this flight time, s."""
+        return height_of_flight(flight - self._flight_error, self._start_stance.body.height, self._gravity)
 
-    def _learn(self, step: _Step) -> None:
-        """What a jump was late by and flew longer than its plan, half of it, goes into the next one's."""
+    def _correct_timing(self, step: _Step) -> None:
+        """Correct the lead and the flight time of later jumps by half of the error of this one."""
         reached = step.flight()
         if reached is None:
             return
         took_off, landed = reached
-        self._late += 0.5 * (took_off - step.span.take_off)
-        self._long += 0.5 * (landed - took_off - step.span.flight)
+        self._lead_error += 0.5 * (took_off - step.span.take_off)
+        self._flight_error += 0.5 * (landed - took_off - step.span.flight)

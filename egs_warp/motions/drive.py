@@ -1,7 +1,7 @@
-"""Driven by commands that can change at every step: a walk, a crawl or a roll whose way is made as it goes.
+"""Walk, crawl or roll under commands that can change at every time step.
 
-Each pace is planned when it begins, from the command of that moment; when the command is to stand, the feet close and
-the body gathers itself.
+Each step of a walk is planned when it begins, from the command at that moment. When the command is zero, the feet close
+and the body returns to its standing pose.
 """
 
 from __future__ import annotations
@@ -25,215 +25,234 @@ from egs_warp.motions.stand import Stand
 from egs_warp.motions.velocity_profile import ProfileSample
 from egs_warp.motions.walk import MAX_LAG, Walk
 
-_AHEAD = 4
-"""Paces to come that a walk plans for, as if the command stayed."""
-_QUICKEST = 1.6
-"""Of the usual speed of a gait: as quick as a walk may be told to be."""
+_PLANNED_STEPS = 4
+"""Number of future steps that a walk plans, assuming a constant command."""
+_MAX_SPEED_FACTOR = 1.6
+"""Largest speed of a walk, relative to the nominal speed of the gait."""
 
 
 def integrate_command(
-    place: np.ndarray, command: Drive, time: float, pace: StepLimits, *, unit: float, height: float
+    planar_pose: np.ndarray, command: Drive, time: float, limits: StepLimits, *, unit: float, height: float
 ) -> np.ndarray:
-    """(3,) the place ``time`` seconds after ``place`` (3,) under ``command``, no further than one ``pace``."""
-    spell = time / unit
-    share = 1.0 / max(spell * _effort(command, pace, height), 1.0)
-    turn = share * spell * command.turn
-    # Along the arc that it goes on: by its chord.
-    middle = place[2] + 0.5 * turn
-    ahead, left = share * spell * height * np.array([command.forward, command.sideways * (pace.side_fraction > 0.0)])
+    """Return the planar pose (3,) ``time`` seconds after ``planar_pose`` (3,) under ``command``, at most one step away.
+
+    Args:
+        planar_pose: (3,) x and y in metres, heading in radians.
+        command: velocity command.
+        time: s.
+        limits: limits of one step.
+        unit: time unit sqrt(H / g), s.
+        height: body height H, m.
+    """
+    duration = time / unit
+    share = 1.0 / max(duration * _effort(command, limits, height), 1.0)
+    turn = share * duration * command.turn
+    # The body moves along an arc; this is the direction of its chord.
+    middle = planar_pose[2] + 0.5 * turn
+    ahead, left = (
+        share * duration * height * np.array([command.forward, command.sideways * (limits.side_fraction > 0.0)])
+    )
     cos, sin = np.cos(middle), np.sin(middle)
-    return place + [cos * ahead - sin * left, sin * ahead + cos * left, turn]
+    return planar_pose + [cos * ahead - sin * left, sin * ahead + cos * left, turn]
 
 
-def _effort(command: Drive, pace: StepLimits, height: float) -> float:
-    """The longest paces in sqrt(H / g) that a ``command`` takes."""
-    aside = command.sideways / pace.side_fraction if pace.side_fraction > 0.0 else 0.0
-    return height * float(np.hypot(command.forward, aside)) / pace.length + abs(command.turn) / pace.turn
+def _effort(command: Drive, limits: StepLimits, height: float) -> float:
+    """Return the number of longest steps per sqrt(H / g) that a ``command`` needs."""
+    aside = command.sideways / limits.side_fraction if limits.side_fraction > 0.0 else 0.0
+    return height * float(np.hypot(command.forward, aside)) / limits.length + abs(command.turn) / limits.turn
 
 
 class DrivenWalk(Walk):
-    """A walk whose places are made as it goes."""
+    """Walk whose route is extended while it runs."""
 
-    def __init__(self, place: Stance, command: Drive) -> None:
+    def __init__(self, stance: Stance, command: Drive) -> None:
         self.command = command
-        super().__init__(place, lambda _: np.zeros((2, 3)), place.body.height)
-        self._usual = self.gait
+        super().__init__(stance, lambda _: np.zeros((2, 3)), stance.body.height)
+        self._nominal_gait = self.gait
         self._lay_places(0)
 
     def _plan_swing(self, swing: int, local: np.ndarray) -> None:
         if self._mean_lag(local) > MAX_LAG:
-            # It goes on from where slipping feet have left it.
-            self.places[min(swing, self.gait.step_count), :2] -= self._foothold_error(local).mean(axis=0)
+            # Continue from where slipping feet have left the body.
+            self.planar_poses[min(swing, self.gait.step_count), :2] -= self._foothold_error(local).mean(axis=0)
         self._lay_places(swing)
 
     def _lay_places(self, swing: int) -> None:
-        """Where the body goes from swing ``swing`` on; it has got as far as the place of that number."""
-        kept = list(self.places[: swing + 1])
-        kept += [kept[-1]] * (swing + 1 - len(kept))
+        """Plan the planar poses from swing ``swing`` on; the pose of that index has been reached."""
+        places_so_far = list(self.planar_poses[: swing + 1])
+        places_so_far += [places_so_far[-1]] * (swing + 1 - len(places_so_far))
         if self.command.is_zero:
             if swing >= self.gait.step_count and swing > 0:
-                return  # It closes its feet already.
-            places = kept if swing > 0 else [*kept, kept[-1]]
+                return  # The feet are already closing.
+            planar_poses = places_so_far if swing > 0 else [*places_so_far, places_so_far[-1]]
         else:
-            time = self._usual.swing_time + self._usual.double_time
-            rate = self._quickness(time)
+            time = self._nominal_gait.swing_time + self._nominal_gait.double_time
+            rate = self._speed_factor(time)
             self.gait = replace(
-                self._usual, swing_time=self._usual.swing_time / rate, double_time=self._usual.double_time / rate
+                self._nominal_gait,
+                swing_time=self._nominal_gait.swing_time / rate,
+                double_time=self._nominal_gait.double_time / rate,
             )
-            places = kept
-            for _ in range(_AHEAD):
-                places.append(self._next(places[-1], time / rate))
-        self.places = np.array(places)
-        self.gait = replace(self.gait, step_count=len(places) - 1)
+            planar_poses = places_so_far
+            for _ in range(_PLANNED_STEPS):
+                planar_poses.append(self._next_pose(planar_poses[-1], time / rate))
+        self.planar_poses = np.array(planar_poses)
+        self.gait = replace(self.gait, step_count=len(planar_poses) - 1)
 
-    def _next(self, place: np.ndarray, time: float) -> np.ndarray:
+    def _next_pose(self, planar_pose: np.ndarray, time: float) -> np.ndarray:
         unit, height = self.body.time_unit, self.body.height
-        return integrate_command(place, self.command, time, self._pace, unit=unit, height=height)
+        return integrate_command(planar_pose, self.command, time, self._step_limits, unit=unit, height=height)
 
-    def _quickness(self, time: float) -> float:
-        """Over the usual, that the command takes at the longest pace."""
-        effort = _effort(self.command, self._pace, self.body.height)
-        return float(np.clip(time / self.body.time_unit * effort, 1.0, _QUICKEST))
+    def _speed_factor(self, time: float) -> float:
+        """Return the speed relative to the nominal one that the command needs at the longest step."""
+        effort = _effort(self.command, self._step_limits, self.body.height)
+        return float(np.clip(time / self.body.time_unit * effort, 1.0, _MAX_SPEED_FACTOR))
 
 
 class DrivenCrawl(Crawl):
-    """A crawl whose rounds are planned as it goes."""
+    """Crawl whose rounds are planned from the current command."""
 
-    def __init__(self, place: Stance, command: Drive) -> None:
+    def __init__(self, stance: Stance, command: Drive) -> None:
         self.command = command
-        super().__init__(place, lambda _: np.zeros((2, 3)))
+        super().__init__(stance, lambda _: np.zeros((2, 3)))
 
     def _aim(self) -> tuple[np.ndarray, bool]:
         unit, height = self.body.time_unit, self.body.height
-        aim = integrate_command(self._from, self.command, self._round, self.pace, unit=unit, height=height)
+        aim = integrate_command(self._from, self.command, self._round, self.step_limits, unit=unit, height=height)
         return aim, self.command.is_zero
 
 
 class DrivenRoll(Roll):
-    """A roll at the speed that it is told; a ball does not turn."""
+    """Roll at the commanded velocity; a ball does not turn."""
 
-    def __init__(self, place: Stance, command: Drive) -> None:
+    def __init__(self, stance: Stance, command: Drive) -> None:
         self.command = command
-        super().__init__(place, lambda _: np.zeros((2, 3)))
-        self._wanted, self._aimed = np.zeros(2), self._start
+        super().__init__(stance, lambda _: np.zeros((2, 3)))
+        self._velocity, self._target = np.zeros(2), self._start
 
-    def _ahead(self, com: np.ndarray, elapsed: float, dt: float) -> ProfileSample:
+    def _profile_sample(self, com: np.ndarray, elapsed: float, dt: float) -> ProfileSample:
         unit = self.body.speed_unit
-        told = unit * np.array([self.command.forward, self.command.sideways])
-        most = self.top_push * dt
-        change = told - self._wanted
-        change *= min(1.0, most / max(float(np.linalg.norm(change)), 1e-12))
-        self._wanted = self._wanted + change
-        self._aimed = self._aimed + dt * self._wanted
-        # What it is held back by is not made up for.
-        off = self._aimed - com[:2]
-        self._aimed = com[:2] + off * min(1.0, 0.1 * self.body.height / max(float(np.linalg.norm(off)), 1e-12))
-        return ProfileSample(self._aimed - self._start, self._wanted, change / dt)
+        target = unit * np.array([self.command.forward, self.command.sideways])
+        max_change = self.top_push * dt
+        change = target - self._velocity
+        change *= min(1.0, max_change / max(float(np.linalg.norm(change)), 1e-12))
+        self._velocity = self._velocity + change
+        self._target = self._target + dt * self._velocity
+        # A body that is held back does not catch up.
+        off = self._target - com[:2]
+        self._target = com[:2] + off * min(1.0, 0.1 * self.body.height / max(float(np.linalg.norm(off)), 1e-12))
+        return ProfileSample(self._target - self._start, self._velocity, change / dt)
 
     def _is_over(self, com: np.ndarray, elapsed: float) -> bool:
-        return self.command.is_zero and not self._wanted.any()
+        return self.command.is_zero and not self._velocity.any()
 
 
 @dataclass(frozen=True)
 class DrivePlanRecord:
-    """What a drive aims at."""
+    """Planned quantities of a drive."""
 
     seconds: float
-    """Until it is told to stand for good."""
+    """Time at which the last command, zero, starts, s."""
 
 
 @dataclass(frozen=True)
 class DriveOutcome:
-    """What became of a drive; body heights along the ground, degrees."""
+    """Displacement during a drive: body heights forward and to the left along the ground."""
 
     ahead: float
     left: float
 
 
 class LiveDrive:
-    """Does as the command says, from one step to the next: ``command`` may be set at any time."""
+    """Follow ``command``, which may be set at any time."""
 
-    def __init__(self, place: Stance) -> None:
-        """The body stands at ``place``. Raises ``UserError`` for one that cannot go at all."""
-        self._place = place
+    def __init__(self, stance: Stance) -> None:
+        """Create the motion of the body that stands at ``stance``.
+
+        Raises:
+            UserError: if the body cannot move at all.
+        """
+        self._stance = stance
         self.command = Drive()
-        start_drive(place, self.command)
-        self._motion: DrivenWalk | DrivenCrawl | DrivenRoll | Stand = Stand(place)
+        start_drive(stance, self.command)
+        self._motion: DrivenWalk | DrivenCrawl | DrivenRoll | Stand = Stand(stance)
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether it stands, as it is told to."""
-        return self.command.is_zero and self._motion.resting
+        """True if the command is zero and the body stands at rest."""
+        return self.command.is_zero and self._motion.is_at_rest
 
     def notes(self) -> list[str]:
-        """None: it goes as fast as it can."""
+        """Return no messages: the body moves as fast as it can."""
         return []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
+        step."""
         motion = self._motion
         if isinstance(motion, Stand):
-            if not self.command.is_zero and motion.resting:
-                self._place = self._place.next_stance(state.positions, report)
-                self._motion = start_drive(self._place, self.command)
+            if not self.command.is_zero and motion.is_at_rest:
+                self._stance = self._stance.next_stance(state.positions, report)
+                self._motion = start_drive(self._stance, self.command)
         else:
             motion.command = self.command
-            if motion.resting:
-                self._place = self._place.next_stance(state.positions, report)
-                self._motion = Stand(self._place)
+            if motion.is_at_rest:
+                self._stance = self._stance.next_stance(state.positions, report)
+                self._motion = Stand(self._stance)
         return self._motion.objectives(state, report, dt)
 
 
-def start_drive(place: Stance, command: Drive) -> DrivenWalk | DrivenCrawl | DrivenRoll:
-    """What a body at ``place`` does under commands, by what it stands on."""
-    base = place.base()
+def start_drive(stance: Stance, command: Drive) -> DrivenWalk | DrivenCrawl | DrivenRoll:
+    """Return the motion of a body at ``stance`` under commands; its type depends on the support."""
+    base = stance.base()
     if base is SupportKind.LYING:
-        return DrivenCrawl(place, command)
+        return DrivenCrawl(stance, command)
     if base is SupportKind.ROUND_BASE:
-        return DrivenRoll(place, command)
-    return DrivenWalk(place, command)
+        return DrivenRoll(stance, command)
+    return DrivenWalk(stance, command)
 
 
 class ScriptedDrive:
-    """A drive by commands known before."""
+    """Drive with a prescribed sequence of commands."""
 
-    def __init__(self, place: Stance, plan: DrivePlan) -> None:
-        self._place, self._plan, self._driven = place, plan, LiveDrive(place)
-        self._began: float | None = None
-        self._over = False
+    def __init__(self, stance: Stance, plan: DrivePlan) -> None:
+        self._stance, self._plan, self._drive = stance, plan, LiveDrive(stance)
+        self._start_time: float | None = None
+        self._is_done = False
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether it stands at the end."""
-        return self._over and self._driven.resting
+        """True if all commands are done and the body stands at rest."""
+        return self._is_done and self._drive.is_at_rest
 
     @property
     def expected_time(self) -> float:
-        """Seconds, with what closing the feet takes."""
-        return self._plan.seconds + 6.0 * self._place.body.time_unit
+        """Expected duration in seconds, including the time to close the feet."""
+        return self._plan.seconds + 6.0 * self._stance.body.time_unit
 
     def plan_record(self) -> DrivePlanRecord:
-        """What it aims at."""
+        """Return the planned quantities of the motion."""
         return DrivePlanRecord(self._plan.seconds)
 
     def planned_com(self, elapsed: float) -> None:
-        """Nothing: it goes on from the measured body."""
+        """Return None: each step starts from the measured body."""
 
     def notes(self) -> list[str]:
-        """None."""
+        """Return no messages."""
         return []
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> DriveOutcome:
-        """Where it has come to."""
+        """Measure the displacement between two states of the trajectory."""
         ends = trajectory.positions[[first, last]]
-        body = self._place.body
-        moved = self._place.ground.axes @ (body.centre_of_mass(ends[1]) - body.centre_of_mass(ends[0]))
+        body = self._stance.body
+        moved = self._stance.ground.axes @ (body.centre_of_mass(ends[1]) - body.centre_of_mass(ends[0]))
         return DriveOutcome(float(moved[0]) / body.height, float(moved[1]) / body.height)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
-        self._began = state.time if self._began is None else self._began
-        elapsed = state.time - self._began
-        self._over = elapsed >= self._plan.seconds - 1e-9
-        self._driven.command = self._plan.at(elapsed)
-        return self._driven.objectives(state, report, dt)
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
+        step."""
+        self._start_time = state.time if self._start_time is None else self._start_time
+        elapsed = state.time - self._start_time
+        self._is_done = elapsed >= self._plan.seconds - 1e-9
+        self._drive.command = self._plan.at(elapsed)
+        return self._drive.objectives(state, report, dt)

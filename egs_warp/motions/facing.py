@@ -1,4 +1,4 @@
-"""Which way a jump faces on its way; ``twist`` has the one that turns."""
+"""Heading policies of a jump. ``motions.twist`` has the one that turns."""
 
 from __future__ import annotations
 
@@ -10,56 +10,75 @@ from egs_warp.motions.stance import BalanceController, Measurement
 
 
 class HeadingPolicy(Protocol):
-    """What a jump asks about its turning; angles in radians about up, counter-clockwise from above."""
+    """Heading policy of a jump; angles in radians about up, counterclockwise as seen from above."""
 
     target_heading: float
-    """From the start to the landing."""
+    """Heading change from the start to the landing."""
     heading: float
-    """From the start until now, counted beyond whole turns."""
+    """Heading change from the start until now, without wrapping."""
     predicted_heading: float
-    """What ``turned`` will be at touch-down, as the body flies; told by ``airborne_pose``."""
+    """Predicted ``heading`` at touch-down; ``airborne_pose`` updates it."""
 
     def update(self, heading: float) -> None:
-        """Told before each step: how the body faces, from the start, whole turns apart."""
+        """Update ``heading`` before a time step from the measured heading, which is known up to whole turns."""
         ...
 
     def thrust_momentum(
-        self, pose: BalanceController, seen: Measurement, upright: np.ndarray, *, left: float, flight_time: float
+        self,
+        controller: BalanceController,
+        measurement: Measurement,
+        upright: np.ndarray,
+        *,
+        left: float,
+        flight_time: float,
     ) -> np.ndarray:
-        """(3,) kg m^2/s to leave the ground with, ``left`` seconds from now, so that a flight of ``flight_time``
-        seconds ends upright and turned; ``upright`` (3,) is the rotation vector to the landing without its turn."""
+        """Return the angular momentum (3,) in kg m^2/s for take-off.
+
+        Args:
+            controller: controller of the body.
+            measurement: measured body.
+            upright: (3,) rotation vector to the landing pose without the heading change.
+            left: time until take-off, s.
+            flight_time: time of the flight, s, at whose end the body is upright and turned.
+        """
         ...
 
     def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: float) -> np.ndarray:
-        """(3, 3) ``pose`` (3, 3) for a body with angular ``momentum`` (3,), ``left`` seconds before it lands."""
+        """Return ``pose`` (3, 3) adapted to a body with angular ``momentum`` (3,), ``left`` seconds before it lands."""
         ...
 
-    def landed_heading(self, pose: BalanceController, positions: np.ndarray) -> float:
-        """How the body that has landed with its nodes at ``positions`` (N, 3) shall face, from the landing of
-        ``pose``."""
+    def landed_heading(self, controller: BalanceController, positions: np.ndarray) -> float:
+        """Return the target heading of the landed body with its nodes at ``positions`` (N, 3), relative to the landing
+        frame of ``controller``."""
         ...
 
 
 class KeepHeading:
-    """Lands facing as it stood."""
+    """Heading policy that keeps the heading of the start."""
 
     target_heading = 0.0
     heading = 0.0
     predicted_heading = 0.0
 
     def update(self, heading: float) -> None:
-        """Nothing depends on it."""
+        """Do nothing: the heading does not change."""
 
     def thrust_momentum(
-        self, pose: BalanceController, seen: Measurement, upright: np.ndarray, *, left: float, flight_time: float
+        self,
+        controller: BalanceController,
+        measurement: Measurement,
+        upright: np.ndarray,
+        *,
+        left: float,
+        flight_time: float,
     ) -> np.ndarray:
-        """Upright alone."""
-        return seen.inertia @ (upright / flight_time)
+        """Return the angular momentum (3,) that only brings the body upright."""
+        return measurement.inertia @ (upright / flight_time)
 
     def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: float) -> np.ndarray:
-        """``pose`` as it is."""
+        """Return ``pose`` unchanged."""
         return pose
 
-    def landed_heading(self, pose: BalanceController, positions: np.ndarray) -> float:
-        """Straight ahead."""
+    def landed_heading(self, controller: BalanceController, positions: np.ndarray) -> float:
+        """Return 0."""
         return 0.0

@@ -1,4 +1,4 @@
-"""A body that has fallen ends its motion: told by how it is tilted, and by what it lies on."""
+"""Detect from tilt and contacts that a body has fallen, and end its motion or let it get up."""
 
 from __future__ import annotations
 
@@ -18,91 +18,97 @@ from egs_warp.motions.sequence import BodyMotion, MotionSequence, MotionTask, St
 from egs_warp.motions.stance import sole_shares
 
 FALLEN_TILT = 60.0
-"""Degrees. A body on feet of half width w, its centre of mass h above them, has tipped for good beyond atan(w / h): by
-60 degrees whatever is no wider than 3.5 h, and so all that can tip."""
+"""Degrees of tilt at which a body has fallen. A body on feet of half width w with its centre of mass h above them tips
+over beyond atan(w / h). For any body narrower than 3.5 h, that is below 60 degrees."""
 MIN_LYING_LOAD = 0.5
-"""Of the weight. Where the ground bears so much of a body and none of it by the base, it lies on something else; less
-is what brushes a riser or a wall."""
+"""Share of the weight: a body that the ground supports by more than this, and not at all at its base, lies on something
+else. Smaller loads come from brushing a riser or a wall."""
 MAX_RECOVERIES = 3
-"""In one run."""
+"""Largest number of attempts to get up in one run."""
 FALLEN_TIME = 0.5
-"""Of sqrt(H / g): for how long either must last on the ground. A body falls by H / 8 meanwhile; what a landing does in
-passing is shorter."""
+"""Time in sqrt(H / g) for which one of the two conditions must hold on the ground. A body falls by H / 8 in this time;
+contacts in passing during a landing are shorter."""
 
 
 class FallMonitor:
-    """Runs a sequence until its body has fallen, then asks for nothing more: the muscles let go. Or it gets up, and
-    goes on with what is next. A ball cannot fall."""
+    """Run a sequence until its body has fallen; then return no objectives, so that the muscles relax, or get up and
+    continue with the next motion. A ball cannot fall."""
 
-    def __init__(self, sequence: MotionSequence, place: Stance, *, gets_up: bool = False) -> None:
-        """``place``: how the body stands; ``gets_up``: whether it is to try that."""
-        body = place.body
+    def __init__(self, sequence: MotionSequence, stance: Stance, *, gets_up: bool = False) -> None:
+        """Monitor ``sequence``.
+
+        Args:
+            sequence: motions to run.
+            stance: stance of the body at the start.
+            gets_up: True if a fallen body tries to get up.
+        """
+        body = stance.body
         self.sequence = sequence
-        self._body, self._up = body, place.ground.axes[2]
-        arms = place.standing - body.centre_of_mass(place.standing)
+        self._body, self._up = body, stance.ground.axes[2]
+        arms = stance.standing - body.centre_of_mass(stance.standing)
         self._moments = body.node_mass[:, None] * arms
-        self._has_upright = place.base() is not SupportKind.ROUND_BASE
-        self._in_base = sole_shares(body, place.ground, place.standing) > 0.0
-        self._longest = FALLEN_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
-        self._seen = self._lain = 0.0
-        self._gets_up, self._risen = gets_up, 0
+        self._has_upright = stance.base() is not SupportKind.ROUND_BASE
+        self._in_base = sole_shares(body, stance.ground, stance.standing) > 0.0
+        self._fallen_time = FALLEN_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
+        self._last_time = self._lying_time = 0.0
+        self._gets_up, self._recoveries = gets_up, 0
         self.spent = 0.0
-        """Seconds in which it has got up."""
+        """Time spent on getting up, s."""
         self.time = 0.0
-        """Seconds of the state that it saw last."""
+        """Time of the last state, s."""
         self.fallen: str | None = None
-        """How it was told, once the body has fallen."""
+        """Description of the fall, or None if the body has not fallen."""
 
     @property
     def is_finished(self) -> bool:
-        """Whether the last motion has come to rest, or the body has fallen."""
+        """True if the last motion has come to rest or the body has fallen."""
         return self.sequence.is_finished or self.fallen is not None
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Those of the sequence, none of a fallen body."""
+        """Return the objectives of the sequence; none if the body has fallen."""
         self.time = state.time
         if self.fallen is None and report is not None and self._has_upright:
             self._check_fall(state, report)
         return self.sequence.objectives(state, report, dt) if self.fallen is None else []
 
     def _check_fall(self, state: BodyState, report: StepReport) -> None:
-        past, self._seen = state.time - self._seen, state.time
+        elapsed, self._last_time = state.time - self._last_time, state.time
         motion = self.sequence.done[-1].motion
         if isinstance(motion, GetUp):
-            self._check_recovery(motion, past)
+            self._check_recovery(motion, elapsed)
             return
-        # What bounces on its side has not come to its feet in between.
+        # A body that bounces on its side has not come to its feet in between.
         if report.forces[:, 0].sum() <= 0.0:
             return
         lies = self._lying_note(state, report) if not _tips(self.sequence.done[-1].motion) else None
-        self._lain = 0.0 if lies is None else self._lain + past
-        if self._lain >= self._longest:
+        self._lying_time = 0.0 if lies is None else self._lying_time + elapsed
+        if self._lying_time >= self._fallen_time:
             self._record_fall(f"{lies} at {state.time:.2f} s")
 
     def _record_fall(self, why: str) -> None:
-        self._lain = 0.0
-        if not self._gets_up or self._risen == MAX_RECOVERIES:
+        self._lying_time = 0.0
+        if not self._gets_up or self._recoveries == MAX_RECOVERIES:
             self.fallen = why
             return
-        self._risen += 1
+        self._recoveries += 1
         self.sequence.start_get_up(MotionTask("get up", {}, GetUp), why)
 
-    def _check_recovery(self, getting_up: GetUp, past: float) -> None:
-        """How it gets on."""
-        self.spent += past
-        if not getting_up.resting:
+    def _check_recovery(self, getting_up: GetUp, elapsed: float) -> None:
+        """Check whether getting up has succeeded or failed."""
+        self.spent += elapsed
+        if not getting_up.is_at_rest:
             return
         before = self.sequence.done[-2] if len(self.sequence.done) > 1 else None
         if getting_up.up and before is not None and before.fell is not None:
             before.got_up = True
         elif not getting_up.up:
-            told = before.fell if before is not None else None
-            self.fallen = told or f"it does not get up, at {self._seen:.2f} s"
+            description = before.fell if before is not None else None
+            self.fallen = description or f"the body does not get up, at {self._last_time:.2f} s"
 
     def _lying_note(self, state: BodyState, report: StepReport) -> str | None:
-        """How a body on the ground lies that does not stand on it."""
+        """Describe how a body on the ground lies; None if it stands."""
         loads = report.forces[:, 0] / self._body.weight
-        # By how the body stood, as ``best_turn``; moments about the centre of mass sum to nothing.
+        # Rotation from the standing pose, as ``kabsch_rotation``: moments about the centre of mass sum to zero.
         turn = nearest_rotation(state.positions.T @ self._moments)
         tilt = float(np.degrees(np.arccos(np.clip(self._up @ turn @ self._up, -1.0, 1.0))))
         if tilt > FALLEN_TILT:
@@ -114,7 +120,7 @@ class FallMonitor:
 
 
 def _tips(motion: BodyMotion) -> bool:
-    """Whether its user may ask a ``motion`` to tip the body."""
+    """Return True if the user's key frames may tip the body."""
     return isinstance(motion, Follow) and any(
         key.part == "body" and key.quantity in (Quantity.ORIENTATION, Quantity.ANGULAR_MOMENTUM) for key in motion.keys
     )

@@ -1,4 +1,4 @@
-"""Follow a user's own key frames as nearly as the muscles and the ground allow (docs/concepts/motions.md)."""
+"""Follow key frames of the user as closely as the muscles and the ground allow (docs/concepts/motions.md)."""
 
 from __future__ import annotations
 
@@ -30,35 +30,35 @@ from egs_warp.motions.keyframes import Channel, Key, Quantity, channels
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import BalanceController, RestDetector, Weights
 
-MISSED = 0.1
-"""Of the largest value of its channel: a key missed by more is noted."""
-LONGEST_HOLD = 9.0
-"""Of sqrt(H / g): at most for how long, after the last key, the body is waited for to be calm."""
-USUAL_HOLD = 1.5
-"""The same, as it usually takes."""
+MISS_TOLERANCE = 0.1
+"""Fraction of the largest value of a channel: a key that is missed by more is reported."""
+MAX_HOLD_TIME = 9.0
+"""Longest time in sqrt(H / g) after the last key for the body to come to rest."""
+USUAL_HOLD_TIME = 1.5
+"""Typical time in sqrt(H / g) after the last key until the body is at rest."""
 
 
 @dataclass(frozen=True)
 class FollowPlan:
-    """Key frames asked for, and how they are kept so far."""
+    """Number and duration of the key frames, and the largest error so far."""
 
     keys: float
     duration: float
     """Seconds."""
     worst_miss: float
-    """In the unit of its quantity."""
+    """Largest error at a key, in the unit of its quantity."""
 
 
 @dataclass(frozen=True)
 class FollowOutcome:
-    """How near a trajectory came to its key frames."""
+    """Measured result of following key frames."""
 
     worst_miss: float
-    """In the unit of its quantity."""
+    """Largest error at a key, in the unit of its quantity."""
 
 
 class FollowPhase(Enum):
-    """Phases of a trajectory."""
+    """Phases of following key frames."""
 
     FOLLOW = "follow"
     HOLD = "hold"
@@ -66,128 +66,135 @@ class FollowPhase(Enum):
 
 
 class Follow:
-    """The keys' own objectives, and beside them a standing body:
-    balance, no spin, its shape, each unless a key rules it.
-    """
+    """Follow key frames, with objectives for a standing body in addition: balance, no spin and the shape, each unless a
+    key sets the same quantity."""
 
-    def __init__(self, place: Stance, keys: Sequence[Key], *, weights: Weights | None = None) -> None:
-        """Raises ``UserError`` for a key of a part that the body does not have."""
-        self.body, self.ground, self.weights = place.body, place.ground, weights or Weights()
+    def __init__(self, stance: Stance, keys: Sequence[Key], *, weights: Weights | None = None) -> None:
+        """Create the motion of the body that stands at ``stance``.
+
+        Raises:
+            UserError: for a key of a part that the body does not have.
+        """
+        self.body, self.ground, self.weights = stance.body, stance.ground, weights or Weights()
         self.keys, self.channels = tuple(keys), channels(keys)
-        self.parts = {part.name: part for part in parts_of_body(place)}
+        self.parts = {part.name: part for part in parts_of_body(stance)}
         for key in self.keys:
             if key.part not in self.parts:
                 raise UserError(f"{key.where}: the body has no part {key.part!r}; it has {', '.join(self.parts)}")
-        self.pose = BalanceController(self.body, place.ground, place.standing, place.contact_points, place.friction)
+        self.controller = BalanceController(
+            self.body, stance.ground, stance.standing, stance.contact_points, stance.friction
+        )
         self.phase = FollowPhase.FOLLOW
-        self._standing = place.standing
+        self._standing = stance.standing
         self._gravity = float(np.linalg.norm(self.body.gravity))
         self._rate = 6.0 * float(np.sqrt(self._gravity / self.body.height))
-        self._began: float | None = None
+        self._start_time: float | None = None
         self._end = max(key.time for key in self.keys)
-        self._calm = RestDetector(self.body)
+        self._rest_detector = RestDetector(self.body)
         self._restless = False
         self._reached: dict[int, np.ndarray] = {}
         self._turned = {name: np.zeros(3) for name in self.parts}
 
     @property
     def expected_time(self) -> float:
-        """Seconds: the keys, and what a body usually takes to be calm after them."""
-        return self._end + USUAL_HOLD * float(np.sqrt(self.body.height / self._gravity))
+        """Expected duration in seconds: that of the keys and the typical time to come to rest."""
+        return self._end + USUAL_HOLD_TIME * float(np.sqrt(self.body.height / self._gravity))
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether the body is calm after the last key, or was waited for long enough."""
+        """True if the body is at rest after the last key, or the time for that is over."""
         return self.phase is FollowPhase.REST
 
     def plan_record(self) -> FollowPlan:
-        """How many keys there are, how long they take, and the worst miss so far."""
+        """Return the number of keys, their duration and the largest error so far."""
         misses = [float(np.linalg.norm(self._miss(index))) for index in self._reached]
         return FollowPlan(float(len(self.keys)), self._end, max(misses, default=0.0))
 
     def planned_com(self, elapsed: float) -> None:
-        """Nothing: keys are of parts of the body."""
+        """Return None: keys refer to parts of the body."""
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> FollowOutcome:
-        """The worst miss of all keys."""
+        """Return the largest error of all keys."""
         return FollowOutcome(self.plan_record().worst_miss)
 
     def notes(self) -> list[str]:
-        """Which keys were missed, and whether the body never came to rest."""
+        """Return messages for the user about missed keys and a body that did not come to rest."""
         notes = []
         for index, key in enumerate(self.keys):
             group = [np.linalg.norm(k.value) for k in self.keys if (k.part, k.quantity) == (key.part, key.quantity)]
             name = f"{key.where}: {key.part} {key.quantity.value} at {key.time:g} s"
             if index not in self._reached:
                 notes.append(f"{name} was not reached in time")
-            elif np.linalg.norm(self._miss(index)) > MISSED * max(group):
-                told = ", ".join(f"{value:.3g}" for value in self._reached[index])
-                notes.append(f"{name}: reached ({told})")
+            elif np.linalg.norm(self._miss(index)) > MISS_TOLERANCE * max(group):
+                values = ", ".join(f"{value:.3g}" for value in self._reached[index])
+                notes.append(f"{name}: reached ({values})")
         if self._restless:
-            notes.append("the body was not yet at rest when the time for it, after the last key, was up")
+            notes.append("the body did not come to rest in the time allowed after the last key")
         return notes
 
     def _miss(self, index: int) -> np.ndarray:
-        """(3,) from a key's value to that at its time, in its unit; of an orientation, the rotation between the two."""
+        """Return the error (3,) at a key, measured value minus key value, in the unit of its quantity; for an
+        orientation, the rotation between the two."""
         key, reached = self.keys[index], self._reached[index]
         if key.quantity is Quantity.ORIENTATION:
             return turn_between(np.array(key.value), reached)
         return reached - np.array(key.value)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
-        if self._began is None:
-            self._began = state.time
-        elapsed = state.time - self._began
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
+        step."""
+        if self._start_time is None:
+            self._start_time = state.time
+        elapsed = state.time - self._start_time
         for index, key in enumerate(self.keys):
             if index not in self._reached and elapsed >= key.time - 0.5 * dt:
-                self._reached[index] = self._measured(key.part, key.quantity, state)
+                self._reached[index] = self._measure(key.part, key.quantity, state)
         self._advance_phase(state, elapsed)
-        # Where a part is, is held after its last key; how fast it goes, is not.
-        ruling = [c for c in self.channels if c.quantity in _HELD or elapsed < c.times[-1] - 0.5 * dt]
+        # Positions and orientations are held after the last key of their channel, velocities and momenta are not.
+        ruling = [c for c in self.channels if c.quantity in _POSE_QUANTITIES or elapsed < c.times[-1] - 0.5 * dt]
         return [
             *self._standing_objectives(state, report, dt, {(channel.part, channel.quantity) for channel in ruling}),
-            *(self._keyed(channel, state, elapsed, dt) for channel in ruling),
+            *(self._key_objective(channel, state, elapsed, dt) for channel in ruling),
         ]
 
     def _advance_phase(self, state: BodyState, elapsed: float) -> None:
-        """After the last key the body holds still until its centre of mass has been slow for a while, or time is up."""
+        """Advance the phase: after the last key, hold still until the body is at rest or the time is over."""
         if self.phase is FollowPhase.FOLLOW and elapsed > self._end:
             self.phase = FollowPhase.HOLD
         if self.phase is not FollowPhase.HOLD:
             return
-        calm = self._calm.update(self.body.centre_of_mass(state.velocities), elapsed)
-        late = elapsed - self._end > LONGEST_HOLD * np.sqrt(self.body.height / self._gravity)
+        calm = self._rest_detector.update(self.body.centre_of_mass(state.velocities), elapsed)
+        late = elapsed - self._end > MAX_HOLD_TIME * np.sqrt(self.body.height / self._gravity)
         if calm or late:
             self.phase, self._restless = FollowPhase.REST, not calm
 
     def _standing_objectives(
         self, state: BodyState, report: StepReport | None, dt: float, ruled: set[tuple[str, Quantity]]
     ) -> list[AnyObjective]:
-        seen = self.pose.measure(state, report)
-        balance = np.array([*(seen.foot_centre - self.pose.base_offset), self.pose.standing_height])
+        measurement = self.controller.measure(state, report)
+        balance = np.array([*(measurement.foot_centre - self.controller.base_offset), self.controller.standing_height])
         rules: list[AnyObjective] = []
-        velocity = self._rate / 3.0 * (balance - seen.com)
-        pose = self.pose.over_base(seen.com, seen.foot_centre, seen.heading)
-        upright = self.pose.turn_towards(seen, pose) * 0.7 * self._rate
-        velocity, spin = self.pose.balance_targets(seen, velocity, upright, dt)
+        velocity = self._rate / 3.0 * (balance - measurement.com)
+        pose = self.controller.over_base(measurement.com, measurement.foot_centre, measurement.heading)
+        upright = self.controller.turn_towards(measurement, pose) * 0.7 * self._rate
+        velocity, spin = self.controller.balance_targets(measurement, velocity, upright, dt)
         if not {("body", Quantity.POSITION), ("body", Quantity.VELOCITY)} & ruled:
             rules.append(centre_of_mass_velocity(self.body, self.ground.axes.T @ velocity, self.weights.com))
         if not {("body", Quantity.ORIENTATION), ("body", Quantity.ANGULAR_MOMENTUM)} & ruled:
-            rules.append(AngularMomentumObjective(seen.inertia @ spin, self.weights.spin))
-        # The shape at rest goes along with the centre of mass.
+            rules.append(AngularMomentumObjective(measurement.inertia @ spin, self.weights.spin))
+        # The shape at rest moves with the centre of mass.
         arms = self._standing - self.body.centre_of_mass(self._standing)
         now = state.positions - self.body.centre_of_mass(state.positions)
         drift = self.body.centre_of_mass(state.velocities)
         rules.append(node_velocities(self.body, drift + self._rate * (arms - now), self.weights.pose))
         return rules
 
-    def _keyed(self, channel: Channel, state: BodyState, elapsed: float, dt: float) -> AnyObjective:
+    def _key_objective(self, channel: Channel, state: BodyState, elapsed: float, dt: float) -> AnyObjective:
         part, body, whole = self.parts[channel.part], self.body, channel.part == "body"
         axes = Coordinates(self.ground.axes, False)
         value, rate = channel.at(elapsed + dt)
-        now = self._measured(channel.part, channel.quantity, state)
-        # Sums of steps may end a hair after their key, so the middle of the step says on the way to which key it is.
+        now = self._measure(channel.part, channel.quantity, state)
+        # Rounding may put the end of a time step just after its key, so the middle of the step selects the next key.
         weight = channel.weight_at(elapsed + 0.5 * dt)
         weight *= self.weights.com if channel.quantity in _LINEAR else self.weights.spin
         if channel.quantity is Quantity.POSITION:
@@ -206,10 +213,9 @@ class Follow:
             return AngularMomentumObjective(self.ground.axes.T @ momentum, weight)
         return part_angular_momentum(body, part, state, momentum, weight, axes)
 
-    def _measured(self, name: str, quantity: Quantity, state: BodyState) -> np.ndarray:
-        """(3,) in the unit of the quantity, axes of the ground;
-        of a turn, the one that the body came by since the last look at it.
-        """
+    def _measure(self, name: str, quantity: Quantity, state: BodyState) -> np.ndarray:
+        """Return the measured value (3,) of a quantity of the part ``name``, in its unit and in ground axes. A rotation
+        is unwrapped relative to the last call."""
         part, axes, height = self.parts[name], self.ground.axes, self.body.height
         if quantity is Quantity.POSITION:
             return axes @ (part.centre(state.positions) - part.centre(self._standing)) / height
@@ -227,32 +233,33 @@ class Follow:
 
 
 _LINEAR = (Quantity.POSITION, Quantity.VELOCITY)
-_HELD = (Quantity.POSITION, Quantity.ORIENTATION)
+_POSE_QUANTITIES = (Quantity.POSITION, Quantity.ORIENTATION)
 
 
-def parts_of_body(place: Stance) -> list[BodyPart]:
-    """The parts that keys may name: the whole body, its base, its head and its feet.
+def parts_of_body(stance: Stance) -> list[BodyPart]:
+    """Return the parts that keys may name: the whole body, its base, its head and its feet.
 
-    A single foot is the base. Several are numbered anticlockwise as seen from above, from straight ahead on.
+    A single foot is the base. Several feet are numbered counterclockwise as seen from above, from straight ahead on.
     """
-    body, ground, standing = place.body, place.ground, place.standing
+    body, ground, standing = stance.body, stance.ground, stance.standing
     heights = (standing - ground.origin) @ ground.surface_normal
     base = BodyPart.base(body, heights)
-    found = [BodyPart.whole(body), base, BodyPart.head(body, ground.local(standing)[:, 2])]
-    feet = place.feet()
+    parts = [BodyPart.whole(body), base, BodyPart.head(body, ground.local(standing)[:, 2])]
+    feet = stance.feet()
     if len(feet) < 2:
-        return [*found, BodyPart("foot", base.nodes, base.masses)]
+        return [*parts, BodyPart("foot", base.nodes, base.masses)]
     soles = [base.nodes[foot.leg[base.nodes] > 0.0] for foot in feet]
     # A leg that is too short to reach the base stands on its own lowest nodes.
     soles = [nodes if len(nodes) else foot.sole for nodes, foot in zip(soles, feet, strict=True)]
     order = order_counterclockwise(np.array([ground.local(standing[foot.sole])[:, :2].mean(axis=0) for foot in feet]))
-    return found + [BodyPart.of(body, f"foot {number}", soles[index]) for number, index in enumerate(order, start=1)]
+    return parts + [BodyPart.of(body, f"foot {number}", soles[index]) for number, index in enumerate(order, start=1)]
 
 
 def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(3,) the rotation that leads from one orientation to another, all rotation vectors in degrees.
+    """Return the rotation (3,) from one orientation to another; all are rotation vectors in degrees.
 
-    Its angle is at most 360: orientations a whole turn apart are told apart, those two turns apart are not.
+    Its angle is at most 360. Orientations that differ by one full turn are distinguished, those that differ by two are
+    not.
     """
     (a, *u), (b, *v) = _quaternion(first), _quaternion(second)
     w, axis = a * b + np.dot(u, v), a * np.array(v) - b * np.array(u) - np.cross(v, u)
@@ -261,16 +268,16 @@ def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _quaternion(turn: np.ndarray) -> np.ndarray:
-    """(4,) scalar first, of a rotation vector (3,) in degrees; of opposite sign for turns that differ by 360."""
+    """Return the unit quaternion (4,), scalar first, of a rotation vector (3,) in degrees; its sign changes with every
+    full turn."""
     half = 0.5 * np.radians(turn)
     angle = float(np.linalg.norm(half))
     return np.array([np.cos(angle), *(np.sinc(angle / np.pi) * half)])
 
 
 def _lift_near(turn: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """(3,) ``turn``, a rotation vector of at most 180 degrees,
-    or the same rotation the longer way round if that is nearer to ``last``.
-    """
+    """Return ``turn``, a rotation vector (3,) of at most 180 degrees, or the same rotation the longer way round if that
+    is nearer to ``last``."""
     if _quaternion(turn) @ _quaternion(last) >= 0.0:
         return turn
     angle = float(np.linalg.norm(turn))

@@ -1,4 +1,4 @@
-"""Where feet stood and how far they slipped, from a trajectory alone."""
+"""Footfalls and foot slip, measured from a trajectory alone."""
 
 from __future__ import annotations
 
@@ -10,30 +10,35 @@ import numpy as np
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.feet import Foot, foot_of_node
 
-_STANDS = 0.05
-"""Share of the weight above which a foot supports the body; below it, it is being set down or lifted."""
+_MIN_STANCE_LOAD = 0.05
+"""Share of the weight above which a foot supports the body; below it, the foot is being set down or lifted."""
 
 
 @dataclass(frozen=True)
 class Footfalls:
-    """What the feet of a walk did; lengths over the stride."""
+    """Slip and landings of the feet of a walk; lengths relative to the stride."""
 
     slip: float
-    """Longest way along the ground that the loaded contact points of a foot slid while it stood: in each step the mean
-    over the foot's contacts, weighted by their normal forces, added up from landing to lift-off."""
+    """Largest slip of a foot during one stance, along the ground. In each time step, the slip is the mean over the
+    foot's contacts, weighted by their normal forces; the steps are summed from landing to lift-off."""
     sole_shift: float
-    """Largest distance of the middle of a sole from where it came to stand, while it stood:
-    slip and rolling together.
-    """
+    """Largest displacement of the middle of a sole during one stance, from slip and rolling together."""
     landings: int
-    """Times that a foot came to stand again."""
+    """Number of times that a foot landed."""
 
 
 def footfalls(
     trajectory: Trajectory, feet: Sequence[Foot], *, stride: float, first: int = 0, last: int = -1
 ) -> Footfalls:
-    """Measure between two states of the trajectory (indices into ``time``); ``stride`` in metres. What was told to go
-    nowhere has none, and no slip over it."""
+    """Measure the footfalls between two states of a trajectory.
+
+    Args:
+        trajectory: recorded motion.
+        feet: feet of the body.
+        stride: length of a stride, m; with 0, slip and shift are reported as 0.
+        first: index of the first state.
+        last: index of the last state.
+    """
     t = trajectory
     last = last % len(t.time)
     up = -t.gravity / np.linalg.norm(t.gravity)
@@ -50,12 +55,12 @@ def footfalls(
     for index, one in enumerate(feet):
         mine = foot == index
         load = np.bincount(step[mine] - first, normal[mine], last - first)
-        way = np.stack(
+        slip_vector = np.stack(
             [np.bincount(step[mine] - first, normal[mine] * slid[mine, k], last - first) for k in range(3)], 1
         )
-        lengths = np.linalg.norm(way, axis=1) / np.where(load > 0.0, load, 1.0)
+        lengths = np.linalg.norm(slip_vector, axis=1) / np.where(load > 0.0, load, 1.0)
         middle = t.positions[first : last + 1, one.sole].mean(axis=1) @ flat
-        for begin, end in _runs(load > _STANDS * weight):
+        for begin, end in _runs(load > _MIN_STANCE_LOAD * weight):
             landings += begin > 0
             slip = max(slip, float(lengths[begin:end].sum()))
             stood = middle[begin + 1 : end + 1]
@@ -65,6 +70,6 @@ def footfalls(
 
 
 def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
-    """Begin and end (one past the last) of each run of true flags."""
+    """Return start and end (exclusive) of each run of true flags."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]

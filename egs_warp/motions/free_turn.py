@@ -1,4 +1,4 @@
-"""How a body turns in the air, where nothing acts on its spin: Euler's equations of a rigid body."""
+"""Torque-free rotation of a rigid body (Euler's equations), and its inverse problem."""
 
 from __future__ import annotations
 
@@ -7,14 +7,24 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 _STEPS = 16
-"""Of the midpoint rule: to 0.2 degrees of half a turn."""
-_EXACT = 1e-4
-"""Of the spin that is found."""
+"""Number of steps of the midpoint rule; accurate to 0.2 degrees for half a turn."""
+_TOLERANCE = 1e-4
+"""Tolerance of the root search for the spin."""
 
 
 def integrate_rotation(inertia: np.ndarray, spin: np.ndarray, seconds: float) -> Rotation:
-    """By what a body of ``inertia`` (3, 3) kg m^2 has turned ``seconds`` after it had the ``spin`` (3,) rad/s, world
-    axes. Its angular momentum stays, its spin need not: off its principal axes it wobbles."""
+    """Integrate the rotation of a free body.
+
+    The angular momentum is constant. The spin need not be: off its principal axes the body wobbles.
+
+    Args:
+        inertia: (3, 3) kg m^2, world axes, at the start.
+        spin: (3,) rad/s, world axes, at the start.
+        seconds: duration, s.
+
+    Returns:
+        The rotation after ``seconds``.
+    """
     momentum, turned = inertia @ spin, Rotation.identity()
     step = seconds / _STEPS
 
@@ -29,11 +39,20 @@ def integrate_rotation(inertia: np.ndarray, spin: np.ndarray, seconds: float) ->
 
 
 def spin_for_rotation(inertia: np.ndarray, upright: np.ndarray, turn: np.ndarray, seconds: float) -> np.ndarray:
-    """(3,) rad/s with which a free body of ``inertia`` (3, 3) turns by the rotation vector ``upright`` (3,), then by
-    ``turn`` (3,), which may be more than half a turn, in ``seconds``; as if it did not wobble where none is found."""
-    asked = Rotation.from_rotvec(turn) * Rotation.from_rotvec(upright)
+    """Find the initial spin of a free body that produces a given rotation.
+
+    Args:
+        inertia: (3, 3) kg m^2, world axes.
+        upright: (3,) rotation vector that is applied first.
+        turn: (3,) rotation vector that is applied second; its angle may exceed half a turn.
+        seconds: duration, s.
+
+    Returns:
+        (3,) rad/s; the constant spin (upright + turn) / seconds if the root search fails.
+    """
+    target = Rotation.from_rotvec(turn) * Rotation.from_rotvec(upright)
     steady = (upright + turn) / seconds
-    found = root(
-        lambda spin: (asked * integrate_rotation(inertia, spin, seconds).inv()).as_rotvec(), steady, tol=_EXACT
+    solution = root(
+        lambda spin: (target * integrate_rotation(inertia, spin, seconds).inv()).as_rotvec(), steady, tol=_TOLERANCE
     )
-    return found.x if found.success else steady
+    return solution.x if solution.success else steady

@@ -1,6 +1,5 @@
-"""How a body goes its way, by what it stands on: it walks on feet or a flat base, crawls on its length, rolls as a
-ball.
-"""
+"""Choose how a body moves by its support: on feet or a flat base it walks, on its length it crawls, as a ball it
+rolls."""
 
 from __future__ import annotations
 
@@ -13,24 +12,33 @@ from egs_warp.motions.sequence import BodyMotion, Stance
 from egs_warp.motions.turn import Turn
 from egs_warp.motions.walk import Walk
 
-_LEAP = 0.3
-"""Body heights that a ball rises to turn about up."""
+_JUMP_HEIGHT = 0.3
+"""Height in body heights of the jump in which a ball turns about up."""
 
 
-def move_along(place: Stance, route: Route, pace_length: float, *, speed: float = 1.0) -> BodyMotion:
-    """The motion that takes the body at ``place`` along ``route``; ``pace_length``, metres, is asked of feet, ``speed``
-    is over the usual. Raises ``UserError`` for a body that cannot, and where something stands in the way."""
-    base = place.base()
+def move_along(stance: Stance, route: Route, step_length: float, *, speed: float = 1.0) -> BodyMotion:
+    """Return the motion that moves a body along a route.
+
+    Args:
+        stance: stance at the start.
+        route: route to follow.
+        step_length: length of the steps of a walk, m.
+        speed: relative to the nominal speed.
+
+    Raises:
+        UserError: if the body cannot move, or the route leads over a step of the ground.
+    """
+    base = stance.base()
     if base is SupportKind.LYING:
-        return Crawl(place, route, speed=speed)
+        return Crawl(stance, route, speed=speed)
     if base is SupportKind.ROUND_BASE:
-        return Roll(place, route, speed=speed)
-    return Walk(place, route, pace_length, speed=speed)
+        return Roll(stance, route, speed=speed)
+    return Walk(stance, route, step_length, speed=speed)
 
 
-def turn_in_place(place: Stance, angle: float, pace_length: float, *, speed: float = 1.0) -> BodyMotion:
-    """The motion that turns the body by ``angle`` radians on the spot; a ball, which stands on a point, leaps for
-    it."""
-    if place.base() is SupportKind.ROUND_BASE:
-        return Turn(place, JumpTarget(0.0, _LEAP * place.body.height), angle)
-    return move_along(place, turn_route(angle), pace_length, speed=speed)
+def turn_in_place(stance: Stance, angle: float, step_length: float, *, speed: float = 1.0) -> BodyMotion:
+    """Return the motion that turns the body by ``angle`` radians on the spot. A ball, which stands on a point, turns in
+    a jump; other bodies turn as in ``move_along``."""
+    if stance.base() is SupportKind.ROUND_BASE:
+        return Turn(stance, JumpTarget(0.0, _JUMP_HEIGHT * stance.body.height), angle)
+    return move_along(stance, turn_route(angle), step_length, speed=speed)

@@ -1,5 +1,4 @@
-"""Get up: a body that lies presses itself up about the edge of its base, rolls over it, and comes to stand from a
-crouch.
+"""Get up: a lying body pushes itself up about the edge of its base, rolls over it, and straightens from a crouch.
 
 See docs/concepts/motions.md.
 """
@@ -31,37 +30,38 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import RestDetector
 from egs_warp.motions.stand import Stand
 
-UPRIGHT = 15.0
-"""Degrees: a body that stands at rest within this is up."""
-_TRIES = ((1.2, 0.1), (1.6, 0.1), (1.0, 0.05), (1.3, 0.2), (2.2, 0.1), (1.6, 0.2), (3.0, 0.15), (1.0, 0.15))
-"""Of each try, one after the other: its push over the one that would just do in ``_STROKE``, and the height, in body
-heights, that it is to have in hand over the top."""
+MAX_UPRIGHT_TILT = 15.0
+"""Largest tilt in degrees of a body that has got up and stands at rest."""
+_ATTEMPTS = ((1.2, 0.1), (1.6, 0.1), (1.0, 0.05), (1.3, 0.2), (2.2, 0.1), (1.6, 0.2), (3.0, 0.15), (1.0, 0.15))
+"""For each attempt: its push relative to the one that would just suffice over ``_STROKE``, and the height in body
+heights by which the centre of mass aims above the top."""
 _STROKE = 0.35
-"""Radians of the roll over which a body can press itself up."""
-_SWITCHED = 0.4
-"""Of sqrt(H / g), in which a push grows to its full size."""
-_OVER = 0.25
-"""Radians in sqrt(H / g): how fast it is to roll over the top at the least."""
-_BRAKES = 4.0
-"""Radians in H / g: the most that it slows down by."""
-_BASE = 0.3
-"""Body heights: what is at most this high above a standing body's sole turns as its base does."""
-_EDGE = 35.0
-"""Degrees: the body rolls over what would touch first if the ground were steeper by this, or by half of what its base
-is still off the ground."""
-_LANDED = 20.0
-"""Degrees from the ground within which its base has come down."""
-_CROUCH = 0.75
-"""Of the height at which its centre of mass stands: how low it is held until it is calm. Held low, it has further to
-go over the other side of its base."""
-_ASIDE = 0.1
-"""Body heights behind the edge: what presses there can push."""
-_LIES, _ROLLS, _STRAIGHTENS = 6.0, 6.0, 10.0
-"""Of sqrt(H / g): for how long it waits to lie calm, may roll, and may take to come to rest on its feet."""
-_SINKS_AFTER, _SINKS = 0.6, 0.05
-"""Of sqrt(H / g), and radians in it: what by then rolls back so fast has not got over."""
-_LOST = 60.0
-"""Degrees: with its base further off the ground it does not stand."""
+"""Angle of the roll in radians over which a body can push itself up."""
+_PUSH_RAMP_TIME = 0.4
+"""Time in sqrt(H / g) in which a push grows to its full size."""
+_MIN_TOP_RATE = 0.25
+"""Smallest target rate at the top of the roll, in radians per sqrt(H / g)."""
+_MAX_BRAKING = 4.0
+"""Largest deceleration of the roll, in radians per H / g."""
+_BASE_HEIGHT = 0.3
+"""Nodes at most this far above the sole of the standing body, in body heights, belong to the base."""
+_EDGE_ANGLE = 35.0
+"""Degrees: the body rolls over the nodes that would touch first if the ground were steeper by this angle, or by half of
+the tilt of its base if that is less."""
+_LANDED_ANGLE = 20.0
+"""Largest tilt in degrees of a base that has landed."""
+_CROUCH_FRACTION = 0.75
+"""Fraction of the standing height of the centre of mass at which the body is held until it is at rest. A low centre of
+mass has further to go before the body tips over the other side of its base."""
+_MIN_PUSH_DISTANCE = 0.1
+"""Contact points at least this far behind the edge, in body heights, can push."""
+_MAX_LIE_TIME, _MAX_ROLL_TIME, _MAX_STRAIGHTEN_TIME = 6.0, 6.0, 10.0
+"""Longest times in sqrt(H / g) to wait for rest while lying, to roll, and to come to rest on the feet."""
+_FAIL_TIME, _FAIL_RATE = 0.6, 0.05
+"""Time in sqrt(H / g) after which an attempt fails if the body rolls back, and the rate above which it does, in radians
+per sqrt(H / g)."""
+_MAX_BASE_TILT = 60.0
+"""Tilt of the base in degrees beyond which the body does not stand."""
 
 
 class GetUpPhase(Enum):
@@ -70,130 +70,141 @@ class GetUpPhase(Enum):
     LIE = "lie"
     ROLL = "roll"
     CATCH = "catch"
-    """It comes to rest on its base, held low."""
+    """The body comes to rest on its base, held low."""
     STAND = "stand"
     GIVEN_UP = "given up"
 
 
 @dataclass(frozen=True)
 class GetUpPlan:
-    """How often it may try."""
+    """Planned quantities of getting up."""
 
     tries: float
 
 
 @dataclass(frozen=True)
 class GetUpOutcome:
-    """How it got up."""
+    """Measured result of getting up."""
 
     tries: float
 
 
 @dataclass(frozen=True)
 class GetUpControl:
-    """Weights of the objectives; speeds are compared in sqrt(g H)."""
+    """Weights of the objectives; speeds are measured in units of sqrt(g H)."""
 
     com: float = 600.0
     spin: float = 600.0
     pose: float = 0.05
-    """Of the standing shape while it pushes."""
+    """Weight of the standing shape while the body pushes."""
     carried: float = 0.3
-    """Of the shape that it has once it only rolls on."""
+    """Weight of the current shape once the body only rolls on."""
     follow: float = 8.0
-    """Of the shape, in sqrt(g / H)."""
+    """Rate in sqrt(g / H) at which the shape is approached."""
 
 
 @dataclass(frozen=True)
 class _Roll:
-    """How the body rolls over its edge; world axes."""
+    """State of the roll about the edge of the base; world axes."""
 
     axis: np.ndarray
-    """(3,) unit, level: about it the body turns up."""
+    """(3,) unit, horizontal axis about which the body rotates upright."""
     arm: np.ndarray
-    """(3,) metres from the edge to the centre of mass, square to ``axis``."""
+    """(3,) m, from the edge to the centre of mass, orthogonal to ``axis``."""
     inertia: float
-    """kg m^2 about the edge."""
+    """kg m^2, moment of inertia about the edge."""
     rate: float
-    """rad/s about it."""
+    """rad/s, angular velocity about the edge."""
     missing: float
-    """Metres by which the centre of mass has to rise on its way over the top."""
+    """Height in metres by which the centre of mass has to rise to pass the top."""
     pushes: bool
-    """Whether anything bears it behind the edge."""
+    """True if the ground supports the body behind the edge."""
 
 
 class GetUp:
-    """Presses itself up and stands, or gives up after ``_TRIES``."""
+    """Push the body up and stand, or give up after the attempts of ``_ATTEMPTS``."""
 
-    def __init__(self, place: Stance, *, control: GetUpControl | None = None) -> None:
-        """``place``: how the body stands where it does; it lies anyhow. Raises ``UserError`` for a ball."""
-        if place.base() is SupportKind.ROUND_BASE:
-            raise UserError("get up: a ball lies any way up; walk or jump on")
-        body = place.body
-        self._place, self.body, self.ground = place, body, place.ground
+    def __init__(self, stance: Stance, *, control: GetUpControl | None = None) -> None:
+        """Create the motion.
+
+        Args:
+            stance: stance of the upright body, from before it fell.
+            control: weights of the objectives.
+
+        Raises:
+            UserError: for a ball.
+        """
+        if stance.base() is SupportKind.ROUND_BASE:
+            raise UserError("get up: a ball cannot fall over; walk or jump instead")
+        body = stance.body
+        self._stance, self.body, self.ground = stance, body, stance.ground
         self.control = control or GetUpControl()
         self._gravity = float(np.linalg.norm(body.gravity))
         self._unit = body.time_unit
-        self._arms = place.standing - body.centre_of_mass(place.standing)
-        heights = place.standing @ place.ground.surface_normal
-        self._base = np.flatnonzero(heights < heights.min() + _BASE * body.height)
+        self._arms = stance.standing - body.centre_of_mass(stance.standing)
+        heights = stance.standing @ stance.ground.surface_normal
+        self._base = np.flatnonzero(heights < heights.min() + _BASE_HEIGHT * body.height)
         if len(self._base) < 4:
             self._base = np.argsort(heights)[:8]
-        self._calm = RestDetector(body)
+        self._rest_detector = RestDetector(body)
         self.phase, self._entered = GetUpPhase.LIE, -1.0
         self.tries = 0
-        self._push, self._in_hand = 0.0, 0.0
+        self._push, self._margin = 0.0, 0.0
         self._stand: Stand | None = None
         self._degrees = self._base_degrees = 180.0
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether it stands calmly, or has given up."""
+        """True if the body stands at rest, or has given up."""
         if self.phase is GetUpPhase.STAND:
-            return self._stand is not None and self._stand.resting and self._degrees < UPRIGHT
+            return self._stand is not None and self._stand.is_at_rest and self._degrees < MAX_UPRIGHT_TILT
         return self.phase is GetUpPhase.GIVEN_UP
 
     @property
     def up(self) -> bool:
-        """Whether it has come to its feet."""
+        """True if the body stands on its feet."""
         return self.phase is GetUpPhase.STAND
 
     @property
     def expected_time(self) -> float:
-        """Seconds, of one try."""
+        """Expected duration of one attempt, s."""
         return 8.0 * self._unit
 
     def plan_record(self) -> GetUpPlan:
-        """How often it may try."""
-        return GetUpPlan(float(len(_TRIES)))
+        """Return the largest number of attempts."""
+        return GetUpPlan(float(len(_ATTEMPTS)))
 
     def planned_com(self, elapsed: float) -> None:
-        """Nothing: it goes on from how it lies."""
+        """Return None: each attempt starts from the measured body."""
 
     def notes(self) -> list[str]:
-        """What kept it from its feet, for the user."""
-        return [f"it does not get up: it lies after {self.tries} tries"] if self.phase is GetUpPhase.GIVEN_UP else []
+        """Return messages for the user about a body that stays on the ground."""
+        return (
+            [f"the body does not get up: it lies after {self.tries} tries"] if self.phase is GetUpPhase.GIVEN_UP else []
+        )
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> GetUpOutcome:
-        """How often it tried."""
+        """Return the number of attempts."""
         return GetUpOutcome(float(self.tries))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
-        roll = self._measured(state, report)
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
+        step."""
+        roll = self._measure(state, report)
         self._advance(state, report, roll)
         if self.phase in (GetUpPhase.CATCH, GetUpPhase.STAND):
             assert self._stand is not None
             return self._stand.objectives(state, report, dt)
-        return self._rolling(state, roll, dt) if self.phase is GetUpPhase.ROLL else []
+        return self._roll_objectives(state, roll, dt) if self.phase is GetUpPhase.ROLL else []
 
-    def _measured(self, state: BodyState, report: StepReport | None) -> _Roll:
+    def _measure(self, state: BodyState, report: StepReport | None) -> _Roll:
         body, up, normal = self.body, self.ground.axes[2], self.ground.surface_normal
         x, com = state.positions, body.centre_of_mass(state.positions)
         angle, axis = self._tilt(x)
         base_angle, _ = self._tilt(x, self._base)
         self._degrees, self._base_degrees = float(np.degrees(angle)), float(np.degrees(base_angle))
         ahead = np.cross(axis, up)
-        steeper = min(0.5 * base_angle, np.radians(_EDGE))
+        steeper = min(0.5 * base_angle, np.radians(_EDGE_ANGLE))
         first = np.cos(steeper) * ((x - self.ground.origin) @ normal) - np.sin(steeper) * (x @ ahead)
         edge = x[first < first.min() + 0.005 * body.height].mean(axis=0)
         arm = com - edge
@@ -205,52 +216,52 @@ class GetUp:
         behind = 0.0
         if report is not None and report.contacts.count:
             points = np.einsum("cw,cwi->ci", report.contacts.weights, x[report.contacts.nodes])
-            behind = float(report.forces[(points - edge) @ ahead < -_ASIDE * body.height, 0].sum())
+            behind = float(report.forces[(points - edge) @ ahead < -_MIN_PUSH_DISTANCE * body.height, 0].sum())
         return _Roll(axis, arm, inertia, float(axis @ momentum) / inertia, rise, behind > 0.02 * body.weight)
 
     def _advance(self, state: BodyState, report: StepReport | None, roll: _Roll) -> None:
         if self._entered < 0.0:
             self._entered = state.time
         elapsed = (state.time - self._entered) / self._unit
-        calm = self._calm.update(self.body.centre_of_mass(state.velocities), state.time)
+        calm = self._rest_detector.update(self.body.centre_of_mass(state.velocities), state.time)
         load = 0.0 if report is None else float(report.forces[:, 0].sum()) / self.body.weight
-        upright = self._degrees < UPRIGHT
-        if self.phase is GetUpPhase.LIE and (calm or elapsed > _LIES):
+        upright = self._degrees < MAX_UPRIGHT_TILT
+        if self.phase is GetUpPhase.LIE and (calm or elapsed > _MAX_LIE_TIME):
             if upright:
                 self._catch(state, GetUpPhase.STAND, 1.0)
-            elif self.tries == len(_TRIES):
+            elif self.tries == len(_ATTEMPTS):
                 self._enter(GetUpPhase.GIVEN_UP, state.time)
             else:
-                push, in_hand = _TRIES[self.tries]
+                push, margin = _ATTEMPTS[self.tries]
                 needed = max(roll.missing, 0.02 * self.body.height)
                 self._push = push * self.body.mass * self._gravity * needed / (roll.inertia * _STROKE)
-                self._in_hand = in_hand * self.body.height
+                self._margin = margin * self.body.height
                 self.tries += 1
                 self._enter(GetUpPhase.ROLL, state.time)
         elif self.phase is GetUpPhase.ROLL:
-            sinks = roll.rate * self._unit < -_SINKS and self._degrees > _LANDED
-            if self._base_degrees < _LANDED and load > 0.05:
-                self._catch(state, GetUpPhase.CATCH, _CROUCH)
-            elif elapsed > _ROLLS or (elapsed > _SINKS_AFTER and sinks):
+            rolls_back = roll.rate * self._unit < -_FAIL_RATE and self._degrees > _LANDED_ANGLE
+            if self._base_degrees < _LANDED_ANGLE and load > 0.05:
+                self._catch(state, GetUpPhase.CATCH, _CROUCH_FRACTION)
+            elif elapsed > _MAX_ROLL_TIME or (elapsed > _FAIL_TIME and rolls_back):
                 self._enter(GetUpPhase.LIE, state.time)
         elif self.phase in (GetUpPhase.CATCH, GetUpPhase.STAND):
             assert self._stand is not None
-            late = elapsed > _STRAIGHTENS
-            if self._base_degrees > _LOST or (late and not upright):
+            late = elapsed > _MAX_STRAIGHTEN_TIME
+            if self._base_degrees > _MAX_BASE_TILT or (late and not upright):
                 self._enter(GetUpPhase.LIE, state.time)
-            elif self.phase is GetUpPhase.CATCH and upright and (self._stand.resting or late):
+            elif self.phase is GetUpPhase.CATCH and upright and (self._stand.is_at_rest or late):
                 self._catch(state, GetUpPhase.STAND, 1.0)
 
     def _enter(self, phase: GetUpPhase, time: float) -> None:
         self.phase, self._entered = phase, time
 
     def _catch(self, state: BodyState, phase: GetUpPhase, crouch: float) -> None:
-        self._stand = Stand(self._place.moved_to(state.positions), at_rest=False, crouch=crouch)
+        self._stand = Stand(self._stance.moved_to(state.positions), at_rest=False, crouch=crouch)
         self._enter(phase, state.time)
 
     def _tilt(self, positions: np.ndarray, nodes: np.ndarray | slice = slice(None)) -> tuple[float, np.ndarray]:
-        """Radians by which the body, or what some of its ``nodes`` are of it, is off upright, and the level axis (3,),
-        world axes, about which that is undone."""
+        """Return the tilt from upright in radians of the body, or of some of its ``nodes``, and the horizontal axis
+        (3,), world axes, about which a rotation undoes it."""
         mass, arms, up = self.body.node_mass[nodes], self._arms[nodes], self.ground.axes[2]
         now = positions[nodes]
         turn = kabsch_rotation(mass, arms - mass @ arms / mass.sum(), now - mass @ now / mass.sum())
@@ -261,15 +272,15 @@ class GetUp:
         return angle, axis / size if size > 1e-9 else self.ground.axes[0]
 
     def _top(self, arms: np.ndarray, axis: np.ndarray, angle: float) -> float:
-        """Metres over the ground: the highest that the centre of mass of a body of ``arms`` (N, 3) comes on its way, as
-        it rolls about ``axis`` (3,) by ``angle`` radians, whatever edges it rolls over."""
+        """Return the largest height in metres of the centre of mass above the ground while a body with ``arms`` (N, 3)
+        rolls about ``axis`` (3,) by ``angle`` radians, over whichever edges it meets."""
         normal = self.ground.surface_normal
         turns = Rotation.from_rotvec(np.linspace(0.0, angle, max(int(np.degrees(angle) / 3.0), 2))[:, None] * axis)
         return float((-(turns.inv().apply(normal) @ arms.T).min(axis=1)).max())
 
-    def _rolling(self, state: BodyState, roll: _Roll, dt: float) -> list[AnyObjective]:
-        """The centre of mass and the spin of a body that turns about its edge as a whole, as fast as brings it over
-        the top; once nothing pushes it any more, as it does by itself."""
+    def _roll_objectives(self, state: BodyState, roll: _Roll, dt: float) -> list[AnyObjective]:
+        """Return objectives for the centre of mass and the spin of a body that rolls about its edge as a whole, at the
+        rate that takes it over the top. Once nothing pushes it any more, the rate is that of the free roll."""
         body, control, unit = self.body, self.control, self._unit
         weight = body.mass * self._gravity
         elapsed = state.time - self._entered + dt
@@ -279,10 +290,10 @@ class GetUp:
         if carried:
             rate = roll.rate + dt * weight * float(roll.arm @ ahead) / roll.inertia
         else:
-            rise = roll.missing + (self._in_hand if roll.missing > 0.01 * body.height else 0.0)
-            enough = float(np.sqrt(2.0 * weight * rise / roll.inertia + (_OVER / unit) ** 2))
-            push = self._push * max(smooth(elapsed / (_SWITCHED * unit)), 0.1)
-            rate = roll.rate + float(np.clip(enough - roll.rate, -_BRAKES * dt / unit**2, push * dt))
+            rise = roll.missing + (self._margin if roll.missing > 0.01 * body.height else 0.0)
+            target_rate = float(np.sqrt(2.0 * weight * rise / roll.inertia + (_MIN_TOP_RATE / unit) ** 2))
+            push = self._push * max(smooth(elapsed / (_PUSH_RAMP_TIME * unit)), 0.1)
+            rate = roll.rate + float(np.clip(target_rate - roll.rate, -_MAX_BRAKING * dt / unit**2, push * dt))
         velocity = rate * np.cross(roll.axis, roll.arm)
         if carried:
             pose = node_velocities(body, velocity + rate * np.cross(roll.axis, arms), control.carried)
@@ -297,11 +308,12 @@ class GetUp:
         ]
 
 
-def lie_down(place: Stance, degrees: float, axis: np.ndarray) -> np.ndarray:
-    """(N, 3) the body that stands at ``place`` laid over by ``degrees`` about ``axis`` (3,), just over the ground."""
-    body = place.body
-    com = body.centre_of_mass(place.standing)
+def lie_down(stance: Stance, degrees: float, axis: np.ndarray) -> np.ndarray:
+    """Return the nodes (N, 3) of the body of ``stance`` tilted by ``degrees`` about ``axis`` (3,), just above the
+    ground."""
+    body = stance.body
+    com = body.centre_of_mass(stance.standing)
     turn = Rotation.from_rotvec(np.radians(degrees) * np.asarray(axis)).as_matrix()
-    laid = com + (place.standing - com) @ turn.T
-    low = float(((laid - place.ground.origin) @ place.ground.surface_normal).min())
-    return laid + (1e-3 * body.height - low) * place.ground.surface_normal
+    laid = com + (stance.standing - com) @ turn.T
+    low = float(((laid - stance.ground.origin) @ stance.ground.surface_normal).min())
+    return laid + (1e-3 * body.height - low) * stance.ground.surface_normal

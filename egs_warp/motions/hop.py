@@ -1,4 +1,4 @@
-"""Hops: jumps in a row, each to its own square, aimed from where the one before has landed.
+"""Hops: a row of jumps, each to its own target on the ground, planned from the landing of the previous one.
 
 See docs/concepts/motions.md.
 """
@@ -22,87 +22,99 @@ from egs_warp.motions.stance import sole_shares
 
 @dataclass(frozen=True)
 class HopOutcome:
-    """How near a hop came to its square."""
+    """Measured result of a hop."""
 
     target_error: float
-    """From the middle of the feet to that of the square at the end, in lengths of the jump."""
+    """Distance from the middle of the feet to the target at the end, relative to the length of the jump."""
 
 
 class Hop:
-    """A jump whose feet aim at a point of the ground."""
+    """Jump whose feet aim at a point on the ground."""
 
-    def __init__(self, place: Stance, square: np.ndarray, height: float) -> None:
-        """``square`` (3,): where the middle of the feet shall land; ``height``: rise of the centre of mass, both
-        metres."""
-        way = square - sole_shares(place.body, place.ground, place.standing) @ place.standing
-        place = place.with_forward(way)
-        forward, _, rise = place.ground.axes @ way
+    def __init__(self, stance: Stance, square: np.ndarray, height: float) -> None:
+        """Create the hop of the body that stands at ``stance``.
+
+        Args:
+            stance: stance at the start.
+            square: (3,) m, target of the middle of the feet.
+            height: rise of the centre of mass, m.
+        """
+        offset = square - sole_shares(stance.body, stance.ground, stance.standing) @ stance.standing
+        stance = stance.with_forward(offset)
+        forward, _, rise = stance.ground.axes @ offset
         target = JumpTarget(float(forward), height + max(float(rise), 0.0), float(rise))
-        self.jump, self.square = Jump(place, target), square
-        self._feet = sole_shares(place.body, place.ground, place.standing)
+        self.jump, self.square = Jump(stance, target), square
+        self._feet = sole_shares(stance.body, stance.ground, stance.standing)
 
     @property
     def expected_time(self) -> float:
-        """That of the jump."""
+        """Expected duration of the jump, s."""
         return self.jump.expected_time
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether the jump is at rest."""
-        return self.jump.resting
+        """True if the jump is at rest."""
+        return self.jump.is_at_rest
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Those of the jump."""
+        """Return the objectives of the jump."""
         return self.jump.objectives(state, report, dt)
 
     def plan_record(self) -> JumpPlan:
-        """What the jump aims at."""
+        """Return the plan of the jump."""
         return self.jump.plan
 
     def planned_com(self, elapsed: float) -> np.ndarray:
-        """That of the jump."""
+        """Return the planned displacement of the jump, see ``Jump.planned_com``."""
         return self.jump.planned_com(elapsed)
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> HopOutcome:
-        """How near the feet came to the square."""
+        """Measure the error of the landing."""
         return HopOutcome(self.miss(trajectory.positions[last]) / self.jump.target.distance)
 
     def notes(self) -> list[str]:
-        """What kept the jump from its target, for the user."""
+        """Return messages for the user about phases that took too long."""
         return self.jump.notes()
 
     def miss(self, positions: np.ndarray) -> float:
-        """Metres from the middle of the feet to the middle of the square, along the ground."""
+        """Return the distance in metres along the ground from the middle of the feet to the target."""
         off = self._feet @ positions - self.square
         up = self.jump.ground.axes[2]
         return float(np.linalg.norm(off - (off @ up) * up))
 
 
 class HopTargets:
-    """A row of squares ahead of a place; made when the first hop begins, so that later ones do not add up their
-    errors."""
+    """Row of targets ahead of the stance in which the first hop begins, so that errors of the hops do not
+    accumulate."""
 
-    def __init__(self, distance: float, height: float, count: int, asked: Mapping[str, float]) -> None:
-        """``distance`` from square to square and ``height`` of each jump in metres; ``asked`` is what a report says."""
-        self.distance, self.height, self.count, self.asked = distance, height, count, asked
+    def __init__(self, distance: float, height: float, count: int, values: Mapping[str, float]) -> None:
+        """Create the targets.
+
+        Args:
+            distance: from target to target, m.
+            height: of each jump, m.
+            count: number of targets.
+            values: values that the report gives.
+        """
+        self.distance, self.height, self.count, self.values = distance, height, count, values
         self._first: np.ndarray | None = None
-        self._way = np.zeros(3)
+        self._direction = np.zeros(3)
         self._clearance = 0.0
 
     def parts(self) -> list[MotionTask]:
-        """The hops, for a sequence."""
+        """Return the hops, for a sequence."""
         return [
-            MotionTask("hop", {**self.asked, "square": float(k)}, lambda place, k=k: self._begin(place, k))
+            MotionTask("hop", {**self.values, "square": float(k)}, lambda stance, k=k: self._begin(stance, k))
             for k in range(1, self.count + 1)
         ]
 
-    def _begin(self, place: Stance, number: int) -> Hop:
+    def _begin(self, stance: Stance, number: int) -> Hop:
         if self._first is None:
-            share = sole_shares(place.body, place.ground, place.standing)
-            self._first = share @ place.standing
-            self._way = place.ground.axes[0]
-            # The middle of the feet is a little above what they stand on.
-            self._clearance = -place.surface_height_above(self._first)
-        square = self._first + number * self.distance * self._way
-        rise = place.surface_height_above(square) + self._clearance
-        return Hop(place, square + rise * place.ground.axes[2], self.height)
+            share = sole_shares(stance.body, stance.ground, stance.standing)
+            self._first = share @ stance.standing
+            self._direction = stance.ground.axes[0]
+            # The middle of the feet is a little above the ground.
+            self._clearance = -stance.surface_height_above(self._first)
+        square = self._first + number * self.distance * self._direction
+        rise = stance.surface_height_above(square) + self._clearance
+        return Hop(stance, square + rise * stance.ground.axes[2], self.height)

@@ -1,7 +1,7 @@
-"""A jump to a place, as a closed-loop state machine that writes objectives from the measured state
+"""A jump to a target: a closed-loop state machine that computes objectives from the measured state
 (docs/concepts/motions.md).
 
-From take-off on it is told in the frame of the landing, which may be turned, higher or lower.
+From take-off on, quantities are relative to the frame of the landing, which may be rotated, higher or lower.
 """
 
 from __future__ import annotations
@@ -32,64 +32,72 @@ from egs_warp.motions.stance import BalanceController, GroundFrame, Measurement,
 from egs_warp.motions.walk_posture import LeggedPosture, select_posture
 
 STOP_RISE_FRACTION = 0.94
-"""A thrust ends when the centre of mass would reach this share of the asked height in free flight: one step more is too
-much."""
+"""A thrust ends when the centre of mass would reach this fraction of the requested height in free flight: one more time
+step would exceed it."""
 AIM_RISE_FRACTION = 0.99
-"""What a thrust aims at, clear of ``RISE``, so that a speed that is nearly followed ends it."""
+"""Fraction of the requested height at which a thrust aims. It exceeds ``STOP_RISE_FRACTION``, so that a speed that is
+followed almost exactly ends the thrust."""
 FORWARD_TIME_FRACTION = 0.7
-"""Part of the time of a thrust in which the speed forward is to be reached."""
+"""Fraction of the time of a thrust in which the forward speed is reached."""
 MAX_FOOTHOLD_OFFSET = 0.4
-"""Of the footprint: how far from the capture point the feet may be put down for the sake of the target."""
-CLEARANCE = 0.15
-"""Of the height of a step: how far above it the feet are before they swing ahead."""
+"""Fraction of the footprint by which the foothold may differ from the capture point for the sake of the target."""
+STEP_CLEARANCE = 0.15
+"""Clearance of the feet above a step, as a fraction of its height, before they swing forward."""
 APPROACH_RATE = 2.5
-"""Over the time left in the air: the rate at which the pose of the landing is approached, gently at first."""
+"""Rate at which the pose of the landing is approached, times the time left in the air; slow at first."""
 TOUCH_DOWN_HEIGHT = 0.06
-"""Body heights: a centre of mass that has come down to so little above where it stood has landed with the first
-foot."""
+"""Body heights: when the centre of mass is at most this far above its standing height, the first contact counts as the
+landing."""
 MAX_LANDING_TIME = 9.0
-"""Of sqrt(H / g): a body that is not calm by then counts as at rest."""
+"""Longest landing in sqrt(H / g); after it, the body counts as at rest."""
 LANDING_RAMP_TIME = 0.5
-"""Of sqrt(H / g): the time from touch-down until balance and upright are asked for in full."""
+"""Time in sqrt(H / g) from touch-down until balance and upright objectives have their full weight."""
 LANDING_LEAN_FRACTION = 0.7
-"""Of the lean of the landing: what the body is not to be turned by at touch-down. It shears by so much less than its
-feet are ahead, and on its heels it would be thrown over them.
-"""
+"""Fraction of the lean of the landing that the target rotation at touch-down leaves out: the body leans by this much
+less than its feet are ahead. On its heels it would be thrown over them."""
 FLAT_SOLE_SPEED = 0.1
-"""Of sqrt(g H): what comes up to its feet as fast has soles to be flat at all costs, what is slower in part."""
+"""Speed in sqrt(g H) towards the feet from which on the soles must be flat; slower bodies flatten them in part."""
 POSE_BLEND_TIME = 0.3
-"""Of sqrt(H / g): the time in which a phase's pose takes over from the last one's."""
+"""Time in sqrt(H / g) in which the pose of a phase replaces that of the previous one."""
 TAKE_OFF_RELEASE_TIME = 0.6
-"""Of sqrt(H / g): the time after take-off in which the pose of the landing is taken up."""
+"""Time in sqrt(H / g) after take-off in which the pose of the landing is adopted."""
 URGENT_CAPTURE_MARGIN = 0.5
-"""Of the way from the middle of the feet to their edge: with its capture point beyond, a body that lands is balanced
-with more than the usual share of the weights."""
-SWING_WEIGHT, BASE_SWING = 5.0, 1.0
-"""Weights of the soles in the air, of feet on legs and of a base: they swing ahead under a body that keeps its shape.
-Told by the pose alone they come down 0.03 body heights short, and a body with little in front of it falls over them. A
-base is stiff: with 5 a monkey's jump takes half as much work again, and lands no better."""
-AIRBORNE_POSE_WEIGHT, BASE_AIRBORNE = 2.0, 0.3
-"""Weights of the pose in the air, where nothing else can be steered and the feet have to get to their place: on legs
-and of what turns as it flies, by how wide it makes itself; and on a base, straight ahead: with 2 muscles of a pawn give
-0.76 m g H in the air, with 0.3 they give 0.30, and it lands as well."""
+"""Fraction of the distance from the middle of the feet to their edge: with its capture point beyond, a landing body is
+balanced with more than the usual weights."""
+SWING_WEIGHT, BASE_SWING_WEIGHT = 5.0, 1.0
+"""Weights of the soles in the air, for feet on legs and for a base: the soles swing forward under a body that keeps its
+shape. From the pose alone they land 0.03 body heights short, and a body with little support in front falls over them. A
+base is stiff: with a weight of 5, a monkey's jump takes half as much work again and lands no better."""
+AIRBORNE_POSE_WEIGHT, BASE_AIRBORNE_POSE_WEIGHT = 2.0, 0.3
+"""Weights of the pose in the air, where nothing else can be steered and the feet have to reach their target. The first
+is for bodies on legs and for bodies that turn in the air, whose rotation depends on their width; the second is for a
+base without a turn. With 2, the muscles of a pawn do work of 0.76 m g H in the air, with 0.3 they do 0.30, and it lands
+as well."""
 
 
 class Jump:
-    """Settle, crouch, thrust until the measured speed suffices, fly, land ``target.distance`` ahead, rest as soon as it
-    is calm."""
+    """Jump: settle, crouch, thrust until the measured speed suffices, fly, land ``target.distance`` ahead, and come to
+    rest."""
 
     def __init__(
         self,
-        place: Stance,
+        stance: Stance,
         target: JumpTarget,
         *,
         facing: HeadingPolicy | None = None,
         weights: Weights | None = None,
-        settled: bool = False,
+        skips_settling: bool = False,
     ) -> None:
-        """``facing``: which way it lands; straight ahead if not given. ``settled``: it crouches from its first step
-        on."""
-        body, ground = place.body, place.ground
+        """Create the jump of the body that stands at ``stance``.
+
+        Args:
+            stance: stance at the start.
+            target: target of the jump.
+            facing: heading policy; None keeps the heading.
+            weights: weights of the objectives.
+            skips_settling: True starts the crouch at the first time step.
+        """
+        body, ground = stance.body, stance.ground
         self.body, self.target, self.facing = body, target, facing or KeepHeading()
         self.weights = weights or Weights()
         self.gravity = float(np.linalg.norm(body.gravity))
@@ -98,96 +106,96 @@ class Jump:
             ground.origin + target.distance * ground.axes[0] + target.rise * ground.axes[2],
             ground.surface_normal,
         )
-        self.pose = BalanceController(body, ground, place.standing, place.contact_points, place.friction)
+        self.controller = BalanceController(body, ground, stance.standing, stance.contact_points, stance.friction)
         self._landing = BalanceController(
             body,
             landing,
-            landing.world(ground.local(place.standing)),
-            landing.world(ground.local(place.contact_points)),
-            place.friction,
+            landing.world(ground.local(stance.standing)),
+            landing.world(ground.local(stance.contact_points)),
+            stance.friction,
         )
-        feet, carriage = select_posture(place)
-        on_legs = carriage is LeggedPosture
-        self._swing = SWING_WEIGHT if on_legs else BASE_SWING
-        self._airborne = AIRBORNE_POSE_WEIGHT if on_legs or self.facing.target_heading else BASE_AIRBORNE
-        base = np.flatnonzero(sole_shares(body, ground, place.standing))
+        feet, posture = select_posture(stance)
+        on_legs = posture is LeggedPosture
+        self._swing = SWING_WEIGHT if on_legs else BASE_SWING_WEIGHT
+        self._airborne = AIRBORNE_POSE_WEIGHT if on_legs or self.facing.target_heading else BASE_AIRBORNE_POSE_WEIGHT
+        base = np.flatnonzero(sole_shares(body, ground, stance.standing))
         self._soles = [
             BodyPart.of(body, "sole", sole) for sole in ([foot.sole for foot in feet] if on_legs else [base])
         ]
         self._time_unit = float(np.sqrt(body.height / self.gravity))
-        # Feet on legs are put down where they are asked to be, and stay there.
+        # Feet on legs land at their target and stay there.
         self._landing_time = LANDING_TIME * self._time_unit if on_legs else 0.0
-        ahead = ground.axes[0] @ (place.contact_points - body.centre_of_mass(place.standing)).T
-        self._style = place.style
-        self._step, self._furthest_lean = place.step, MAX_LEAN * float(ahead.max())
-        self.plan = self._planned(target)
-        self._settled = settled
+        ahead = ground.axes[0] @ (stance.contact_points - body.centre_of_mass(stance.standing)).T
+        self._style = stance.style
+        self._step, self._max_lean = stance.step, MAX_LEAN * float(ahead.max())
+        self.plan = self._plan_for(target)
+        self._skips_settling = skips_settling
         self.phase = JumpPhase.SETTLE
         self._entered = 0.0
-        local = ground.local(place.standing)
+        local = ground.local(stance.standing)
         self._start_com = body.centre_of_mass(local)
-        self._start_base = self._start_com[:2] + self.pose.base_offset
+        self._start_base = self._start_com[:2] + self.controller.base_offset
         self._last_pose = self._pose_before = np.eye(3)
-        self._asked: np.ndarray | None = None
+        self._requested_velocity: np.ndarray | None = None
         self._flew = False
-        self._calm = RestDetector(body)
+        self._rest_detector = RestDetector(body)
         self._overran: list[JumpPhase] = []
 
     @property
     def ground(self) -> GroundFrame:
-        """The frame in which the motion is told: of the start, from take-off on of the landing."""
-        return self.pose.ground
+        """Reference frame of the motion: that of the start, from take-off on that of the landing."""
+        return self.controller.ground
 
     @property
     def is_airborne(self) -> bool:
-        """Whether the motion is told in the frame of the landing."""
-        return self.pose is self._landing
+        """True if the reference frame is that of the landing."""
+        return self.controller is self._landing
 
     @property
     def expected_time(self) -> float:
-        """Seconds until it is at rest."""
+        """Expected duration in seconds until the body is at rest."""
         return self.plan.expected_duration(abs(self.target.distance) / self.body.height, self._time_unit)
 
-    def _planned(self, target: JumpTarget) -> JumpPlan:
+    def _plan_for(self, target: JumpTarget) -> JumpPlan:
         return plan_jump(
             target,
             height=self.body.height,
-            com_height=self.pose.standing_height,
-            support_ahead=float(self.pose.support_high[0]),
+            com_height=self.controller.standing_height,
+            support_ahead=float(self.controller.support_high[0]),
             gravity=self.gravity,
             step=self._step,
-            lean=min(LEAN_FRACTION * target.distance, self._furthest_lean),
-            friction=self.pose.friction,
+            lean=min(LEAN_FRACTION * target.distance, self._max_lean),
+            friction=self.controller.friction,
             landing_time=self._landing_time,
             style=self._style,
         )
 
     def take_off_time(self, height: float) -> float:
-        """Seconds from the crouch of a jump on the spot, ``height`` metres high, until its thrust ends as planned;
-        both take whole steps."""
-        return self._planned(JumpTarget(0.0, height)).take_off_time(self._step)
+        """Return the planned seconds from the start of the crouch to the end of the thrust for a jump on the spot,
+        ``height`` metres high. Crouch and thrust take whole time steps."""
+        return self._plan_for(JumpTarget(0.0, height)).take_off_time(self._step)
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether the body has landed and is calm."""
+        """True if the body has landed and is at rest."""
         return self.phase is JumpPhase.REST
 
     def plan_record(self) -> JumpPlan:
-        """What the jump aims at."""
+        """Return the plan of the jump."""
         return self.plan
 
     def planned_com(self, elapsed: float) -> np.ndarray:
-        """(3,) metres from where the centre of mass stood, ``elapsed`` seconds after the motion began; NaN after
-        touch-down."""
+        """Return the planned displacement (3,) in metres of the centre of mass ``elapsed`` seconds after the motion
+        began; NaN after touch-down."""
         plan, ground = self.plan, self.ground
         axes = ground.axes @ ground.rotation_about_up(self.facing.target_heading) if self.is_airborne else ground.axes
         return plan.planned_displacement(max(elapsed - SETTLE_TIME * self._time_unit, 0.0), self.gravity) @ axes
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> None:
-        """Nothing beside what is measured of all motions."""
+        """Return None: a jump has no quantities of its own beyond those measured for all motions."""
 
     def notes(self) -> list[str]:
-        """What kept the jump from its target, for the user."""
+        """Return messages for the user about phases that took too long."""
         named = {
             JumpPhase.THRUST: "the muscles could not reach the take-off speed within the time of a thrust",
             JumpPhase.FLIGHT: "the body never came back to the ground",
@@ -195,32 +203,33 @@ class Jump:
         return [f"{phase.value} took too long: {named[phase]}" for phase in self._overran]
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
-        seen = self.pose.measure(state, report)
-        self.facing.update(seen.heading + (self.facing.target_heading if self.is_airborne else 0.0))
-        self._advance_phase(seen, state.time, dt)
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
+        step."""
+        measurement = self.controller.measure(state, report)
+        self.facing.update(measurement.heading + (self.facing.target_heading if self.is_airborne else 0.0))
+        self._advance_phase(measurement, state.time, dt)
         elapsed = state.time - self._entered + dt
         if self.phase is JumpPhase.FLIGHT:
-            return self._flight_objectives(state, seen, dt)
+            return self._flight_objectives(state, measurement, dt)
         if self.phase is JumpPhase.THRUST:
-            return self._thrust(state, seen, elapsed, dt)
+            return self._thrust(state, measurement, elapsed, dt)
         if self.phase in (JumpPhase.SETTLE, JumpPhase.CROUCH):
-            return self._crouch(state, seen, elapsed, dt)
-        return self._land(state, seen, dt)
+            return self._crouch(state, measurement, elapsed, dt)
+        return self._land(state, measurement, dt)
 
-    def _advance_phase(self, seen: Measurement, time: float, dt: float) -> None:
-        # What a foot brushes on its way up is no landing.
-        seen = replace(seen, in_contact=seen.in_contact and seen.velocity[2] < 0.0)
+    def _advance_phase(self, measurement: Measurement, time: float, dt: float) -> None:
+        # Contacts while the body still rises are no landing.
+        measurement = replace(measurement, in_contact=measurement.in_contact and measurement.velocity[2] < 0.0)
         elapsed, plan = time - self._entered + 1e-9, self.plan
         following = {
-            JumpPhase.SETTLE: self._settled or elapsed >= SETTLE_TIME * self._time_unit,
+            JumpPhase.SETTLE: self._skips_settling or elapsed >= SETTLE_TIME * self._time_unit,
             JumpPhase.CROUCH: elapsed >= plan.crouch_time,
-            JumpPhase.THRUST: self._is_thrust_done(seen, dt),
-            JumpPhase.FLIGHT: self._flew and self._has_landed(seen),
+            JumpPhase.THRUST: self._is_thrust_done(measurement, dt),
+            JumpPhase.FLIGHT: self._flew and self._has_landed(measurement),
             JumpPhase.LAND: elapsed >= MAX_LANDING_TIME * self._time_unit,
             JumpPhase.REST: False,
         }
-        if self.phase is JumpPhase.FLIGHT and not seen.in_contact:
+        if self.phase is JumpPhase.FLIGHT and not measurement.in_contact:
             self._flew = True
         limits = {JumpPhase.THRUST: 3.0 * plan.thrust_time, JumpPhase.FLIGHT: 3.0 * plan.flight_time}
         if not following[self.phase] and elapsed > limits.get(self.phase, np.inf):
@@ -230,183 +239,207 @@ class Jump:
             self.phase = list(JumpPhase)[list(JumpPhase).index(self.phase) + 1]
             self._entered, self._pose_before = time, self._last_pose
         if self.phase is JumpPhase.FLIGHT and not self.is_airborne:
-            # Poses are told from how the body stands, which is turned where it lands.
-            turned = self.ground.rotation_about_up(self.facing.target_heading)
-            self._last_pose, self._pose_before = self._last_pose @ turned.T, self._pose_before @ turned.T
-            self.pose = self._landing
-        elif self.phase is JumpPhase.LAND and self._calm.update(seen.velocity, time):
+            # Poses are relative to the standing pose of the frame, which is rotated in the frame of the landing.
+            rotation = self.ground.rotation_about_up(self.facing.target_heading)
+            self._last_pose, self._pose_before = self._last_pose @ rotation.T, self._pose_before @ rotation.T
+            self.controller = self._landing
+        elif self.phase is JumpPhase.LAND and self._rest_detector.update(measurement.velocity, time):
             self.phase = JumpPhase.REST
 
-    def _is_thrust_done(self, seen: Measurement, dt: float) -> bool:
-        """Whether the centre of mass, in free flight from here, would reach the asked height."""
-        speed = max(seen.velocity[2] - 0.5 * self.gravity * dt, 0.0)
-        apex = seen.com[2] + speed**2 / (2.0 * self.gravity)
+    def _is_thrust_done(self, measurement: Measurement, dt: float) -> bool:
+        """Return True if the centre of mass would reach the requested height in free flight."""
+        speed = max(measurement.velocity[2] - 0.5 * self.gravity * dt, 0.0)
+        apex = measurement.com[2] + speed**2 / (2.0 * self.gravity)
         enough = bool(apex >= self._start_com[2] + STOP_RISE_FRACTION * self.target.height)
-        # A body in the air has thrust, however fast it goes; waiting for the asked speed there would lose the steering
-        # of the feet.
-        return enough or not (seen.in_contact or seen.sole_height <= 0.0)
+        # A body in the air has finished its thrust, whatever its speed; waiting for the target speed would lose the
+        # time to steer the feet.
+        return enough or not (measurement.in_contact or measurement.sole_height <= 0.0)
 
-    def _has_landed(self, seen: Measurement) -> bool:
-        """Whether the body stands on the ground again; the first foot to brush it is too little to balance on."""
-        low = seen.com[2] < self._start_com[2] + TOUCH_DOWN_HEIGHT * self.body.height
-        return seen.in_contact and seen.velocity[2] < 0.0 and (low or seen.normal_load > 1.0)
+    def _has_landed(self, measurement: Measurement) -> bool:
+        """Return True if the body stands on the ground again; the first contact alone is too little to balance on."""
+        low = measurement.com[2] < self._start_com[2] + TOUCH_DOWN_HEIGHT * self.body.height
+        return measurement.in_contact and measurement.velocity[2] < 0.0 and (low or measurement.normal_load > 1.0)
 
-    def _crouch(self, state: BodyState, seen: Measurement, elapsed: float, dt: float) -> list[AnyObjective]:
+    def _crouch(self, state: BodyState, measurement: Measurement, elapsed: float, dt: float) -> list[AnyObjective]:
         position, velocity = self._start_com, np.zeros(3)
         if self.phase is JumpPhase.CROUCH:
             position, velocity = self.plan.crouch(self._start_com, elapsed)
-        velocity = self._following(seen, position, velocity, dt)
-        pose = self.pose.bent_over_base(position, self._start_base)
-        velocity, spin = self.pose.balance_targets(seen, velocity, self._upright(seen, pose), dt)
-        return self._body_objectives(state, seen, velocity, pose, spin, dt)
+        velocity = self._following(measurement, position, velocity, dt)
+        pose = self.controller.bent_over_base(position, self._start_base)
+        velocity, spin = self.controller.balance_targets(measurement, velocity, self._upright(measurement, pose), dt)
+        return self._body_objectives(state, measurement, velocity, pose, spin, dt)
 
-    def _thrust(self, state: BodyState, seen: Measurement, elapsed: float, dt: float) -> list[AnyObjective]:
-        """Along the ground the speed that brings the centre of mass from where it is to where it shall touch down."""
+    def _thrust(self, state: BodyState, measurement: Measurement, elapsed: float, dt: float) -> list[AnyObjective]:
+        """Return the objectives of the thrust. Along the ground, the target speed takes the centre of mass from its
+        measured position to its position at touch-down."""
         plan = self.plan
         position, velocity = plan.thrust(self._start_com, elapsed)
-        # No faster up than free flight to the asked height needs.
-        up = min(self._following(seen, position, velocity, dt)[2], self._sufficient_speed(seen, dt))
-        left = max((plan.speed_up - seen.velocity[2]) / plan.speed_up * plan.thrust_time, dt)
+        # No faster upward than free flight to the requested height needs.
+        up = min(self._following(measurement, position, velocity, dt)[2], self._sufficient_speed(measurement, dt))
+        left = max((plan.speed_up - measurement.velocity[2]) / plan.speed_up * plan.thrust_time, dt)
         landing = self._landing_com(position)
         goal = np.array([landing[0], self._start_com[1]])
-        needed = (goal - seen.com[:2] - 0.5 * left * seen.velocity[:2]) / (plan.flight_time + 0.5 * left)
-        # What the ground gives lags behind what is asked: the speed forward is asked for ahead of the speed up, and
-        # with what the last step fell short by, at most twice over.
-        change = (needed - seen.velocity[:2]) * dt / max(FORWARD_TIME_FRACTION * left, dt)
-        short = self._asked - seen.velocity[:2] if self._asked is not None else np.zeros(2)
-        most = np.linalg.norm(change)
-        short *= min(1.0, most / max(float(np.linalg.norm(short)), 1e-12))
-        velocity = np.array([*(seen.velocity[:2] + change + short), up])
+        needed = (goal - measurement.com[:2] - 0.5 * left * measurement.velocity[:2]) / (plan.flight_time + 0.5 * left)
+        # The ground forces lag behind the objectives. So the forward speed leads the upward speed, and the shortfall of
+        # the last time step is added, up to doubling the change.
+        change = (needed - measurement.velocity[:2]) * dt / max(FORWARD_TIME_FRACTION * left, dt)
+        short = (
+            self._requested_velocity - measurement.velocity[:2] if self._requested_velocity is not None else np.zeros(2)
+        )
+        max_change = np.linalg.norm(change)
+        short *= min(1.0, max_change / max(float(np.linalg.norm(short)), 1e-12))
+        velocity = np.array([*(measurement.velocity[:2] + change + short), up])
         flat = self._base_of_landing() - LANDING_LEAN_FRACTION * np.array([self.plan.landing_lag, 0.0])
-        upright = self.pose.over_base(landing, flat, self.facing.heading)
-        standing = self.pose.bent_over_base(position, self._start_base, self.facing.heading)
-        spin = self._thrust_spin(seen, upright, standing, elapsed, left, dt)
-        velocity, spin = self.pose.balance_targets(seen, velocity, spin, dt)
-        self._asked = velocity[:2]
-        return self._body_objectives(state, seen, velocity, standing, spin, dt)
+        upright = self.controller.over_base(landing, flat, self.facing.heading)
+        standing = self.controller.bent_over_base(position, self._start_base, self.facing.heading)
+        spin = self._thrust_spin(measurement, upright, standing, elapsed, left, dt)
+        velocity, spin = self.controller.balance_targets(measurement, velocity, spin, dt)
+        self._requested_velocity = velocity[:2]
+        return self._body_objectives(state, measurement, velocity, standing, spin, dt)
 
     def _thrust_spin(
-        self, seen: Measurement, landing: np.ndarray, standing: np.ndarray, elapsed: float, left: float, dt: float
+        self,
+        measurement: Measurement,
+        landing: np.ndarray,
+        standing: np.ndarray,
+        elapsed: float,
+        left: float,
+        dt: float,
     ) -> np.ndarray:
-        """(3,) rad/s to ask for ``left`` seconds before take-off: from what keeps the body in the pose ``standing``
-        (3, 3) to what brings it to that of the ``landing`` (3, 3). The spin of a turn grows as the speed does, since
-        friction does with the load."""
-        up, inertia = self.ground.axes[2], seen.inertia
-        upright = self.pose.turn_towards(seen, landing)
-        wanted = self.facing.thrust_momentum(self.pose, seen, upright, left=left, flight_time=self.plan.flight_time)
+        """Return the target spin (3,) in rad/s, ``left`` seconds before take-off.
+
+        It blends from the spin that keeps the body in the pose ``standing`` (3, 3) to the one that takes it to the pose
+        ``landing`` (3, 3). The spin about up grows with the speed, because friction grows with the load.
+        """
+        up, inertia = self.ground.axes[2], measurement.inertia
+        upright = self.controller.turn_towards(measurement, landing)
+        target_momentum = self.facing.thrust_momentum(
+            self.controller, measurement, upright, left=left, flight_time=self.plan.flight_time
+        )
         share = min(elapsed / self.plan.thrust_time, 1.0)
-        momentum = share * wanted + (1.0 - share) * (inertia @ self._upright(seen, standing))
+        momentum = share * target_momentum + (1.0 - share) * (inertia @ self._upright(measurement, standing))
         if self.facing.target_heading:
-            now = up @ seen.angular_momentum
-            about_up = now + dt / max(FORWARD_TIME_FRACTION * left, dt) * (up @ wanted - now)
+            now = up @ measurement.angular_momentum
+            about_up = now + dt / max(FORWARD_TIME_FRACTION * left, dt) * (up @ target_momentum - now)
             momentum += (about_up - up @ momentum) * up
         return np.linalg.solve(inertia, momentum)
 
-    def _flight_objectives(self, state: BodyState, seen: Measurement, dt: float) -> list[AnyObjective]:
-        touch_down, left = self._touch_down(seen, dt)
+    def _flight_objectives(self, state: BodyState, measurement: Measurement, dt: float) -> list[AnyObjective]:
+        touch_down, left = self._touch_down(measurement, dt)
         heading = self.facing.heading - self.facing.target_heading
-        pose = self.pose.over_base(touch_down, self._foothold(state, seen, touch_down, left), heading)
-        # Nothing turns a body in the air; a foot that lags on the ground must not push any more.
-        spin = np.linalg.solve(seen.inertia, seen.angular_momentum)
-        pose = self.facing.airborne_pose(pose, seen.angular_momentum, self.ground.axes[2], left)
-        velocity = seen.velocity - np.array([0.0, 0.0, self.gravity * dt])
-        # What was strained by the thrust is let go of first.
+        pose = self.controller.over_base(touch_down, self._foothold(state, measurement, touch_down, left), heading)
+        # No force turns a body in the air; a foot that lags on the ground must not push any more.
+        spin = np.linalg.solve(measurement.inertia, measurement.angular_momentum)
+        pose = self.facing.airborne_pose(pose, measurement.angular_momentum, self.ground.axes[2], left)
+        velocity = measurement.velocity - np.array([0.0, 0.0, self.gravity * dt])
+        # First, the strain of the thrust is released.
         share = self._ramp_or_full(state.time + dt, TAKE_OFF_RELEASE_TIME)
-        held = self._body_objectives(state, seen, velocity, pose, spin, dt, left=left, share=share)
-        return [*held, *self._swing_objectives(state, pose, left, share)]
+        objectives = self._body_objectives(state, measurement, velocity, pose, spin, dt, left=left, share=share)
+        return [*objectives, *self._swing_objectives(state, pose, left, share)]
 
     def _swing_objectives(self, state: BodyState, pose: np.ndarray, left: float, share: float) -> list[AnyObjective]:
-        """Soles go to where the ``pose`` (3, 3) of the landing has them, in ``left`` s, for a ``share`` of their
-        weight."""
+        """Return objectives that move the soles to where the ``pose`` (3, 3) of the landing has them, in ``left``
+        seconds, with the fraction ``share`` of their weight."""
         rate = min(APPROACH_RATE / left, 6.0 / self._time_unit)
         com, about = self.body.centre_of_mass(state.positions), Coordinates(np.eye(3), True)
 
         def swung(sole: BodyPart) -> AnyObjective:
-            way = pose @ sole.centre(self.pose.arms) - (sole.centre(state.positions) - com)
-            return part_velocity(self.body, sole, rate * way, share * self._swing, about)
+            offset = pose @ sole.centre(self.controller.arms) - (sole.centre(state.positions) - com)
+            return part_velocity(self.body, sole, rate * offset, share * self._swing, about)
 
         return [swung(sole) for sole in self._soles]
 
-    def _land(self, state: BodyState, seen: Measurement, dt: float) -> list[AnyObjective]:
+    def _land(self, state: BodyState, measurement: Measurement, dt: float) -> list[AnyObjective]:
         rate = self.plan.landing_rate
-        goal = np.array([*(seen.foot_centre - self.pose.base_offset), self._start_com[2]])
-        acceleration = rate**2 * (goal - seen.com) - 2.0 * rate * seen.velocity
+        goal = np.array([*(measurement.foot_centre - self.controller.base_offset), self._start_com[2]])
+        acceleration = rate**2 * (goal - measurement.com) - 2.0 * rate * measurement.velocity
         acceleration[2] = max(acceleration[2], -0.8 * self.gravity)
-        acceleration[:2] = self.pose.capture_acceleration(seen, goal[:2])
-        velocity = seen.velocity + dt * acceleration
-        heading = self.facing.landed_heading(self.pose, state.positions)
-        # Upright, wherever the centre of mass is now: a body that leans with it is never called back.
-        pose = self.pose.over_base(np.array([*goal[:2], seen.com[2] + dt * velocity[2]]), seen.foot_centre, heading)
-        # What still comes up to its feet is turned until these are flat, for whoever stands on his heels cannot brake:
-        # upright in the mean while it is sheared back, its sole would point up by half of that.
-        ahead = goal[:2] - seen.com[:2]
-        closing = float(ahead @ seen.velocity[:2]) / max(float(np.linalg.norm(ahead)), 1e-9 * self.body.height)
-        coming = min(max(closing / (FLAT_SOLE_SPEED * self.body.speed_unit), 0.0), 1.0)
-        flat = self.pose.over_base(np.array([*(goal[:2] - coming * ahead), seen.com[2]]), seen.foot_centre, heading)
-        upright = self._ramp(state.time + dt, LANDING_RAMP_TIME) * self._upright(seen, flat)
-        velocity, spin = self.pose.balance_targets(seen, velocity, upright, dt)
-        # The ground catches what comes down; then little is asked of what comes to rest by itself.
-        urgent = (self.pose.capture_margin(seen) - URGENT_CAPTURE_MARGIN) / (1.0 - URGENT_CAPTURE_MARGIN)
+        acceleration[:2] = self.controller.capture_acceleration(measurement, goal[:2])
+        velocity = measurement.velocity + dt * acceleration
+        heading = self.facing.landed_heading(self.controller, state.positions)
+        # Upright wherever the centre of mass is now: a pose that leans with it would not return.
+        pose = self.controller.over_base(
+            np.array([*goal[:2], measurement.com[2] + dt * velocity[2]]), measurement.foot_centre, heading
+        )
+        # While the body still moves towards its feet, it is rotated until the soles are flat, because a body on its
+        # heels cannot brake. With an upright mean rotation while it is sheared back, its sole would point up by half of
+        # the shear.
+        ahead = goal[:2] - measurement.com[:2]
+        closing = float(ahead @ measurement.velocity[:2]) / max(float(np.linalg.norm(ahead)), 1e-9 * self.body.height)
+        approach = min(max(closing / (FLAT_SOLE_SPEED * self.body.speed_unit), 0.0), 1.0)
+        flat = self.controller.over_base(
+            np.array([*(goal[:2] - approach * ahead), measurement.com[2]]), measurement.foot_centre, heading
+        )
+        upright = self._ramp(state.time + dt, LANDING_RAMP_TIME) * self._upright(measurement, flat)
+        velocity, spin = self.controller.balance_targets(measurement, velocity, upright, dt)
+        # The ground stops the fall; afterwards low weights suffice for a body that comes to rest by itself.
+        urgent = (self.controller.capture_margin(measurement) - URGENT_CAPTURE_MARGIN) / (1.0 - URGENT_CAPTURE_MARGIN)
         share = self._ramp_or_full(state.time + dt, LANDING_RAMP_TIME) * max(self.weights.landing, min(urgent, 1.0))
-        return self._body_objectives(state, seen, velocity, pose, spin, dt, share=share)
+        return self._body_objectives(state, measurement, velocity, pose, spin, dt, share=share)
 
     def _ramp_or_full(self, time: float, unit: float) -> float:
-        """As ``_grown``, at once of what has a turn to steer."""
+        """Return the value of ``_ramp``, or 1 for a jump that turns."""
         return 1.0 if self.facing.target_heading else self._ramp(time, unit)
 
     def _ramp(self, time: float, unit: float) -> float:
-        """Share of the weight at ``time`` s of what grows to all of it over ``unit`` sqrt(H / g) of a phase."""
+        """Return the fraction of the full weight at ``time`` s; it ramps up over ``unit`` sqrt(H / g) from the start of
+        the phase."""
         share = min((time - self._entered) / (unit * self._time_unit), 1.0)
         return share * share * (3.0 - 2.0 * share)
 
-    def _following(self, seen: Measurement, position: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
-        """(3,) m/s that follows a reference ``position`` (3,) with its ``velocity`` (3,)."""
+    def _following(self, measurement: Measurement, position: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
+        """Return the velocity (3,) in m/s that follows a reference ``position`` (3,) with its ``velocity`` (3,)."""
         rate = 6.0 / self._time_unit
-        return velocity + rate * (position - velocity * dt - seen.com)
+        return velocity + rate * (position - velocity * dt - measurement.com)
 
-    def _upright(self, seen: Measurement, pose: np.ndarray) -> np.ndarray:
-        """(3,) rad/s that turns a standing body to ``pose`` (3, 3)."""
-        return self.pose.turn_towards(seen, pose) * 4.0 / self._time_unit
+    def _upright(self, measurement: Measurement, pose: np.ndarray) -> np.ndarray:
+        """Return the spin (3,) in rad/s that turns a standing body to ``pose`` (3, 3)."""
+        return self.controller.turn_towards(measurement, pose) * 4.0 / self._time_unit
 
-    def _sufficient_speed(self, seen: Measurement, dt: float) -> float:
-        """Speed up, m/s, at the end of this step from which free flight reaches the asked height."""
-        rise = self._start_com[2] + AIM_RISE_FRACTION * self.target.height - seen.com[2]
+    def _sufficient_speed(self, measurement: Measurement, dt: float) -> float:
+        """Return the upward speed in m/s at the end of this time step from which free flight reaches the target
+        height."""
+        rise = self._start_com[2] + AIM_RISE_FRACTION * self.target.height - measurement.com[2]
         return sufficient_speed(rise, self.gravity, dt)
 
     def _base_of_landing(self) -> np.ndarray:
-        """(2,) where the middle of the feet shall land, in the frame of the start."""
+        """Return the target (2,) of the middle of the feet, in the frame of the start."""
         return self._start_base + [self.target.distance, 0.0]
 
     def _landing_com(self, position: np.ndarray) -> np.ndarray:
-        """(3,) where the centre of mass shall touch down, in the frame of the start."""
-        ahead = self._base_of_landing()[0] - self.pose.base_offset[0] - self.plan.landing_lag
+        """Return the target (3,) of the centre of mass at touch-down, in the frame of the start."""
+        ahead = self._base_of_landing()[0] - self.controller.base_offset[0] - self.plan.landing_lag
         return np.array([ahead, position[1], self._start_com[2]])
 
-    def _touch_down(self, seen: Measurement, dt: float) -> tuple[np.ndarray, float]:
-        """Where the centre of mass (3,) will be when the feet have fallen by their distance to the ground now, and in
-        how many s."""
-        drop = max(seen.com[2] - self._start_com[2], 0.0)
-        speed, gap = seen.velocity[2], max(seen.sole_height, 0.0)
+    def _touch_down(self, measurement: Measurement, dt: float) -> tuple[np.ndarray, float]:
+        """Predict the touch-down: the centre of mass (3,) when the feet have fallen by their present height, and the
+        seconds until then."""
+        drop = max(measurement.com[2] - self._start_com[2], 0.0)
+        speed, gap = measurement.velocity[2], max(measurement.sole_height, 0.0)
         latest = max((speed + np.sqrt(max(speed**2 + 2.0 * self.gravity * drop, 0.0))) / self.gravity, dt)
         left = min(max((speed + np.sqrt(speed**2 + 2.0 * self.gravity * gap)) / self.gravity, dt), latest)
-        return np.array([*(seen.com[:2] + seen.velocity[:2] * left), self._start_com[2]]), left
+        return np.array([*(measurement.com[:2] + measurement.velocity[:2] * left), self._start_com[2]]), left
 
-    def _foothold(self, state: BodyState, seen: Measurement, touch_down: np.ndarray, left: float) -> np.ndarray:
-        """(2,) where to put the feet in ``left`` s: the target, if the body that comes in so can stop over it."""
-        if seen.velocity[2] > 0.0 and self.ground.local(state.positions)[:, 2].min() < CLEARANCE * self.target.rise:
-            # Feet that swing ahead before they are higher than the step would strike it.
-            return touch_down[:2] + seen.foot_centre - seen.com[:2]
-        falling = max(left * self.gravity - seen.velocity[2], 0.0)
-        capture_time = stopping_time(self.pose.standing_height, falling, self.gravity, self._landing_time)
-        capture = touch_down[:2] + seen.velocity[:2] * capture_time + self.pose.base_offset
-        low, high = self.pose.support_low, self.pose.support_high
-        # The capture point stays within their share of the feet, wherever these are.
+    def _foothold(self, state: BodyState, measurement: Measurement, touch_down: np.ndarray, left: float) -> np.ndarray:
+        """Return the foothold (2,) for a landing in ``left`` seconds: the target, if the body can come to rest over it,
+        otherwise the nearest point at which it can."""
+        if (
+            measurement.velocity[2] > 0.0
+            and self.ground.local(state.positions)[:, 2].min() < STEP_CLEARANCE * self.target.rise
+        ):
+            # Feet that swing forward before they are higher than the step would strike it.
+            return touch_down[:2] + measurement.foot_centre - measurement.com[:2]
+        falling = max(left * self.gravity - measurement.velocity[2], 0.0)
+        capture_time = stopping_time(self.controller.standing_height, falling, self.gravity, self._landing_time)
+        capture = touch_down[:2] + measurement.velocity[:2] * capture_time + self.controller.base_offset
+        low, high = self.controller.support_low, self.controller.support_high
+        # The capture point stays within this fraction of the feet, wherever they land.
         return np.clip(self._start_base, capture - MAX_FOOTHOLD_OFFSET * high, capture - MAX_FOOTHOLD_OFFSET * low)
 
     def _body_objectives(
         self,
         state: BodyState,
-        seen: Measurement,
+        measurement: Measurement,
         com_velocity: np.ndarray,
         pose: np.ndarray,
         spin: np.ndarray,
@@ -415,25 +448,36 @@ class Jump:
         left: float | None = None,
         share: float = 1.0,
     ) -> list[AnyObjective]:
-        """``left``: seconds before the landing, of a body in the air; ``share``: of their weight with which one that
-        lands is balanced, and the pose of one in the air held."""
-        # Where a phase begins with another pose than the last ended with, the way between them is gone in some steps.
+        """Return the objectives of the body.
+
+        Args:
+            state: current state.
+            measurement: measured body.
+            com_velocity: (3,) m/s, target velocity of the centre of mass, ground axes.
+            pose: (3, 3) target pose.
+            spin: (3,) rad/s, target spin, world axes.
+            dt: time step, s.
+            left: time until the landing of a body in the air, s; None on the ground.
+            share: fraction of the weights of balance while landing, and of the pose in the air.
+        """
+        # If a phase begins with another pose than the previous one ended with, the difference is blended over some time
+        # steps.
         pose = self._pose_before + self._ramp(state.time + dt, POSE_BLEND_TIME) * (pose - self._pose_before)
         rate = (pose - self._last_pose) / dt
         if np.abs(rate).max() > 5.0 / self._time_unit:
             rate = np.zeros((3, 3))
         self._last_pose = pose
-        # What comes down is to be stopped by the ground: asked for free fall, muscles would pull the feet away.
+        # The ground is to stop the fall: with objectives for free fall, muscles would pull the feet away.
         falling = self.phase is JumpPhase.FLIGHT and float(com_velocity[2]) < 0.0
         follow, weights = 6.0 / self._time_unit, self.weights
         if self.phase is JumpPhase.LAND or falling:
-            asked = 0.0 if falling else share
-            weights = replace(weights, com=asked * weights.com, up=asked * weights.up, spin=asked * weights.spin)
+            factor = 0.0 if falling else share
+            weights = replace(weights, com=factor * weights.com, up=factor * weights.up, spin=factor * weights.spin)
         if left is not None:
             follow, weights = min(APPROACH_RATE / left, follow), replace(weights, pose=share * self._airborne)
-        return self.pose.objectives(
+        return self.controller.objectives(
             state,
-            seen,
+            measurement,
             com_velocity=com_velocity,
             pose=pose,
             pose_rate=rate,

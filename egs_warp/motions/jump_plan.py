@@ -1,4 +1,4 @@
-"""Numbers of a jump, from what is asked and the body's height alone (docs/concepts/motions.md)."""
+"""Plan of a jump, from its target and the body's height alone (docs/concepts/motions.md)."""
 
 from __future__ import annotations
 
@@ -10,43 +10,43 @@ import numpy as np
 from egs_warp.motions.style import Style
 
 EXIT_SPEED_FACTOR = 2.0
-"""Speed ahead at the end of a crouch, in leans over its time: 2 is a steady acceleration, 0 a stop."""
+"""Forward speed at the end of a crouch, in leans per crouch time: 2 is a constant acceleration, 0 a stop."""
 LEAN_FRACTION = 0.15
-"""Of the distance: how far the weight is put ahead before take-off. With it over the middle of the feet a push forward
-would turn the body backward."""
+"""Fraction of the jump distance by which the centre of mass moves forward before take-off. Over the middle of the feet,
+a forward push would turn the body backward."""
 MAX_LEAN = 0.35
-"""Of the way from under the centre of mass to the front of the feet."""
+"""Largest lean, as a fraction of the distance from below the centre of mass to the front of the feet."""
 MAX_CROUCH = 0.26
-"""Of the height of the centre of mass, deeper ones crush elements to a fifth; a higher jump thrusts harder instead."""
+"""Deepest crouch, as a fraction of the height of the centre of mass. Deeper crouches compress elements to a fifth; a
+higher jump thrusts harder instead."""
 THRUST_ACCELERATION = 2.8
-"""Of gravity: mean acceleration of a thrust. A harder one takes a shallower crouch, which strains a stiff body less.
-"""
+"""Mean acceleration of a thrust, in g. A harder thrust needs a shallower crouch, which strains a stiff body less."""
 FRICTION_FRACTION = 0.9
-"""Of what friction gives while a thrust lasts: what its speed ahead may take. A thrust to which it would give less
-lasts longer, in a crouch that is deeper by ``DEEPER`` body heights at most."""
-_LEAST_FRICTION = 1e-6
+"""Fraction of the friction impulse of a thrust that the forward speed may use. If friction gives less, the thrust lasts
+longer, from a crouch that is deeper by at most ``MAX_EXTRA_CROUCH`` body heights."""
+_MIN_FRICTION = 1e-6
 MIN_CROUCH, MAX_EXTRA_CROUCH = 0.02, 0.02
-"""Body heights that a crouch is deep at least, without the way of half a step; and more for the sake of friction."""
+"""Smallest depth of a crouch in body heights, without the displacement of half a time step, and largest additional
+depth for the sake of friction."""
 THRUST_START_FRACTION, THRUST_RAMP_FRACTION = 0.3, 0.4
-"""Share of its full strength with which a thrust begins, where the crouch has left it, and share of its time until it
-is reached.
-"""
+"""Fraction of its full strength with which a thrust starts, where the crouch has left it, and fraction of its duration
+until the full strength is reached."""
 
-_EXTENSION, _EXTENDED = 0.04, 0.25
-"""How much higher than it stands a body leaves the ground: body heights, and of the height of the jump at most."""
+_MAX_EXTENSION, _MAX_EXTENSION_FRACTION = 0.04, 0.25
+"""Rise of the centre of mass above its standing height at take-off: in body heights, and at most this fraction of the
+height of the jump."""
 SETTLE_TIME = 0.3
-"""Of sqrt(H / g): when it begins to crouch."""
-USUAL_LANDING, USUAL_LANDING_AHEAD = 0.7, 1.0
-"""Of sqrt(H / g): from touch-down until it is at rest, as a rule, and more for each body height ahead (measured on the
-pawn)."""
+"""Time before the crouch starts, in sqrt(H / g)."""
+USUAL_LANDING_TIME, USUAL_LANDING_TIME_PER_DISTANCE = 0.7, 1.0
+"""Typical time from touch-down to rest in sqrt(H / g), and additional time per body height of jump distance (measured
+on the pawn)."""
 LANDING_TIME = 0.35
-"""Of sqrt(H / g): in which the fall of a body on legs is stopped, while it goes on over its feet (measured on the
-robot, whose feet stay where they touch down).
-"""
+"""Time in sqrt(H / g) in which the fall of a body on legs is stopped, while it moves on over its feet (measured on the
+robot, whose feet stay where they touch down)."""
 
 
 class JumpPhase(Enum):
-    """Phases of a jump in their order."""
+    """Phases of a jump, in order."""
 
     SETTLE = "settle"
     CROUCH = "crouch"
@@ -58,73 +58,74 @@ class JumpPhase(Enum):
 
 @dataclass(frozen=True)
 class JumpTarget:
-    """What is asked, in metres."""
+    """Target of a jump; metres."""
 
     distance: float
     height: float
     rise: float = 0.0
-    """How much higher the landing is than the start."""
+    """Height of the landing above the start, m."""
 
 
 @dataclass(frozen=True)
 class JumpPlan:
-    """Numbers a jump is planned with; metres, seconds, m/s."""
+    """Planned quantities of a jump; metres, seconds, m/s."""
 
     crouch_depth: float
     extension: float
     crouch_time: float
-    """A whole number of steps: what is asked goes over into the thrust without a jolt."""
+    """A whole number of time steps, so that the objectives are continuous where the thrust starts."""
     thrust_time: float
     flight_time: float
     speed_up: float
     speed_forward: float
     lean: float
-    """How far the centre of mass moves ahead while crouching."""
+    """Forward displacement of the centre of mass during the crouch."""
     landing_lag: float
-    """How far it is behind its place over the base at touch-down."""
+    """Distance of the centre of mass behind its standing position over the feet at touch-down."""
     landing_rate: float
-    """1/s of the critically damped descent on landing."""
+    """1/s, rate of the critically damped descent on landing."""
 
     @property
     def _down(self) -> np.ndarray:
-        """(3,) from where the centre of mass stands to where the crouch brings it."""
+        """(3,) m, displacement of the centre of mass during the crouch."""
         return np.array([self.lean, 0.0, -self.crouch_depth])
 
     @property
     def _onset(self) -> np.ndarray:
-        """(3,) m/s. The crouch ends at rest over the ground but already on the way ahead: friction has little left to
-        give during the thrust."""
+        """(3,) m/s, velocity at the end of the crouch: at rest vertically but already moving forward, because friction
+        can give little during the thrust."""
         return np.array([min(EXIT_SPEED_FACTOR * self.lean / self.crouch_time, self.speed_forward), 0.0, 0.0])
 
     def crouch(self, start: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """Position and velocity (3,) of the centre of mass that stood at ``start`` (3,), ``elapsed`` seconds into the
-        crouch."""
+        """Return position and velocity (3,) of the centre of mass that stood at ``start`` (3,), ``elapsed`` seconds
+        into the crouch."""
         s = min(elapsed / self.crouch_time, 1.0)
         blend, slope = s * s * (3 - 2 * s), 6 * s * (1 - s) / self.crouch_time
         carried, rate = s * s * (s - 1) * self.crouch_time, s * (3 * s - 2)
         return start + blend * self._down + carried * self._onset, slope * self._down + rate * self._onset
 
     def thrust(self, start: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """The same, ``elapsed`` seconds into the thrust, which grows to a steady acceleration to the take-off's
-        speed.
+        """Return position and velocity (3,) of the centre of mass ``elapsed`` seconds into the thrust, whose
+        acceleration grows to a constant value and ends at the take-off speed. ``start`` (3,) is the standing position.
         """
         gained = np.array([self.speed_forward, 0.0, self.speed_up]) - self._onset
-        speed, way = ramp_integrals(elapsed / self.thrust_time)
-        position = start + self._down + self._onset * elapsed + way * self.thrust_time * gained
+        speed, displacement = ramp_integrals(elapsed / self.thrust_time)
+        position = start + self._down + self._onset * elapsed + displacement * self.thrust_time * gained
         return position, self._onset + speed * gained
 
-    def expected_duration(self, ahead: float, time_unit: float) -> float:
-        """Seconds until a jump of ``ahead`` body heights is at rest; ``time_unit`` is sqrt(H / g)."""
-        landing = USUAL_LANDING + USUAL_LANDING_AHEAD * ahead
+    def expected_duration(self, distance: float, time_unit: float) -> float:
+        """Return the seconds until a jump over ``distance`` body heights is at rest; ``time_unit`` is sqrt(H / g)."""
+        landing = USUAL_LANDING_TIME + USUAL_LANDING_TIME_PER_DISTANCE * distance
         return self.crouch_time + self.thrust_time + self.flight_time + (SETTLE_TIME + landing) * time_unit
 
     def take_off_time(self, step: float) -> float:
-        """Seconds from the crouch until the thrust ends; both take whole steps of ``step`` s."""
+        """Return the seconds from the start of the crouch to the end of the thrust; both take whole time steps of
+        ``step`` s."""
         return step * float(sum(np.ceil(seconds / step - 1e-6) for seconds in (self.crouch_time, self.thrust_time)))
 
     def planned_displacement(self, elapsed: float, gravity: float) -> np.ndarray:
-        """(3,) metres from where the centre of mass stood, ``elapsed`` seconds after the crouch began; NaN after
-        touch-down."""
+        """Return the planned displacement (3,) in metres of the centre of mass ``elapsed`` seconds after the crouch
+        began; NaN after touch-down."""
         nothing = np.zeros(3)
         if elapsed <= self.crouch_time:
             return self.crouch(nothing, elapsed)[0]
@@ -140,57 +141,59 @@ class JumpPlan:
 
 
 def sufficient_speed(rise: float, gravity: float, dt: float) -> float:
-    """Speed up, m/s, at the end of a step of ``dt`` s from which free flight rises by ``rise`` metres from where the
-    step began."""
+    """Return the upward speed in m/s at the end of a time step of ``dt`` s from which free flight rises by ``rise``
+    metres above the start of the step."""
     step_gain = gravity * dt  # v dt + (v - g dt/2)^2 / 2g = rise, solved for v
     return float(max(-0.5 * step_gain + np.sqrt(max(2.0 * gravity * rise, 0.0)), 0.0))
 
 
 def ramp_integrals(share: float) -> tuple[float, float]:
-    """Speed and way, of the speed gained and of that speed times the thrust's time, when a ``share`` of that time has
-    passed.
+    """Return speed and displacement of a thrust after the fraction ``share`` of its duration, relative to the gained
+    speed and to that speed times the duration.
 
-    The push grows from ``ONSET`` to its full strength over the first ``RAMP`` of the thrust: muscles cannot be switched
-    on at once.
+    The acceleration grows from ``THRUST_START_FRACTION`` to its full value over the first ``THRUST_RAMP_FRACTION`` of
+    the thrust, because muscles cannot be switched on at once.
     """
     ramp = min(share, THRUST_RAMP_FRACTION)
     speed = THRUST_START_FRACTION * ramp + (1.0 - THRUST_START_FRACTION) * ramp**2 / (2.0 * THRUST_RAMP_FRACTION)
-    way = THRUST_START_FRACTION * ramp**2 / 2.0 + (1.0 - THRUST_START_FRACTION) * ramp**3 / (6.0 * THRUST_RAMP_FRACTION)
+    displacement = THRUST_START_FRACTION * ramp**2 / 2.0 + (1.0 - THRUST_START_FRACTION) * ramp**3 / (
+        6.0 * THRUST_RAMP_FRACTION
+    )
     rest = share - ramp
-    way += speed * rest + 0.5 * rest**2
+    displacement += speed * rest + 0.5 * rest**2
     speed += rest
     whole = 1.0 - 0.5 * (1.0 - THRUST_START_FRACTION) * THRUST_RAMP_FRACTION
-    return speed / whole, way / whole
+    return speed / whole, displacement / whole
 
 
 def stopping_time(com_height: float, fall_speed: float, gravity: float, landing_time: float = 0.0) -> float:
-    """Seconds t such that a body that lands at speed v ahead, with its feet v t ahead of its centre of mass, comes to
-    rest over them.
+    """Return the time t in seconds such that a body that lands at forward speed v, with its feet v t ahead of its
+    centre of mass, comes to rest over them.
 
-    Landing without spin, the ground's push goes through the centre of mass at ``com_height`` h above feet that are y
-    ahead: y'' = W^2 y, with W^2 = (g + w / T) / h for the ``landing_time`` T that the ``fall_speed`` w takes to stop,
-    and w^2 = g / h after it, when the capture point is to be at the feet, -y' = w y. At once (T = 0) the push takes w
-    y / h off the speed ahead.
+    In a landing without spin, the ground force passes through the centre of mass at ``com_height`` h above the feet,
+    which are y ahead: y'' = W^2 y. W^2 = (g + w / T) / h during the ``landing_time`` T in which the ``fall_speed`` w is
+    stopped, and w^2 = g / h afterwards, when the capture point must be at the feet, -y' = w y. For T = 0, the landing
+    impulse reduces the forward speed by w y / h at once.
     """
     swaying = np.sqrt(gravity / com_height)
     if landing_time <= 0.0:
         return float(1.0 / (swaying + fall_speed / com_height))
-    pressed = np.sqrt((gravity + fall_speed / landing_time) / com_height)
-    even, odd = np.cosh(pressed * landing_time), np.sinh(pressed * landing_time)
-    return float((even + swaying / pressed * odd) / (swaying * even + pressed * odd))
+    loaded_rate = np.sqrt((gravity + fall_speed / landing_time) / com_height)
+    even, odd = np.cosh(loaded_rate * landing_time), np.sinh(loaded_rate * landing_time)
+    return float((even + swaying / loaded_rate * odd) / (swaying * even + loaded_rate * odd))
 
 
 def level_flight(jump_height: float, height: float, gravity: float) -> float:
-    """Seconds that a body of ``height`` metres, whose centre of mass rises by ``jump_height`` metres, is off the ground
-    when it lands as high as it started."""
-    rise = jump_height - min(_EXTENSION * height, _EXTENDED * jump_height)
+    """Return the flight time in seconds of a body of ``height`` metres whose centre of mass rises by ``jump_height``
+    metres and that lands on the level of its start."""
+    rise = jump_height - min(_MAX_EXTENSION * height, _MAX_EXTENSION_FRACTION * jump_height)
     return float(np.sqrt(8.0 * rise / gravity))
 
 
 def height_of_flight(seconds: float, height: float, gravity: float) -> float:
-    """Metres: what ``level_flight`` undoes."""
+    """Return the jump height in metres for a flight time; the inverse of ``level_flight``."""
     rise = gravity * seconds**2 / 8.0
-    return min(rise + _EXTENSION * height, rise / (1.0 - _EXTENDED))
+    return min(rise + _MAX_EXTENSION * height, rise / (1.0 - _MAX_EXTENSION_FRACTION))
 
 
 def plan_jump(
@@ -206,38 +209,47 @@ def plan_jump(
     landing_time: float = 0.0,
     style: Style | None = None,
 ) -> JumpPlan:
-    """Stroke, times and take-off velocity for a jump of ``target`` by a body of ``height`` H
-    (docs/concepts/motions.md).
+    """Plan stroke, times and take-off velocity of a jump (docs/concepts/motions.md).
 
-    Its centre of mass is ``com_height`` over the ground and the front of its feet ``support_ahead`` of it, gravity is
-    in m/s^2, a solver step takes ``step`` seconds, ``lean`` is that of the plan, ``friction`` the ground's, and the
-    fall is stopped within ``landing_time`` seconds; metres.
+    Args:
+        target: target of the jump.
+        height: body height H, m.
+        com_height: standing height of the centre of mass, m.
+        support_ahead: distance from the centre of mass to the front of the feet, m.
+        gravity: m/s^2.
+        step: solver time step, s.
+        lean: forward displacement of the centre of mass during the crouch, m.
+        friction: Coulomb coefficient of the ground.
+        landing_time: time in which the fall is stopped, s.
+        style: factors of the jump; None is the default style.
     """
     style = style or Style()
     time_unit = np.sqrt(height / gravity)
-    extension = min(_EXTENSION * height, _EXTENDED * target.height)
+    extension = min(_MAX_EXTENSION * height, _MAX_EXTENSION_FRACTION * target.height)
     rise = target.height - extension
     speed_up = np.sqrt(2.0 * gravity * rise) + 0.5 * gravity * step
     flight_time = np.sqrt(2.0 * rise / gravity) + np.sqrt(2.0 * max(rise - target.rise, 0.0) / gravity)
-    # The front of the footprint helps a body that comes in to stop over its base.
+    # The front of the footprint helps a landing body to stop over its base.
     fall_speed = np.sqrt(2.0 * gravity * max(rise - target.rise, 0.0))
     capture_time = stopping_time(com_height, fall_speed, gravity, landing_time)
     footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
     crouch_time = np.ceil(style.anticipation * style.timing * 1.1 * time_unit / step) * step
     acceleration = THRUST_ACCELERATION * gravity / style.timing
-    shortest = extension + MIN_CROUCH * height
-    stroke = max(speed_up**2 / (2.0 * acceleration), shortest)
-    # A low jump far ahead is long on the ground: what friction gives ahead goes with what presses, speed up and weight.
+    min_stroke = extension + MIN_CROUCH * height
+    stroke = max(speed_up**2 / (2.0 * acceleration), min_stroke)
+    # A low, long jump spends long on the ground: the forward impulse is bounded by friction times the normal impulse,
+    # which consists of the upward momentum and the weight.
     ahead = (target.distance - lean + footprint_help) / (
         flight_time + capture_time
     ) - EXIT_SPEED_FACTOR * lean / crouch_time
-    needed = (ahead / (FRICTION_FRACTION * max(friction, _LEAST_FRICTION)) - speed_up) / gravity
-    stroke = max(stroke, min(ramp_integrals(1.0)[1] * speed_up * needed, shortest + MAX_EXTRA_CROUCH * height))
-    # Every step goes its whole way at the speed of its end: half a step's way more than the thrust itself.
+    needed = (ahead / (FRICTION_FRACTION * max(friction, _MIN_FRICTION)) - speed_up) / gravity
+    stroke = max(stroke, min(ramp_integrals(1.0)[1] * speed_up * needed, min_stroke + MAX_EXTRA_CROUCH * height))
+    # Each time step moves at the velocity of its end, which adds half a time step of displacement to that of the
+    # thrust.
     stroke += 0.5 * speed_up * step
     crouch_depth = min(style.anticipation * (stroke - extension), MAX_CROUCH * com_height)
-    way = crouch_depth + extension - 0.5 * speed_up * step
-    thrust_time = max(way / (ramp_integrals(1.0)[1] * speed_up), 2.0 * step)
+    displacement = crouch_depth + extension - 0.5 * speed_up * step
+    thrust_time = max(displacement / (ramp_integrals(1.0)[1] * speed_up), 2.0 * step)
     speed_forward = (target.distance - lean + footprint_help) / (flight_time + capture_time + 0.5 * thrust_time)
     return JumpPlan(
         crouch_depth=float(crouch_depth),

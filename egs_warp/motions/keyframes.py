@@ -1,9 +1,9 @@
-"""Key frames of a user's own trajectory, from JSON or CSV: what a part of the body shall do, and when.
+"""Key frames of a user's trajectory, from JSON or CSV: target values of parts of the body over time.
 
 See docs/concepts/motions.md.
 
-JSON: a list of keys, ``[{"time": 0.5, "part": "head", "quantity": "position", "value": [0.1, 0, 0]}]``; CSV: a header
-``time,part,quantity,x,y,z`` and a key a row. Both may give a ``weight``.
+JSON: a list of keys, ``[{"time": 0.5, "part": "head", "quantity": "position", "value": [0.1, 0, 0]}]``. CSV: a header
+``time,part,quantity,x,y,z`` and one key per row. Both may give a ``weight``.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ from egs_warp.io.text import parse_json, read_text
 
 
 class Quantity(Enum):
-    """What a key gives; components are forward, left and up as the body stands at the start."""
+    """Quantity that a key sets; components are forward, left and up relative to the body at the start."""
 
     POSITION = "position"
     """Displacement from the start, body heights."""
     VELOCITY = "velocity"
-    """Body heights a second."""
+    """Body heights per second."""
     ORIENTATION = "orientation"
-    """Turn from the start as a rotation vector, degrees; its length says the way round: 270 is not -90."""
+    """Rotation from the start as a rotation vector, degrees; its length gives the direction: 270 differs from -90."""
     ANGULAR_MOMENTUM = "angular_momentum"
-    """About the part's centre, body mass x height squared a second."""
+    """About the part's centre, body mass x height squared per second."""
 
 
 PARTS = ("body", "base", "head", "foot")
-"""Parts that a key may name: the whole body (of which the position is that of the centre of mass), what stands on the
-ground, the top, the only foot. Feet of a body with several have numbers, as ``foot 2``."""
+"""Parts that a key may name: the whole body, whose position is that of the centre of mass, the base on the ground, the
+head at the top, and the foot of a body with one foot. Several feet are numbered, as ``foot 2``."""
 _NUMBERED_FOOT = re.compile(r"foot [1-9]\d?")
-LONGEST_TIME = 60.0
+MAX_TIME = 60.0
 """Seconds."""
-SHORTEST_GAP = 0.001
-"""Seconds between two keys of a channel, and before the first."""
-LARGEST: Mapping[Quantity, float] = {
+MIN_GAP = 0.001
+"""Smallest time in seconds between two keys of a channel, and before the first key."""
+MAX_LENGTH: Mapping[Quantity, float] = {
     Quantity.POSITION: 10.0,
     Quantity.VELOCITY: 20.0,
     Quantity.ORIENTATION: 360.0,
     Quantity.ANGULAR_MOMENTUM: 10.0,
 }
-"""Length of a value beyond which it is refused as a slip of the pen."""
+"""Largest length of a value; larger ones are rejected as typing errors."""
 _FIELDS = ("time", "part", "quantity", "value", "weight")
 
 
@@ -65,39 +65,42 @@ class Key:
     quantity: Quantity
     value: tuple[float, float, float]
     weight: float = 1.0
-    """Relative to the motion's own, on the way from the key before to this one."""
+    """Weight relative to that of the motion, in the interval that ends at this key."""
     where: str = ""
-    """File and place in it, for messages."""
+    """File and position in it, for messages."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """All keys of one part and quantity, joined by a monotone cubic from zero at time 0;
-    after the last key its value stays.
-    """
+    """All keys of one part and quantity, interpolated by a monotone cubic from zero at time 0; the value is constant
+    after the last key."""
 
     part: str
     quantity: Quantity
     times: np.ndarray
-    """(k+1,) seconds, from 0."""
+    """(k+1,) s, starting with 0."""
     values: np.ndarray
-    """(k+1, 3)."""
+    """(k+1, 3) values in the unit of the quantity, starting with zero."""
     weights: np.ndarray
-    """(k,) of the keys."""
+    """(k,) weights of the keys."""
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Value (3,) and its rate (3,) per second."""
+        """Return the value (3,) and its rate (3,) per second at ``time``."""
         inside = min(time, float(self.times[-1]))
         curve = PchipInterpolator(self.times, self.values, axis=0)
         return curve(inside), curve(inside, 1) * (time < self.times[-1])
 
     def weight_at(self, time: float) -> float:
-        """That of the next key; after the last one, its own."""
+        """Return the weight of the next key, or of the last key after it."""
         return float(self.weights[min(np.searchsorted(self.times[1:], time), len(self.weights) - 1)])
 
 
 def read_keyframes(path: Path) -> tuple[Key, ...]:
-    """Keys of a ``.json`` or ``.csv`` file; raises ``UserError`` for the first malformed one, with its place."""
+    """Read the keys of a ``.json`` or ``.csv`` file.
+
+    Raises:
+        UserError: for the first malformed key, with its position.
+    """
     path = Path(path)
     if path.suffix.lower() not in (".json", ".csv"):
         raise UserError(f"{path}: key frames are read from .json or .csv")
@@ -110,17 +113,19 @@ def read_keyframes(path: Path) -> tuple[Key, ...]:
 
 
 def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
-    """Keys by part and quantity; raises ``UserError`` if two of a channel are nearly at the same time,
-    or times go back.
+    """Group keys by part and quantity.
+
+    Raises:
+        UserError: if times of a channel do not increase by at least ``MIN_GAP``.
     """
-    found: dict[tuple[str, Quantity], list[Key]] = {}
+    groups: dict[tuple[str, Quantity], list[Key]] = {}
     for key in keys:
-        group = found.setdefault((key.part, key.quantity), [])
+        group = groups.setdefault((key.part, key.quantity), [])
         before, what = (group[-1].time, "the key before") if group else (0.0, "the start")
-        if round(key.time - before, 9) < SHORTEST_GAP:
+        if round(key.time - before, 9) < MIN_GAP:
             raise UserError(
-                f"{key.where}: time {key.time:g} is not {SHORTEST_GAP:g} s after {before:g}, {what} of "
-                f"{key.part} {key.quantity.value}; give keys in the order of their times, so far apart"
+                f"{key.where}: time {key.time:g} is not {MIN_GAP:g} s after {before:g}, {what} of "
+                f"{key.part} {key.quantity.value}; give keys in the order of their times, at least that far apart"
             )
         group.append(key)
     return tuple(
@@ -131,7 +136,7 @@ def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
             np.array([(0.0, 0.0, 0.0), *(key.value for key in group)]),
             np.array([key.weight for key in group]),
         )
-        for (part, quantity), group in found.items()
+        for (part, quantity), group in groups.items()
     )
 
 
@@ -158,7 +163,9 @@ def _from_csv(text: str, path: Path) -> list[Key]:
     header = [name.strip().lower() for name in rows[0]]
     needed = ["time", "part", "quantity", "x", "y", "z"]
     if sorted(set(header) - {"weight"}) != sorted(needed) or len(set(header)) != len(header):
-        raise UserError(f"{path}, line 1: the columns are {','.join(header)}; give {','.join(needed)} and maybe weight")
+        raise UserError(
+            f"{path}, line 1: the columns are {','.join(header)}; give {','.join(needed)} and optionally weight"
+        )
     keys = []
     for line, row in enumerate(rows[1:], start=2):
         where = f"{path}, line {line}"
@@ -168,15 +175,15 @@ def _from_csv(text: str, path: Path) -> list[Key]:
             raise UserError(f"{where}: {len(row)} values for {len(header)} columns")
         cells = dict(zip(header, (cell.strip() for cell in row), strict=True))
         entry: dict[str, Any] = {"part": cells["part"], "quantity": cells["quantity"]}
-        entry["time"] = _parsed(cells["time"])
-        entry["value"] = [_parsed(cells[axis]) for axis in "xyz"]
+        entry["time"] = _parse_cell(cells["time"])
+        entry["value"] = [_parse_cell(cells[axis]) for axis in "xyz"]
         if cells.get("weight"):
-            entry["weight"] = _parsed(cells["weight"])
+            entry["weight"] = _parse_cell(cells["weight"])
         keys.append(_key(entry, where))
     return keys
 
 
-def _parsed(cell: str) -> float | str:
+def _parse_cell(cell: str) -> float | str:
     try:
         return float(cell)
     except ValueError:
@@ -199,14 +206,14 @@ def _key(entry: Mapping[str, Any], where: str) -> Key:
     if quantity not in names:
         raise UserError(f"{where}: quantity {quantity!r} is unknown; give one of {', '.join(names)}")
     time = _number(entry["time"])
-    if not 0.0 < time <= LONGEST_TIME:
-        raise UserError(f"{where}: time {entry['time']!r}: give seconds above 0, at most {LONGEST_TIME:g}")
+    if not 0.0 < time <= MAX_TIME:
+        raise UserError(f"{where}: time {entry['time']!r}: give seconds above 0, at most {MAX_TIME:g}")
     if not isinstance(value, list) or len(value) != 3 or not all(math.isfinite(_number(item)) for item in value):
         raise UserError(f"{where}: value {value!r}: give three numbers: forward, left, up")
-    largest = LARGEST[Quantity(quantity)]
+    max_length = MAX_LENGTH[Quantity(quantity)]
     length = math.hypot(*value)
-    if length > largest:
-        raise UserError(f"{where}: value {value!r} has the length {length:g}; at most {largest:g} is done")
+    if length > max_length:
+        raise UserError(f"{where}: value {value!r} has the length {length:g}; at most {max_length:g} is allowed")
     weight = _number(entry.get("weight", 1.0))
     if not 0.0 < weight <= 1000.0:
         raise UserError(f"{where}: weight {entry['weight']!r}: give a number above 0, at most 1000")
@@ -214,5 +221,5 @@ def _key(entry: Mapping[str, Any], where: str) -> Key:
 
 
 def _number(value: Any) -> float:
-    """The number, or nan for anything else."""
+    """Return the number, or NaN for anything else."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan

@@ -1,7 +1,7 @@
-"""Limbs on which a body stands: the branches of its sections at equal height that reach the ground.
+"""Limbs on which a body stands: branches of its horizontal sections that reach the ground.
 
-Level sections of a solid and how they touch are its Reeb graph of height. Limbs are found where they are apart, which
-may be above feet that melt together, and followed up to where they meet and down to the ground.
+Horizontal sections of a solid and their contacts form the Reeb graph of its height. Limbs are found where they are
+separate, which may be above feet that have merged, and are followed up to where they join and down to the ground.
 """
 
 from __future__ import annotations
@@ -18,47 +18,49 @@ from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 from egs_warp.meshing.occupancy import LatticeSolid
 from egs_warp.muscles.level_set_cells import LevelSetCells
 
-_SLICE = 0.02
-"""Body heights: thickness of a section of a mesh."""
-_CLEAR = 1e-3
-"""Slices: how far cuts are from nodes."""
+_SECTION_THICKNESS = 0.02
+"""Thickness of a section of a mesh, in body heights."""
+_CUT_MARGIN = 1e-3
+"""Smallest distance of cuts from nodes, in section thicknesses."""
 _NEAR_GROUND = 0.07
 """Body heights: a limb that ends higher hangs."""
-_APART = 0.08
-"""Body heights over which a limb is apart from all others; what is shorter is a toe."""
-_JOINED = 0.1
-"""Body heights, or a mean edge of the mesh if that is more: limbs joined on the ground by more are one base."""
-_BAR = 0.5
-"""Body heights of air between two limbs: what joins them across more, however thin, is no flaw of a capture."""
+_MIN_LIMB_HEIGHT = 0.08
+"""Smallest height in body heights over which a limb is separate from all others; a shorter one is a toe."""
+_MAX_MERGED_HEIGHT = 0.1
+"""Body heights, or a mean edge length of the mesh if that is more: limbs that are connected on the ground over a larger
+height are one base."""
+_MAX_GAP = 0.5
+"""Gap between two limbs in body heights: a connection across a larger gap, however thin, is no flaw of a capture."""
 
 
 @dataclass(frozen=True)
 class Sections:
-    """Connected slabs of equal height of a solid, and which of them touch. S sections, N nodes of the body's cage."""
+    """Connected slabs of equal thickness of a solid, and which of them touch. S sections, N nodes of the body's
+    cage."""
 
     thickness: float
     """Metres."""
     levels: np.ndarray
-    """(S,) int, counted from the ground."""
+    """(S,) int, level of each section, counted from the ground."""
     centres: np.ndarray
-    """(S, 3) metres, about."""
+    """(S, 3) m, approximate centres."""
     volumes: np.ndarray
     """(S,) m^3."""
     joints: np.ndarray
-    """(., 2) int: touching sections on consecutive levels, the lower one first."""
+    """(J, 2) int, touching sections on consecutive levels, the lower one first."""
     section_from_node: np.ndarray
-    """(N,) the section that holds each node of the cage, or is nearest to it."""
+    """(N,) int, section that contains each node of the cage, or the nearest one."""
     melt: float
-    """Metres: what is joined by no more than this on the ground may be apart in truth."""
+    """Height in metres: parts that are connected on the ground over at most this height may be separate in reality."""
 
     @classmethod
     def of_mesh(cls, mesh: TetMesh, heights: np.ndarray) -> Sections:
-        """Of ``mesh`` itself, whose nodes are at ``heights`` (N,) over the ground."""
+        """Return the sections of ``mesh`` itself, whose nodes are at ``heights`` (N,) above the ground, m."""
         size = float(np.ptp(heights))
-        thickness = _SLICE * size
+        thickness = _SECTION_THICKNESS * size
         field = (heights - heights.min()) / thickness
-        # A face that lies in a cut belongs to no cell.
-        field = np.where(np.abs(field - np.rint(field)) < _CLEAR, np.rint(field) + _CLEAR, field)
+        # A face that lies in a cut would belong to no cell.
+        field = np.where(np.abs(field - np.rint(field)) < _CUT_MARGIN, np.rint(field) + _CUT_MARGIN, field)
         cells = LevelSetCells.cut(mesh.tets, field, level_count=int(np.ceil(field.max())))
         count, section = _components(cells.count, cells.touching)
         tet_from_node = np.zeros(len(mesh.nodes), int)
@@ -74,16 +76,16 @@ class Sections:
             np.bincount(section, volumes, count),
             _distinct(section[cells.stacked], count),
             section[cells.holding(tet_from_node, field)],
-            max(_JOINED * size, mean_edge_length(mesh)),
+            max(_MAX_MERGED_HEIGHT * size, mean_edge_length(mesh)),
         )
 
     @classmethod
     def of_solid(cls, solid: LatticeSolid, mesh: TetMesh) -> Sections:
-        """Of the ``solid`` that the cage ``mesh`` was made around, whose gaps are finer than those of the mesh; both in
-        the frame of the body."""
-        places = np.argwhere(solid.inside)
+        """Return the sections of the ``solid`` around which the cage ``mesh`` was made and whose gaps are finer than
+        those of the mesh; both are in the frame of the body."""
+        cells = np.argwhere(solid.inside)
         number = np.full(solid.inside.shape, -1)
-        number[tuple(places.T)] = np.arange(len(places))
+        number[tuple(cells.T)] = np.arange(len(cells))
         number = np.pad(number, 1, constant_values=-1)
         sideways, upwards = [], []
         for x, y in ((0, 0), (1, 0), (0, 1), (1, 1), (1, -1), (-1, 0), (0, -1), (-1, -1), (-1, 1)):
@@ -91,10 +93,10 @@ class Sections:
             if (x, y) > (0, 0):
                 sideways.append(_both(number, shifted))
             upwards.append(_both(number, np.roll(shifted, -1, axis=2)))
-        count, section = _components(len(places), np.concatenate(sideways))
+        count, section = _components(len(cells), np.concatenate(sideways))
         levels = np.zeros(count, int)
-        levels[section] = places[:, 2]
-        points = solid.points(places)
+        levels[section] = cells[:, 2]
+        points = solid.points(cells)
         return cls(
             solid.spacing,
             levels,
@@ -102,7 +104,7 @@ class Sections:
             solid.spacing**3 * np.bincount(section, minlength=count),
             _distinct(section[np.concatenate(upwards)], count),
             section[np.asarray(KDTree(points).query(mesh.nodes)[1])],
-            _JOINED * float(np.ptp(mesh.nodes[:, 2])),
+            _MAX_MERGED_HEIGHT * float(np.ptp(mesh.nodes[:, 2])),
         )
 
 
@@ -111,13 +113,13 @@ def _components(count: int, pairs: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def _distinct(pairs: np.ndarray, count: int) -> np.ndarray:
-    """(., 2) each pair of numbers below ``count`` once."""
+    """Return the distinct pairs (P, 2) of numbers below ``count``."""
     return np.stack(np.divmod(np.unique(pairs[:, 0].astype(np.int64) * count + pairs[:, 1]), count), axis=1)
 
 
 def _both(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    there = (first >= 0) & (second >= 0)
-    return np.stack([first[there], second[there]], axis=1)
+    valid = (first >= 0) & (second >= 0)
+    return np.stack([first[valid], second[valid]], axis=1)
 
 
 def _centres(section: np.ndarray, points: np.ndarray, masses: np.ndarray, count: int) -> np.ndarray:
@@ -127,21 +129,21 @@ def _centres(section: np.ndarray, points: np.ndarray, masses: np.ndarray, count:
 
 @dataclass(frozen=True)
 class Limbs:
-    """What a body stands on. N nodes."""
+    """Limbs on which a body stands. N nodes."""
 
     limb_from_node: np.ndarray
-    """(N,) int: the limb that each node is a part of, -1 for the body above them."""
+    """(N,) int, limb of each node, -1 for the body above the limbs."""
     tops: tuple[float, ...]
-    """Metres over the ground: where each limb meets another, or the body ends."""
+    """Heights in metres above the ground at which each limb joins another or the body ends."""
 
     @property
     def count(self) -> int:
-        """At least 1: a body without limbs, or on one alone, is one as a whole."""
+        """Number of limbs, at least 1: a body without limbs or on a single limb counts as one limb."""
         return len(self.tops)
 
 
 def find_limbs(sections: Sections, nodes: np.ndarray) -> Limbs:
-    """The limbs that reach the ground, of a body whose cage has ``nodes`` (N, 3), metres."""
+    """Find the limbs that reach the ground, of a body whose cage has ``nodes`` (N, 3), m."""
     graph = _Graph(sections)
     candidates = [graph.limbs_through(crossing) for crossing in graph.crossings()]
     bases = [graph.bases(limbs) for limbs in candidates]
@@ -154,7 +156,7 @@ def find_limbs(sections: Sections, nodes: np.ndarray) -> Limbs:
     for limb, base in zip(limbs, base_from_limb, strict=True):
         base_from_section[list(limb.own)] = base
     limb_from_node = base_from_section[sections.section_from_node]
-    # Feet that have melted together are parted half way between their limbs.
+    # Feet that have merged are split half way between their limbs.
     shared = np.isin(sections.section_from_node, list(graph.shared_below(limbs)))
     ends = np.array([sections.centres[list(limb.lowest), :2].mean(axis=0) for limb in limbs])
     limb_from_node[shared] = base_from_limb[np.asarray(KDTree(ends).query(nodes[shared, :2])[1], int)]
@@ -166,7 +168,7 @@ def find_limbs(sections: Sections, nodes: np.ndarray) -> Limbs:
 
 
 def _score(limbs: Sequence[_Limb], base_from_limb: np.ndarray) -> int:
-    """Levels over which two feet or more are apart, together; 0 for fewer."""
+    """Return the total number of levels over which two or more feet are separate; 0 for fewer feet."""
     apart = np.zeros(int(base_from_limb.max(initial=-1)) + 1, int)
     np.maximum.at(apart, base_from_limb, [limb.apart for limb in limbs])
     return int(apart.sum()) if len(apart) > 1 else 0
@@ -174,27 +176,27 @@ def _score(limbs: Sequence[_Limb], base_from_limb: np.ndarray) -> int:
 
 @dataclass(frozen=True)
 class _Limb:
-    """A limb of a section graph; levels."""
+    """Limb of a section graph; heights are levels."""
 
     own: frozenset[int]
-    """Its sections, where it is apart from all others."""
+    """Its sections, where it is separate from all others."""
     lowest: frozenset[int]
-    """Those of its own lowest level."""
+    """Its sections on its lowest level."""
     bottom: int
-    """Its own lowest level."""
+    """Its lowest level."""
     top: int
-    """The level at which it meets another."""
-    joined: bool
-    """It shares what is below with another."""
+    """Level at which it joins another limb."""
+    is_joined: bool
+    """True if it shares the sections below with another limb."""
 
     @property
     def apart(self) -> int:
-        """Levels over which it is apart."""
+        """Number of levels over which the limb is separate."""
         return self.top - self.bottom
 
 
 class _Graph:
-    """Sections by level, with what touches from above and below."""
+    """Graph of sections by level, with the sections that touch from above and below."""
 
     def __init__(self, sections: Sections) -> None:
         self.sections = sections
@@ -210,12 +212,13 @@ class _Graph:
         self.height = size * sections.thickness
         """Metres."""
         self._near = int(np.ceil(_NEAR_GROUND * size))
-        self._shortest = max(2, round(_APART * size))
+        self._shortest = max(2, round(_MIN_LIMB_HEIGHT * size))
         self._melt = int(np.ceil(sections.melt / sections.thickness))
-        self._bar = _BAR * self.height
+        self._bar = _MAX_GAP * self.height
 
     def crossings(self) -> list[list[int]]:
-        """For each level with more than one, its sections that lead down to the ground and together carry the body."""
+        """Return, for each level with more than one, the sections that lead down to the ground and support the body
+        together."""
         grounded = [level <= self._near for level in self.levels]
         for level in self.by_level:
             for section in level:
@@ -229,7 +232,7 @@ class _Graph:
                 section = root[section]
             return section
 
-        found = []
+        result = []
         for level in reversed(self.by_level):
             for section in level:
                 for above in sorted(self.up[section]):
@@ -239,18 +242,18 @@ class _Graph:
                         mass[mine] += mass[other]
             if not level:
                 continue
-            # What stands apart from the body all the way up, such as a tail, carries nothing.
+            # A part that is separate from the body up to its top, such as a tail, supports nothing.
             body = max(map(find, level), key=lambda one: mass[one])
             crossing = [section for section in level if find(section) == body and grounded[section]]
             if len(crossing) > 1:
-                found.append(crossing)
-        return found[::-1]
+                result.append(crossing)
+        return result[::-1]
 
     def limbs_through(self, crossing: Sequence[int]) -> list[_Limb]:
-        """The limbs that go through the sections of one level, those of a good length; none if there are not two."""
+        """Return the limbs through the sections of one level that are long enough; none if fewer than two remain."""
         level = int(self.levels[crossing[0]])
-        tops, above, _, _ = self._followed(crossing, self.up)
-        bottoms, below, ends, met = self._followed(crossing, self.down)
+        tops, above, _, _ = self._follow(crossing, self.up)
+        bottoms, below, ends, met = self._follow(crossing, self.down)
         limbs = []
         for k in range(len(crossing)):
             bottom = level - bottoms[k]
@@ -259,31 +262,34 @@ class _Graph:
                 limbs.append(limb)
         return limbs if len(limbs) > 1 else []
 
-    def _followed(
-        self, crossing: Sequence[int], onwards: Sequence[set[int]]
+    def _follow(
+        self, crossing: Sequence[int], neighbours: Sequence[set[int]]
     ) -> tuple[list[int], list[set[int]], list[set[int]], list[bool]]:
-        """Of what is followed from each section until it meets another: levels gone, sections, the last of these, and
-        whether it did meet."""
+        """Follow the graph from each section until it meets another section's path.
+
+        Returns:
+            For each section: levels covered, sections covered, the last of these, and True if it met another.
+        """
         count = len(crossing)
         front: list[set[int]] = [{section} for section in crossing]
-        own, last, gone, met = [set(one) for one in front], list(front), [0] * count, [False] * count
+        own, last, level_counts, met = [set(one) for one in front], list(front), [0] * count, [False] * count
         going = set(range(count))
         while going:
-            # Those that have met go on, so that the others see what they have become.
-            front = [set().union(*(onwards[section] for section in one)) for one in front]
+            # Paths that have met continue, so that other paths can meet their continuation.
+            front = [set().union(*(neighbours[section] for section in one)) for one in front]
             met = [
                 met[k] or (k in going and any(front[k] & front[j] for j in range(count) if j != k))
                 for k in range(count)
             ]
             going = {k for k in going if front[k] and not met[k]}
             for k in going:
-                last[k], gone[k] = front[k], gone[k] + 1
+                last[k], level_counts[k] = front[k], level_counts[k] + 1
                 own[k] |= front[k]
-        return gone, own, last, met
+        return level_counts, own, last, met
 
     def bases(self, limbs: Sequence[_Limb]) -> np.ndarray:
-        """(limbs,) the number of each limb's foot: those that are joined by much have one, and those that a bar joins
-        where no other limb stands between them."""
+        """Return the foot number (limbs,) of each limb. Limbs share a foot if they are connected over a large height,
+        or by a bar without another limb between them."""
         if not limbs:
             return np.zeros(0, int)
         under = [self._ground_under(limb) for limb in limbs]
@@ -295,7 +301,7 @@ class _Graph:
         return _components(len(limbs), np.array(thick + bars, int).reshape(-1, 2))[1]
 
     def _air(self, one: _Limb, other: _Limb) -> float:
-        """Metres between the lowest own sections of two limbs, each taken for a square."""
+        """Return the gap in metres between the lowest own sections of two limbs, each approximated by a square."""
         at, volumes = self.sections.centres[:, :2], self.sections.volumes
         ends = [list(limb.lowest) for limb in (one, other)]
         first, second = (np.average(at[end], axis=0, weights=volumes[end]) for end in ends)
@@ -303,18 +309,18 @@ class _Graph:
         return float(np.linalg.norm(second - first) - 0.5 * sum(sides))
 
     def _ground_under(self, limb: _Limb) -> set[int]:
-        """The last sections that what is under the limb leads down to."""
+        """Return the lowest sections that are reached by going down from the limb."""
         below = set(limb.lowest)
         while further := set().union(*(self.down[section] for section in below)):
             below = further
         return below
 
     def shared_below(self, limbs: Sequence[_Limb]) -> set[int]:
-        """Sections under the limbs that are not their own."""
+        """Return the sections under the limbs that belong to none of them."""
         own = set().union(*(limb.own for limb in limbs))
-        found: set[int] = set()
+        result: set[int] = set()
         edge = {section for limb in limbs for section in limb.lowest}
         while edge:
-            edge = set().union(*(self.down[section] for section in edge)) - found - own
-            found |= edge
-        return found
+            edge = set().union(*(self.down[section] for section in edge)) - result - own
+            result |= edge
+        return result

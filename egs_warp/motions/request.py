@@ -1,4 +1,4 @@
-"""One motion that is asked for."""
+"""Request for one motion."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from egs_warp.motions.command import DrivePlan
 from egs_warp.motions.style import Style
 
 LARGEST_TARGET = 10.0
-"""Body heights; a larger target is refused as a slip of the pen."""
+"""Largest target, in body heights; larger values are rejected as typing errors."""
 LARGEST_TURN = 720.0
-"""Degrees."""
+"""Largest turn, in degrees."""
 
 
 @dataclass(frozen=True)
 class MotionRequest:
-    """One motion of a script, with every value known."""
+    """One motion of a script, with all values resolved."""
 
     name: str
     asked: Mapping[str, float]
-    """Values by name, lengths in body heights, as reports give them."""
+    """Values by name, lengths in body heights, as in reports."""
     repeat: int = 1
     file: Path | None = None
-    """Key frames of a trajectory, points of a path, speeds of a drive."""
+    """File of key frames of a trajectory, points of a path, speeds of a drive, or beats of a dance."""
     drive: DrivePlan | None = None
-    """Speeds that come from no file."""
+    """Commands of a drive without a file."""
     style: Style | None = None
-    """How it jumps, where that is not as the rest of the run."""
+    """Style of its jumps, if it differs from that of the run."""

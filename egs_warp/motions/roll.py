@@ -1,4 +1,4 @@
-"""Roll: a ball is driven by its centre of mass, held ahead of the centre of pressure that its soft sole can give.
+"""Roll: a ball is driven by its centre of mass, which is held ahead of the centre of pressure within its soft sole.
 
 See docs/concepts/motions.md.
 """
@@ -26,21 +26,21 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import REST_SPEED, RestDetector
 from egs_warp.motions.velocity_profile import ProfileSample, VelocityProfile
 
-_STEP = 0.1
-"""Body heights between two places of the way."""
-_SPEED, _PUSH = 0.3, 0.05
-"""The usual speed, in sqrt(g H), and how it is gathered and lost, in g."""
+_ROUTE_STEP = 0.1
+"""Distance in body heights between two planar poses of the route."""
+_SPEED, _ACCELERATION = 0.3, 0.05
+"""Nominal speed in sqrt(g H), and acceleration and deceleration in g."""
 _RATE = 1.5
-"""Over sqrt(H / g): how fast what it is off the way is made up for."""
-_ARRIVED = 0.03
-"""Body heights from the end of the way."""
-_MARGIN = 0.8
-"""Part of what it stands on over which the centre of pressure may be."""
+"""Rate in sqrt(g / H) at which position errors are corrected."""
+_ARRIVAL_TOLERANCE = 0.03
+"""Distance from the end of the route, in body heights, within which the ball has arrived."""
+_SUPPORT_FRACTION = 0.8
+"""Fraction of the support within which the centre of pressure stays."""
 
 
 @dataclass(frozen=True)
 class RollPlan:
-    """Numbers of a roll; metres, seconds."""
+    """Planned quantities of a roll; metres, seconds, m/s."""
 
     way: float
     seconds: float
@@ -49,74 +49,74 @@ class RollPlan:
 
 @dataclass(frozen=True)
 class RollOutcome:
-    """How a ball rolled."""
+    """Measured result of a roll."""
 
     rolled_degrees: float
-    """All that it turned about level axes, whichever way."""
+    """Total rotation about horizontal axes, in any direction."""
 
 
 @dataclass(frozen=True)
 class RollControl:
-    """Weights of the objectives; speeds are compared in sqrt(g H)."""
+    """Weights of the objectives; speeds are measured in units of sqrt(g H)."""
 
     com: float = 600.0
     spin: float = 100.0
     pose: float = 0.3
     follow: float = 4.0
-    """Of the shape, in sqrt(g / H)."""
+    """Rate in sqrt(g / H) at which the shape is approached."""
 
 
 class Roll:
-    """Rolls along a route, and comes to rest at its end."""
+    """Roll along a route and come to rest at its end."""
 
-    def __init__(self, place: Stance, route: Route, *, speed: float = 1.0, control: RollControl | None = None) -> None:
-        """``speed`` over the usual. The ball stands at ``place``."""
-        body = place.body
-        self.body, self.ground, self.control = body, place.ground, control or RollControl()
+    def __init__(self, stance: Stance, route: Route, *, speed: float = 1.0, control: RollControl | None = None) -> None:
+        """Create the motion of the ball that stands at ``stance``; ``speed`` is relative to the nominal speed."""
+        body = stance.body
+        self.body, self.ground, self.control = body, stance.ground, control or RollControl()
         self._gravity = float(np.linalg.norm(body.gravity))
-        normal = place.ground.axes @ place.ground.surface_normal
+        normal = stance.ground.axes @ stance.ground.surface_normal
         self._slope = -normal[:2] / normal[2]
-        """Metres that the ground rises for each metre forward and to the left."""
+        """(2,) slope of the ground: metres of rise per metre forward and to the left."""
         self._rest = body.mesh.nodes - body.centre_of_mass(body.mesh.nodes)
-        com = place.ground.local(body.centre_of_mass(place.standing))
+        com = stance.ground.local(body.centre_of_mass(stance.standing))
         self._start = com[:2]
-        self._sunk = self._radius(place.standing) - self._over_ground(com)
-        self.places = route(StepLimits(_STEP * body.height, np.pi, side_fraction=1.0, faces_travel=False))
-        check_route(place, self.places)
-        self.top_push = speed * _PUSH * self._gravity
-        """m/s^2."""
-        self.table = VelocityProfile.of(
-            self.places[:, :2], speed=speed * _SPEED * body.speed_unit, acceleration=self.top_push
+        self._compression = self._radius(stance.standing) - self._height_above_ground(com)
+        self.planar_poses = route(StepLimits(_ROUTE_STEP * body.height, np.pi, side_fraction=1.0, faces_travel=False))
+        check_route(stance, self.planar_poses)
+        self.top_push = speed * _ACCELERATION * self._gravity
+        """m/s^2, acceleration and deceleration."""
+        self.table = VelocityProfile.from_path(
+            self.planar_poses[:, :2], speed=speed * _SPEED * body.speed_unit, acceleration=self.top_push
         )
-        self._began: float | None = None
-        self._calm = RestDetector(body)
-        self._resting = False
+        self._start_time: float | None = None
+        self._rest_detector = RestDetector(body)
+        self._is_resting = False
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether it lies still at the end of its way."""
-        return self._resting
+        """True if the body lies still at the end of its route."""
+        return self._is_resting
 
     @property
     def expected_time(self) -> float:
-        """Seconds, with what coming to rest takes."""
+        """Expected duration in seconds, including the time to come to rest."""
         return self.table.seconds + 2.0 * self.body.time_unit
 
     def plan_record(self) -> RollPlan:
-        """What it aims at."""
+        """Return the planned quantities of the motion."""
         return RollPlan(self.table.length, self.table.seconds, self.table.top_speed)
 
     def planned_com(self, elapsed: float) -> np.ndarray:
-        """(3,) metres from where it stood."""
-        x, y = self.table.at(elapsed).place
+        """Return the planned displacement (3,) in metres of the centre of mass."""
+        x, y = self.table.at(elapsed).position
         return np.array([x, y, self._slope @ [x, y]]) @ self.ground.axes
 
     def notes(self) -> list[str]:
-        """None."""
+        """Return no messages."""
         return []
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> RollOutcome:
-        """How far it turned between two states of the trajectory."""
+        """Measure the rotation about horizontal axes between two states of the trajectory."""
         mass, angle = self.body.node_mass, 0.0
         states = trajectory.positions[first : last % len(trajectory.time) + 1]
         arms = [x - mass @ x / mass.sum() for x in states]
@@ -128,23 +128,24 @@ class Roll:
         return RollOutcome(float(np.degrees(angle)))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
+        step."""
         body, axes, control = self.body, self.ground.axes, self.control
-        self._began = state.time if self._began is None else self._began
+        self._start_time = state.time if self._start_time is None else self._start_time
         local = self.ground.local(state.positions)
         com, moving = body.centre_of_mass(local), axes @ body.centre_of_mass(state.velocities)
-        elapsed = state.time - self._began
-        ahead = self._ahead(com, elapsed, dt)
-        calm = self._calm.update(moving, state.time)
+        elapsed = state.time - self._start_time
+        sample = self._profile_sample(com, elapsed, dt)
+        calm = self._rest_detector.update(moving, state.time)
         slow = bool(np.linalg.norm(moving) <= REST_SPEED * body.speed_unit)
-        self._resting = (calm and self._is_over(com, elapsed)) or (self._resting and slow)
+        self._is_resting = (calm and self._is_over(com, elapsed)) or (self._is_resting and slow)
         rate = _RATE / body.time_unit
-        off = self._start + ahead.place - com[:2]
-        wanted = ahead.acceleration + 2.0 * rate * (ahead.velocity - moving[:2]) + rate**2 * off
+        off = self._start + sample.position - com[:2]
+        desired = sample.acceleration + 2.0 * rate * (sample.velocity - moving[:2]) + rate**2 * off
         inertia = body.inertia(state.positions)
-        level = moving[:2] + dt * self._given(wanted, com, inertia, local, report)
-        radius = self._radius(state.positions) - self._sunk
-        climb = self._slope @ level + 6.0 / body.time_unit * (radius - self._over_ground(com))
+        level = moving[:2] + dt * self._feasible_acceleration(desired, com, inertia, local, report)
+        radius = self._radius(state.positions) - self._compression
+        climb = self._slope @ level + 6.0 / body.time_unit * (radius - self._height_above_ground(com))
         velocity = np.array([*level, climb]) @ axes
         turning = np.cross(self.ground.surface_normal, velocity) / radius
         arms = state.positions - body.centre_of_mass(state.positions)
@@ -156,24 +157,35 @@ class Roll:
             node_velocities(body, pose, control.pose),
         ]
 
-    def _ahead(self, com: np.ndarray, elapsed: float, dt: float) -> ProfileSample:
-        """Where the centre of mass, now at ``com`` (3,), is to be at the end of the step; the way from its start."""
+    def _profile_sample(self, com: np.ndarray, elapsed: float, dt: float) -> ProfileSample:
+        """Return the target of the centre of mass, now at ``com`` (3,), at the end of the time step, relative to its
+        start."""
         return self.table.at(elapsed + dt)
 
     def _is_over(self, com: np.ndarray, elapsed: float) -> bool:
-        """Whether there is nowhere left to go."""
-        missed = float(np.linalg.norm(self._start + self.table.at(np.inf).place - com[:2]))
-        return elapsed >= self.table.seconds and missed <= _ARRIVED * self.body.height
+        """Return True if the end of the route is reached."""
+        error = float(np.linalg.norm(self._start + self.table.at(np.inf).position - com[:2]))
+        return elapsed >= self.table.seconds and error <= _ARRIVAL_TOLERANCE * self.body.height
 
-    def _given(
-        self, wanted: np.ndarray, com: np.ndarray, inertia: np.ndarray, local: np.ndarray, report: StepReport | None
+    def _feasible_acceleration(
+        self, desired: np.ndarray, com: np.ndarray, inertia: np.ndarray, local: np.ndarray, report: StepReport | None
     ) -> np.ndarray:
-        """(2,) m/s^2 along the ground, of what is ``wanted`` (2,), that the ground can give.
+        """Limit a desired acceleration along the ground to what the ground can provide.
 
-        A ball that rolls without slipping gathers speed and spin at once, m r (1 + I / (m r^2)) a, by its weight times
-        the way from the centre of pressure to its centre of mass.
+        A ball that rolls without slipping gains speed and spin at once. Its weight provides m r (1 + I / (m r^2)) a,
+        times the distance from the centre of pressure to the centre of mass.
+
+        Args:
+            desired: (2,) m/s^2, desired acceleration.
+            com: (3,) m, centre of mass, ground coordinates.
+            inertia: (3, 3) kg m^2, world axes.
+            local: (N, 3) m, nodes, ground coordinates.
+            report: report of the previous time step.
+
+        Returns:
+            (2,) m/s^2.
         """
-        height = max(self._over_ground(com), 0.2 * self.body.height)
+        height = max(self._height_above_ground(com), 0.2 * self.body.height)
         lever = height + 0.5 * (np.trace(inertia) - self.ground.axes[2] @ inertia @ self.ground.axes[2]) / (
             self.body.mass * height
         )
@@ -181,18 +193,21 @@ class Roll:
             return np.zeros(2)
         contacts = report.contacts
         points = np.einsum("cw,cwi->ci", contacts.weights, local[contacts.nodes])[:, :2]
-        middle, reach = 0.5 * (points.max(axis=0) + points.min(axis=0)), 0.5 * _MARGIN * np.ptp(points, axis=0)
+        middle, reach = (
+            0.5 * (points.max(axis=0) + points.min(axis=0)),
+            0.5 * _SUPPORT_FRACTION * np.ptp(points, axis=0),
+        )
         uphill = height * self._slope
-        pressed = com[:2] - uphill - lever / self._gravity * wanted
+        pressed = com[:2] - uphill - lever / self._gravity * desired
         return (com[:2] - uphill - np.clip(pressed, middle - reach, middle + reach)) * self._gravity / lever
 
-    def _over_ground(self, com: np.ndarray) -> float:
-        """Metres from the ground to ``com`` (3,), ground coordinates."""
+    def _height_above_ground(self, com: np.ndarray) -> float:
+        """Return the height in metres of ``com`` (3,) above the ground, ground coordinates."""
         return float(com[2] - self._slope @ com[:2])
 
     def _radius(self, positions: np.ndarray) -> float:
-        """Metres from the centre of mass to the ground, of the body at rest turned as the nodes at ``positions`` (N, 3)
-        are."""
+        """Return the distance in metres from the centre of mass to the ground, of the body at rest rotated as the nodes
+        at ``positions`` (N, 3)."""
         turn = kabsch_rotation(self.body.node_mass, self._rest, positions - self.body.centre_of_mass(positions))
         normal, up = self.ground.surface_normal, self.ground.axes[2]
         return float(-(self._rest @ (turn.T @ normal)).min() / (normal @ up))

@@ -1,6 +1,6 @@
-"""The way of a walk: where a body stands after each of its paces.
+"""Routes: the planar pose of a body after each step.
 
-A body's place is (x, y, heading): metres ahead and to the left of where it started, radians about up. See
+A planar pose is (x, y, heading): metres forward and to the left of the start, radians about up. See
 docs/concepts/motions.md.
 """
 
@@ -16,91 +16,97 @@ from egs_warp.errors import UserError
 from egs_warp.io.text import read_text
 
 MAX_STEPS = 400
-"""Of one walk."""
-_LONGEST_GAP = 1.0
-"""Body heights between two points of a path."""
-_THERE = 1e-9
+"""Largest number of steps of one walk."""
+_MAX_GAP = 1.0
+"""Largest distance in body heights between two points of a path."""
+_ROUNDING = 1e-9
 """Metres."""
 
 
 @dataclass(frozen=True)
 class StepLimits:
-    """The most that a body's place changes by in one pace; what turns it leaves less for the way ahead."""
+    """Largest change of a body's planar pose in one step. A step that turns leaves less for the displacement."""
 
     length: float
     """Metres."""
     turn: float
     """Radians."""
     side_fraction: float = 0.0
-    """Part of ``length`` that it may go to its side."""
+    """Fraction of ``length`` that a step may go sideways."""
     faces_travel: bool = True
-    """Whether it turns the way it goes; what rolls or crawls goes any way as it is."""
+    """True if the body turns to the direction in which it moves; a body that rolls or crawls moves in any direction as
+    it is."""
 
 
 Route = Callable[[StepLimits], np.ndarray]
-"""Gives the places (P+1, 3) before the first and after each pace."""
+"""Function that returns the planar poses (P+1, 3) before the first and after each step."""
 
 
 def straight_route(distance: float) -> Route:
-    """``distance`` metres ahead in even paces; backwards if it is negative."""
+    """Return the route of ``distance`` metres forward in equal steps; backwards if it is negative."""
 
-    def places(pace: StepLimits) -> np.ndarray:
-        count = max(int(np.ceil(abs(distance) / pace.length - _THERE)), 1)
+    def planar_poses(limits: StepLimits) -> np.ndarray:
+        count = max(int(np.ceil(abs(distance) / limits.length - _ROUNDING)), 1)
         return np.linspace([0.0, 0.0, 0.0], [distance, 0.0, 0.0], count + 1)
 
-    return places
+    return planar_poses
 
 
 def turn_route(angle: float) -> Route:
-    """By ``angle`` radians on the spot, in even paces."""
+    """Return the route that turns by ``angle`` radians on the spot, in equal steps."""
 
-    def places(pace: StepLimits) -> np.ndarray:
-        count = max(int(np.ceil(abs(angle) / pace.turn - _THERE)), 1)
+    def planar_poses(limits: StepLimits) -> np.ndarray:
+        count = max(int(np.ceil(abs(angle) / limits.turn - _ROUNDING)), 1)
         return np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, angle], count + 1)
 
-    return places
+    return planar_poses
 
 
 def path_route(points: np.ndarray) -> Route:
-    """Past each of ``points`` (n, 2), metres, to the last, turned the way it goes if it ``faces`` that; it turns on the
-    spot where it must.
+    """Return the route through ``points`` (n, 2), metres, to the last. A body that faces its direction of travel turns
+    on the spot where it must.
 
-    Raises ``UserError`` where that takes more than ``MOST_PACES``.
+    Raises:
+        UserError: when called, if the path takes more than ``MAX_STEPS`` steps.
     """
 
-    def places(pace: StepLimits) -> np.ndarray:
-        way = [np.zeros(3)]
+    def planar_poses(limits: StepLimits) -> np.ndarray:
+        poses = [np.zeros(3)]
         for number, point in enumerate(points):
-            near = _THERE if number == len(points) - 1 else pace.length
-            while np.linalg.norm(point - way[-1][:2]) > near:
-                if len(way) > MAX_STEPS:
-                    raise UserError(f"walk: the way takes more than {MAX_STEPS} paces; choose a shorter one")
-                way.append(_nearer(way[-1], point, pace))
-        return np.array(way) if len(way) > 1 else np.zeros((2, 3))
+            near = _ROUNDING if number == len(points) - 1 else limits.length
+            while np.linalg.norm(point - poses[-1][:2]) > near:
+                if len(poses) > MAX_STEPS:
+                    raise UserError(f"walk: the path takes more than {MAX_STEPS} steps; choose a shorter one")
+                poses.append(_nearer(poses[-1], point, limits))
+        return np.array(poses) if len(poses) > 1 else np.zeros((2, 3))
 
-    return places
+    return planar_poses
 
 
-def _nearer(place: np.ndarray, point: np.ndarray, pace: StepLimits) -> np.ndarray:
-    """(3,) one pace on from ``place`` (3,) towards ``point`` (2,)."""
-    arm = point - place[:2]
-    if not pace.faces_travel:
-        way = float(np.linalg.norm(arm))
-        return np.array([*(place[:2] + min(1.0, pace.length / way) * arm), place[2]])
-    off = np.arctan2(arm[1], arm[0]) - place[2]
-    turn = float(np.clip((off + np.pi) % (2.0 * np.pi) - np.pi, -pace.turn, pace.turn))
-    heading = place[2] + turn
+def _nearer(planar_pose: np.ndarray, point: np.ndarray, limits: StepLimits) -> np.ndarray:
+    """Return the planar pose (3,) one step after ``planar_pose`` (3,) towards ``point`` (2,)."""
+    arm = point - planar_pose[:2]
+    if not limits.faces_travel:
+        distance = float(np.linalg.norm(arm))
+        return np.array([*(planar_pose[:2] + min(1.0, limits.length / distance) * arm), planar_pose[2]])
+    off = np.arctan2(arm[1], arm[0]) - planar_pose[2]
+    turn = float(np.clip((off + np.pi) % (2.0 * np.pi) - np.pi, -limits.turn, limits.turn))
+    heading = planar_pose[2] + turn
     ahead = np.array([np.cos(heading), np.sin(heading)])
-    length = min(pace.length * (1.0 - abs(turn) / pace.turn), max(float(arm @ ahead), 0.0))
-    if float(np.linalg.norm(arm)) <= pace.length and abs(turn) < 0.5 * pace.turn:
+    length = min(limits.length * (1.0 - abs(turn) / limits.turn), max(float(arm @ ahead), 0.0))
+    if float(np.linalg.norm(arm)) <= limits.length and abs(turn) < 0.5 * limits.turn:
         return np.array([*point, heading])
-    return np.array([*(place[:2] + length * ahead), heading])
+    return np.array([*(planar_pose[:2] + length * ahead), heading])
 
 
 def read_path(path: Path) -> np.ndarray:
-    """(n, 2) body heights ahead and to the left of the start, of a file of lines ``ahead,left``.
+    """Read a path from a file of lines ``ahead,left``.
 
-    Raises ``UserError``, with the line, for what is no such file or has gaps.
+    Returns:
+        (n, 2) body heights forward and to the left of the start.
+
+    Raises:
+        UserError: with the line, for a malformed file or a gap.
     """
     points: list[Sequence[float]] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -110,13 +116,13 @@ def read_path(path: Path) -> np.ndarray:
             point = [float(word) for word in line.replace(",", " ").split()]
         except ValueError:
             if not points:
-                continue  # the names of the columns
+                continue  # header line
             point = []
         if len(point) != 2 or not np.all(np.isfinite(point)):
             raise UserError(f"{path}, line {number}: {line.strip()[:60]!r}: give two numbers, ahead and left")
         gap = float(np.linalg.norm(np.subtract(point, points[-1] if points else (0.0, 0.0))))
-        if gap > _LONGEST_GAP:
-            advice = f"give points at most {_LONGEST_GAP:g} apart, the first so near the start 0,0"
+        if gap > _MAX_GAP:
+            advice = f"give points at most {_MAX_GAP:g} apart, the first at most that far from the start 0,0"
             raise UserError(f"{path}, line {number}: the path jumps by {gap:.3g} body heights; {advice}")
         points.append(point)
     if not points:

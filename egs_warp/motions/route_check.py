@@ -1,4 +1,4 @@
-"""Whether the ground lets a body go its way."""
+"""Check of a route against steps of the ground."""
 
 from __future__ import annotations
 
@@ -7,22 +7,29 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.motions.sequence import Stance
 
-HIGHEST_STEP = 0.03
-"""Body heights: what is higher above the ground, or lower below it, stands in the way."""
+MAX_STEP_HEIGHT = 0.03
+"""Largest difference in body heights between the height of an obstacle or gap and that of the ground."""
 
 
-def check_route(place: Stance, places: np.ndarray) -> None:
-    """Raises ``UserError`` where a body that stands at ``place`` comes over a step on its way by ``places`` (n, 3): see
-    ``motions.route``."""
-    body, ground = place.body, place.ground
-    start = ground.local(body.centre_of_mass(place.standing))
+def check_route(stance: Stance, planar_poses: np.ndarray) -> None:
+    """Check that a route does not lead over a step of the ground.
+
+    Args:
+        stance: stance at the start.
+        planar_poses: (n, 3) planar poses of the route, see ``motions.route``.
+
+    Raises:
+        UserError: at the first step that is higher than ``MAX_STEP_HEIGHT``.
+    """
+    body, ground = stance.body, stance.ground
+    start = ground.local(body.centre_of_mass(stance.standing))
     normal = ground.axes @ ground.surface_normal
     slope = -normal[:2] / normal[2]
-    for x, y, _ in places:
+    for x, y, _ in planar_poses:
         level = np.array([start[0] + x, start[1] + y, 0.0])
         level[2] = slope @ level[:2]
-        rise = place.surface_height_above(ground.world(level)) / body.height
-        if abs(rise) > HIGHEST_STEP:
+        rise = stance.surface_height_above(ground.world(level)) / body.height
+        if abs(rise) > MAX_STEP_HEIGHT:
             where = f"{x / body.height:.2f} ahead and {y / body.height:.2f} to the left"
-            found = f"what is there is {abs(rise):.2f} body heights {'higher' if rise > 0.0 else 'lower'}"
-            raise UserError(f"walk: the way leads over a step, {where}: {found}; walk round it, or jump or hop")
+            obstacle = f"the surface there is {abs(rise):.2f} body heights {'higher' if rise > 0.0 else 'lower'}"
+            raise UserError(f"walk: the path leads over a step, {where}: {obstacle}; walk round it, or jump or hop")

@@ -1,8 +1,8 @@
-"""What a user asks for: one motion or several in a row, as a line of text or a JSON file.
+"""Scripts of one or several motions, from a line of text or a JSON file.
 
-A line names motions, separated by commas, each with its numbers in their order, or by name, and ``xN`` for N times:
-``hop x3, twist 180, walk 2``, ``jump 0.5 height=0.3``, ``walk to 1,0.5``. A JSON file holds a list of objects:
-``[{"motion": "hop", "repeat": 3}, {"motion": "twist", "heading_degrees": 180}]``.
+A line lists motions, separated by commas. Each has its numbers in order or by name, and ``xN`` for N repeats: ``hop x3,
+twist 180, walk 2``, ``jump 0.5 height=0.3``, ``walk to 1,0.5``. A JSON file contains a list of objects: ``[{"motion":
+"hop", "repeat": 3}, {"motion": "twist", "heading_degrees": 180}]``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import parse_json, read_text, whole_number
-from egs_warp.motions.beats import asked_beats
+from egs_warp.motions.beats import parse_beats
 from egs_warp.motions.command import Drive, DrivePlan
 from egs_warp.motions.repertoire import MOTIONS, MotionKind, parts_of
 from egs_warp.motions.request import MotionRequest
@@ -25,81 +25,99 @@ from egs_warp.motions.style import Style, read_style
 
 MOST_MOTIONS = 100
 _NAMES = ", ".join(MOTIONS)
-_FILE = "file of beats"
-"""Among the values that motions take which do not say their own."""
+_BEATS_FILE = "file of beats"
+"""Key of the file of beats among the default values of a script."""
 
 
 @dataclass(frozen=True)
 class Script:
-    """Motions to be done one after the other."""
+    """Sequence of motions."""
 
     requests: tuple[MotionRequest, ...]
 
     @property
     def name(self) -> str:
-        """That of its motions, or "motions" where they differ."""
+        """Name of its motions, or "motions" if they differ."""
         names = {request.name for request in self.requests}
         return names.pop() if len(names) == 1 else "motions"
 
     def frames(self, height: float = 1.0) -> int:
-        """At 60 Hz, after which the script is cut off, for a body of ``height`` metres: motions take longer as the root
-        of it. Raises ``UserError`` for a bad file."""
+        """Return the number of frames at 60 Hz after which the script is cut off. Durations scale with the square root
+        of the body ``height``, in metres.
+
+        Raises:
+            UserError: for an invalid file.
+        """
         frames = sum(request.repeat * MOTIONS[request.name].frames(request) for request in self.requests)
         return round(frames * max(1.0, height**0.5))
 
     def style(self, text: str | None) -> Style:
-        """Of its jumps, as ``text`` says (``read_style``), the usual one if it is None. Raises ``UserError`` for a bad
-        one, and where nothing jumps."""
+        """Return the style of its jumps from ``text`` (see ``read_style``), the default style if it is None.
+
+        Raises:
+            UserError: for an invalid text, and if no motion jumps.
+        """
         if text is None:
             return Style()
         if not any(MOTIONS[request.name].jumps for request in self.requests):
-            raise ArgumentError("style", f"nothing jumps in {self.name!r}; ask for a jump, hop, twist or dance")
+            raise ArgumentError("style", f"nothing jumps in {self.name!r}; add a jump, hop, twist or dance")
         return read_style(text)
 
     def parts(self, height: float) -> list[MotionTask]:
-        """The motions in their order, for a body of ``height`` metres."""
+        """Return the tasks of all motions in order, for a body of ``height`` metres."""
         return [part for request in self.requests for part in parts_of(request, height)]
 
-    def check(self, place: Stance) -> list[float]:
-        """Seconds that each motion is expected to take, for a body that stands at ``place``.
+    def check(self, stance: Stance) -> list[float]:
+        """Return the expected duration in seconds of each motion, for a body that stands at ``stance``.
 
-        Raises the ``UserError`` that a later motion would raise when its turn comes.
+        Raises:
+            UserError: the error that a later motion would raise when it starts.
         """
-        return [part.begin(place).expected_time for part in self.parts(place.body.height)]
+        return [part.begin(stance).expected_time for part in self.parts(stance.body.height)]
 
 
 def motion(text: str, *, beats: str | None = None, **values: float | None) -> Script:
-    """One motion by name (``jump``, ``hop``, ``twist``, ``walk``, ``walk to``, ``turn`` ...), several as a line of
-    text, or the JSON file that ``text`` names.
+    """Parse motions.
 
-    ``values`` (lengths in body heights) hold for motions that take them and do not say their own; those that are None
-    are left out. ``beats`` are those of dances that do not say theirs: a tempo, as ``90``, with the seconds of its
-    first beat behind it or not, or a file. Raises ``UserError`` for the first mistake.
+    Args:
+        text: one motion by name (``jump``, ``hop``, ``twist``, ``walk``, ``walk to``, ``turn`` ...), several as a line
+            of text, or the path of a JSON file.
+        beats: beats of dances without their own: a tempo such as ``90``, optionally followed by the time of the first
+            beat in seconds, or the path of a file.
+        values: default values by name, lengths in body heights, for motions that have the parameter and do not set it;
+            None values are ignored.
+
+    Raises:
+        UserError: for the first mistake.
     """
-    given: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    defaults: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
     if beats is not None:
-        to_dance_to = asked_beats(beats)
-        given |= {_FILE: to_dance_to} if isinstance(to_dance_to, Path) else to_dance_to
+        beats_default = parse_beats(beats)
+        defaults |= {_BEATS_FILE: beats_default} if isinstance(beats_default, Path) else beats_default
     if text.strip().lower().endswith(".json") and "," not in text and len(text.split()) == 1:
-        requests = _from_json(Path(text.strip()), given)
+        requests = _from_json(Path(text.strip()), defaults)
     else:
-        # A comma before a number parts two numbers, as in walk to 1,2.
+        # A comma before a number separates two numbers, as in walk to 1,2.
         pieces = [piece.strip() for piece in re.split(r",(?!\s*[-+.]?\d)", text)]
-        requests = [_from_words(piece, given, f"motion {number}") for number, piece in enumerate(pieces, start=1)]
+        requests = [_from_words(piece, defaults, f"motion {number}") for number, piece in enumerate(pieces, start=1)]
     count = sum(request.repeat for request in requests)
     if count > MOST_MOTIONS:
-        raise ArgumentError("motion", f"{count} motions are asked for; at most {MOST_MOTIONS} are done in a row")
+        raise ArgumentError("motion", f"{count} motions are given; at most {MOST_MOTIONS} are allowed")
     if beats is not None and not any(MOTIONS[request.name].beats for request in requests):
-        raise ArgumentError("beats", f"no motion of {text.strip()!r} takes them; ask for a dance")
-    for name in values.keys() & given.keys():
+        raise ArgumentError("beats", f"no motion of {text.strip()!r} takes beats; add a dance")
+    for name in values.keys() & defaults.keys():
         if not any(name in request.asked for request in requests):
             raise ArgumentError(name, f"no motion of {text.strip()!r} takes it")
     return Script(tuple(requests))
 
 
 def drive_script(*steps: tuple[float, Drive]) -> Script:
-    """To go by ``Drive`` commands, each from so many seconds after the start on, the last of them to stand. Raises
-    ``ArgumentError`` for times that do not grow."""
+    """Return a script of ``Drive`` commands. Each step is a time in seconds from the start and the command that is
+    valid from then on; the last command is zero.
+
+    Raises:
+        ArgumentError: for times that do not increase.
+    """
     plan = DrivePlan(tuple(time for time, _ in steps), tuple(command for _, command in steps))
     return Script((MotionRequest("drive", {}, drive=plan),))
 
@@ -201,8 +219,10 @@ def _request(
     if file is not None and kind.file is None and not kind.beats:
         raise UserError(f"{where}: {kind.usage(name)}")
     if kind.beats and file is None and not values.keys() & known.keys():
-        file = defaults.get(_FILE)
+        file = defaults.get(_BEATS_FILE)
     if kind.beats and file is not None and values:
-        raise UserError(f"{where}: {', '.join(values)} beside the beats of {file}; give one of them")
-    asked = {key: value.parse(values.get(key, defaults.get(key, value.default)), where) for key, value in known.items()}
-    return MotionRequest(name, asked, int(repeat), file)
+        raise UserError(f"{where}: {', '.join(values)} and the beats of {file} are both given; give one of them")
+    resolved = {
+        key: value.parse(values.get(key, defaults.get(key, value.default)), where) for key, value in known.items()
+    }
+    return MotionRequest(name, resolved, int(repeat), file)

@@ -1,4 +1,4 @@
-"""Motions one after the other: each begins where, and as, the body stands when the one before has come to rest."""
+"""Sequence of motions: each starts from the stance in which the previous one has come to rest."""
 
 from __future__ import annotations
 
@@ -24,49 +24,54 @@ from egs_warp.motions.style import Style
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-_ROLLED = 30.0
-"""Degrees: a ball that lies within this of how it lay has turned about up, else it has rolled."""
-LATE = 0.03
-"""Of its time so far: what a motion is given that takes longer than expected."""
+_MIN_ROLL_ANGLE = 30.0
+"""Degrees: a ball whose up axis has tilted by less than this has turned about up; otherwise it has rolled."""
+REMAINING_TIME_FRACTION = 0.03
+"""Fraction of the elapsed time that is the estimate of the remaining time of a motion that takes longer than expected.
+"""
 
 
 @dataclass(frozen=True)
 class Stance:
-    """Where a body stands, upright and at rest, and which way is forward."""
+    """Stance of a body: its standing pose, upright and at rest, on a ground frame with a forward direction."""
 
     body: SoftBody
     ground: GroundFrame
-    """Its origin is under the centre of mass; up is against gravity."""
+    """Ground frame: its origin is under the centre of mass, and up is against gravity."""
     standing: np.ndarray
-    """(N, 3) nodes, metres."""
+    """(N, 3) m, nodes."""
     contact_points: np.ndarray
-    """(k, 3) points of the body on the ground, metres."""
+    """(k, 3) m, points of the body on the ground."""
     step: float
-    """Seconds of a solver step."""
+    """Solver time step, s."""
     solids: tuple[Surface, ...] = ()
-    """What there is to stand on, the ground among it."""
+    """Surfaces that can support the body, including the ground."""
     friction: float = 0.8
     """Coulomb coefficient."""
     limbs: Limbs | None = None
-    """Of the capture, where there is one; else they are those of the cage."""
+    """Limbs of the capture; None uses those of the cage."""
     style: Style = field(default_factory=Style)
-    """Of what jumps."""
+    """Style of jumps."""
 
     def feet(self) -> tuple[Foot, ...]:
-        """What the body stands on (``find_feet``)."""
+        """Return the feet of the body, see ``find_feet``."""
         heights = (self.standing - self.ground.origin) @ self.ground.surface_normal
         return find_feet(self.body.mesh, heights, self.body.height, self.limbs)
 
     def base(self) -> SupportKind:
-        """What kind of thing that is, of the body as it is without its weight."""
+        """Return the kind of support, from the undeformed body in the orientation of the stance."""
         nodes = self.body.mesh.nodes
         turn = self.body.best_fit_rotation(self.standing)
         return support_kind_of(self.body.mesh, nodes @ (turn.T @ self.ground.surface_normal), len(self.feet()))
 
     def next_stance(self, positions: np.ndarray, report: StepReport | None) -> Stance:
-        """Where a motion begins that finds the nodes at ``positions`` (N, 3) at rest; ``report`` of the step before.
+        """Return the stance in which the next motion starts.
 
-        A ball stands on whatever it has rolled onto.
+        A ball stands on whichever part it has rolled onto.
+
+        Args:
+            positions: (N, 3) m, nodes of the body at rest.
+            report: report of the previous time step.
         """
         if report is None or report.contacts.count == 0 or self.base() is not SupportKind.ROUND_BASE:
             return self.moved_to(positions)
@@ -75,7 +80,7 @@ class Stance:
         arms = self.standing - body.centre_of_mass(self.standing)
         turn = kabsch_rotation(body.node_mass, arms, positions - com)
         axes = self.ground.axes
-        if axes[2] @ turn @ axes[2] > np.cos(np.radians(_ROLLED)):
+        if axes[2] @ turn @ axes[2] > np.cos(np.radians(_MIN_ROLL_ANGLE)):
             axes = self.moved_to(positions).ground.axes
         normal = self.ground.surface_normal
         under = GroundFrame.on_plane(Plane(normal, -float(normal @ self.ground.origin)), axes[0], com, up=axes[2])
@@ -83,7 +88,7 @@ class Stance:
         return replace(self, ground=under, standing=positions.copy(), contact_points=touching)
 
     def moved_to(self, positions: np.ndarray) -> Stance:
-        """The same stance turned about up and moved to where the feet of ``positions`` (N, 3) are."""
+        """Return the same stance, rotated about up and moved to the feet of ``positions`` (N, 3)."""
         share = sole_shares(self.body, self.ground, self.standing)
         angle = heading_between(self.standing, positions, share, self.ground)
         feet, moved = share @ self.standing, share @ positions
@@ -98,13 +103,15 @@ class Stance:
         )
 
     def surface_height_above(self, point: np.ndarray) -> float:
-        """Metres from ``point`` (3,) up to the highest surface over or under it; 0 if there is none."""
+        """Return the signed distance in metres from ``point`` (3,) up to the highest surface above or below it; 0
+        without a surface."""
         rise = surface_above(self.solids, point, self.ground.axes[2])
         return rise if np.isfinite(rise) else 0.0
 
     def landing(self, target: JumpTarget) -> JumpTarget:
-        """The ``target`` on what is ahead of the feet there, higher or lower, cleared by half of the asked height at
-        least. Level over nothing, and before what is higher than the jump, as a wall or a lintel is."""
+        """Return ``target`` with the rise of the surface ahead of the feet. The jump clears it by at least half of the
+        requested height. The target is unchanged without a surface, and ahead of one that is higher than the jump, such
+        as a wall or a lintel."""
         feet, up = sole_shares(self.body, self.ground, self.standing) @ self.standing, self.ground.axes[2]
         ahead = surface_above(self.solids, feet + target.distance * self.ground.axes[0], up)
         rise = ahead - surface_above(self.solids, feet, up)
@@ -113,64 +120,66 @@ class Stance:
         return replace(target, rise=rise, height=max(target.height, rise + 0.5 * target.height))
 
     def with_forward(self, direction: np.ndarray) -> Stance:
-        """The same stance with another way forward (3,); the body is not turned."""
+        """Return the same stance with another forward ``direction`` (3,); the body is not rotated."""
         x, y = self.ground.axes[:2] @ direction
         turn = self.ground.rotation_about_up(float(np.arctan2(y, x)))
         return replace(self, ground=replace(self.ground, axes=self.ground.axes @ turn.T))
 
 
 class BodyMotion(Protocol):
-    """A state machine that ends at rest."""
+    """Motion of a body: a state machine that ends at rest."""
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether it has come to its end."""
+        """True if the motion has ended."""
         ...
 
     @property
     def expected_time(self) -> float:
-        """Seconds from its first step until it is at rest."""
+        """Expected seconds from the first time step until the body is at rest."""
         ...
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is of the step before."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
+        step."""
         ...
 
     def plan_record(self) -> DataclassInstance:
-        """What it aims at."""
+        """Return the planned quantities of the motion."""
         ...
 
     def planned_com(self, elapsed: float) -> np.ndarray | None:
-        """(3,) metres from where the centre of mass stood to where it was planned to be ``elapsed`` seconds after the
-        motion began, before its first step; NaN where nothing was planned, None if nothing ever is."""
+        """Return the planned displacement (3,) in metres of the centre of mass ``elapsed`` seconds after the motion
+        began, before its first time step; NaN where nothing was planned, None if the motion has no such plan."""
         ...
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> DataclassInstance | None:
-        """What it did beside what is measured of all motions; ``first`` and ``last`` are indices into ``time``."""
+        """Return quantities of this motion beyond those measured for all motions; ``first`` and ``last`` are indices
+        into ``time``."""
         ...
 
     def notes(self) -> list[str]:
-        """What kept it from its target, for the user."""
+        """Return messages for the user about targets that were missed."""
         ...
 
 
 @dataclass
 class MotionRecord:
-    """A motion of a sequence and when it began."""
+    """Started motion of a sequence."""
 
     name: str
     asked: Mapping[str, float]
     motion: BodyMotion
     start_time: float
     fell: str | None = None
-    """How it was told that the body fell, where that ended it."""
+    """Description of the fall that ended the motion, or None."""
     got_up: bool = False
-    """Whether the body has got up after that."""
+    """True if the body has got up after that fall."""
 
 
 @dataclass(frozen=True)
 class MotionTask:
-    """A motion to come."""
+    """Planned motion of a sequence."""
 
     name: str
     asked: Mapping[str, float]
@@ -178,70 +187,74 @@ class MotionTask:
 
 
 class MotionSequence:
-    """Runs ``parts`` one after the other from ``place``; itself a motion."""
+    """Run ``parts`` one after the other from ``stance``; itself a motion."""
 
-    def __init__(self, place: Stance, parts: Sequence[MotionTask]) -> None:
-        self._place = place
+    def __init__(self, stance: Stance, parts: Sequence[MotionTask]) -> None:
+        self._stance = stance
         self._parts = list(parts)
         self._count = len(self._parts)
         self.done: list[MotionRecord] = []
-        self._dropped = self._rises = False
-        """Whether the present motion counts no more, and getting up is next."""
+        self._is_dropped = self._gets_up_next = False
+        """True if a fall has ended the current motion; True if getting up is the next motion."""
 
     @property
     def is_finished(self) -> bool:
-        """Whether the last motion has come to rest."""
+        """True if the last motion has come to rest."""
         return not self._parts and self._resting
 
     @property
     def _resting(self) -> bool:
-        return bool(self.done) and (self._dropped or self.done[-1].motion.is_at_rest)
+        return bool(self.done) and (self._is_dropped or self.done[-1].motion.is_at_rest)
 
     def start_get_up(self, get_up: MotionTask, why: str) -> None:
-        """The body has fallen, as ``why`` tells: what it does ends, and it is to ``get_up`` before it goes on."""
+        """End the current motion because the body has fallen, as ``why`` describes; ``get_up`` runs before the sequence
+        continues."""
         self.done[-1].fell = why
         self._parts.insert(0, get_up)
-        self._dropped = self._rises = True
+        self._is_dropped = self._gets_up_next = True
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
+        """Return the objectives of the current motion for the time step of ``dt`` seconds from ``state``; start the
+        next motion if the current one has ended."""
         if self._parts and (not self.done or self._resting):
-            place = self._place.next_stance(state.positions, report) if self.done else self._place
-            if place.base() is SupportKind.ROUND_BASE:
-                self._place = place
+            stance = self._stance.next_stance(state.positions, report) if self.done else self._stance
+            if stance.base() is SupportKind.ROUND_BASE:
+                self._stance = stance
             part = self._parts.pop(0)
-            self._dropped = self._rises = False
-            self.done.append(MotionRecord(part.name, part.asked, part.begin(place), state.time))
+            self._is_dropped = self._gets_up_next = False
+            self.done.append(MotionRecord(part.name, part.asked, part.begin(stance), state.time))
         return self.done[-1].motion.objectives(state, report, dt)
 
     def time_left(self, time: float, expected: Sequence[float]) -> float:
-        """Seconds from ``time`` until the last motion is at rest; ``expected`` is what each of all takes, seconds."""
-        to_come = len(self._parts) - self._rises
+        """Estimate the seconds from ``time`` until the last motion is at rest; ``expected`` are the durations of all
+        motions, s."""
+        to_come = len(self._parts) - self._gets_up_next
         later = sum(expected[len(expected) - to_come :])
         if not self.done or self._resting:
             return later
         past = time - self.done[-1].start_time
-        return later + max(self.done[-1].motion.expected_time - past, LATE * past)
+        return later + max(self.done[-1].motion.expected_time - past, REMAINING_TIME_FRACTION * past)
 
     def unfinished_note(self) -> list[str]:
-        """What the last frame kept from its end, for the user."""
+        """Return messages for the user about motions that did not end or did not start."""
         if not self.done or self._resting:
             return self.unstarted_note()
         return [f"{self.done[-1].name} was cut off before it came to rest; give more frames", *self.unstarted_note()]
 
     def unstarted_note(self) -> list[str]:
-        """What did not begin, for the user."""
+        """Return messages for the user about motions that did not start."""
         if not self._parts:
             return []
         names = ", ".join(part.name for part in self._parts)
         return [f"{len(self._parts)} of {self._count} motions did not begin: {names}"]
 
     def spans(self, time: np.ndarray) -> list[tuple[int, int]]:
-        """First and last index into ``time`` (F+1,) of each motion that was begun."""
+        """Return the first and last index into ``time`` (F+1,) of each started motion."""
         return spans_of(self.done, time)
 
 
 def spans_of(done: Sequence[MotionRecord], time: np.ndarray) -> list[tuple[int, int]]:
-    """First and last index into ``time`` (F+1,) of each of the motions ``done``, one after the other to the end."""
+    """Return the first and last index into ``time`` (F+1,) of each motion of ``done``; each lasts until the next one
+    starts."""
     starts = [int(np.searchsorted(time, entry.start_time - 1e-9)) for entry in done]
     return list(zip(starts, [*starts, len(time) - 1][1:], strict=True))

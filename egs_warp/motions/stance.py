@@ -1,4 +1,4 @@
-"""Measured quantities of a body and the family of poses that motions steer through."""
+"""Measurement of a body, ground frames, rest detection, and the balance controller with its family of poses."""
 
 from __future__ import annotations
 
@@ -22,62 +22,62 @@ from egs_warp.locomotion.objectives import (
 from egs_warp.locomotion.stepper import StepReport
 
 SHEAR_BASIS = np.einsum("ki,j->kij", np.eye(3)[:2], np.eye(3)[2])
-"""(2, 3, 3) what a unit of lean ahead and to the left adds to a pose that is sheared by it."""
-_PINNED = 1e6
-"""Of the largest stiffness: what holds a node where it stands."""
+"""(2, 3, 3) change of a sheared pose per unit of lean forward and to the left."""
+_PIN_STIFFNESS = 1e6
+"""Stiffness that pins a node, relative to the largest entry of the stiffness matrix."""
 SOLE_HEIGHT = 0.06
-"""Body heights: what is at most this far above a standing body's lowest node is its sole."""
+"""Body heights: nodes at most this far above a standing body's lowest node are its sole."""
 REST_SPEED = 0.03
-"""Speed of the centre of mass, in sqrt(g H), below which a standing body is calm."""
+"""Speed of the centre of mass, in sqrt(g H), below which a standing body counts as slow."""
 REST_TIME = 0.3
-"""Of sqrt(H / g): for how long a body is calm before it is at rest."""
+"""Time in sqrt(H / g) for which a body is slow before it is at rest."""
 SUPPORT_MARGIN = 0.95
-"""Of the footprint: where the centre of pressure may be."""
+"""Fraction of the footprint within which the centre of pressure stays."""
 FRICTION_FRACTION = 0.95
-"""Of what friction could give at most: asked for more, feet slide, and what else is asked falls short."""
+"""Fraction of the friction cone that objectives may use; with more, feet slide and other objectives fall short."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of a motion's objectives; speeds are compared in sqrt(g H).
+    """Weights of a motion's objectives; speeds are measured in units of sqrt(g H).
 
-    What is asked for is what happens, since contact forces come as they are planned: balance goes before effort.
+    Contact forces follow the plan, so objectives are met. Balance has priority over effort.
     """
 
     com: float = 600.0
-    """Of the centre of mass, along the ground."""
+    """Weight of the velocity of the centre of mass along the ground."""
     up: float = 600.0
-    """Of the centre of mass, up."""
+    """Weight of the upward velocity of the centre of mass."""
     spin: float = 600.0
     pose: float = 0.02
     landing: float = 0.1
-    """Share of ``com``, ``up`` and ``spin`` that is asked for from touch-down on: what is left is to come to rest,
+    """Fraction of ``com``, ``up`` and ``spin`` that applies from touch-down on, when the body only has to come to rest,
     at no given time."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """The body as the controller sees it, in the frame of the ground: x forward, y left, z up."""
+    """Measured quantities of a body in the ground frame: x forward, y left, z up."""
 
     com: np.ndarray
-    """(3,) metres, relative to the ground frame's origin."""
+    """(3,) m, centre of mass relative to the origin of the ground frame."""
     velocity: np.ndarray
-    """(3,) m/s."""
+    """(3,) m/s, velocity of the centre of mass."""
     foot_centre: np.ndarray
-    """(2,) metres: centre of the feet (nodes near the sole at rest)."""
+    """(2,) m, centre of the feet (nodes near the sole at rest)."""
     sole_height: float
-    """Metres: lowest contact point above the plane."""
+    """Height of the lowest contact point above the ground, m."""
     in_contact: bool
-    """Whether a contact force acts."""
+    """True if a contact force acts."""
     normal_load: float
-    """Normal contact forces, body weights."""
+    """Sum of the normal contact forces, body weights."""
     heading: float
-    """Radians about z, from the start."""
+    """Heading relative to the start, radians about z."""
     support: np.ndarray
-    """(2, 2) metres: least and largest coordinates along the ground of what the body can press on now."""
+    """(2, 2) m, smallest and largest ground coordinates of the points in contact."""
     angular_velocity_term: np.ndarray
-    """(2,) m/s: what the spin about the centre of mass adds to its speed along the ground in the momentum about the
-    feet."""
+    """(2,) m/s, contribution of the spin to the angular momentum about the feet, as an equivalent velocity of the
+    centre of mass along the ground."""
     rotation: np.ndarray
     """(3, 3) best-fit rotation from the standing pose, world axes."""
     angular_momentum: np.ndarray
@@ -88,22 +88,26 @@ class Measurement:
 
 @dataclass(frozen=True)
 class GroundFrame:
-    """A right-handed frame on the plane: rows of ``axes`` are forward, left and up."""
+    """Right-handed frame on a plane; the rows of ``axes`` are forward, left and up."""
 
     axes: np.ndarray
-    """(3, 3)."""
+    """(3, 3) unit rows."""
     origin: np.ndarray
-    """(3,) metres, on the plane."""
+    """(3,) m, on the plane."""
     surface_normal: np.ndarray
-    """(3,) unit, of the plane; up, but on a slope."""
+    """(3,) unit normal of the plane; differs from up on a slope."""
 
     @classmethod
     def on_plane(
         cls, plane: Plane, forward: np.ndarray, below: np.ndarray, *, up: np.ndarray | None = None
     ) -> GroundFrame:
-        """Frame with its origin on the plane under the point ``below``; ``forward`` is made horizontal.
+        """Create a frame on a plane.
 
-        ``up`` (3,) is against gravity where the plane is a slope.
+        Args:
+            plane: the ground.
+            forward: (3,) forward direction; it is projected to the horizontal.
+            below: (3,) m, point above the origin of the frame.
+            up: (3,) unit, against gravity; None uses the normal of the plane.
         """
         vertical = plane.normal if up is None else up
         flat = forward - (forward @ vertical) * vertical
@@ -112,20 +116,20 @@ class GroundFrame:
         return cls(np.stack([flat, np.cross(vertical, flat), vertical]), origin, plane.normal)
 
     def rotation_about_up(self, angle: float) -> np.ndarray:
-        """(3, 3) rotation by ``angle`` radians about up, world axes."""
+        """Return the rotation matrix (3, 3) by ``angle`` radians about up, world axes."""
         return Rotation.from_rotvec(angle * self.axes[2]).as_matrix()
 
     def local(self, points: np.ndarray) -> np.ndarray:
-        """World points (..., 3) to ground coordinates."""
+        """Transform world points (..., 3) to ground coordinates."""
         return (points - self.origin) @ self.axes.T
 
     def world(self, points: np.ndarray) -> np.ndarray:
-        """Ground coordinates (..., 3) to world points."""
+        """Transform ground coordinates (..., 3) to world points."""
         return self.origin + points @ self.axes
 
 
 class RestDetector:
-    """Whether the centre of mass has been slow for long enough."""
+    """Detector of rest: the centre of mass has been slow for long enough."""
 
     def __init__(self, body: SoftBody) -> None:
         gravity = float(np.linalg.norm(body.gravity))
@@ -134,7 +138,15 @@ class RestDetector:
         self._since: float | None = None
 
     def update(self, velocity: np.ndarray, time: float) -> bool:
-        """To be asked in every step, with the ``velocity`` (3,) of the centre of mass, m/s, and the ``time``, s."""
+        """Update the detector; call it in every time step.
+
+        Args:
+            velocity: (3,) m/s, velocity of the centre of mass.
+            time: s.
+
+        Returns:
+            True if the body is at rest.
+        """
         if np.linalg.norm(velocity) > self._speed:
             self._since = None
         elif self._since is None:
@@ -143,43 +155,59 @@ class RestDetector:
 
 
 class BalanceController:
-    """Affine poses of the rest shape, A = stretch along up, bulge across it, shear by the lean.
+    """Balance controller with affine poses of the rest shape: stretch along up, bulging across it, shear by the lean.
 
     See docs/concepts/motions.md.
     """
 
     def __init__(
-        self, body: SoftBody, ground: GroundFrame, standing: np.ndarray, touching: np.ndarray, friction: float
+        self, body: SoftBody, ground: GroundFrame, standing: np.ndarray, contact_points: np.ndarray, friction: float
     ) -> None:
-        """``standing`` (N, 3): nodes at rest; ``touching`` (k, 3): points of the body on the ground then; ``friction``:
-        Coulomb coefficient."""
+        """Create the controller.
+
+        Args:
+            body: the body.
+            ground: ground frame.
+            standing: (N, 3) m, nodes at rest.
+            contact_points: (k, 3) m, points of the body on the ground at rest.
+            friction: Coulomb coefficient.
+        """
         self.body, self.ground, self.friction = body, ground, friction
         self._normal = ground.axes @ ground.surface_normal
         local = ground.local(standing)
         self.arms = (local - body.centre_of_mass(local)) @ ground.axes
-        """(N, 3) metres, world axes: the standing nodes from their centre of mass."""
+        """(N, 3) m, standing nodes relative to their centre of mass, world axes."""
         self.standing_height = float(body.centre_of_mass(local)[2])
         self._sole_share = sole_shares(body, ground, standing)
         self._standing = standing
         self.base_offset = self._base(local) - body.centre_of_mass(local)[:2]
-        footprint = ground.local(touching)[:, :2] - body.centre_of_mass(local)[:2]
+        footprint = ground.local(contact_points)[:, :2] - body.centre_of_mass(local)[:2]
         self.support_low = np.minimum(footprint.min(axis=0), -0.01 * body.height)
         self.support_high = np.maximum(footprint.max(axis=0), 0.01 * body.height)
 
     def balance_targets(
-        self, seen: Measurement, velocity: np.ndarray, spin: np.ndarray, dt: float
+        self, measurement: Measurement, velocity: np.ndarray, spin: np.ndarray, dt: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The end velocity (3,) m/s of the centre of mass, ground axes, and spin (3,) rad/s, world axes, nearest to
-        those asked for that feet can bring about without tipping or sliding.
+        """Project the requested velocities onto those that the feet can produce without tipping or slipping.
 
-        About the feet the momentum m h (v + swing) changes by the weight times the way from the centre of pressure to
-        the centre of mass, so that centre, kept within the footprint, bounds the sum of both; friction bounds the one.
+        The angular momentum about the feet, m h (v + angular_velocity_term), changes at a rate of the weight times the
+        horizontal distance from the centre of pressure to the centre of mass. Keeping the centre of pressure in the
+        footprint bounds the sum of both terms; friction bounds the first.
+
+        Args:
+            measurement: measured body.
+            velocity: (3,) m/s, requested velocity of the centre of mass, ground axes.
+            spin: (3,) rad/s, requested angular velocity, world axes.
+            dt: time step, s.
+
+        Returns:
+            Velocity (3,) and spin (3,) at the end of the step.
         """
         gravity = float(np.linalg.norm(self.body.gravity))
-        up = max(gravity + (velocity[2] - seen.velocity[2]) / dt, 0.2 * gravity)
-        height = self._com_height(seen.com)
-        level = velocity[:2] - seen.velocity[:2]
-        turn = self._angular_velocity_term(seen.inertia @ spin, height) - seen.angular_velocity_term
+        up = max(gravity + (velocity[2] - measurement.velocity[2]) / dt, 0.2 * gravity)
+        height = self._com_height(measurement.com)
+        level = velocity[:2] - measurement.velocity[:2]
+        turn = self._angular_velocity_term(measurement.inertia @ spin, height) - measurement.angular_velocity_term
 
         def within_grip(change: np.ndarray) -> np.ndarray:
             push = np.array([*(change / dt), 0.0])
@@ -188,54 +216,59 @@ class BalanceController:
             )
 
         level = within_grip(level)
-        pressure = seen.com[:2] - height / up * (level + turn) / dt
-        middle, reach = seen.support.mean(axis=0), 0.5 * SUPPORT_MARGIN * (seen.support[1] - seen.support[0])
-        # Never ask for a fall: some push either way stays allowed even where the centre of mass is past the edge.
+        pressure = measurement.com[:2] - height / up * (level + turn) / dt
+        middle, reach = (
+            measurement.support.mean(axis=0),
+            0.5 * SUPPORT_MARGIN * (measurement.support[1] - measurement.support[0]),
+        )
+        # Never request a fall: a small push in either direction stays allowed even with the centre of mass beyond the
+        # edge.
         slack = 0.04 * self.body.height
-        low = np.minimum(middle - reach, seen.com[:2] - slack)
-        high = np.maximum(middle + reach, seen.com[:2] + slack)
-        both = (seen.com[:2] - np.clip(pressure, low, high)) * up / height * dt
-        # Each gives way as its objective weighs it, speeds as they are, spins with the radius of gyration; what
-        # friction denies the one, the other takes.
-        share = 1.0 / (1.0 + 0.5 * np.trace(seen.inertia) / (self.body.mass * height**2))
+        low = np.minimum(middle - reach, measurement.com[:2] - slack)
+        high = np.maximum(middle + reach, measurement.com[:2] + slack)
+        both = (measurement.com[:2] - np.clip(pressure, low, high)) * up / height * dt
+        # Both terms are reduced according to the weights of their objectives, speeds directly, spins with the radius of
+        # gyration. What friction denies to the first is left to the second.
+        share = 1.0 / (1.0 + 0.5 * np.trace(measurement.inertia) / (self.body.mass * height**2))
         level = within_grip(level + share * (both - level - turn))
         turn = both - level
-        swing = seen.angular_velocity_term + turn
-        momentum = self.ground.axes @ seen.inertia @ spin
+        swing = measurement.angular_velocity_term + turn
+        momentum = self.ground.axes @ measurement.inertia @ spin
         momentum[:2] = self.body.mass * height * np.array([-swing[1], swing[0]])
         return (
-            np.array([*(seen.velocity[:2] + level), velocity[2]]),
-            np.linalg.solve(seen.inertia, self.ground.axes.T @ momentum),
+            np.array([*(measurement.velocity[:2] + level), velocity[2]]),
+            np.linalg.solve(measurement.inertia, self.ground.axes.T @ momentum),
         )
 
-    def capture_acceleration(self, seen: Measurement, goal: np.ndarray) -> np.ndarray:
-        """(2,) m/s^2 along the ground that brings a body that falls like a pendulum to rest over ``goal`` (2,).
+    def capture_acceleration(self, measurement: Measurement, goal: np.ndarray) -> np.ndarray:
+        """Return the acceleration (2,) in m/s^2 along the ground that brings a body that falls like a pendulum to rest
+        over ``goal`` (2,). It steers the capture point, computed from the momentum about the feet, to the goal."""
+        pendulum = self._pendulum_rate2(measurement)
+        return -2.0 * pendulum * (self._capture(measurement) - goal) + pendulum * (measurement.com[:2] - goal)
 
-        The capture point, of the momentum about the feet, is steered to it.
-        """
-        pendulum = self._pendulum_rate2(seen)
-        return -2.0 * pendulum * (self._capture(seen) - goal) + pendulum * (seen.com[:2] - goal)
+    def capture_margin(self, measurement: Measurement) -> float:
+        """Return the distance of the capture point from the middle of the support, relative to the distance of its
+        edge. Beyond 1, the body falls unless it steps."""
+        middle, reach = measurement.support.mean(axis=0), 0.5 * (measurement.support[1] - measurement.support[0])
+        return float((np.abs(self._capture(measurement) - middle) / np.maximum(reach, 1e-3 * self.body.height)).max())
 
-    def capture_margin(self, seen: Measurement) -> float:
-        """How far the capture point is from the middle of what the body stands on, 1 at its edge: beyond it, it falls
-        unless it steps."""
-        middle, reach = seen.support.mean(axis=0), 0.5 * (seen.support[1] - seen.support[0])
-        return float((np.abs(self._capture(seen) - middle) / np.maximum(reach, 1e-3 * self.body.height)).max())
+    def _pendulum_rate2(self, measurement: Measurement) -> float:
+        """Return the squared rate of the linear inverted pendulum, 1/s^2."""
+        return float(np.linalg.norm(self.body.gravity)) / self._com_height(measurement.com)
 
-    def _pendulum_rate2(self, seen: Measurement) -> float:
-        """1/s^2, of the linear inverted pendulum."""
-        return float(np.linalg.norm(self.body.gravity)) / self._com_height(seen.com)
-
-    def _capture(self, seen: Measurement) -> np.ndarray:
-        """(2,) where the body, told to hold there, would come to rest over its feet."""
-        return seen.com[:2] + (seen.velocity[:2] + seen.angular_velocity_term) / np.sqrt(self._pendulum_rate2(seen))
+    def _capture(self, measurement: Measurement) -> np.ndarray:
+        """Return the capture point (2,): over it, the feet could bring the body to rest."""
+        return measurement.com[:2] + (measurement.velocity[:2] + measurement.angular_velocity_term) / np.sqrt(
+            self._pendulum_rate2(measurement)
+        )
 
     def _com_height(self, com: np.ndarray) -> float:
-        """Metres: height of the centre of mass ``com`` (3,), ground coordinates, over the feet."""
+        """Return the height in metres of the centre of mass ``com`` (3,), ground coordinates, above the feet; at least
+        0.3 of the standing height."""
         return max(float(com[2]), 0.3 * self.standing_height)
 
     def _angular_velocity_term(self, momentum: np.ndarray, height: float) -> np.ndarray:
-        """(2,) of ``Measurement``, of an angular ``momentum`` (3,), world axes."""
+        """Return ``Measurement.angular_velocity_term`` (2,) of an angular ``momentum`` (3,), world axes."""
         turning = self.ground.axes @ momentum / (self.body.mass * height)
         return np.array([turning[1], -turning[0]])
 
@@ -243,7 +276,7 @@ class BalanceController:
         return (self._sole_share @ local)[:2]
 
     def measure(self, state: BodyState, report: StepReport | None) -> Measurement:
-        """What the controller sees."""
+        """Measure the body; ``report`` is of the previous time step."""
         local = self.ground.local(state.positions)
         forces = report.forces[:, 0].sum() if report is not None else self.body.weight
         rotation = self._rotation(state.positions)
@@ -266,34 +299,34 @@ class BalanceController:
         )
 
     def _support(self, local: np.ndarray, report: StepReport | None) -> np.ndarray:
-        """(2, 2) of ``Measurement``: the whole footprint where nothing is on the ground."""
+        """Return ``Measurement.support`` (2, 2); the whole footprint without contacts."""
         if report is None or report.contacts.count == 0:
             return self._base(local) - self.base_offset + np.stack([self.support_low, self.support_high])
         contacts = report.contacts
-        places = np.einsum("cw,cwi->ci", contacts.weights, local[contacts.nodes])[:, :2]
-        return np.stack([places.min(axis=0), places.max(axis=0)])
+        points = np.einsum("cw,cwi->ci", contacts.weights, local[contacts.nodes])[:, :2]
+        return np.stack([points.min(axis=0), points.max(axis=0)])
 
     def _rotation(self, positions: np.ndarray) -> np.ndarray:
         arms = positions - self.body.centre_of_mass(positions)
         return kabsch_rotation(self.body.node_mass, self.arms, arms)
 
     def sole_heading(self, positions: np.ndarray) -> float:
-        """Radians about the ground's normal by which the feet alone are turned from the standing pose."""
+        """Return the angle in radians about up by which the feet alone are rotated from the standing pose."""
         return heading_between(self.arms, positions, self._sole_share, self.ground)
 
     def over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
-        """(3, 3) the pose whose sole is flat at ``base`` (2,) while the centre of mass is at ``com`` (3,),
-        ground coordinates: sheared by the lean between them.
-        """
+        """Return the pose (3, 3) with its sole flat at ``base`` (2,) and the centre of mass at ``com`` (3,), ground
+        coordinates: sheared by the lean between them."""
         return self._leaning(com, base, heading, SHEAR_BASIS)
 
     def bent_over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
-        """(3, 3) the same of a body that bends as it does by itself: turned as far as that strains it least."""
+        """Return the pose (3, 3) of ``over_base`` for a body that bends naturally: rotated by as much as strains it
+        least."""
         return self._leaning(com, base, heading, self._bending)
 
     def _leaning(self, com: np.ndarray, base: np.ndarray, heading: float, leans: np.ndarray) -> np.ndarray:
-        """(3, 3) world matrix: stretch along up, half the volume kept by bulging, ``leans`` (2, 3, 3) for each unit of
-        lean, then turned by ``heading`` radians."""
+        """Return the pose (3, 3), world axes: stretch along up, bulging that conserves half of the volume change,
+        ``leans`` (2, 3, 3) per unit of lean, then a rotation by ``heading`` radians."""
         turn = Rotation.from_rotvec([0.0, 0.0, heading]).as_matrix()
         lean = (com[:2] - base + turn[:2, :2] @ self.base_offset) / self.standing_height
         lean = lean * min(1.0, 0.5 / max(float(np.linalg.norm(lean)), 1e-9))
@@ -304,16 +337,16 @@ class BalanceController:
 
     @cached_property
     def _bending(self) -> np.ndarray:
-        """(2, 3, 3) ground axes: what a unit of lean ahead and to the left adds to the pose of a body that a pull along
-        the ground bends, its sole held: the affine map nearest to its small displacements, by mass."""
+        """(2, 3, 3) change of the pose per unit of lean forward and to the left, ground axes, for a body with a fixed
+        sole that a horizontal body force bends: the affine map nearest to its small displacements, weighted by mass."""
         body, assembly, axes = self.body, self.body.assembly, self.ground.axes
         entries = assembly.hessian_entries(self._standing, projected=True)
-        held = np.repeat(self._sole_share > 0.0, 3)
-        entries[assembly.diagonal_entries] += _PINNED * entries.max() * held
+        is_fixed = np.repeat(self._sole_share > 0.0, 3)
+        entries[assembly.diagonal_entries] += _PIN_STIFFNESS * entries.max() * is_fixed
         factors = MultifrontalLdl(assembly.upper_pattern, assembly.analysis)
         factors.update(entries)
-        pulls = np.stack([np.kron(body.node_mass, axis) for axis in axes[:2]], axis=1)
-        bent = factors.solve(pulls * ~held[:, None]).reshape(len(body.node_mass), 3, 2)
+        loads = np.stack([np.kron(body.node_mass, axis) for axis in axes[:2]], axis=1)
+        bent = factors.solve(loads * ~is_fixed[:, None]).reshape(len(body.node_mass), 3, 2)
         arms = self._standing - body.centre_of_mass(self._standing)
         spread = np.linalg.inv(np.einsum("n,ni,nj->ij", body.node_mass, arms, arms))
         fits = []
@@ -327,7 +360,7 @@ class BalanceController:
     def objectives(
         self,
         state: BodyState,
-        seen: Measurement,
+        measurement: Measurement,
         *,
         com_velocity: np.ndarray,
         pose: np.ndarray,
@@ -336,18 +369,25 @@ class BalanceController:
         follow: float,
         weights: Weights,
     ) -> list[AnyObjective]:
-        """Objectives for a step: centre-of-mass velocity (3,) in ground axes, angular velocity ``spin`` (3,) in world
-        axes, and a pose.
+        """Return the objectives of a time step.
 
-        ``pose`` (3, 3) is approached at rate ``follow`` (1/s) on top of its own ``pose_rate`` (3, 3).
+        Args:
+            state: current state.
+            measurement: measured body.
+            com_velocity: (3,) m/s, target velocity of the centre of mass, ground axes.
+            pose: (3, 3) target pose, world axes.
+            pose_rate: (3, 3) 1/s, rate of the target pose.
+            spin: (3,) rad/s, target angular velocity, world axes.
+            follow: 1/s, rate at which the pose is approached.
+            weights: weights of the objectives.
         """
         body = self.body
         com = body.centre_of_mass(state.positions)
         arms = state.positions - com
         velocity = self.ground.axes.T @ com_velocity
-        wanted = self.arms @ pose.T
-        pose_velocity = velocity + self.arms @ pose_rate.T + follow * (wanted - arms)
-        momentum = seen.inertia @ spin
+        target = self.arms @ pose.T
+        pose_velocity = velocity + self.arms @ pose_rate.T + follow * (target - arms)
+        momentum = measurement.inertia @ spin
         return [
             *self._balance(velocity, weights),
             AngularMomentumObjective(momentum, weights.spin),
@@ -355,7 +395,7 @@ class BalanceController:
         ]
 
     def _balance(self, velocity: np.ndarray, weights: Weights) -> list[Objective]:
-        """``velocity`` (3,) of the centre of mass, world axes."""
+        """Return the objectives for the ``velocity`` (3,) of the centre of mass, world axes."""
         both = centre_of_mass_velocity(self.body, velocity, weights.com)
         if weights.up == weights.com:
             return [both]
@@ -365,19 +405,19 @@ class BalanceController:
             replace(both, rows=up @ both.rows, target=up @ velocity, weight=weights.up),
         ]
 
-    def turn_towards(self, seen: Measurement, pose: np.ndarray) -> np.ndarray:
-        """(3,) rotation vector, world axes, from the measured best-fit rotation to that of ``pose``."""
-        wanted = kabsch_rotation(self.body.node_mass, self.arms, self.arms @ pose.T)
-        return Rotation.from_matrix(wanted @ seen.rotation.T).as_rotvec()
+    def turn_towards(self, measurement: Measurement, pose: np.ndarray) -> np.ndarray:
+        """Return the rotation vector (3,), world axes, from the measured best-fit rotation to that of ``pose``."""
+        target = kabsch_rotation(self.body.node_mass, self.arms, self.arms @ pose.T)
+        return Rotation.from_matrix(target @ measurement.rotation.T).as_rotvec()
 
 
-def _share_in_cone(push: np.ndarray, held: np.ndarray, normal: np.ndarray, friction: float) -> float:
-    """Largest s for which ``held`` + s ``push`` (3,) is in the friction cone about ``normal`` (3,); 0 where ``held`` is
-    not; infinite where ``push`` never leaves it."""
+def _share_in_cone(push: np.ndarray, load: np.ndarray, normal: np.ndarray, friction: float) -> float:
+    """Return the largest s for which ``load`` + s ``push`` (3,) is in the friction cone about ``normal`` (3,); 0 if
+    ``load`` is outside, infinite if ``push`` never leaves the cone."""
     wide = 1.0 + friction**2
     a = float(push @ push - wide * (push @ normal) ** 2)
-    b = float(push @ held - wide * (push @ normal) * (held @ normal))
-    c = float(held @ held - wide * (held @ normal) ** 2)
+    b = float(push @ load - wide * (push @ normal) * (load @ normal))
+    c = float(load @ load - wide * (load @ normal) ** 2)
     if c > 0.0:
         return 0.0
     if a <= 0.0:
@@ -386,18 +426,16 @@ def _share_in_cone(push: np.ndarray, held: np.ndarray, normal: np.ndarray, frict
 
 
 def sole_shares(body: SoftBody, ground: GroundFrame, standing: np.ndarray) -> np.ndarray:
-    """(N,) weights, sum 1, whose mean is the centre of the feet:
-    the mass of the nodes that are near the ground at rest.
-    """
+    """Return weights (N,), sum 1, whose mean is the centre of the feet: the mass of the nodes near the ground at
+    rest."""
     heights = standing @ ground.surface_normal
     mass = body.node_mass * (heights < heights.min() + SOLE_HEIGHT * body.height)
     return mass / mass.sum()
 
 
 def heading_between(before: np.ndarray, after: np.ndarray, share: np.ndarray, ground: GroundFrame) -> float:
-    """Radians about the ground's up by which points ``before`` (N, 3), weighted by ``share`` (N,),
-    best turn to ``after``.
-    """
+    """Return the best-fit rotation angle in radians about up from points ``before`` (N, 3) to ``after`` (N, 3),
+    weighted by ``share`` (N,)."""
     flat_before, flat_after = ((x - share @ x) @ ground.axes[:2].T for x in (before, after))
     sine = share @ (flat_before[:, 0] * flat_after[:, 1] - flat_before[:, 1] * flat_after[:, 0])
     return float(np.arctan2(sine, share @ (flat_before * flat_after).sum(axis=1)))

@@ -1,4 +1,4 @@
-"""How a jump is acted: numbers an animator knows, 1 being what egs_warp does by itself (docs/motions/style.md)."""
+"""Style of a jump: factors that animators use; 1 is the default of egs_warp (docs/motions/style.md)."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from egs_warp.errors import ArgumentError
 from egs_warp.motions.values import Value
 
 LEAST, MOST = 0.5, 2.0
-"""Of each number: beyond, the stroke of a jump is none that a body could make."""
+"""Smallest and largest factor; beyond, no body could make the stroke of the jump."""
 
 
 @dataclass(frozen=True)
 class Style:
-    """Factors."""
+    """Factors of a jump, relative to the default."""
 
     anticipation: float = 1.0
-    """Of depth and time of a crouch."""
+    """Depth and duration of the crouch."""
     squash: float = 1.0
-    """Of the time in which a landing is stopped, and so of how far it gives way."""
+    """Time in which a landing is stopped, and thereby its compression."""
     timing: float = 1.0
-    """Of the time of crouch and thrust: below 1 they are quick and hard."""
+    """Duration of crouch and thrust: below 1 they are quick and hard."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -29,7 +29,7 @@ class Style:
                 raise ArgumentError(name, f"give a number from {LEAST:g} to {MOST:g}", value=value)
 
     def __str__(self) -> str:
-        """As ``read_style`` reads it: a preset's name, or all numbers."""
+        """Return the text that ``read_style`` reads: a preset's name, or all numbers."""
         values = vars(self)
         same = [name for name, preset in PRESETS.items() if preset == values]
         return same[0] if same else " ".join(f"{name}={value!r}" for name, value in values.items())
@@ -44,14 +44,15 @@ _NAMES = tuple(field.name for field in fields(Style))
 
 
 def read_style(text: str) -> Style:
-    """Of a line such as ``heavy`` or ``anticipation=1.3 squash=1.2``; numbers go before those of the preset.
+    """Parse a style such as ``heavy`` or ``anticipation=1.3 squash=1.2``; numbers override those of the preset.
 
-    Raises ``UserError`` for the first mistake.
+    Raises:
+        UserError: for the first mistake.
     """
     values: dict[str, float] = {}
     words = text.replace(",", " ").split()
     if not words:
-        raise ArgumentError("style", f"nothing is given; give {_usage()}")
+        raise ArgumentError("style", f"the text is empty; give {_usage()}")
     for number, word in enumerate(words):
         name, equals, value = word.partition("=")
         if not equals and number == 0 and name in PRESETS:
@@ -64,4 +65,4 @@ def read_style(text: str) -> Style:
 
 
 def _usage() -> str:
-    return f"one of {', '.join(PRESETS)}, or numbers as anticipation=1.3, of {', '.join(_NAMES)}"
+    return f"one of {', '.join(PRESETS)}, or numbers such as anticipation=1.3, of {', '.join(_NAMES)}"

@@ -1,4 +1,4 @@
-"""Turn by an asked angle in as few twists as friction allows (docs/concepts/motions.md)."""
+"""Turn by a given angle in as few jumps as friction allows (docs/concepts/motions.md)."""
 
 from __future__ import annotations
 
@@ -13,122 +13,132 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpPlan, JumpTarget
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.twist import AIRBORNE_SHARE, twist
+from egs_warp.motions.twist import AIRBORNE_FRACTION, twist
 
-TOLERANCE = np.radians(8.0)
-"""A body that has landed this near to its angle stays."""
-MOST_JUMPS = 5
-USUAL_JUMPS = 4.0 / 3.0
-"""Expected for what one should do: so often is a landing further off than ``TOLERANCE``, which takes another."""
-PYRAMID = 0.79
-"""Mean over all directions of what a friction pyramid of four edges gives of Coulomb's cone."""
-RESERVE = 0.8
-"""Part of what friction could do at most that one jump is asked for."""
+HEADING_TOLERANCE = np.radians(8.0)
+"""Largest heading error in radians of a landing after which no further jump follows."""
+MAX_JUMPS = 5
+EXPECTED_JUMPS = 4.0 / 3.0
+"""Expected number of jumps for a turn that one jump should complete: a third of the landings miss by more than
+``HEADING_TOLERANCE``, which takes another jump."""
+PYRAMID_FRICTION_RATIO = 0.79
+"""Tangential force of a friction pyramid with four edges relative to Coulomb's cone, mean over all directions."""
+MAX_TURN_FRACTION = 0.8
+"""Fraction of the largest possible turn that one jump requests."""
 
 
 @dataclass(frozen=True)
 class TurnPlan(JumpPlan):
-    """The plan of the first jump of a turn, and how many there were."""
+    """Plan of the first jump of a turn, and the number of jumps so far."""
 
     jumps: float
 
 
 class Turn:
-    """Twists by ``turn`` radians in all that end ``target.distance`` ahead; what one leaves, the next ones make up."""
+    """Turn by ``turn`` radians in jumps that end ``target.distance`` ahead; each jump corrects the error of the
+    previous ones."""
 
-    def __init__(self, place: Stance, target: JumpTarget, turn: float) -> None:
-        self._place, self._height = place, target.height
-        self._goal = place.ground.origin + target.distance * place.ground.axes[0]
-        self._left = turn
-        self._missing: float | None = None
-        """Radians that the present jump, once it is in the air, leaves of the turn."""
-        first = twist(place, target, turn)
-        self.most_in_a_jump = RESERVE * largest_turn(first, place)
-        self._one_jump = abs(turn) <= self.most_in_a_jump
-        self.jumps = [first if self._one_jump else twist(place, target, self._share())]
+    def __init__(self, stance: Stance, target: JumpTarget, turn: float) -> None:
+        self._stance, self._height = stance, target.height
+        self._goal = stance.ground.origin + target.distance * stance.ground.axes[0]
+        self._remaining_turn = turn
+        self._remaining_after_jump: float | None = None
+        """Predicted or measured remaining turn after the current jump, in radians; None before it is in the air."""
+        first = twist(stance, target, turn)
+        self.max_turn_per_jump = MAX_TURN_FRACTION * largest_turn(first, stance)
+        self._one_jump = abs(turn) <= self.max_turn_per_jump
+        self.jumps = [first if self._one_jump else twist(stance, target, self._next_turn())]
 
     @property
     def expected_time(self) -> float:
-        """Seconds, of the jumps so far and of those that what is left of the turn takes."""
-        before, at_once = len(self.jumps) - 1, self.most_in_a_jump
-        if self._missing is None:
-            # What makes up for a landing is a small turn, and hits.
-            count = before + (1.0 if before else USUAL_JUMPS) * max(abs(self._left) / at_once, 1.0)
+        """Expected duration in seconds of the jumps so far and those for the remaining turn."""
+        before, at_once = len(self.jumps) - 1, self.max_turn_per_jump
+        if self._remaining_after_jump is None:
+            # The correction of a landing is a small turn, which succeeds.
+            count = before + (1.0 if before else EXPECTED_JUMPS) * max(abs(self._remaining_turn) / at_once, 1.0)
         else:
-            further = np.ceil(abs(self._missing) / at_once)
-            count = before + 1 + further * self._chance_of_another(abs(self._missing))
-        return float(min(count, MOST_JUMPS)) * self.jumps[0].expected_time
+            further = np.ceil(abs(self._remaining_after_jump) / at_once)
+            count = before + 1 + further * self._chance_of_another(abs(self._remaining_after_jump))
+        return float(min(count, MAX_JUMPS)) * self.jumps[0].expected_time
 
     def _chance_of_another(self, missing: float) -> float:
-        """Chance of another jump, by what is ``missing``; in the air, where it will land is not certain."""
+        """Return the probability of another jump after a remaining turn of ``missing`` radians; in the air, the landing
+        is uncertain."""
         if self.jumps[-1].phase is JumpPhase.FLIGHT:
-            return min(missing / (2.0 * TOLERANCE), 1.0)
-        return float(missing > TOLERANCE)
+            return min(missing / (2.0 * HEADING_TOLERANCE), 1.0)
+        return float(missing > HEADING_TOLERANCE)
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether the present jump is at rest."""
-        return self.jumps[-1].resting
+        """True if the current jump is at rest."""
+        return self.jumps[-1].is_at_rest
 
     def plan_record(self) -> TurnPlan:
-        """What the first jump aims at, and how many there were."""
+        """Return the plan of the first jump and the number of jumps."""
         return TurnPlan(**asdict(self.jumps[0].plan), jumps=float(len(self.jumps)))
 
     def planned_com(self, elapsed: float) -> np.ndarray:
-        """That of the first jump; what the next ones make up is not known before."""
+        """Return the planned displacement of the first jump; later jumps depend on its error."""
         return self.jumps[0].planned_com(elapsed)
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> None:
-        """Nothing beside what is measured of all motions."""
+        """Return None: a jump has no quantities of its own beyond those measured for all motions."""
 
     def notes(self) -> list[str]:
-        """What kept the turn from its target, for the user."""
+        """Return messages for the user about missed targets and the number of jumps."""
         notes = [note for jump in self.jumps for note in jump.notes()]
         if not self._one_jump:
-            notes.append(f"friction gives a turn of {np.degrees(self.most_in_a_jump):.0f} degrees a jump")
+            notes.append(f"friction allows a turn of {np.degrees(self.max_turn_per_jump):.0f} degrees a jump")
         if len(self.jumps) > 1:
             notes.append(f"turned in {len(self.jumps)} jumps")
         return notes
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
+        step."""
         result = self.jumps[-1].objectives(state, report, dt)
         jump = self.jumps[-1]
-        self._missing = self._left - jump.facing.predicted_heading if jump.phase is JumpPhase.FLIGHT else None
+        self._remaining_after_jump = (
+            self._remaining_turn - jump.facing.predicted_heading if jump.phase is JumpPhase.FLIGHT else None
+        )
         if jump.phase in (JumpPhase.LAND, JumpPhase.REST):
-            # The frame of a landed jump is turned by what was asked of it, so its feet tell what it fell short by.
-            self._missing = self._left - jump.facing.target_heading - jump.pose.sole_heading(state.positions)
-            if jump.resting and len(self.jumps) < MOST_JUMPS and abs(self._missing) > TOLERANCE:
-                self._left, self._missing = self._missing, None
-                self.jumps.append(self._again(state))
+            # The frame of a landed jump is rotated by the requested turn, so the heading of its feet in it is the
+            # error.
+            self._remaining_after_jump = (
+                self._remaining_turn - jump.facing.target_heading - jump.controller.sole_heading(state.positions)
+            )
+            if jump.is_at_rest and len(self.jumps) < MAX_JUMPS and abs(self._remaining_after_jump) > HEADING_TOLERANCE:
+                self._remaining_turn, self._remaining_after_jump = self._remaining_after_jump, None
+                self.jumps.append(self._next_jump(state))
                 result = self.jumps[-1].objectives(state, report, dt)
         return result
 
-    def _share(self) -> float:
-        """One of the equal jumps that what is left takes, radians."""
-        return self._left / float(np.ceil(abs(self._left) / self.most_in_a_jump))
+    def _next_turn(self) -> float:
+        """Return the turn in radians of one of the equal jumps that the remaining turn takes."""
+        return self._remaining_turn / float(np.ceil(abs(self._remaining_turn) / self.max_turn_per_jump))
 
-    def _again(self, state: BodyState) -> Jump:
-        place = self._place.moved_to(state.positions)
-        way = self._goal - place.ground.origin
-        distance = float(np.linalg.norm(place.ground.axes[:2] @ way))
-        if distance > 0.02 * place.body.height:
-            place = place.with_forward(way)
+    def _next_jump(self, state: BodyState) -> Jump:
+        stance = self._stance.moved_to(state.positions)
+        offset = self._goal - stance.ground.origin
+        distance = float(np.linalg.norm(stance.ground.axes[:2] @ offset))
+        if distance > 0.02 * stance.body.height:
+            stance = stance.with_forward(offset)
         else:
             distance = 0.0
-        return twist(place, JumpTarget(distance, self._height), self._share())
+        return twist(stance, JumpTarget(distance, self._height), self._next_turn())
 
 
-def largest_turn(jump: Jump, place: Stance) -> float:
-    """Radians that friction under the feet could turn the body by in one jump as planned (docs/concepts/motions.md).
+def largest_turn(jump: Jump, stance: Stance) -> float:
+    """Return the largest turn in radians that friction under the feet allows in one jump as planned
+    (docs/concepts/motions.md).
 
-    Its impulse is mu r_eff times that of the normal forces, m (v_z + g t), r_eff the mean distance of the feet from
-    their middle.
+    The friction impulse about up is mu r_eff times the impulse of the normal forces, m (v_z + g t); r_eff is the mean
+    distance of the contact points from their middle.
     """
-    plan, body, up = jump.plan, place.body, place.ground.axes[2]
-    arms = (place.contact_points - place.contact_points.mean(axis=0)) @ place.ground.axes[:2].T
+    plan, body, up = jump.plan, stance.body, stance.ground.axes[2]
+    arms = (stance.contact_points - stance.contact_points.mean(axis=0)) @ stance.ground.axes[:2].T
     # Points are denser at the rim of a sole; over a disc the mean distance is 2/3 of the radius.
     lever = min(float(np.linalg.norm(arms, axis=1).mean()), 2.0 / 3.0 * float(np.linalg.norm(arms, axis=1).max()))
     impulse = body.mass * (plan.speed_up + jump.gravity * plan.thrust_time)
-    rate = PYRAMID * place.friction * lever * impulse / float(up @ body.inertia(place.standing) @ up)
-    return rate * AIRBORNE_SHARE * plan.flight_time
+    rate = PYRAMID_FRICTION_RATIO * stance.friction * lever * impulse / float(up @ body.inertia(stance.standing) @ up)
+    return rate * AIRBORNE_FRACTION * plan.flight_time

@@ -13,60 +13,73 @@ from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import BalanceController, Measurement
 
-AIRBORNE_SHARE = 0.88
-"""Of the planned time of flight the body is off the ground: it stretches before it leaves it and before it lands."""
-SPARE_SPIN = 1.15
-"""Spin is built with this factor in hand: the muscles fall short of what is asked, and wide in the air the body is
-slowed."""
-SLIDE = np.radians(5.0)
-"""By this angle the feet slide on while friction stops the spin on landing."""
-WIDEST = 1.15
-"""How much wider or narrower than standing the body makes itself in the air."""
+AIRBORNE_FRACTION = 0.88
+"""Fraction of the planned flight time in which the body is off the ground: it stretches before take-off and before
+landing."""
+SPIN_FACTOR = 1.15
+"""Factor on the spin of the thrust: muscles fall short of the objective, and the wide body in the air turns more
+slowly."""
+LANDING_SLIDE_ANGLE = np.radians(5.0)
+"""Angle in radians by which the feet slide on while friction stops the spin on landing."""
+MAX_WIDTH = 1.15
+"""Largest width of the body in the air relative to standing; 1 / ``MAX_WIDTH`` is the smallest."""
 
 
-def twist(place: Stance, target: JumpTarget, turn: float) -> Jump:
-    """A jump that lands facing ``turn`` radians, counter-clockwise from above, from where it faced at the start."""
-    return Jump(place, place.landing(target), facing=TurnHeading(place, turn))
+def twist(stance: Stance, target: JumpTarget, turn: float) -> Jump:
+    """Return a jump that lands with its heading changed by ``turn`` radians, counterclockwise as seen from above."""
+    return Jump(stance, stance.landing(target), facing=TurnHeading(stance, turn))
 
 
 class TurnHeading:
-    """The ``Facing`` of a jump that turns."""
+    """Heading policy of a jump that turns."""
 
-    def __init__(self, place: Stance, turn: float) -> None:
-        self.body, self.target_heading, self.heading, self.predicted_heading = place.body, turn, 0.0, 0.0
-        self._standing_inertia = place.body.inertia(place.standing)
+    def __init__(self, stance: Stance, turn: float) -> None:
+        self.body, self.target_heading, self.heading, self.predicted_heading = stance.body, turn, 0.0, 0.0
+        self._standing_inertia = stance.body.inertia(stance.standing)
 
     def update(self, heading: float) -> None:
-        """Follows the turn from step to step, so that whole turns count."""
+        """Update the heading without wrapping, so that full turns count."""
         self.heading += float(np.remainder(heading - self.heading + np.pi, 2.0 * np.pi) - np.pi)
 
     def thrust_momentum(
-        self, pose: BalanceController, seen: Measurement, upright: np.ndarray, *, left: float, flight_time: float
+        self,
+        controller: BalanceController,
+        measurement: Measurement,
+        upright: np.ndarray,
+        *,
+        left: float,
+        flight_time: float,
     ) -> np.ndarray:
-        """(3,) kg m^2/s with which the body, once in the air, turns upright and by what is left.
+        """Return the angular momentum (3,) in kg m^2/s with which the body in the air turns upright and by the
+        remaining heading change.
 
-        It flies in about the shape in which it stands, so its inertia then, not the one now, says how.
+        The body flies in about its standing shape, so the standing inertia applies, not that of the crouch.
         """
-        up, rotation = pose.ground.axes[2], seen.rotation
+        up, rotation = controller.ground.axes[2], measurement.rotation
         inertia = rotation @ self._standing_inertia @ rotation.T
-        momentum = float(up @ seen.angular_momentum)
+        momentum = float(up @ measurement.angular_momentum)
         spinning = momentum / float(up @ inertia @ up)
-        airborne = AIRBORNE_SHARE * flight_time + 0.5 * left
-        turn = SPARE_SPIN * self._left_to_turn() - 0.5 * left * spinning
+        airborne = AIRBORNE_FRACTION * flight_time + 0.5 * left
+        turn = SPIN_FACTOR * self._remaining_turn() - 0.5 * left * spinning
         return inertia @ spin_for_rotation(inertia, upright, turn * up, airborne)
 
     def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: float) -> np.ndarray:
-        """Arms in, arms out: as wide as makes, with the spin that there is, the turn that is left."""
-        to_turn, turning = self._left_to_turn(), float(up @ momentum) * left / float(up @ self._standing_inertia @ up)
+        """Widen or narrow ``pose`` so that the present spin completes the remaining turn, as skaters do with their
+        arms."""
+        to_turn, turning = self._remaining_turn(), float(up @ momentum) * left / float(up @ self._standing_inertia @ up)
         self.predicted_heading = self.heading + turning
         ratio = turning / to_turn if turning * to_turn > 0.0 else np.inf
-        width = float(np.sqrt(np.clip(ratio, 1.0 / WIDEST**2, WIDEST**2)))
+        width = float(np.sqrt(np.clip(ratio, 1.0 / MAX_WIDTH**2, MAX_WIDTH**2)))
         return pose @ (width * np.eye(3) + (1.0 - width) * np.outer(up, up))
 
-    def landed_heading(self, pose: BalanceController, positions: np.ndarray) -> float:
-        """As the feet stand, so shall the body: what it was turned too little is not made up by standing twisted."""
-        return pose.sole_heading(positions)
+    def landed_heading(self, controller: BalanceController, positions: np.ndarray) -> float:
+        """Return the heading of the feet: a missing turn is not corrected by a twisted stance."""
+        return controller.sole_heading(positions)
 
-    def _left_to_turn(self) -> float:
-        """Radians until the feet should touch down; they slide on by some more."""
-        return self.target_heading - np.sign(self.target_heading) * min(SLIDE, abs(self.target_heading)) - self.heading
+    def _remaining_turn(self) -> float:
+        """Return the remaining turn in radians until touch-down; the feet then slide on."""
+        return (
+            self.target_heading
+            - np.sign(self.target_heading) * min(LANDING_SLIDE_ANGLE, abs(self.target_heading))
+            - self.heading
+        )

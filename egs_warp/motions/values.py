@@ -1,4 +1,4 @@
-"""Numbers that can be asked for, each within bounds of its own."""
+"""Numeric parameters of motions, with their bounds."""
 
 from __future__ import annotations
 
@@ -11,26 +11,30 @@ from egs_warp.errors import UserError
 
 @dataclass(frozen=True)
 class Value:
-    """One number that a motion takes."""
+    """Numeric parameter of a motion."""
 
     name: str
     default: float
-    least: float
-    most: float
+    minimum: float
+    maximum: float
     unit: str
     is_integer: bool = False
     is_exclusive: bool = False
-    """Whether ``least`` itself is too little."""
+    """True if ``minimum`` itself is not allowed."""
 
-    def parse(self, given: Any, where: str) -> float:
-        """``given`` as a number within the bounds. Raises ``UserError``, which begins with ``where``."""
+    def parse(self, value: Any, where: str) -> float:
+        """Return ``value`` as a number within the bounds.
+
+        Raises:
+            UserError: if it is not; the message begins with ``where``.
+        """
         try:
-            number = math.nan if isinstance(given, bool) else float(given)
+            number = math.nan if isinstance(value, bool) else float(value)
         except (TypeError, ValueError, OverflowError):
             number = math.nan
-        fits = self.least <= number <= self.most and not (self.is_exclusive and number == self.least)
+        fits = self.minimum <= number <= self.maximum and not (self.is_exclusive and number == self.minimum)
         if not fits or (self.is_integer and number != int(number)):
             kind = "a whole number" if self.is_integer else "a number"
-            span = f"above {self.least:g} up to" if self.is_exclusive else f"from {self.least:g} to"
-            raise UserError(f"{where}: {self.name} {given}: give {kind} of {self.unit} {span} {self.most:g}")
+            span = f"above {self.minimum:g} up to" if self.is_exclusive else f"from {self.minimum:g} to"
+            raise UserError(f"{where}: {self.name} {value}: give {kind} of {self.unit} {span} {self.maximum:g}")
         return number

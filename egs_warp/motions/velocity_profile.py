@@ -1,4 +1,4 @@
-"""When a body is to be where on its way: as fast as it may, gathering and losing speed evenly, slower at corners."""
+"""Velocity profile along a path: as fast as allowed, with constant acceleration and deceleration, slower at corners."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 _SAMPLES = 8
-"""Of each stretch of the way."""
+"""Samples per segment of the path."""
 
 
 @dataclass(frozen=True)
 class ProfileSample:
-    """Where it is to be, and how it goes; along the ground."""
+    """Target position, velocity and acceleration along the ground."""
 
-    place: np.ndarray
-    """(2,) metres."""
+    position: np.ndarray
+    """(2,) m."""
     velocity: np.ndarray
     """(2,) m/s."""
     acceleration: np.ndarray
@@ -24,32 +24,40 @@ class ProfileSample:
 
 @dataclass(frozen=True)
 class VelocityProfile:
-    """A way of n points in time; from rest to rest, standing still before and after."""
+    """Velocity profile over n points, from rest to rest; constant before and after."""
 
     points: np.ndarray
-    """(n, 2) metres."""
+    """(n, 2) m."""
     speeds: np.ndarray
-    """(n,) m/s at the points; between two of them speed changes evenly."""
+    """(n,) m/s, speeds at the points; acceleration is constant between two points."""
     times: np.ndarray
-    """(n,) seconds at the points."""
+    """(n,) s, times at the points."""
 
     @classmethod
-    def of(cls, way: np.ndarray, *, speed: float, acceleration: float) -> VelocityProfile:
-        """Along the points ``way`` (k, 2), metres, at no more than ``speed`` m/s, gathered and lost by ``push`` m/s^2;
-        past a corner only as fast as it goes on the same way, beyond a right angle from rest."""
-        steps = np.diff(way, axis=0)
-        kept = np.flatnonzero(np.linalg.norm(steps, axis=1) > 1e-12)
-        if not len(kept):
-            return cls(way[:1], np.zeros(1), np.zeros(1))
-        corners = np.concatenate([way[kept], way[kept[-1] + 1 : kept[-1] + 2]])
+    def from_path(cls, path: np.ndarray, *, speed: float, acceleration: float) -> VelocityProfile:
+        """Compute the profile along a path.
+
+        Past a corner, the speed is at most ``speed`` times the cosine of the change of direction; at a right angle or
+        more, the body stops.
+
+        Args:
+            path: (k, 2) m, points of the path.
+            speed: largest speed, m/s.
+            acceleration: acceleration and deceleration, m/s^2.
+        """
+        steps = np.diff(path, axis=0)
+        moving = np.flatnonzero(np.linalg.norm(steps, axis=1) > 1e-12)
+        if not len(moving):
+            return cls(path[:1], np.zeros(1), np.zeros(1))
+        corners = np.concatenate([path[moving], path[moving[-1] + 1 : moving[-1] + 2]])
         steps = np.diff(corners, axis=0)
         lengths = np.linalg.norm(steps, axis=1)
-        ways = steps / lengths[:, None]
+        directions = steps / lengths[:, None]
         parts = np.arange(_SAMPLES) / _SAMPLES
         points = np.concatenate([(corners[:-1, None] + parts[:, None] * steps[:, None]).reshape(-1, 2), corners[-1:]])
         gaps = np.repeat(lengths / _SAMPLES, _SAMPLES)
         squares = np.full(len(points), speed**2)
-        squares[_SAMPLES:-1:_SAMPLES] *= np.maximum((ways[1:] * ways[:-1]).sum(axis=1), 0.0) ** 2
+        squares[_SAMPLES:-1:_SAMPLES] *= np.maximum((directions[1:] * directions[:-1]).sum(axis=1), 0.0) ** 2
         squares[0] = squares[-1] = 0.0
         for k, gap in enumerate(gaps):
             squares[k + 1] = min(squares[k + 1], squares[k] + 2.0 * acceleration * gap)
@@ -61,21 +69,21 @@ class VelocityProfile:
 
     @property
     def seconds(self) -> float:
-        """In all."""
+        """Total duration, s."""
         return float(self.times[-1])
 
     @property
     def length(self) -> float:
-        """Metres."""
+        """Length of the path, m."""
         return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
     @property
     def top_speed(self) -> float:
-        """m/s."""
+        """Largest speed, m/s."""
         return float(self.speeds.max())
 
     def at(self, elapsed: float) -> ProfileSample:
-        """``elapsed`` seconds after the start."""
+        """Return the sample ``elapsed`` seconds after the start."""
         if elapsed <= 0.0 or elapsed >= self.seconds:
             still = np.zeros(2)
             return ProfileSample(self.points[0 if elapsed <= 0.0 else -1], still, still)
@@ -84,5 +92,5 @@ class VelocityProfile:
         ahead = step / np.linalg.norm(step)
         past, span = elapsed - self.times[k], self.times[k + 1] - self.times[k]
         push = (self.speeds[k + 1] - self.speeds[k]) / span
-        gone = self.speeds[k] * past + 0.5 * push * past**2
-        return ProfileSample(self.points[k] + gone * ahead, (self.speeds[k] + push * past) * ahead, push * ahead)
+        distance = self.speeds[k] * past + 0.5 * push * past**2
+        return ProfileSample(self.points[k] + distance * ahead, (self.speeds[k] + push * past) * ahead, push * ahead)

@@ -1,4 +1,4 @@
-"""Walk: groups of feet swing and stand in turn, and the body is balanced over them as an inverted pendulum.
+"""Walk: groups of feet swing and stand in turn, and the body balances over them as a linear inverted pendulum.
 
 See docs/concepts/motions.md.
 """
@@ -41,104 +41,115 @@ from egs_warp.motions.walk_posture import select_posture
 MIN_FOOT_LOAD = 0.01
 """Share of the weight that a foot must carry to count as landed."""
 MAX_LAG = 0.5
-"""Of a pace: so far behind, it is made again."""
+"""Mean lag of the feet, in steps, beyond which a step is repeated."""
 MIN_STEP_LENGTH = 0.002
-"""Body heights: a shorter pace is none."""
-_SHIFT, _GATHER, _REST = 1.5, 3.0, 1.0
-"""Of sqrt(H / g): how long the first and the last phase take, and how long the body stands then."""
-_PLAN_STEP, _PLANNED = 1.0 / 12.0, 8
-"""Of sqrt(H / g), and phases: the steps of a plan, and how far it looks ahead."""
+"""Smallest step length in body heights."""
+_SHIFT_TIME, _GATHER_TIME, _REST_TIME = 1.5, 3.0, 1.0
+"""Durations of the first and the last phase, and of standing afterwards, in sqrt(H / g)."""
+_PLAN_STEP, _PLANNED_PHASES = 1.0 / 12.0, 8
+"""Time step of a plan in sqrt(H / g), and number of phases that it covers."""
 
 
 class Walk:
-    """Shifts its weight, swings and stands until the last swing has closed the feet, and gathers itself."""
+    """Walk: shift the weight, swing and stand until the last swing has closed the feet, and return to the standing
+    pose."""
 
     def __init__(
         self,
-        place: Stance,
+        stance: Stance,
         route: Route,
-        pace_length: float,
+        step_length: float,
         *,
         speed: float = 1.0,
         control: WalkControl | None = None,
     ) -> None:
-        """``pace_length`` in metres, shortened to what the body can do; ``speed`` over the usual. Raises ``UserError``
-        for a body without a foot, and where something stands in the way."""
-        body = place.body
-        feet, carriage = select_posture(place)
+        """Plan the walk of the body that stands at ``stance``.
+
+        Args:
+            stance: stance at the start.
+            route: route to follow.
+            step_length: step length in metres; it is shortened to what the body can do.
+            speed: relative to the nominal speed.
+            control: weights and gains.
+
+        Raises:
+            UserError: for a body without a foot, and for a route over a step of the ground.
+        """
+        body = stance.body
+        feet, posture = select_posture(stance)
         if not feet:
             raise UserError("walk: the body has no feet, and no flat base of which it could lift a side")
-        self.body, self.ground = body, place.ground
+        self.body, self.ground = body, stance.ground
         self.control = control or WalkControl()
-        normal = place.ground.axes @ place.ground.surface_normal
+        normal = stance.ground.axes @ stance.ground.surface_normal
         self._slope = -normal[:2] / normal[2]
-        """Metres that the ground rises for each metre forward and to the left."""
-        standing = self.ground.local(place.standing)
+        """(2,) slope of the ground: metres of rise per metre forward and to the left."""
+        standing = self.ground.local(stance.standing)
         feet = tuple(
             feet[k] for k in order_counterclockwise(np.array([standing[foot.sole, :2].mean(axis=0) for foot in feet]))
         )
         self.feet = feet
-        self._carriage = carriage(place, feet)
-        self._footing = FootholdPlanner(place, feet)
+        self._posture = posture(stance, feet)
+        self._planner = FootholdPlanner(stance, feet)
         self._start_com = body.centre_of_mass(standing)
         self.gravity = float(np.linalg.norm(body.gravity))
         self._time_unit = float(np.sqrt(body.height / self.gravity))
-        self._asked_length = pace_length
-        pace = StepLimits(min(pace_length, self._carriage.step_limits.length), self._carriage.step_limits.turn)
-        if pace.length < MIN_STEP_LENGTH * body.height:
+        self._requested_length = step_length
+        limits = StepLimits(min(step_length, self._posture.step_limits.length), self._posture.step_limits.turn)
+        if limits.length < MIN_STEP_LENGTH * body.height:
             raise UserError(
-                f"walk: friction {place.friction:g} cannot turn the body about a side of its base; jump or hop"
+                f"walk: friction {stance.friction:g} cannot turn the body about a side of its base; jump or hop"
             )
-        self.places = route(pace)
-        """(P+1, 3) the body before the first and after each pace: see ``motions.route``."""
-        check_route(place, self.places)
-        paces, lift, tempo = len(self.places) - 1, self._carriage.lift, self._carriage.timing
-        self.gait = Gait.of(len(feet), paces, lift, tempo, time_unit=self._time_unit / speed)
-        self._pace = pace
+        self.planar_poses = route(limits)
+        """(P+1, 3) planar poses of the body before the first and after each step, see ``motions.route``."""
+        check_route(stance, self.planar_poses)
+        step_count, lift, timing = len(self.planar_poses) - 1, self._posture.lift, self._posture.timing
+        self.gait = Gait.create(len(feet), step_count, lift, timing, time_unit=self._time_unit / speed)
+        self._step_limits = limits
         self._parts = [BodyPart.of(body, f"foot {index}", foot.sole) for index, foot in enumerate(feet)]
         self._near_points = [np.flatnonzero(foot_of_node(feet) == index) for index in range(len(feet))]
-        """Nodes that go with each foot."""
+        """Nodes that belong to each foot."""
         self._rate = float(np.sqrt(self.gravity / self._start_com[2]))
         self.phase = WalkPhase.SHIFT
         self.swing = -1
         self._entered: float | None = None
-        self._footprints = self._footing.start
-        """(F, 4) where each foot stands, or was lifted from: see ``motions.walk_posture``."""
+        self._footprints = self._planner.start
+        """(F, 4) foothold of each foot, the previous one while it swings, see ``motions.walk_posture``."""
         self.swinging: tuple[int, ...] = ()
-        """The feet that are lifted, carried and set down."""
+        """Feet that are being lifted, moved and set down."""
         self._sidestep = np.zeros(2)
-        """Metres that the feet which swing come down off their place to catch the body."""
-        self._support: np.ndarray | None = None
-        """(2,) the centre of pressure that was asked for last."""
-        self._is_late = self._again = 0
-        self._requested_steps = paces
+        """(2,) m, offset of the swinging feet from their nominal footholds to catch the body."""
+        self._target_pressure: np.ndarray | None = None
+        """(2,) m, last target of the centre of pressure."""
+        self._late_swings = self._repeated_steps = 0
+        self._requested_steps = step_count
         self._arrived_footholds = [0] * len(feet)
-        """The pace to whose place each foot came last."""
+        """Step at whose planar pose each foot landed last."""
 
     @property
     def expected_time(self) -> float:
-        """Seconds, of swings that end in time."""
+        """Expected duration in seconds, if all swings end in time."""
         gait = self.gait
         swings = gait.swings * (gait.swing_time + gait.double_time) - gait.double_time
         return self._duration(WalkPhase.SHIFT) + swings + self._duration(WalkPhase.GATHER)
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether the body has gathered itself."""
+        """True if the body has returned to its standing pose."""
         return self.phase is WalkPhase.REST
 
     def plan_record(self) -> WalkPlan:
-        """What the walk aims at."""
-        gait, paces = self.gait, np.diff(self.places, axis=0)
-        length = float(np.linalg.norm(paces[:, :2], axis=1).max())
+        """Return the planned quantities of the walk."""
+        gait, steps = self.gait, np.diff(self.planar_poses, axis=0)
+        length = float(np.linalg.norm(steps[:, :2], axis=1).max())
         return WalkPlan(float(gait.step_count), length, gait.swing_time, gait.double_time, gait.lift, self._stride())
 
     def _stride(self) -> float:
-        """Metres: the longest way between two footprints of one foot, of what turns as well."""
+        """Return the largest distance in metres between two consecutive footprints of one foot, including turns."""
         rounds = len(self.gait.groups)
         prints = np.array(
             [
-                [self._footing.nominal_foothold(place, foot)[:2] for place in self.places]
+                [self._planner.nominal_foothold(planar_pose, foot)[:2] for planar_pose in self.planar_poses]
                 for foot in range(len(self.feet))
             ]
         )
@@ -146,26 +157,30 @@ class Walk:
         return float(np.linalg.norm(apart, axis=2).max())
 
     def planned_com(self, elapsed: float) -> None:
-        """Nothing: it goes on from the measured feet."""
+        """Return None: each step starts from the measured feet."""
 
     def notes(self) -> list[str]:
-        """What kept the walk from its target, for the user."""
-        found = []
-        if self._pace.length < self._asked_length:
-            asked, reached = self._asked_length / self.body.height, self._pace.length / self.body.height
-            found.append(f"steps of {asked:.2f} body heights were asked; the body goes by {reached:.2f} at most")
-        if self._again:
-            found.append(f"the feet slipped: {self._again} pace{'s' * (self._again > 1)} made again")
-        if self._is_late:
-            found.append(f"{self._is_late} swings took too long: a foot found no ground")
-        return found
+        """Return messages for the user about shortened, repeated and late steps."""
+        notes = []
+        if self._step_limits.length < self._requested_length:
+            requested, reached = self._requested_length / self.body.height, self._step_limits.length / self.body.height
+            notes.append(
+                f"steps of {requested:.2f} body heights were requested; "
+                f"the body can make steps of {reached:.2f} at most"
+            )
+        if self._repeated_steps:
+            notes.append(f"the feet slipped: {self._repeated_steps} step{'s' * (self._repeated_steps > 1)} repeated")
+        if self._late_swings:
+            notes.append(f"{self._late_swings} swings took too long: a foot found no ground")
+        return notes
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> Footfalls:
-        """What the feet did between two states of a trajectory."""
+        """Measure the footfalls between two states of a trajectory."""
         return footfalls(trajectory, self.feet, stride=self._stride(), first=first, last=last)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
+        step."""
         body, axes, control = self.body, self.ground.axes, self.control
         local = self.ground.local(state.positions)
         self._advance_phase(local, report, state.time)
@@ -174,16 +189,23 @@ class Walk:
         com = body.centre_of_mass(local)
         com_velocity = self._com_velocity(local, axes @ body.centre_of_mass(state.velocities), elapsed, dt)
         before, after = self._foot_targets(elapsed - dt), self._foot_targets(elapsed)
-        pose = self._carriage.pose(com, self._heading(elapsed - dt), before)
-        next_pose = self._carriage.pose(com + dt * com_velocity, self._heading(elapsed), after)
-        spin = control.turn_rate / self._time_unit * self._turn(local, pose) + self._turn(pose, next_pose) / dt
+        pose = self._posture.pose(com, self._heading(elapsed - dt), before)
+        next_pose = self._posture.pose(com + dt * com_velocity, self._heading(elapsed), after)
+        spin = (
+            control.turn_rate / self._time_unit * self._best_fit_rotation(local, pose)
+            + self._best_fit_rotation(pose, next_pose) / dt
+        )
         follow = min(control.follow / self._time_unit, 0.7 / dt)
         return [
-            centre_of_mass_velocity(body, com_velocity @ axes, self._carriage.com_weight),
+            centre_of_mass_velocity(body, com_velocity @ axes, self._posture.com_weight),
             AngularMomentumObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
             node_velocities(body, follow * (next_pose - local) @ axes, control.pose),
             *(self._foot_objective(index, local, before, after, elapsed, dt) for index in self.swinging),
-            *(self._unload_objectives(index, elapsed) for index in self.swinging if elapsed < self.gait.carried_until),
+            *(
+                self._unload_objectives(index, elapsed)
+                for index in self.swinging
+                if elapsed < self.gait.transfer_end_time
+            ),
             *([self._no_slip_objectives(report, elapsed)] if report is not None else []),
         ]
 
@@ -192,14 +214,14 @@ class Walk:
             self._enter(WalkPhase.SHIFT, time, local)
         assert self._entered is not None
         elapsed, gait = time - self._entered + 1e-9, self.gait
-        if self.swinging and elapsed >= gait.carried_until:
+        if self.swinging and elapsed >= gait.transfer_end_time:
             loads = foot_loads(self.feet, report, self.body.weight)
             for index in self.swinging:
-                if loads[index] > MIN_FOOT_LOAD or (elapsed >= gait.swing_time and self._footing.is_down(index, local)):
+                if loads[index] > MIN_FOOT_LOAD or (elapsed >= gait.swing_time and self._planner.is_down(index, local)):
                     self._has_landed(index, local)
         if self.phase is WalkPhase.SWING and elapsed >= gait.swing_time:
             if not self.swinging or elapsed >= 2.0 * gait.swing_time:
-                self._is_late += bool(self.swinging)
+                self._late_swings += bool(self.swinging)
                 for index in self.swinging:
                     self._has_landed(index, local)
                 self._enter(self._after_swing(self.swing), time, local)
@@ -212,60 +234,66 @@ class Walk:
             self._enter(WalkPhase.REST, time, local)
 
     def _plan_swing(self, swing: int, local: np.ndarray) -> None:
-        """``swing`` is to begin with the nodes at ``local`` (N, 3); a pace that slipping feet have lost is made again.
-        What is driven (``motions.drive``) chooses now where it goes."""
-        if self._again < self._requested_steps and self._mean_lag(local) > MAX_LAG and swing < self.gait.step_count:
-            self.places = np.insert(self.places, swing + 1, self.places[swing], axis=0)
+        """Plan ``swing``, which starts with the nodes at ``local`` (N, 3): repeat a step that slipping feet have lost.
+        A walk under commands (``motions.drive``) extends its route here."""
+        if (
+            self._repeated_steps < self._requested_steps
+            and self._mean_lag(local) > MAX_LAG
+            and swing < self.gait.step_count
+        ):
+            self.planar_poses = np.insert(self.planar_poses, swing + 1, self.planar_poses[swing], axis=0)
             self.gait = replace(self.gait, step_count=self.gait.step_count + 1)
-            self._again += 1
+            self._repeated_steps += 1
 
     def _mean_lag(self, local: np.ndarray) -> float:
-        """Paces by which the feet are short of where they came to, in the mean."""
-        ahead = self._nominal_footholds([pace + 1 for pace in self._arrived_footholds]) - self._nominal_footholds(
+        """Return the mean lag of the feet behind their nominal footholds, in steps."""
+        ahead = self._nominal_footholds([step + 1 for step in self._arrived_footholds]) - self._nominal_footholds(
             self._arrived_footholds
         )
         return float((self._foothold_error(local) * ahead).sum() / max((ahead**2).sum(), 1e-12))
 
     def _foothold_error(self, local: np.ndarray) -> np.ndarray:
-        """(F, 2) metres from where each foot is to where it came to."""
+        """Return the error (F, 2) in metres, nominal minus measured position, of each foot."""
         return self._nominal_footholds(self._arrived_footholds) - np.array(
             [local[foot.sole, :2].mean(axis=0) for foot in self.feet]
         )
 
-    def _nominal_footholds(self, paces: Sequence[int]) -> np.ndarray:
-        """(F, 2) where each foot belongs after so many paces."""
-        places = [self.places[min(pace, self.gait.step_count)] for pace in paces]
-        return np.array([self._footing.nominal_foothold(place, foot)[:2] for foot, place in enumerate(places)])
+    def _nominal_footholds(self, steps: Sequence[int]) -> np.ndarray:
+        """Return the nominal position (F, 2) of each foot after its number of steps, ``steps``."""
+        planar_poses = [self.planar_poses[min(step, self.gait.step_count)] for step in steps]
+        return np.array(
+            [self._planner.nominal_foothold(planar_pose, foot)[:2] for foot, planar_pose in enumerate(planar_poses)]
+        )
 
     def _enter(self, phase: WalkPhase, time: float, local: np.ndarray) -> None:
         self.phase, self._entered = phase, time
         for foot in set(range(len(self.feet))) - set(self.swinging):
-            # Where it stands now: it may have slid.
-            self._footprints[foot] = self._footing.landed_foothold(foot, local, float(self._footprints[foot, 3]))
+            # The foot may have slid; this is where it stands now.
+            self._footprints[foot] = self._planner.landed_foothold(foot, local, float(self._footprints[foot, 3]))
         self._plan = self._planned_pendulum()
 
     def _after_swing(self, swing: int) -> WalkPhase:
         return WalkPhase.GATHER if swing == self.gait.swings - 1 else WalkPhase.STAND
 
     def _duration(self, phase: WalkPhase) -> float:
-        """Seconds."""
+        """Return the duration of a phase in seconds."""
         return {
-            WalkPhase.SHIFT: _SHIFT * self._time_unit,
+            WalkPhase.SHIFT: _SHIFT_TIME * self._time_unit,
             WalkPhase.SWING: self.gait.swing_time,
             WalkPhase.STAND: self.gait.double_time,
-            WalkPhase.GATHER: (_GATHER + _REST) * self._time_unit,
-            WalkPhase.REST: _REST * self._time_unit,
+            WalkPhase.GATHER: (_GATHER_TIME + _REST_TIME) * self._time_unit,
+            WalkPhase.REST: _REST_TIME * self._time_unit,
         }[phase]
 
     def _has_landed(self, index: int, local: np.ndarray) -> None:
-        """Foot ``index`` has landed where it is."""
+        """Record that foot ``index`` has landed where it is."""
         self.swinging = tuple(foot for foot in self.swinging if foot != index)
         self._arrived_footholds[index] = self.gait.target_step(self.swing)
-        planned = float(self.places[self._arrived_footholds[index]][2])
-        self._footprints[index] = self._footing.landed_foothold(index, local, planned)
+        planned = float(self.planar_poses[self._arrived_footholds[index]][2])
+        self._footprints[index] = self._planner.landed_foothold(index, local, planned)
 
     def _progress(self, phase: WalkPhase, swing: int, elapsed: float) -> float:
-        """Paces that the body should have done ``elapsed`` seconds into a phase."""
+        """Return the steps that the body should have completed ``elapsed`` seconds into a phase."""
         if phase is WalkPhase.SHIFT:
             return 0.0
         if phase in (WalkPhase.GATHER, WalkPhase.REST):
@@ -275,77 +303,80 @@ class Walk:
         return self.gait.progress(swing, elapsed)
 
     def _place_at(self, progress: float) -> np.ndarray:
-        """(3,) the body's place after so many paces."""
+        """Return the planar pose (3,) of the body after ``progress`` steps."""
         count = self.gait.step_count
         progress = min(max(progress, 0.0), float(count))
         k = min(int(progress), count - 1)
-        return self.places[k] + (progress - k) * (self.places[k + 1] - self.places[k])
+        return self.planar_poses[k] + (progress - k) * (self.planar_poses[k + 1] - self.planar_poses[k])
 
     def _heading(self, elapsed: float) -> float:
         return float(self._place_at(self._progress(self.phase, self.swing, elapsed))[2])
 
     def _planned_pendulum(self) -> PendulumPlan:
-        """From the start of this phase on: the centre of pressure as near as the feet let it to where the centre of
-        mass should be, and from the one swing to the next by the way."""
+        """Plan the pendulum from the start of this phase. During swings, the centre of pressure is as near to the
+        planned centre of mass as the feet allow; in between, it is interpolated."""
         step = _PLAN_STEP * self._time_unit
         phases = list(self._pressures(step))
         pieces = []
         for number, (phase, pressure) in enumerate(phases):
             if phase is not WalkPhase.SWING:
-                ways = (np.arange(len(pressure)) + 0.5) / len(pressure)
-                start = phases[number - 1][1][-1] if number else self._support
+                fractions = (np.arange(len(pressure)) + 0.5) / len(pressure)
+                start = phases[number - 1][1][-1] if number else self._target_pressure
                 if start is None or phase is WalkPhase.SHIFT:
                     start = pressure[0]
                 end = phases[number + 1][1][0] if number + 1 < len(phases) else pressure[-1]
                 if phase is WalkPhase.SHIFT:
-                    ways = np.array([smooth(way) for way in ways])
+                    fractions = np.array([smooth(fraction) for fraction in fractions])
                 elif phase is WalkPhase.GATHER:
-                    ways = np.array([smooth(way * (_GATHER + _REST)) for way in ways])
-                pressure = start + ways[:, None] * (end - start)
+                    fractions = np.array([smooth(fraction * (_GATHER_TIME + _REST_TIME)) for fraction in fractions])
+                pressure = start + fractions[:, None] * (end - start)
             pieces.append(pressure)
-        return PendulumPlan.over(np.concatenate(pieces), step, self._rate)
+        return PendulumPlan.from_pressure(np.concatenate(pieces), step, self._rate)
 
     def _pressures(self, step: float) -> Iterator[tuple[WalkPhase, np.ndarray]]:
-        """This phase and those to come, each with the centre of pressure (n, 2) every ``step`` seconds that would keep
-        the centre of mass on its way."""
+        """Yield the current and future phases, each with the centre of pressure (n, 2) every ``step`` seconds that is
+        nearest to the planned centre of mass."""
         footprints, phase, swing = self._footprints.copy(), self.phase, self.swing
-        for _ in range(_PLANNED):
+        for _ in range(_PLANNED_PHASES):
             count = max(round(self._duration(phase) / step), 1)
-            wanted = np.array([self._com_at(self._progress(phase, swing, (k + 0.5) * step)) for k in range(count)])
+            targets = np.array([self._com_at(self._progress(phase, swing, (k + 0.5) * step)) for k in range(count)])
             if phase is not WalkPhase.SWING:
-                yield phase, wanted
+                yield phase, targets
                 if phase in (WalkPhase.GATHER, WalkPhase.REST):
                     return
                 phase, swing = WalkPhase.SWING, swing + 1
                 continue
             lifted = self.gait.swing_feet(swing)
             standing = [foot for foot in range(len(self.feet)) if foot not in lifted]
-            under = self._footing.support_points(footprints, standing, self.control.planned_margin)
-            yield phase, np.array([nearest_in_hull(under, place) for place in wanted])
+            under = self._planner.support_points(footprints, standing, self.control.planned_margin)
+            yield phase, np.array([nearest_in_hull(under, target) for target in targets])
             for foot in lifted:
-                footprints[foot] = self._footing.nominal_foothold(self.places[self.gait.target_step(swing)], foot)
+                footprints[foot] = self._planner.nominal_foothold(self.planar_poses[self.gait.target_step(swing)], foot)
             phase = self._after_swing(swing)
 
     def _com_at(self, progress: float) -> np.ndarray:
-        """(2,) where the centre of mass belongs after so many paces."""
+        """Return the planned position (2,) of the centre of mass after ``progress`` steps."""
         return self._start_com[:2] + self._place_at(progress)[:2]
 
     def _com_velocity(self, local: np.ndarray, velocity: np.ndarray, elapsed: float, dt: float) -> np.ndarray:
-        """(3,) m/s at the end of the step; steered by a centre of pressure under the standing feet, so that the
-        divergent part of the motion follows the plan. What these cannot catch, the next footprints are to."""
+        """Return the target velocity (3,) in m/s of the centre of mass at the end of the time step.
+
+        A centre of pressure under the standing feet steers the divergent component of motion to its plan. The next
+        footprints catch the error that this leaves.
+        """
         com = self.body.centre_of_mass(local)
         pressure, divergent = self._plan.at(elapsed)
         off = com[:2] + velocity[:2] / self._rate - divergent
         standing = [foot for foot in range(len(self.feet)) if foot not in self.swinging]
-        under = self._footing.support_points(
-            self._footing.current_footholds(local, self._footprints), standing, self.control.margin
+        under = self._planner.support_points(
+            self._planner.current_footholds(local, self._footprints), standing, self.control.margin
         )
         pressed = nearest_in_hull(under, pressure + self.control.balance * off)
-        self._support = pressed
-        if self.swinging and elapsed < self.gait.carried_until:
+        self._target_pressure = pressed
+        if self.swinging and elapsed < self.gait.transfer_end_time:
             left = max(self.gait.swing_time - elapsed, 0.0)
             caught = drift(off, pressed - pressure, float(np.exp(self._rate * left)))
-            caught *= min(1.0, self._carriage.capture_range / max(float(np.linalg.norm(caught)), 1e-12))
+            caught *= min(1.0, self._posture.capture_range / max(float(np.linalg.norm(caught)), 1e-12))
             share = 1.0 - float(np.exp(-self.control.sidestep * dt / self._time_unit))
             self._sidestep = self._sidestep + share * (caught - self._sidestep)
         level = velocity[:2] + dt * self._rate**2 * (com[:2] - pressed)
@@ -354,14 +385,14 @@ class Walk:
         return np.array([*level, up])
 
     def _foot_targets(self, elapsed: float) -> np.ndarray:
-        """(F, 4) where the feet should be ``elapsed`` seconds into the phase."""
+        """Return the target footholds (F, 4) ``elapsed`` seconds into the phase."""
         targets, gait = self._footprints.copy(), self.gait
         for index in self.swinging:
             progress = elapsed / gait.swing_time
-            goal = self._footing.nominal_foothold(self.places[gait.target_step(self.swing)], index)
+            goal = self._planner.nominal_foothold(self.planar_poses[gait.target_step(self.swing)], index)
             goal[:3] += [*self._sidestep, self._slope @ self._sidestep]
             targets[index] += gait.transfer_progress(progress) * (goal - self._footprints[index])
-            # One that has found no ground in time reaches down for it.
+            # A foot without contact at the end of its swing reaches down.
             targets[index, 2] += gait.foot_height(progress) - 0.02 * self.body.height * max(progress - 1.0, 0.0)
         return targets
 
@@ -369,28 +400,29 @@ class Walk:
         self, index: int, local: np.ndarray, before: np.ndarray, after: np.ndarray, elapsed: float, dt: float
     ) -> Objective:
         sole, part, control = self.feet[index].sole, self._parts[index], self.control
-        now, then = (self._footing.sole(index, place[index]) for place in (before, after))
-        # The sole that stood is not the flat one that swings: torn straight in the first step, it would drag.
+        now, then = (self._planner.sole(index, footholds[index]) for footholds in (before, after))
+        # The sole that stood is not as flat as the one that swings. Straightened in the first time step, it would drag.
         share = control.foot_share * self.gait.steering_progress(elapsed / self.gait.swing_time)
         velocity = (share * (now - local[sole]) + then - now) / dt
-        return part_nodes(self.body, part, velocity @ self.ground.axes, self._carriage.swing_weight)
+        return part_nodes(self.body, part, velocity @ self.ground.axes, self._posture.swing_weight)
 
     def _unload_objectives(self, index: int, elapsed: float) -> LoadObjective:
-        """A foot is unloaded bit by bit before it rises."""
+        """Return the objective that unloads a foot gradually before it rises."""
         return LoadObjective(
             self._near_points[index], self.control.unload * self.gait.steering_progress(elapsed / self.gait.swing_time)
         )
 
     def _no_slip_objectives(self, report: StepReport, elapsed: float) -> Objective:
-        """What stands does not slide, nor does what is lifted before it goes ahead."""
+        """Return the objective that standing feet do not slide, nor lifted feet before they move forward."""
         contacts = report.contacts
-        ahead = self.swinging if elapsed > self.gait.carried_from else ()
+        ahead = self.swinging if elapsed > self.gait.transfer_start_time else ()
         stands = ~np.isin(foot_of_contact(self.feet, contacts), ahead)
         return no_slip_contacts(
-            contacts, np.where(stands, report.forces[:, 0], 0.0) / self.body.weight, self._carriage.stance_weight
+            contacts, np.where(stands, report.forces[:, 0], 0.0) / self.body.weight, self._posture.stance_weight
         )
 
-    def _turn(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """(3,) rotation vector that best carries ``before`` (N, 3) to ``after`` (N, 3)."""
+    def _best_fit_rotation(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Return the (3,) best-fit rotation (Kabsch) from ``before`` (N, 3) to ``after`` (N, 3) as a rotation
+        vector."""
         arms, aims = (x - self.body.centre_of_mass(x) for x in (before, after))
         return Rotation.from_matrix(kabsch_rotation(self.body.node_mass, arms, aims)).as_rotvec()

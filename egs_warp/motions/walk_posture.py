@@ -1,6 +1,6 @@
-"""How a walking body is carried: the pose that follows from where its feet and its centre of mass are.
+"""Posture of a walking body: its pose as a function of its footholds and its centre of mass.
 
-Places of feet are (x, y, z, heading): metres in the frame of the start, radians about up.
+Footholds are (x, y, z, heading): metres in the ground frame of the start, radians about up.
 """
 
 from __future__ import annotations
@@ -19,77 +19,83 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import SHEAR_BASIS
 
 MAX_STEP_PER_LEG = 0.5
-"""Longest pace over the shortest leg's length."""
+"""Longest step relative to the shortest leg's length."""
 MAX_SIDE_STEP = 0.5
-"""Of its longest pace: how far a body on legs goes to the side, where one leg comes up to the next."""
-LARGEST_TURN = float(np.radians(15.0))
-"""Of one pace on legs."""
+"""Longest sideways step of a body on legs relative to its longest step: one leg comes up to the next."""
+MAX_TURN = float(np.radians(15.0))
+"""Largest turn of one step on legs, in radians."""
 MAX_FOOT_LIFT = 0.03
-"""Body heights that a foot is lifted at most."""
+"""Largest lift of a foot, in body heights."""
 LEGGED_TIMING, ROCKING_TIMING = GaitTiming(0.94, 0.78, 0.2, 0.6), GaitTiming(0.94, 0.55, 0.1, 0.75)
-"""Gaits at the usual speed; what turns about its sides takes most of a swing for it, and falls to and fro between them
-with less of a lean, the less time it stands on both."""
+"""Gait timing at nominal speed, on legs and on a single base. A body that pivots about its sides uses most of a swing
+for it; the less time it stands on both sides, the less it leans from one to the other."""
 MAX_PIVOT, MAX_ROLL = 0.45, 0.05
-"""Radians by which a body on one base turns about one side, and tips to lift the other, at most: faster, it would throw
-itself off the side on which it stands."""
+"""Largest angles in radians by which a body on one base pivots about one side, and tips to lift the other. Faster, it
+would throw itself off the side on which it stands."""
 COUNTER_ROTATION = 1.5
-"""By how much less than its base a body turns for each body height above it, over the turn of the base: the less of it
-turns with the base, the less friction it takes."""
+"""Counter-rotation: reduction of the rotation of a node per body height above the base, relative to the rotation of the
+base. The less of the body rotates with the base, the less friction the pivot needs."""
 MIN_TURNED_INERTIA = 0.2
-"""Of the whole moment of inertia: what friction is taken to have to turn, whatever goes the other way."""
+"""Smallest fraction of the moment of inertia that friction is assumed to rotate, whatever the counter-rotation."""
 MAX_SWING_FACTOR = 1.25
-"""Times the usual swing that it may take to turn so far, where friction under one side is not enough in the usual."""
+"""Largest factor on the swing time for a pivot for which friction under one side does not suffice in the nominal time.
+"""
 MAX_FRICTION_USE = 1.2
-"""Peak of the torque about up that a pivot would take over what friction under the one side gives; it may lag a little
-(measured on monkey and pawn)."""
-_PEAK = 5.77
-"""Largest second derivative of the way from 0 to 1 that a foot is carried in a time of 1."""
+"""Peak torque about up of a pivot relative to the friction torque under one side; it may slip a little (measured on
+monkey and pawn)."""
+_MAX_CURVATURE = 5.77
+"""Largest second derivative of ``smooth``, the path from 0 to 1 of a foot in a time of 1."""
 MIN_LEG_LENGTH = 0.2
-"""Body heights: on shorter legs a body goes as on one base."""
+"""Shortest legs in body heights; with shorter ones, a body moves as on a single base."""
 MAX_SEQUENTIAL_FEET = 4
-"""Feet from which on the others stand while one swings."""
-_SOLE = 0.02
-"""Body heights: nodes at most this high are the sole of a base."""
-_FURTHEST_LEAN = 0.5
-"""Sideways for one up."""
+"""Number of feet from which on several feet stand while one swings."""
+_SOLE_HEIGHT = 0.02
+"""Body heights: nodes of a base at most this high are its sole."""
+_MAX_LEAN = 0.5
+"""Largest lean: horizontal displacement per height."""
 
 
 class WalkPosture(Protocol):
-    """Gives poses, and how far one pace may go."""
+    """Posture of a walking body: target poses, step limits, timing and weights."""
 
     step_limits: StepLimits
-    """The most that a pace may be."""
+    """Limits of one step."""
     lift: float
-    """Metres that a foot is lifted."""
+    """Lift of a foot, m."""
     capture_range: float
-    """Metres by which a foot may come down off its place to catch the body."""
+    """Largest distance in metres from its nominal foothold at which a foot may land to catch the body."""
     timing: GaitTiming
-    """How the gait shares out its time at the usual speed."""
+    """Timing of the gait at nominal speed."""
     com_weight: float
-    """Weight of the motion of the centre of mass: balance."""
+    """Weight of the velocity of the centre of mass: balance."""
     swing_weight: float
-    """Weight of the motion of a sole that swings."""
+    """Weight of the velocity of a swinging sole."""
     stance_weight: float
-    """Weight of contact points that stand and would slide, each by its share of the weight."""
+    """Weight of no slip at standing contact points, each scaled by its share of the load."""
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
-        """(N, 3) nodes of the body with its centre of mass at ``com`` (3,), turned by ``heading`` radians, its feet at
-        ``feet`` (F, 4)."""
+        """Return the target nodes (N, 3), ground coordinates.
+
+        Args:
+            com: (3,) m, centre of mass.
+            heading: heading of the body, radians.
+            feet: (F, 4) footholds.
+        """
         ...
 
 
 class LeggedPosture:
-    """Each leg goes with its foot, the rest of the body with the centre of mass."""
+    """Posture on legs: each leg moves with its foot, the rest of the body with the centre of mass."""
 
-    def __init__(self, place: Stance, feet: Sequence[Foot]) -> None:
-        """The body stands at ``place``."""
-        body, standing = place.body, place.ground.local(place.standing)
+    def __init__(self, stance: Stance, feet: Sequence[Foot]) -> None:
+        """Create the posture of the body that stands at ``stance``."""
+        body, standing = stance.body, stance.ground.local(stance.standing)
         self._start_com = body.centre_of_mass(standing)
         self._arms = standing - self._start_com
         self._legs = np.array([foot.leg for foot in feet])
         self._leg_mass = self._legs @ body.node_mass / body.mass
         self._soles = np.array([self._arms[foot.sole].mean(axis=0) for foot in feet])
-        self.step_limits = StepLimits(MAX_STEP_PER_LEG * min(foot.length for foot in feet), LARGEST_TURN, MAX_SIDE_STEP)
+        self.step_limits = StepLimits(MAX_STEP_PER_LEG * min(foot.length for foot in feet), MAX_TURN, MAX_SIDE_STEP)
         self.lift = MAX_FOOT_LIFT * body.height
         self.capture_range = MAX_STEP_PER_LEG * min(foot.length for foot in feet)
         self.timing = LEGGED_TIMING
@@ -98,7 +104,7 @@ class LeggedPosture:
         self.stance_weight = 100.0
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
-        """See ``Carriage``."""
+        """Return the target nodes (N, 3), see ``WalkPosture.pose``."""
         turn = Rotation.from_rotvec([0.0, 0.0, heading]).as_matrix()
         stretched = feet[:, :3] - self._soles @ turn.T
         trunk = (com - self._leg_mass @ stretched) / (1.0 - self._leg_mass.sum())
@@ -106,54 +112,53 @@ class LeggedPosture:
 
 
 class RockingPosture:
-    """The two sides of the base turn and tip the body, as one walks a wardrobe; it leans over them, and what is above
-    turns the other way, as shoulders do over hips."""
+    """Posture on a single base: its two sides pivot and tip the body, as one walks a wardrobe. The body leans over
+    them, and its upper part rotates the other way, as shoulders do over hips."""
 
-    def __init__(self, place: Stance, feet: Sequence[Foot]) -> None:
-        """The body stands at ``place``; the two ``feet``."""
-        body, standing = place.body, place.ground.local(place.standing)
+    def __init__(self, stance: Stance, feet: Sequence[Foot]) -> None:
+        """Create the posture of the body that stands at ``stance``; ``feet`` are the two sides of its base."""
+        body, standing = stance.body, stance.ground.local(stance.standing)
         soles = np.array([standing[foot.sole].mean(axis=0) for foot in feet])
         self._arms = standing - soles.mean(axis=0)
         self._com = body.centre_of_mass(self._arms)
         self._share = body.node_mass / body.mass
         self._turning = 1.0 - COUNTER_ROTATION * self._arms[:, 2] / body.height
-        """(N,) how far each node turns with the base."""
+        """(N,) rotation of each node relative to that of the base."""
         self._between = soles[0] - soles[1]
         self._width = float(np.hypot(*self._between[:2]))
-        usual = MAX_FRICTION_USE * self._pivot(place, soles, self._inertia(body.node_mass))
+        usual = MAX_FRICTION_USE * self._pivot(stance, soles, self._inertia(body.node_mass))
         slower = float(np.clip(np.sqrt(MAX_PIVOT / max(usual, 1e-12)), 1.0, MAX_SWING_FACTOR))
         self.timing = replace(ROCKING_TIMING, swing_time=slower * ROCKING_TIMING.swing_time)
         pivot = min(MAX_PIVOT, slower**2 * usual)
         self.step_limits = StepLimits(0.5 * pivot * self._width, 0.5 * pivot)
         self.lift = min(MAX_ROLL * self._width, MAX_FOOT_LIFT * body.height)
         self.capture_range = 0.0
-        self.com_weight = 300.0  # where friction gives too little for both, balance goes before turning
-        self.swing_weight = (
-            2.0  # half of the body swings: faster, it pushes the rest back, and that falls behind its feet
-        )
+        self.com_weight = 300.0  # if friction does not suffice for both, balance has priority over turning
+        self.swing_weight = 2.0  # half of the body swings: faster, it pushes back the rest, which falls behind its feet
         self.stance_weight = 5.0  # what turns about a patch slides at its edges
 
     def _inertia(self, node_mass: np.ndarray) -> float:
-        """kg m^2, angular momentum about up through the centre of mass for one radian a second of the base."""
+        """Return the angular momentum in kg m^2 about up through the centre of mass per rad/s of the base."""
         moments = node_mass * ((self._arms - self._com)[:, :2] ** 2).sum(axis=1)
         return float(max(moments @ self._turning, MIN_TURNED_INERTIA * moments.sum()))
 
     @staticmethod
-    def _pivot(place: Stance, soles: np.ndarray, inertia: float) -> float:
-        """Radians by which friction under one side turns the body while the other is carried ahead in a usual
-        swing."""
-        body = place.body
-        touching = place.ground.local(place.contact_points)[:, :2]
+    def _pivot(stance: Stance, soles: np.ndarray, inertia: float) -> float:
+        """Return the angle in radians by which friction under one side can rotate the body in a nominal swing of the
+        other side."""
+        body = stance.body
+        touching = stance.ground.local(stance.contact_points)[:, :2]
         away = np.linalg.norm(touching[:, None] - soles[:, :2], axis=2)
         patches = [touching[away.argmin(axis=1) == side] for side in (0, 1)]
         arms = [np.linalg.norm(patch - patch.mean(axis=0), axis=1).mean() for patch in patches if len(patch)]
         gravity = float(np.linalg.norm(body.gravity))
-        torque = place.friction * body.mass * gravity * min(map(float, arms), default=0.0)
+        torque = stance.friction * body.mass * gravity * min(map(float, arms), default=0.0)
         time = ROCKING_TIMING.transfer_fraction * ROCKING_TIMING.swing_time * float(np.sqrt(body.height / gravity))
-        return torque * time**2 / (_PEAK * inertia)
+        return torque * time**2 / (_MAX_CURVATURE * inertia)
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
-        """See ``Carriage``; the places of the feet turn its base, ``heading`` is that of the body as a whole."""
+        """Return the target nodes (N, 3), see ``WalkPosture.pose``. The footholds rotate the base; ``heading`` is that
+        of the body as a whole."""
         middle, between, rest = feet[:, :3].mean(axis=0), feet[0, :3] - feet[1, :3], self._between
         yaw = np.arctan2(between[1], between[0]) - np.arctan2(rest[1], rest[0])
         across = np.array([between[1], -between[0], 0.0]) / np.hypot(*between[:2])
@@ -162,12 +167,12 @@ class RockingPosture:
         upright = middle + turn @ self._com
         moved = np.stack([(turn @ lean @ self._com)[:2] for lean in SHEAR_BASIS], axis=1)
         lean = np.linalg.solve(moved, (com - upright)[:2])
-        lean *= min(1.0, _FURTHEST_LEAN / max(float(np.linalg.norm(lean)), 1e-12))
+        lean *= min(1.0, _MAX_LEAN / max(float(np.linalg.norm(lean)), 1e-12))
         strain = np.eye(3) + np.einsum("k,kij->ij", lean, SHEAR_BASIS)
         strain[:, 2] *= 1.0 + (com[2] - upright[2]) / self._com[2]
         leant = self._arms @ strain.T
         centre = self._share @ leant
-        # Turned less than the base, about up through the centre of mass, which stays.
+        # Rotate less than the base, about up through the centre of mass, which is unchanged.
         less = (self._turning - 1.0) * (np.remainder(yaw - heading + np.pi, 2.0 * np.pi) - np.pi)
         cos, sin = np.cos(less)[:, None], np.sin(less)[:, None]
         level = (leant - centre)[:, :2]
@@ -176,15 +181,15 @@ class RockingPosture:
         return middle + leant @ turn.T
 
 
-def select_posture(place: Stance) -> tuple[tuple[Foot, ...], type[LeggedPosture] | type[RockingPosture]]:
-    """The feet on which the body that stands at ``place`` walks, and how these carry it: its own, or the sides of its
-    base. No feet at all where it lies or rolls."""
-    feet, standing, height = place.feet(), place.ground.local(place.standing), place.body.height
+def select_posture(stance: Stance) -> tuple[tuple[Foot, ...], type[LeggedPosture] | type[RockingPosture]]:
+    """Return the feet on which a body walks, and the class of its posture: its own feet, or the sides of its base.
+    There are no feet if the body lies or rolls."""
+    feet, standing, height = stance.feet(), stance.ground.local(stance.standing), stance.body.height
     heights = standing[:, 2] - standing[:, 2].min()
-    base = place.base()
+    base = stance.base()
 
     def on_leg(foot: Foot) -> bool:
-        # On few feet a swing is a fall that the next footprint catches: a stump wider than long does not reach there.
+        # On few feet, a swing is a fall that the next footprint catches: a stump wider than long does not reach it.
         return foot.length >= max(
             MIN_LEG_LENGTH * height, _width(standing[foot.sole]) if len(feet) < MAX_SEQUENTIAL_FEET else 0.0
         )
@@ -195,9 +200,9 @@ def select_posture(place: Stance) -> tuple[tuple[Foot, ...], type[LeggedPosture]
         return feet, RockingPosture
     if base in (SupportKind.LYING, SupportKind.ROUND_BASE):
         return (), RockingPosture
-    return split_base(standing[:, :2], heights, np.flatnonzero(heights < _SOLE * height), height), RockingPosture
+    return split_base(standing[:, :2], heights, np.flatnonzero(heights < _SOLE_HEIGHT * height), height), RockingPosture
 
 
 def _width(sole: np.ndarray) -> float:
-    """Metres: side of the square that is as large as the box around a ``sole`` (k, 3)."""
+    """Return the side in metres of the square with the area of the bounding box of a ``sole`` (k, 3)."""
     return float(np.sqrt(np.ptp(sole[:, :2], axis=0).prod()))

@@ -1,4 +1,4 @@
-"""A long body crawls: a wave of strides runs along it, and it comes where it is told, any way."""
+"""Crawl: a wave of strides runs along a long body, which reaches its target in any direction."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from egs_warp.locomotion.objectives import LoadObjective
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory, measure
-from egs_warp.motions.crawl import STRAIN, Crawl
+from egs_warp.motions.crawl import MAX_STRAIN, Crawl
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.gait_selection import move_along, turn_in_place
 from egs_warp.motions.route import Route, path_route, straight_route
@@ -30,17 +30,17 @@ def worm() -> CoarseCreature:
 
 @dataclass(frozen=True)
 class Crawled:
-    """What came of it."""
+    """Result of a crawl."""
 
     crawl: Crawl
     trajectory: Trajectory
     reports: list[StepReport]
     place: np.ndarray
-    """(3,) where it has come to."""
+    """(3,) planar pose at the end."""
 
 
 def crawled(route: Route) -> Crawled:
-    """Crawl until it rests."""
+    """Crawl until the body rests."""
     made = worm()
     crawl = Crawl(made.place, route)
     state, memory, reports = made.start, made.stepper.initial_memory(), []
@@ -48,12 +48,12 @@ def crawled(route: Route) -> Crawled:
         wishes = crawl.objectives(state, reports[-1] if reports else None, DT)
         state, memory, fresh = made.stepper.advance(state, memory, wishes, DT)
         reports += fresh
-        if crawl.resting:
+        if crawl.is_at_rest:
             break
-    assert crawl.resting and crawl.notes() == []
+    assert crawl.is_at_rest and crawl.notes() == []
     recorder = Recorder(made.stepper.body, made.stepper.muscles, made.stepper.geometry, made.start, 0.0, drag=0.0)
     recorder.add(reports)
-    place = crawl._place_of(made.place.ground.local(state.positions))
+    place = crawl._planar_pose(made.place.ground.local(state.positions))
     return Crawled(crawl, recorder.trajectory(), reports, place)
 
 
@@ -66,9 +66,9 @@ def test_what_lies_along_the_ground_crawls() -> None:
 
 
 def test_a_stride_strains_it_by_no_more_than_it_may() -> None:
-    """The wave at its steepest; and every slice ends where the body is to be."""
+    """At the steepest point of the wave; and every section ends at the target of the body."""
     crawl = Crawl(worm().place, straight_route(5.0))
-    crawl._to = np.array([crawl.pace.length, 0.0, 0.0])
+    crawl._to = np.array([crawl.step_limits.length, 0.0, 0.0])
     along_it, most = crawl._standing[:, 0], 0.0
     for elapsed in np.linspace(0.0, crawl._round, 60):
         pose = crawl._pose(float(elapsed))
@@ -76,8 +76,8 @@ def test_a_stride_strains_it_by_no_more_than_it_may() -> None:
         moved, rest = (pose - crawl._standing)[order, 0], along_it[order]
         apart = np.diff(rest) > 0.1
         most = max(most, float(np.abs(np.diff(moved)[apart] / np.diff(rest)[apart]).max()))
-    assert 0.7 * STRAIN < most < 1.01 * STRAIN
-    assert crawl._pose(crawl._round) == pytest.approx(crawl._placed(crawl._to))
+    assert 0.7 * MAX_STRAIN < most < 1.01 * MAX_STRAIN
+    assert crawl._pose(crawl._round) == pytest.approx(crawl._posed_nodes(crawl._to))
     assert crawl._pose(0.0) == pytest.approx(crawl._standing)
 
 

@@ -1,4 +1,4 @@
-"""Dances: what leaves the ground and meets it does so on a beat, as the forces of the ground tell."""
+"""Dance: take-offs and touch-downs, measured from the contact forces, are on beats."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.beats import Span, even_beats, next_span, read_beats
-from egs_warp.motions.dance import HIGHEST, IN_TIME, LOWEST, Dance
+from egs_warp.motions.dance import BEAT_TOLERANCE, MAX_HEIGHT, MIN_HEIGHT, Dance
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget, height_of_flight, level_flight
 from egs_warp.motions.script import motion
@@ -29,7 +29,8 @@ def danced() -> Run:
 
 
 def flights(trajectory: Trajectory, least: float) -> list[tuple[float, float]]:
-    """Ends of the last step on the ground and of the first one on it again, of all flights of ``least`` seconds."""
+    """Return the flights of at least ``least`` seconds: end of the last step on the ground and of the first one on it
+    again."""
     load = np.bincount(
         trajectory.contact_step,
         np.einsum("ci,ci->c", trajectory.contact_force, trajectory.contact_normal),
@@ -42,22 +43,22 @@ def flights(trajectory: Trajectory, least: float) -> list[tuple[float, float]]:
 
 
 def check_that_it_keeps_time(dance: Dance, trajectory: Trajectory) -> None:
-    """Every flight of the trajectory begins and ends within 40 ms of what was asked, and none is left out."""
+    """Every flight of the trajectory begins and ends within 40 ms of its target time, and none is left out."""
     reached = dance.outcome_record(trajectory, 0, -1)
     asked = np.array([event.asked for event in reached.events]).reshape(-1, 2)
-    found = np.array(flights(trajectory, level_flight(0.5 * LOWEST, 1.0, 9.81)))
+    found = np.array(flights(trajectory, level_flight(0.5 * MIN_HEIGHT, 1.0, 9.81)))
     assert len(found) == len(asked) > 1
-    # A motion sees whole steps, also where one was done in parts.
+    # A motion receives whole steps, also if one was repeated with smaller steps.
     step = trajectory.dt.max()
     found = step * np.column_stack([np.floor(found[:, 0] / step + 1e-6), np.ceil(found[:, 1] / step - 1e-6)])
     np.testing.assert_allclose([event.reached for event in reached.events], found.ravel(), atol=1e-9)
-    assert np.abs(found - asked).max() <= IN_TIME
+    assert np.abs(found - asked).max() <= BEAT_TOLERANCE
     assert reached.worst_error == pytest.approx(np.abs(found - asked).max())
 
 
 def test_a_dance_keeps_time(danced: Run) -> None:
     dance = danced.sequence.done[0].motion
-    assert isinstance(dance, Dance) and dance.resting
+    assert isinstance(dance, Dance) and dance.is_at_rest
     check_that_it_keeps_time(dance, danced.trajectory)
     assert {round(event.asked, 9) for event in dance.outcome_record(danced.trajectory, 0, -1).events} == {
         0.5,
@@ -91,15 +92,15 @@ def test_the_pawn_keeps_time_through_the_whole_figure(beats: str) -> None:
 
 
 def test_a_flight_and_its_height_are_told_from_each_other() -> None:
-    """T = sqrt(8 Z / g), of the rise Z beyond what the body has stretched by when it leaves the ground."""
-    for height in (LOWEST, 0.16, 0.3, HIGHEST):
+    """T = sqrt(8 Z / g), with the rise Z above the extension of the body at take-off."""
+    for height in (MIN_HEIGHT, 0.16, 0.3, MAX_HEIGHT):
         assert height_of_flight(level_flight(height, 1.0, 9.81), 1.0, 9.81) == pytest.approx(height)
     assert level_flight(0.5, 1.0, 9.81) == pytest.approx(np.sqrt(8.0 * 0.46 / 9.81))
 
 
 def test_a_jump_says_when_it_takes_off(place: Stance) -> None:
-    """As the flight does, the lead follows from the plan that the jump itself has."""
-    jump = Jump(place, JumpTarget(0.0, 0.4), settled=True)
+    """The lead and the flight follow from the plan of the jump."""
+    jump = Jump(place, JumpTarget(0.0, 0.4), skips_settling=True)
     assert jump.plan.flight_time == pytest.approx(level_flight(0.4, place.body.height, 9.81))
     lead = jump.plan.crouch_time + jump.plan.thrust_time
     assert lead <= jump.take_off_time(0.4) < lead + 2.0 * place.step
@@ -117,7 +118,7 @@ def test_a_jump_spans_two_beats() -> None:
 
 
 def test_easier_jumps_are_preferred_to_hasty_ones() -> None:
-    """Of beats a sixth of a second apart it takes every third."""
+    """With beats a sixth of a second apart, it uses every third."""
     found = span_of(tuple(np.arange(1, 20) / 6.0))
     assert found is not None and found.flight == pytest.approx(0.5)
 
@@ -145,13 +146,13 @@ def test_beats_are_read_from_the_first_column(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "beats.csv: no beats; give lines of seconds"),
-        ("time\n", "beats.csv: no beats; give lines of seconds"),
-        ("1\nsoon\n", "beats.csv, line 2: 'soon': give the seconds of a beat, from 0 to 600"),
-        ("-1\n", "line 1: '-1': give the seconds of a beat, from 0 to 600"),
-        ("1\ninf\n", "line 2: 'inf': give the seconds of a beat, from 0 to 600"),
-        ("1\n1\n", "line 2: '1': is not after 1, the beat before; give beats in their order"),
-        ("\n".join(str(k / 10) for k in range(1001)), "1001 beats; at most 1000 are danced to"),
+        ("", "beats.csv: no beats; give one time in seconds per line"),
+        ("time\n", "beats.csv: no beats; give one time in seconds per line"),
+        ("1\nsoon\n", "beats.csv, line 2: 'soon': give the time of a beat in seconds, from 0 to 600"),
+        ("-1\n", "line 1: '-1': give the time of a beat in seconds, from 0 to 600"),
+        ("1\ninf\n", "line 2: 'inf': give the time of a beat in seconds, from 0 to 600"),
+        ("1\n1\n", "line 2: '1': is not after 1, the beat before; give beats in increasing order"),
+        ("\n".join(str(k / 10) for k in range(1001)), "1001 beats; at most 1000 are allowed"),
     ],
 )
 def test_a_bad_file_of_beats_is_told_in_one_line(tmp_path: Path, text: str, said: str) -> None:
@@ -176,11 +177,11 @@ def test_beats_are_given_to_the_dances_of_a_script(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "beats", "said"),
     [
-        ("jump", "90", "beats: no motion of 'jump' takes them; ask for a dance"),
-        ("dance", " ", "beats: nothing is given; give a file of seconds or a tempo, as 90"),
+        ("jump", "90", "beats: no motion of 'jump' takes beats; add a dance"),
+        ("dance", " ", "beats: the value is empty; give a file of times in seconds or a tempo such as 90"),
         ("dance", "9999", "tempo 9999: give a number of beats a minute from 10 to 400"),
         ("dance", "90 nan", "first nan: give a number of seconds from 0 to 600"),
-        ("dance b.csv 90", None, "tempo beside the beats of b.csv; give one of them"),
+        ("dance b.csv 90", None, "tempo and the beats of b.csv are both given; give one of them"),
         ("dance 1 2 3 4", None, "'4' is one value too many; dance takes tempo, first, beats or a file of beats"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Driven bodies: the way is made as it goes, no pace is longer than may be, and told to stand they stand."""
+"""Drive: the route is extended while it runs, no step exceeds its limits, and a zero command ends in a stance."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def stool() -> CoarseCreature:
 
 @given(_SPEED, _SPEED, _SPEED, st.floats(0.01, 3.0))
 def test_no_pace_is_longer_than_may_be(forward: float, sideways: float, turn: float, time: float) -> None:
-    """What is asked goes as far as it may, in the mix that was asked."""
+    """A command is scaled to the limits of a step, with its ratio of directions unchanged."""
     command, start = Drive(forward, sideways, turn), np.array([0.3, -0.2, 0.7])
     change = integrate_command(start, command, time, PACE, unit=0.5, height=0.8) - start
     middle = start[2] + 0.5 * change[2]
@@ -70,9 +70,9 @@ def test_a_file_of_speeds_is_read(tmp_path: Path) -> None:
     ("text", "told"),
     [
         ("0,0.1,0\n", "line 1: '0,0.1,0': give four numbers, time,forward,sideways,turn"),
-        ("1,0,0,0\n0.5,0,0,0\n", "line 2: time 0.5: give seconds that grow, from 0 to 60"),
+        ("1,0,0,0\n0.5,0,0,0\n", "line 2: time 0.5: give increasing times in seconds, from 0 to 60"),
         ("0,9,0,0\n", "line 1: forward 9.0: give a speed from -2 to 2"),
-        ("0,0.1,0,0\n", "commands: the last one does not stand; end with 0,0,0"),
+        ("0,0.1,0,0\n", "commands: the last command is not zero; end with 0,0,0"),
         ("\n", "no commands; give lines of four numbers, time,forward,sideways,turn"),
     ],
 )
@@ -85,54 +85,57 @@ def test_a_bad_file_is_told_in_a_line(tmp_path: Path, text: str, told: str) -> N
 
 
 def test_the_way_is_made_from_the_command_of_the_moment() -> None:
-    """What has been gone stays, what is to come turns with the command, and told to stand it closes its feet."""
+    """Past poses stay, future ones follow the command, and a zero command closes the feet."""
     walk = DrivenWalk(stool().place, Drive(0.1))
-    before = walk.places.copy()
+    before = walk.planar_poses.copy()
     assert (
         walk.gait.step_count == len(before) - 1 > 2 and np.all(np.diff(before[:, 0]) > 0.0) and not before[:, 2].any()
     )
     walk.command = Drive(0.1, 0.0, 0.1)
     walk._lay_places(2)
-    assert walk.places[:3] == pytest.approx(before[:3]) and walk.places[3, 2] > 0.0
+    assert walk.planar_poses[:3] == pytest.approx(before[:3]) and walk.planar_poses[3, 2] > 0.0
     walk.command = Drive()
     walk._lay_places(3)
-    assert len(walk.places) == 4 and walk.gait.swings == 3 + len(walk.gait.groups) - 1
+    assert len(walk.planar_poses) == 4 and walk.gait.swings == 3 + len(walk.gait.groups) - 1
     walk.command = Drive(-0.1)
     walk._lay_places(4)
-    assert walk.places[4] == pytest.approx(walk.places[3]) and walk.places[5, 0] < walk.places[4, 0]
+    assert (
+        walk.planar_poses[4] == pytest.approx(walk.planar_poses[3])
+        and walk.planar_poses[5, 0] < walk.planar_poses[4, 0]
+    )
 
 
 def test_it_goes_on_from_where_slipping_feet_have_left_it() -> None:
-    """Feet a pace behind where they came to take the way with them; so they do in the closing swings of three groups of
-    feet, which come after the last place."""
+    """Feet that lag by a step shift the route; also in the closing swings of three groups of feet, which come after the
+    last pose."""
     place = stool().place
     walk, standing = DrivenWalk(place, Drive(0.1)), place.ground.local(place.standing)
-    before, length = walk.places.copy(), walk.places[1, 0]
+    before, length = walk.planar_poses.copy(), walk.planar_poses[1, 0]
     walk._arrived_footholds = [2] * len(walk.feet)
     walk._plan_swing(2, standing + [before[2, 0], 0.0, 0.0])
-    assert walk.places[:5] == pytest.approx(before)
+    assert walk.planar_poses[:5] == pytest.approx(before)
     walk._plan_swing(2, standing + [before[1, 0], 0.0, 0.0])
-    assert np.array_equal(walk.places[:2], before[:2])
-    assert walk.places[2:5, 0] == pytest.approx(before[2:, 0] - length)
+    assert np.array_equal(walk.planar_poses[:2], before[:2])
+    assert walk.planar_poses[2:5, 0] == pytest.approx(before[2:, 0] - length)
     walk.command = Drive()
     walk._lay_places(3)
     walk.gait = replace(walk.gait, groups=((0,), (1, 2), (3,)))
-    walk._arrived_footholds, last = [3, 2, 2, 3], walk.places[3, 0]
+    walk._arrived_footholds, last = [3, 2, 2, 3], walk.planar_poses[3, 0]
     walk._plan_swing(4, standing)
-    assert len(walk.places) == 4 and walk.places[3, 0] < last
+    assert len(walk.planar_poses) == 4 and walk.planar_poses[3, 0] < last
 
 
 def test_a_quick_command_makes_the_gait_quicker() -> None:
     slow, quick = (DrivenWalk(stool().place, Drive(speed)) for speed in (0.02, 1.0))
     assert quick.gait.swing_time == pytest.approx(slow.gait.swing_time / 1.6)
-    longest = np.linalg.norm(np.diff(quick.places[:, :2], axis=0), axis=1)
-    assert longest == pytest.approx(quick._pace.length)
+    longest = np.linalg.norm(np.diff(quick.planar_poses[:, :2], axis=0), axis=1)
+    assert longest == pytest.approx(quick._step_limits.length)
 
 
 @pytest.mark.slow
 def test_a_stool_is_driven_and_stands_again() -> None:
-    """Ahead for a second and a half, the first half second of which it shifts its weight: it comes as far as its speed
-    says, within a pace, and stands."""
+    """Forward for 1.5 s, of which the first half second shifts the weight: the distance follows from the speed within a
+    step, and it stands at the end."""
     made, speed = stool(), 0.06
     plan = DrivePlan((0.0, 1.5), (Drive(speed), Drive()))
     driven = ScriptedDrive(made.place, plan)
@@ -142,9 +145,9 @@ def test_a_stool_is_driven_and_stands_again() -> None:
         wishes = driven.objectives(state, reports[-1] if reports else None, DT)
         state, memory, fresh = made.stepper.advance(state, memory, wishes, DT)
         reports += fresh
-        if driven.resting:
+        if driven.is_at_rest:
             break
-    assert driven.resting
+    assert driven.is_at_rest
     moved = body.centre_of_mass(state.positions) - body.centre_of_mass(made.start.positions)
     pace = speed * 1.72 * body.height
     assert moved[0] == pytest.approx(speed * body.speed_unit * (1.5 - 1.5 * body.time_unit), abs=pace)
@@ -157,9 +160,9 @@ def test_every_kind_of_body_can_be_driven() -> None:
     worm = coarse_creature(worm_mesh(), forward=FORWARD)
     for made in (stool(), ball, worm):
         driven = LiveDrive(made.place)
-        assert driven.resting and isinstance(driven._motion, Stand)
+        assert driven.is_at_rest and isinstance(driven._motion, Stand)
         driven.command = Drive(0.1)
-        assert not driven.resting
+        assert not driven.is_at_rest
         assert driven.objectives(made.start, None, DT) and not isinstance(driven._motion, Stand)
     walk = LiveDrive(stool().place)
     walk.command = Drive(0.1)

@@ -1,4 +1,4 @@
-"""A fall ends a motion: by tilt, by what the body lies on; flights, landings and what the user asks for are none."""
+"""Falls by tilt and by contacts; flights, landings and intended tilts are no falls."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def made() -> CoarseCreature:
 
 
 class Stands:
-    """A motion that asks for something and never rests."""
+    """Motion with objectives that never rests."""
 
-    resting = False
+    is_at_rest = False
 
     def __init__(self, _: object) -> None:
         pass
@@ -51,7 +51,8 @@ def watched(made: CoarseCreature, begin: Any = Stands) -> FallMonitor:
 def seen(
     made: CoarseCreature, watch: FallMonitor, *, degrees: float, load: float, seconds: float, on: str = "base"
 ) -> None:
-    """Show it a body turned by so much, which the ground bears by ``load`` of its weight at its base or top."""
+    """Pass a body rotated by an angle to the monitor; the ground supports it with ``load`` of its weight at its base or
+    top."""
     body, start = made.place.body, made.start
     turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
     state = BodyState(start.positions @ turn.T, start.velocities)
@@ -89,7 +90,7 @@ def test_a_fallen_body_is_asked_for_nothing(made: CoarseCreature) -> None:
 
 
 def test_a_body_that_gets_up_is_not_watched_meanwhile(made: CoarseCreature) -> None:
-    """The motion that fell is marked, getting up takes its place, and only its giving up is a fall."""
+    """The motion that fell is marked, getting up replaces it, and only its failure counts as a fall."""
     sequence = MotionSequence(made.place, [MotionTask("stand", {}, cast(Any, Stands))])
     watch = FallMonitor(sequence, made.place, gets_up=True)
     seen(made, watch, degrees=90.0, load=1.0, seconds=1.0)
@@ -111,7 +112,7 @@ def test_keys_may_tip_the_body(made: CoarseCreature) -> None:
 
 
 def test_a_body_on_its_side_has_fallen() -> None:
-    """With the whole stepper, but weak: its muscles let go, and the run ends a little later."""
+    """With the whole stepper and weak muscles: they relax, and the run ends a little later."""
     made = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD, strength=0.2)
     turn = Rotation.from_euler("x", 90.0, degrees=True).as_matrix()
     positions = made.start.positions @ turn.T

@@ -1,6 +1,4 @@
-"""Following key frames: what is measured of a posed block, what is asked of the next step,
-and what is said of missed keys.
-"""
+"""Key frames: measured quantities of a posed block, objectives of the next step, and messages about missed keys."""
 
 from __future__ import annotations
 
@@ -51,16 +49,16 @@ def test_each_quantity_is_measured_in_its_unit_along_forward_left_up(place: Stan
     omega = np.array([0.0, 2.0, 0.0])
     velocities = height * np.array([-0.5, 0.7, 0.0]) + np.cross(omega, positions - follow.parts[part].centre(positions))
     state = BodyState(positions, velocities)
-    assert np.allclose(follow._measured(part, Quantity.POSITION, state), [0.1, 0.2, 0.3])
-    assert np.allclose(follow._measured(part, Quantity.ORIENTATION, state), [0.0, 0.0, 30.0])
-    assert np.allclose(follow._measured(part, Quantity.VELOCITY, state), [0.7, 0.5, 0.0])
+    assert np.allclose(follow._measure(part, Quantity.POSITION, state), [0.1, 0.2, 0.3])
+    assert np.allclose(follow._measure(part, Quantity.ORIENTATION, state), [0.0, 0.0, 30.0])
+    assert np.allclose(follow._measure(part, Quantity.VELOCITY, state), [0.7, 0.5, 0.0])
     arms = positions[nodes] - follow.parts[part].centre(positions)
     spin = (body.node_mass[nodes, None] * np.cross(arms, np.cross(omega, arms))).sum(axis=0) / (body.mass * height**2)
-    assert np.allclose(follow._measured(part, Quantity.ANGULAR_MOMENTUM, state), [spin[1], -spin[0], spin[2]])
+    assert np.allclose(follow._measure(part, Quantity.ANGULAR_MOMENTUM, state), [spin[1], -spin[0], spin[2]])
 
 
 def test_a_position_key_asks_for_the_speed_of_its_curve(place: Stance) -> None:
-    """On the curve the head is asked for the curve's own speed; behind it for more."""
+    """On the curve, the target speed of the head is that of the curve; behind it, it is higher."""
     follow = Follow(place, [key(1.0, "head", Quantity.POSITION, (0.2, 0.0, 0.0))])
     (channel,) = follow.channels
     still = BodyState(place.standing, 0 * place.standing)
@@ -79,7 +77,7 @@ def test_a_position_key_asks_for_the_speed_of_its_curve(place: Stance) -> None:
 
 
 def test_each_key_has_its_own_weight(place: Stance) -> None:
-    """Of 1 and 9, the first key's holds until it is reached, the second's from then on."""
+    """The weight of the first key, 1, holds until that key; the weight of the second, 9, from then on."""
     value = (0.1, 0.0, 0.0)
     keys = [Key(time, "head", Quantity.POSITION, value, weight) for time, weight in ((6 * DT, 1.0), (12 * DT, 9.0))]
     follow, found = Follow(place, keys), []
@@ -176,7 +174,7 @@ def test_a_trajectory_rests_once_the_body_is_slow_and_at_last_in_any_case(place:
 
 
 def test_places_are_held_after_their_last_key_and_speeds_are_not(place: Stance) -> None:
-    """After a body velocity the balance rules again; a head position stays asked for."""
+    """After the last key of a body velocity, the balance objectives apply again; a head position stays a target."""
     keys = [key(0.1, "body", Quantity.VELOCITY, (0.3, 0.0, 0.0)), key(0.2, "head", Quantity.POSITION, (0.1, 0.0, 0.0))]
     follow = Follow(place, keys)
     names = []
@@ -196,7 +194,7 @@ def spun(place: Stance, degrees: float, time: float) -> BodyState:
 @pytest.mark.parametrize("part", ["body", "head"])
 @pytest.mark.parametrize("asked", [170.0, 180.0, 270.0, 360.0, -360.0])
 def test_a_turn_is_reached_the_way_round_that_was_asked(place: Stance, part: str, asked: float) -> None:
-    """A body that turns all the way misses nothing; by 10 degrees less, 10; one that does not turn, all of it."""
+    """A body that turns completely has no error; 10 degrees less has 10, and no turn has all of it."""
     for share, miss in ((1.0, 0.0), (1.0 - 10.0 / abs(asked), 10.0), (0.0, abs(asked))):
         follow = Follow(place, [key(1.0, part, Quantity.ORIENTATION, (0.0, 0.0, asked))])
         for time in np.linspace(0.0, 1.0, 61):
@@ -207,9 +205,8 @@ def test_a_turn_is_reached_the_way_round_that_was_asked(place: Stance, part: str
 
 @pytest.mark.parametrize("behind", [0.0, 20.0, 190.0])
 def test_a_turn_over_half_is_steered_the_way_round_that_was_asked(place: Stance, behind: float) -> None:
-    """Late in a turn by 350 degrees the asked rate is that of the curve, and more for what the body is behind,
-    however far.
-    """
+    """Late in a turn by 350 degrees, the target rate is that of the curve plus a correction of the error, however
+    large."""
     follow = Follow(place, [key(2.0, "body", Quantity.ORIENTATION, (0.0, 0.0, 350.0))])
     (channel,), body = follow.channels, place.body
     follow.objectives(spun(place, 0.0, 0.0), None, DT)

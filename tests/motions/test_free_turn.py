@@ -35,7 +35,7 @@ def test_about_a_principal_axis_a_body_does_not_wobble() -> None:
 
 @pytest.mark.parametrize("turn", [0.4, -1.6, 4.0])
 def test_a_body_off_its_axes_comes_to_the_turn_that_is_asked(turn: float) -> None:
-    """A spin straight about up would leave it tilted by degrees; the spin that is found ends it upright."""
+    """A spin about up alone would leave it tilted by degrees; the result of the root search ends upright."""
     inertia, upright, asked = leaning([0.5, 0.8, 0.3], 0.25), np.array([0.05, -0.08, 0.02]), np.array([0.0, 0.0, turn])
     goal = Rotation.from_rotvec(asked) * Rotation.from_rotvec(upright)
 

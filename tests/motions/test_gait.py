@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from egs_warp.motions.gait import Gait, feet_in_turn
 from egs_warp.motions.walk_posture import LEGGED_TIMING
 
-GAIT = Gait.of(4, 4, 0.03, LEGGED_TIMING, time_unit=0.32)
+GAIT = Gait.create(4, 4, 0.03, LEGGED_TIMING, time_unit=0.32)
 
 
 @given(st.integers(2, 9))
 def test_every_foot_swings_once_in_a_round_and_none_beside_its_neighbour(count: int) -> None:
-    """Of more than three feet; of four the diagonals swing together. Some foot always stands."""
+    """With more than three feet, several swing together, the diagonals of four. Some foot always stands."""
     groups = feet_in_turn(count)
     assert sorted(foot for group in groups for foot in group) == list(range(count))
     assert all(0 < len(group) < count for group in groups)
@@ -28,7 +28,7 @@ def test_every_foot_swings_once_in_a_round_and_none_beside_its_neighbour(count: 
 @given(st.integers(2, 7), st.integers(1, 12))
 def test_footprints_follow_each_other_and_close(feet: int, paces: int) -> None:
     """Each swing comes one pace ahead of the last, and at the end all feet are at the last place."""
-    gait = Gait.of(feet, paces, 0.03, LEGGED_TIMING, time_unit=0.3)
+    gait = Gait.create(feet, paces, 0.03, LEGGED_TIMING, time_unit=0.3)
     at = np.zeros(feet)
     for swing in range(gait.swings):
         for foot in gait.swing_feet(swing):
@@ -41,7 +41,7 @@ def test_footprints_follow_each_other_and_close(feet: int, paces: int) -> None:
 def test_the_body_is_as_far_as_its_feet(feet: int) -> None:
     """Far from both ends: in the middle of a swing as far as the groups of feet are in the mean of before and after;
     and evenly."""
-    gait = Gait.of(feet, 40, 0.03, LEGGED_TIMING, time_unit=0.3)
+    gait = Gait.create(feet, 40, 0.03, LEGGED_TIMING, time_unit=0.3)
     swing, rounds = 20, len(gait.groups)
     before = np.mean([gait.target_step(swing - 1 - k) for k in range(rounds)])
     after = np.mean([gait.target_step(swing - k) for k in range(rounds)])
@@ -70,10 +70,12 @@ def test_a_swinging_foot_leaves_and_lands_at_rest() -> None:
 
 
 def test_a_foot_is_steered_bit_by_bit_and_goes_ahead_only_when_it_is_up() -> None:
-    """Not at all where the swing begins, wholly before it is carried far; carried between the two times that are
-    told."""
+    """Steering is zero at the start of a swing and full before the foot moves far; it moves between the two given
+    times."""
     steered = [GAIT.steering_progress(s) for s in (0.0, 0.1, 0.2, 0.3, 1.0)]
     assert steered[0] == 0.0 and steered[3:] == [1.0, 1.0] and np.all(np.diff(steered[:4]) > 0.0)
-    assert GAIT.transfer_progress(GAIT.carried_from / GAIT.swing_time) == 0.0
-    assert GAIT.transfer_progress(GAIT.carried_until / GAIT.swing_time) == pytest.approx(1.0)
-    assert 0.0 < GAIT.transfer_progress(0.5 * (GAIT.carried_from + GAIT.carried_until) / GAIT.swing_time) < 1.0
+    assert GAIT.transfer_progress(GAIT.transfer_start_time / GAIT.swing_time) == 0.0
+    assert GAIT.transfer_progress(GAIT.transfer_end_time / GAIT.swing_time) == pytest.approx(1.0)
+    assert (
+        0.0 < GAIT.transfer_progress(0.5 * (GAIT.transfer_start_time + GAIT.transfer_end_time) / GAIT.swing_time) < 1.0
+    )

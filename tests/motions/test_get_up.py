@@ -1,4 +1,4 @@
-"""A body that lies gets up: it presses itself up about the edge of its base, rolls over it and stands."""
+"""Get up: a lying body pushes itself up about the edge of its base, rolls over it and stands."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.fall_monitor import FallMonitor
-from egs_warp.motions.get_up import _TRIES, GetUp, GetUpPhase, lie_down
+from egs_warp.motions.get_up import _ATTEMPTS, GetUp, GetUpPhase, lie_down
 from egs_warp.motions.sequence import MotionSequence, MotionTask
 from egs_warp.motions.stand import Stand, StandFor
 from tests.support.creatures import CoarseCreature, coarse_creature
@@ -39,7 +39,7 @@ def lying(degrees: float, axis: np.ndarray = LEFT) -> BodyState:
 
 @pytest.mark.parametrize(("degrees", "axis"), [(90.0, LEFT), (-60.0, LEFT), (170.0, FORWARD)])
 def test_it_knows_how_it_lies(degrees: float, axis: np.ndarray) -> None:
-    """The angle to upright, and the level axis about which that is undone."""
+    """The angle to upright and the horizontal axis of the rotation that undoes it."""
     angle, about = GetUp(block().place)._tilt(lying(degrees, axis).positions)
     assert np.degrees(angle) == pytest.approx(abs(degrees), abs=1e-6)
     assert about == pytest.approx(-np.sign(degrees) * axis, abs=1e-6)
@@ -48,7 +48,7 @@ def test_it_knows_how_it_lies(degrees: float, axis: np.ndarray) -> None:
 
 @pytest.mark.parametrize("degrees", [30.0, 60.0, 90.0, 120.0])
 def test_the_top_is_over_the_edges_that_it_rolls_over(degrees: float) -> None:
-    """A block stands highest on an edge: half of its diagonal, on whichever it comes to on its way."""
+    """The centre of mass of a block is highest above an edge: half of its diagonal, whichever edge it meets."""
     get_up, state = GetUp(block().place), lying(degrees)
     arms = state.positions - get_up.body.centre_of_mass(state.positions)
     top = get_up._top(arms, -LEFT, np.radians(degrees))
@@ -61,8 +61,8 @@ def test_the_top_is_over_the_edges_that_it_rolls_over(degrees: float) -> None:
 
 
 def test_it_turns_as_a_whole_about_the_edge_of_its_base() -> None:
-    """What is asked of the centre of mass and of the spin is one turn about the lower edge of the base, up; with
-    nothing left that bears it behind that edge, it is let fall back as it would by itself."""
+    """The targets of the centre of mass and of the spin are one rotation about the lower edge of the base. Without
+    support behind that edge, they are those of the free fall back."""
     get_up, state = GetUp(block().place), lying(90.0)
     get_up.phase, get_up._entered, get_up._push = GetUpPhase.ROLL, 0.0, 50.0
     com, spin, _ = get_up.objectives(replace(state, time=0.05), None, DT)
@@ -81,19 +81,19 @@ def test_it_turns_as_a_whole_about_the_edge_of_its_base() -> None:
 
 
 def test_each_try_pushes_otherwise() -> None:
-    """None that has failed is done again as it was."""
-    assert len(set(_TRIES)) == len(_TRIES) >= 3
-    assert all(push > 0.0 and in_hand > 0.0 for push, in_hand in _TRIES)
+    """No failed attempt is repeated unchanged."""
+    assert len(set(_ATTEMPTS)) == len(_ATTEMPTS) >= 3
+    assert all(push > 0.0 and in_hand > 0.0 for push, in_hand in _ATTEMPTS)
 
 
 def test_a_body_that_is_caught_is_held_low() -> None:
-    """A crouched stand asks the centre of mass down, a straight one leaves it where it is."""
+    """The target velocity of the centre of mass is downward in a crouched stand, zero in a straight one."""
     made = block()
     for crouch, down in ((1.0, False), (0.75, True)):
         stand = Stand(made.place, at_rest=False, crouch=crouch)
         com = stand.objectives(made.start, None, DT)[0]
-        assert isinstance(com, Objective) and (com.target[2] < -0.01) == down and not stand.resting
-    assert Stand(made.place).resting
+        assert isinstance(com, Objective) and (com.target[2] < -0.01) == down and not stand.is_at_rest
+    assert Stand(made.place).is_at_rest
 
 
 def test_a_body_that_stands_is_up() -> None:
@@ -101,26 +101,26 @@ def test_a_body_that_stands_is_up() -> None:
     get_up = GetUp(made.place)
     for step in range(20):
         get_up.objectives(replace(made.start, time=step * DT), None, DT)
-        if get_up.resting:
+        if get_up.is_at_rest:
             break
-    assert get_up.up and get_up.resting and get_up.tries == 0 and get_up.notes() == []
+    assert get_up.up and get_up.is_at_rest and get_up.tries == 0 and get_up.notes() == []
 
 
 def test_a_ball_lies_any_way_up() -> None:
     ball = coarse_creature(ball_mesh(), forward=FORWARD, all_round=True)
-    with pytest.raises(UserError, match="get up: a ball lies any way up; walk or jump on"):
+    with pytest.raises(UserError, match="get up: a ball cannot fall over; walk or jump instead"):
         GetUp(ball.place)
 
 
 def test_it_gives_up_after_its_tries() -> None:
-    """Shown a body that never moves from its side."""
+    """With a body that never moves from its side."""
     get_up, state = GetUp(block().place), lying(90.0)
     for step in range(6000):
         get_up.objectives(replace(state, time=step * DT), None, DT)
-        if get_up.resting:
+        if get_up.is_at_rest:
             break
-    assert get_up.phase is GetUpPhase.GIVEN_UP and not get_up.up and get_up.tries == len(_TRIES)
-    assert get_up.notes() == [f"it does not get up: it lies after {len(_TRIES)} tries"]
+    assert get_up.phase is GetUpPhase.GIVEN_UP and not get_up.up and get_up.tries == len(_ATTEMPTS)
+    assert get_up.notes() == [f"the body does not get up: it lies after {len(_ATTEMPTS)} tries"]
 
 
 @cache
@@ -146,7 +146,7 @@ def risen(degrees: float, sideways: bool) -> tuple[FallMonitor, list[StepReport]
 @pytest.mark.slow
 @pytest.mark.parametrize(("degrees", "sideways"), [(90.0, False), (80.0, False), (90.0, True)])
 def test_a_block_gets_up_and_goes_on(degrees: float, sideways: bool) -> None:
-    """The motion that fell is over, the next one is done from where it has come to stand."""
+    """The motion that fell is over; the next one starts from the new stance."""
     watch, _, _, end = risen(degrees, sideways)
     assert watch.fallen is None and watch.is_finished
     assert [entry.name for entry in watch.sequence.done] == ["stand", "get up", "stand"]
@@ -159,7 +159,7 @@ def test_a_block_gets_up_and_goes_on(degrees: float, sideways: bool) -> None:
 
 @pytest.mark.slow
 def test_it_gets_up_calmly() -> None:
-    """A try takes some m g H of the muscles' work (14 at most of those measured); three throws took eighty."""
+    """An attempt takes some m g H of muscle work (14 at most of those measured); three throws took eighty."""
     watch, _, _, _ = risen(90.0, False)
     _, entry, last = watch.sequence.done
     assert isinstance(entry.motion, GetUp)

@@ -10,7 +10,7 @@ import pytest
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
-from egs_warp.motions.jump import BASE_SWING, MAX_FOOTHOLD_OFFSET, Jump
+from egs_warp.motions.jump import BASE_SWING_WEIGHT, MAX_FOOTHOLD_OFFSET, Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget, stopping_time
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.twist import TurnHeading
@@ -29,7 +29,7 @@ def test_a_landing_frame_holds_the_landed_body(place: Stance) -> None:
     assert jump.phase is JumpPhase.FLIGHT and jump.is_airborne
     landed = moved(place, 0.8, np.array([0.5, 0.0, 0.1]))
     assert np.allclose(jump.ground.local(landed), start)
-    assert jump.pose.measure(BodyState(landed, 0 * landed), None).heading == pytest.approx(0.0, abs=1e-9)
+    assert jump.controller.measure(BodyState(landed, 0 * landed), None).heading == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(("distance", "lean"), [(0.0, 0.0), (0.3, 0.045), (2.0, 0.07)])
@@ -42,7 +42,7 @@ def test_the_weight_goes_ahead_with_the_distance_and_stays_well_behind_the_toes(
 
 @pytest.mark.parametrize(("mesh", "soles"), [(coarse_stool(), 4), (None, 1)])
 def test_soles_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, soles: int) -> None:
-    """Each foot on legs, and the base of a body that has none: asked to go ahead and not aside."""
+    """The soles of feet on legs, and the base of other bodies, have forward and no sideways target velocities."""
     place = block_place(mesh)
     jump = Jump(place, JumpTarget(0.5, 0.3))
     jump.phase = JumpPhase.THRUST
@@ -55,8 +55,8 @@ def test_soles_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, soles: int
 
 
 def test_a_landing_that_may_fail_is_balanced_in_full() -> None:
-    """Asked little of while its capture point is near the middle of its feet, everything once that is at their edge;
-    next to nothing in the first step, in which the ground catches it."""
+    """Weights are low while the capture point is near the middle of the feet and full once it is at their edge; nearly
+    zero in the first step, in which the ground stops the fall."""
     place = block_place()
     weights = []
     for time, speed in ((1.0, 0.0), (1.0, 2.0), (0.0, 2.0)):
@@ -70,7 +70,7 @@ def test_a_landing_that_may_fail_is_balanced_in_full() -> None:
 
 
 def test_what_has_taken_off_takes_up_its_pose_gently() -> None:
-    """Next to nothing of it in the first step in the air, all of it 0.6 sqrt(H / g) later."""
+    """Nearly zero in the first step in the air, full weight 0.6 sqrt(H / g) later."""
     place = block_place()
     jump = Jump(place, JumpTarget(0.5, 0.3))
     jump.phase = JumpPhase.THRUST
@@ -81,13 +81,13 @@ def test_what_has_taken_off_takes_up_its_pose_gently() -> None:
         swung = [one for one in asked if isinstance(one, Objective) and one.name == "sole velocity"]
         weights.append(swung[0].weight)
     assert jump.phase is JumpPhase.FLIGHT
-    assert 0.0 < weights[0] < 0.05 * BASE_SWING and weights[1] == BASE_SWING
+    assert 0.0 < weights[0] < 0.05 * BASE_SWING_WEIGHT and weights[1] == BASE_SWING_WEIGHT
 
 
 @pytest.mark.parametrize(("com_speed", "flat"), [(1.0, True), (-1.0, False)])
 def test_what_comes_up_to_its_feet_turns_until_they_are_flat(com_speed: float, flat: bool) -> None:
-    """Sheared back over a flat sole it is turned back in the mean, by half of the shear: as it comes up to its feet it
-    is not told to turn, for its sole would point up; as it falls back from them, it is told to come upright."""
+    """Sheared back over a flat sole, its mean rotation is back by half of the shear. While it moves towards its feet,
+    no rotation is requested, because its sole would point up; while it falls back from them, it turns upright."""
     place = block_place()
     height = place.standing[:, 2:] - place.standing[:, 2].min()
     sheared = place.standing + 0.1 * height / height.max() * [-1.0, 0.0, 0.0]
@@ -102,8 +102,8 @@ def test_what_comes_up_to_its_feet_turns_until_they_are_flat(com_speed: float, f
 
 @pytest.mark.parametrize("toes", [0.05, 0.2])
 def test_feet_come_down_so_far_ahead_that_the_body_stops_over_them(toes: float) -> None:
-    """Where the target lies too near to stop, the capture point is ahead of the middle of the feet by no more than its
-    share of what they reach ahead, however far they reach behind."""
+    """If the target is too near to stop, the capture point is ahead of the middle of the feet by at most its fraction
+    of their forward reach, however far they reach behind."""
     place = block_place()
     touching = place.contact_points[place.contact_points[:, 0] < toes + 1e-9]
     place = replace(place, contact_points=np.vstack([touching, [toes, 0.0, 0.0]]))
@@ -112,10 +112,10 @@ def test_feet_come_down_so_far_ahead_that_the_body_stops_over_them(toes: float) 
     state = BodyState(place.standing + [0.0, 0.0, 0.3], np.tile([speed, 0.0, -1.0], (len(place.standing), 1)), 0.01)
     jump.objectives(state, None, DT)
     assert jump.phase is JumpPhase.FLIGHT
-    seen = jump.pose.measure(state, None)
-    down = np.array([0.1, 0.0, jump.pose.standing_height])
+    seen = jump.controller.measure(state, None)
+    down = np.array([0.1, 0.0, jump.controller.standing_height])
     left = 0.1
-    stop = stopping_time(jump.pose.standing_height, left * 9.81 + 1.0, 9.81)
+    stop = stopping_time(jump.controller.standing_height, left * 9.81 + 1.0, 9.81)
     placed = jump._foothold(state, seen, down, left)  # pyright: ignore[reportPrivateUsage]
-    ahead = down[0] + stop * speed + jump.pose.base_offset[0] - placed[0]
+    ahead = down[0] + stop * speed + jump.controller.base_offset[0] - placed[0]
     assert ahead == pytest.approx(MAX_FOOTHOLD_OFFSET * toes)

@@ -143,13 +143,13 @@ def test_a_thrust_lasts_until_friction_has_given_the_speed_ahead(distance: float
     if distance == 0.6:
         assert plan == easy and spare(plan) > 0.0
     elif distance == 0.75:
-        # Reckoned with the speed that a thrust of no length would ask for, it is a little longer than it need be.
+        # Computed with the speed of a thrust of zero duration, it is a little longer than necessary.
         assert 0.0 < deeper < 0.02 and 0.0 < spare(easy) < spare(plan) < 0.3
     elif distance == 0.8:
         assert deeper == pytest.approx(0.02) and spare(easy) < 0.0 < spare(plan)
     else:
         assert deeper == pytest.approx(0.02) and spare(plan) < 0.0
-    # Without friction nothing is given: as deep as where it gives too little.
+    # Without friction, the crouch is as deep as with too little friction.
     assert planned(0.0).crouch_depth - easy.crouch_depth == pytest.approx(0.02)
 
 
@@ -179,7 +179,7 @@ def test_a_given_lean_is_kept() -> None:
 
 @pytest.mark.parametrize("step", [1 / 30, 1 / 60, 1 / 90])
 def test_a_crouch_goes_over_into_its_thrust_in_whole_steps(step: float) -> None:
-    """Otherwise its last step would ask for less than its whole way: a jolt against the motion."""
+    """Otherwise the target of its last step would be shorter than a whole step: a jolt against the motion."""
     plan = plan_jump(
         JumpTarget(0.5, 0.2), height=1.0, com_height=0.45, support_ahead=0.2, gravity=GRAVITY, step=step, lean=0.1
     )

@@ -95,10 +95,10 @@ def test_a_weight_holds_on_the_way_to_its_key(tmp_path: Path) -> None:
         ([{**GOOD, "value": [0, 10**401, 0]}], "key 1: value [0, inf, 0]: give three numbers"),
         (f'[{{"time": {5000 * "9"}}}]', 'key 1: "part" is missing'),
         ([{**GOOD, "value": 4}], "key 1: value 4: give three numbers: forward, left, up"),
-        ([{**GOOD, "value": [0, 30, 40]}], "value [0, 30, 40] has the length 50; at most 10 is done"),
+        ([{**GOOD, "value": [0, 30, 40]}], "value [0, 30, 40] has the length 50; at most 10 is allowed"),
         (
             [{**GOOD, "quantity": "orientation", "value": [0, 0, -361]}],
-            "key 1: value [0, 0, -361] has the length 361; at most 360 is done",
+            "key 1: value [0, 0, -361] has the length 361; at most 360 is allowed",
         ),
         ([{**GOOD, "weight": 0}], "key 1: weight 0: give a number above 0, at most 1000"),
         ([GOOD, GOOD], "key 2: time 0.5 is not 0.001 s after 0.5, the key before of head position"),
@@ -119,7 +119,7 @@ def test_malformed_json(tmp_path: Path, content: object, message: str) -> None:
         (HEADER, "no key frames; give at least one"),
         (
             "time,part,x,y,z\n",
-            "line 1: the columns are time,part,x,y,z; give time,part,quantity,x,y,z and maybe weight",
+            "line 1: the columns are time,part,x,y,z; give time,part,quantity,x,y,z and optionally weight",
         ),
         (HEADER + "0.5,head,position,1,2\n", "line 2: 5 values for 6 columns"),
         (

@@ -1,4 +1,4 @@
-"""Limbs and feet of bodies of many shapes: what they stand on is told by the limbs above as much as by the ground."""
+"""Limbs and feet of bodies of many shapes: the support depends on the limbs above as much as on the ground."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from egs_warp.motions.limbs import Sections, find_limbs
 from tests.support.meshes import carved, coarse_stool, column, figure, stool
 
 Shape = Callable[[np.ndarray], np.ndarray]
-"""Which of the points (n, 3) it holds."""
+"""Function that returns which of the points (n, 3) are inside."""
 SIZE = (1.0, 1.0, 1.0)
 
 
 def legged(count: int, *, radius: float = 0.36, thick: float = 0.09, seat: float = 0.7, turn: float = 0.3) -> Shape:
-    """A round seat on so many legs."""
+    """Return a round seat on ``count`` legs."""
     angles = turn + 2.0 * np.pi * np.arange(count) / count
     places = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 

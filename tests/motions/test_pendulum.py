@@ -18,7 +18,7 @@ def test_a_plan_is_a_motion_of_the_pendulum_that_ends_over_its_pressure() -> Non
     """c'' = w^2 (c - p), begun with the planned divergent part, keeps to the plan and does not run away; p jumps."""
     step = 0.05
     pressure = np.array([[0.1, 0.0]] * 8 + [[0.0, 0.2]] * 6 + [[0.3, 0.1]] * 30)
-    plan = PendulumPlan.over(pressure, step, RATE)
+    plan = PendulumPlan.from_pressure(pressure, step, RATE)
     place = np.array([0.08, 0.01])
     state = np.concatenate([place, RATE * (plan.divergent[0] - place)])
     for k, p in enumerate(pressure):
@@ -31,7 +31,7 @@ def test_a_plan_is_a_motion_of_the_pendulum_that_ends_over_its_pressure() -> Non
 
 
 def test_a_plan_is_told_between_its_steps_and_stays_at_its_end() -> None:
-    plan = PendulumPlan.over(np.array([[0.0, 0.0], [1.0, 0.0]]), 0.1, RATE)
+    plan = PendulumPlan.from_pressure(np.array([[0.0, 0.0], [1.0, 0.0]]), 0.1, RATE)
     pressure, divergent = plan.at(0.05)
     assert pressure == pytest.approx([0.0, 0.0])
     assert divergent == pytest.approx(0.5 * (plan.divergent[0] + plan.divergent[1]))

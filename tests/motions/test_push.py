@@ -1,4 +1,4 @@
-"""Pushes: impulses and gusts that momenta, ledger and audit know of; who stands keeps its feet, or falls."""
+"""Pushes: impulses and gusts in momenta, energy balance and audit; a standing body keeps its feet, or falls."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def made() -> CoarseCreature:
 
 
 def stood(made: CoarseCreature, pushes: str, frames: int = 40, **given: Path) -> tuple[RolloutResult, str | None]:
-    """A block that is told to stand, and how it fell, if it did."""
+    """A block that stands, and the description of its fall, if it fell."""
     place = made.place
     watch = FallMonitor(MotionSequence(place, motion("stand 0.5").parts(place.body.height)), place)
     simulation = roll_out(
@@ -150,8 +150,8 @@ def test_what_the_run_was_over_before_is_told() -> None:
     pushes = read_pushes("0.5 0.1 left, 1-3 0.1 back, 2 0.1 left")
     assert [push.unapplied_note(2.0) for push in pushes] == [
         None,
-        "the gust until 3 s was not over when the run was",
-        "the push at 2 s never came: the run was over before",
+        "the gust until 3 s did not act in full: the run ended before",
+        "the push at 2 s did not act: the run ended before",
     ]
     assert [push.unapplied_note(3.0) for push in pushes] == [None] * 3
 
@@ -159,11 +159,11 @@ def test_what_the_run_was_over_before_is_told() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("script", ["stand 0.2", pytest.param("turn 10", marks=pytest.mark.slow)])
 def test_a_creature_is_pushed_while_it_stands_or_turns(script: str) -> None:
-    """The way is that of the body as it stands at the start; what came too late is told."""
+    """The direction is relative to the body at the start; a push after the end of the run is reported."""
     creature = coarse_pawn()
     done = simulate(creature, motion(script), pushes=read_pushes("0.1 0.05 left, 0.2-0.3 0.05 back 0.8, 60 0.1 up"))
     t = done.trajectory
-    assert done.fallen is None and done.cut_short() == ["the push at 60 s never came: the run was over before"]
+    assert done.fallen is None and done.cut_short() == ["the push at 60 s did not act: the run ended before"]
     momentum = np.einsum("n,kni->ki", t.node_mass, t.kick_velocity) @ done.place.ground.axes.T
     unit = 0.05 * creature.body.mass * creature.body.speed_unit
     np.testing.assert_allclose(momentum[0] / unit, [0.0, 1.0, 0.0], atol=1e-9)
@@ -179,7 +179,7 @@ def test_a_creature_is_pushed_while_it_stands_or_turns(script: str) -> None:
         ({"impulse": np.array([0.0, np.nan, 0.0])}, "impulse nan: give a number from 0 to 10"),
         ({"impulse": np.array([0.0, 8.0, 8.0])}, "impulse 11.3137: give a number from 0 to 10"),
         ({"height": 1.5}, "height 1.5: give a number from 0 to 1"),
-        ({"lasts": np.inf}, "lasts inf: give a number from 0 to 600"),
+        ({"duration": np.inf}, "duration inf: give a number from 0 to 600"),
     ],
 )
 def test_numbers_that_no_push_has_are_refused(numbers: dict[str, Any], said: str) -> None:
@@ -191,10 +191,10 @@ def test_numbers_that_no_push_has_are_refused(numbers: dict[str, Any], said: str
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("", "push 1 (''): give a time, an impulse and a way"),
-        ("0.5 0.1", "push 1 ('0.5 0.1'): give a time, an impulse and a way"),
+        ("", "push 1 (''): give a time, an impulse and a direction"),
+        ("0.5 0.1", "push 1 ('0.5 0.1'): give a time, an impulse and a direction"),
         ("0.5 0.1 left, soon 0.1 left", "push 2 ('soon 0.1 left'): time 'soon': give seconds"),
-        ("0.5 0.1 sideways", "unknown way 'sideways'; give one of ahead, back, left, right, up, down"),
+        ("0.5 0.1 sideways", "unknown direction 'sideways'; give one of ahead, back, left, right, up, down"),
         ("0.5 nan left", "impulse nan: give m sqrt(g H) from 0 to 10"),
         ("0.5 1e9 left", "impulse 1e9: give m sqrt(g H) from 0 to 10"),
         ("2-1 0.1 left", "time 1: give seconds from 2 to 600"),

@@ -1,4 +1,4 @@
-"""A ball rolls: it comes where it is told without slipping, and goes on from whatever side it has come to lie on."""
+"""Roll: a ball reaches its target without slipping, and continues from whichever side it lies on."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def ball() -> CoarseCreature:
 
 @dataclass(frozen=True)
 class Rolled:
-    """What came of it."""
+    """Result of a roll."""
 
     roll: Roll
     trajectory: Trajectory
@@ -64,7 +64,7 @@ def rolled() -> Rolled:
     recorder = Recorder(made.stepper.body, made.stepper.muscles, made.stepper.geometry, made.start, 0.0, drag=0.0)
     recorder.add(reports)
     roll = sequence.done[0].motion
-    assert isinstance(roll, Roll) and roll.resting
+    assert isinstance(roll, Roll) and roll.is_at_rest
     return Rolled(roll, recorder.trajectory(), reports, state, watch.fallen)
 
 
@@ -77,7 +77,7 @@ def test_a_ball_is_told_from_what_stands() -> None:
 
 
 def test_a_ball_that_has_turned_over_is_still_one() -> None:
-    """Told by its shape as it lies, not by the side that it once stood on."""
+    """The kind of support follows from its shape as it lies, not from the side on which it once stood."""
     made = ball()
     turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     com = made.place.body.centre_of_mass(made.place.standing)
@@ -103,13 +103,13 @@ def test_a_step_in_its_way_is_refused() -> None:
     place = ball().place
     wall = (step(Plane(UP, 0.0), 0.5 * FORWARD, FORWARD, 0.2),)
     blocked = Stance(place.body, place.ground, place.standing, place.contact_points, DT, wall)
-    with pytest.raises(UserError, match="the way leads over a step"):
+    with pytest.raises(UserError, match="the path leads over a step"):
         move_along(blocked, straight_route(1.0), 0.1)
 
 
 @pytest.mark.slow
 def test_a_ball_rolls_to_its_point_without_slipping() -> None:
-    """Within 0.03, by an angle of way over radius, and no one takes that for a fall."""
+    """Within 0.03, with an angle of distance over radius, and without counting as a fall."""
     done = rolled()
     local = done.roll.ground.local(done.end.positions)
     com = done.roll.body.centre_of_mass(local)

@@ -56,7 +56,7 @@ def test_a_path_is_followed_past_its_points() -> None:
 
 
 def test_a_way_of_too_many_paces_is_refused() -> None:
-    with pytest.raises(UserError, match="walk: the way takes more than 400 paces; choose a shorter one"):
+    with pytest.raises(UserError, match="walk: the path takes more than 400 steps; choose a shorter one"):
         path_route(np.array([[9.0, 0.0]]))(StepLimits(0.01, 0.25))
 
 

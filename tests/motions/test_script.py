@@ -47,7 +47,9 @@ def test_a_run_is_the_quickest_walk_by_the_longest_paces(place: Stance) -> None:
     fast, usual = run.begin(place), walk.begin(place)
     assert isinstance(fast, Walk) and isinstance(usual, Walk)
     assert fast.gait.swing_time == pytest.approx(usual.gait.swing_time / 1.6)
-    assert fast.gait.step_count <= usual.gait.step_count and fast.places[-1] == pytest.approx(usual.places[-1])
+    assert fast.gait.step_count <= usual.gait.step_count and fast.planar_poses[-1] == pytest.approx(
+        usual.planar_poses[-1]
+    )
 
 
 def test_what_takes_no_numbers_says_so() -> None:
@@ -96,7 +98,7 @@ def test_ways_are_asked_for_in_words(tmp_path: Path) -> None:
         ("turn 45 9", "('turn 45 9'): speed 9: give a number of times the usual from 0.3 to 1.6"),
         ("jump speed=2", "('jump speed=2'): 'speed' is unknown; jump takes distance, height"),
         ("trajectory", "('trajectory'): trajectory needs a file of key frames, as trajectory keys.json"),
-        ("hop x60, hop x60", "motion: 120 motions are asked for; at most 100 are done in a row"),
+        ("hop x60, hop x60", "motion: 120 motions are given; at most 100 are allowed"),
         ("jump x2 x3", "('jump x2 x3'): 'x3' is a second number of repeats; give one"),
         ("jump x" + 5000 * "9", "repeat inf; give a whole number from 1 to 100"),
         ("jump distance=1 distance=2", "distance is given twice; give it once"),

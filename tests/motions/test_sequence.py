@@ -135,7 +135,7 @@ def test_what_the_last_frame_cut_off_is_told(place: Stance) -> None:
 
 
 def test_a_motion_that_cannot_be_is_refused_before_the_first(place: Stance) -> None:
-    with pytest.raises(UserError, match="walk: the way takes more than 400 paces"):
+    with pytest.raises(UserError, match="walk: the path takes more than 400 steps"):
         motion("hop x2, jump, walk to 9,9 0.01").check(place)
     motion("hop x2, jump").check(place)
 

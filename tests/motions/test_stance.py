@@ -1,4 +1,4 @@
-"""What the feet can give: ends of a step that do not tip the body, against a search over all of them."""
+"""Balance controller: ends of a step that do not tip the body, against an exhaustive search."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def stood(
 
 
 def swing(place: Stance, state: BodyState, seen: Measurement, spin: np.ndarray) -> np.ndarray:
-    """(2,) m/s that a ``spin`` (3,) adds to the speed in the momentum about the feet."""
+    """Return the velocity (2,) in m/s that a ``spin`` (3,) adds in the angular momentum about the feet."""
     momentum = place.ground.axes @ place.body.inertia(state.positions) @ spin / (place.body.mass * seen.com[2])
     return np.array([momentum[1], -momentum[0]])
 
@@ -77,8 +77,7 @@ def test_what_feet_can_give_is_asked_for_as_it_is_and_a_falling_body_may_be_push
 
 @pytest.mark.parametrize("up", [0.0, 0.25])
 def test_no_more_is_asked_than_friction_gives(place: Stance, up: float) -> None:
-    """Coulomb: what is asked keeps its way and is 0.95 of what the ground's friction could do; less is asked as it
-    is."""
+    """Coulomb: a request keeps its direction and is limited to 0.95 of the friction; a smaller one is unchanged."""
     pose, _, seen = stood(place, 0.05, (0.0, 0.0, 0.0))
     wanted = np.array([0.009, -0.012])
     most = 0.95 * 0.05 * (GRAVITY + up / DT) * DT
@@ -90,8 +89,8 @@ def test_no_more_is_asked_than_friction_gives(place: Stance, up: float) -> None:
 
 @pytest.mark.parametrize("way", [(1.0, 0.0), (-1.0, 0.0), (0.6, -0.8)])
 def test_on_a_slope_friction_gives_less_uphill(way: tuple[float, float]) -> None:
-    """What is asked for is on the cone about the ground's normal: uphill that is weight x tan(friction angle - slope),
-    by hand."""
+    """The limited request is on the cone about the ground's normal: uphill that is weight x tan(friction angle -
+    slope), by hand."""
     friction, slope = 0.3, np.radians(8.0)
     rising = np.array([-np.sin(slope), 0.0, np.cos(slope)])
     push, weight = np.array([*way, 0.0]), np.array([0.0, 0.0, 2.0])
@@ -107,7 +106,7 @@ def test_on_a_slope_friction_gives_less_uphill(way: tuple[float, float]) -> None
 
 @pytest.mark.parametrize("spin", [(0.0, -2.0, 0.0), (1.5, 1.0, 0.2)])
 def test_what_friction_denies_the_speed_the_spin_takes(place: Stance, spin: tuple[float, float, float]) -> None:
-    """On a slippery ground, too, the centre of pressure asked for is within the footprint."""
+    """On slippery ground, too, the requested centre of pressure is within the footprint."""
     pose, state, seen = stood(place, 0.3, (0.05, -0.03, 0.1))
     velocity, turned = pose.balance_targets(seen, np.array([0.3, 0.01, 0.0]), np.array(spin), DT)
     change = velocity[:2] + swing(place, state, seen, turned)
@@ -118,8 +117,8 @@ def test_what_friction_denies_the_speed_the_spin_takes(place: Stance, spin: tupl
 
 
 def test_a_body_that_turns_forward_is_caught_further_ahead(place: Stance) -> None:
-    """The capture point is that of the momentum about the feet: at rest over its place nothing is asked, and spin
-    counts as the speed that has the same momentum."""
+    """The capture point follows from the angular momentum about the feet: at rest over its position, the acceleration
+    is zero, and spin counts as the velocity with the same momentum."""
     pose, state, seen = stood(place, 1.0, (0.0, 0.0, 0.0))
     np.testing.assert_allclose(pose.capture_acceleration(seen, seen.com[:2]), 0.0, atol=1e-12)
     ahead = BodyState(state.positions, np.broadcast_to(0.1 * place.ground.axes[0], state.positions.shape))

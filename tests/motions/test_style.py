@@ -26,12 +26,12 @@ from tests.support.stances import FORWARD
 
 @dataclass(frozen=True)
 class Jumped:
-    """Of the centre of mass, metres and seconds."""
+    """Heights of the centre of mass and times; metres, seconds."""
 
     depth: float
-    """Of the crouch."""
+    """Depth of the crouch."""
     lowest: float
-    """When it ends."""
+    """End of the crouch."""
     take_off: float
     apex: float
     """Above where it stood."""
@@ -68,7 +68,7 @@ def test_the_usual_style_changes_no_bit() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["anticipation", "timing"])
 def test_anticipation_and_timing_lengthen_a_crouch(name: str) -> None:
-    """By as much as they say, to the step; the height that was asked is reached all the same."""
+    """By exactly their factors, to the step; the requested height is still reached."""
     short, usual, long = jumped(f"{name}=0.7"), jumped(None), jumped(f"{name}=1.4")
     crouches = np.array([short.lowest, usual.lowest, long.lowest]) - 0.1  # it settles first
     np.testing.assert_allclose(crouches / crouches[1], [0.7, 1.0, 1.4], atol=0.06)
@@ -84,7 +84,7 @@ def test_anticipation_deepens_a_crouch() -> None:
 
 @pytest.mark.slow
 def test_timing_makes_a_thrust_soft() -> None:
-    """The mean push is divided by it: to the same speed up, a thrust takes so many times as long."""
+    """The mean acceleration is divided by it: a thrust to the same upward speed takes longer by the factor."""
     usual, *others = (planned(Style(timing=timing)) for timing in (1.0, 0.7, 1.4))
     np.testing.assert_allclose([other.thrust_time / usual.thrust_time for other in others], [0.7, 1.4], rtol=1e-6)
     assert others[0].speed_up == others[1].speed_up == usual.speed_up
@@ -147,7 +147,7 @@ def test_presets_can_be_changed() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "style: nothing is given; give one of light, heavy, rubbery, or numbers as anticipation=1.3, of"),
+        ("", "style: the text is empty; give one of light, heavy, rubbery, or numbers such as anticipation=1.3, of"),
         ("floppy", "style: unknown word 'floppy'; give one of light, heavy, rubbery, or numbers"),
         ("squash=1 heavy", "style: unknown word 'heavy'; give one of"),
         ("wobble=2", "style: unknown word 'wobble=2'; give one of"),
@@ -163,7 +163,7 @@ def test_a_bad_style_is_told_in_one_line(text: str, said: str) -> None:
 
 
 def test_a_style_without_a_jump_is_refused() -> None:
-    with pytest.raises(ArgumentError, match=r"^style: nothing jumps in 'walk'; ask for a jump, hop, twist or dance$"):
+    with pytest.raises(ArgumentError, match=r"^style: nothing jumps in 'walk'; add a jump, hop, twist or dance$"):
         motion("walk").style("heavy")
     assert motion("walk").style(None) == Style()
     with pytest.raises(ArgumentError, match=r"^squash 9: give a number from 0.5 to 2$"):

@@ -1,4 +1,4 @@
-"""Turns on a block that is posed by hand: as many twists as friction asks for."""
+"""Turns of a block that is posed by hand: as many jumps as friction requires."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.stances import DT, moved
 def land(jump: Jump, state: BodyState) -> None:
     """Put a jump where it has landed and come to rest but for the last step."""
     jump.phase, jump._entered = JumpPhase.LAND, -100.0
-    jump.pose = jump._landing
+    jump.controller = jump._landing
 
 
 def test_a_turn_that_falls_short_is_made_up_where_it_began(place: Stance) -> None:
@@ -39,31 +39,31 @@ def test_a_turn_that_falls_short_is_made_up_where_it_began(place: Stance) -> Non
     there = moved(place, np.radians(55.0), np.zeros(3))
     land(second, BodyState(there, 0 * there, 20.0))
     turn.objectives(BodyState(there, 0 * there, 20.0), None, DT)
-    assert len(turn.jumps) == 2 and turn.resting
+    assert len(turn.jumps) == 2 and turn.is_at_rest
 
 
 def test_a_slippery_floor_takes_more_jumps(place: Stance) -> None:
     """The largest turn is proportional to friction; a turn beyond it is shared out evenly."""
     target = JumpTarget(0.0, 0.2)
     rough, smooth = (Turn(replace(place, friction=mu), target, np.pi) for mu in (0.8, 0.2))
-    assert smooth.most_in_a_jump == pytest.approx(rough.most_in_a_jump / 4.0)
-    count = np.ceil(np.pi / smooth.most_in_a_jump)
+    assert smooth.max_turn_per_jump == pytest.approx(rough.max_turn_per_jump / 4.0)
+    count = np.ceil(np.pi / smooth.max_turn_per_jump)
     assert count >= 2.0 and smooth.jumps[0].facing.target_heading == pytest.approx(np.pi / count)
     landed = moved(place, smooth.jumps[0].facing.target_heading, np.zeros(3))
     state = BodyState(landed, 0 * landed, 10.0)
     land(smooth.jumps[0], state)
     smooth.objectives(state, None, DT)
     assert smooth.jumps[1].facing.target_heading == pytest.approx(np.pi / count)
-    assert smooth.notes()[0] == f"friction gives a turn of {np.degrees(smooth.most_in_a_jump):.0f} degrees a jump"
+    assert smooth.notes()[0] == f"friction allows a turn of {np.degrees(smooth.max_turn_per_jump):.0f} degrees a jump"
 
 
 @pytest.mark.parametrize("points", ["disc", "rim"])
 def test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground(place: Stance, points: str) -> None:
-    """docs/concepts/motions.md: a disc pressed down by N resists twisting by 2/3 mu N R; its impulse while thrusting
-    turns the flying body.
+    """Largest turn of a disc (docs/concepts/motions.md).
 
-    Of Coulomb's cone a pyramid of four edges gives 1 / (|cos| + |sin|) in each direction. The body is off the ground
-    for nine tenths of the planned time, within a twentieth.
+    A disc pressed down by N resists twisting by 2/3 mu N R; its impulse during the thrust turns the flying body. Of
+    Coulomb's cone, a pyramid of four edges gives 1 / (|cos| + |sin|) in each direction. The body is off the ground for
+    nine tenths of the planned time, within a twentieth.
     """
     radius, mu = 0.15, 0.5
     angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)

@@ -1,4 +1,4 @@
-"""Twists on a block that is posed by hand: what spin is asked of the ground, and what shape in the air."""
+"""Twists of a block that is posed by hand: target spin on the ground and target shape in the air."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
 from egs_warp.motions.jump import FORWARD_TIME_FRACTION, Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.twist import AIRBORNE_SHARE, SLIDE, SPARE_SPIN, twist
+from egs_warp.motions.twist import AIRBORNE_FRACTION, LANDING_SLIDE_ANGLE, SPIN_FACTOR, twist
 from tests.support.meshes import box_mesh
 from tests.support.stances import DT, block_place, moved
 
 
 def yaw_asked(jump: Jump, state: BodyState) -> float:
-    """Angular momentum about up, kg m^2/s, that the step from ``state`` asks for."""
+    """Target angular momentum about up, kg m^2/s, of the step from ``state``."""
     asked = jump.objectives(state, None, DT)[1]
     assert isinstance(asked, AngularMomentumObjective)
     return float(asked.target[2])
@@ -31,12 +31,12 @@ def inertia_about_up(place: Stance, positions: np.ndarray) -> float:
 
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.0 * np.pi])
 def test_a_twist_asks_friction_for_the_spin_that_is_left(turn: float) -> None:
-    """In the last step of the thrust: the spin that turns the standing body by what is left while it flies, whatever
-    its shape now, and a reserve.
+    """In the last step of the thrust, the target is the spin that completes the remaining turn of the standing body in
+    flight, whatever its present shape, with a reserve.
 
-    What is asked falls in proportion to the angle turned and is nothing a few degrees, which the feet slide on by,
-    before the end. Its own turning is counted beyond half turns. The body's masses mirror: what is asked against its
-    tilt has no momentum about up.
+    The target falls in proportion to the completed turn. It is zero a few degrees before the end, by which the feet
+    slide on. The heading is counted beyond half turns. The body's masses are symmetric: the target against its tilt has
+    no momentum about up.
     """
     place = block_place(box_mesh((2, 2, 4), (0.4, 0.4, 1.0)))
     jump = twist(place, JumpTarget(0.0, 0.2), turn)
@@ -48,7 +48,7 @@ def test_a_twist_asks_friction_for_the_spin_that_is_left(turn: float) -> None:
     asked = sign * np.array([yaw_asked(jump, state) for state in states])
     slope, start = np.polyfit(angles, asked, 1)
     assert np.allclose(asked, start + slope * angles, rtol=1e-6)
-    assert np.degrees(abs(turn) + start / slope) == pytest.approx(np.degrees(SLIDE), abs=1e-3)
+    assert np.degrees(abs(turn) + start / slope) == pytest.approx(np.degrees(LANDING_SLIDE_ANGLE), abs=1e-3)
     reserve = -slope * jump.plan.flight_time / inertia_about_up(place, place.standing)
     assert 1.1 < reserve < 1.7
     crouched = moved(place, float(sign * 0.6), np.zeros(3))
@@ -61,8 +61,8 @@ def test_a_twist_asks_friction_for_the_spin_that_is_left(turn: float) -> None:
 
 
 def test_a_twist_gathers_its_spin_as_the_speed_up_is_gathered(place: Stance) -> None:
-    """What friction can give follows the load: a body that is still is asked for the share of the whole spin that a
-    step is of the thrust, one that rises at half the speed for twice that."""
+    """The friction follows the load: for a body at rest, the target is the fraction of the whole spin that a step is of
+    the thrust; for one that rises at half the speed, twice that."""
     shares = []
     for risen in (0.0, 0.5):
         jump = twist(place, JumpTarget(0.0, 0.2), 1.0)
@@ -71,22 +71,19 @@ def test_a_twist_gathers_its_spin_as_the_speed_up_is_gathered(place: Stance) -> 
         velocities[:, 2] = risen * jump.plan.speed_up
         asked = yaw_asked(jump, BodyState(place.standing, velocities, 0.0))
         left = (1.0 - risen) * jump.plan.thrust_time
-        whole = inertia_about_up(place, place.standing) * (1.0 - SLIDE) * SPARE_SPIN
-        whole /= AIRBORNE_SHARE * jump.plan.flight_time + 0.5 * left
+        whole = inertia_about_up(place, place.standing) * (1.0 - LANDING_SLIDE_ANGLE) * SPIN_FACTOR
+        whole /= AIRBORNE_FRACTION * jump.plan.flight_time + 0.5 * left
         shares.append(asked / whole)
         assert shares[-1] == pytest.approx(DT / (FORWARD_TIME_FRACTION * left), rel=5e-3)
     assert shares[1] == pytest.approx(2.0 * shares[0], rel=5e-3)
 
 
 def test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn(place: Stance) -> None:
-    """Angular momentum L is kept: the inertia I (arms in or out) that turns by the angle left in the time left is L t /
-    angle.
-
-    The body is asked to approach that shape at one rate; at the spin that fits it as it stands it is asked for
-    nothing.
-    """
+    """Angular momentum L is conserved: the inertia I (arms in or out) that turns by the remaining angle in the
+    remaining time is L t / angle. The target shape is approached at one rate; at the spin that fits the standing shape,
+    the target is zero."""
     turn, speed = 1.5, 2.5
-    left = turn - SLIDE
+    left = turn - LANDING_SLIDE_ANGLE
     time = 2.0 * speed / 9.81
     corners = [int(np.argmin(np.linalg.norm(place.standing - [x, x, 0.0], axis=1))) for x in (-0.2, 0.2)]
     arms = place.standing - place.body.centre_of_mass(place.standing)
@@ -98,7 +95,7 @@ def test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn(
         spin = fitting * width**2
         velocities = np.cross([0.0, 0.0, spin], arms) + [0.0, 0.0, speed]
         flying = BodyState(place.standing, velocities, 0.01)
-        for when in (0.01, 0.5, 0.5):  # the last time the pose asked for has been taken over and is at rest
+        for when in (0.01, 0.5, 0.5):  # the last time, the target pose has been reached and is constant
             objectives = jump.objectives(replace(flying, time=when), None, DT)
         assert jump.phase is JumpPhase.FLIGHT
         shape = objectives[2]

@@ -48,19 +48,19 @@ def biped() -> TetMesh:
 
 @dataclass(frozen=True)
 class Walked:
-    """What came of a walk."""
+    """Result of a walk."""
 
     creature: CoarseCreature
     walk: Walk
     trajectory: Trajectory
     fell: Footfalls
     air: float
-    """Metres: how high the lowest node of a swinging sole came."""
+    """Largest height of the lowest node of a swinging sole, m."""
     unconverged: int
 
 
 def walked(creature: CoarseCreature, route: Route, pace_length: float, *, speed: float = 1.0) -> Walked:
-    """Walk until it rests, at most 300 steps."""
+    """Walk until the body rests, at most 300 steps."""
     stepper, state = creature.stepper, creature.start
     walk = Walk(creature.place, route, pace_length, speed=speed)
     reports: list[StepReport] = []
@@ -71,9 +71,9 @@ def walked(creature: CoarseCreature, route: Route, pace_length: float, *, speed:
         reports += fresh
         for index in walk.swinging:
             air = max(air, float(state.positions[walk.feet[index].sole, 2].min()))
-        if walk.resting:
+        if walk.is_at_rest:
             break
-    assert walk.resting and walk.notes() == []
+    assert walk.is_at_rest and walk.notes() == []
     recorder = Recorder(stepper.body, stepper.muscles, stepper.geometry, creature.start, 0.0, drag=0.0)
     recorder.add(reports)
     trajectory = recorder.trajectory()
@@ -113,8 +113,8 @@ def test_a_coarse_stool_takes_a_step(slope: float) -> None:
 def test_a_body_on_two_legs_keeps_its_balance(route: Route) -> None:
     """Two paces ahead, and on the spot: it comes to its place, upright."""
     done = walked(strong(biped()), route, 0.06)
-    assert isinstance(done.walk._carriage, LeggedPosture) and len(done.walk.feet) == 2
-    reached, place = measure(done.trajectory), done.walk.places[-1]
+    assert isinstance(done.walk._posture, LeggedPosture) and len(done.walk.feet) == 2
+    reached, place = measure(done.trajectory), done.walk.planar_poses[-1]
     assert reached.distance * done.creature.place.body.height == pytest.approx(place[0], abs=0.012)
     assert reached.heading_degrees == pytest.approx(np.degrees(place[2]), abs=3.0) and reached.tilt_degrees < 4.0
     check_audit(done)
@@ -125,7 +125,7 @@ def test_a_body_on_two_legs_keeps_its_balance(route: Route) -> None:
 def test_a_block_waddles(route: Route) -> None:
     """It lifts one side of its base, turns about the other, and so on: it comes to its place, upright."""
     done = walked(strong(block_mesh()), route, 0.04)
-    body, reached, place = done.creature.place.body, measure(done.trajectory), done.walk.places[-1]
+    body, reached, place = done.creature.place.body, measure(done.trajectory), done.walk.planar_poses[-1]
     assert reached.distance * body.height == pytest.approx(place[0], abs=0.2 * 0.04)
     assert reached.heading_degrees == pytest.approx(np.degrees(place[2]), abs=3.0) and reached.tilt_degrees < 3.0
     assert done.air > 0.0 and done.fell.landings >= 2
@@ -145,20 +145,20 @@ def test_a_base_does_not_run_ahead_of_what_is_above_it(data_dir: Path) -> None:
 
 
 def test_a_pace_that_slipping_feet_have_lost_is_made_again() -> None:
-    """Feet that are where they came to go on; half a pace behind, they go to the same place once more, told in one
-    line, and the way still ends where it did."""
+    """Feet at their footholds continue; feet that lag by half a step repeat it, with one message, and the route ends at
+    the same place."""
     place = coarse_creature(block_mesh(), forward=AHEAD, settled=False).place
     walk = Walk(place, straight_route(0.12), 0.04)
-    standing, before, paces = place.ground.local(place.standing), walk.places.copy(), walk.gait.step_count
+    standing, before, paces = place.ground.local(place.standing), walk.planar_poses.copy(), walk.gait.step_count
     walk._arrived_footholds = [1, 1]
     pace = before[1, 0]
     assert walk._mean_lag(standing + [pace, 0.0, 0.0]) == pytest.approx(0.0, abs=1e-9)
     assert walk._mean_lag(standing) == pytest.approx(1.0)
     walk._plan_swing(1, standing + [0.8 * pace, 0.0, 0.0])
-    assert np.array_equal(walk.places, before) and not walk.notes()
+    assert np.array_equal(walk.planar_poses, before) and not walk.notes()
     walk._plan_swing(1, standing + [0.2 * pace, 0.0, 0.0])
-    assert walk.gait.step_count == paces + 1 and np.array_equal(np.delete(walk.places, 2, axis=0), before)
-    assert np.array_equal(walk.places[2], before[1]) and "1 pace" in walk.notes()[-1]
+    assert walk.gait.step_count == paces + 1 and np.array_equal(np.delete(walk.planar_poses, 2, axis=0), before)
+    assert np.array_equal(walk.planar_poses[2], before[1]) and "1 step" in walk.notes()[-1]
 
 
 def test_the_plan_tells_what_the_legs_can_do() -> None:
@@ -171,22 +171,25 @@ def test_the_plan_tells_what_the_legs_can_do() -> None:
     assert fast.swing_time == pytest.approx(planned.swing_time / 1.5)
     strides_out = Walk(place, straight_route(1.6), 0.8)
     assert strides_out.plan_record().pace_length <= 0.5 * min(foot.length for foot in strides_out.feet)
-    assert strides_out.notes()[0].startswith("steps of 1.00 body heights were asked; the body goes by 0.3")
+    assert strides_out.notes()[0].startswith(
+        "steps of 1.00 body heights were requested; the body can make steps of 0.3"
+    )
     turned = Walk(place, turn_route(0.5), 0.08).plan_record()
     far = max(np.linalg.norm(place.ground.local(place.standing)[f.sole, :2].mean(axis=0)) for f in place.feet())
     assert turned.stride == pytest.approx(2.0 * 2.0 * np.sin(0.125) * far, rel=0.05) and turned.paces == 2.0
 
 
 def test_feet_go_to_where_they_belong_when_the_body_turns() -> None:
-    """Told by turning the whole standing body to each place of the way, about where its centre of mass was."""
+    """Compared with rotating the whole standing body to each planar pose of the route, about its initial centre of
+    mass."""
     place = coarse_creature(stool(), forward=AHEAD, settled=False).place
     walk = Walk(place, path_route(np.array([[0.2, 0.3]])), 0.1)
     standing, com = place.ground.local(place.standing), place.body.centre_of_mass(place.ground.local(place.standing))
-    for x, y, heading in walk.places:
+    for x, y, heading in walk.planar_poses:
         turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
         moved = (standing[:, :2] - com[:2]) @ turn.T + com[:2] + [x, y]
         for index, foot in enumerate(walk.feet):
-            home = walk._footing.nominal_foothold(np.array([x, y, heading]), index)
+            home = walk._planner.nominal_foothold(np.array([x, y, heading]), index)
             assert home[:2] == pytest.approx(moved[foot.sole].mean(axis=0), abs=1e-12) and home[3] == heading
 
 
@@ -201,17 +204,17 @@ def test_it_is_planned_to_press_where_its_feet_are(mesh: Callable[[], TetMesh]) 
     lifted = walk.gait.swing_feet(0)
     stands = [index for index in range(len(walk.feet)) if index not in lifted]
     assert stands and len(stands) < len(walk.feet)
-    under = np.concatenate([walk._footing.soles[index, :2] + walk._footing.grips[index] for index in stands])
+    under = np.concatenate([walk._planner.soles[index, :2] + walk._planner.grips[index] for index in stands])
     assert nearest_in_hull(under, swing) == pytest.approx(swing, abs=1e-9)
     if len(lifted) == 1:  # the diagonals of four feet cross
-        other = walk._footing.soles[lifted[0], :2] + walk._footing.grips[lifted[0]]
+        other = walk._planner.soles[lifted[0], :2] + walk._planner.grips[lifted[0]]
         assert np.linalg.norm(nearest_in_hull(other, swing) - swing) > 0.0
     reach = 0.3 + np.ptp(place.standing[:, :2], axis=0)
     assert np.all(np.abs(plan.divergent - walk._start_com[:2]) < reach)
 
 
 def test_a_foot_that_has_turned_all_the_way_round_is_told_so() -> None:
-    """A heading is told as near to the planned one as whole turns let it."""
+    """A measured heading is unwrapped to the value nearest to the planned one."""
     place = coarse_creature(stool(), forward=AHEAD, settled=False).place
     walk = Walk(place, turn_route(np.radians(420.0)), 0.08)
     walk.swing = walk.gait.swings - 1
@@ -245,6 +248,6 @@ def test_what_has_no_feet_and_what_stands_in_the_way_is_told() -> None:
     walled = replace(place, solids=(*place.solids, wall))
     Walk(walled, straight_route(0.5), 0.1)
     with pytest.raises(
-        UserError, match=r"the way leads over a step, .* ahead and 0.00 to the left: .* higher; walk round"
+        UserError, match=r"the path leads over a step, .* ahead and 0.00 to the left: .* higher; walk round"
     ):
         Walk(walled, straight_route(1.2), 0.1)

@@ -1,4 +1,4 @@
-"""Poses of walking bodies: the centre of mass and the feet come where they are asked to be."""
+"""Postures of walking bodies: the centre of mass and the feet reach their targets."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_body_stands_as_it_stood(place: Stance) -> None:
 
 
 def test_legs_go_with_their_feet() -> None:
-    """The soles are where they are asked to be, each moved as one, and so is the centre of mass; the body turns."""
+    """The soles are at their targets, each moved rigidly, and so is the centre of mass; the body turns."""
     place = block_place(coarse_stool())
     standing, feet, carriage, soles = carried(place)
     assert isinstance(carriage, LeggedPosture) and len(feet) == 4
@@ -58,8 +58,8 @@ def test_legs_go_with_their_feet() -> None:
 
 
 def test_a_base_turns_and_tips_with_its_sides() -> None:
-    """One side ahead turns it about the other, one side up tips it; the middles of the sides come near their places,
-    the centre of mass where it is asked to be."""
+    """Moving one side forward rotates the body about the other, lifting it tips the body; the middles of the sides are
+    near their targets, and the centre of mass is at its target."""
     place = block_place()
     standing, feet, carriage, soles = carried(place)
     assert isinstance(carriage, RockingPosture) and len(feet) == 2

@@ -266,7 +266,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("balance: the margin of the footprint", "motions/stance.py"),
-            *("0.5 * SUPPORT_MARGIN * (seen.support[1]", "0.5 * (seen.support[1]"),
+            *("0.5 * SUPPORT_MARGIN * (measurement.support[1]", "0.5 * (measurement.support[1]"),
             "motions/test_stance.py::test_the_nearest_end_of_a_step_that_does_not_tip",
         ),
         (
@@ -281,17 +281,17 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("the largest turn: the pyramid of friction", "motions/turn.py"),
-            *("rate = PYRAMID * place.friction", "rate = place.friction"),
+            *("rate = PYRAMID_FRICTION_RATIO * stance.friction", "rate = stance.friction"),
             "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground",
         ),
         (
             *("twist: the spin of the standing body, not of the crouched one", "motions/twist.py"),
-            *("return inertia @ spin_for_rotation(", "return seen.inertia @ spin_for_rotation("),
+            *("return inertia @ spin_for_rotation(", "return measurement.inertia @ spin_for_rotation("),
             "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
         ),
         (
             *("twist: the time of flight", "motions/twist.py"),
-            *("airborne = AIRBORNE_SHARE * flight_time", "airborne = 2.0 * AIRBORNE_SHARE * flight_time"),
+            *("airborne = AIRBORNE_FRACTION * flight_time", "airborne = 2.0 * AIRBORNE_FRACTION * flight_time"),
             "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
         ),
         (

@@ -93,7 +93,7 @@ def test_a_motion_that_the_body_cannot_do_is_told(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
     played.ask("motion", text="walk to 9,9 0.01, jump")
     played.step()
-    assert played.told == ["walk: the way takes more than 400 paces; choose a shorter one"]
+    assert played.told == ["walk: the path takes more than 400 steps; choose a shorter one"]
     assert played.session.steering.idle or played.session.steering.doing == "stand"
     assert played.session.steering.begun == []
 
