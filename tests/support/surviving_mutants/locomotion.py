@@ -85,8 +85,8 @@ LOCOMOTION = [
     ),
     Survivor(
         "locomotion/synergies.py",
-        "if muscles.segment_count <= most:",
-        "if muscles.segment_count < most:",
+        "if muscles.segment_count <= max_count:",
+        "if muscles.segment_count < max_count:",
         "as many groups as muscles: each is one of its own either way",
     ),
     Survivor(
