@@ -73,7 +73,7 @@ def test_a_program_beside_one_that_is_solved_needs_no_iterations(monkeypatch: py
         lower, upper = np.full(30, -0.1), np.full(30, 0.2)
         asked = quadratic_program(P, q, A).solve(lower, upper)
         with monkeypatch.context() as patch:
-            patch.setattr(operator_splitting, "_answer", None)
+            patch.setattr(operator_splitting, "_run_osqp", None)
             beside = quadratic_program(P, q, A).solve(lower, upper, beside=True)
             rows, below = np.vstack([A, A[:1]]), np.append(lower, 0.3)
             none = quadratic_program(P, q, rows).solve(below, np.append(upper, 1.0), beside=True)
@@ -88,7 +88,7 @@ def test_each_splitting_is_that_of_its_name(monkeypatch: pytest.MonkeyPatch) -> 
     P, q, A = random_program(0)
     lower, upper = np.r_[0.0, np.full(29, -0.1)], np.r_[0.0, np.full(29, 0.2)]
     expected = quadratic_program(P, q, A, solver="osqp").solve(lower, upper)
-    monkeypatch.setattr(operator_splitting, "_answer", None)
+    monkeypatch.setattr(operator_splitting, "_run_osqp", None)
     found = quadratic_program(P, q, A, solver="admm").solve(lower, upper)
     assert found.status is QpStatus.SOLVED and np.abs(found.x - expected.x).max() < 1e-3
     with pytest.raises(TypeError):
