@@ -199,7 +199,7 @@ def test_a_search_goes_on_as_the_host_s(
     monkeypatch.setattr(device_plan, "PARALLEL_RESTART_COST", 0.0 if beside else np.inf)
     if what != "astray":
         monkeypatch.setattr(device_plan, "RESTART_COST", 0.0)
-    planner_of(stepper)._rooms.clear()
+    planner_of(stepper)._workspaces.clear()
     start = begun(stepper, creature.start, memory)
     asked: list[str] = []
 
@@ -208,9 +208,9 @@ def test_a_search_goes_on_as_the_host_s(
 
     noted(device_plan, "search_modes", search_modes)
     noted(device_plan, "solve_relaxed", solve_relaxed)
-    noted(PlanWorkspace, "_enqueue_elsewhere", PlanWorkspace._enqueue_elsewhere)
+    noted(PlanWorkspace, "_enqueue_restart", PlanWorkspace._enqueue_restart)
     noted(PlanWorkspace, "_enqueue_from_point", PlanWorkspace._enqueue_from_point)
-    noted(PlanWorkspace, "_end_at", PlanWorkspace._end_at)
+    noted(PlanWorkspace, "_replace_end", PlanWorkspace._replace_end)
     if what != "astray":
         monkeypatch.setattr(strategies, "RESTART_COST", 0.0)
         monkeypatch.setattr(strategies, "RESTART_GAP", 0.0)
@@ -225,19 +225,19 @@ def test_a_search_goes_on_as_the_host_s(
         monkeypatch.setattr(device_plan, "FOUND", -1)
         monkeypatch.setattr(strategies, "search_modes_device", lambda *_, **__: None)
     elif what == "no bound":
-        monkeypatch.setattr(RelaxationWorkspace, "found", lambda _: None)
+        monkeypatch.setattr(RelaxationWorkspace, "parse_result", lambda _: None)
     elif what == "second astray":
         monkeypatch.setattr(ModeSearchWorkspace, "parse_result", lambda *_: None)
     assert is_the_host_s(stepper, start, memory, objectives)
     expected = {
-        "costly": ["_enqueue_elsewhere", "_end_at"],
-        "better": ["_enqueue_elsewhere", "_end_at"],
-        "kept": ["_enqueue_elsewhere"],
-        "astray": ["search_modes", "_end_at"],
-        "no bound": ["_enqueue_elsewhere", "solve_relaxed", "_enqueue_from_point", "_end_at"],
-        "second astray": ["_enqueue_elsewhere", "search_modes", "_end_at"],
+        "costly": ["_enqueue_restart", "_replace_end"],
+        "better": ["_enqueue_restart", "_replace_end"],
+        "kept": ["_enqueue_restart"],
+        "astray": ["search_modes", "_replace_end"],
+        "no bound": ["_enqueue_restart", "solve_relaxed", "_enqueue_from_point", "_replace_end"],
+        "second astray": ["_enqueue_restart", "search_modes", "_replace_end"],
     }
-    again = ["_enqueue_elsewhere"] if beside and what in ("astray", "no bound") else []
+    again = ["_enqueue_restart"] if beside and what in ("astray", "no bound") else []
     assert asked == again + expected[what]
     found = planner_of(stepper).plan(start, objectives)
     assert found is not None
@@ -266,7 +266,7 @@ def test_what_is_not_as_usual_is_left_to_the_host(
         **{"verdicts": ((0, 3), 0.0), "sizes": ((1, 2), np.nan), "missed": ((2, 1), 1.0)},
         **{"horizon": ((3, 0), 0.0), "end": ((3, 1), np.inf), "forces": ((3, 2), 1.0)},
     }[what]
-    room = planner_of(stepper)._room_for(start)
+    room = planner_of(stepper)._workspace_for(start)
     told = [part.copy() for part in room._parts]
     told[place[0]][place[1]] = value
     monkeypatch.setattr(room, "_parts", told)

@@ -176,7 +176,7 @@ def test_one_launch_finds_the_optimum_without_complementarity(activations: int, 
         program = body_program(seed, activations, contacts, bias=0.5 * (seed % 3))
         found = search.search(program, *entered(program), 12)
         room.enqueue()
-        there, here = room.found(), solve_relaxed(program, QpSolver.OSQP)
+        there, here = room.parse_result(), solve_relaxed(program, QpSolver.OSQP)
         assert here is not None
         if there is None:
             continue
