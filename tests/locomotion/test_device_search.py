@@ -239,7 +239,12 @@ def test_bounds_give_way_by_as_much_as_on_the_host() -> None:
         mode_search.INFEASIBLE_COST,
         block_active_set.PIVOTS,
     )
-    here = active_set._BROKEN, solvers._BOUND_PADDING * 3e-5, active_set._HOPELESS, active_set._PIVOTS
+    here = (
+        active_set._BOUND_TOLERANCE,
+        solvers._BOUND_PADDING * 3e-5,
+        active_set._INFEASIBLE_COST,
+        active_set._MAX_PIVOTS,
+    )
     assert [float(each) for each in there] == pytest.approx(here, rel=1e-12)
 
 

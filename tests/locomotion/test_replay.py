@@ -143,7 +143,7 @@ def test_parts_of_divided_steps_are_put_together_again(tmp_path: Path) -> None:
     recorder = slid.recorder(folder=lambda: tmp_path)
     reports = slid.reports
     for asked, (first, last) in enumerate([(0, 1), (1, 5), (5, 6), (6, 14), (14, 24)]):
-        recorder.add(reports[first:last], asked=asked)
+        recorder.add(reports[first:last], request_digest=asked)
     recorder.trajectory()
     replay = Replay(tmp_path, recorder.start, slid.stepper.detector)
     found = [replay.step(asked) for asked in range(5)]
@@ -155,7 +155,7 @@ def test_parts_of_divided_steps_are_put_together_again(tmp_path: Path) -> None:
 def test_another_run_is_refused(cut_off: Path) -> None:
     other = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.01)), forward=FORWARD)
     for made, script in ((other, "jump"), (block(), "jump 0.6")):
-        with pytest.raises(UserError, match="does not fit the run that is to go on: capture, flags, program or"):
+        with pytest.raises(UserError, match="belongs to another run: capture, flags, program or"):
             run(made, script, parts=lambda: cut_off, resume=cut_off)
 
 
@@ -194,7 +194,7 @@ def test_a_run_that_is_pushed_goes_on_and_another_push_is_refused(tmp_path: Path
     for name in whole.trajectory.__dataclass_fields__:
         assert np.array_equal(getattr(again.trajectory, name), getattr(whole.trajectory, name)), name
     for other in (pushed(1.1), lambda time, dt: None):
-        with pytest.raises(UserError, match="does not fit the run that is to go on"):
+        with pytest.raises(UserError, match="belongs to another run"):
             run(block(), resume=parts, kicks=other)
 
 
