@@ -186,7 +186,7 @@ def _flows(t: Trajectory, body: _Elements, muscles: _Muscles, step: int) -> tupl
         push_out,
         -0.5 * _squared(mass, velocity - t.velocities[step] - kick),
         element_result.lost_elastic,
-        muscle_result.lost,
+        muscle_result.loss,
         element_result.lost_damping,
         float(inner_spin @ _momentum(mass, before, velocity)),
         float(added @ (_momentum(mass, after, velocity) + 0.5 * _inertia(mass, after) @ added)),
@@ -296,7 +296,7 @@ class _Pull:
 
     work: float
     effort: float
-    lost: float
+    loss: float
     torque: np.ndarray
     """(3,) N m at the end, with the arms of the start."""
 

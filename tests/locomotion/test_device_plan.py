@@ -1,4 +1,4 @@
-"""Plans that are made at once on the device are those of one look after the other, on every device."""
+"""Plans of the device planner equal those of prediction and plan one after the other, on every device."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def begun(stepper: LocomotionStepper, state: BodyState, memory: WarmStart) -> St
 
 
 def on_its_edge(stepper: LocomotionStepper) -> BodyState:
-    """With few contacts, none of which another repeats: rounding does not lead their forces astray."""
+    """Return a state with few independent contacts, whose forces are not sensitive to rounding."""
     turned = Rotation.from_rotvec([0.1, 0.03, 0.0]).apply(stepper.body.mesh.nodes)
     up = -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
     return BodyState(turned - stepper.detector.gaps(turned)[0].min() * up, np.zeros_like(turned))
@@ -100,7 +100,7 @@ def is_the_host_s(
     np.testing.assert_allclose(plan.forces, expected.forces, rtol=0, atol=1e-6 * stepper.body.weight)
     scale = np.abs(delassus).max(initial=1e-300)
     np.testing.assert_allclose(delassus, prospect.linearization.delassus, rtol=0, atol=1e-9 * scale)
-    # Without muscles it is another place than the one that is at hand.
+    # Without muscles it is not the current iterate.
     assert isinstance(begun_at, DeviceNewtonIterate) and begun_at.tension is None
     return True
 
@@ -113,7 +113,7 @@ def test_plans_are_those_of_one_look_after_the_other(creature: Creature, stepper
         at_once += is_the_host_s(stepper, begun(stepper, state, memory), memory, objectives)
         state, memory, reports = stepper.advance(state, memory, objectives, DT)
         assert all(report.converged for report in reports), number
-    # This body's base has few points that do not repeat each other: the search goes astray at times.
+    # The contact points of this body are nearly redundant, so the search fails numerically at times.
     assert at_once >= 3
     up = -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
     flown = BodyState(creature.start.positions + 0.3 * stepper.body.height * up, state.velocities)
@@ -126,7 +126,7 @@ def test_plans_are_those_of_one_look_after_the_other(creature: Creature, stepper
 def test_the_solve_goes_on_from_the_plan_s_end(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing is asked there a second time: its first Newton step is on its way, and brings what asking brings."""
+    """The solve makes no second request: its first Newton step is already in flight, and equals a requested one."""
     memory = stepper.initial_memory()
     start = begun(stepper, creature.start, memory)
     found = planner_of(stepper).plan(start, asks(creature, 0.1))
@@ -192,9 +192,9 @@ def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: Locomoti
 def test_a_search_goes_on_as_the_host_s(
     what: str, beside: bool, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where its end costs so much that another may be better, and where that is: to the host's plan, at whose end the
-    solve begins, whether the second search is ``beside`` the first or after it. Only what is led astray the host
-    searches itself."""
+    """A restart, made if the first result costs much, leads to the plan of the host, and the solve starts at its end;
+    the second search runs concurrently with the first or after it. Only after a numerical failure does the host search.
+    """
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     monkeypatch.setattr(device_plan, "PARALLEL_RESTART_COST", 0.0 if beside else np.inf)
     if what != "astray":
@@ -257,8 +257,8 @@ def test_a_search_goes_on_as_the_host_s(
 def test_what_is_not_as_usual_is_left_to_the_host(
     what: str, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A matrix that is not definite, an element that is inverted, forces that miss their laws, while the contact is
-    foreseen or at the end of the search."""
+    """A matrix that is not positive definite, an inverted element, or a Coulomb violation, in the prediction or at the
+    end of the search."""
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     start = begun(stepper, creature.start, memory)
     assert planner_of(stepper).plan(start, objectives) is not None
@@ -287,7 +287,7 @@ def test_a_body_that_is_squeezed_flat_is_left_to_the_host(creature: Creature, st
 def test_a_step_that_goes_amiss_is_planned_again_on_the_device(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every step is asked for again: what comes of it is the host's."""
+    """Every step is replanned, with the result of the host."""
     monkeypatch.setattr(stepping, "_REPLAN_FACTOR", 0.0)
     monkeypatch.setattr(stepping, "_REPLAN_MARGIN", -1.0)
     planned: list[bool] = []
@@ -333,7 +333,7 @@ def test_the_same_body_on_other_ground_shares_what_it_works_with(
 def test_a_step_is_begun_when_the_one_before_has_ended(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Once; whatever else is done there meanwhile, it is begun again, and ends alike."""
+    """Once. If other work runs in between, it is started again and has the same end."""
     counted: list[StepInputs] = []
     begin = DevicePlanner.start
     monkeypatch.setattr(DevicePlanner, "start", lambda self, start: counted.append(start) or begin(self, start))

@@ -35,12 +35,12 @@ class KilledError(Exception):
 
 
 def block() -> CoarseCreature:
-    """45 nodes, made anew: nothing of an earlier run is left in it."""
+    """Return a new creature of 45 nodes, without state of an earlier run."""
     return coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
 
 
 def walker() -> CoarseCreature:
-    """A stool, made anew."""
+    """Return a new stool."""
     return coarse_creature(coarse_stool(), forward=np.array([1.0, 0.0, 0.0]))
 
 
@@ -64,7 +64,7 @@ BODIES = {"jump": block, "walk 0.1": walker}
 
 @pytest.fixture(scope="module")
 def cut_off_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What is left of a jump that was cut off."""
+    """Return the parts of a jump that was cut off."""
     parts = tmp_path_factory.mktemp("cut") / "parts"
     with pytest.raises(KilledError):
         run(block(), killed_at=CUT, parts=lambda: parts)
@@ -92,7 +92,7 @@ def same_steps(one: tuple[StepReport, ...], other: tuple[StepReport, ...]) -> bo
 def test_a_run_goes_on_to_the_same_bits(
     script: str, cut_off: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Only what had not been written down is solved, by a body that is made anew."""
+    """Only steps that were not recorded are solved, by a new body."""
     body, folder = BODIES[script], cut_off
     whole = uninterrupted() if script == "jump" else run(body(), script)
     if script != "jump":
@@ -138,7 +138,7 @@ def test_a_run_goes_on_from_any_of_its_steps(tmp_path: Path, monkeypatch: pytest
 
 
 def test_parts_of_divided_steps_are_put_together_again(tmp_path: Path) -> None:
-    """Steps that did not converge at once: what was asked is asked once for all of their parts."""
+    """Steps that were divided because they did not converge: their parts have one digest."""
     slid = slide()
     recorder = slid.recorder(folder=lambda: tmp_path)
     reports = slid.reports
@@ -177,7 +177,7 @@ def test_a_damaged_part_is_told_and_can_be_left_out(cut_off: Path) -> None:
 
 
 def test_a_run_that_is_pushed_goes_on_and_another_push_is_refused(tmp_path: Path) -> None:
-    """The push comes before the cut; what is asked of its step is the same without it."""
+    """The push comes before the cut; the objectives of its step are the same without it."""
     made = block()
 
     def pushed(size: float) -> Any:

@@ -189,7 +189,7 @@ def test_same_solves_give_the_same_bits() -> None:
 
 
 def test_daqp_is_optional(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The engine does not need DAQP; whoever asks for it without having it is told what to do."""
+    """The engine does not need DAQP; without the package, selecting it gives an error that says what to do."""
     real = builtins.__import__
 
     def without(name: str, *rest: Any, **options: Any) -> ModuleType:

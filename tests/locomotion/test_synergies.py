@@ -45,9 +45,8 @@ def test_alike_are_grouped_and_few_are_left_alone() -> None:
 
 
 def test_muscles_are_grouped_by_what_they_do_in_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of sqrt(H / g) / 19: velocities whose impulse, by central differences of the equation of that step, is along the
-    pull's.
-    """
+    """Effects are velocities in a step of sqrt(H / g) / 19: their impulse, by central differences of the equation of
+    that step, is along that of the muscle."""
     given = []
     monkeypatch.setattr(module, "find_synergies", lambda *rest: given.append(rest) or find_synergies(*rest))
     stepper = coarse_creature(block_mesh(), forward=FORWARD, settled=False).stepper
