@@ -147,8 +147,8 @@ class LocomotionStepper:
             linear_solver_on(body.assembly.device, body.assembly.upper_pattern),
             make_step_linearizer(self.linearizer, muscles, synergies),
         )
-        # The prefetched inputs of the next step, with the warm start for which they are valid.
         self._device_planner = _make_device_planner(self.planner, self.linearizer, self.solver)
+        # The prefetched inputs of the next step, with the warm start for which they are valid.
         self._prefetched: tuple[WarmStart, StepInputs] | None = None
 
     def with_friction(self, friction: float) -> LocomotionStepper:
@@ -193,8 +193,8 @@ class LocomotionStepper:
         """Make one step of ``dt`` s; if it does not converge, repeat it as half steps.
 
         The half steps do not replan: the objectives are those of the whole step. The planned activations may be the
-        cause, so the half steps are computed twice, with the planned and with the previous activations. The result that
-        converged is used, and of two such results the one with the lower objective value.
+        cause, so the half steps are computed twice, with the planned and with the previous activations. Of the two
+        results one that converged is preferred, then the one with the lower objective value.
 
         Args:
             state: state at the start.
@@ -277,17 +277,13 @@ class LocomotionStepper:
         """Make one step of ``dt`` s: detect, predict, plan, solve, replan if the plan was inaccurate, report.
 
         1. Detect (``_start``): select the contact points that the step may bring to the ground, and transfer their
-        previous forces.
-
+           previous forces.
         2. Predict and plan (``_plan``): predict the end of the step under the previous activations, linearise the step
-        there, and find the activations that minimise the cost subject to Coulomb contact.
-
+           there, and find the activations that minimise the cost subject to Coulomb contact.
         3. Solve (``_solve``): solve the equation of motion and contact together, nonlinearly, with the planned
-        activations fixed (``CoupledSolver``).
-
+           activations fixed (``CoupledSolver``).
         4. Replan (``_replan``): if the objectives cost clearly more than the plan expects, plan about the solved end
-        and solve again.
-
+           and solve again.
         5. Report (``_finish``). On a GPU, also start the prediction of the next step asynchronously.
 
         Args:
