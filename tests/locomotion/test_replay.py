@@ -169,7 +169,7 @@ def test_a_damaged_part_is_told_and_can_be_left_out(cut_off: Path) -> None:
     second.unlink()
     assert same_steps(run(block(), parts=lambda: cut_off, resume=cut_off).reports, uninterrupted().reports)
     (cut_off / "steps-000000.npz").unlink()
-    with pytest.raises(UserError, match=r"steps-000000\.npz: is missing; remove the parts after it to go on"):
+    with pytest.raises(UserError, match=r"steps-000000\.npz: is missing; remove the parts after it to continue"):
         run(block(), parts=lambda: cut_off, resume=cut_off)
     (cut_off / "start.npz").unlink()
     with pytest.raises(UserError, match=r"start\.npz: is missing; begin the run again"):
