@@ -17,15 +17,25 @@ class Audit:
     """Largest errors over all steps, as defined in docs/guide/report.md; all but the counts are dimensionless."""
 
     momentum_residual: float
+    """Force that is missing in the balance of linear momentum, over m g."""
     angular_momentum_residual: float
+    """Torque that is missing in the balance of angular momentum, over m g H."""
     energy_residual: float
+    """Residual of the energy balance, over m g H."""
     cone_violation: float
+    """Force outside the friction cone, over m g."""
     friction_gap: float
+    """Difference between the work of friction and that of friction at its bound against the slip, over m g H."""
     contact_velocity: float
+    """Difference between stored end velocities and displacements of loaded contacts, over sqrt(g H)."""
     penetration: float
+    """Depth of the deepest contact point, over H."""
     complementarity_gap: float
+    """Normal force times gap, over m g H."""
     inverted_elements: int
+    """Number of inverted elements, summed over all states."""
     newton_unconverged: int
+    """Number of steps that did not converge."""
 
 
 def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton_unconverged: int = 0) -> Audit:
