@@ -1,4 +1,5 @@
-"""Which activations to send: the program of a step, its contact states and its solvers (section 3.3, Eq. 9, 12, 13).
+"""Choice of the muscle activations of each step: QP, contact modes and solvers (section 3.3, Eq. 9, 12, 13).
 
-In: a body, objectives on its velocities, contact points. Out: activations, the step they make, and its audit.
+Input: a body, objectives on its velocities, and contact points. Output: activations, the simulated step, and its audit.
+Entry points: ``LocomotionStepper`` makes one step, ``roll_out`` a whole run.
 """

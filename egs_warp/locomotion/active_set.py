@@ -1,6 +1,7 @@
-"""The optimum of a strictly convex quadratic program to rounding, from a guess of the rows that hold it.
+"""Optimum of a strictly convex QP to rounding, from a guess of its active constraints.
 
-The dual active-set method of Goldfarb and Idnani (1983), begun where a guess leaves it, as a kernel.
+The dual active-set method of Goldfarb and Idnani (1983), started at the guess. Its kernels are in
+``egs_warp.kernels.locomotion.active_set`` and ``egs_warp.kernels.locomotion.whitened_constraints``.
 """
 
 from __future__ import annotations
@@ -17,17 +18,18 @@ from egs_warp.kernels.locomotion.whitened_constraints import STEP, WhitenedConst
 from egs_warp.launching import thread_local_cache
 from egs_warp.precision import Vec4, real
 
-_PIVOTS = 600
-_BROKEN = 1e-8
-"""By which a row may leave its bounds, or times its length by z where that is more."""
-_HOPELESS = 1e6
-"""Times all that the objective can fall: bounds that cost more are met by no point."""
+_MAX_PIVOTS = 600
+"""Maximum number of changes of the active set."""
+_BOUND_TOLERANCE = 1e-8
+"""Tolerance of the bounds of a row, times its norm in z if that is more than 1."""
+_INFEASIBLE_COST = 1e6
+"""Times ``WhitenedQp.objective_drop``: bounds that cost more than this are infeasible."""
 
 
 @dataclass(frozen=True)
 class WhitenedQp:
-    """The rows A of min 1/2 x^T P x + q^T x in coordinates z = D^1/2 L^T (x - x0), P = L D L^T, in which distances from
-    the minimum x0 are costs."""
+    """The QP min 1/2 x^T P x + q^T x with rows A, in whitened coordinates z = D^1/2 L^T (x - x0), P = L D L^T, with the
+    unconstrained minimum x0: the Hessian is the identity, and the cost half the squared distance from x0."""
 
     P: np.ndarray
     """(n, n)."""
@@ -36,152 +38,176 @@ class WhitenedQp:
     rows: np.ndarray
     """(m, n) A."""
     minimum: np.ndarray
-    """(n,) x0, without any bounds."""
+    """(n,) x0, the unconstrained minimum."""
     values_at_minimum: np.ndarray
     """(m,) A x0."""
     row_norms: np.ndarray
-    """(m,) of the rows by z, 1 for those without any."""
+    """(m,) norms of the rows in z; 1 for zero rows."""
     objective_drop: float
-    """By how much the objective is lower at x0 than at 0, or 1 if that is less."""
+    """Decrease of the objective from x = 0 to x0, at least 1."""
 
     @classmethod
     def of(cls, P: np.ndarray, q: np.ndarray, A: np.ndarray) -> WhitenedQp:
-        """Of P (n, n), q (n,) and A (m, n). Raises ``numpy.linalg.LinAlgError`` where P is not positive definite; one
-        that holds no number has no minimum."""
+        """Whiten the QP.
+
+        Args:
+            P: (n, n).
+            q: (n,).
+            A: (m, n).
+
+        Raises:
+            numpy.linalg.LinAlgError: P is finite but not positive definite. If P is not finite, the minimum is NaN.
+        """
         P, q, A = (np.asarray(each, dtype=np.float64) for each in (P, q, A))
-        minimum, free, lengths = _room_for(A).reduce(P, q, A)
-        return cls(P, q, A, minimum, free, lengths, max(1.0, -0.5 * float(q @ minimum)))
+        minimum, values_at_minimum, row_norms = _workspace_for(A).reduce(P, q, A)
+        return cls(P, q, A, minimum, values_at_minimum, row_norms, max(1.0, -0.5 * float(q @ minimum)))
 
     @property
     def unit_rows(self) -> np.ndarray:
-        """(m, n) the rows by z, each of length 1 or 0; as long as no others of as many are made."""
-        return _room_for(self.rows).units(self)
+        """(m, n) rows in z, each of length 1 or 0. A view that is valid until another QP of this size is whitened in
+        this thread."""
+        return _workspace_for(self.rows).unit_rows(self)
 
     def whiten(self, x: np.ndarray) -> np.ndarray:
-        """(n,) z of ``x`` (n,)."""
-        return _room_for(self.rows).place(self, x)
+        """Return z (n,) of ``x`` (n,)."""
+        return _workspace_for(self.rows).whiten(self, x)
 
     @cached_property
     def slack(self) -> np.ndarray:
-        """(m,) by how much each row may break its bounds."""
-        return _BROKEN * np.maximum(1.0, self.row_norms)
+        """(m,) tolerance of the bounds of each row."""
+        return _BOUND_TOLERANCE * np.maximum(1.0, self.row_norms)
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """Where the search has ended."""
+    """Result of the active-set method."""
 
     x: np.ndarray
     """(n,)."""
     multipliers: np.ndarray
-    """(m,) positive where the upper bound pushes."""
+    """(m,) positive at an active upper bound."""
     feasible: bool
-    """Whether any point satisfies the bounds; else ``x`` means nothing."""
+    """True if a point satisfies the bounds; otherwise ``x`` has no meaning."""
 
 
 class _Workspace:
-    """Memory for a program of so many rows and unknowns, and launches that are made again and again: a new one takes
-    longer than the search. It has the rows of one program at a time, the last that was asked for."""
+    """Reused memory and recorded launches for QPs of at most ``rows`` rows and ``unknowns`` unknowns; allocating them
+    takes longer than a solve. It holds the whitened rows of one QP at a time, the last that was loaded."""
 
     def __init__(self, rows: int, unknowns: int) -> None:
-        wide = -(-unknowns // 8) * 8
-        self._minimum, self._free, self._lengths = np.zeros(unknowns), np.zeros(rows), np.zeros(rows)
-        self._units, self._unknowns = np.zeros((rows, wide)), unknowns
-        reduced = WhitenedConstraints()
-        self._transpose, self._roots = np.zeros((unknowns, wide)), np.zeros(unknowns)
-        reduced.lower, reduced.columns = _zeros((unknowns, wide)), _zeros((unknowns, rows))
-        reduced.upper, reduced.roots = _shared(self._transpose), _shared(self._roots)
-        reduced.scratch = _zeros((room_of(unknowns, wide),))
-        reduced.minimum, reduced.free, reduced.lengths = map(_shared, (self._minimum, self._free, self._lengths))
-        reduced.rows, reduced.products = map(_by_fours, (self._units, np.zeros((rows, rows))))
-        reduced.has_products = wp.zeros(rows, dtype=int, device="cpu")
+        padded_unknowns = -(-unknowns // 8) * 8
+        self._minimum, self._values_at_minimum, self._row_norms = np.zeros(unknowns), np.zeros(rows), np.zeros(rows)
+        self._units, self._unknowns = np.zeros((rows, padded_unknowns)), unknowns
+        constraints = WhitenedConstraints()
+        self._transpose, self._roots = np.zeros((unknowns, padded_unknowns)), np.zeros(unknowns)
+        constraints.lower, constraints.columns = _zeros((unknowns, padded_unknowns)), _zeros((unknowns, rows))
+        constraints.upper, constraints.roots = _shared(self._transpose), _shared(self._roots)
+        constraints.scratch = _zeros((room_of(unknowns, padded_unknowns),))
+        constraints.minimum, constraints.free, constraints.lengths = map(
+            _shared, (self._minimum, self._values_at_minimum, self._row_norms)
+        )
+        constraints.rows, constraints.products = map(_by_fours, (self._units, np.zeros((rows, rows))))
+        constraints.has_products = wp.zeros(rows, dtype=int, device="cpu")
         self._definite, self._at_zero = np.zeros(1, np.int32), np.zeros(rows)
         self._lower, self._upper, self._slack = np.zeros((3, rows))
-        self._most, self._pulls = np.zeros(1), np.zeros(unknowns)
-        self._side, self._active, self._ended = (np.zeros(count, np.int32) for count in (rows, unknowns, 2))
+        self._cost_limit, self._multipliers = np.zeros(1), np.zeros(unknowns)
+        self._side, self._active, self._end = (np.zeros(count, np.int32) for count in (rows, unknowns, 2))
         program, search = kernels.Program(), kernels.ActiveSetState()
-        program.constraints, program.values_at_origin = reduced, _by_fours(self._at_zero)
+        program.constraints, program.values_at_origin = constraints, _by_fours(self._at_zero)
         program.lower, program.upper, program.slack = map(_shared, (self._lower, self._upper, self._slack))
-        program.cost_limit, search.multipliers = _shared(self._most), _shared(self._pulls)
+        program.cost_limit, search.multipliers = _shared(self._cost_limit), _shared(self._multipliers)
         search.side, search.active = _shared(self._side), _shared(self._active)
-        search.values, search.orthogonal_part = _by_fours(np.zeros(rows)), _by_fours(np.zeros(wide))
+        search.values, search.orthogonal_part = _by_fours(np.zeros(rows)), _by_fours(np.zeros(padded_unknowns))
         search.factor = _zeros((unknowns, unknowns))
         search.rates, search.solved_products = _zeros((unknowns,)), _zeros((unknowns,))
-        self._reducing: Any = wp.launch(
+        self._whitening_launch: Any = wp.launch(
             reduce_kernel,
             1,
             inputs=[0, 0, 0, 0, 0, 0],
-            outputs=[reduced, _shared(self._definite)],
+            outputs=[constraints, _shared(self._definite)],
             device="cpu",
             record_cmd=True,
         )
-        self._searching: Any = wp.launch(
+        self._search_launch: Any = wp.launch(
             kernels.optimum_kernel,
             1,
-            inputs=[program, _PIVOTS, search],
-            outputs=[_shared(self._ended), 0],
+            inputs=[program, _MAX_PIVOTS, search],
+            outputs=[_shared(self._end), 0],
             device="cpu",
             record_cmd=True,
         )
-        # The launches have where these lie.
-        self._held = reduced, program, search
-        self._has: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        # The launches hold the addresses of these structs' arrays.
+        self._structs = constraints, program, search
+        self._loaded: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def reduce(self, P: np.ndarray, q: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Minimum, rows at it and their lengths: see ``ReducedRows``."""
+        """Whiten the QP; return x0 (n,), A x0 (m,) and the norms of the rows (m,)."""
         P, q, A = (each if each.strides[-1] == 8 else np.ascontiguousarray(each) for each in (P, q, A))
-        given = P.ctypes.data, P.strides[0] // 8, q.ctypes.data, A.ctypes.data, A.strides[0] // 8, len(A)
-        for place, value in enumerate(given):
-            self._reducing.set_param_at_index_from_ctype(place, value)
-        self._reducing.launch()
-        self._has = P, q, A
+        arguments = P.ctypes.data, P.strides[0] // 8, q.ctypes.data, A.ctypes.data, A.strides[0] // 8, len(A)
+        for index, value in enumerate(arguments):
+            self._whitening_launch.set_param_at_index_from_ctype(index, value)
+        self._whitening_launch.launch()
+        self._loaded = P, q, A
         if not self._definite[0]:
             if np.isfinite(P).all():
                 raise np.linalg.LinAlgError("the Hessian is not positive definite")
-            self._minimum[:], self._free[:], self._lengths[:] = np.nan, np.nan, 1.0
-        return self._minimum.copy(), self._free[: len(A)].copy(), self._lengths[: len(A)].copy()
+            self._minimum[:], self._values_at_minimum[:], self._row_norms[:] = np.nan, np.nan, 1.0
+        return self._minimum.copy(), self._values_at_minimum[: len(A)].copy(), self._row_norms[: len(A)].copy()
 
-    def units(self, reduced: WhitenedQp) -> np.ndarray:
-        """See ``ReducedRows``."""
-        self._take(reduced)
-        return self._units[: len(reduced.rows), : self._unknowns]
+    def unit_rows(self, qp: WhitenedQp) -> np.ndarray:
+        """Return the unit rows (m, n) of the QP in z."""
+        self._load(qp)
+        return self._units[: len(qp.rows), : self._unknowns]
 
-    def place(self, reduced: WhitenedQp, x: np.ndarray) -> np.ndarray:
-        """See ``ReducedRows``."""
-        self._take(reduced)
-        away = x - reduced.minimum
-        return (away + self._transpose[:, : self._unknowns] @ away) / self._roots
+    def whiten(self, qp: WhitenedQp, x: np.ndarray) -> np.ndarray:
+        """Return z (n,) of ``x`` (n,)."""
+        self._load(qp)
+        offset = x - qp.minimum
+        return (offset + self._transpose[:, : self._unknowns] @ offset) / self._roots
 
-    def _take(self, reduced: WhitenedQp) -> None:
-        wanted = reduced.P, reduced.q, reduced.rows
-        if self._has is None or any(one is not other for one, other in zip(self._has, wanted, strict=True)):
-            self.reduce(*wanted)
-            self._has = wanted
+    def _load(self, qp: WhitenedQp) -> None:
+        """Whiten the QP unless it is the one that is loaded."""
+        arrays = qp.P, qp.q, qp.rows
+        if self._loaded is None or any(one is not other for one, other in zip(self._loaded, arrays, strict=True)):
+            self.reduce(*arrays)
+            self._loaded = arrays
 
     def search(
-        self, reduced: WhitenedQp, lower: np.ndarray, upper: np.ndarray, side: np.ndarray
+        self, qp: WhitenedQp, lower: np.ndarray, upper: np.ndarray, side: np.ndarray
     ) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """How it ended, of the rows that hold the numbers, the sides and the multipliers, and the point."""
-        self._take(reduced)
-        m, point = len(reduced.rows), np.empty(self._unknowns)
-        self._at_zero[:m], self._at_zero[m:] = reduced.values_at_minimum / reduced.row_norms, 0.0
-        self._lower[:m], self._lower[m:] = lower / reduced.row_norms, -np.inf
-        self._upper[:m], self._upper[m:] = upper / reduced.row_norms, np.inf
-        self._slack[:m], self._slack[m:] = reduced.slack / reduced.row_norms, 0.0
+        """Run the active-set method.
+
+        Args:
+            qp: the whitened QP.
+            lower: (m,) lower bounds of the rows.
+            upper: (m,) upper bounds.
+            side: (m,) guess of the active bounds: 1 lower, -1 upper, 0 none.
+
+        Returns:
+            Status; active rows, their sides and their multipliers for unit rows, each (active count,); and the point
+            (n,).
+        """
+        self._load(qp)
+        m, point = len(qp.rows), np.empty(self._unknowns)
+        self._at_zero[:m], self._at_zero[m:] = qp.values_at_minimum / qp.row_norms, 0.0
+        self._lower[:m], self._lower[m:] = lower / qp.row_norms, -np.inf
+        self._upper[:m], self._upper[m:] = upper / qp.row_norms, np.inf
+        self._slack[:m], self._slack[m:] = qp.slack / qp.row_norms, 0.0
         self._side[:m], self._side[m:] = side, 0
-        self._most[0] = _HOPELESS * reduced.objective_drop
-        self._searching.set_param_at_index_from_ctype(4, point.ctypes.data)
-        self._searching.launch()
-        how, count = self._ended.tolist()
+        self._cost_limit[0] = _INFEASIBLE_COST * qp.objective_drop
+        self._search_launch.set_param_at_index_from_ctype(4, point.ctypes.data)
+        self._search_launch.launch()
+        status, count = self._end.tolist()
         active = self._active[:count].copy()
-        return how, active, self._side[active], self._pulls[:count].copy(), point
+        return status, active, self._side[active], self._multipliers[:count].copy(), point
 
 
-_room = thread_local_cache(16)(_Workspace)
+_thread_workspace = thread_local_cache(16)(_Workspace)
 
 
-def _room_for(A: np.ndarray) -> _Workspace:
-    return _room(-(-len(A) // STEP) * STEP, A.shape[1])
+def _workspace_for(A: np.ndarray) -> _Workspace:
+    """Return the workspace of this thread for the size of ``A``."""
+    return _thread_workspace(-(-len(A) // STEP) * STEP, A.shape[1])
 
 
 def _zeros(shape: tuple[int, ...]) -> wp.array:
@@ -197,21 +223,30 @@ def _by_fours(values: np.ndarray) -> wp.array:
 
 
 def solve_from_guess(
-    reduced: WhitenedQp, lower: np.ndarray, upper: np.ndarray, low: np.ndarray, high: np.ndarray
+    qp: WhitenedQp, lower: np.ndarray, upper: np.ndarray, at_lower: np.ndarray, at_upper: np.ndarray
 ) -> Optimum | None:
-    """Of l <= A x <= u, l < u; ``low`` and ``high`` (m,) guess which rows lie at which bound. None where rounding leads
-    the search astray.
+    """Solve the QP subject to lower <= A x <= upper, lower < upper.
+
+    Args:
+        qp: the whitened QP.
+        lower: (m,).
+        upper: (m,).
+        at_lower: (m,) bool, guess of the rows at their lower bound.
+        at_upper: (m,) bool, guess of the rows at their upper bound.
+
+    Returns:
+        The optimum, or None on numerical failure.
     """
-    m, n = reduced.rows.shape
-    side = np.where(low & np.isfinite(lower), 1, np.where(high & np.isfinite(upper), -1, 0))
-    how, active, sides, pulls, x = _room_for(reduced.rows).search(reduced, lower, upper, side)
+    m, n = qp.rows.shape
+    side = np.where(at_lower & np.isfinite(lower), 1, np.where(at_upper & np.isfinite(upper), -1, 0))
+    status, active, sides, active_multipliers, x = _workspace_for(qp.rows).search(qp, lower, upper, side)
     multipliers = np.zeros(m)
-    if how == kernels.NUMERICAL_FAILURE:
+    if status == kernels.NUMERICAL_FAILURE:
         return None
-    if how == kernels.INFEASIBLE:
+    if status == kernels.INFEASIBLE:
         return Optimum(np.zeros(n), multipliers, False)
-    multipliers[active] = -sides * pulls / reduced.row_norms[active]
-    at, slack = reduced.rows @ x, 10.0 * reduced.slack
-    # Rows that contradict each other are met by none, whatever their multipliers.
-    met = bool((at > lower - slack).all() and (at < upper + slack).all())
-    return Optimum(x, multipliers, True) if met else None
+    multipliers[active] = -sides * active_multipliers / qp.row_norms[active]
+    values, slack = qp.rows @ x, 10.0 * qp.slack
+    # Contradicting rows have multipliers too, so the bounds are checked.
+    is_feasible = bool((values > lower - slack).all() and (values < upper + slack).all())
+    return Optimum(x, multipliers, True) if is_feasible else None

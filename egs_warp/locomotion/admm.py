@@ -1,6 +1,6 @@
-"""OSQP's operator splitting on many quadratic programs at once, as kernels.
+"""OSQP's operator splitting (ADMM) on many dense QPs at once.
 
-See ``egs_warp.kernels.locomotion.admm``.
+Its kernels are in ``egs_warp.kernels.locomotion.admm``.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from egs_warp.launching import Device, empty_pooled
 from egs_warp.precision import real
 
 _RHO = 0.1
-"""Of a program's first iterations."""
+"""Initial step size parameter rho."""
 
 
 class AdmmStatus(Enum):
-    """How iterations end."""
+    """Status of the iterations when they end."""
 
     SOLVED = kernels.SOLVED
     """Residuals are within the accuracy."""
     INEXACT = kernels.INEXACT
-    """They are within ten times that at the last iteration."""
+    """At the iteration limit, residuals are within ten times the accuracy."""
     LIMIT = kernels.LIMIT
-    """They are not."""
+    """At the iteration limit, residuals are larger."""
     INFEASIBLE = kernels.INFEASIBLE
     """There is a certificate that no point satisfies the bounds."""
     DOUBTFUL = kernels.DOUBTFUL
-    """There is one within ten times its accuracy at the last iteration."""
+    """At the iteration limit, there is such a certificate to ten times its tolerance."""
     FAILED = -1
-    """Nothing is known."""
+    """The iterates are not finite, or the solver failed."""
 
 
 @dataclass(frozen=True)
 class DenseQp:
-    """min 1/2 x^T P x + q^T x over rows A; their bounds come later."""
+    """The QP min 1/2 x^T P x + q^T x over rows A, whose bounds are given to ``solve``."""
 
     P: np.ndarray
     """(n, n) symmetric and positive semidefinite."""
@@ -54,25 +54,31 @@ class DenseQp:
 
 @dataclass(frozen=True)
 class AdmmResult:
-    """Where the iterations on a program have ended."""
+    """Result of the iterations on one QP."""
 
     ending: AdmmStatus
     x: np.ndarray
     """(n,)."""
     multipliers: np.ndarray
-    """(m,) positive where the upper bound pushes."""
+    """(m,) positive at an active upper bound."""
     iterations: int
 
 
 class AdmmPrograms:
-    """k programs, whose sizes may differ, that are iterated on side by side. Each begins where its last iterations
-    have ended, with the rho that they have found."""
+    """Batch of k QPs, whose sizes may differ, solved in one launch. Each solve is warm-started from the previous one,
+    with its rho.
+
+    Args:
+        programs: the k QPs.
+        device: device of the kernels.
+        scaling: number of equilibration passes.
+        adapt: number of iterations after which rho may change, a multiple of ``kernels.CHECK``.
+        rho: initial rho.
+    """
 
     def __init__(
         self, programs: Sequence[DenseQp], *, device: Device, scaling: int = 4, adapt: int = 50, rho: float = _RHO
     ) -> None:
-        """``scaling`` passes equilibrate, rho begins with ``rho`` and may change every ``adapt`` iterations, a multiple
-        of ``kernels.CHECK``."""
         self._device = wp.get_device(device)
         self._scaling, self._adapt, self._first = scaling, adapt, rho
         self._sizes = [one.A.shape for one in programs]
@@ -95,8 +101,15 @@ class AdmmPrograms:
         accuracy: float,
         iterations: int,
     ) -> list[AdmmResult]:
-        """With each program's bounds l <= A x <= u (m,), from its start (n,) if there is one; at most ``iterations``
-        each, to ``accuracy``, absolute and relative."""
+        """Solve all QPs with bounds lower <= A x <= upper.
+
+        Args:
+            lower: (m,) of each QP.
+            upper: (m,) of each QP.
+            starts: (n,) of each QP; None starts from its previous solution.
+            accuracy: absolute and relative tolerance of the residuals.
+            iterations: maximum number of iterations.
+        """
         k, n = self._x.shape
         m = self._y.shape[1]
         for x, start in zip(self._x, starts, strict=True):
@@ -106,111 +119,135 @@ class AdmmPrograms:
         self._programs.upper = self._on_device(_padded(upper, (k, m)))
         iterates = scaled.Iterates()
         iterates.x, iterates.y, iterates.rho = map(self._on_device, (self._x, self._y, self._rho))
-        memory, ended, taken = _memory(self._device, k, m, n)
+        workspace, ended, taken = _workspace(self._device, k, m, n)
         block = _block(self._device)
         wp.launch(
             kernels.admm_kernel,
             k * block,
-            inputs=[self._programs, accuracy, iterations, self._scaling, self._adapt, memory, iterates],
+            inputs=[self._programs, accuracy, iterations, self._scaling, self._adapt, workspace, iterates],
             outputs=[ended, taken],
             device=self._device,
             block_dim=block,
         )
         self._x, self._y, self._rho = iterates.x.numpy(), iterates.y.numpy(), iterates.rho.numpy()
-        how, count = ended.numpy(), taken.numpy()
-        ends = []
+        status, count = ended.numpy(), taken.numpy()
+        results = []
         for i, (rows, columns) in enumerate(self._sizes):
-            ending, x, y = AdmmStatus(int(how[i])), self._x[i, :columns].copy(), self._y[i, :rows].copy()
+            ending, x, y = AdmmStatus(int(status[i])), self._x[i, :columns].copy(), self._y[i, :rows].copy()
             if not np.isfinite(x).all() or not np.isfinite(y).all():
                 ending = AdmmStatus.FAILED
             if ending in (AdmmStatus.INFEASIBLE, AdmmStatus.DOUBTFUL, AdmmStatus.FAILED):
-                # What was driven apart is no place to begin.
+                # Iterates that diverged are no warm start.
                 self._x[i], self._y[i], self._rho[i] = 0.0, 0.0, self._first
-            ends.append(AdmmResult(ending, x, y, int(count[i])))
-        return ends
+            results.append(AdmmResult(ending, x, y, int(count[i])))
+        return results
 
     def _on_device(self, values: np.ndarray) -> wp.array:
         return wp.array(values, dtype=real, device=self._device, copy=False)
 
 
 class AdmmWarmStart:
-    """Iterations on min 1/2 x^T x over rows A, of so many rows and unknowns: memory and a launch are made once, for
-    only numbers change, which come and go in one piece. They begin where they are told to."""
+    """Short runs on QPs min 1/2 x^T x over rows A, all started from given points. Buffers and the launch are allocated
+    once for at most ``rows`` rows and ``unknowns`` unknowns; each run makes one upload. ``adapt`` and ``rho`` are those
+    of ``AdmmPrograms``, ``accuracy`` and ``iterations`` those of its ``solve``."""
 
     def __init__(
         self, rows: int, unknowns: int, device: str, *, accuracy: float, iterations: int, adapt: int, rho: float
     ) -> None:
-        """See ``AdmmPrograms``."""
         self._device, self._rho = wp.get_device(device), rho
         m, n = rows, unknowns
         self._parts = np.cumsum([m * n, m, m, n, m, 1])
         size, pinned = int(self._parts[-1]), self._device.is_cuda
-        self._here, self._there = wp.zeros(size, real, "cpu", pinned=pinned), wp.zeros(size, real, self._device)
+        self._host_buffer, self._device_buffer = (
+            wp.zeros(size, real, "cpu", pinned=pinned),
+            wp.zeros(size, real, self._device),
+        )
         programs, iterates = scaled.Programs(), scaled.Iterates()
-        begins = [0, *self._parts.tolist()]
-        there: Any = self._there
-        A, lower, upper, x, y, iterates.rho = (there[a:b] for a, b in pairwise(begins))
+        offsets = [0, *self._parts.tolist()]
+        device_values: Any = self._device_buffer
+        A, lower, upper, x, y, iterates.rho = (device_values[a:b] for a, b in pairwise(offsets))
         programs.A, programs.lower, programs.upper = A.reshape((1, m, n)), lower.reshape((1, m)), upper.reshape((1, m))
         iterates.x, iterates.y = x.reshape((1, n)), y.reshape((1, m))
         programs.P = wp.array(np.eye(n)[None], dtype=real, device=self._device)
         programs.q = wp.zeros((1, n), dtype=real, device=self._device)
         programs.rows, programs.variables = (wp.array([size], dtype=int, device=self._device) for size in (m, n))
-        memory, self._ended, self._taken = _memory(self._device, 1, m, n)
-        self._how, self._count = (wp.zeros(1, int, "cpu", pinned=pinned) for _ in range(2))
-        self._held = programs, iterates, memory
+        workspace, self._status, self._iterations = _workspace(self._device, 1, m, n)
+        self._host_status, self._host_iterations = (wp.zeros(1, int, "cpu", pinned=pinned) for _ in range(2))
+        self._structs = programs, iterates, workspace
         block = _block(self._device)
         self._launch: Any = wp.launch(
             kernels.admm_kernel,
             block,
-            inputs=[programs, accuracy, iterations, 0, adapt, memory, iterates],
-            outputs=[self._ended, self._taken],
+            inputs=[programs, accuracy, iterations, 0, adapt, workspace, iterates],
+            outputs=[self._status, self._iterations],
             device=self._device,
             block_dim=block,
             record_cmd=True,
         )
 
     def run(self, rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> AdmmResult:
-        """With ``rows`` A (m, n), which may be fewer than there is room for, and bounds l <= A x <= u (m,), from
-        ``start`` (n,), or from 0."""
+        """Iterate on the QP with ``rows`` A (m, n), of which there may be fewer than the capacity, and bounds (m,).
+
+        Args:
+            rows: (m, n).
+            lower: (m,).
+            upper: (m,).
+            start: (n,); None starts from 0.
+        """
         m, n = rows.shape
-        A, low, high, x, y, rho = np.split(self._here.numpy(), self._parts[:-1])
+        A, low, high, x, y, rho = np.split(self._host_buffer.numpy(), self._parts[:-1])
         A[: m * n], A[m * n :] = rows.ravel(), 0.0
         low[:m], low[m:], high[:m], high[m:] = lower, -1.0, upper, 1.0
         x[:], y[:], rho[:] = 0.0 if start is None else start, 0.0, self._rho
-        wp.copy(self._there, self._here)
+        wp.copy(self._device_buffer, self._host_buffer)
         self._launch.launch()
-        # The iterates lie behind what they are told of.
-        behind = int(self._parts[2])
-        wp.copy(self._here, self._there, behind, behind, len(self._there) - behind)
-        wp.copy(self._how, self._ended)
-        wp.copy(self._count, self._taken)
+        # The iterates are stored after the rows and bounds; only they are downloaded.
+        iterates_offset = int(self._parts[2])
+        wp.copy(
+            self._host_buffer,
+            self._device_buffer,
+            iterates_offset,
+            iterates_offset,
+            len(self._device_buffer) - iterates_offset,
+        )
+        wp.copy(self._host_status, self._status)
+        wp.copy(self._host_iterations, self._iterations)
         wp.synchronize_stream(self._device)
-        ending = AdmmStatus(int(self._how.numpy()[0]))
+        ending = AdmmStatus(int(self._host_status.numpy()[0]))
         if not np.isfinite(x).all() or not np.isfinite(y).all():
             ending = AdmmStatus.FAILED
-        return AdmmResult(ending, x.copy(), y[:m].copy(), int(self._count.numpy()[0]))
+        return AdmmResult(ending, x.copy(), y[:m].copy(), int(self._host_iterations.numpy()[0]))
 
 
-def _memory(device: wp.Device, k: int, m: int, n: int) -> tuple[Any, wp.array, wp.array]:
-    """Of k programs of so many rows and variables: to work in, how they end, and after how many iterations."""
-    memory = scaled.AdmmWorkspace()
+def _workspace(device: wp.Device, k: int, m: int, n: int) -> tuple[Any, wp.array, wp.array]:
+    """Return the workspace of ``k`` QPs with at most ``m`` rows and ``n`` variables, and their (k,) status and (k,)
+    iteration count."""
+    workspace = scaled.AdmmWorkspace()
     square, table = ((k, n, n), real), ((k, m, n), real)
-    memory.P, memory.inverse, memory.rows, memory.columns, memory.by_variable, memory.by_row, ended, taken = (
-        empty_pooled(
-            device,
-            *(square, square, table, ((k, n, m), real), ((k, scaled.BY_VARIABLE, n), real)),
-            *(((k, scaled.BY_ROW, m), real), (k, int), (k, int)),
-        )
+    (
+        workspace.P,
+        workspace.inverse,
+        workspace.rows,
+        workspace.columns,
+        workspace.by_variable,
+        workspace.by_row,
+        ended,
+        taken,
+    ) = empty_pooled(
+        device,
+        *(square, square, table, ((k, n, m), real), ((k, scaled.BY_VARIABLE, n), real)),
+        *(((k, scaled.BY_ROW, m), real), (k, int), (k, int)),
     )
-    return memory, ended, taken
+    return workspace, ended, taken
 
 
 def _block(device: wp.Device) -> int:
+    """Return the number of threads of a block."""
     return 1 if device.is_cpu else kernels.BLOCK
 
 
 def _padded(values: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
-    """Arrays (``shape``) with zeros after what is shorter."""
+    """Return an array of ``shape`` with ``values``, padded with zeros."""
     if len(values) == 1:
         return np.ascontiguousarray(values[0], dtype=np.float64)[None]
     padded = np.zeros(shape)

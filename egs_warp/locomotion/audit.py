@@ -1,4 +1,5 @@
-"""Whether a run obeys its equations, from a trajectory's arrays alone; shares no code with the solver."""
+"""Audit of a run: residuals of its equations, from the arrays of a trajectory alone. It shares no code with the
+solver."""
 
 from __future__ import annotations
 
@@ -13,36 +14,52 @@ from egs_warp.locomotion.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class Audit:
-    """Maxima over all steps, as defined in docs/guide/report.md; all but the counts are dimensionless."""
+    """Largest errors over all steps, as defined in docs/guide/report.md; all but the counts are dimensionless."""
 
     momentum_residual: float
+    """Force that is missing in the balance of linear momentum, over m g."""
     angular_momentum_residual: float
+    """Torque that is missing in the balance of angular momentum, over m g H."""
     energy_residual: float
+    """Residual of the energy balance, over m g H."""
     cone_violation: float
+    """Force outside the friction cone, over m g."""
     friction_gap: float
+    """Difference between the work of friction and that of friction at its bound against the slip, over m g H."""
     contact_velocity: float
+    """Difference between stored end velocities and displacements of loaded contacts, over sqrt(g H)."""
     penetration: float
+    """Depth of the deepest contact point, over H."""
     complementarity_gap: float
+    """Normal force times gap, over m g H."""
     inverted_elements: int
+    """Number of inverted elements, summed over all states."""
     newton_unconverged: int
+    """Number of steps that did not converge."""
 
 
 def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton_unconverged: int = 0) -> Audit:
-    """Recompute every bound of the audit from the trajectory; ``energy`` is its ledger, if that is known."""
+    """Recompute every error from the trajectory.
+
+    Args:
+        trajectory: the run.
+        energy: its energy balance; None computes it.
+        newton_unconverged: number of steps that did not converge, which is copied to the result.
+    """
     t = trajectory
     unit = t.node_mass.sum() * np.linalg.norm(t.gravity) * t.height
     linear, angular = _momentum_residuals(t)
     normals = _contact_normals(t)
     normal = np.einsum("ci,ci->c", t.contact_force, normals)
     tangential = t.contact_force - normal[:, None] * normals
-    rubbing = np.linalg.norm(tangential, axis=1)
-    stored, way = _contact_ways(t)
-    along = np.einsum("ci,ci->c", way, normals)
-    slip = way - along[:, None] * normals
-    # Coulomb: mu f_n |slip| + f_t . slip is nowhere negative, and zero where friction is all it can be and opposes
-    # slip, or where nothing slips.
+    friction_forces = np.linalg.norm(tangential, axis=1)
+    by_velocities, displacements = _contact_displacements(t)
+    along = np.einsum("ci,ci->c", displacements, normals)
+    slip = displacements - along[:, None] * normals
+    # Coulomb: mu f_n |slip| + f_t . slip is never negative, and zero if friction is at its bound and opposes the slip,
+    # or if the contact does not slip.
     friction_gap = np.abs(t.friction * normal * np.linalg.norm(slip, axis=1) + np.einsum("ci,ci->c", tangential, slip))
-    missed = np.linalg.norm(stored - way, axis=1) / t.dt[t.contact_step]
+    velocity_errors = np.linalg.norm(by_velocities - displacements, axis=1) / t.dt[t.contact_step]
     deepest = min(float(t.min_gap.min()), float(_uneven_end_gaps(t).min(initial=0.0)))
     edges = t.positions[:, t.tets[:, 1:]] - t.positions[:, t.tets[:, :1]]
     energy = energy or energy_balance(t)
@@ -50,9 +67,13 @@ def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton
         momentum_residual=float(np.linalg.norm(linear, axis=1).max(initial=0.0) * t.height / unit),
         angular_momentum_residual=float(np.linalg.norm(angular, axis=1).max(initial=0.0) / unit),
         energy_residual=energy.max_residual,
-        cone_violation=float(np.maximum(rubbing - t.friction * normal, -normal).max(initial=0.0) * t.height / unit),
+        cone_violation=float(
+            np.maximum(friction_forces - t.friction * normal, -normal).max(initial=0.0) * t.height / unit
+        ),
         friction_gap=float(friction_gap.max(initial=0.0) / unit),
-        contact_velocity=float(missed[normal > 0.0].max(initial=0.0) / np.sqrt(np.linalg.norm(t.gravity) * t.height)),
+        contact_velocity=float(
+            velocity_errors[normal > 0.0].max(initial=0.0) / np.sqrt(np.linalg.norm(t.gravity) * t.height)
+        ),
         penetration=float(max(-deepest, 0.0) / t.height),
         complementarity_gap=float((normal * np.maximum(_start_gaps(t) + along, 0.0)).max(initial=0.0) / unit),
         inverted_elements=int((np.linalg.det(edges) <= 0.0).sum()),
@@ -61,7 +82,7 @@ def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton
 
 
 def _momentum_residuals(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """(F, 3) newtons and (F, 3) newton metres by which the two momenta change beside what acts from outside."""
+    """Return (F, 3) N and (F, 3) N m, rates of change of the two momenta minus external forces and torques."""
     mass = t.node_mass.sum()
     com = np.einsum("n,fni->fi", t.node_mass, t.positions) / mass
     momentum = np.einsum("n,fni->fi", t.node_mass, t.velocities)
@@ -83,14 +104,13 @@ def _momentum_residuals(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _start_points(t: Trajectory) -> np.ndarray:
-    """(C, 3) metres: the contacts at the start of their steps."""
+    """Return (C, 3) m, positions of the contacts at the start of their steps."""
     return np.einsum("cw,cwi->ci", t.contact_weights, t.positions[t.contact_step[:, None], t.contact_nodes])
 
 
 def _start_gaps(t: Trajectory) -> np.ndarray:
-    """(C,) metres from its plane, or from the uneven ground's tangent plane, to each contact at the start of its
-    step.
-    """
+    """Return (C,) m, distance of each contact from its plane, or from the tangent plane of uneven ground, at the start
+    of its step."""
     planes = t.planes[t.contact_plane]
     points = _start_points(t)
     gaps = np.einsum("ci,ci->c", planes[:, :3], points) + planes[:, 3]
@@ -100,35 +120,36 @@ def _start_gaps(t: Trajectory) -> np.ndarray:
 
 
 def _on_uneven_ground(t: Trajectory) -> np.ndarray:
-    """(C,) bool."""
+    """Return (C,) bool, True for contacts with uneven ground."""
     return (t.contact_plane == 0) & (t.ground_coefficients.size > 0)
 
 
 def _contact_normals(t: Trajectory) -> np.ndarray:
-    """(C, 3) as stored, but of uneven ground as its heights have it."""
+    """Return (C, 3) unit normals: as stored, but recomputed from the heights for uneven ground."""
     normals, uneven = t.contact_normal.copy(), _on_uneven_ground(t)
     normals[uneven] = _ground(t, _start_points(t)[uneven])[1]
     return normals
 
 
 def _uneven_end_gaps(t: Trajectory) -> np.ndarray:
-    """(c,) metres from uneven ground to each contact with it at the end of its step."""
+    """Return (c,) m, distance from uneven ground of each contact with it at the end of its step."""
     after = t.contact_step + 1
     ends = np.einsum("cw,cwi->ci", t.contact_weights, t.positions[after[:, None], t.contact_nodes])
     return _ground_gaps(t, ends[_on_uneven_ground(t)])
 
 
 def _ground_gaps(t: Trajectory, points: np.ndarray) -> np.ndarray:
-    """(n,) metres from the tangent plane under each of ``points`` (n, 3)."""
+    """Return (n,) m, distance of ``points`` (n, 3) from the tangent plane of the ground below each."""
     lift, normals = _ground(t, points)
     return ((points - t.ground_origin) @ t.ground_axes[2] - lift) * (normals @ t.ground_axes[2])
 
 
 def _ground(t: Trajectory, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) height of uneven ground at ``points`` (n, 3) and (n, 3) its normal, by SciPy's splines and differences."""
+    """Return (n,) m, height of uneven ground at ``points`` (n, 3), and (n, 3) its normals, by SciPy's splines and
+    finite differences."""
     if len(points) == 0:
         return np.zeros(0), np.zeros((0, 3))
-    # The edge goes on level.
+    # The ground continues level beyond its edge.
     padded = np.pad(t.ground_coefficients, 3, mode="edge")
     flat = (points - t.ground_origin) @ t.ground_axes[:2].T / t.ground_spacing + 3.0
 
@@ -143,8 +164,9 @@ def _ground(t: Trajectory, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return height(0.0, 0.0), normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
-def _contact_ways(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """(C, 3) metres that each contact goes in its step by the stored velocities of the end, and by the positions."""
+def _contact_displacements(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Return (C, 3) m twice: displacement of each contact in its step by the stored end velocities, and by the
+    positions."""
     after = t.contact_step + 1
     velocities = np.einsum("cw,cwi->ci", t.contact_weights, t.velocities[after[:, None], t.contact_nodes])
     ends = np.einsum("cw,cwi->ci", t.contact_weights, t.positions[after[:, None], t.contact_nodes])

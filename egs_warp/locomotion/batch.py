@@ -1,7 +1,7 @@
-"""Many worlds of one body side by side on one device, each under activations that are given.
+"""Steps of many worlds of one body in lockstep on one device, each under prescribed activations.
 
-``BatchStepper.advance`` is ``LocomotionStepper.advance_held`` of all of them in lockstep: the same equations, the same
-decisions, in kernels over all worlds and products of their matrices.
+``BatchStepper.advance`` does what ``LocomotionStepper.advance_with_activations`` does for each world: the same
+equations and the same decisions, in kernels over all worlds and batched matrix products.
 """
 
 from __future__ import annotations
@@ -30,59 +30,60 @@ from egs_warp.render.autograd import torch_stream
 
 @dataclass(frozen=True)
 class BatchState(BatchedRecord):
-    """Where c worlds are, and what their last steps hand on."""
+    """State of c worlds and the warm start of their next step."""
 
     worlds: torch.Tensor
-    """(c,) int64, ascending: which of the stepper's worlds these are."""
+    """(c,) int64, ascending, indices of these worlds among the stepper's."""
     positions: torch.Tensor
-    """(c, N, 3) metres."""
+    """(c, N, 3) m."""
     velocities: torch.Tensor
     """(c, N, 3) m/s."""
     time: torch.Tensor
-    """(c,) seconds."""
+    """(c,) s."""
     points: torch.Tensor
-    """(c, K) int64, contact points in use, in each world the first of the K places."""
+    """(c, K) int64, contact points in use; each world uses the first ``counts`` of the K slots."""
     counts: torch.Tensor
-    """(c,) int32."""
+    """(c,) int32, number of contact points in use."""
     forces: torch.Tensor
-    """(c, K, 3) newtons."""
+    """(c, K, 3) N, in the axes of each contact."""
 
     @property
     def valid(self) -> torch.Tensor:
-        """(c, K) bool: the places that are taken."""
+        """(c, K) bool, True for slots in use."""
         return torch.arange(self.points.shape[1], device=self.counts.device) < self.counts[:, None]
 
 
 @dataclass(frozen=True)
 class BatchStep(BatchedRecord):
-    """What happened in one step of c worlds; on the device until it is asked for."""
+    """Result of one step of c worlds, on the device."""
 
     dt: float
-    """Seconds."""
+    """s."""
     after: BatchState
     contacts: BatchContacts
     forces: torch.Tensor
-    """(c, K, 3) newtons."""
+    """(c, K, 3) N."""
     end_gaps: torch.Tensor
-    """(c, K) metres."""
+    """(c, K) m."""
     min_gap: torch.Tensor
-    """(c,) metres."""
+    """(c,) m."""
     activations: torch.Tensor
-    """(c, M) metres."""
+    """(c, M) m."""
     iterations: torch.Tensor
-    """(c,) int64, of Newton's method."""
+    """(c,) int64, Newton iterations."""
     converged: torch.Tensor
     """(c,) bool."""
     added_spin: torch.Tensor
-    """(c,) rad/s."""
+    """(c,) rad/s, see ``StepReport``."""
 
     @property
     def worlds(self) -> torch.Tensor:
-        """(c,) int64, ascending: those that made this step."""
+        """(c,) int64, ascending, worlds that made this step."""
         return self.after.worlds
 
     def reports(self) -> list[StepReport]:
-        """One for each of ``worlds``, as the step alone makes it, but that it has no milliseconds."""
+        """Download the step; return one report for each of ``worlds``, as a single step makes it but without
+        milliseconds."""
         state, contacts = self.after, self.contacts
         host = [
             each.cpu().numpy()
@@ -100,19 +101,19 @@ class BatchStep(BatchedRecord):
             each.cpu().numpy()
             for each in (self.min_gap, self.activations, self.iterations, self.converged, self.added_spin)
         )
-        made = []
+        reports = []
         for world, count in enumerate(counts.tolist()):
-            there = slice(0, count)
-            touched = ContactSet(
-                *(points[world, there], nodes[world, there], weights[world, there], axes[world, there]),
-                *(gaps[world, there], faces[world, there].astype(np.int32), positions.shape[1]),
+            valid = slice(0, count)
+            contact_set = ContactSet(
+                *(points[world, valid], nodes[world, valid], weights[world, valid], axes[world, valid]),
+                *(gaps[world, valid], faces[world, valid].astype(np.int32), positions.shape[1]),
             )
             report = StepReport(
                 state=BodyState(positions[world], velocities[world], float(times[world])),
                 dt=self.dt,
-                contacts=touched,
-                forces=forces[world, there],
-                end_gaps=end_gaps[world, there],
+                contacts=contact_set,
+                forces=forces[world, valid],
+                end_gaps=end_gaps[world, valid],
                 min_gap=float(min_gap[world]),
                 activations=activations[world],
                 qp_count=0,
@@ -121,16 +122,14 @@ class BatchStep(BatchedRecord):
                 converged=bool(converged[world]),
                 added_spin=float(spins[world]),
             )
-            made.append(report)
-        return made
+            reports.append(report)
+        return reports
 
 
 class BatchStepper:
-    """Steps of many worlds with one body and one set of muscles, on ground of one shape and of each world's own
-    friction.
+    """Stepper of many worlds with one body, one set of muscles and one flat ground, each with its own friction.
 
-    It works where the body's assembly lies: on a GPU, where torch sees that too, or on a CPU, which has no use for it
-    but to be checked against.
+    It runs on the device of the body's assembly: a GPU that torch sees too, or, for tests, a CPU.
     """
 
     def __init__(
@@ -145,11 +144,20 @@ class BatchStepper:
         chunk_bytes: int = CHUNK_BYTES,
         stages: StageTimer = no_timer,
     ) -> None:
-        """``frictions`` (B,): Coulomb coefficient of each world's ground, in place of the ``geometry``'s. Factors take
-        72 N^2 bytes for each world; ``chunk_bytes`` bounds the matrices that are worked on at a time, beside which some
-        times as much is needed. ``panel``: columns that are factored at a time. ``stages`` is told what is being done.
+        """Allocate the buffers that all steps share. Factors take 72 N^2 bytes for each world.
 
-        Raises ``ArgumentError`` for ground that is not flat.
+        Args:
+            body: the body.
+            muscles: its muscles.
+            geometry: ground and contact points; its friction is not used.
+            frictions: (B,) Coulomb coefficient of each world.
+            settings: options of the stepper.
+            panel: number of columns that are factored at a time.
+            chunk_bytes: bound on the matrices that are factored at a time; some times as much is needed beside them.
+            stages: context manager that times each stage.
+
+        Raises:
+            ArgumentError: the ground is not flat.
         """
         self.settings = settings or LocomotionSettings()
         self.device = torch.device(str(body.assembly.device))
@@ -173,10 +181,15 @@ class BatchStepper:
         return torch.as_tensor(np.asarray(values, dtype=np.float64), device=self.device)
 
     def start(self, states: Sequence[BodyState], memories: Sequence[WarmStart] | None = None) -> BatchState:
-        """Each world at one of ``states``; what their last steps handed on is in ``memories``, nothing if None."""
+        """Return the state of all worlds at the start.
+
+        Args:
+            states: state of each world.
+            memories: warm start of each world; None starts without contacts.
+        """
         count = len(self._frictions)
-        most = max((len(memory.points) for memory in memories or ()), default=0)
-        points, forces = np.zeros((count, most), np.int64), np.zeros((count, most, 3))
+        capacity = max((len(memory.points) for memory in memories or ()), default=0)
+        points, forces = np.zeros((count, capacity), np.int64), np.zeros((count, capacity, 3))
         counts = np.zeros(count, np.int32)
         for world, memory in enumerate(memories or ()):
             counts[world] = len(memory.points)
@@ -192,85 +205,111 @@ class BatchStepper:
         )
 
     def settle(self) -> tuple[list[BodyState], torch.Tensor]:
-        """``settle`` of every world: at rest on its ground, and (B,) bool, for which that cannot be solved."""
+        """Do ``rollout.settle`` for every world.
+
+        Returns:
+            The state of each world at rest on its ground, and (B,) bool, True for worlds whose steps could not be
+            solved.
+        """
         body, nodes = self.body, self.body.mesh.nodes
         with torch.no_grad(), torch_stream(self.device):
             state = self.start([BodyState(nodes, np.zeros_like(nodes))] * len(self._frictions))
-            ends, begun = state.positions.clone(), self._tensor(body.centre_of_mass(nodes))
-            lost = torch.zeros(len(ends), dtype=torch.bool, device=self.device)
+            ends, start_centre = state.positions.clone(), self._tensor(body.centre_of_mass(nodes))
+            any_failed = torch.zeros(len(ends), dtype=torch.bool, device=self.device)
             for _ in range(SETTLING_STEPS):
                 if len(state.worlds) == 0:
                     break
                 state, moved, failed = self._passive_step(state, SETTLING_STEP * body.time_unit)
-                ends[state.worlds], lost[state.worlds] = state.positions, failed
-                gone = (self.common.centre(state.positions)[:, 0] - begun).norm(dim=1)
-                state = state.subset(nonzero(~has_settled(body, moved, gone) & ~failed))
-        return [BodyState(end, np.zeros_like(end)) for end in ends.cpu().numpy()], lost
+                ends[state.worlds], any_failed[state.worlds] = state.positions, failed
+                centre_moved = (self.common.centre(state.positions)[:, 0] - start_centre).norm(dim=1)
+                state = state.subset(nonzero(~has_settled(body, moved, centre_moved) & ~failed))
+        return [BodyState(end, np.zeros_like(end)) for end in ends.cpu().numpy()], any_failed
 
     def _passive_step(self, state: BatchState, dt: float) -> tuple[BatchState, torch.Tensor, torch.Tensor]:
-        """Without muscles and drag, its end at rest; (c,) metres that a coordinate of a node has moved at most, and
-        (c,) bool, for which a tangent had no factors."""
+        """Make a step without muscles and drag; its end is at rest.
+
+        Returns:
+            The state; (c,) m, largest displacement of a node along an axis; and (c,) bool, True where a tangent was not
+            positive definite.
+        """
         problem = self._problem(state, dt, 0.0)
-        contacts, known, start_gaps = self._detect(problem, state)
+        contacts, previous_forces, start_gaps = self._detect(problem, state)
         velocities = problem.rigid_guess()
-        lost = ~problem.factor(velocities, None)
+        failed = ~problem.factor(velocities, None)
         contacts, result = self.solver.solve(
             *(problem, contacts, self.solver.linearize(problem, contacts)),
             *(self._stiffness.new_zeros((len(velocities), len(self._stiffness))), self._frictions[state.worlds]),
             velocities=velocities,
-            forces=known,
+            forces=previous_forces,
             start_gaps=start_gaps,
         )
         after = BatchState(
             *(state.worlds, problem.end_positions(result.velocities), torch.zeros_like(velocities), state.time),
             *(contacts.points, contacts.counts, result.forces),
         )
-        return after, dt * result.velocities.abs().flatten(1).amax(dim=1), lost | result.is_singular
+        return after, dt * result.velocities.abs().flatten(1).amax(dim=1), failed | result.is_singular
 
     def advance(
         self, state: BatchState, activations: np.ndarray | torch.Tensor, dt: float
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
-        """A step of ``dt`` s of the worlds in ``state`` under ``activations`` (c, M) metres: where those are that it
-        can be solved for, what each of them did, in the order of time, and (c,) bool which of ``state`` could not be
-        solved, not even in part. Those whose step does not converge make it again in halves."""
+        """Make one step of ``dt`` s; repeat it as half steps for the worlds in which it does not converge.
+
+        Args:
+            state: worlds to step.
+            activations: (c, M) m.
+            dt: step size, s.
+
+        Returns:
+            State of the worlds that were solved; their steps in order of time; and (c,) bool, True for worlds of
+            ``state`` for which not even a part of the step was solved.
+        """
         with torch.no_grad(), torch_stream(self.device):
-            given = torch.as_tensor(activations, dtype=torch.float64, device=self.device)
-            after, done, lost = self._parts(state, given, dt, MAX_HALVINGS)
-            fine = torch.zeros(len(self._frictions), dtype=torch.bool, device=self.device)
+            on_device = torch.as_tensor(activations, dtype=torch.float64, device=self.device)
+            after, done, failed = self._parts(state, on_device, dt, MAX_HALVINGS)
+            solved = torch.zeros(len(self._frictions), dtype=torch.bool, device=self.device)
             for step in done:
-                fine[step.worlds] |= step.converged
-            lost |= ~fine[state.worlds]
-            fine[state.worlds[lost]] = False
-            told = [step.subset(nonzero(fine[step.worlds])) for step in done]
-            return after.subset(nonzero(fine[after.worlds])), [step for step in told if len(step.worlds) > 0], lost
+                solved[step.worlds] |= step.converged
+            failed |= ~solved[state.worlds]
+            solved[state.worlds[failed]] = False
+            solved_steps = [step.subset(nonzero(solved[step.worlds])) for step in done]
+            return (
+                after.subset(nonzero(solved[after.worlds])),
+                [step for step in solved_steps if len(step.worlds) > 0],
+                failed,
+            )
 
     def _parts(
-        self, state: BatchState, activations: torch.Tensor, dt: float, left: int
+        self, state: BatchState, activations: torch.Tensor, dt: float, max_halvings: int
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
-        """Steps of ``dt``, those that do not converge in halves, so many times over as are ``left``; (c,) bool, which
-        worlds were lost on the way."""
-        step, lost = self._step(state, activations, dt)
-        again = nonzero(~step.converged & ~lost)
-        if left == 0 or len(again) == 0:
-            fine = nonzero(~lost)
-            return step.after.subset(fine), [step.subset(fine)], lost
-        fine = nonzero(step.converged & ~lost)
-        done, after = [step.subset(fine)], step.after.subset(fine)
-        half, rows, given = state.gather(again), again, activations[again]
+        """Make a step of ``dt``, and two half steps, up to ``max_halvings`` times, for the worlds in which it does not
+        converge.
+
+        Returns:
+            State of the solved worlds, their steps, and (c,) bool, True for failed worlds.
+        """
+        step, failed = self._step(state, activations, dt)
+        repeated = nonzero(~step.converged & ~failed)
+        if max_halvings == 0 or len(repeated) == 0:
+            solved = nonzero(~failed)
+            return step.after.subset(solved), [step.subset(solved)], failed
+        solved = nonzero(step.converged & ~failed)
+        done, after = [step.subset(solved)], step.after.subset(solved)
+        half, rows, half_activations = state.gather(repeated), repeated, activations[repeated]
         for _ in range(2):
-            half, parts, gone = self._parts(half, given, 0.5 * dt, left - 1)
+            half, parts, half_failed = self._parts(half, half_activations, 0.5 * dt, max_halvings - 1)
             done += parts
-            lost[rows[gone]] = True
-            rows, given = rows[~gone], given[~gone]
-        return _merged(after, half), done, lost
+            failed[rows[half_failed]] = True
+            rows, half_activations = rows[~half_failed], half_activations[~half_failed]
+        return _merged(after, half), done, failed
 
     def _step(self, state: BatchState, activations: torch.Tensor, dt: float) -> tuple[BatchStep, torch.Tensor]:
-        """``LocomotionStepper.held_step`` of the worlds in ``state``; (c,) bool, for which a tangent had no factors."""
+        """Make ``LocomotionStepper.step_with_activations`` for all worlds; also return (c,) bool, True where a tangent
+        was not positive definite."""
         frictions, tensions = self._frictions[state.worlds], self._stiffness * activations
         with self._stages("detect"):
             problem = self._problem(state, dt, self.settings.drag)
-            contacts, known, start_gaps = self._detect(problem, state)
-        response, velocities, forces, lost = self._predict(problem, contacts, known, tensions, frictions)
+            contacts, previous_forces, start_gaps = self._detect(problem, state)
+        response, velocities, forces, failed = self._predict(problem, contacts, previous_forces, tensions, frictions)
         contacts, result = self.solver.solve(
             *(problem, contacts, response, tensions, frictions),
             velocities=velocities,
@@ -278,8 +317,8 @@ class BatchStepper:
             start_gaps=start_gaps,
         )
         step = self._finish(problem, contacts, result, state, activations)
-        lost |= result.is_singular
-        return replace(step, converged=step.converged & ~lost), lost
+        failed |= result.is_singular
+        return replace(step, converged=step.converged & ~failed), failed
 
     def _problem(self, state: BatchState, dt: float, drag: float) -> BatchProblem:
         return BatchProblem.at(self.common, state.worlds, state.positions, state.velocities, dt=dt, drag=drag)
@@ -287,7 +326,7 @@ class BatchStepper:
     def _detect(
         self, problem: BatchProblem, state: BatchState
     ) -> tuple[BatchContacts, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
-        """Contacts, the forces (c, K, 3) newtons that they had in the last step, and gaps and faces at the start."""
+        """Return the contacts, their forces (c, K, 3) N in the previous step, and gaps and faces at the start."""
         ballistic = state.velocities + problem.dt * self.common.gravity
         gaps, _ = self.detector.gaps(problem.end_positions(ballistic))
         chosen = self.detector.select(state.points, state.valid, state.forces[:, :, 0] > 0.0, gaps)
@@ -299,45 +338,55 @@ class BatchStepper:
         self,
         problem: BatchProblem,
         contacts: BatchContacts,
-        known: torch.Tensor,
+        previous_forces: torch.Tensor,
         tensions: torch.Tensor,
         frictions: torch.Tensor,
     ) -> tuple[BatchLinearization, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """``LocomotionStepper.foresee``: response, velocities (c, N, 3), forces (c, K, 3), and (c,) bool, for which a
-        tangent had no factors."""
+        """Do ``LocomotionStepper.predict`` for all worlds.
+
+        Returns:
+            Contact linearisation, velocities (c, N, 3) m/s, forces (c, K, 3) N, and (c,) bool, True where a tangent was
+            not positive definite.
+        """
         solver, stages = self.solver, self._stages
-        velocities, shift = problem.rigid_guess(), solver.normal_bias(contacts, problem.dt)
+        velocities, bias = problem.rigid_guess(), solver.normal_bias(contacts, problem.dt)
         with stages("factor"):
-            lost = ~problem.factor(velocities, None)
+            failed = ~problem.factor(velocities, None)
         with stages("elasticity"):
-            missing = problem.residual(velocities, tensions)
-        missing = missing - problem.dt * contacts.nodal_forces(known, velocities.shape[1])
+            residual = problem.residual(velocities, tensions)
+        residual = residual - problem.dt * contacts.nodal_forces(previous_forces, velocities.shape[1])
         with stages("substitute"):
-            moved, _ = apply_inverse(problem, missing.flatten(1)[:, :, None])
-        ahead = velocities - moved.view_as(velocities)
-        taken = nonzero(problem.is_inversion_free(ahead) & ~lost)
-        velocities[taken] = ahead[taken]
-        if len(taken) > 0:
+            newton_step, _ = apply_inverse(problem, residual.flatten(1)[:, :, None])
+        trial = velocities - newton_step.view_as(velocities)
+        accepted = nonzero(problem.is_inversion_free(trial) & ~failed)
+        velocities[accepted] = trial[accepted]
+        if len(accepted) > 0:
             with stages("factor"):
-                lost[taken] = ~problem.subset(taken).factor(velocities[taken], None)
+                failed[accepted] = ~problem.subset(accepted).factor(velocities[accepted], None)
         response = solver.linearize(problem, contacts)
-        looking, forces = nonzero(~lost), known.clone()
+        active, forces = nonzero(~failed), previous_forces.clone()
         for _ in range(PREDICTION_ITERATIONS):
-            if len(looking) == 0:
+            if len(active) == 0:
                 break
-            part, touched, answer = problem.subset(looking), contacts.subset(looking), response.subset(looking)
+            part, active_contacts, linearization = (
+                problem.subset(active),
+                contacts.subset(active),
+                response.subset(active),
+            )
             with stages("elasticity"):
-                missing = part.residual(velocities[looking], tensions[looking])
+                residual = part.residual(velocities[active], tensions[active])
             with stages("substitute"):
-                moved, _ = apply_inverse(part, missing.flatten(1)[:, :, None], answer.momentum_projection)
-            free = velocities[looking] - moved.view_as(missing)
-            found, _ = solver.solve_coulomb(touched, answer, free, shift[looking], frictions[looking], known[looking])
-            ahead = free + (answer.columns @ found.flatten(1)[:, :, None]).view_as(free)
-            fine = part.is_inversion_free(ahead)
-            forces[looking] = found
-            looking = looking[fine]
-            velocities[looking], known[looking] = ahead[fine], found[fine]
-        return response, velocities, forces, lost
+                newton_step, _ = apply_inverse(part, residual.flatten(1)[:, :, None], linearization.momentum_projection)
+            free = velocities[active] - newton_step.view_as(residual)
+            contact_forces, _ = solver.solve_coulomb(
+                active_contacts, linearization, free, bias[active], frictions[active], previous_forces[active]
+            )
+            trial = free + (linearization.columns @ contact_forces.flatten(1)[:, :, None]).view_as(free)
+            solved = part.is_inversion_free(trial)
+            forces[active] = contact_forces
+            active = active[solved]
+            velocities[active], previous_forces[active] = trial[solved], contact_forces[solved]
+        return response, velocities, forces, failed
 
     def _finish(
         self,
@@ -370,11 +419,11 @@ class BatchStepper:
 
 
 def _merged(one: BatchState, other: BatchState) -> BatchState:
-    """The worlds of both, which are others, in ascending order."""
-    most = max(one.points.shape[1], other.points.shape[1])
+    """Return the worlds of both states, which are disjoint, in ascending order."""
+    capacity = max(one.points.shape[1], other.points.shape[1])
     one, other = (
         replace(each, points=padded(each.points, more), forces=padded(each.forces, more))
-        for each, more in ((each, most - each.points.shape[1]) for each in (one, other))
+        for each, more in ((each, capacity - each.points.shape[1]) for each in (one, other))
     )
     values = {
         field.name: torch.cat([getattr(one, field.name), getattr(other, field.name)]) for field in fields(BatchState)

@@ -1,4 +1,4 @@
-"""The global optimum of a step's program over all contact states, by branch and bound (Eq. 9, 13)."""
+"""Global optimum of the QP of a step over all contact states, by branch and bound (Eq. 9, 13)."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from egs_warp.locomotion.solvers import QpSolution, QpSolver, quadratic_program
 
 
 class _Decided(Enum):
-    """How much is decided about a contact."""
+    """Decision about a contact in a node of the tree."""
 
     NOTHING = "nothing"
     SEPARATE = "separate"
     STATIC = "static"
     ARC = "arc"
-    """It slides, along directions still to be told apart."""
+    """It slides, in one of a range of directions."""
     SLIDE = "slide"
-    """It slides along the given directions."""
+    """It slides, in the given directions."""
 
 
 _LEAVES = (_Decided.SEPARATE, _Decided.STATIC, _Decided.SLIDE)
@@ -31,16 +31,14 @@ _LEAVES = (_Decided.SEPARATE, _Decided.STATIC, _Decided.SLIDE)
 
 @dataclass(frozen=True)
 class _Branch:
-    """What is decided about one contact; a contact that slides does so along directions ``first`` to ``last`` of the
-    ring.
-    """
+    """Decision about one contact. A contact that slides does so in the directions ``first`` to ``last`` of the ring."""
 
     decided: _Decided = _Decided.NOTHING
     first: int = 0
     last: int = 0
 
     def children(self, directions: int) -> list[_Branch]:
-        """Branches that together hold every state of this one."""
+        """Return branches that together contain every state of this one."""
         if self.decided is _Decided.NOTHING:
             half = directions // 2
             return [
@@ -50,7 +48,7 @@ class _Branch:
                 _Branch(_Decided.ARC, half, directions),
             ]
         if self.decided is _Decided.ARC and self.last - self.first > 1:
-            # Friction lies on one edge of the pyramid or on a face between two, so the halves share only the middle
+            # Friction is along one edge of the pyramid or on a face between two, so the halves share only the middle
             # edge.
             middle = (self.first + self.last) // 2
             return [replace(self, last=middle), replace(self, first=middle)]
@@ -65,20 +63,20 @@ class _Branch:
 
 @dataclass(frozen=True)
 class ExactResult:
-    """Best point found, and the proof."""
+    """Best point and the lower bound that was proved."""
 
     y: np.ndarray
     """(variables,)."""
     states: np.ndarray
-    """(n,)."""
+    """(n,) contact states."""
     objective: float
     bound: float
-    """No contact states give less than this."""
+    """Lower bound on the objective of all contact states."""
     qp_count: int
 
     @property
     def proved(self) -> bool:
-        """Whether the search ended before its limit, so that no contact states give less."""
+        """True if the search ended before its limit, so that no contact states have a lower objective."""
         return self.objective - self.bound <= 1e-6 * (1.0 + abs(self.objective))
 
 
@@ -89,11 +87,20 @@ def exact_states(
     qp_limit: int = 20000,
     relative_gap: float = 0.0,
 ) -> ExactResult | None:
-    """Global optimum of ``program``; None if no contact states are feasible (or found within ``qp_limit``).
+    """Find the global optimum of ``program``.
 
-    ``starts``: states (n,) worth trying first; a good one prunes most of the tree. Each node relaxes the pairs that are
-    not decided yet to 0 <= x, 0 <= w, which is a convex QP that bounds all its states from below. The search ends when
-    no node is better by more than 1e-7, or ``relative_gap`` of the best objective.
+    Each node relaxes the undecided pairs to 0 <= x, 0 <= w; this convex QP bounds the objective of all its states from
+    below.
+
+    Args:
+        program: the QP with a friction pyramid.
+        starts: states (n,) that are tried first; good ones prune most of the tree.
+        qp_limit: maximum number of QPs.
+        relative_gap: the search ends when no node is better by more than 1e-7, or by this fraction of the best
+            objective.
+
+    Returns:
+        The optimum; None if no contact states are feasible, or none were found within ``qp_limit``.
     """
     layout = program.layout
     qp = quadratic_program(program.P, program.q, program.A, solver=QpSolver.DAQP)
@@ -117,10 +124,10 @@ def exact_states(
         solved += 1
         lower, upper = _bounds(program, branches)
         solution = qp.solve(lower - program.offset, upper - program.offset)
-        if solution.usable and not _hopeless(solution.objective):
+        if solution.usable and not is_pruned(solution.objective):
             heapq.heappush(heap, (solution.objective, next(order), branches, solution))
 
-    def _hopeless(objective: float) -> bool:
+    def is_pruned(objective: float) -> bool:
         if best is None:
             return False
         slack = max(1e-7, relative_gap * (best[0] + program.constant))
@@ -130,7 +137,7 @@ def exact_states(
     bound = np.inf
     while heap and solved < qp_limit:
         objective, _, branches, solution = heapq.heappop(heap)
-        if _hopeless(objective):
+        if is_pruned(objective):
             bound = objective
             break
         violated = _most_violated(program, branches, solution.x)
@@ -148,7 +155,7 @@ def exact_states(
 
 
 def _bounds(program: ContactProgram, branches: tuple[_Branch, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of all rows where undecided pairs are only non-negative."""
+    """Return lower and upper bounds of all rows, where undecided pairs are only non-negative."""
     layout = program.layout
     n, nd = layout.contacts, layout.directions
     lower, upper = layout.bounds(np.full(n, SEPARATE))
@@ -177,7 +184,7 @@ def _bounds(program: ContactProgram, branches: tuple[_Branch, ...]) -> tuple[np.
 
 
 def _most_violated(program: ContactProgram, branches: tuple[_Branch, ...], y: np.ndarray) -> int | None:
-    """Undecided contact whose pairs are furthest from complementary."""
+    """Return the undecided contact whose pairs are furthest from complementary; None if all are complementary."""
     worst = Pairs.of(program.layout, *program.pairs(y)).violation
     worst[[branch.decided in _LEAVES for branch in branches]] = 0.0
     pick = int(np.argmax(worst))

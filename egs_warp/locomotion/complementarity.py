@@ -1,6 +1,6 @@
-"""Contact states of the QP and how they change (Eq. 9, 13; pivoting after Tan, Turk and Liu 2012).
+"""Contact states of the QP and changes of state (Eq. 9, 13; pivoting after Tan, Turk and Liu 2012).
 
-See docs/concepts/locomotion.md.
+See docs/concepts/locomotion.md#contact-states.
 """
 
 from __future__ import annotations
@@ -14,58 +14,58 @@ from egs_warp.contact.detection import tangent_directions
 
 SEPARATE = -2
 STATIC = -1
-"""A state is SEPARATE, STATIC, or slide k: friction along +D_k and slip along -D_k for 0 <= k < n_d; n_d + k: friction
-anywhere between D_k and D_(k+1), slip midway."""
+"""A state is ``SEPARATE``, ``STATIC``, or slide k: for 0 <= k < n_d friction along +D_k and slip along -D_k; for n_d +
+k friction between D_k and D_(k+1) and slip midway."""
 
 
 class Pivot(NamedTuple):
-    """A contact's move to another state."""
+    """Change of a contact's state."""
 
     gain: float
-    """How strongly the multipliers ask for it."""
+    """Size of the multiplier that proposes it."""
     contact: int
     state: int
-    """The new one."""
+    """New state."""
 
 
 @dataclass(frozen=True)
 class ContactLayout:
-    """Where the unknowns y = (a, f_n, f_t, lambda) and the rows (y, c, D^T u' + E lambda, mu f_n - E^T f_t) lie."""
+    """Layout of the unknowns y = (a, f_n, f_t, lambda) and of the rows (y, c, D^T u' + E lambda, mu f_n - E^T f_t)."""
 
     activations: int
-    """M."""
+    """Number of activations M."""
     contacts: int
-    """n."""
+    """Number of contacts n."""
     directions: int
-    """n_d."""
+    """Number of friction directions n_d."""
 
     @property
     def variables(self) -> int:
-        """M + n (n_d + 2)."""
+        """Number of unknowns M + n (n_d + 2)."""
         return self.activations + self.contacts * (self.directions + 2)
 
     @property
     def normal(self) -> slice:
-        """f_n; shifted by ``variables - activations`` these are the rows of c."""
+        """Slice of f_n; shifted by ``variables - activations`` it gives the rows of c."""
         return slice(self.activations, self.activations + self.contacts)
 
     @property
     def tangent(self) -> slice:
-        """f_t, contact-major."""
+        """Slice of f_t, contact by contact."""
         return slice(self.normal.stop, self.normal.stop + self.contacts * self.directions)
 
     @property
     def slip(self) -> slice:
-        """lambda."""
+        """Slice of lambda."""
         return slice(self.tangent.stop, self.variables)
 
     def paired(self, part: slice) -> slice:
-        """Rows of the w that is complementary to this part of x."""
+        """Return the rows of w that are complementary to the slice ``part`` of x."""
         shift = self.variables - self.activations
         return slice(part.start + shift, part.stop + shift)
 
     def free_directions(self, states: np.ndarray) -> np.ndarray:
-        """(n, n_d) whether friction along D_k is free (and the slip row held)."""
+        """Return (n, n_d) bool, True where friction along D_k is free and its slip row is fixed to zero."""
         nd = self.directions
         free = np.zeros((self.contacts, nd), bool)
         free[states == STATIC] = True
@@ -76,7 +76,7 @@ class ContactLayout:
         return free
 
     def bounds(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper bounds of all rows: each state (n,) holds one side of each pair at zero."""
+        """Return lower and upper bounds of all rows: each of ``states`` (n,) fixes one side of each pair to zero."""
         lower = np.zeros(2 * self.variables - self.activations)
         upper = np.full_like(lower, np.inf)
         lower[: self.activations], upper[: self.activations] = -1.0, 1.0
@@ -106,18 +106,19 @@ class Pairs:
     drift: np.ndarray
     """(n, n_d) w of ``friction``: D^T u' + lambda."""
     cone: np.ndarray
-    """(n,) w of ``slip``: mu f_n less the sum of f_t."""
+    """(n,) w of ``slip``: mu f_n minus the sum of f_t."""
 
     @classmethod
     def of(cls, layout: ContactLayout, x: np.ndarray, w: np.ndarray) -> Pairs:
-        """From x and w (pairs,) as ``ContactProgram.pairs`` gives them."""
+        """Split ``x`` and ``w`` (pairs,), as returned by ``ContactProgram.pairs``."""
         n, nd = layout.contacts, layout.directions
         middle = slice(n, n + n * nd)
         return cls(x[:n], x[middle].reshape(n, nd), x[middle.stop :], w[:n], w[middle].reshape(n, nd), w[middle.stop :])
 
     @property
     def violation(self) -> np.ndarray:
-        """(n,) the largest smaller side of each contact's pairs: zero where Eq. (9) holds."""
+        """(n,) largest complementarity violation of each contact, the smaller side of a pair; zero where Eq. (9)
+        holds."""
         normal, slip = np.minimum(self.normal, self.gap), np.minimum(self.slip, self.cone)
         return np.maximum(np.maximum(normal, slip), np.minimum(self.friction, self.drift).max(axis=1))
 
@@ -125,7 +126,15 @@ class Pairs:
 def states_from_prediction(
     normal_forces: np.ndarray, tangential: np.ndarray, velocities: np.ndarray, friction: float, directions: int
 ) -> np.ndarray:
-    """(n,) states from stage 1: forces (n,), friction (n, 2) newtons and tangential velocities (n, 2) m/s (Eq. 12)."""
+    """Return the predicted states (n,) (Eq. 12).
+
+    Args:
+        normal_forces: (n,) predicted normal forces.
+        tangential: (n, 2) predicted friction forces, same unit.
+        velocities: (n, 2) predicted tangential velocities.
+        friction: Coulomb coefficient.
+        directions: number of friction directions n_d.
+    """
     table = tangent_directions(directions)
     static = np.linalg.norm(tangential, axis=1) < 0.999 * friction * normal_forces
     slide = np.argmin(velocities @ table.T, axis=1)
@@ -133,7 +142,8 @@ def states_from_prediction(
 
 
 def states_of_pairs(layout: ContactLayout, x: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """(n,) states of the larger side of each pair: x and w (pairs,) as ``ContactProgram.pairs`` gives them."""
+    """Return the states (n,) in which the larger side of each pair is free, for ``x`` and ``w`` (pairs,) of
+    ``ContactProgram.pairs``."""
     pairs, nd = Pairs.of(layout, x, w), layout.directions
     side = pairs.friction - pairs.drift
     first = np.argmax(side, axis=1)
@@ -156,75 +166,83 @@ def proposed_pivots(
     *,
     zero: float = 1e-4,
 ) -> list[Pivot]:
-    """Moves of contacts, best first, read from the multipliers (rows,) of the rows held at zero
-    (docs/concepts/locomotion.md).
+    """Propose changes of state from the multipliers, best first (docs/concepts/locomotion.md#moves).
 
-    ``x`` and ``w`` (pairs,) as ``ContactProgram.pairs`` gives them. Only states that the point itself obeys are
-    proposed, so no proposal is infeasible, nor are several contacts' proposals together. ``zero`` is the accuracy of x,
-    w and the multipliers.
+    Only states that the point itself satisfies are proposed, so no proposal is infeasible, even several at once.
+
+    Args:
+        layout: layout of unknowns and rows.
+        states: (n,) current states.
+        x: (pairs,) of ``ContactProgram.pairs``.
+        w: (pairs,) of ``ContactProgram.pairs``.
+        multipliers: (rows,) of the rows, of which those fixed to zero count.
+        zero: accuracy of x, w and the multipliers.
     """
-    point, held = Pairs.of(layout, x, w), _multipliers(layout, multipliers)
+    point, multiplier = Pairs.of(layout, x, w), _multipliers(layout, multipliers)
     pivots: list[Pivot] = []
     for i, state in enumerate(states):
         if state == SEPARATE:
-            moves = _moves_of_separate(i, point, held, zero)
+            moves = _moves_of_separate(i, point, multiplier, zero)
         elif state == STATIC:
-            moves = _moves_of_static(i, point, held, zero, layout.directions)
+            moves = _moves_of_static(i, point, multiplier, zero, layout.directions)
         else:
-            moves = _moves_of_sliding(i, int(state), point, held, zero, layout.directions)
+            moves = _moves_of_sliding(i, int(state), point, multiplier, zero, layout.directions)
         pivots += [Pivot(float(gain), i, int(new)) for gain, new in moves if gain > zero]
     return sorted(pivots, key=lambda pivot: -pivot.gain)
 
 
 def _multipliers(layout: ContactLayout, multipliers: np.ndarray) -> Pairs:
+    """Split the multipliers (rows,) as the pairs of their rows."""
     return Pairs.of(layout, multipliers[layout.activations : layout.variables], multipliers[layout.variables :])
 
 
 _Moves: TypeAlias = list[tuple[float, int]]
-"""Gains and new states of one contact."""
+"""Gain and new state of each move of one contact."""
 
 
-def _moves_of_separate(i: int, point: Pairs, held: Pairs, zero: float) -> _Moves:
+def _moves_of_separate(i: int, point: Pairs, multiplier: Pairs, zero: float) -> _Moves:
     if point.gap[i] > zero:
         return []
     along = point.drift[i] - point.slip[i]
-    return [(held.normal[i], int(np.argmin(along)) if along.min() < -zero else STATIC)]
+    return [(multiplier.normal[i], int(np.argmin(along)) if along.min() < -zero else STATIC)]
 
 
-def _moves_of_static(i: int, point: Pairs, held: Pairs, zero: float, nd: int) -> _Moves:
+def _moves_of_static(i: int, point: Pairs, multiplier: Pairs, zero: float, nd: int) -> _Moves:
     table = tangent_directions(nd)
-    # The rows of a static contact are redundant: only their sum along D means something.
-    pull = held.drift[i] @ table
-    size = float(np.linalg.norm(pull))
+    # The rows of a static contact are redundant, so only the sum of their multipliers along D is defined.
+    gradient = multiplier.drift[i] @ table
+    size = float(np.linalg.norm(gradient))
     if point.normal[i] <= zero:
-        return [(max(held.gap[i], size), SEPARATE), (size, int(np.argmin(table @ pull)))]
+        return [(max(multiplier.gap[i], size), SEPARATE), (size, int(np.argmin(table @ gradient)))]
     if point.cone[i] > zero:
         return []
     k = int(np.argmax(point.friction[i]))
-    along = float(table[k] @ pull)
-    across = float(np.linalg.norm(pull - along * table[k]))
+    along = float(table[k] @ gradient)
+    across = float(np.linalg.norm(gradient - along * table[k]))
     after, before = (k + 1) % nd, (k - 1) % nd
-    beside = after if point.friction[i, after] >= point.friction[i, before] else before
-    if point.friction[i, beside] > zero:
-        middle = table[k] + table[beside]
-        return [(-float(middle @ pull), nd + (k if beside == after else before))] if middle @ pull < 0.0 else []
+    neighbour = after if point.friction[i, after] >= point.friction[i, before] else before
+    if point.friction[i, neighbour] > zero:
+        middle = table[k] + table[neighbour]
+        return (
+            [(-float(middle @ gradient), nd + (k if neighbour == after else before))] if middle @ gradient < 0.0 else []
+        )
     return [(size, k)] if along < np.tan(np.pi / nd) * across else []
 
 
-def _moves_of_sliding(i: int, state: int, point: Pairs, held: Pairs, zero: float, nd: int) -> _Moves:
+def _moves_of_sliding(i: int, state: int, point: Pairs, multiplier: Pairs, zero: float, nd: int) -> _Moves:
     k, moves = state % nd, []
     if point.slip[i] <= zero:
-        moves.append((max(held.cone[i], held.friction[i].max(initial=0.0)), STATIC))
+        moves.append((max(multiplier.cone[i], multiplier.friction[i].max(initial=0.0)), STATIC))
     if point.normal[i] <= zero:
-        moves.append((held.gap[i], SEPARATE))
+        moves.append((multiplier.gap[i], SEPARATE))
     if state < nd:
         for between, other in ((nd + k, (k + 1) % nd), (nd + (k - 1) % nd, (k - 1) % nd)):
             if point.drift[i, other] <= zero:
-                moves.append((held.friction[i, other], between))
+                moves.append((multiplier.friction[i, other], between))
     else:
         for left, other in ((k, (k + 1) % nd), ((k + 1) % nd, k)):
             if point.friction[i, left] <= zero:
-                moves.append((held.drift[i, left], other))
+                moves.append((multiplier.drift[i, left], other))
     return moves
 
 
@@ -237,25 +255,26 @@ def plain_pivots(
     *,
     zero: float = 1e-4,
 ) -> list[Pivot]:
-    """The moves of ``proposed_pivots`` as a QPCC pivots without our corrections: each multiplier is taken at its word.
+    """Propose changes of state as a QPCC pivots, for the baseline: each multiplier alone decides. Arguments as for
+    ``proposed_pivots``.
 
-    A contact whose free side is zero goes to the state in which the multiplier's row is free: static to separate or
-    slide k, slide k to static, separate or slide j, separate to static. For the baseline.
+    A contact whose free side is zero changes to the state in which the row of the multiplier is free: static to
+    separate or slide k, slide k to static, separate or slide j, separate to static.
     """
-    point, held, nd = Pairs.of(layout, x, w), _multipliers(layout, multipliers), layout.directions
+    point, multiplier, nd = Pairs.of(layout, x, w), _multipliers(layout, multipliers), layout.directions
     pivots: list[Pivot] = []
     for i, state in enumerate(states):
         k = int(state)
         if state == SEPARATE:
-            gains = [(held.normal[i], STATIC)] if point.gap[i] <= zero else []
+            gains = [(multiplier.normal[i], STATIC)] if point.gap[i] <= zero else []
         elif state == STATIC:
-            gains = [(held.gap[i], SEPARATE)] if point.normal[i] <= zero else []
+            gains = [(multiplier.gap[i], SEPARATE)] if point.normal[i] <= zero else []
             if point.cone[i] <= zero:
-                # Raising lambda opens every direction's row; friction stays where it is largest.
-                gains.append((max(held.slip[i], held.drift[i].max()), int(np.argmax(point.friction[i]))))
+                # Raising lambda frees the row of every direction; friction stays where it is largest.
+                gains.append((max(multiplier.slip[i], multiplier.drift[i].max()), int(np.argmax(point.friction[i]))))
         else:
-            gains = [(held.cone[i], STATIC)] if point.slip[i] <= zero else []
-            gains += [(held.gap[i], SEPARATE)] if point.normal[i] <= zero else []
-            gains += [(held.friction[i, j], j) for j in range(nd) if j != k and point.drift[i, j] <= zero]
+            gains = [(multiplier.cone[i], STATIC)] if point.slip[i] <= zero else []
+            gains += [(multiplier.gap[i], SEPARATE)] if point.normal[i] <= zero else []
+            gains += [(multiplier.friction[i, j], j) for j in range(nd) if j != k and point.drift[i, j] <= zero]
         pivots += [Pivot(float(gain), i, int(new)) for gain, new in gains if gain > zero]
     return sorted(pivots, key=lambda pivot: -pivot.gain)

@@ -1,7 +1,8 @@
-"""The program of a step over the activations alone: contact as what it makes of them, one linear piece at a time
-(Eq. 9, 13).
+"""QP of a step over the activations alone, with exact Coulomb contact, and the search over contact modes (Eq. 9, 13).
 
-See docs/concepts/locomotion.md.
+Contact forces are a function of the activations, affine in each region of fixed contact modes. ``search_modes`` solves
+one QP in each region that it visits. Its kernels are in ``egs_warp.kernels.locomotion.mode_region``, the version for a
+GPU is ``device_search``. See docs/concepts/locomotion.md#modes.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ FREE, STICK, SLIDE = kernels.FREE, kernels.STICK, kernels.SLIDE
 
 @dataclass(frozen=True)
 class CoulombProgram:
-    """min 1/2 x^T P x + q^T x + constant over x = (a, f), where f is what exact Coulomb contact answers to a.
+    """Problem min 1/2 x^T P x + q^T x + constant over x = (a, f), where f are the exact Coulomb forces that follow from
+    a.
 
-    Activations are in their bounds, forces in body weights (contact-major: normal and two tangents), speeds in
-    sqrt(g H). Contact velocities are ``rows`` x + ``offset``, the normal ones with the push-out's shift.
+    Activations are fractions of their bounds, forces are in body weights (for each contact normal, then two tangential
+    components), speeds in sqrt(g H). Contact velocities are ``rows`` x + ``offset``, of which the normal ones include
+    the velocity bias.
     """
 
     P: np.ndarray
@@ -40,26 +43,26 @@ class CoulombProgram:
     """(3n,)."""
     friction: float
     lower: np.ndarray
-    """(m,) of the activations."""
+    """(m,) lower bounds of the activations."""
     upper: np.ndarray
-    """(m,)."""
+    """(m,) upper bounds of the activations."""
 
     @property
     def activation_count(self) -> int:
-        """m."""
+        """Number of activations m."""
         return len(self.lower)
 
     @property
     def contact_count(self) -> int:
-        """n."""
+        """Number of contacts n."""
         return len(self.offset) // 3
 
     def objective(self, x: np.ndarray) -> float:
-        """Value at ``x``."""
+        """Return the objective at ``x`` (m + 3n,), with the constant."""
         return float(0.5 * x @ self.P @ x + self.q @ x + self.constant)
 
     def contact_response(self, activations: np.ndarray, guess: np.ndarray) -> np.ndarray:
-        """(m + 3n,) ``activations`` (m,) and what contact answers to them; its forces are near ``guess`` (n, 3)."""
+        """Return x = (a, f(a)), (m + 3n,), for ``activations`` (m,). The Coulomb solve starts from ``guess`` (n, 3)."""
         m, n = self.activation_count, self.contact_count
         operator = self.rows[:, m:].copy()
         operator[np.diag_indices_from(operator)] += kernels.DELASSUS_REGULARIZATION * operator.diagonal().mean()
@@ -70,45 +73,48 @@ class CoulombProgram:
 
 @dataclass(frozen=True)
 class ContactModes:
-    """How each contact moves in a piece."""
+    """Contact mode of each contact: free, stick, or slide in a direction."""
 
     kind: np.ndarray
-    """(n,) FREE, STICK or SLIDE."""
+    """(n,) ``FREE``, ``STICK`` or ``SLIDE``."""
     slip: np.ndarray
-    """(n, 2) unit vectors along which those that slide do."""
+    """(n, 2) unit vectors, directions of motion of the sliding contacts."""
 
     @classmethod
     def of(cls, forces: np.ndarray, friction: float) -> ContactModes:
-        """Those of ``forces`` (n, 3) body weights that obey Coulomb's law."""
-        pull = np.linalg.norm(forces[:, 1:], axis=1)
-        pressing = forces[:, 0] > kernels.ZERO_FORCE
-        sliding = pressing & (pull >= kernels.CONE_FRACTION * friction * forces[:, 0])
-        kind = np.where(sliding, SLIDE, np.where(pressing, STICK, FREE))
+        """Return the modes of ``forces`` (n, 3), body weights, that satisfy Coulomb's law."""
+        tangential = np.linalg.norm(forces[:, 1:], axis=1)
+        touching = forces[:, 0] > kernels.ZERO_FORCE
+        sliding = touching & (tangential >= kernels.CONE_FRACTION * friction * forces[:, 0])
+        kind = np.where(sliding, SLIDE, np.where(touching, STICK, FREE))
         return cls(kind, _unit(-forces[:, 1:]))
 
 
 @dataclass(frozen=True)
 class ModeRegionOptimum:
-    """Optimum of a piece."""
+    """Optimum of the QP of one mode region."""
 
     x: np.ndarray
     """(m + 3n,)."""
     objective: float
     next_modes: ContactModes | None
-    """Those of the piece that lies beyond the bounds that hold the optimum back; None if none does."""
+    """Modes of the region past all active mode constraints; None if none is active."""
     next_modes_single: ContactModes | None
-    """Of these bounds only the one that holds it back most is left behind."""
+    """Modes past the active constraint with the largest multiplier alone; None unless several are active."""
 
 
 @dataclass(frozen=True)
 class ModeSearchResult:
-    """Best point found."""
+    """Best point of a mode search."""
 
     x: np.ndarray | None
     """(m + 3n,); None if no QP had a solution."""
     objective: float
+    """Infinite without ``x``."""
     qp_count: int
+    """Number of QPs that were solved."""
     infeasible: int
+    """Number of QPs without a solution."""
 
 
 def search_modes(
@@ -120,33 +126,43 @@ def search_modes(
     solver: QpSolver | str,
     device: Device = None,
 ) -> ModeSearchResult:
-    """From the piece of ``modes``, which holds ``start`` (m + 3n,), onward as long as the objective falls.
+    """Search over contact modes: solve the QP of a region, go to the region past its active mode constraints, and
+    repeat while the objective falls.
 
-    Neighbouring pieces share the point between them, so no step is lost on an infeasible one. What slides in ``modes``
-    is held at first: feet that slide apart under a load each resist only where they came from, and no way leads from
-    there to a common push. ``solver`` and ``device``: see ``quadratic_program``.
+    The optimum of a region lies on the boundary to the next one, so each QP has a feasible start. The search begins
+    with the sliding contacts of ``modes`` set to stick, and with ``modes`` themselves if that region has no solution:
+    feet that slide apart under load resist only in one direction each, and from there the search does not reach a
+    common push-off.
+
+    Args:
+        program: the QP of the step.
+        start: (m + 3n,) point in the region of ``modes``.
+        modes: modes in which the search begins.
+        qp_limit: maximum number of QPs.
+        solver: QP solver, see ``quadratic_program``.
+        device: device of the solver ``admm``.
     """
     best: ModeRegionOptimum | None = None
     count = infeasible = 0
-    sliding, modes = modes, ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
+    sliding_modes, modes = modes, ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
     while count < qp_limit:
         count += 1
         solution = solve_mode_region(program, start, modes, solver, device=device, warm_start=best is not None)
         if solution is None:
             infeasible += 1
-            if best is not None or infeasible > 1 or (sliding.kind != SLIDE).all():
+            if best is not None or infeasible > 1 or (sliding_modes.kind != SLIDE).all():
                 break
-            modes = sliding
+            modes = sliding_modes
             continue
         if best is not None and solution.objective >= best.objective:
-            # Together the contacts went too far; the one that is pushed most may still gain.
+            # All transitions at once raised the objective; that with the largest multiplier alone may still lower it.
             if best.next_modes_single is None or modes is best.next_modes_single:
                 break
             modes = best.next_modes_single
             continue
-        enough = best is not None and best.objective - solution.objective < kernels.GAIN * abs(best.objective)
+        is_small_gain = best is not None and best.objective - solution.objective < kernels.GAIN * abs(best.objective)
         best, start = solution, solution.x
-        if solution.next_modes is None or enough:
+        if solution.next_modes is None or is_small_gain:
             break
         modes = solution.next_modes
     return ModeSearchResult(best.x if best else None, best.objective if best else float("inf"), count, infeasible)
@@ -155,29 +171,35 @@ def search_modes(
 def solve_relaxed(
     program: CoulombProgram, solver: QpSolver | str, *, device: Device = None
 ) -> tuple[np.ndarray, float] | None:
-    """The activations (m,) and the objective of the optimum with forces that need not be what contact answers: within
-    the cone, but also where nothing touches. No piece has a lower objective. None without a solution.
+    """Solve the relaxed QP over activations and forces: forces within the friction cone, and no complementarity, so
+    that a force may act where nothing touches. Its optimum is a lower bound on the objective in every mode region.
+
+    Returns:
+        The activations (m,) and the objective, or None without a solution.
     """
     m, n = program.activation_count, program.contact_count
     forces = np.hstack([np.zeros((3 * n, m)), np.eye(3 * n)])
     cone = [forces[::3]]
     for angle in 2.0 * np.pi * np.arange(kernels.CONE_FACES) / kernels.CONE_FACES:
-        # Around the cone: what bounds must not cut it.
+        # A pyramid around the cone, because a lower bound must not exclude points of the cone.
         cone.append(program.friction * forces[::3] - np.cos(angle) * forces[1::3] - np.sin(angle) * forces[2::3])
     A = np.vstack([np.eye(m, m + 3 * n), *cone, program.rows[::3]])
     lower = np.concatenate([program.lower, np.zeros(n * (1 + kernels.CONE_FACES)), -program.offset[::3]])
     upper = np.concatenate([program.upper, np.full(len(lower) - m, np.inf)])
     P = program.P + kernels.DELASSUS_REGULARIZATION * program.P.diagonal().mean() * np.eye(len(program.P))
-    found = quadratic_program(P, program.q, A, solver=solver, device=device).solve(lower, upper)
-    if not found.usable:
+    relaxed = quadratic_program(P, program.q, A, solver=solver, device=device).solve(lower, upper)
+    if not relaxed.usable:
         return None
-    return np.clip(found.x[:m], program.lower, program.upper), found.objective + program.constant
+    return np.clip(relaxed.x[:m], program.lower, program.upper), relaxed.objective + program.constant
 
 
 @dataclass(frozen=True)
 class ModeRegion:
-    """Where each contact goes on as it does: forces are ``offset`` + ``slope`` a, the cost of activations a is
-    1/2 a^T P a + q^T a and a constant, and ``rows`` a + ``rows_offset`` >= 0 is where it holds."""
+    """Reduced QP for one assignment of contact modes.
+
+    With the modes fixed, contact forces are affine in the activations a, f = force_offset + force_slope a, so the cost
+    is 1/2 a^T P a + q^T a + const. The assignment is valid where rows a + rows_offset >= 0.
+    """
 
     force_offset: np.ndarray
     """(3n,) body weights."""
@@ -188,53 +210,54 @@ class ModeRegion:
     q: np.ndarray
     """(m,)."""
     rows: np.ndarray
-    """(m + k, m), the first m those of the activations themselves."""
+    """(m + k, m): m rows of the activations themselves, then k mode constraints."""
     rows_offset: np.ndarray
     """(m + k,)."""
     contact: np.ndarray
-    """(k,) whose row each of the others is."""
+    """(k,) contact of each mode constraint."""
     transitions: np.ndarray
-    """(k,) what happens to it beyond."""
+    """(k,) transition of that contact where the constraint is violated: ``TO_FREE``, ``TO_SLIDE``,
+    ``TO_OTHER_DIRECTION`` or ``TO_TOUCHING``."""
 
     @classmethod
     def of(cls, program: CoulombProgram, modes: ContactModes) -> ModeRegion | None:
-        """That of ``modes``; None if no forces hold what is held."""
+        """Return the region of ``modes``, or None if the equations of its contact forces are singular."""
         m, n = program.activation_count, program.contact_count
         stick, slide, free = (np.flatnonzero(modes.kind == kind) for kind in (STICK, SLIDE, FREE))
         contact = np.concatenate([stick, slide, np.tile(stick, kernels.CONE_FACES), slide, slide, free])
-        onward = np.repeat(
+        transitions = np.repeat(
             [kernels.TO_FREE, kernels.TO_SLIDE, kernels.TO_OTHER_DIRECTION, kernels.TO_TOUCHING],
             [len(stick) + len(slide), kernels.CONE_FACES * len(stick), 2 * len(slide), len(free)],
         )
-        given = [np.ascontiguousarray(each) for each in (program.P, program.q, program.rows, program.offset)]
-        given += [modes.kind.astype(np.int32), np.ascontiguousarray(modes.slip)]
-        total, wide = m + len(contact), kernels.padded(m)
-        shapes = (3 * n, wide), 3 * n, (m, wide), m, (total, wide), total
-        slope, offset, P, q, rows, rows_offset = made = [np.empty(shape) for shape in shapes]
-        room = _workspace(kernels.scratch_size(m, n), 10 * n)
+        inputs = [np.ascontiguousarray(each) for each in (program.P, program.q, program.rows, program.offset)]
+        inputs += [modes.kind.astype(np.int32), np.ascontiguousarray(modes.slip)]
+        row_count, padded_m = m + len(contact), kernels.padded(m)
+        shapes = (3 * n, padded_m), 3 * n, (m, padded_m), m, (row_count, padded_m), row_count
+        slope, offset, P, q, rows, rows_offset = outputs = [np.empty(shape) for shape in shapes]
+        workspace = _workspace(kernels.scratch_size(m, n), 10 * n)
         launch_cached(
             kernels.mode_region_kernel,
             1,
-            inputs=[m, n, program.friction, *_addresses(given), room.numbers, room.scratch, total],
-            outputs=[*_addresses(made), room.there_array],
-            device=room.device,
+            inputs=[m, n, program.friction, *_addresses(inputs), workspace.numbers, workspace.scratch, row_count],
+            outputs=[*_addresses(outputs), workspace.is_valid_array],
+            device=workspace.device,
         )
-        if not room.there[0]:
+        if not workspace.is_valid[0]:
             return None
-        return cls(offset, slope[:, :m], P[:, :m], q, rows[:, :m], rows_offset, contact, onward)
+        return cls(offset, slope[:, :m], P[:, :m], q, rows[:, :m], rows_offset, contact, transitions)
 
 
 class _Workspace:
-    """Memory of a thread in which pieces are made."""
+    """Reused host buffers of one thread for building mode regions."""
 
     def __init__(self) -> None:
         self.device = wp.get_device("cpu")
-        self.there = np.zeros(1, np.int32)
-        self.there_array = wp.array(self.there, dtype=int, device="cpu", copy=False)
+        self.is_valid = np.zeros(1, np.int32)
+        self.is_valid_array = wp.array(self.is_valid, dtype=int, device="cpu", copy=False)
         self.scratch, self.numbers = zeros(0, real, "cpu"), zeros(0, int, "cpu")
 
     def grown(self, scratch: int, numbers: int) -> _Workspace:
-        """With so many numbers at least."""
+        """Return this workspace with at least ``scratch`` floats and ``numbers`` integers."""
         if self.scratch.size < scratch:
             self.scratch = zeros(scratch, real, "cpu")
         if self.numbers.size < numbers:
@@ -242,11 +265,12 @@ class _Workspace:
         return self
 
 
-_thread_room = thread_local_cache(1)(_Workspace)
+_thread_workspace = thread_local_cache(1)(_Workspace)
 
 
 def _workspace(scratch: int, numbers: int) -> _Workspace:
-    return _thread_room().grown(scratch, numbers)
+    """Return this thread's workspace with at least these sizes."""
+    return _thread_workspace().grown(scratch, numbers)
 
 
 def _addresses(values: Sequence[np.ndarray]) -> list[int]:
@@ -262,40 +286,54 @@ def solve_mode_region(
     device: Device = None,
     warm_start: bool = False,
 ) -> ModeRegionOptimum | None:
-    """Optimum of the activations in the piece of ``modes``; what ``start`` breaks of its bounds, up to ``BROKEN``, may
-    stay broken as much. None without a solution. ``beside`` where another piece of the step is solved already.
+    """Solve the QP of the activations in the region of ``modes``.
+
+    Mode constraints that ``start`` violates by up to ``BROKEN`` may stay violated by as much.
+
+    Args:
+        program: the QP of the step.
+        start: (m + 3n,) point from which the solver starts.
+        modes: modes of the region.
+        solver: QP solver, see ``quadratic_program``.
+        device: device of the solver ``admm``.
+        warm_start: True if another region of the step has been solved; skips operator splitting (``SplittingProgram``).
+
+    Returns:
+        The optimum, or None without a solution.
     """
-    m, piece = program.activation_count, ModeRegion.of(program, modes)
-    if piece is None:
+    m, region = program.activation_count, ModeRegion.of(program, modes)
+    if region is None:
         return None
-    b = piece.rows_offset[m:]
-    lower = np.minimum(-b, np.maximum(piece.rows[m:] @ start[:m], -b - kernels.BROKEN)) - kernels.ROUNDING
-    found = quadratic_program(piece.P, piece.q, piece.rows, solver=solver, device=device).solve(
+    b = region.rows_offset[m:]
+    lower = np.minimum(-b, np.maximum(region.rows[m:] @ start[:m], -b - kernels.BROKEN)) - kernels.ROUNDING
+    optimum = quadratic_program(region.P, region.q, region.rows, solver=solver, device=device).solve(
         np.concatenate([program.lower, lower]),
         np.concatenate([program.upper, np.full(len(lower), np.inf)]),
         start[:m],
         beside=warm_start,
     )
-    if not found.usable:
+    if not optimum.usable:
         return None
-    a = np.clip(found.x, program.lower, program.upper)
-    x = np.concatenate([a, piece.force_offset + piece.force_slope @ a])
+    a = np.clip(optimum.x, program.lower, program.upper)
+    x = np.concatenate([a, region.force_offset + region.force_slope @ a])
     objective = program.objective(x)
-    pushes = -found.multipliers[m:]
-    active = np.flatnonzero(pushes > kernels.ACTIVE * max(abs(objective), 1e-9))
-    further = nearest = None
+    multipliers = -optimum.multipliers[m:]
+    active = np.flatnonzero(multipliers > kernels.ACTIVE * max(abs(objective), 1e-9))
+    next_all = next_single = None
     if len(active):
-        contact, onward, pushes = piece.contact[active], piece.transitions[active], pushes[active]
-        beyond = _NextModes(program, modes, x)
-        further = beyond.after_transitions(contact, onward, pushes)
+        contact, transitions, multipliers = region.contact[active], region.transitions[active], multipliers[active]
+        neighbours = _NextModes(program, modes, x)
+        next_all = neighbours.after_transitions(contact, transitions, multipliers)
         if len(active) > 1:
-            most = [int(np.argmax(pushes))]
-            nearest = beyond.after_transitions(contact[most], onward[most], pushes[most])
-    return ModeRegionOptimum(x, objective, further, nearest)
+            strongest = [int(np.argmax(multipliers))]
+            next_single = neighbours.after_transitions(
+                contact[strongest], transitions[strongest], multipliers[strongest]
+            )
+    return ModeRegionOptimum(x, objective, next_all, next_single)
 
 
 class _NextModes:
-    """Modes past the bounds that hold the optimum ``x`` back."""
+    """Modes of the regions next to the optimum ``x`` in the region of ``modes``."""
 
     def __init__(self, program: CoulombProgram, modes: ContactModes, x: np.ndarray) -> None:
         self._modes = modes
@@ -303,14 +341,15 @@ class _NextModes:
         self._against, self._along = _unit(-x[program.activation_count :].reshape(-1, 3)[:, 1:]), _unit(tangents)
         self._moving = np.linalg.norm(tangents, axis=1) > kernels.ZERO_SPEED
 
-    def after_transitions(self, contacts: np.ndarray, onward: np.ndarray, pushes: np.ndarray) -> ContactModes:
-        """Modes where ``contacts`` go ``onward``, the most pushed one's word last."""
+    def after_transitions(self, contacts: np.ndarray, transitions: np.ndarray, multipliers: np.ndarray) -> ContactModes:
+        """Return the modes after ``contacts`` make their ``transitions``. If a contact has several, that with the
+        largest of ``multipliers`` counts."""
         kind, slip = self._modes.kind.copy(), self._modes.slip.copy()
-        for index in np.argsort(pushes, kind="stable"):
+        for index in np.argsort(multipliers, kind="stable"):
             i = contacts[index]
-            if onward[index] == kernels.TO_FREE:
+            if transitions[index] == kernels.TO_FREE:
                 kind[i] = FREE
-            elif onward[index] == kernels.TO_SLIDE:
+            elif transitions[index] == kernels.TO_SLIDE:
                 kind[i], slip[i] = SLIDE, self._against[i]
             elif self._moving[i]:
                 kind[i], slip[i] = SLIDE, self._along[i]

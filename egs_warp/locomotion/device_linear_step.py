@@ -1,4 +1,7 @@
-"""Linear steps on a GPU, where the responses of contact are: no column of theirs comes to the host (Eq. 7, 8, 13)."""
+"""Linear steps on a GPU, on the device of the contact linearisation: their columns are never downloaded (Eq. 7, 8, 13).
+
+The arithmetic is torch on the device, recorded as CUDA graphs.
+"""
 
 from __future__ import annotations
 
@@ -23,166 +26,192 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.precision import real
 
-_MORE = 8
-"""Contacts for which there is memory beyond those that there are."""
+_EXTRA_CONTACTS = 8
+"""Additional contact capacity when buffers grow."""
 
 
 @dataclass(frozen=True)
 class DeviceLinearStep(LinearStep):
-    """``LinearStep`` whose velocities are a tensor."""
+    """``LinearStep`` whose ``velocities`` are a tensor on the device."""
 
     response: DeviceContactLinearization
-    known: np.ndarray
-    """(3n, k + 1) m/s of the contacts."""
-    of_ends: StagingBuffer
-    of_squares: StagingBuffer
+    host_contact_velocities: np.ndarray
+    """(3n, k + 1) m/s, contact velocities, on the host."""
+    end_staging: StagingBuffer
+    """Staging buffer of ``end_velocities``."""
+    square_staging: StagingBuffer
+    """Staging buffer of ``objective_quadratic``."""
 
     def end_velocities(self, x: np.ndarray) -> np.ndarray:
-        """See ``LinearStep``."""
+        """Return v(x), (3N,) m/s, for ``x`` (k,)."""
         stream = self.response.owner.stream
         with stream:
-            self.of_ends.start_download(self.velocities @ self.of_ends.upload(x, np.ones(1)))
+            self.end_staging.start_download(self.velocities @ self.end_staging.upload(x, np.ones(1)))
             stream.wait()
-        return self.of_ends.result(len(self.velocities)).copy()
+        return self.end_staging.result(len(self.velocities)).copy()
 
     def contact_velocities(self, contacts: ContactSet) -> np.ndarray:
-        """See ``LinearStep``."""
+        """Return W ``velocities``, (3n, k + 1) m/s, which were downloaded when the step was linearised."""
         assert contacts is self.response.contacts
-        return self.known
+        return self.host_contact_velocities
 
     def objective_quadratic(self, objectives: Sequence[Objective]) -> Callable[[], np.ndarray]:
-        """See ``LinearStep``; those begun before are lost."""
+        """Start computing the quadratic form of the weighted squares of ``objectives``, see ``LinearStep``. A later
+        call discards the result of an earlier one."""
         stream, width = self.response.owner.stream, self.count + 1
         with stream:
-            self.of_squares.start_download(squares_of(self.velocities, objectives, self.of_squares).view(-1))
+            self.square_staging.start_download(
+                objective_form(self.velocities, objectives, self.square_staging).view(-1)
+            )
 
-        def form_here() -> np.ndarray:
+        def wait_form() -> np.ndarray:
             stream.wait()
-            return self.of_squares.result(width**2).reshape(width, width).copy()
+            return self.square_staging.result(width**2).reshape(width, width).copy()
 
-        return form_here
+        return wait_form
 
 
-def squares_of(velocities: torch.Tensor, objectives: Sequence[Objective], room: StagingBuffer) -> torch.Tensor:
-    """``LinearStep.squares`` of the ``velocities`` (3N, k + 1), on the device; what is asked goes there by the
-    ``room``."""
+def objective_form(velocities: torch.Tensor, objectives: Sequence[Objective], staging: StagingBuffer) -> torch.Tensor:
+    """Return the form G of ``LinearStep.objective_quadratic``, (k + 1, k + 1) on the device.
+
+    Args:
+        velocities: (3N, k + 1) m/s, ``LinearStep.velocities``.
+        objectives: objectives of the motion.
+        staging: buffer through which their rows and targets are uploaded.
+    """
     size = len(velocities)
-    one, several = _by_entries(objectives)
-    rows = np.concatenate([np.zeros((0, size)), *(root * dense for root, dense, _ in several)])
-    targets = np.concatenate([np.zeros(0), *(root * target for root, _, target in several)])
-    parts = [np.concatenate([np.zeros(0), *each]) for each in zip(*one, strict=True)] or [np.zeros(0)] * 3
-    told = room.upload(*parts, targets, rows)
-    places, shares, wanted, asked, dense = told.split([*(len(part) for part in parts), len(targets), rows.size])
-    missed = shares[:, None] * velocities[places.long()]
-    missed[:, -1] -= wanted
-    form = missed.T @ missed
-    missed = dense.view(-1, size) @ velocities
-    missed[:, -1] -= asked
-    return form.addmm_(missed.T, missed)
+    single, dense_rows = _by_entries(objectives)
+    rows = np.concatenate([np.zeros((0, size)), *(root * dense for root, dense, _ in dense_rows)])
+    targets = np.concatenate([np.zeros(0), *(root * target for root, _, target in dense_rows)])
+    parts = [np.concatenate([np.zeros(0), *each]) for each in zip(*single, strict=True)] or [np.zeros(0)] * 3
+    uploaded = staging.upload(*parts, targets, rows)
+    indices, entries, entry_targets, dense_targets, dense = uploaded.split(
+        [*(len(part) for part in parts), len(targets), rows.size]
+    )
+    residual = entries[:, None] * velocities[indices.long()]
+    residual[:, -1] -= entry_targets
+    form = residual.T @ residual
+    residual = dense.view(-1, size) @ velocities
+    residual[:, -1] -= dense_targets
+    return form.addmm_(residual.T, residual)
 
 
 def _by_entries(objectives: Sequence[Objective]) -> tuple[list[Any], list[Any]]:
-    """Of those with one entry in each row, in as many rows as there are nodes, where these are, what they are, and
-    the targets; of the others the root of their weight, the rows, and the targets. The first ones' roots are in
-    them."""
-    one, several = [], []
+    """Split objectives by their rows.
+
+    Returns:
+        Of objectives with one entry in each row: indices, entries and targets, scaled by the root of the weight. Of the
+        others: root of the weight, dense rows, and targets.
+    """
+    single, dense_rows = [], []
     for objective in objectives:
         root, rows = np.sqrt(2.0 * objective.weight), objective.rows
         if isinstance(rows, np.ndarray):
-            several.append((root, rows, objective.target))
+            dense_rows.append((root, rows, objective.target))
         elif (np.diff(rows.indptr) == 1).all():
-            one.append((rows.indices, root * rows.data, root * objective.target))
+            single.append((rows.indices, root * rows.data, root * objective.target))
         else:
-            several.append((root, rows.toarray(), objective.target))
-    return one, several
+            dense_rows.append((root, rows.toarray(), objective.target))
+    return single, dense_rows
 
 
 class StagingBuffer:
-    """Memory by which numbers go to the device in one piece and come back so, as long as they need it."""
+    """Pinned staging buffer, which uploads and downloads arrays in one transfer and grows as needed."""
 
     def __init__(self, stream: GraphStream) -> None:
-        self._stream, self._told, self._here = stream, PinnedUpload(stream, 0), stream.pinned(0)
+        self._stream, self._upload, self._download = stream, PinnedUpload(stream, 0), stream.pinned(0)
 
     def upload(self, *parts: np.ndarray) -> torch.Tensor:
-        """The ``parts`` one behind the other."""
+        """Upload the concatenated ``parts``; return them on the device."""
         count = sum(part.size for part in parts)
-        if len(self._told.host) < count:
-            self._told = PinnedUpload(self._stream, 2 * count)
-        self._told.set(*parts)
-        return self._told.device[:count]
+        if len(self._upload.host) < count:
+            self._upload = PinnedUpload(self._stream, 2 * count)
+        self._upload.set(*parts)
+        return self._upload.device[:count]
 
     def start_download(self, values: torch.Tensor) -> None:
-        """``values`` (n,) are on their way."""
-        if len(self._here) < len(values):
-            self._here = self._stream.pinned(2 * len(values))
-        self._here[: len(values)].copy_(values, non_blocking=True)
+        """Start downloading ``values`` (n,), asynchronously."""
+        if len(self._download) < len(values):
+            self._download = self._stream.pinned(2 * len(values))
+        self._download[: len(values)].copy_(values, non_blocking=True)
 
     def result(self, count: int) -> np.ndarray:
-        """(count,) of what has come."""
-        return self._here.numpy()[:count]
+        """Return the first ``count`` entries that were downloaded; synchronise the stream first."""
+        return self._download.numpy()[:count]
 
 
 class DeviceLinearSteps:
-    """``LinearSteps`` where the responses are."""
+    """``StepLinearizer`` on the device of the contact linearisations."""
 
     def __init__(self, owner: DeviceContactLinearizer, muscles: MuscleSet, synergies: Synergies) -> None:
         self.owner, self.count = owner, synergies.count
         at_bounds = MuscleEnergy.of(muscles, muscles.bounds)
         self._rows, self._tensions = owner.tensor(at_bounds.rows.toarray()), owner.tensor(at_bounds.tensions)
         self._members = owner.tensor(synergies.members.toarray())
-        self._works = GraphCache(owner.stream)
-        self._memory = owner.zeros(0)
-        self._speeds_here = owner.stream.pinned(0)
-        self._rooms = StagingBuffer(owner.stream), StagingBuffer(owner.stream)
+        self._graphs = GraphCache(owner.stream)
+        self._buffer = owner.zeros(0)
+        self._host_buffer = owner.stream.pinned(0)
+        self._staging = StagingBuffer(owner.stream), StagingBuffer(owner.stream)
 
-    def linearize(self, prospect: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
-        """See ``LinearSteps``; it is overwritten by the next. ``other`` comes last: both work on one stream."""
-        response, owner, m = prospect.linearization, self.owner, self.count
+    def linearize(self, predicted: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
+        """Linearise the step about ``predicted``; the next call overwrites the result. ``other`` runs last, because
+        both use one stream."""
+        response, owner, m = predicted.linearization, self.owner, self.count
         assert isinstance(response, DeviceContactLinearization)
-        room, dt = response.workspace, response.tangent.problem.dt
+        newton, dt = response.workspace, response.tangent.problem.dt
         width = 3 * response.contacts.count
-        # Without muscles and contact.
-        response.running_iterate_at(None, prospect.velocities, prospect.forces)
+        # Residual without muscles and contact.
+        response.running_iterate_at(None, predicted.velocities, predicted.forces)
         with owner.stream:
-            velocities, speeds = self._room_for(3 * len(prospect.velocities), 3 * room.capacity, m + width + 1)
+            velocities, host_speeds = self._buffers_for(
+                3 * len(predicted.velocities), 3 * newton.capacity, m + width + 1
+            )
 
             def work() -> None:
-                self.write(room, self.segment_forces(room), dt, velocities)
-                speeds.copy_(room.contact_velocities(velocities), non_blocking=True)
+                self.write(newton, self.segment_forces(newton), dt, velocities)
+                host_speeds.copy_(newton.contact_velocities(velocities), non_blocking=True)
 
-            self._works.run((id(room), width, dt), work)
+            self._graphs.run((id(newton), width, dt), work)
             owner.stream.wait()
-        known = speeds.numpy()[:width].copy()
+        host_contact_velocities = host_speeds.numpy()[:width].copy()
         torques = torques_of(response.tangent.problem, response.contacts, m)
-        return DeviceLinearStep(velocities, torques, response, known, *self._rooms), other()
+        return DeviceLinearStep(velocities, torques, response, host_contact_velocities, *self._staging), other()
 
-    def _room_for(self, unknowns: int, rows: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """(unknowns, width) on the device and (rows, width) on the host, always in the same memory while that will
-        do."""
-        if self._memory.numel() < unknowns * width or self._speeds_here.numel() < rows * width:
-            self._memory = self.owner.zeros(unknowns * (width + 3 * _MORE))
-            self._speeds_here = self.owner.stream.pinned((rows + 3 * _MORE) * (width + 3 * _MORE))
-            self._works.forget()
-        velocities = self._memory[: unknowns * width].view(unknowns, width)
-        return velocities, self._speeds_here[: rows * width].view(rows, width)
+    def _buffers_for(self, unknowns: int, rows: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return buffers (unknowns, width) on the device and (rows, width) on the host, the same memory while its
+        capacity suffices."""
+        if self._buffer.numel() < unknowns * width or self._host_buffer.numel() < rows * width:
+            self._buffer = self.owner.zeros(unknowns * (width + 3 * _EXTRA_CONTACTS))
+            self._host_buffer = self.owner.stream.pinned((rows + 3 * _EXTRA_CONTACTS) * (width + 3 * _EXTRA_CONTACTS))
+            self._graphs.forget()
+        velocities = self._buffer[: unknowns * width].view(unknowns, width)
+        return velocities, self._host_buffer[: rows * width].view(rows, width)
 
-    def segment_forces(self, room: NewtonWorkspace) -> torch.Tensor:
-        """(M, 3) newtons by which the segments draw their ends together at their bounds, where the last trial of the
-        ``room`` ends."""
-        return wp.to_torch(self.owner.lines.enqueue_segment_forces(as_warp(self._tensions, real), vectors(room.ends)))
+    def segment_forces(self, newton: NewtonWorkspace) -> torch.Tensor:
+        """Return (M, 3) N, by which the segments pull their ends together at their bounds, where the last trial of
+        ``newton`` ends."""
+        return wp.to_torch(self.owner.lines.enqueue_segment_forces(as_warp(self._tensions, real), vectors(newton.ends)))
 
-    def write(self, room: NewtonWorkspace, pulls: torch.Tensor, dt: float, velocities: torch.Tensor) -> None:
-        """``LinearStep.velocities`` about the last trial of the ``room``, one under no muscles: Eq. (7)."""
+    def write(self, newton: NewtonWorkspace, segment_forces: torch.Tensor, dt: float, velocities: torch.Tensor) -> None:
+        """Write ``LinearStep.velocities`` about the last trial of ``newton``, which must be one without muscles
+        (Eq. 7).
+
+        Args:
+            newton: workspace of the Newton loop.
+            segment_forces: (M, 3) N, of ``segment_forces``.
+            dt: step size, s.
+            velocities: (3N, k + 1) m/s, output.
+        """
         m = self.count
-        foreseen, _, free, _ = room.trial_parts()
-        of_groups = pulls[:, :, None] * self._members[:, None, :]
-        impulses = (self._rows.T @ of_groups.flatten(1)).mul_(-dt).view(-1, m)
-        moved = room.apply_inverse(torch.hstack([impulses, free[:, None]]))
-        velocities[:, :m] = moved[:, :-1]
+        predicted_velocities, _, free, _ = newton.trial_parts()
+        group_forces = segment_forces[:, :, None] * self._members[:, None, :]
+        impulses = (self._rows.T @ group_forces.flatten(1)).mul_(-dt).view(-1, m)
+        solved = newton.apply_inverse(torch.hstack([impulses, free[:, None]]))
+        velocities[:, :m] = solved[:, :-1]
         columns = velocities[:, m:-1]
-        torch.mul(room.columns[:, : columns.shape[1]], self.owner.body.weight, out=columns)
-        torch.sub(foreseen, moved[:, -1], out=velocities[:, -1])
+        torch.mul(newton.columns[:, : columns.shape[1]], self.owner.body.weight, out=columns)
+        torch.sub(predicted_velocities, solved[:, -1], out=velocities[:, -1])
 
     def lengths(self, positions: torch.Tensor) -> torch.Tensor:
-        """(M,) metres of the segments at node ``positions`` (3N,)."""
+        """Return (M,) m, lengths of the segments at node ``positions`` (3N,)."""
         return torch.linalg.vector_norm(self._rows @ positions.view(-1, 3), dim=1)

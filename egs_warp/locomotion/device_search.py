@@ -1,4 +1,7 @@
-"""The search over pieces of contact where the body lies: one launch, and one look at what it found."""
+"""The mode search of a step on a GPU, in one launch and one read-back.
+
+Its kernels are in ``egs_warp.kernels.locomotion.mode_search`` and ``egs_warp.kernels.locomotion.relaxed_contact``.
+"""
 
 from __future__ import annotations
 
@@ -19,99 +22,129 @@ from egs_warp.launching import PinnedMirror, device_of, round_up, thread_local_c
 from egs_warp.locomotion.contact_modes import ContactModes, CoulombProgram, ModeSearchResult
 from egs_warp.precision import real
 
-_PLACES = 8
-"""Contacts are so many at a time."""
+_CAPACITY_MULTIPLE = 8
+"""Contact capacities are multiples of this."""
 
 
 def search_modes_device(
     program: CoulombProgram, start: np.ndarray, modes: ContactModes, *, qp_limit: int, device: wp.Device
 ) -> ModeSearchResult | None:
-    """``search_pieces`` on the ``device``; None where rounding leads astray."""
-    places = round_up(program.contact_count, _PLACES)
-    return _room(program.activation_count, places, device.alias).search(program, start, modes, qp_limit)
+    """Run ``search_modes`` on a device, with the same result.
+
+    Args:
+        program: the QP of the step.
+        start: (m + 3n,) point in the region of ``modes``.
+        modes: modes in which the search begins.
+        qp_limit: maximum number of QPs.
+        device: device of the kernel.
+
+    Returns:
+        The result, or None on numerical failure.
+    """
+    capacity = round_up(program.contact_count, _CAPACITY_MULTIPLE)
+    return _thread_workspace(program.activation_count, capacity, device.alias).search(program, start, modes, qp_limit)
 
 
 class ModeSearchWorkspace:
-    """Memory for programs of m activations and n contacts at most, and the launch that reads what is ``told`` and
-    writes the ``answer``, see ``search_kernel``: it has ``settled`` the search as soon as an end is not ``costly``, and
-    ends where another that it is ``beside`` has done so."""
+    """Buffers and recorded launch of ``mode_search_kernel`` for at most ``m`` activations and ``n`` contacts.
+
+    ``packed_qp`` is the input and ``packed_result`` the output, both documented at the kernel. ``is_accepted`` (1,)
+    int32 is set as soon as the search has a result that costs less than ``restart_cost``. If ``first_search`` is given,
+    this search runs concurrently with it and ends once that has set its ``is_accepted``.
+    """
 
     def __init__(
-        self, m: int, n: int, alias: str, *, costly: float = 0.0, beside: ModeSearchWorkspace | None = None
+        self, m: int, n: int, alias: str, *, restart_cost: float = 0.0, first_search: ModeSearchWorkspace | None = None
     ) -> None:
         self._device, size = wp.get_device(alias), m + 3 * n
         zeros = partial(wp.zeros, device=self._device)
         self.packed_qp = zeros(
             kernels.HEADER_SIZE + size * size + size + 3 * n * (size + 1) + 3 * m + 3 * n, dtype=real
         )
-        self.packed_result, self.settled = zeros(kernels.HEADER_SIZE + size, dtype=real), zeros(1, dtype=int)
-        further, forces, answers = 9 * n, 3 * n, 5 * n
-        total = m + further
-        room = kernels.Workspace()
+        self.packed_result, self.is_accepted = zeros(kernels.HEADER_SIZE + size, dtype=real), zeros(1, dtype=int)
+        constraint_capacity, force_count, base_count = 9 * n, 3 * n, 5 * n
+        row_capacity = m + constraint_capacity
+        workspace = kernels.Workspace()
         for name, shape in {
             **dict.fromkeys(("held_index", "first"), n),
-            **dict.fromkeys(("closed_forces", "held_forces", "speeds"), forces),
-            **{"base_rows": (further, 3), "contact": further, "transition": further, "next": further, "kinds": (4, n)},
+            **dict.fromkeys(("closed_forces", "held_forces", "speeds"), force_count),
+            **{
+                "base_rows": (constraint_capacity, 3),
+                "contact": constraint_capacity,
+                "transition": constraint_capacity,
+                "next": constraint_capacity,
+                "kinds": (4, n),
+            },
         }.items():
-            setattr(room, name, zeros(shape, dtype=int))
+            setattr(workspace, name, zeros(shape, dtype=int))
         for name, shape in {
-            "coefficients": (further, 3),
-            "equations": (forces, forces + m + 1),
-            "force_map": (answers, m + 1),
-            "cost_rows": (size, forces),
+            "coefficients": (constraint_capacity, 3),
+            "equations": (force_count, force_count + m + 1),
+            "force_map": (base_count, m + 1),
+            "cost_rows": (size, force_count),
             "cost_products": (size, m + 1),
             **dict.fromkeys(("cost", "root"), (m, m)),
             **dict.fromkeys(("slope", "minimum", "optimum", "start"), m),
-            **dict.fromkeys(("at_minimum", "at_start", "at_found"), answers),
-            **{"lengths": total, "bounds": (2, total), "multipliers": further, "slips": (4, n, 2)},
+            **dict.fromkeys(("at_minimum", "at_start", "at_found"), base_count),
+            **{
+                "lengths": row_capacity,
+                "bounds": (2, row_capacity),
+                "multipliers": constraint_capacity,
+                "slips": (4, n, 2),
+            },
             **dict.fromkeys(("values", "trial"), size),
         }.items():
-            setattr(room, name, zeros(shape, dtype=real))
-        # The launch has where these lie.
-        self._held = room, *_active_set(total, m + answers, m, beside.settled if beside else zeros(1, dtype=int))
-        given = [self.packed_qp, costly, *self._held]
-        self._launch: Any = _launch(kernels.mode_search_kernel, given, [self.packed_result, self.settled])
+            setattr(workspace, name, zeros(shape, dtype=real))
+        # The launch holds the addresses of these structs' arrays.
+        self._structs = (
+            workspace,
+            *_active_set(
+                row_capacity, m + base_count, m, first_search.is_accepted if first_search else zeros(1, dtype=int)
+            ),
+        )
+        inputs = [self.packed_qp, restart_cost, *self._structs]
+        self._launch: Any = _launch(kernels.mode_search_kernel, inputs, [self.packed_result, self.is_accepted])
 
     @cached_property
     def _host_input(self) -> wp.array:
-        """What goes there. What is read is what was told for this search: the launch before has ended, since its answer
-        was looked at."""
+        """Host buffer for ``packed_qp``. It may be overwritten once the result of the previous launch was read."""
         return self.packed_qp if self._device.is_cpu else wp.zeros(self.packed_qp.shape, real, "cpu", pinned=True)
 
     @cached_property
     def _host_result(self) -> PinnedMirror:
+        """Host mirror of ``packed_result``."""
         return PinnedMirror(self.packed_result)
 
     def enqueue(self) -> None:
-        """The search, with nothing that waits."""
+        """Queue the search; returns at once."""
         self._launch.launch()
 
     def parse_input(self) -> tuple[CoulombProgram, np.ndarray, ContactModes]:
-        """What was told: the program, activations (m,) of the start and how contacts move there."""
-        told = self.packed_qp.numpy()
-        m, n = int(told[0]), int(told[1])
+        """Return the contents of ``packed_qp``: the QP, activations (m,) of the start, and the modes there."""
+        packed = self.packed_qp.numpy()
+        m, n = int(packed[0]), int(packed[1])
         size = m + 3 * n
         shapes = (size, size), (size,), (3 * n, size), (3 * n,), (m,), (m,), (m,), (n,), (n, 2)
         ends = np.cumsum([math.prod(shape) for shape in shapes])
-        parts = np.split(told[kernels.HEADER_SIZE : kernels.HEADER_SIZE + ends[-1]], ends[:-1])
+        parts = np.split(packed[kernels.HEADER_SIZE : kernels.HEADER_SIZE + ends[-1]], ends[:-1])
         P, q, rows, offset, lower, upper, *start = (
             each.reshape(shape) for each, shape in zip(parts, shapes, strict=True)
         )
-        program = CoulombProgram(P, q, float(told[3]), rows, offset, float(told[2]), lower, upper)
+        program = CoulombProgram(P, q, float(packed[3]), rows, offset, float(packed[2]), lower, upper)
         return program, start[0], ContactModes(start[1].astype(int), start[2])
 
     def search(
         self, program: CoulombProgram, start: np.ndarray, modes: ContactModes, qp_limit: int
     ) -> ModeSearchResult | None:
-        """See ``search_at_once``."""
+        """Upload the QP, run the search, and return its result; arguments as for ``search_modes_device``."""
         m, n, at = program.activation_count, program.contact_count, kernels.HEADER_SIZE
-        given = self._host_input.numpy()
-        given[:at] = m, n, program.friction, program.constant, qp_limit, 0, 0, 0
+        packed = self._host_input.numpy()
+        packed[:at] = m, n, program.friction, program.constant, qp_limit, 0, 0, 0
         for part in (
             *(program.P, program.q, program.rows, program.offset, program.lower, program.upper),
             *(start[:m], modes.kind, modes.slip),
         ):
-            given[at : at + part.size] = part.ravel()
+            packed[at : at + part.size] = part.ravel()
             at += part.size
         if self._host_input is not self.packed_qp:
             wp.copy(self.packed_qp, self._host_input, count=at)
@@ -119,71 +152,81 @@ class ModeSearchWorkspace:
         return self.parse_result(m + 3 * n)
 
     def parse_result(self, size: int) -> ModeSearchResult | None:
-        """What has come of the search, a point (size,); None where rounding leads astray."""
-        answer = self._host_result.get()
-        ended, count, infeasible, objective, there = answer[:5].tolist()
-        if ended == NUMERICAL_FAILURE:
+        """Download the result, whose point has ``size`` entries; return None on numerical failure."""
+        packed_result = self._host_result.get()
+        status, count, infeasible, objective, has_point = packed_result[:5].tolist()
+        if status == NUMERICAL_FAILURE:
             return None
-        x = answer[kernels.HEADER_SIZE : kernels.HEADER_SIZE + size] if there else None
+        x = packed_result[kernels.HEADER_SIZE : kernels.HEADER_SIZE + size] if has_point else None
         return ModeSearchResult(x, objective, int(count), int(infeasible))
 
 
 class RelaxationWorkspace:
-    """Memory for the optimum without complementarity of the program that a ``search`` of m activations and n contacts
-    at most was told, and its launch, whose ``answer`` is what ``relax_kernel`` says, unless that search has settled."""
+    """Buffers and recorded launch of ``relaxed_qp_kernel``, the relaxed optimum of the QP in ``search.packed_qp``, for
+    at most ``m`` activations and ``n`` contacts. It ends early once ``search`` has set ``is_accepted``.
+    ``packed_result`` is the output, documented at the kernel."""
 
     def __init__(self, m: int, n: int, search: ModeSearchWorkspace) -> None:
-        device, size, total = device_of(search.packed_qp), m + 3 * n, m + (2 + CONE_FACES) * n
-        self.answer = wp.zeros(kernels.HEADER_SIZE + m, dtype=real, device=device)
+        device, size, row_capacity = device_of(search.packed_qp), m + 3 * n, m + (2 + CONE_FACES) * n
+        self.packed_result = wp.zeros(kernels.HEADER_SIZE + m, dtype=real, device=device)
         relaxed = Relaxed()
         for name, shape in {
             **{"cost": (size, size), "root": (size, size), "leaving": (n, size), "speeds": n},
             **dict.fromkeys(("minimum", "found", "slope", "values"), size),
-            **{"lengths": total, "bounds": (2, total)},
+            **{"lengths": row_capacity, "bounds": (2, row_capacity)},
         }.items():
             setattr(relaxed, name, wp.zeros(shape, dtype=real, device=device))
-        # The launch has where these lie.
-        self._held = search.packed_qp, relaxed, *_active_set(total, n + size, size, search.settled)
-        self._launch: Any = _launch(relaxed_qp_kernel, list(self._held), [self.answer])
+        # The launch holds the addresses of these structs' arrays.
+        self._structs = search.packed_qp, relaxed, *_active_set(row_capacity, n + size, size, search.is_accepted)
+        self._launch: Any = _launch(relaxed_qp_kernel, list(self._structs), [self.packed_result])
 
     @cached_property
-    def _answer_here(self) -> PinnedMirror:
-        return PinnedMirror(self.answer)
+    def _host_result(self) -> PinnedMirror:
+        """Host mirror of ``packed_result``."""
+        return PinnedMirror(self.packed_result)
 
     def enqueue(self) -> None:
-        """The launch, with nothing that waits."""
+        """Queue the launch; returns at once."""
         self._launch.launch()
 
-    def found(self) -> tuple[np.ndarray, float] | None:
-        """What has come of it, see ``solve_relaxed``; None where rounding leads astray, or the search has settled."""
-        answer = self._answer_here.get()
-        # Contact can always push so hard that nothing sinks in: where no point is found there is one all the same.
-        return (answer[kernels.HEADER_SIZE :], float(answer[1])) if answer[0] == FOUND else None
+    def parse_result(self) -> tuple[np.ndarray, float] | None:
+        """Download the relaxed optimum, activations and objective as of ``solve_relaxed``; return None on numerical
+        failure, or if the search was accepted first."""
+        packed_result = self._host_result.get()
+        # Large enough forces always prevent penetration, so the relaxed QP is feasible: other statuses are failures.
+        return (packed_result[kernels.HEADER_SIZE :], float(packed_result[1])) if packed_result[0] == FOUND else None
 
 
-def _active_set(rows: int, made_of: int, unknowns: int, settled: wp.array) -> tuple[Any, Any, Any]:
-    """``UnitRows``, ``Holding`` and ``Splitting`` for so many at most."""
-    zeros = partial(wp.zeros, device=device_of(settled))
-    units, holding, splitting = UnitConstraints(), ActiveSet(), Splitting()
-    units.cancelled = settled
-    units.units, units.base_values = zeros((made_of, unknowns), dtype=real), zeros(made_of, dtype=real)
+def _active_set(rows: int, base_rows: int, unknowns: int, cancelled: wp.array) -> tuple[Any, Any, Any]:
+    """Allocate ``UnitConstraints``, ``ActiveSet`` and ``Splitting``.
+
+    Args:
+        rows: row capacity.
+        base_rows: number of base rows of which the rows are combinations.
+        unknowns: capacity of unknowns.
+        cancelled: (1,) int32 on the device, ends the iterations when set.
+    """
+    zeros = partial(wp.zeros, device=device_of(cancelled))
+    units, active_set, splitting = UnitConstraints(), ActiveSet(), Splitting()
+    units.cancelled = cancelled
+    units.units, units.base_values = zeros((base_rows, unknowns), dtype=real), zeros(base_rows, dtype=real)
     units.base_rows, units.coefficients = zeros((rows, 3), dtype=int), zeros((rows, 3), dtype=real)
     for name in ("values_at_origin", "lower", "upper", "slack"):
         setattr(units, name, zeros(rows, dtype=real))
-    holding.side, holding.active = zeros(rows, dtype=int), zeros(unknowns, dtype=int)
+    active_set.side, active_set.active = zeros(rows, dtype=int), zeros(unknowns, dtype=int)
     for name in ("active_rows", "active_columns", "products", "root", "inverse"):
-        setattr(holding, name, zeros((unknowns, unknowns), dtype=real))
-    holding.values = zeros(rows, dtype=real)
+        setattr(active_set, name, zeros((unknowns, unknowns), dtype=real))
+    active_set.values = zeros(rows, dtype=real)
     for name in ("multipliers", "z", "dual_direction", "scratch_a", "scratch_b", "entering_row", "orthogonal_part"):
-        setattr(holding, name, zeros(unknowns, dtype=real))
+        setattr(active_set, name, zeros(unknowns, dtype=real))
     splitting.initial_values, splitting.all_multipliers = zeros(rows, dtype=real), zeros(rows, dtype=real)
     for name in ("rows", "projected", "multipliers", "sums", "right", "between", "step"):
         setattr(splitting, name, zeros(unknowns, dtype=real))
-    return units, holding, splitting
+    return units, active_set, splitting
 
 
 def _launch(kernel: Any, inputs: list[Any], outputs: list[wp.array]) -> Any:
-    """By one block."""
+    """Record a launch of ``kernel`` by one block."""
     device = device_of(outputs[0])
     return wp.launch(
         kernel,
@@ -196,4 +239,4 @@ def _launch(kernel: Any, inputs: list[Any], outputs: list[wp.array]) -> Any:
     )
 
 
-_room = thread_local_cache(16)(ModeSearchWorkspace)
+_thread_workspace = thread_local_cache(16)(ModeSearchWorkspace)

@@ -1,7 +1,8 @@
-"""Where the energy of every step comes from and goes to, from a trajectory's arrays alone (docs/concepts/ledger.md).
+"""Energy balance of every step, from the arrays of a trajectory alone (docs/concepts/ledger.md).
 
-Shares no code with the solver: energies, damping and muscles are written down a second time here, in NumPy, and no term
-is what is left over of others. So ``Ledger.residual`` is an error of the run, or of one of the two.
+It shares no code with the solver: energies, damping and muscles are implemented a second time here, in NumPy, and no
+term is the remainder of others. So ``EnergyBalance.residual`` is an error of the run or of one of the two
+implementations.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from egs_warp.locomotion.trajectory import Trajectory
 
 STORED = ("kinetic_com", "kinetic_rotation", "kinetic_deformation", "potential", "elastic")
-"""Energies of a state."""
+"""Names of the energies of a state."""
 FLOWS = (
     "muscles",
     "pushes",
@@ -30,12 +31,12 @@ FLOWS = (
     "spin_inside",
     "spin_after",
 )
-"""What a step adds to their sum."""
+"""Names of the terms that a step adds to the sum of the energies."""
 
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Joules: F+1 states, F steps. What takes energy from the body is negative."""
+    """Energy balance in J of F+1 states and F steps. Terms that take energy from the body are negative."""
 
     energy_unit: float
     """m g H."""
@@ -44,92 +45,94 @@ class EnergyBalance:
     kinetic_rotation: np.ndarray
     """(F+1,) of the rigid rotation with the body's angular momentum."""
     kinetic_deformation: np.ndarray
-    """(F+1,) of what moves beside that."""
+    """(F+1,) of the remaining motion."""
     potential: np.ndarray
-    """(F+1,) in gravity, above the origin."""
+    """(F+1,) in gravity, relative to the origin."""
     elastic: np.ndarray
     """(F+1,) Neo-Hookean (Eq. 5)."""
     muscles: np.ndarray
-    """(F,) sum of T (L before - L after)."""
+    """(F,) work of muscles, sum of T (L before - L after)."""
     pushes: np.ndarray
-    """(F,) what is given to the nodes from outside as the step begins."""
+    """(F,) energy of the velocities that external pushes add at the start of the step."""
     damping: np.ndarray
-    """(F,) what the material dissipates."""
+    """(F,) dissipation of the material."""
     drag: np.ndarray
-    """(F,) of the air."""
+    """(F,) work of the drag of the air."""
     friction: np.ndarray
-    """(F,) tangential contact forces."""
+    """(F,) work of tangential contact forces."""
     contact: np.ndarray
-    """(F,) normal forces on points that come nearer to their plane."""
+    """(F,) work of normal forces on points that approach their plane."""
     push_out: np.ndarray
-    """(F,) normal forces on points that leave it."""
+    """(F,) work of normal forces on points that leave their plane."""
     lost_inertia: np.ndarray
-    """(F,) by implicit Euler, of the kinetic energy."""
+    """(F,) kinetic energy lost by implicit Euler."""
     lost_elastic: np.ndarray
-    """(F,) by implicit Euler, which takes the elastic force of the step's end for the whole step."""
+    """(F,) lost by implicit Euler, which applies the elastic force at the end of the step throughout the step."""
     lost_muscle: np.ndarray
-    """(F,) likewise, of the muscles' forces."""
+    """(F,) lost in the same way by the muscles' forces."""
     lost_damping: np.ndarray
-    """(F,) likewise, of the damping's."""
+    """(F,) lost in the same way by the damping's forces."""
     spin_inside: np.ndarray
-    """(F,) work of the torque that is taken off the internal forces within the step, to keep the angular momentum."""
+    """(F,) work of the torque that is removed from the internal forces within the step, to conserve the angular
+    momentum."""
     spin_after: np.ndarray
-    """(F,) kinetic energy of the spin that is added to the velocities after the step, for the same end."""
+    """(F,) kinetic energy of the rotation that is added to the velocities after the step, for the same purpose."""
     muscle_work: np.ndarray
-    """(F,) sum of max(0, T (L before - L after)): what muscles give, those that are stretched not set off; no flow."""
+    """(F,) sum of max(0, T (L before - L after)): positive work of muscles, without that absorbed by stretched ones;
+    not a flow."""
 
     @property
     def stored(self) -> np.ndarray:
-        """(F+1,) sum of all energies of a state."""
+        """(F+1,) J, sum of all energies of a state."""
         return np.sum([getattr(self, name) for name in STORED], axis=0)
 
     @property
     def residual(self) -> np.ndarray:
-        """(F,) what the stored energy gains beside all flows, over m g H."""
+        """(F,) change of the stored energy minus the sum of all flows, over m g H."""
         return (np.diff(self.stored) - np.sum([getattr(self, name) for name in FLOWS], axis=0)) / self.energy_unit
 
     @property
     def max_residual(self) -> float:
-        """Largest ``residual`` of any step, either way."""
-        # Not max(initial=0): where an element is inverted there is no energy, and NaN must be seen.
+        """Largest absolute ``residual`` of a step."""
+        # Not max(initial=0): the energy of an inverted element is NaN, which must not be hidden.
         return float(np.abs(self.residual).max()) if len(self.residual) else 0.0
 
 
 @dataclass(frozen=True)
 class EnergyTotals:
-    """A ledger over all steps, over m g H but for its unit."""
+    """Energy balance summed over all steps, in units of m g H."""
 
     unit_joules: float
-    """m g H."""
+    """m g H, J."""
     muscle_work: float
     """Sum over segments and steps of max(0, T (L before - L after))."""
     flows: Mapping[str, float]
-    """Of each of ``FLOWS``, its sum."""
+    """Sum of each of ``FLOWS``."""
     change: float
-    """Energy of the last state less that of the first."""
+    """Stored energy of the last state minus that of the first."""
     peak_deformation: float
     """Largest kinetic energy of deformation."""
     peak_elastic: float
     """Largest elastic energy."""
     worst_residual: float
-    """Of any step."""
+    """Largest absolute residual of a step."""
 
     @classmethod
-    def of(cls, books: EnergyBalance) -> EnergyTotals:
-        """Of a run."""
+    def of(cls, balance: EnergyBalance) -> EnergyTotals:
+        """Sum the balance of a run."""
         return cls(
-            books.energy_unit,
-            float(books.muscle_work.sum() / books.energy_unit),
-            {name: float(getattr(books, name).sum() / books.energy_unit) for name in FLOWS},
-            float((books.stored[-1] - books.stored[0]) / books.energy_unit),
-            float(books.kinetic_deformation.max() / books.energy_unit),
-            float(books.elastic.max() / books.energy_unit),
-            books.max_residual,
+            balance.energy_unit,
+            float(balance.muscle_work.sum() / balance.energy_unit),
+            {name: float(getattr(balance, name).sum() / balance.energy_unit) for name in FLOWS},
+            float((balance.stored[-1] - balance.stored[0]) / balance.energy_unit),
+            float(balance.kinetic_deformation.max() / balance.energy_unit),
+            float(balance.elastic.max() / balance.energy_unit),
+            balance.max_residual,
         )
 
 
 def energy_balance(trajectory: Trajectory) -> EnergyBalance:
-    """Every term of every step."""
+    """Compute the energy balance of a trajectory."""
     t = trajectory
     mass = t.node_mass.sum()
     body = _Elements.of(t)
@@ -144,64 +147,71 @@ def energy_balance(trajectory: Trajectory) -> EnergyBalance:
 
 
 def _stored(t: Trajectory, body: _Elements, positions: np.ndarray, velocities: np.ndarray) -> tuple[float, ...]:
+    """Return the energies of a state, in the order of ``STORED``."""
     mass = t.node_mass.sum()
     com, mean = t.node_mass @ positions / mass, t.node_mass @ velocities / mass
-    turn = np.cross(_spin(t.node_mass, positions, velocities), positions - com)
+    rotation = np.cross(_spin(t.node_mass, positions, velocities), positions - com)
     return (
         0.5 * float(mass * mean @ mean),
-        0.5 * _squared(t.node_mass, turn),
-        0.5 * _squared(t.node_mass, velocities - mean - turn),
+        0.5 * _squared(t.node_mass, rotation),
+        0.5 * _squared(t.node_mass, velocities - mean - rotation),
         -float(mass * com @ t.gravity),
         body.energy(positions),
     )
 
 
 def _flows(t: Trajectory, body: _Elements, muscles: _Muscles, step: int) -> tuple[float, ...]:
+    """Return the flows of a step, in the order of ``FLOWS``, then ``muscle_work``."""
     dt, mass = float(t.dt[step]), t.node_mass
     before, after = t.positions[step], t.positions[step + 1]
-    way = after - before
-    kick = t.kick_velocity[t.kick_step == step].sum(axis=0) if len(t.kick_step) else np.zeros_like(way)
-    # That of the equation of motion; a spin may have been added to what was stored.
-    velocity = way / dt
-    strain = body.step(before, after, dt)
-    pull = muscles.step(t.activations[step], before, after)
+    displacements = after - before
+    kick = t.kick_velocity[t.kick_step == step].sum(axis=0) if len(t.kick_step) else np.zeros_like(displacements)
+    # Velocity in the equation of motion; the stored one may include an added rotation.
+    velocity = displacements / dt
+    element_result = body.step(before, after, dt)
+    muscle_result = muscles.step(t.activations[step], before, after)
     added = _spin(mass, after, t.velocities[step + 1] - velocity)
-    # Of the internal forces, which have none about their own points of attack: implicit Euler lets them act at the
-    # end's directions with the arms of the start.
-    eaten = -dt * (strain.torque + pull.torque)
-    given = np.linalg.solve(_inertia(mass, before), eaten - _inertia(mass, after) @ added)
-    friction, contact, push_out = _contacts(t, step, way)
+    # Internal forces have no net torque at the end of the step, but implicit Euler applies them, with the directions of
+    # the end, at the lever arms of the start.
+    lost_momentum = -dt * (element_result.torque + muscle_result.torque)
+    inner_spin = np.linalg.solve(_inertia(mass, before), lost_momentum - _inertia(mass, after) @ added)
+    friction, contact, push_out = _contacts(t, step, displacements)
     return (
-        pull.work,
+        muscle_result.work,
         float(mass @ (kick * (t.velocities[step] + 0.5 * kick)).sum(axis=1)),
-        strain.dissipated,
+        element_result.dissipated,
         -t.drag * dt * _squared(mass, velocity),
         friction,
         contact,
         push_out,
         -0.5 * _squared(mass, velocity - t.velocities[step] - kick),
-        strain.lost_elastic,
-        pull.lost,
-        strain.lost_damping,
-        float(given @ _momentum(mass, before, velocity)),
+        element_result.lost_elastic,
+        muscle_result.loss,
+        element_result.lost_damping,
+        float(inner_spin @ _momentum(mass, before, velocity)),
         float(added @ (_momentum(mass, after, velocity) + 0.5 * _inertia(mass, after) @ added)),
-        pull.effort,
+        muscle_result.effort,
     )
 
 
-def _contacts(t: Trajectory, step: int, way: np.ndarray) -> tuple[float, float, float]:
-    """Work of friction, of normal forces on points that come nearer to their plane, and on those that leave it."""
+def _contacts(t: Trajectory, step: int, displacements: np.ndarray) -> tuple[float, float, float]:
+    """Return the work of friction, of normal forces on points that approach their plane, and on points that leave
+    it."""
     first, last = np.searchsorted(t.contact_step, [step, step + 1])
-    moved = np.einsum("cw,cwi->ci", t.contact_weights[first:last], way[t.contact_nodes[first:last]])
+    point_displacements = np.einsum(
+        "cw,cwi->ci", t.contact_weights[first:last], displacements[t.contact_nodes[first:last]]
+    )
     normals, forces = t.contact_normal[first:last], t.contact_force[first:last]
-    along, pressed = np.sum(moved * normals, axis=1), np.sum(forces * normals, axis=1)
+    along, pressed = np.sum(point_displacements * normals, axis=1), np.sum(forces * normals, axis=1)
     work = pressed * along
-    tangential = np.sum((forces - pressed[:, None] * normals) * (moved - along[:, None] * normals))
+    tangential = np.sum((forces - pressed[:, None] * normals) * (point_displacements - along[:, None] * normals))
     return float(tangential), float(work[along < 0.0].sum()), float(work[along >= 0.0].sum())
 
 
 @dataclass(frozen=True)
 class _Strain:
+    """Result of the elements in a step, J."""
+
     dissipated: float
     lost_elastic: float
     lost_damping: float
@@ -219,8 +229,11 @@ class _Elements:
     volumes: np.ndarray
     """(T,)."""
     mu: float
+    """Pa, Lame parameter."""
     lam: float
+    """Pa, Lame parameter."""
     damping_time: float
+    """s."""
 
     @classmethod
     def of(cls, t: Trajectory) -> _Elements:
@@ -230,11 +243,11 @@ class _Elements:
         return cls(t.tets, np.linalg.inv(edges), np.linalg.det(edges) / 6.0, mu, lam, t.damping_time)
 
     def gradients(self, positions: np.ndarray) -> np.ndarray:
-        """(T, 3, 3) F."""
+        """Return (T, 3, 3) F at ``positions`` (N, 3)."""
         return _edges(positions, self.tets) @ self.rest_inverses
 
     def energy(self, positions: np.ndarray) -> float:
-        """Eq. 5 over all elements; not finite where one is inverted."""
+        """Return the energy of all elements (Eq. 5), J; not finite if one is inverted."""
         F = self.gradients(positions)
         with np.errstate(invalid="ignore", divide="ignore"):
             log_j = np.log(np.linalg.det(F))
@@ -242,7 +255,7 @@ class _Elements:
         return float(self.volumes @ density)
 
     def step(self, before: np.ndarray, after: np.ndarray, dt: float) -> _Strain:
-        """What the elements do in a step."""
+        """Compute dissipation, losses and torque of the elements in a step."""
         F0, F1 = self.gradients(before), self.gradients(after)
         change = F1 - F0
         inverse = np.linalg.inv(F1)
@@ -263,30 +276,35 @@ class _Elements:
         )
 
     def _remainder(self, change: np.ndarray, relative: np.ndarray, log_j: np.ndarray) -> np.ndarray:
-        """(T,) Psi(F0) - Psi(F1) + P(F1) : (F1 - F0), from the ``change`` F1 - F0 (T, 3, 3) and ln det F1.
+        """Return (T,) Psi(F0) - Psi(F1) + P(F1) : (F1 - F0).
 
-        ``relative`` is A = F1^-1 (F1 - F0), so det F0 = det F1 det(I - A), however far the step goes.
+        Args:
+            change: (T, 3, 3) F1 - F0.
+            relative: (T, 3, 3) A = F1^-1 (F1 - F0); det F0 = det F1 det(I - A) for a step of any size.
+            log_j: (T,) ln det F1.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
-            fallen = np.log(np.linalg.det(np.eye(3) - relative))
-        curved = fallen + _trace(relative)  # -tr(A A) / 2 of a small step
-        squares = self.mu * (change * change).sum(axis=(1, 2)) + self.lam * fallen**2
+            log_change = np.log(np.linalg.det(np.eye(3) - relative))
+        curved = log_change + _trace(relative)  # -tr(A A) / 2 of a small step
+        squares = self.mu * (change * change).sum(axis=(1, 2)) + self.lam * log_change**2
         return 0.5 * squares + (self.lam * log_j - self.mu) * curved
 
 
 @dataclass(frozen=True)
 class _Pull:
+    """Result of the muscles in a step, J."""
+
     work: float
     effort: float
-    lost: float
+    loss: float
     torque: np.ndarray
     """(3,) N m at the end, with the arms of the start."""
 
 
 @dataclass(frozen=True)
 class _Muscles:
-    """Segments that pull with a constant tension along the line between their ends, with less of it where they are
-    shorter than 0.7 of their rest length, and nothing below 0.3 (docs/concepts/muscles.md)."""
+    """Muscle segments with a constant tension along the line between their ends, less of it where they are shorter than
+    0.7 of their rest length, and none below 0.3 (docs/concepts/muscles.md)."""
 
     starts: np.ndarray
     nodes: np.ndarray
@@ -303,7 +321,7 @@ class _Muscles:
         )
 
     def step(self, activations: np.ndarray, before: np.ndarray, after: np.ndarray) -> _Pull:
-        """What all segments do in a step."""
+        """Compute work, loss and torque of all segments in a step."""
         tension = self.stiffness * activations
         start, end = self._lines(before), self._lines(after)
         long, short = np.linalg.norm(start, axis=1), np.linalg.norm(end, axis=1)
@@ -311,22 +329,22 @@ class _Muscles:
         share = 3.0 * limb**2 - 2.0 * limb**3
         work = tension * (self._pulled(long) - self._pulled(short))
         directions = end / np.maximum(short, 1e-300)[:, None]
-        # The force of the end, share T u1, over the whole way: T (W0 - W1 + share u1.(x1 - x0)), W the length over
-        # which all of the tension would do as much. A line that turns gets none of the force across it, one that
-        # shortens below 0.7 the share of its end.
+        # Work of the force of the end, share T u1, over the step: T (W0 - W1 + share u1.(x1 - x0)), W the length over
+        # which the full tension does the same work. The loss has two parts: rotation of the line, and the change of
+        # ``share`` of a line shorter than 0.7 of its rest length.
         turned = 0.5 * share * long * ((start / np.maximum(long, 1e-300)[:, None] - directions) ** 2).sum(axis=1)
-        limped = self._pulled(long) - self._pulled(short) - share * (long - short)
+        weakened = self._pulled(long) - self._pulled(short) - share * (long - short)
         torque = -np.cross(start, (tension * share)[:, None] * directions).sum(axis=0)
-        return _Pull(float(work.sum()), float(work[work > 0.0].sum()), -float(tension @ (turned + limped)), torque)
+        return _Pull(float(work.sum()), float(work[work > 0.0].sum()), -float(tension @ (turned + weakened)), torque)
 
     def _pulled(self, lengths: np.ndarray) -> np.ndarray:
-        """(M,) metres, the integral of the share of the tension that is left, from nothing to ``lengths`` (M,)."""
+        """Return (M,) m, the integral of the fraction of the tension from length 0 to ``lengths`` (M,)."""
         rest = self.rest_lengths
         limb = np.clip((lengths / rest - 0.3) / 0.4, 0.0, 1.0)
         return rest * (0.4 * limb**3 - 0.2 * limb**4) + np.maximum(lengths - 0.7 * rest, 0.0)
 
     def _lines(self, positions: np.ndarray) -> np.ndarray:
-        """(M, 3) from each segment's first end to its second."""
+        """Return (M, 3) m from the first end of each segment to its second."""
         if len(self.segments) == 0:
             return np.zeros((0, 3))
         ends = np.add.reduceat(self.weights[:, None] * positions[self.nodes], self.starts[:-1], axis=0)
@@ -343,21 +361,21 @@ def _trace(matrices: np.ndarray) -> np.ndarray:
 
 
 def _squared(mass: np.ndarray, velocities: np.ndarray) -> float:
-    """v.M v."""
+    """Return v^T M v."""
     return float(mass @ (velocities**2).sum(axis=1))
 
 
 def _momentum(mass: np.ndarray, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
-    """(3,) angular momentum about the centre of mass."""
+    """Return (3,) angular momentum about the centre of mass."""
     return mass @ np.cross(positions - mass @ positions / mass.sum(), velocities)
 
 
 def _inertia(mass: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """(3, 3) about the centre of mass."""
+    """Return (3, 3) inertia about the centre of mass."""
     arms = positions - mass @ positions / mass.sum()
     return float(mass @ (arms**2).sum(axis=1)) * np.eye(3) - np.einsum("n,ni,nj->ij", mass, arms, arms)
 
 
 def _spin(mass: np.ndarray, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
-    """(3,) rad/s of the rigid rotation that has the angular momentum."""
+    """Return (3,) rad/s, angular velocity of the rigid rotation with the angular momentum."""
     return np.linalg.solve(_inertia(mass, positions), _momentum(mass, positions, velocities))

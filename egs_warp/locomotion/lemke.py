@@ -1,4 +1,4 @@
-"""Linear complementarity problems by Lemke's method."""
+"""Lemke's method for linear complementarity problems."""
 
 from __future__ import annotations
 
@@ -7,10 +7,18 @@ from scipy.linalg.blas import dger  # pyright: ignore[reportAttributeAccessIssue
 
 
 def lemke(matrix: np.ndarray, q: np.ndarray, *, pivot_limit: int = 2000) -> np.ndarray | None:
-    """z (n,) with 0 <= z, 0 <= matrix z + q and their product zero; None on a secondary ray or at ``pivot_limit``.
+    """Solve the linear complementarity problem 0 <= z, 0 <= w = matrix z + q, z^T w = 0.
 
-    For the contact rows of Eq. (9) the matrix is copositive and the method ends at a solution (Anitescu and Potra
+    For the contact rows of Eq. (9) the matrix is copositive, so the method ends at a solution (Anitescu and Potra
     1997). Ties are broken lexicographically by the columns of the basis inverse, so degenerate problems cannot cycle.
+
+    Args:
+        matrix: (n, n).
+        q: (n,).
+        pivot_limit: maximum number of pivots.
+
+    Returns:
+        z (n,), or None on a secondary ray or at ``pivot_limit``.
     """
     count = len(q)
     if count == 0 or q.min() >= 0.0:
@@ -33,13 +41,14 @@ def lemke(matrix: np.ndarray, q: np.ndarray, *, pivot_limit: int = 2000) -> np.n
         column = tableau[:, entering]
         usable = np.flatnonzero(column > scale)
         if len(usable) == 0:
-            # A ray; but one that the covering variable is already too small to matter on is the solution.
+            # A secondary ray; if the covering variable has already vanished, this point is the solution.
             return _solution(tableau, basis) if tableau[basis == 2 * count, -1].item() < 1e-11 else None
         row = _smallest_ratio(tableau, column, usable, basis, 2 * count)
     return None
 
 
 def _solution(tableau: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Return z (n,) of a final tableau."""
     count = len(tableau)
     values = np.zeros(2 * count + 1)
     values[basis] = tableau[:, -1]
@@ -47,7 +56,8 @@ def _solution(tableau: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def _smallest_ratio(tableau: np.ndarray, column: np.ndarray, rows: np.ndarray, basis: np.ndarray, cover: int) -> int:
-    """Row of the smallest ratio; the covering variable leaves first, other ties go to the lexicographic minimum."""
+    """Return the row of the smallest ratio. In a tie the covering variable leaves first, else the lexicographic
+    minimum."""
     count = len(tableau)
     for index in (-1, *range(count)):
         ratios = tableau[rows, index] / column[rows]

@@ -1,4 +1,4 @@
-"""A step's end, linear in activations and contact forces about one that is foreseen (Eq. 7, 8, 13)."""
+"""End of a step as an affine function of activations and contact forces, about a predicted end (Eq. 7, 8, 13)."""
 
 from __future__ import annotations
 
@@ -18,123 +18,140 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import SynergyColumns
 
 PREDICTION_ITERATIONS = 2
-"""Newton steps with contact in which a step is foreseen."""
+"""Number of Newton steps with contact forces that predict the end of a step."""
 
 
 @dataclass(frozen=True)
 class PredictedStep:
-    """Where a step would end under some activations, and the tangent there."""
+    """Predicted end of a step under given activations, and the linearisation there."""
 
     linearization: ContactLinearization
     normal_bias: np.ndarray
-    """(n,) m/s, the constants of the contacts' normal measures."""
+    """(n,) m/s, velocity bias of each contact in the normal direction, see ``CoupledSolver.normal_bias``."""
     activations: np.ndarray
-    """(M,) metres."""
+    """(M,) m."""
     velocities: np.ndarray
-    """(N, 3) m/s."""
+    """(N, 3) m/s, end of the step."""
     forces: np.ndarray
-    """(n, 3) newtons."""
+    """(n, 3) N, in the axes of each contact."""
 
 
 @dataclass(frozen=True)
 class StepInputs:
-    """What a step begins with."""
+    """Inputs of a step that are known before its activations are planned."""
 
     problem: StepProblem
     contacts: ContactSet
     normal_bias: np.ndarray
-    """(n,) m/s, see ``Prospect``."""
+    """(n,) m/s, velocity bias of each contact in the normal direction."""
     friction: float
     activations: np.ndarray
-    """(M,) metres of the step before."""
+    """(M,) m, of the previous step."""
     forces: np.ndarray
-    """(n, 3) newtons of the step before, as far as these contacts were there."""
+    """(n, 3) N, forces of the previous step on those of these contacts that it had; zero for the others."""
 
     @classmethod
-    def from_prediction(cls, prospect: PredictedStep, friction: float, activations: np.ndarray) -> StepInputs:
-        """Of the step of the ``prospect``, with its forces."""
-        response = prospect.linearization
+    def from_prediction(cls, predicted: PredictedStep, friction: float, activations: np.ndarray) -> StepInputs:
+        """Return the inputs of the same step about ``predicted``, with its contact forces and other previous
+        ``activations``."""
+        response = predicted.linearization
         return cls(
-            response.tangent.problem, response.contacts, prospect.normal_bias, friction, activations, prospect.forces
+            response.tangent.problem, response.contacts, predicted.normal_bias, friction, activations, predicted.forces
         )
 
 
 @dataclass(frozen=True)
 class LinearStep:
-    """End velocity and change of angular momentum of a step, linear in x = (activations, contact forces)."""
+    """End velocity v(x) and change of angular momentum of a step, affine in x = (activations, contact forces), k
+    unknowns."""
 
     velocities: Any
-    """(3N, k + 1) m/s for each of x, and without muscles and contact."""
+    """(3N, k + 1) m/s: derivative of the end velocity by each of x, and in the last column v(0), without muscles and
+    contact."""
     torques: np.ndarray
-    """(3, k) kg m^2/s for each of x."""
+    """(3, k) kg m^2/s: derivative of the angular momentum by each of x."""
 
     @property
     def count(self) -> int:
-        """k."""
+        """Number of unknowns k."""
         return self.torques.shape[1]
 
     @property
     def columns(self) -> np.ndarray:
-        """(3N, k) m/s for each of x."""
+        """(3N, k) m/s, derivative of the end velocity by x."""
         return self.velocities[:, :-1]
 
     @property
     def base(self) -> np.ndarray:
-        """(3N,) m/s without muscles and contact."""
+        """(3N,) m/s, end velocity without muscles and contact."""
         return self.velocities[:, -1]
 
     def end_velocities(self, x: np.ndarray) -> np.ndarray:
-        """(3N,) m/s for ``x`` (k,)."""
+        """Return v(x), (3N,) m/s, for ``x`` (k,)."""
         return self.base + self.columns @ x
 
     def contact_velocities(self, contacts: ContactSet) -> np.ndarray:
-        """(3n, k + 1) m/s of ``contacts`` along their axes, as ``velocities``."""
+        """Return W ``velocities``, (3n, k + 1) m/s, in the axes of ``contacts`` (Eq. 8)."""
         return contacts.contact_velocities(self.velocities)
 
     def objective_quadratic(self, objectives: Sequence[Objective]) -> Callable[[], np.ndarray]:
-        """Begins what gives (k + 1, k + 1) G with (x, 1) G (x, 1) / 2 the weighted squares of what ``objectives`` ask,
-        (m/s)^2."""
+        """Start computing the quadratic form of the weighted squares of ``objectives``; it may run asynchronously on a
+        device.
+
+        Returns:
+            A function that blocks for G, (k + 1, k + 1) (m/s)^2; the weighted squares are 1/2 (x, 1)^T G (x, 1).
+        """
         form = np.zeros((self.count + 1, self.count + 1))
         for objective in objectives:
-            missed = objective.rows @ self.velocities
-            missed[:, -1] -= objective.target
-            form += 2.0 * objective.weight * (missed.T @ missed)
+            residual = objective.rows @ self.velocities
+            residual[:, -1] -= objective.target
+            form += 2.0 * objective.weight * (residual.T @ residual)
         return lambda: form
 
 
 class StepLinearizer(Protocol):
-    """Linear steps of one body, about one prospect after the other."""
+    """Builder of the linear steps of one body."""
 
-    def linearize(self, prospect: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
-        """The step about ``prospect``, of the groups' activations in their bounds and contact forces in body weights.
-        And what ``other`` gives, which may be called meanwhile."""
+    def linearize(self, predicted: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
+        """Linearise the step about ``predicted``.
+
+        Args:
+            predicted: end of the step about which to linearise.
+            other: independent work, which may run at the same time.
+
+        Returns:
+            The linear step, and the result of ``other``. Unknowns are the activations of the synergies as fractions of
+            their bounds, then the contact forces in body weights.
+        """
         ...
 
 
 class HostStepLinearizer:
-    """``LinearSteps`` in arrays of the host."""
+    """``StepLinearizer`` with NumPy arrays."""
 
     def __init__(self, muscles: MuscleSet, synergies: Synergies) -> None:
         self._impulses = SynergyColumns(muscles, synergies.group_from_muscle)
         self._count = synergies.count
 
-    def linearize(self, prospect: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
-        """See ``LinearSteps``."""
-        response, foreseen, m = prospect.linearization, prospect.velocities, self._count
+    def linearize(self, predicted: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
+        """Linearise the step about ``predicted``: v = v^ - J^-1 r0(v^) + dt J^-1 (A a + W^T f), Eq. (7); run ``other``
+        concurrently."""
+        response, predicted_velocities, m = predicted.linearization, predicted.velocities, self._count
         problem, contacts = response.tangent.problem, response.contacts
         weight = problem.body.weight
-        # Without muscles and contact.
-        free = problem.residual(foreseen, None).ravel()
-        impulses = self._impulses.with_base(free, problem.end_positions(foreseen), problem.dt)
-        solved, given = run_concurrently(lambda: response.tangent.solve(impulses), other)
+        # Residual without muscles and contact.
+        free = problem.residual(predicted_velocities, None).ravel()
+        impulses = self._impulses.with_base(free, problem.end_positions(predicted_velocities), problem.dt)
+        solved, other_result = run_concurrently(lambda: response.tangent.solve(impulses), other)
         velocities = np.empty((free.size, m + 3 * contacts.count + 1))
         velocities[:, :m] = solved[:, :-1]
         np.multiply(weight, response.columns, out=velocities[:, m:-1])
-        np.subtract(foreseen.ravel(), solved[:, -1], out=velocities[:, -1])
-        return LinearStep(velocities, torques_of(problem, contacts, m)), given
+        np.subtract(predicted_velocities.ravel(), solved[:, -1], out=velocities[:, -1])
+        return LinearStep(velocities, torques_of(problem, contacts, m)), other_result
 
 
 def torques_of(problem: StepProblem, contacts: ContactSet, m: int) -> np.ndarray:
-    """(3, m + 3n) kg m^2/s of a step: none of ``m`` activations, of each contact force of a body weight."""
+    """Return (3, m + 3n) kg m^2/s, derivative of the angular momentum by x: zero for ``m`` activations, and the torque
+    of a body weight in each direction of each contact."""
     torques = problem.dt * problem.body.weight * contacts.contact_velocities(problem.rotation_modes).T
     return np.hstack([np.zeros((3, m)), torques])

@@ -1,8 +1,8 @@
-"""What a motion asks of a step's end: weighted squares of linear functions of it (docs/concepts/motions.md).
+"""Objectives of a motion on the end of a step: weighted squares of functions linear in it (docs/concepts/motions.md).
 
-Each kind says what it measures in the end of a step: by ``rows`` of the end velocity, or by ``slopes`` (j, k) for each
-of k unknowns that change the angular momentum by ``torques`` (3, k); and its ``gap`` (j,) at one end, as the slopes in
-units of ``speed`` m/s, sqrt(g H).
+``Objective`` is linear in the end velocity, by ``rows``. The other kinds are linear in the unknowns x of the QP, by
+``slopes`` (j, k), the derivative by each of k unknowns, whose angular momenta are ``torques`` (3, k). ``residual`` (j,)
+is the value at one end of the step. Slopes and residuals are in units of ``speed``, sqrt(g H) in m/s.
 """
 
 from __future__ import annotations
@@ -22,33 +22,38 @@ from egs_warp.geometry.frames import cross_matrices, orthonormal_basis
 
 @dataclass(frozen=True)
 class Objective:
-    """weight |rows v - target|^2, all in m/s so that weights compare."""
+    """Objective weight |rows v - target|^2 on the end velocity v, in m/s, so that weights are comparable."""
 
     name: str
     rows: sparse.csr_matrix | np.ndarray
-    """(k, 3N), sparse where they are many."""
+    """(k, 3N), sparse or dense."""
     target: np.ndarray
     """(k,) m/s."""
     weight: float
 
     def residual(
-        self, problem: StepProblem, contacts: ContactSet, velocities: np.ndarray, gained: np.ndarray, speed: float
+        self,
+        problem: StepProblem,
+        contacts: ContactSet,
+        velocities: np.ndarray,
+        angular_impulse: np.ndarray,
+        speed: float,
     ) -> np.ndarray:
-        """At the end of ``velocities`` (3N,), the angular momentum ``gained`` (3,)."""
+        """Return (k,) at the end ``velocities`` (3N,) m/s; ``angular_impulse`` is not used."""
         return (self.rows @ velocities - self.target) / speed
 
 
 def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
-    """Velocity (3,) of the centre of mass."""
+    """Return the objective that the centre of mass has velocity ``target`` (3,) m/s."""
     return Objective("com", body.mean_rows, np.asarray(target, float), weight)
 
 
 @dataclass(frozen=True)
 class AngularMomentumObjective:
-    """weight |L+ - target|^2 / (m r)^2, r the radius of gyration, for the angular momentum about the centre of mass at
-    the end of the step.
+    """Objective weight |L+ - target|^2 / (m r)^2 on the angular momentum L+ about the centre of mass at the end of the
+    step, with the radius of gyration r.
 
-    The stepper keeps L+ = L + dt sum (x - c) x f (docs/concepts/body.md), so contact forces alone steer it.
+    The stepper conserves L+ = L + dt sum (x - c) x f (docs/concepts/body.md), so only contact forces change it.
     """
 
     target: np.ndarray
@@ -56,14 +61,20 @@ class AngularMomentumObjective:
     weight: float
 
     def slopes(self, problem: StepProblem, contacts: ContactSet, torques: np.ndarray, speed: float) -> np.ndarray:
-        """See the module."""
+        """Return (3, k), the derivative of the residual by the unknowns, whose ``torques`` are (3, k) kg m^2/s."""
         return torques / self._unit(problem, speed)
 
     def residual(
-        self, problem: StepProblem, contacts: ContactSet, velocities: np.ndarray, gained: np.ndarray, speed: float
+        self,
+        problem: StepProblem,
+        contacts: ContactSet,
+        velocities: np.ndarray,
+        angular_impulse: np.ndarray,
+        speed: float,
     ) -> np.ndarray:
-        """At the end of a step in which contact forces have ``gained`` (3,) kg m^2/s."""
-        return (problem.angular_momentum + gained - self.target) / self._unit(problem, speed)
+        """Return (3,) at the end of a step in which contact forces add ``angular_impulse`` (3,) kg m^2/s;
+        ``velocities`` are not used."""
+        return (problem.angular_momentum + angular_impulse - self.target) / self._unit(problem, speed)
 
     @staticmethod
     def _unit(problem: StepProblem, speed: float) -> float:
@@ -73,9 +84,10 @@ class AngularMomentumObjective:
 
 @dataclass(frozen=True)
 class LoadObjective:
-    """weight times the squared share of the weight that each contact of some nodes carries.
+    """Objective weight times the squared load, as a fraction of the body weight, of each contact of the ``nodes``.
 
-    A contact that holds does so whatever its nodes are asked to do: what is to be lifted is unloaded first.
+    A loaded contact stays closed whatever velocity its nodes should have, so a foot must be unloaded before it is
+    lifted.
     """
 
     nodes: np.ndarray
@@ -83,18 +95,22 @@ class LoadObjective:
     weight: float
 
     def slopes(self, problem: StepProblem, contacts: ContactSet, torques: np.ndarray, speed: float) -> np.ndarray:
-        """One row for each contact nearest to one of the nodes; the contact forces, in body weights, are the last
-        unknowns.
-        """
+        """Return one row for each contact whose nearest node is one of ``nodes``. The last unknowns are the contact
+        forces, in body weights."""
         loaded = self._loaded(contacts)
         rows = np.zeros((len(loaded), torques.shape[1]))
         rows[np.arange(len(loaded)), torques.shape[1] - 3 * contacts.count + 3 * loaded] = 1.0
         return rows
 
     def residual(
-        self, problem: StepProblem, contacts: ContactSet, velocities: np.ndarray, gained: np.ndarray, speed: float
+        self,
+        problem: StepProblem,
+        contacts: ContactSet,
+        velocities: np.ndarray,
+        angular_impulse: np.ndarray,
+        speed: float,
     ) -> np.ndarray:
-        """None: a load is judged in the program alone."""
+        """Return zeros: loads count in the QP only, not in the objective value of a solved step."""
         return np.zeros(len(self._loaded(contacts)))
 
     def _loaded(self, contacts: ContactSet) -> np.ndarray:
@@ -105,17 +121,23 @@ AnyObjective = Objective | AngularMomentumObjective | LoadObjective
 
 
 def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
-    """Velocities (N, 3) of all nodes, each weighted by its share of the mass: a pose to move towards."""
+    """Return the objective that all nodes have velocities ``target`` (N, 3) m/s, each weighted by its mass fraction:
+    motion towards a pose."""
     shares = body.mass_roots
     return Objective("pose", sparse.csr_matrix(sparse.diags(shares)), shares * target.ravel(), weight)
 
 
 def deformation_velocities(body: SoftBody, positions: np.ndarray, target: np.ndarray, weight: float) -> Objective:
-    """Of velocities (N, 3) the part that strains the body as a whole, the same everywhere: a pose to move towards that
-    leaves the finer shape to the body's elasticity, where it goes to objectives of their own, and how it turns to its
-    angular momentum.
+    """Return the objective on the homogeneous deformation rate of ``target`` velocities: motion towards a pose that
+    leaves the finer shape to elasticity, and translation and rotation to their own objectives.
 
-    The six rows are orthonormal in the mean over the mass, so the weight compares with that of ``node_velocities``.
+    The six rows are orthonormal in the mean over the mass, so the weight is comparable with that of
+    ``node_velocities``.
+
+    Args:
+        positions: (N, 3) m.
+        target: (N, 3) m/s.
+        weight: weight.
     """
     arms = positions - body.centre_of_mass(positions)
     modes = np.zeros((12, len(arms), 3))
@@ -124,16 +146,16 @@ def deformation_velocities(body: SoftBody, positions: np.ndarray, target: np.nda
         modes[mode, :, k] += arms[:, i]
         modes[mode, :, i] += arms[:, k]
     weights = body.mass_roots
-    # By columns, as LAPACK takes them.
+    # Transposed, because LAPACK takes columns.
     orthonormal, triangle = np.linalg.qr((modes.reshape(12, -1) * weights).T)
-    kept = 6 + np.flatnonzero(np.abs(np.diag(triangle)[6:]) > 1e-6 * np.abs(triangle).max())
-    rows = (orthonormal[:, kept] * weights[:, None]).T
+    independent = 6 + np.flatnonzero(np.abs(np.diag(triangle)[6:]) > 1e-6 * np.abs(triangle).max())
+    rows = (orthonormal[:, independent] * weights[:, None]).T
     return Objective("pose", rows, rows @ target.ravel(), weight)
 
 
 @dataclass(frozen=True)
 class BodyPart:
-    """The whole body or a part of it (a foot, the head, the base): some nodes and their masses."""
+    """The whole body or a part of it (a foot, the head, the base): nodes and their masses."""
 
     name: str
     nodes: np.ndarray
@@ -143,30 +165,30 @@ class BodyPart:
 
     @classmethod
     def of(cls, body: SoftBody, name: str, nodes: np.ndarray) -> BodyPart:
-        """The part made of ``nodes``."""
+        """Return the part with these ``nodes`` (k,)."""
         return cls(name, nodes, body.node_mass[nodes])
 
     @classmethod
     def whole(cls, body: SoftBody) -> BodyPart:
-        """All of it."""
+        """Return the whole body."""
         return cls.of(body, "body", np.arange(len(body.node_mass)))
 
     @classmethod
     def base(cls, body: SoftBody, heights: np.ndarray) -> BodyPart:
-        """What stands on the ground: nodes whose height (N,) at rest is at most 0.06 H above the lowest."""
+        """Return the base: nodes whose height (N,) m at rest is at most 0.06 H above the lowest."""
         return cls.of(body, "base", np.flatnonzero(heights < heights.min() + 0.06 * body.height))
 
     @classmethod
     def head(cls, body: SoftBody, heights: np.ndarray) -> BodyPart:
-        """The topmost part: nodes whose height (N,) at rest is at most 0.15 H below the highest."""
+        """Return the top: nodes whose height (N,) m at rest is at most 0.15 H below the highest."""
         return cls.of(body, "head", np.flatnonzero(heights > heights.max() - 0.15 * body.height))
 
     def centre(self, points: np.ndarray) -> np.ndarray:
-        """(3,) mass-weighted mean of ``points`` (N, 3) over the part."""
+        """Return (3,), the mass-weighted mean of ``points`` (N, 3) over the part."""
         return self.masses @ points[self.nodes] / self.masses.sum()
 
     def inertia(self, points: np.ndarray) -> np.ndarray:
-        """(3, 3) kg m^2, inertia about the part's centre at ``points`` (N, 3)."""
+        """Return (3, 3) kg m^2, inertia about the part's centre at ``points`` (N, 3) m."""
         arms = points[self.nodes] - self.centre(points)
         second = np.einsum("n,ni,nj->ij", self.masses, arms, arms)
         return np.trace(second) * np.eye(3) - second
@@ -174,12 +196,12 @@ class BodyPart:
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Axes in which an objective is told, and whether relative to the centre of mass."""
+    """Coordinates of the target of an objective."""
 
     axes: np.ndarray
-    """(3, 3) rows are unit vectors; a target's components are along them."""
+    """(3, 3) rows are unit vectors, along which the components of a target are."""
     relative: bool
-    """Whether the origin moves with the centre of mass of the whole body."""
+    """True if the origin moves with the centre of mass of the whole body."""
 
 
 WORLD = Coordinates(np.eye(3), False)
@@ -188,7 +210,8 @@ WORLD = Coordinates(np.eye(3), False)
 def part_velocity(
     body: SoftBody, part: BodyPart, target: np.ndarray, weight: float, coordinates: Coordinates = WORLD
 ) -> Objective:
-    """Velocity (3,) m/s of the centre of ``part``; of the base, relative to the centre of mass, it steers a landing."""
+    """Return the objective that the centre of ``part`` has velocity ``target`` (3,) m/s in ``coordinates``. For the
+    base, relative to the centre of mass, it controls a landing."""
     shares = np.zeros(len(body.node_mass))
     shares[part.nodes] = part.masses / part.masses.sum()
     if coordinates.relative:
@@ -205,11 +228,12 @@ def part_position(
     rate: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Position (3,) metres of the centre of ``part``, approached at ``rate`` 1/s; 1/dt means at the end of the step."""
-    place = part.centre(state.positions)
+    """Return the objective that the centre of ``part`` approaches position ``target`` (3,) m in ``coordinates`` at
+    ``rate`` 1/s; 1/dt reaches it at the end of the step."""
+    centre = part.centre(state.positions)
     if coordinates.relative:
-        place = place - body.centre_of_mass(state.positions)
-    return part_velocity(body, part, rate * (target - coordinates.axes @ place), weight, coordinates)
+        centre = centre - body.centre_of_mass(state.positions)
+    return part_velocity(body, part, rate * (target - coordinates.axes @ centre), weight, coordinates)
 
 
 def part_acceleration(
@@ -221,7 +245,8 @@ def part_acceleration(
     dt: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Acceleration (3,) m/s^2 of the centre of ``part`` over the step of ``dt`` seconds."""
+    """Return the objective that the centre of ``part`` has mean acceleration ``target`` (3,) m/s^2 in ``coordinates``
+    over the step of ``dt`` s."""
     velocity = part.centre(state.velocities)
     if coordinates.relative:
         velocity = velocity - body.centre_of_mass(state.velocities)
@@ -236,11 +261,11 @@ def part_angular_momentum(
     weight: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Angular momentum (3,) kg m^2/s of ``part`` about its own centre; in relative coordinates about the centre of mass
-    of the body, with velocities relative to its.
+    """Return the objective that ``part`` has angular momentum ``target`` (3,) kg m^2/s about its own centre; in
+    relative coordinates about the centre of mass of the body, with velocities relative to its velocity.
 
-    Told in m/s: over mass x radius of gyration. For the whole body ``SpinObjective`` is exact, this is linear in the
-    arms.
+    Rows are in m/s: angular momentum over mass x radius of gyration. For the whole body ``AngularMomentumObjective`` is
+    exact; this one uses the lever arms at the start of the step.
     """
     if coordinates.relative:
         pivot, moving = body.centre_of_mass(state.positions), body.node_mass / body.mass
@@ -264,9 +289,8 @@ def part_angular_velocity(
     weight: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Angular velocity (3,) rad/s of ``part``, that of the rigid body with its momentum:
-    the rate of its orientation.
-    """
+    """Return the objective that ``part`` has angular velocity ``target`` (3,) rad/s: that of the rigid body with its
+    angular momentum. Rows are in m/s: angular velocity times radius of gyration."""
     momentum = part_angular_momentum(body, part, state, np.zeros(3), weight)
     unit = _gyration(part, state.positions) * part.masses.sum()
     radius = _gyration(part, state.positions)
@@ -275,17 +299,18 @@ def part_angular_velocity(
 
 
 def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, weight: float, rate: float) -> Objective:
-    """Area (m^2) of the convex hull of ``part`` seen along ``up`` (3,), approached at ``rate`` 1/s.
+    """Return the objective that the area of the convex hull of ``part``, projected along ``up`` (3,), approaches
+    ``target`` m^2 at ``rate`` 1/s.
 
-    Told in m/s: dA/dt over the hull's perimeter is the speed at which its sides move outwards.
+    Rows are in m/s: dA/dt over the perimeter of the hull is the speed at which its sides move outwards.
     """
     plane = np.stack(orthonormal_basis(up))
     hull = ConvexHull(state.positions[part.nodes] @ plane.T)
     corners = part.nodes[hull.vertices]  # anticlockwise in two dimensions
     flat = state.positions[corners] @ plane.T
-    ahead, behind = np.roll(flat, -1, axis=0), np.roll(flat, 1, axis=0)
-    perimeter = float(np.linalg.norm(ahead - flat, axis=1).sum())
-    slopes = 0.5 * np.stack([ahead[:, 1] - behind[:, 1], behind[:, 0] - ahead[:, 0]], axis=1) @ plane
+    following, preceding = np.roll(flat, -1, axis=0), np.roll(flat, 1, axis=0)
+    perimeter = float(np.linalg.norm(following - flat, axis=1).sum())
+    slopes = 0.5 * np.stack([following[:, 1] - preceding[:, 1], preceding[:, 0] - following[:, 0]], axis=1) @ plane
     rows = np.zeros((len(state.positions), 3))
     rows[corners] = slopes / perimeter
     return Objective(
@@ -297,9 +322,8 @@ def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, w
 
 
 def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float) -> Objective:
-    """Velocities (k, 3) m/s of every node of ``part``, each with the same share of the weight:
-    place and shape at once.
-    """
+    """Return the objective that each node of ``part`` has velocity ``target`` (k, 3) m/s, with equal weights: position
+    and shape at once."""
     count = len(part.nodes)
     columns = (3 * part.nodes[:, None] + np.arange(3)).ravel()
     share = np.sqrt(1.0 / count)
@@ -310,7 +334,8 @@ def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float
 
 
 def no_slip_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> Objective:
-    """That no contact slides, each weighted by its share of the weight in ``loads`` (n,)."""
+    """Return the objective that contacts do not slide, each weighted by its ``loads`` (n,), fractions of the body
+    weight."""
     shares = np.sqrt(np.repeat(loads, 3))
     shares[::3] = 0.0
     rows = sparse.csr_matrix(contacts.jacobian.multiply(shares[:, None]))
@@ -318,10 +343,10 @@ def no_slip_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> 
 
 
 def _along(shares: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """(k, 3N) rows of the mean by ``shares`` (N,) of velocities, along ``axes`` (k, 3)."""
+    """Return (k, 3N), rows of the mean velocity with weights ``shares`` (N,), along ``axes`` (k, 3)."""
     return (axes[:, None, :] * shares[:, None]).reshape(len(axes), -1)
 
 
 def _gyration(part: BodyPart, points: np.ndarray) -> float:
-    """Metres."""
+    """Return the radius of gyration, m."""
     return float(np.sqrt(0.5 * np.trace(part.inertia(points)) / part.masses.sum()))

@@ -1,4 +1,7 @@
-"""Who iterates by OSQP's operator splitting: OSQP on the host, or kernels; the one place that imports OSQP."""
+"""OSQP's operator splitting behind one interface: the package OSQP on the host, or kernels (``admm``).
+
+The only module that imports OSQP.
+"""
 
 from __future__ import annotations
 
@@ -15,45 +18,51 @@ from egs_warp.launching import Device, thread_local_cache
 from egs_warp.locomotion.admm import AdmmPrograms, AdmmResult, AdmmStatus, AdmmWarmStart, DenseQp
 
 SCALING_PASSES = 4
-"""Passes of the equilibration."""
+"""Number of equilibration passes."""
 RHO_UPDATE_INTERVAL = 50
-"""Iterations after which rho may change: by the clock, two runs would differ."""
+"""Number of iterations after which rho may change. OSQP's interval by time would make runs irreproducible."""
 WARM_START_ITERATIONS = 15
-"""Iterations that tell which rows hold an optimum."""
+"""Number of iterations of a warm start, which finds the active rows of an optimum."""
 RHO = 1.0
-"""Of these: what multipliers are to distances where costs are squares of distances and rows have length 1."""
-_ENOUGH = 1e-3
-"""Accuracy at which they may end before."""
-_ROWS = 8
-"""Rows by which programs differ that OSQP has memory for."""
+"""Step size parameter of a warm start, for whitened rows of length 1."""
+_WARM_START_ACCURACY = 1e-3
+"""Accuracy at which a warm start may end earlier."""
+_ROW_MULTIPLE = 8
+"""The row capacity of warm starts is a multiple of this."""
 _CODES: Any = osqp.SolverStatus
 
 
 class SplittingRun(Protocol):
-    """On one program, set up once."""
+    """Iterations on one QP, set up once."""
 
     def run(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> AdmmResult:
-        """With these bounds (m,), from ``start`` (n,), else from where they last ended."""
+        """Iterate with bounds ``lower``, ``upper`` (m,) from ``start`` (n,); None starts from the previous result."""
         ...
 
 
 class OperatorSplitting(Protocol):
-    """Who iterates on programs with the same P and q."""
+    """Operator splitting for QPs with the same P and q."""
 
     def warm_start(
         self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None
     ) -> AdmmResult:
-        """A few iterations on min 1/2 z^T z subject to l <= R z <= u (m,), rows R (m, n) ``units`` long, from
-        ``start`` (n,), else from 0."""
+        """Run ``WARM_START_ITERATIONS`` iterations on a whitened QP: min 1/2 z^T z subject to lower <= R z <= upper.
+
+        Args:
+            units: (m, n) R, rows of length 1.
+            lower: (m,).
+            upper: (m,).
+            start: (n,); None starts from 0.
+        """
         ...
 
     def full_run(self, A: np.ndarray, iterations: int) -> SplittingRun:
-        """With rows A (m, n), at most ``iterations`` each time."""
+        """Set up iterations on the QP with rows ``A`` (m, n), at most ``iterations`` in each run."""
         ...
 
 
 class OsqpSplitting:
-    """A ``Splitting`` by OSQP."""
+    """``OperatorSplitting`` by the package OSQP."""
 
     def __init__(self, P: np.ndarray, q: np.ndarray, *, accuracy: float) -> None:
         self._P, self._q, self._accuracy = P, q, accuracy
@@ -61,38 +70,48 @@ class OsqpSplitting:
     def warm_start(
         self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None
     ) -> AdmmResult:
-        """See ``Splitting``."""
-        return _near(-(-len(units) // _ROWS) * _ROWS, units.shape[1]).run(units, lower, upper, start)
+        """Run a few iterations on the whitened QP, see ``OperatorSplitting.warm_start``."""
+        return _osqp_warm_start(-(-len(units) // _ROW_MULTIPLE) * _ROW_MULTIPLE, units.shape[1]).run(
+            units, lower, upper, start
+        )
 
     @cached_property
     def _upper_half(self) -> sparse.csc_matrix:
         return sparse.csc_matrix(np.triu(self._P))
 
     def full_run(self, A: np.ndarray, iterations: int) -> OsqpIterations:
-        """See ``Splitting``."""
-        given: dict[str, Any] = {"P": self._upper_half, "q": self._q, "A": sparse.csc_matrix(A), "max_iter": iterations}
-        return OsqpIterations({**given, "eps_abs": self._accuracy, "eps_rel": self._accuracy})
+        """Set up OSQP with rows ``A`` (m, n), at most ``iterations`` in each run."""
+        options: dict[str, Any] = {
+            "P": self._upper_half,
+            "q": self._q,
+            "A": sparse.csc_matrix(A),
+            "max_iter": iterations,
+        }
+        return OsqpIterations({**options, "eps_abs": self._accuracy, "eps_rel": self._accuracy})
 
 
 class OsqpIterations:
-    """``Iterations`` by OSQP."""
+    """``SplittingRun`` by the package OSQP.
 
-    def __init__(self, given: dict[str, Any]) -> None:
-        """``given``: what ``osqp.OSQP.setup`` takes besides the bounds and what is the same in all programs."""
-        self._given = given
+    Args:
+        options: arguments of ``osqp.OSQP.setup``, except for the bounds and the options that all QPs share.
+    """
+
+    def __init__(self, options: dict[str, Any]) -> None:
+        self._options = options
         self._solver: osqp.OSQP | None = None
 
     def run(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> AdmmResult:
-        """See ``Iterations``."""
+        """Iterate with bounds ``lower``, ``upper`` (m,) from ``start`` (n,); None starts from the previous result."""
         if self._solver is None:
             self._solver = osqp.OSQP(algebra="builtin")
             self._solver.setup(
-                **self._given,
+                **self._options,
                 l=lower,
                 u=upper,
                 verbose=False,
                 scaling=SCALING_PASSES,
-                polishing=False,  # it fails on redundant rows and took half of the time
+                polishing=False,  # fails on redundant rows and takes half of the time
                 warm_starting=True,
                 adaptive_rho=True,
                 adaptive_rho_interval=RHO_UPDATE_INTERVAL,
@@ -102,23 +121,25 @@ class OsqpIterations:
             self._solver.update(l=lower, u=upper)
         if start is not None:
             self._solver.warm_start(x=start)
-        return _iterate(_answer(self._solver))
+        return _convert_result(_run_osqp(self._solver))
 
 
-def _iterate(result: Any) -> AdmmResult:
-    ending = {
+def _convert_result(result: Any) -> AdmmResult:
+    """Convert a result of OSQP."""
+    status = {
         _CODES.OSQP_SOLVED: AdmmStatus.SOLVED,
         _CODES.OSQP_SOLVED_INACCURATE: AdmmStatus.INEXACT,
         _CODES.OSQP_MAX_ITER_REACHED: AdmmStatus.LIMIT,
         _CODES.OSQP_PRIMAL_INFEASIBLE: AdmmStatus.INFEASIBLE,
         _CODES.OSQP_PRIMAL_INFEASIBLE_INACCURATE: AdmmStatus.DOUBTFUL,
     }.get(result.info.status_val, AdmmStatus.FAILED)
-    return AdmmResult(ending, result.x, result.y, result.info.iter)
+    return AdmmResult(status, result.x, result.y, result.info.iter)
 
 
 class OsqpWarmStart:
-    """OSQP for programs of so many rows and unknowns: set up once, for only
-    numbers change. It begins where it is told to, so what it was asked before does not matter."""
+    """Warm starts by the package OSQP on whitened QPs of at most ``rows`` rows and ``unknowns`` unknowns. OSQP is set
+    up once and only numbers are updated. Each run starts from the given point, so it does not depend on previous runs.
+    """
 
     def __init__(self, rows: int, unknowns: int) -> None:
         self._units, self._ones = np.zeros((unknowns, rows)), np.ones(rows)
@@ -126,13 +147,13 @@ class OsqpWarmStart:
         self._solver.setup(
             P=sparse.identity(unknowns, format="csc"),
             q=np.zeros(unknowns),
-            # With ones in place of zeros, which it would leave out.
+            # Ones, because OSQP drops zeros from the sparsity pattern.
             A=sparse.csc_matrix(np.ones((rows, unknowns))),
             l=-self._ones,
             u=self._ones,
             rho=RHO,
-            eps_abs=_ENOUGH,
-            eps_rel=_ENOUGH,
+            eps_abs=_WARM_START_ACCURACY,
+            eps_rel=_WARM_START_ACCURACY,
             scaling=0,
             max_iter=WARM_START_ITERATIONS,
             adaptive_rho=False,
@@ -141,31 +162,32 @@ class OsqpWarmStart:
         )
 
     def run(self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> AdmmResult:
-        """See ``Splitting.near``."""
+        """Run a few iterations on the whitened QP with rows ``units`` (m, n), see ``OperatorSplitting.warm_start``."""
         m, n = units.shape
         self._units[:, :m], self._units[:, m:] = units.T, 0.0
-        # Rows of zeros after the last have bounds, too: OSQP factors anew where some come or go.
-        low, high = -self._ones, self._ones.copy()
-        low[:m], high[:m] = lower, upper
-        self._solver.update(Ax=self._units.ravel(), l=low, u=high)
-        self._solver.warm_start(x=np.zeros(n) if start is None else start, y=np.zeros(len(low)))
-        made = _iterate(_answer(self._solver))
-        return replace(made, multipliers=made.multipliers[:m])
+        # Padding rows have bounds too, because OSQP factors again when finite bounds are added or removed.
+        padded_lower, padded_upper = -self._ones, self._ones.copy()
+        padded_lower[:m], padded_upper[:m] = lower, upper
+        self._solver.update(Ax=self._units.ravel(), l=padded_lower, u=padded_upper)
+        self._solver.warm_start(x=np.zeros(n) if start is None else start, y=np.zeros(len(padded_lower)))
+        result = _convert_result(_run_osqp(self._solver))
+        return replace(result, multipliers=result.multipliers[:m])
 
 
-_near = thread_local_cache(16)(OsqpWarmStart)
+_osqp_warm_start = thread_local_cache(16)(OsqpWarmStart)
 
 
-def _answer(solver: osqp.OSQP) -> Any:
+def _run_osqp(solver: osqp.OSQP) -> Any:
+    """Solve, and raise ``KeyboardInterrupt`` if OSQP was interrupted."""
     result = solver.solve(raise_error=False)
     if result.info.status_val == _CODES.OSQP_SIGINT:
-        # OSQP takes Ctrl-C for itself while it runs; the program would go on with what it had found by then.
+        # OSQP handles Ctrl-C itself while it runs and returns its current point.
         raise KeyboardInterrupt
     return result
 
 
 class AdmmSplitting:
-    """A ``Splitting`` by kernels."""
+    """``OperatorSplitting`` by kernels."""
 
     def __init__(self, P: np.ndarray, q: np.ndarray, *, accuracy: float, device: Device) -> None:
         self._P, self._q, self._accuracy, self._device = P, q, accuracy, device
@@ -173,32 +195,38 @@ class AdmmSplitting:
     def warm_start(
         self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None
     ) -> AdmmResult:
-        """See ``Splitting``."""
-        rows = -(-len(units) // _ROWS) * _ROWS
-        return _near_by_kernels(rows, units.shape[1], str(wp.get_device(self._device))).run(units, lower, upper, start)
+        """Run a few iterations on the whitened QP, see ``OperatorSplitting.warm_start``."""
+        rows = -(-len(units) // _ROW_MULTIPLE) * _ROW_MULTIPLE
+        return _admm_warm_start(rows, units.shape[1], str(wp.get_device(self._device))).run(units, lower, upper, start)
 
     def full_run(self, A: np.ndarray, iterations: int) -> AdmmIterations:
-        """See ``Splitting``."""
+        """Set up the kernels with rows ``A`` (m, n), at most ``iterations`` in each run."""
         programs = AdmmPrograms(
             [DenseQp(self._P, self._q, A)], device=self._device, scaling=SCALING_PASSES, adapt=RHO_UPDATE_INTERVAL
         )
         return AdmmIterations(programs, self._accuracy, iterations)
 
 
-_near_by_kernels = thread_local_cache(16)(
-    partial(AdmmWarmStart, accuracy=_ENOUGH, iterations=WARM_START_ITERATIONS, adapt=RHO_UPDATE_INTERVAL, rho=RHO)
+_admm_warm_start = thread_local_cache(16)(
+    partial(
+        AdmmWarmStart,
+        accuracy=_WARM_START_ACCURACY,
+        iterations=WARM_START_ITERATIONS,
+        adapt=RHO_UPDATE_INTERVAL,
+        rho=RHO,
+    )
 )
 
 
 @dataclass(frozen=True)
 class AdmmIterations:
-    """``Iterations`` by kernels."""
+    """``SplittingRun`` by kernels."""
 
     programs: AdmmPrograms
     accuracy: float
     iterations: int
 
     def run(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> AdmmResult:
-        """See ``Iterations``."""
+        """Iterate with bounds ``lower``, ``upper`` (m,) from ``start`` (n,); None starts from the previous result."""
         (end,) = self.programs.solve([lower], [upper], [start], accuracy=self.accuracy, iterations=self.iterations)
         return end

@@ -1,4 +1,5 @@
-"""The activations of a step: what is asked of it, as a program about a foreseen end, and the search (Eq. 13)."""
+"""The plan of a step: assemble the QP about the predicted end, search it, and compute the end that it expects
+(Eq. 13)."""
 
 from __future__ import annotations
 
@@ -23,32 +24,34 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import shortening
 
 MIN_STEPS_PER_TIME_UNIT = 19.0
-"""Least number of steps in sqrt(H / g) within which a body can be steered."""
-_ORDINARY_STRENGTH = 4.0
+"""Minimum number of steps in sqrt(H / g); with longer steps a body cannot be controlled."""
+_REFERENCE_STRENGTH = 4.0
+"""Body weights, force of the muscle for which ``LocomotionSettings`` gives the activation weights."""
 WORK_WEIGHT = 10.0
-"""Cost of the square of what a muscle gives or takes in a step, in m g H: muscles that shorten are else set against
-others that they stretch (jumps of pawn, robot and monkey work 1.64, 1.78 and 1.54 m g H in place of 1.49, 1.34, 1.40).
-"""
-_FASTEST = 7.0
-"""Bounds of activations, in their bounds a sqrt(H / g): how fast a muscle is switched on and off."""
+"""Weight of the squared work of a muscle in a step, in (m g H)^2. Without it, muscles that shorten act against muscles
+that they stretch: the jumps of pawn, robot and monkey take 1.64, 1.78 and 1.54 m g H instead of 1.49, 1.34 and 1.40."""
+_MAX_ACTIVATION_RATE = 7.0
+"""Maximum change of an activation in sqrt(H / g), in units of its bound."""
 REGULARIZATION = 1e-7
+"""Added to the diagonal of P for the activations."""
 
 
 @dataclass(frozen=True)
 class StepProgram:
-    """What is asked of a step, and what it is asked of."""
+    """The QP of one step and the linearisation it was built from."""
 
     program: CoulombProgram
     predicted: PredictedContact
     linear: LinearStep
-    """Of the activations of the synergies in their bounds, and of contact forces in body weights."""
+    """Unknowns are the activations of the synergies as fractions of their bounds, then contact forces in body
+    weights."""
     contact_velocities: np.ndarray
-    """(3n, k + 1) m/s of the contacts, as its velocities."""
+    """(3n, k + 1) m/s, W times the velocities of ``linear`` (Eq. 8)."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Activations, and the end that the program expects of them."""
+    """Planned activations and the end of the step that the QP expects."""
 
     activations: np.ndarray
     """(M,) metres."""
@@ -57,10 +60,12 @@ class Plan:
     forces: np.ndarray
     """(n, 3) newtons."""
     qp_count: int = 0
+    """Number of QPs that were solved."""
     qp_infeasible: int = 0
+    """Number of QPs without a solution."""
 
     def counting(self, *plans: Plan) -> Plan:
-        """This plan, with the programs counted that all ``plans`` of the step took."""
+        """Return this plan with the QP counts of all ``plans`` of the step."""
         return replace(
             self,
             qp_count=sum(plan.qp_count for plan in plans),
@@ -70,7 +75,7 @@ class Plan:
 
 @dataclass
 class StepPlanner:
-    """Programs of one body's steps."""
+    """Planner of the steps of one body: builds the QP and searches it."""
 
     body: SoftBody
     muscles: MuscleSet
@@ -78,17 +83,30 @@ class StepPlanner:
     friction: float
     settings: LocomotionSettings
     factors: LinearSolver
-    """Of the effort's horizon."""
+    """Solver for the matrix of ``EffortModel``."""
     linear_steps: StepLinearizer
+    """Builder of the linear step about a predicted end."""
 
     def plan(
-        self, prospect: PredictedStep, last: np.ndarray, objectives: Sequence[AnyObjective], clock: StageClock
+        self, predicted: PredictedStep, last: np.ndarray, objectives: Sequence[AnyObjective], clock: StageClock
     ) -> Plan:
-        """Activations for what the ``objectives`` ask, after ``last`` (M,) metres of the step before."""
-        problem, settings, m = prospect.linearization.tangent.problem, self.settings, self.synergies.count
-        program = self.program(prospect, last, objectives)
+        """Plan the activations of a step.
+
+        The QP is built about ``predicted`` and searched by the strategy of the settings. Of its solution only the
+        activations are used: the contact forces that follow from them by Coulomb's law, and the end of the step, are
+        computed from the linear step. If that end would invert an element, the predicted velocities stand in for it. If
+        no QP has a solution, the plan keeps the previous activations.
+
+        Args:
+            predicted: predicted end of the step.
+            last: (M,) m, activations of the previous step.
+            objectives: objectives of the motion.
+            clock: timer of the stages.
+        """
+        problem, settings, m = predicted.linearization.tangent.problem, self.settings, self.synergies.count
+        program = self.program(predicted, last, objectives)
         clock.lap("program")
-        found = search_program(
+        result = search_program(
             program.program,
             settings.strategy,
             program.predicted,
@@ -98,83 +116,100 @@ class StepPlanner:
             device=self.body.assembly.device,
         )
         clock.lap("qp")
-        if found.x is None:
-            return Plan(last, prospect.velocities, prospect.forces, found.qp_count, found.infeasible)
-        activations = (self.synergies.members @ found.x[:m]) * self.muscles.bounds
-        moved = program.contact_velocities[:, -1] + program.contact_velocities[:, :m] @ found.x[:m]
-        asked = self.body.weight * found.x[m:].reshape(-1, 3)
-        forces, _ = prospect.linearization.solve_coulomb(moved, prospect.normal_bias, self.friction, asked)
-        end = program.linear.end_velocities(np.append(found.x[:m], forces / self.body.weight))
-        velocities = end.reshape(prospect.velocities.shape)
+        if result.x is None:
+            return Plan(last, predicted.velocities, predicted.forces, result.qp_count, result.infeasible)
+        activations = (self.synergies.members @ result.x[:m]) * self.muscles.bounds
+        contact_free = program.contact_velocities[:, -1] + program.contact_velocities[:, :m] @ result.x[:m]
+        qp_forces = self.body.weight * result.x[m:].reshape(-1, 3)
+        forces, _ = predicted.linearization.solve_coulomb(contact_free, predicted.normal_bias, self.friction, qp_forces)
+        end = program.linear.end_velocities(np.append(result.x[:m], forces / self.body.weight))
+        velocities = end.reshape(predicted.velocities.shape)
         clock.lap("contact")
         if not problem.is_inversion_free(velocities):
-            velocities = prospect.velocities
-        return Plan(activations, velocities, forces, found.qp_count, found.infeasible)
+            velocities = predicted.velocities
+        return Plan(activations, velocities, forces, result.qp_count, result.infeasible)
 
-    def program(self, prospect: PredictedStep, last: np.ndarray, objectives: Sequence[AnyObjective]) -> StepProgram:
-        """What is asked of the step, linear about the ``prospect``; ``last`` (M,) are the step before's activations."""
-        response, foreseen, body = prospect.linearization, prospect.velocities, self.body
+    def program(self, predicted: PredictedStep, last: np.ndarray, objectives: Sequence[AnyObjective]) -> StepProgram:
+        """Build the QP of the step about ``predicted``: objectives, elastic effort and activation costs, contact
+        velocities, and bounds of the activations. ``last`` (M,) m are the activations of the previous step."""
+        response, predicted_velocities, body = predicted.linearization, predicted.velocities, self.body
         problem, contacts = response.tangent.problem, response.contacts
         weight, speed = body.weight, body.speed_unit
-        # What the kernels of elasticity are needed for goes on in one thread alone.
-        linear, horizon = self.linear_steps.linearize(prospect, lambda: EffortModel.of(problem, foreseen, self.factors))
+        # ``linearize`` may run both at once: only ``EffortModel`` uses the kernels of elasticity, which serve one
+        # thread.
+        linear, effort_model = self.linear_steps.linearize(
+            predicted, lambda: EffortModel.of(problem, predicted_velocities, self.factors)
+        )
         previous = self.synergies.mean(last / self.muscles.bounds)
-        asked = objectives_cost(problem, linear, contacts, objectives, speed)
-        activation = self._activation_cost(problem, foreseen, previous, linear.count)
-        effort = effort_cost(problem, linear, foreseen.ravel(), horizon)
-        cost = asked() + effort + activation
-        speeds = linear.contact_velocities(contacts)
-        rows, offset = speeds[:, :-1] / speed, speeds[:, -1] / speed
-        offset[::3] += prospect.normal_bias / speed
+        finish_objectives = objectives_cost(problem, linear, contacts, objectives, speed)
+        activation = self._activation_cost(problem, predicted_velocities, previous, linear.count)
+        effort = effort_cost(problem, linear, predicted_velocities.ravel(), effort_model)
+        cost = finish_objectives() + effort + activation
+        contact_velocities = linear.contact_velocities(contacts)
+        rows, offset = contact_velocities[:, :-1] / speed, contact_velocities[:, -1] / speed
+        offset[::3] += predicted.normal_bias / speed
         bounds = self.activation_bounds(previous, problem.dt)
-        pieces = CoulombProgram(cost.P, cost.q, cost.constant, rows, offset, self.friction, *bounds)
-        slip = contacts.contact_velocities(foreseen.ravel()).reshape(-1, 3) / speed
-        start = self.synergies.mean(prospect.activations / self.muscles.bounds)
-        return StepProgram(pieces, PredictedContact(start, prospect.forces / weight, slip), linear, speeds)
+        coulomb_program = CoulombProgram(cost.P, cost.q, cost.constant, rows, offset, self.friction, *bounds)
+        slip = contacts.contact_velocities(predicted_velocities.ravel()).reshape(-1, 3) / speed
+        start = self.synergies.mean(predicted.activations / self.muscles.bounds)
+        return StepProgram(
+            coulomb_program, PredictedContact(start, predicted.forces / weight, slip), linear, contact_velocities
+        )
 
     def activation_bounds(self, previous: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """(m,) each, how low and how high activations may go in ``dt`` seconds from the ``previous`` (m,)."""
-        reach = _FASTEST * dt / self.body.time_unit
-        return np.maximum(previous - reach, -1.0), np.minimum(previous + reach, 1.0)
+        """Return lower and upper bounds (m,) of the activations after ``dt`` s from ``previous`` (m,): [-1, 1] and the
+        maximum rate of change."""
+        max_change = _MAX_ACTIVATION_RATE * dt / self.body.time_unit
+        return np.maximum(previous - max_change, -1.0), np.minimum(previous + max_change, 1.0)
 
     def _activation_cost(
-        self, problem: StepProblem, foreseen: np.ndarray, previous: np.ndarray, count: int
+        self, problem: StepProblem, predicted_velocities: np.ndarray, previous: np.ndarray, count: int
     ) -> QuadraticCost:
-        """Of ``count`` unknowns that begin with the activations, how large they are, what their muscles give or take
-        on the way to the end of ``foreseen`` (N, 3) m/s, and how they change from ``previous`` (m,)."""
+        """Return the cost of the size of activations, of the work of their muscles, and of the change of activations.
+
+        Args:
+            problem: the step.
+            predicted_velocities: (N, 3) m/s, end up to which the work is computed.
+            previous: (m,) activations of the previous step.
+            count: number of unknowns, of which the first m are the activations.
+        """
         size, change = self.activation_weights(problem.dt)
-        shorter = shortening(self.muscles, problem.state.positions, problem.end_positions(foreseen))
-        works = self.muscles.max_forces * shorter / (self.body.weight * self.body.height)
-        size = size + WORK_WEIGHT * (self.synergies.members.T @ works**2)
+        shortenings = shortening(self.muscles, problem.state.positions, problem.end_positions(predicted_velocities))
+        muscle_works = self.muscles.max_forces * shortenings / (self.body.weight * self.body.height)
+        size = size + WORK_WEIGHT * (self.synergies.members.T @ muscle_works**2)
         diagonal, q = np.zeros(count), np.zeros(count)
         diagonal[: len(previous)] = 2.0 * (size + change) + REGULARIZATION
         q[: len(previous)] = -2.0 * change * previous
         return QuadraticCost(np.diag(diagonal), q, float(change @ previous**2))
 
     def activation_weights(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """(m,) of the squares of activations, and of their changes, in a step of ``dt`` seconds."""
-        share = dt * MIN_STEPS_PER_TIME_UNIT / self.body.time_unit
+        """Return (m,) weights of squared activations and (m,) of their squared changes, in a step of ``dt`` s."""
+        step_fraction = dt * MIN_STEPS_PER_TIME_UNIT / self.body.time_unit
         strengths, squares = self._strengths
         settings = self.settings
-        return settings.activation_weight * share**2 * strengths, settings.activation_change_weight * share * squares
+        return (
+            settings.activation_weight * step_fraction**2 * strengths,
+            settings.activation_change_weight * step_fraction * squares,
+        )
 
     @cached_property
     def _strengths(self) -> tuple[np.ndarray, np.ndarray]:
-        """(m,) sums over each synergy's muscles of their strength, in that of ordinary ones, and of its square."""
-        strength = self.muscles.max_forces / (_ORDINARY_STRENGTH * self.body.weight)
+        """Sums over the muscles of each synergy, (m,) of the relative strength and (m,) of its square."""
+        strength = self.muscles.max_forces / (_REFERENCE_STRENGTH * self.body.weight)
         members = self.synergies.members
         return members.T @ strength, members.T @ strength**2
 
 
 @dataclass
 class StageClock:
-    """Milliseconds of each stage of a step."""
+    """Timer of the stages of a step."""
 
     milliseconds: dict[str, float] = field(default_factory=dict)
+    """ms of each stage; a stage that occurs twice is summed."""
     _last: float = field(default_factory=time.perf_counter)
 
     def lap(self, name: str) -> None:
-        """Since the lap before was ``name``."""
+        """Add the time since the previous lap to stage ``name``."""
         now = time.perf_counter()
         self.milliseconds[name] = self.milliseconds.get(name, 0.0) + 1e3 * (now - self._last)
         self._last = now

@@ -1,6 +1,6 @@
-"""Writes a simulation down as it goes, so that a run that is killed loses no more than its last steps.
+"""Recorder that writes a simulation to disk as it runs, so that a killed run loses only its last steps.
 
-Beside what a trajectory keeps, parts hold all that a ``StepReport`` says: ``Replay`` reads it.
+Parts contain the arrays of a trajectory and all fields of ``StepReport``, which ``Replay`` reads.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from egs_warp.locomotion.trajectory import FIRST_PART, Trajectory, part_name, wr
 from egs_warp.muscles.muscle_set import MuscleSet
 
 _STEPS_A_PART = 10
+"""Minimum number of steps in a part."""
 REPORTED = ("qp_count", "qp_infeasible", "newton_iterations", "converged", "added_spin")
-"""Fields of ``StepReport`` that are arrays of a part, a row a step."""
+"""Fields of ``StepReport`` that are arrays of a part, one row a step."""
 
 
 class Recorder:
-    """Gathers the steps of one body; parts of them go to a folder as soon as they are full."""
+    """Collector of the steps of one body; writes each part to a folder when it is full."""
 
     def __init__(
         self,
@@ -38,42 +39,56 @@ class Recorder:
         frame: BodyFrame | None = None,
         folder: Callable[[], Path] | None = None,
     ) -> None:
-        """``start_gap``: smallest gap at ``start``, metres; ``frame``: where the body lies in its capture; ``folder``:
-        tells, once the first step is done, where the parts go; it is made where it is missing.
+        """Write down the start of a run.
+
+        Args:
+            body: the body.
+            muscles: its muscles.
+            geometry: ground and contact points.
+            start: first state.
+            start_gap: m, smallest gap at ``start``.
+            drag: 1/s, alpha of Rayleigh damping.
+            frame: placement of the body in its capture.
+            folder: function that returns the folder of the parts, called after the first step; a missing folder is
+                created. None keeps all parts in memory.
         """
         self._folder, self._path = folder, None
-        self._steps = self._written = self._asked_steps = 0
+        self._steps = self._written = self._requested_steps = 0
         self._reports: list[StepReport] = []
-        self._asked: list[tuple[int, int]] = []
+        self._requests: list[tuple[int, int]] = []
         self._kicks: list[tuple[int, np.ndarray]] = []
         self.start = self._first(body, muscles, geometry, start, start_gap, drag, frame)
-        """The first part."""
+        """Arrays of the first part."""
         self._parts = [self.start]
 
-    def add(self, reports: Sequence[StepReport], *, asked: int = 0, kick: np.ndarray | None = None) -> None:
-        """Write down the next steps, into which one that was asked for was divided; ``asked`` is the ``digest`` of its
-        objectives and of ``kick`` (N, 3) m/s, which its nodes were given from outside as it began; it is read in a
-        folder alone.
+    def add(self, reports: Sequence[StepReport], *, request_digest: int = 0, kick: np.ndarray | None = None) -> None:
+        """Add the steps into which one requested step was divided.
+
+        Args:
+            reports: their reports, in order.
+            request_digest: ``replay.digest`` of the objectives and of ``kick``; only read where a run is continued.
+            kick: (N, 3) m/s, velocities that external pushes added to the nodes at the start of the step.
         """
         if kick is not None:
             self._kicks.append((self._steps + len(self._reports), kick))
         self._reports += reports
-        self._asked += [(self._asked_steps, asked)] * len(reports)
-        self._asked_steps += 1
+        self._requests += [(self._requested_steps, request_digest)] * len(reports)
+        self._requested_steps += 1
         if len(self._reports) >= _STEPS_A_PART:
             self._parts.append(self._part())
         self._write()
 
     def trajectory(self) -> Trajectory:
-        """All steps so far."""
+        """Return the trajectory of all steps so far."""
         if self._reports:
             self._parts.append(self._part())
         if self._path is None:
-            return Trajectory.joined(self._parts)
+            return Trajectory.from_parts(self._parts)
         self._write()
         return Trajectory.load(self._path)
 
     def _write(self) -> None:
+        """Write the full parts, and the first one once the folder is known."""
         if self._folder is None:
             return
         if self._path is None:
@@ -94,6 +109,7 @@ class Recorder:
         drag: float,
         frame: BodyFrame | None,
     ) -> dict[str, np.ndarray]:
+        """Return the arrays of the first part: the start, and all that is constant in a run."""
         material = body.assembly.material
         part = {
             "time": np.array([start.time]),
@@ -146,9 +162,9 @@ class Recorder:
         return part
 
     def _part(self) -> dict[str, np.ndarray]:
-        """The steps since the last part."""
+        """Return the arrays of the steps since the last part."""
         reports, self._reports = self._reports, []
-        asked, self._asked = self._asked, []
+        requests, self._requests = self._requests, []
         kicks, self._kicks = self._kicks, []
         counts = [report.contacts.count for report in reports]
         part = {
@@ -169,8 +185,8 @@ class Recorder:
             "contact_load": np.concatenate([report.forces for report in reports]),
             "kick_step": np.array([step for step, _ in kicks], np.int32),
             "kick_velocity": np.array([kick for _, kick in kicks]).reshape(-1, *reports[0].state.positions.shape),
-            "asked_step": np.array([step for step, _ in asked]),
-            "asked_digest": np.array([number for _, number in asked], np.uint64),
+            "asked_step": np.array([step for step, _ in requests]),
+            "asked_digest": np.array([number for _, number in requests], np.uint64),
             **{name: np.array([getattr(report, name) for report in reports]) for name in REPORTED},
             **_laps(reports),
         }
@@ -179,7 +195,8 @@ class Recorder:
 
 
 def _laps(reports: Sequence[StepReport]) -> dict[str, np.ndarray]:
-    """The ``stages`` (S,) of the steps by name and their ``milliseconds`` (n, S), NaN where a step did without one."""
+    """Return the names of the ``stages`` (S,) and their ``milliseconds`` (n, S); NaN where a step did not have a
+    stage."""
     stages = list(dict.fromkeys(stage for report in reports for stage in report.milliseconds))
     laps = [[report.milliseconds.get(stage, np.nan) for stage in stages] for report in reports]
     return {"stages": np.array(stages, str), "milliseconds": np.array(laps)}

@@ -1,8 +1,8 @@
-"""A run that was cut off goes on: what it has recorded is done again without solving, then the solver takes over.
+"""Continuation of a run that was cut off: recorded steps are replayed without solving, then the solver continues.
 
-All that lasts from step to step is the state, the ``StepMemory`` and what the motion has seen. The first two are in the
-record; the motion sees the recorded steps again and asks for the same ones. So nothing else is ever saved, and a run
-that goes on has the bits of one that was never cut off.
+All that a step passes to the next one is the state, the ``WarmStart`` and the history of the motion. The first two are
+recorded; the motion is given the recorded steps again and makes the same requests. So nothing else has to be saved, and
+a continued run is bit-identical to one that was never cut off.
 """
 
 from __future__ import annotations
@@ -27,31 +27,41 @@ from egs_warp.locomotion.trajectory import FIRST_PART, part_paths, read_arrays
 
 
 class Replay:
-    """The steps in the folder of a ``Recorder``, one after the other as they were asked for."""
+    """Recorded steps in the folder of a ``Recorder``, returned one request after the other."""
 
     def __init__(self, folder: Path, start: Mapping[str, np.ndarray], detector: ContactDetector) -> None:
-        """``start``: the first part as the run that goes on would write it; ``detector``: of its contacts.
+        """Open a recording.
 
-        Raises ``UserError`` where the recorded run began otherwise, or its first part is damaged.
+        Args:
+            folder: folder of the recorder.
+            start: first part as the continued run would write it.
+            detector: detector of its contacts.
+
+        Raises:
+            UserError: the recorded run started differently, or its first part is damaged.
         """
         self._folder, self._detector = folder, detector
         recorded = _read(folder / FIRST_PART)
         if recorded.keys() != start.keys() or any(recorded[key].tobytes() != start[key].tobytes() for key in start):
-            raise _other(folder)
+            raise _other_run(folder)
         self._steps = self._recorded(start["positions"][0])
 
-    def step(self, asked: int) -> list[StepReport]:
-        """The next recorded step, in the parts it was divided into; none once all are done. ``asked`` is the ``digest``
-        of what is asked of it.
+    def step(self, request_digest: int) -> list[StepReport]:
+        """Return the next recorded step, as the steps into which it was divided; empty at the end of the recording.
 
-        Raises ``UserError`` where something else was asked of it, or its part is damaged.
+        Args:
+            request_digest: ``digest`` of the objectives of the step.
+
+        Raises:
+            UserError: the recorded step had other objectives, or its part is damaged.
         """
-        then, reports = next(self._steps, (asked, []))
-        if then != asked:
-            raise _other(self._folder)
+        recorded_digest, reports = next(self._steps, (request_digest, []))
+        if recorded_digest != request_digest:
+            raise _other_run(self._folder)
         return reports
 
     def _recorded(self, positions: np.ndarray) -> Iterator[tuple[int, list[StepReport]]]:
+        """Yield the digest and the reports of each requested step, from the state ``positions`` (N, 3)."""
         count = 0
         for path in part_paths(self._folder):
             part = _read(path)
@@ -61,12 +71,12 @@ class Replay:
                 digests = [int(part["asked_digest"][end - 1]) for end in ends]
             except READ_ERRORS as error:
                 raise _damaged(path, error) from error
-            for digest_then, first, end in zip(digests, [0, *ends], ends, strict=False):
-                yield digest_then, reports[first:end]
+            for part_digest, first, end in zip(digests, [0, *ends], ends, strict=False):
+                yield part_digest, reports[first:end]
             count, positions = count + len(reports), reports[-1].state.positions
 
     def _reports(self, part: Mapping[str, np.ndarray], positions: np.ndarray, count: int) -> list[StepReport]:
-        """Of a part that begins at ``positions`` (N, 3), after ``count`` steps."""
+        """Return the reports of a part that starts at ``positions`` (N, 3), after ``count`` steps."""
         reports = []
         stages = part["stages"].tolist()
         bounds = np.searchsorted(part["contact_step"], np.arange(count, count + len(part["dt"]) + 1))
@@ -89,8 +99,9 @@ class Replay:
 
 
 def digest(objectives: Sequence[AnyObjective | np.ndarray]) -> int:
-    """64 bits that tell what is asked of a step, and what is given to its nodes from outside, from anything else."""
-    found = hashlib.blake2b(digest_size=8)
+    """Return a 64-bit hash of the objectives of a step and of the velocities and activations that are prescribed to
+    it."""
+    hasher = hashlib.blake2b(digest_size=8)
 
     def feed(value: Any) -> None:
         if is_dataclass(value):
@@ -102,11 +113,11 @@ def digest(objectives: Sequence[AnyObjective | np.ndarray]) -> int:
         else:
             array = np.ascontiguousarray(value)
             assert array.dtype != object, "objectives are numbers and names"
-            found.update(array.tobytes())
+            hasher.update(array.tobytes())
 
     for objective in objectives:
         feed(objective)
-    return int.from_bytes(found.digest(), "big")
+    return int.from_bytes(hasher.digest(), "big")
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
@@ -117,15 +128,16 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _damaged(path: Path, error: Exception) -> UserError:
+    """Return the error for a part that is missing or cannot be read."""
     missing = isinstance(error, FileNotFoundError)
     what = "is missing" if missing else f"is damaged ({error})"
-    gone = "the parts after it" if missing else "it and the parts after it"
-    cure = "begin the run again" if path.name == FIRST_PART else f"remove {gone} to go on from there"
-    return UserError(f"{path}: {what}; {cure}")
+    removed = "the parts after it" if missing else "it and the parts after it"
+    remedy = "begin the run again" if path.name == FIRST_PART else f"remove {removed} to continue from there"
+    return UserError(f"{path}: {what}; {remedy}")
 
 
-def _other(folder: Path) -> UserError:
+def _other_run(folder: Path) -> UserError:
+    """Return the error for a recording of another run."""
     return UserError(
-        f"{folder}: does not fit the run that is to go on: capture, flags, program or machine have changed; begin the"
-        " run again"
+        f"{folder}: belongs to another run: capture, flags, program or machine have changed; begin the run again"
     )

@@ -1,4 +1,4 @@
-"""A body, its muscles and its ground, ready to move; and the loop that moves it."""
+"""The loop over the steps of a run: motion, stepper, recorder; and the settling of a body on its ground."""
 
 from __future__ import annotations
 
@@ -25,46 +25,46 @@ from egs_warp.locomotion.trajectory import Trajectory
 FRAME_RATE = 60
 """Frames of a video, 1/s."""
 SETTLING_STEP, SETTLING_STEPS = 0.25, 12
-"""sqrt(H / g) of each step in which a body comes to rest on its ground, and how many it has for that."""
+"""Step size in sqrt(H / g), and maximum number of steps, in which a body comes to rest on its ground."""
 REST_FRAMES = 20
-"""Frames shown after the last motion has come to rest."""
+"""Number of frames after the last motion has finished."""
 
 
 class Motion(Protocol):
-    """Anything that writes objectives from the measured state."""
+    """Source of objectives, computed from the measured state."""
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is of the step before."""
+        """Return the objectives of the step of ``dt`` s that starts at ``state``; ``report`` is that of the previous
+        step."""
         ...
 
 
 @dataclass(frozen=True)
 class RolloutResult:
-    """A finished simulation."""
+    """Result of a simulation."""
 
     trajectory: Trajectory
     reports: tuple[StepReport, ...]
     frames: np.ndarray
-    """(n,) index into the trajectory's times for each frame of the video."""
+    """(n,) index into the times of the trajectory for each frame of the video."""
     stopped: bool = False
-    """Whether it ended at a step that could not be solved."""
+    """True if it ended at a step that could not be solved."""
 
 
 def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]:
-    """Seconds of a solver step, and how many make a frame: steps of at most ``step`` seconds and of sqrt(H / g) / 19,
-    within which a body can be steered (docs/concepts/conventions.md). A frame is as long as a ``step`` that is longer.
-    """
-    longest = body.time_unit / MIN_STEPS_PER_TIME_UNIT
+    """Return the size of a solver step, s, and the number of steps in a frame. Steps are at most ``step`` s and at most
+    sqrt(H / g) / 19 (docs/concepts/conventions.md). If ``step`` is longer than a frame, a frame is as long."""
+    max_step = body.time_unit / MIN_STEPS_PER_TIME_UNIT
     frame = max(1.0 / FRAME_RATE, step or 0.0)
-    count = int(np.ceil(frame / min(longest, step or longest) - 1e-3))
+    count = int(np.ceil(frame / min(max_step, step or max_step) - 1e-3))
     return frame / count, count
 
 
 def settle(stepper: LocomotionStepper) -> BodyState:
-    """The body at rest on its ground: contact steps from rest, long ones, each begun without velocity.
+    """Let the body come to rest on its ground: long contact steps without muscles, each started without velocity.
 
-    One that gives way is not followed to the ground: it is returned once a node has gone 0.2 H in one step, or its
-    centre of mass 0.1 H in all.
+    A body that collapses is not followed to the ground: the loop ends once a node moves by 0.2 H in one step, or the
+    centre of mass has moved by 0.1 H in all.
     """
     body = stepper.body
     state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
@@ -73,19 +73,28 @@ def settle(stepper: LocomotionStepper) -> BodyState:
     for _ in range(SETTLING_STEPS):
         with one_blas_thread():
             result = stepper.passive_step(state, memory, dt)
-        moved = dt * float(np.abs(result.velocities).max())
+        max_displacement = dt * float(np.abs(result.velocities).max())
         state = BodyState(state.positions + dt * result.velocities, np.zeros_like(state.positions))
         memory = replace(memory, points=result.contacts.points, forces=result.forces)
-        gone = body.centre_of_mass(state.positions) - body.centre_of_mass(body.mesh.nodes)
-        if has_settled(body, moved, np.linalg.norm(gone)):
+        centre_displacement = body.centre_of_mass(state.positions) - body.centre_of_mass(body.mesh.nodes)
+        if has_settled(body, max_displacement, np.linalg.norm(centre_displacement)):
             break
     return state
 
 
-def has_settled(body: SoftBody, moved: Any, gone: Any) -> Any:
-    """Whether a body rests, or gives way, whose nodes have ``moved`` so many metres at most in the last step, and whose
-    centre of mass has ``gone`` so many in all: of one, or of as many as there are numbers."""
-    return (moved > 0.2 * body.height) | (gone > 0.1 * body.height) | (moved < 2e-4 * body.height)
+def has_settled(body: SoftBody, max_displacement: Any, centre_displacement: Any) -> Any:
+    """Return True if a body is at rest or collapses.
+
+    Args:
+        body: the body.
+        max_displacement: m, largest displacement of a node along an axis in the last step, a number or an array.
+        centre_displacement: m, displacement of the centre of mass in all, a number or an array.
+    """
+    return (
+        (max_displacement > 0.2 * body.height)
+        | (centre_displacement > 0.1 * body.height)
+        | (max_displacement < 2e-4 * body.height)
+    )
 
 
 def roll_out(
@@ -104,15 +113,25 @@ def roll_out(
     activations: np.ndarray | None = None,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> RolloutResult:
-    """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``, or a step
-    cannot be solved.
+    """Run ``frames`` frames of ``motion`` from ``start``. The run ends earlier if the motion has ``finished`` for
+    ``REST_FRAMES`` frames, or if a step cannot be solved.
 
-    ``step``: seconds that a solver step takes at most, see ``solver_steps``. ``place`` is where the body lies in its
-    capture; steps are written into the folder that ``parts`` tells as they are done (``Recorder``); those in the folder
-    ``resume`` are not solved again (``Replay``). ``kicks`` tells the velocities (N, 3) m/s that something from outside
-    gives the nodes in the step from a time on, if anything does. With ``activations`` (steps, M) metres muscles do what
-    those say, whatever the motion asks for, as long as there are any for a whole frame. ``progress`` is told each frame
-    done.
+    Args:
+        stepper: stepper of the body.
+        geometry: ground and contact points, for the recording.
+        start: first state.
+        motion: source of the objectives.
+        frames: maximum number of frames.
+        step: s, maximum size of a solver step, see ``solver_steps``.
+        place: placement of the body in its capture.
+        parts: function that returns the folder in which steps are recorded (``Recorder``).
+        resume: folder of a recording whose steps are not solved again (``Replay``).
+        finished: function that returns True once the motion has finished.
+        kicks: function of time and step size, s, that returns the velocities (N, 3) m/s which external pushes add to
+            the nodes in that step, or None.
+        activations: (steps, M) m, prescribed activations, which replace the planned ones; the run ends with the last
+            whole frame of them.
+        progress: function that receives the index of each finished frame.
     """
     dt, per_frame = solver_steps(stepper.body, step)
     if activations is not None:
@@ -134,28 +153,30 @@ def roll_out(
         folder=parts,
     )
     replay = Replay(resume, recorder.start, stepper.detector) if resume is not None else None
-    # It takes time, and is read where a run goes on.
-    digested = parts is not None or resume is not None
+    # Digests take time and are only read where a run is continued.
+    needs_digest = parts is not None or resume is not None
     for frame in range(frames):
         for part in range(per_frame):
             with one_blas_thread():
                 objectives = motion.objectives(state, reports[-1] if reports else None, dt)
             kick = kicks(state.time, dt)
-            held = None if activations is None else activations[frame * per_frame + part]
-            given = [each for each in (kick, held) if each is not None]
-            asked = digest([*objectives, *given]) if digested else 0
-            done = replay.step(asked) if replay is not None else []
-            begin = state.with_velocity_kick(kick)
-            if held is None:
-                done = done or _advanced(partial(stepper.advance, begin, memory, objectives, dt))
+            step_activations = None if activations is None else activations[frame * per_frame + part]
+            prescribed = [each for each in (kick, step_activations) if each is not None]
+            request_digest = digest([*objectives, *prescribed]) if needs_digest else 0
+            done = replay.step(request_digest) if replay is not None else []
+            pushed_state = state.with_velocity_kick(kick)
+            if step_activations is None:
+                done = done or _try_advance(partial(stepper.advance, pushed_state, memory, objectives, dt))
             else:
-                done = done or _advanced(partial(stepper.advance_with_activations, begin, memory, held, dt))
+                done = done or _try_advance(
+                    partial(stepper.advance_with_activations, pushed_state, memory, step_activations, dt)
+                )
             stopped = not done
             if stopped:
                 break
             state, memory = done[-1].state, WarmStart.from_report(done[-1])
             reports.extend(done)
-            recorder.add(done, asked=asked, kick=kick)
+            recorder.add(done, request_digest=request_digest, kick=kick)
         if shown[-1] < len(reports):
             shown.append(len(reports))
         progress(frame)
@@ -165,8 +186,8 @@ def roll_out(
     return RolloutResult(recorder.trajectory(), tuple(reports), np.array(shown), stopped)
 
 
-def _advanced(advance: Callable[[], tuple[BodyState, WarmStart, list[StepReport]]]) -> list[StepReport]:
-    """A step in the parts it was divided into; none if it cannot be solved, nor any part of it."""
+def _try_advance(advance: Callable[[], tuple[BodyState, WarmStart, list[StepReport]]]) -> list[StepReport]:
+    """Return the reports of a step; empty if neither it nor a part of it can be solved."""
     try:
         _, _, done = advance()
     except (UnsolvableStepError, np.linalg.LinAlgError):

@@ -1,4 +1,4 @@
-"""What may be chosen of a step."""
+"""Options of the stepper."""
 
 from __future__ import annotations
 
@@ -12,36 +12,40 @@ from egs_warp.locomotion.strategies import Strategy
 
 @dataclass(frozen=True)
 class LocomotionSettings:
-    """Numbers of the stepper; lengths are in body heights, forces in body weights, speeds in sqrt(g H)."""
+    """Options of ``LocomotionStepper``. Lengths are in body heights H, forces in body weights, speeds in sqrt(g H)."""
 
     activation_distance: float = 0.01
-    """A point takes part if the step may bring it this near to a plane."""
+    """Contact points that the step may bring closer than this to a plane take part in the step."""
     penetration_tolerance: float = 5e-3
+    """Depth up to which a contact point is not pushed out."""
     push_out_cap: float = 0.05
+    """Largest speed at which points that are deeper are pushed out."""
     qp_limit: int = 12
-    """QPs a step at most; in doubt ``strategies.PATIENCE`` times as many for all strategies but ``pieces``."""
+    """Maximum number of QPs in a step; all strategies but ``modes`` may use ``strategies.RESTART_BUDGET`` times as many
+    while the result is far from the lower bound."""
     qp_solver: QpSolver | str | None = None
-    """None is OSQP, whose iterations are kernels where the body lies on a GPU."""
+    """None selects ``osqp``, or ``admm`` if the body is on a GPU."""
     strategy: Strategy | str = Strategy.MODES
     directions: int = 4
-    """n_d, edges of the friction pyramid of all strategies but ``pieces``, which has the cone."""
+    """n_d, number of edges of the friction pyramid. The strategy ``modes`` uses the exact cone instead."""
     activation_weight: float = 2e-4
-    """For a step of sqrt(H / g) / 19 and a muscle of 4 body weights. Shorter steps change speeds by less, so they weigh
-    activations less: by the square of their share. Stronger muscles weigh more, as their force."""
+    """Weight of squared activations for a step of sqrt(H / g) / 19 and a muscle of 4 body weights. It scales with the
+    square of the step size, because shorter steps change velocities by less, and with the force of the muscle."""
     activation_change_weight: float = 3e-3
-    """Likewise, by the step's share, and by the square of the force: the strong muscles of a stiff body would else play
-    full strokes against each other from step to step, further than the linearised program knows the way."""
+    """Weight of squared changes of activation; scales with the step size and with the square of the force. Without it,
+    strong muscles of a stiff body alternate at full range from step to step, beyond the range in which the linearised
+    QP is accurate."""
     drag: float = 0.0
-    """alpha, 1/s."""
+    """alpha of Rayleigh damping, 1/s."""
 
     def __post_init__(self) -> None:
-        # Names that are not known are refused here, not in the first step.
+        # Raises for unknown names here instead of in the first step.
         if self.qp_solver is not None:
             QpSolver(self.qp_solver)
         Strategy(self.strategy)
 
     def qp_solver_on(self, device: wp.Device) -> QpSolver:
-        """Who solves the QPs of a body that lies on ``device``."""
+        """Return the solver of the QPs for a body on ``device``."""
         if self.qp_solver is None:
             return QpSolver.ADMM if device.is_cuda else QpSolver.OSQP
         return QpSolver(self.qp_solver)

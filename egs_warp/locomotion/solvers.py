@@ -1,4 +1,7 @@
-"""Quadratic programs whose bounds change; the one place that imports DAQP."""
+"""Solvers of QPs whose bounds change while P, q and A stay the same.
+
+The only module that imports DAQP. See docs/concepts/locomotion.md#solvers.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +18,16 @@ from egs_warp.locomotion.admm import AdmmStatus
 from egs_warp.locomotion.operator_splitting import AdmmSplitting, OperatorSplitting, OsqpSplitting, SplittingRun
 
 MAX_VIOLATION = 3e-3
-"""By which a point of OSQP's iteration limit may leave its bounds and still be used."""
-_MOST_ITERATIONS = 4000
+"""Largest violation of its bounds up to which a point at the iteration limit is used."""
+_MAX_ITERATIONS = 4000
 _BOUND_PADDING = 0.3
-"""Of the accuracy, by which bounds are moved apart."""
-_HELD = 1e-12
-"""Between the bounds of a row that is held."""
+"""Bounds are widened by this times the accuracy."""
+_EQUALITY_WIDTH = 1e-12
+"""A row whose bounds are closer than this is an equality."""
 
 
 class QpStatus(Enum):
-    """How a QP ended; the value says cause and cure."""
+    """Status of a solved QP; the value names the cause and what to do."""
 
     SOLVED = "solved"
     INEXACT = "solved to a lower accuracy; the best point found is used"
@@ -41,18 +44,18 @@ _STATUS = {
     AdmmStatus.DOUBTFUL: QpStatus.INFEASIBLE,
     AdmmStatus.FAILED: QpStatus.FAILED,
 }
-"""Of a splitting that had all of its iterations."""
+"""QP status for each status of operator splitting."""
 
 
 class QpSolver(Enum):
-    """Who solves; chosen by name."""
+    """QP solver, selected by name."""
 
     OSQP = "osqp"
-    """Operator splitting: to an accuracy, warm-started, never stuck."""
+    """A few OSQP iterations on the host, then the active-set method."""
     ADMM = "admm"
-    """OSQP's operator splitting as kernels."""
+    """The same iterations and active-set method as kernels on the device."""
     DAQP = "daqp"
-    """Dual active set: to rounding."""
+    """DAQP, a dual active-set method on the host; an optional package."""
 
     @classmethod
     def _missing_(cls, value: object) -> QpSolver:
@@ -61,29 +64,36 @@ class QpSolver(Enum):
 
 @dataclass(frozen=True)
 class QpSolution:
-    """``x`` and ``multipliers`` are only meaningful where ``usable``."""
+    """Solution of a QP. ``x`` and ``multipliers`` have a meaning only if ``usable``."""
 
     status: QpStatus
     x: np.ndarray
     """(n,)."""
     multipliers: np.ndarray
-    """(m,) positive where the upper bound pushes (OSQP's sign)."""
+    """(m,) positive at an active upper bound (OSQP's sign)."""
     objective: float
 
     @property
     def usable(self) -> bool:
-        """Whether ``x`` may be read."""
+        """True if ``x`` may be used."""
         return self.status in (QpStatus.SOLVED, QpStatus.INEXACT, QpStatus.ITERATION_LIMIT)
 
 
 class QuadraticProgram(Protocol):
-    """min 1/2 x^T P x + q^T x subject to l <= A x <= u, set up once; a re-solve changes only l and u."""
+    """The QP min 1/2 x^T P x + q^T x subject to lower <= A x <= upper, set up once; a solve changes only the bounds."""
 
     def solve(
         self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, beside: bool = False
     ) -> QpSolution:
-        """Solve with these bounds (m,), warm-started from ``start`` (n,), or from the last solution; ``beside`` where
-        that is the optimum of a program beside this one."""
+        """Solve with these bounds.
+
+        Args:
+            lower: (m,).
+            upper: (m,).
+            start: (n,) warm start; None uses the last solution.
+            beside: True if another QP of the same step has been solved; ``SplittingProgram`` then skips operator
+                splitting.
+        """
         ...
 
 
@@ -96,8 +106,16 @@ def quadratic_program(
     accuracy: float = 3e-5,
     device: Device = None,
 ) -> QuadraticProgram:
-    """The program with P (n, n), q (n,) and A (m, n) for ``solver`` (or its name); ``accuracy`` is that of operator
-    splitting, ``device`` where it runs as kernels."""
+    """Set up the QP for ``solver`` (or its name).
+
+    Args:
+        P: (n, n).
+        q: (n,).
+        A: (m, n).
+        solver: solver.
+        accuracy: accuracy of operator splitting, absolute and relative.
+        device: device of the kernels of ``admm``.
+    """
     solver = QpSolver(solver)
     if solver is QpSolver.DAQP:
         return DaqpProgram(P, q, A)
@@ -109,10 +127,12 @@ def quadratic_program(
 
 
 class SplittingProgram:
-    """A ``QuadraticProgram`` by OSQP's operator splitting: a few iterations on the rows that matter tell which of them
-    hold the optimum, from where ``active_set`` finds it to rounding. Where rounding leads that astray, they go on with
-    all rows, to the splitting's own accuracy. A program beside one that is solved needs no iterations: the rows that
-    its minimum without bounds breaks are a guess that costs as little.
+    """``QuadraticProgram`` by operator splitting and the active-set method.
+
+    A few iterations of operator splitting, on the rows that the unconstrained minimum violates, guess the active rows.
+    From this guess ``active_set`` finds the optimum to rounding. After a numerical failure, operator splitting
+    continues with all rows to its own accuracy. With ``beside`` the iterations are skipped: the rows that
+    the unconstrained minimum violates are a guess from which the active-set method is as quick.
     """
 
     def __init__(
@@ -120,84 +140,89 @@ class SplittingProgram:
     ) -> None:
         self._P, self._q, self._A = P, q, A
         self._splitting = splitting
-        # What has next to no room between its bounds is as good as without any: room to the accuracy that is asked.
-        self._room = _BOUND_PADDING * accuracy
+        # A region that is a single point has unbounded multipliers, so bounds are widened, within the accuracy.
+        self._padding = _BOUND_PADDING * accuracy
         self._rows = WhitenedQp.of(P, q, A)
-        self._whole: SplittingRun | None = None
+        self._full_run: SplittingRun | None = None
         self._start: np.ndarray | None = None
 
     def solve(
         self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, beside: bool = False
     ) -> QpSolution:
-        """See ``QuadraticProgram``."""
+        """Solve with bounds ``lower``, ``upper`` (m,), see ``QuadraticProgram.solve``."""
         start = self._start if start is None else start
-        if (upper - lower < _HELD).any():
-            # Rows that are held, as those of contact states are, repeat each other: met to an accuracy, not exactly.
-            return self._by_iterations(lower, upper, start)
+        if (upper - lower < _EQUALITY_WIDTH).any():
+            # Equality rows, as those of contact states, are redundant: they are satisfied to an accuracy, not exactly.
+            return self._solve_by_splitting(lower, upper, start)
         rows = self._rows
-        lower, upper = lower - self._room, upper + self._room
-        chosen = (rows.values_at_minimum < lower) | (rows.values_at_minimum > upper)
-        if not chosen.any():
-            # As in flight: there is nothing to iterate on.
-            return self._exact(rows.minimum, np.zeros(len(lower)))
+        lower, upper = lower - self._padding, upper + self._padding
+        violated = (rows.values_at_minimum < lower) | (rows.values_at_minimum > upper)
+        if not violated.any():
+            # No bound is active, as in flight.
+            return self._solved(rows.minimum, np.zeros(len(lower)))
         if beside:
-            return self._from_the_minimum(lower, upper, start)
-        index = np.flatnonzero(chosen)
-        # In coordinates in which costs are squares of distances, where a few iterations go far.
+            return self._solve_from_minimum(lower, upper, start)
+        index = np.flatnonzero(violated)
+        # In whitened coordinates a few iterations are enough.
         below, above = (
             (lower - rows.values_at_minimum) / rows.row_norms,
             (upper - rows.values_at_minimum) / rows.row_norms,
         )
         z = None if start is None else rows.whiten(start)
-        made = self._splitting.warm_start(rows.unit_rows[index], below[index], above[index], z)
+        result = self._splitting.warm_start(rows.unit_rows[index], below[index], above[index], z)
         if (
-            made.ending not in (AdmmStatus.SOLVED, AdmmStatus.INEXACT, AdmmStatus.LIMIT)
-            or not np.isfinite(made.x).all()
+            result.ending not in (AdmmStatus.SOLVED, AdmmStatus.INEXACT, AdmmStatus.LIMIT)
+            or not np.isfinite(result.x).all()
         ):
-            # Whether there is no point the search finds out: OSQP leaves 2e9 where it doubts that there is any.
-            return self._from_the_minimum(lower, upper, start)
+            # The active-set method decides whether the QP is feasible: OSQP returns x = 2e9 where it is uncertain.
+            return self._solve_from_minimum(lower, upper, start)
         multipliers = np.zeros(len(lower))
-        multipliers[index] = made.multipliers
-        at = rows.unit_rows @ made.x
+        multipliers[index] = result.multipliers
+        at = rows.unit_rows @ result.x
         low, high = at - below < -multipliers, above - at < multipliers
-        found = self._finished(lower, upper, low, high & ~low)
-        return found or self._by_iterations(lower, upper, start)
+        solution = self._solve_from_guess(lower, upper, low, high & ~low)
+        return solution or self._solve_by_splitting(lower, upper, start)
 
-    def _from_the_minimum(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> QpSolution:
-        """From the rows that the minimum without bounds breaks."""
-        free = self._rows.values_at_minimum
-        return self._finished(lower, upper, free < lower, free > upper) or self._by_iterations(lower, upper, start)
+    def _solve_from_minimum(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> QpSolution:
+        """Solve with the guess that the rows which the unconstrained minimum violates are active."""
+        values = self._rows.values_at_minimum
+        return self._solve_from_guess(lower, upper, values < lower, values > upper) or self._solve_by_splitting(
+            lower, upper, start
+        )
 
-    def _finished(self, lower: np.ndarray, upper: np.ndarray, low: np.ndarray, high: np.ndarray) -> QpSolution | None:
-        """The optimum, from a guess of the rows that hold it at which bound; None where rounding leads astray."""
-        found = solve_from_guess(self._rows, lower, upper, low, high)
-        if found is None:
+    def _solve_from_guess(
+        self, lower: np.ndarray, upper: np.ndarray, low: np.ndarray, high: np.ndarray
+    ) -> QpSolution | None:
+        """Solve from a guess of the active bounds, (m,) bool each; return None on numerical failure."""
+        solution = solve_from_guess(self._rows, lower, upper, low, high)
+        if solution is None:
             return None
-        if not found.feasible:
+        if not solution.feasible:
             return _solution(QpStatus.INFEASIBLE, self._P, self._q, None, None, len(lower))
-        return self._exact(found.x, found.multipliers)
+        return self._solved(solution.x, solution.multipliers)
 
-    def _exact(self, x: np.ndarray, multipliers: np.ndarray) -> QpSolution:
+    def _solved(self, x: np.ndarray, multipliers: np.ndarray) -> QpSolution:
+        """Return a solved solution, and store ``x`` for the next warm start."""
         self._start = x
         return _solution(QpStatus.SOLVED, self._P, self._q, x, multipliers, len(multipliers))
 
-    def _by_iterations(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> QpSolution:
-        """With all rows, set up once: the splitting's own accuracy."""
-        if self._whole is None:
-            self._whole = self._splitting.full_run(self._A, _MOST_ITERATIONS)
-        made = self._whole.run(lower, upper, start)
-        status = _STATUS[made.ending]
+    def _solve_by_splitting(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> QpSolution:
+        """Solve by operator splitting with all rows, to its own accuracy. Set up at the first call."""
+        if self._full_run is None:
+            self._full_run = self._splitting.full_run(self._A, _MAX_ITERATIONS)
+        result = self._full_run.run(lower, upper, start)
+        status = _STATUS[result.ending]
         if status is QpStatus.ITERATION_LIMIT:
-            rows = self._A @ made.x
-            broken = max(float((lower - rows).max()), float((rows - upper).max()))
-            status = status if broken <= MAX_VIOLATION else QpStatus.FAILED
-        found = _solution(status, self._P, self._q, made.x, made.multipliers, len(lower))
-        self._start = found.x if found.usable else None
-        return found
+            rows = self._A @ result.x
+            violation = max(float((lower - rows).max()), float((rows - upper).max()))
+            status = status if violation <= MAX_VIOLATION else QpStatus.FAILED
+        solution = _solution(status, self._P, self._q, result.x, result.multipliers, len(lower))
+        self._start = solution.x if solution.usable else None
+        return solution
 
 
 class DaqpProgram:
-    """A ``QuadraticProgram`` for DAQP (MIT); P must be positive definite."""
+    """``QuadraticProgram`` by DAQP (MIT); P must be positive definite."""
 
     def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray) -> None:
         self._P, self._q = np.ascontiguousarray(P), q
@@ -206,21 +231,22 @@ class DaqpProgram:
         except ImportError as error:
             raise UserError("QP solver daqp: the package is not installed; pip install daqp, or use osqp") from error
         count = len(q)
-        # DAQP takes leading rows of the identity as plain bounds.
+        # DAQP treats leading rows of the identity as simple bounds.
         plain = A.shape[0] >= count and np.array_equal(A[:count], np.eye(count))
         self._rows = np.ascontiguousarray(A[count:] if plain else A)
         self._model = daqp.Model()
-        # A static contact's rows repeat each other: without reduction DAQP takes some sets of them for contradictory.
+        # The rows of a static contact are redundant: without reduction DAQP reports some of them as infeasible.
         self._model.settings = {"eq_reduction": 1}
         self._ready = False
 
     def solve(
         self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, beside: bool = False
     ) -> QpSolution:
-        """See ``QuadraticProgram``; it starts from its own last active set."""
+        """Solve with bounds ``lower``, ``upper`` (m,). DAQP starts from its last active set; ``start`` and ``beside``
+        are ignored."""
         low, high = np.maximum(lower, -1e30), np.minimum(upper, 1e30)
         held = np.where(high - low < 1e-13, 5, 0).astype(np.int32)
-        # Setting up already finds held rows that contradict each other.
+        # The setup already detects equality rows that contradict each other.
         if self._ready:
             flag = self._model.update(bupper=high, blower=low, sense=held)
         else:
@@ -235,12 +261,13 @@ class DaqpProgram:
             2: QpStatus.INEXACT,
             -1: QpStatus.INFEASIBLE,
             -4: QpStatus.ITERATION_LIMIT,
-            -6: QpStatus.INFEASIBLE,  # held rows contradict each other
+            -6: QpStatus.INFEASIBLE,  # equality rows contradict each other
         }.get(flag, QpStatus.FAILED)
         return _solution(status, self._P, self._q, x, multipliers, len(lower))
 
 
 def _solution(status: QpStatus, P: np.ndarray, q: np.ndarray, x: Any, multipliers: Any, rows: int) -> QpSolution:
+    """Return the solution of this ``status``, with x = 0 and an infinite objective where it is not usable."""
     solution = QpSolution(status, x, multipliers, float("inf"))
     if not solution.usable or x is None or not np.isfinite(x).all():
         failed = QpStatus.INFEASIBLE if status is QpStatus.INFEASIBLE else QpStatus.FAILED

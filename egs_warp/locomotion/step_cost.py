@@ -1,6 +1,6 @@
-"""What a step's end costs, as a quadratic over activations and contact forces: objectives and effort (Eq. 13).
+"""Cost of the end of a step, quadratic in activations and contact forces: objectives and elastic effort (Eq. 13).
 
-See docs/concepts/locomotion.md.
+See docs/concepts/locomotion.md#cost.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from egs_warp.locomotion.linear_step import LinearStep
 from egs_warp.locomotion.objectives import AnyObjective, Objective
 
 EFFORT_WEIGHT = 1.0
-"""Cost of m g H of elastic and damping energy."""
+"""Cost of the energy m g H, elastic and damping."""
 EFFORT_HORIZON = 0.16
-"""Of sqrt(H / g): how far ahead that energy is foreseen. One step ahead, a body that holds itself bent gains next to
-nothing by letting go."""
+"""Time in sqrt(H / g) after the start of a step at which the elastic energy is evaluated. A horizon of one step is too
+short: a body that holds itself bent gains almost nothing by releasing the strain for one step."""
 
 
 @dataclass(frozen=True)
 class QuadraticCost:
-    """1/2 x^T P x + q^T x + constant."""
+    """Cost 1/2 x^T P x + q^T x + constant."""
 
     P: np.ndarray
     """(k, k)."""
@@ -45,7 +45,18 @@ def objectives_cost(
     objectives: Sequence[AnyObjective],
     speed: float,
 ) -> Callable[[], QuadraticCost]:
-    """Begins what gives the weighted squares that a motion asks for, in units of ``speed`` m/s, sqrt(g H)."""
+    """Start computing the weighted squares of ``objectives``, in units of ``speed``; it may run asynchronously on a
+    device.
+
+    Args:
+        problem: the step.
+        linear: end of the step as a function of k unknowns x.
+        contacts: contacts whose forces are the last unknowns.
+        objectives: objectives of the motion.
+        speed: unit of speed sqrt(g H), m/s.
+    Returns:
+        A function that blocks for the cost over x.
+    """
     squares = linear.objective_quadratic([each for each in objectives if isinstance(each, Objective)])
 
     def cost() -> QuadraticCost:
@@ -55,10 +66,10 @@ def objectives_cost(
             if isinstance(objective, Objective):
                 continue
             rows = objective.slopes(problem, contacts, linear.torques, speed)
-            gap = objective.residual(problem, contacts, np.zeros(0), np.zeros(3), speed)
+            residual = objective.residual(problem, contacts, np.zeros(0), np.zeros(3), speed)
             P += 2.0 * objective.weight * rows.T @ rows
-            q += 2.0 * objective.weight * rows.T @ gap
-            constant += objective.weight * float(gap @ gap)
+            q += 2.0 * objective.weight * rows.T @ residual
+            constant += objective.weight * float(residual @ residual)
         return QuadraticCost(P, q, constant)
 
     return cost
@@ -72,82 +83,112 @@ def objectives_value(
     forces: np.ndarray,
     speed: float,
 ) -> float:
-    """The same weighted squares of a step that ends at ``velocities`` (N, 3) under contact ``forces`` (n, 3); loads
-    are left out."""
-    gained = problem.dt * (problem.rotation_modes.T @ contacts.nodal_forces(forces))
-    gaps = [objective.residual(problem, contacts, velocities.ravel(), gained, speed) for objective in objectives]
-    return sum(objective.weight * float(gap @ gap) for objective, gap in zip(objectives, gaps, strict=True))
+    """Return the weighted squares of ``objectives`` at an end of the step, in the same units. Load objectives are zero
+    here.
+
+    Args:
+        velocities: (N, 3) m/s, end of the step.
+        forces: (n, 3) N, contact forces.
+        speed: unit of speed sqrt(g H), m/s.
+    """
+    angular_impulse = problem.dt * (problem.rotation_modes.T @ contacts.nodal_forces(forces))
+    residuals = [
+        objective.residual(problem, contacts, velocities.ravel(), angular_impulse, speed) for objective in objectives
+    ]
+    return sum(
+        objective.weight * float(residual @ residual) for objective, residual in zip(objectives, residuals, strict=True)
+    )
 
 
 @dataclass(frozen=True)
 class EffortModel:
-    """A foreseen end of a step, and one implicit step from there on, of which what is stiff is slack."""
+    """Quadratic model of elastic energy and damping potential about the predicted end of a step, for a motion that
+    continues after the step as one implicit step over the rest of the horizon."""
 
     positions: np.ndarray
-    """(N, 3) metres."""
+    """(N, 3) m, predicted end of the step."""
     duration: float
-    """Seconds after the start of the step."""
+    """s, time from the start of the step to the horizon."""
     energy: float
-    """Elastic, and what damping takes until then, joules."""
+    """J, elastic energy and damping potential at ``positions``."""
     gradient: np.ndarray
-    """(3N,) newtons, its derivative by the positions."""
+    """(3N,) N, derivative of the energy by positions."""
     stiffness_entries: Any
-    """(nnz,) upper entries of the elements' stiffness at the end, made semi-definite, where ``factors`` are."""
+    """(nnz,) N/m, upper entries of the projected (positive semidefinite) element Hessian, on the device of
+    ``factors``."""
     factors: LinearSolver
-    """Of the step's matrix."""
+    """Factors of M + h^2 K, with h the ``duration``."""
 
     @classmethod
     def of(
-        cls, problem: StepProblem, foreseen: np.ndarray, factors: LinearSolver, *, horizon: float = EFFORT_HORIZON
+        cls,
+        problem: StepProblem,
+        predicted_velocities: np.ndarray,
+        factors: LinearSolver,
+        *,
+        horizon: float = EFFORT_HORIZON,
     ) -> EffortModel:
-        """``horizon`` sqrt(H / g) after the start, from the end of ``foreseen`` (N, 3) m/s; ``factors`` take its
-        matrix."""
+        """Build the model at the end of the step and start its factorisation.
+
+        Args:
+            predicted_velocities: (N, 3) m/s, predicted end velocities.
+            factors: solver that takes the matrix M + h^2 K.
+            horizon: h in units of sqrt(H / g); h is at least one step.
+        """
         body = problem.body
-        assembly, time = body.assembly, max(horizon * body.time_unit, problem.dt)
-        end, damping = problem.end_positions(foreseen), assembly.damping(problem.state.positions, time)
-        energy, slope = assembly.energy_and_gradient(end, damping)
-        entries = assembly.entries_for(factors, end, damping, projected=True)
-        # Last: what a GPU has begun it goes on with while the host does other things.
-        factors.start_update(time**2 * entries, np.repeat(body.node_mass, 3))
-        return cls(end, time, energy, slope.ravel(), entries, factors)
+        assembly, duration = body.assembly, max(horizon * body.time_unit, problem.dt)
+        positions, damping = (
+            problem.end_positions(predicted_velocities),
+            assembly.damping(problem.state.positions, duration),
+        )
+        energy, gradient = assembly.energy_and_gradient(positions, damping)
+        entries = assembly.entries_for(factors, positions, damping, projected=True)
+        # Last, because a GPU factors asynchronously while the host continues.
+        factors.start_update(duration**2 * entries, np.repeat(body.node_mass, 3))
+        return cls(positions, duration, energy, gradient.ravel(), entries, factors)
 
 
 def effort_cost(
     problem: StepProblem,
     linear: LinearStep,
-    foreseen: np.ndarray,
-    horizon: EffortModel,
+    predicted_velocities: np.ndarray,
+    model: EffortModel,
     *,
     weight: float = EFFORT_WEIGHT,
 ) -> QuadraticCost:
-    """``weight`` / (m g H) times the elastic energy and what damping takes, at the ``horizon`` if the body goes on at
-    its end velocity, around ``foreseen`` (3N,) m/s.
+    """Return ``weight`` / (m g H) times the elastic energy and damping potential at the horizon of ``model``.
 
-    Of all the shapes in which a body does what is asked, it takes the one that strains it least, and gives back what
-    it has stored: without this, muscles work against each other. What is stiff goes on only until it is slack, as in
-    one implicit step over the horizon: carried on at its speed, what lets go would seem to be strained the other way.
+    Among all shapes that meet the objectives, the body takes the one with the least strain, and it returns stored
+    energy. Without this term muscles work against each other. After the step the motion continues as one implicit step
+    over the rest of the horizon, in which stiff modes move only until they are relaxed. At constant velocity a released
+    mode would appear to be strained in the opposite direction.
+
+    Args:
+        linear: end velocity of the step as a function of the unknowns x.
+        predicted_velocities: (3N,) m/s, end velocities about which the energy is expanded.
+        model: energy, gradient and Hessian there.
     """
-    body, factors = problem.body, horizon.factors
+    body, factors = problem.body, model.factors
     if factors.is_host:
         _require_factors(factors)
     quadratic, force = factors.effort_quadratic(
-        horizon.stiffness_entries,
-        horizon.gradient,
+        model.stiffness_entries,
+        model.gradient,
         np.repeat(body.node_mass, 3),
         linear.velocities,
         dt_now=problem.dt,
-        dt_ahead=horizon.duration - problem.dt,
-        reference=problem.dt * foreseen,
+        dt_ahead=model.duration - problem.dt,
+        reference=problem.dt * predicted_velocities,
     )
     _require_factors(factors)
     unit = weight / (body.weight * body.height)
     return QuadraticCost(
         unit * quadratic[:-1, :-1],
         unit * (force[:-1] + quadratic[:-1, -1]),
-        unit * (horizon.energy + float(force[-1] + 0.5 * quadratic[-1, -1])),
+        unit * (model.energy + float(force[-1] + 0.5 * quadratic[-1, -1])),
     )
 
 
 def _require_factors(factors: LinearSolver) -> None:
     if not factors.is_ready:
-        raise UnsolvableStepError("the matrix of what is foreseen has no factors")
+        raise UnsolvableStepError("the effort matrix of the predicted end could not be factored")

@@ -1,4 +1,9 @@
-"""The stepper: foresee the contact, choose the muscles, solve motion and contact together (Eq. 4, 9, 12, 13)."""
+"""The stepper: predict the end of a step, plan the activations, solve motion and contact together (Eq. 4, 9, 12, 13).
+
+``LocomotionStepper.step`` is one step, ``LocomotionStepper.advance`` also repeats one that does not converge. The
+stages are in ``contact.selection`` (contact points), ``linear_step`` and ``planner`` (plan) and
+``contact.coupled_step`` (solve). On a GPU with the strategy ``modes``, ``device_plan`` replaces prediction and plan.
+"""
 
 from __future__ import annotations
 
@@ -37,57 +42,69 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy, activation_jacobian
 
 MAX_HALVINGS = 4
+"""Maximum number of successive halvings of a step that does not converge."""
 _REPLAN_FACTOR, _REPLAN_MARGIN = 1.2, 0.01
-"""A step whose end costs more than this factor of what its program expected, and this much more, is asked for again."""
+"""A step is replanned if its objectives cost more than this factor times the value that the plan expects, plus this
+margin."""
 
 
 @dataclass(frozen=True)
 class WarmStart:
-    """What a step hands to the next."""
+    """Data that a step passes to the next one."""
 
     points: np.ndarray
-    """(n,) contact points in use."""
+    """(n,) indices of the contact points in use."""
     forces: np.ndarray
-    """(n, 3) newtons."""
+    """(n, 3) N, in the axes of each contact."""
     activations: np.ndarray
-    """(M,) metres."""
+    """(M,) m."""
 
     @classmethod
     def from_report(cls, report: StepReport) -> WarmStart:
-        """What the step of ``report`` hands on."""
+        """Return the warm start of the step that follows the step of ``report``."""
         return cls(report.contacts.points, report.forces, report.activations)
 
     def is_identical(self, other: WarmStart) -> bool:
-        """Whether it has the very arrays of the ``other``."""
+        """Return True if the arrays are the same objects as those of ``other``."""
         return self.points is other.points and self.forces is other.forces and self.activations is other.activations
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """What happened in one step."""
+    """Result of one step."""
 
     state: BodyState
+    """State at the end of the step."""
     dt: float
+    """s."""
     contacts: ContactSet
     forces: np.ndarray
-    """(n, 3) newtons in each contact's frame."""
+    """(n, 3) N, normal and two tangential components in the axes of each contact."""
     end_gaps: np.ndarray
-    """(n,) metres."""
+    """(n,) m, at the end of the step."""
     min_gap: float
-    """Smallest gap of all contact points at the end of the step, metres."""
+    """m, smallest gap of all contact points at the end of the step."""
     activations: np.ndarray
-    """(M,) metres."""
+    """(M,) m."""
     qp_count: int
+    """Number of QPs that were solved."""
     qp_infeasible: int
+    """Number of QPs without a solution."""
     newton_iterations: int
     converged: bool
     added_spin: float
-    """rad/s that implicit Euler would have eaten, see ``StepProblem``."""
+    """rad/s, rotation added to the end velocities to conserve the angular momentum that implicit Euler loses, see
+    ``StepProblem``."""
     milliseconds: dict[str, float] = field(default_factory=dict)
+    """Wall-clock time of each stage, ms."""
 
 
 class LocomotionStepper:
-    """Orchestrates the kernels and the QP for one body."""
+    """Stepper of one body with its muscles and its ground.
+
+    Attributes that other packages use: ``detector`` and ``points`` detect gaps and select contacts, ``solver`` solves
+    motion and contact, ``planner`` plans activations.
+    """
 
     def __init__(
         self,
@@ -115,7 +132,7 @@ class LocomotionStepper:
         self.factors = linear_solver_on(body.assembly.device, body.assembly.upper_pattern)
         self.linearizer = _make_linearizer(self.factors, body, muscles, self.solver)
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
-        # On one thread: what is found here must not hang on how many there are.
+        # One thread, so that the synergies do not depend on the number of threads.
         with one_blas_thread():
             problem = StepProblem(body, rest, body.time_unit / MIN_STEPS_PER_TIME_UNIT)
             tangent = problem.tangent(self.factors, rest.velocities, None)
@@ -130,14 +147,14 @@ class LocomotionStepper:
             linear_solver_on(body.assembly.device, body.assembly.upper_pattern),
             make_step_linearizer(self.linearizer, muscles, synergies),
         )
-        # By this planner; and how the step begins that comes next, likely.
         self._device_planner = _make_device_planner(self.planner, self.linearizer, self.solver)
+        # The prefetched inputs of the next step, with the warm start for which they are valid.
         self._prefetched: tuple[WarmStart, StepInputs] | None = None
 
     def with_friction(self, friction: float) -> LocomotionStepper:
-        """The same on ground of another Coulomb coefficient, for nothing: it shares what this one works with, so the
-        two are for one thread."""
-        # Not by ``copy``, which makes one anew.
+        """Return a stepper for the same ground with another Coulomb coefficient. It is cheap, because it shares the
+        factors and buffers of this one; therefore use both in one thread only."""
+        # ``copy.copy`` would call ``__reduce__`` and build a new stepper.
         other = object.__new__(type(self))
         vars(other).update(vars(self))
         other.geometry = replace(self.geometry, friction=friction)
@@ -149,17 +166,17 @@ class LocomotionStepper:
         return other
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """It is made anew wherever a copy of it is read: its arrays lie on a device."""
+        """Pickle as the constructor call, because the arrays are on a device."""
         device = str(self.body.assembly.device)
-        made = partial(LocomotionStepper, settings=self.settings, device=device)
-        return made, (self.body, self.muscles, self.geometry)
+        constructor = partial(LocomotionStepper, settings=self.settings, device=device)
+        return constructor, (self.body, self.muscles, self.geometry)
 
     def initial_memory(self) -> WarmStart:
-        """No contacts, muscles at rest."""
+        """Return the warm start of a first step: no contacts, activations of zero."""
         return WarmStart(np.zeros(0, int), np.zeros((0, 3)), np.zeros(self.muscles.segment_count))
 
     def passive_step(self, state: BodyState, memory: WarmStart, dt: float) -> CoupledResult:
-        """A step of ``dt`` s without muscles."""
+        """Solve a step of ``dt`` s without muscles, from the rigid motion of the body."""
         problem = StepProblem(self.body, state, dt)
         contacts = self._detect(problem, memory)
         response = self.linearizer(problem.tangent(self.factors, problem.rigid_guess, None), contacts)
@@ -173,50 +190,65 @@ class LocomotionStepper:
         objectives: Sequence[AnyObjective],
         dt: float,
     ) -> tuple[BodyState, WarmStart, list[StepReport]]:
-        """One step of ``dt``; one that does not converge is done again in halves, since what is asked is asked for the
-        whole of it: under the same activations, and under those of the step before. Of the two ends the one that costs
-        the objectives less: where muscles go so far that no end is found, nobody has seen what they do.
+        """Make one step of ``dt`` s; if it does not converge, repeat it as half steps.
+
+        The half steps do not replan: the objectives are those of the whole step. The planned activations may be the
+        cause, so the half steps are computed twice, with the planned and with the previous activations. Of the two
+        results one that converged is preferred, then the one with the lower objective value.
+
+        Args:
+            state: state at the start.
+            memory: warm start from the previous step.
+            objectives: objectives on the end of the step.
+            dt: step size, s.
+
+        Returns:
+            State at the end, warm start of the next step, and the report of each step that was made, in order.
         """
         with one_blas_thread(), self.factors.stream:
             end, after, report = self.step(state, memory, objectives, dt)
             if report.converged:
                 return end, after, [report]
             ends = [
-                self._in_halves(state, memory, activations, dt, MAX_HALVINGS)
+                self._half_steps(state, memory, activations, dt, MAX_HALVINGS)
                 for activations in (report.activations, memory.activations)
             ]
-            return min(ends, key=lambda end: self._cost_of_halves(state, end[2], objectives))
+            return min(ends, key=lambda end: self._rank_half_steps(state, end[2], objectives))
 
-    def _cost_of_halves(
+    def _rank_half_steps(
         self, state: BodyState, reports: Sequence[StepReport], objectives: Sequence[AnyObjective]
     ) -> tuple[bool, float]:
-        """Whether any of the ``reports`` from ``state`` on has not converged, and what their end costs."""
+        """Return the rank of half steps for ``advance``: True if any of ``reports`` did not converge, then the
+        objective value at their end. ``state`` is the start of the first."""
         before, last = (reports[-2].state if len(reports) > 1 else state), reports[-1]
         problem = StepProblem(self.body, before, last.dt, self.settings.drag)
-        missed = objectives_value(
+        value = objectives_value(
             problem, last.contacts, objectives, last.state.velocities, last.forces, self.body.speed_unit
         )
-        return not all(report.converged for report in reports), missed
+        return not all(report.converged for report in reports), value
 
     def advance_with_activations(
         self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float
     ) -> tuple[BodyState, WarmStart, list[StepReport]]:
-        """As ``advance``, under given ``activations`` (M,) metres."""
+        """Make one step of ``dt`` s with prescribed ``activations`` (M,) m, as half steps if it does not converge; see
+        ``advance``."""
         with one_blas_thread(), self.factors.stream:
             end, after, report = self.step_with_activations(state, memory, activations, dt)
             if report.converged:
                 return end, after, [report]
-            return self._in_halves(state, memory, activations, dt, MAX_HALVINGS)
+            return self._half_steps(state, memory, activations, dt, MAX_HALVINGS)
 
-    def _in_halves(
-        self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float, left: int
+    def _half_steps(
+        self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float, max_halvings: int
     ) -> tuple[BodyState, WarmStart, list[StepReport]]:
+        """Make two steps of ``dt`` / 2 with ``activations`` (M,) m, each of which is halved again up to
+        ``max_halvings`` - 1 times if it does not converge."""
         reports: list[StepReport] = []
         for _ in range(2):
             end, after, report = self.step_with_activations(state, memory, activations, 0.5 * dt)
             done = [report]
-            if not report.converged and left > 1:
-                end, after, done = self._in_halves(state, memory, activations, 0.5 * dt, left - 1)
+            if not report.converged and max_halvings > 1:
+                end, after, done = self._half_steps(state, memory, activations, 0.5 * dt, max_halvings - 1)
             state, memory = end, after
             reports += done
         return state, memory, reports
@@ -224,27 +256,51 @@ class LocomotionStepper:
     def step_with_activations(
         self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float
     ) -> tuple[BodyState, WarmStart, StepReport]:
-        """A step of ``dt`` s under given ``activations`` (M,) metres."""
+        """Make one step of ``dt`` s with prescribed ``activations`` (M,) m: detect, predict, solve, report.
+
+        Returns:
+            State at the end, warm start of the next step, and the report, which says whether the step converged.
+        """
         clock = StageClock()
         problem = StepProblem(self.body, state, dt, self.settings.drag)
         start = self.step_inputs(problem, self._detect(problem, memory), memory)
-        prospect = self.predict(replace(start, activations=activations))
+        predicted = self.predict(replace(start, activations=activations))
         clock.lap("foresee")
-        plan = Plan(activations, prospect.velocities, prospect.forces)
-        result = self._solve(prospect.linearization, plan)
+        plan = Plan(activations, predicted.velocities, predicted.forces)
+        result = self._solve(predicted.linearization, plan)
         clock.lap("solve")
         return self._finish(problem, plan, result, clock)
 
     def step(
         self, state: BodyState, memory: WarmStart, objectives: Sequence[AnyObjective], dt: float
     ) -> tuple[BodyState, WarmStart, StepReport]:
-        """Detect, foresee, plan, solve, report, and begin the next."""
+        """Make one step of ``dt`` s: detect, predict, plan, solve, replan if the plan was inaccurate, report.
+
+        1. Detect (``_start``): select the contact points that the step may bring to the ground, and transfer their
+           previous forces.
+        2. Predict and plan (``_plan``): predict the end of the step under the previous activations, linearise the step
+           there, and find the activations that minimise the cost subject to Coulomb contact.
+        3. Solve (``_solve``): solve the equation of motion and contact together, nonlinearly, with the planned
+           activations fixed (``CoupledSolver``).
+        4. Replan (``_replan``): if the objectives cost clearly more than the plan expects, plan about the solved end
+           and solve again.
+        5. Report (``_finish``). On a GPU, also start the prediction of the next step asynchronously.
+
+        Args:
+            state: state at the start.
+            memory: warm start from the previous step.
+            objectives: objectives on the end of the step.
+            dt: step size, s.
+
+        Returns:
+            State at the end, warm start of the next step, and the report, which says whether the step converged.
+        """
         clock = StageClock()
         start = self._start(state, memory, dt)
         problem = start.problem
         clock.lap("detect")
         response, plan = self._plan(start, objectives, clock)
-        # A GPU is on its way to the end meanwhile.
+        # Meanwhile a GPU already runs the solve.
         expected = self._objective_value(problem, objectives, response.contacts, plan)
         result = self._solve(response, plan)
         clock.lap("solve")
@@ -256,7 +312,7 @@ class LocomotionStepper:
             plan, result = self._replan(problem, plan, result, memory, objectives, clock)
         end, after, report = self._finish(problem, plan, result, clock)
         if self._device_planner is not None and report.converged:
-            # A GPU foresees the next one while the motion is asked what that is to do.
+            # A GPU predicts the next step while the motion computes its objectives.
             start = self._start(end, after, dt)
             self._device_planner.start(start)
             self._prefetched = after, start
@@ -264,31 +320,42 @@ class LocomotionStepper:
         return end, after, report
 
     def _start(self, state: BodyState, memory: WarmStart, dt: float) -> StepInputs:
-        """How a step begins, as it was begun when the one before had ended, if it goes on from there."""
-        ahead, self._prefetched = self._prefetched, None
-        if ahead is not None and ahead[0].is_identical(memory) and ahead[1].problem.starts_from(state, dt):
-            return ahead[1]
+        """Detect the contacts of a step and collect its inputs, or return those that were prefetched after the previous
+        step if the step continues from there."""
+        prefetched, self._prefetched = self._prefetched, None
+        if (
+            prefetched is not None
+            and prefetched[0].is_identical(memory)
+            and prefetched[1].problem.starts_from(state, dt)
+        ):
+            return prefetched[1]
         problem = StepProblem(self.body, state, dt, self.settings.drag)
         return self.step_inputs(problem, self._detect(problem, memory), memory)
 
     def step_inputs(self, problem: StepProblem, contacts: ContactSet, memory: WarmStart) -> StepInputs:
-        """How a step with these ``contacts`` begins after that of the ``memory``."""
-        known = self.points.transfer_forces(contacts.points, memory.points, memory.forces)
-        shift = self.solver.normal_bias(contacts, problem.dt)
-        return StepInputs(problem, contacts, shift, self.geometry.friction, memory.activations, known)
+        """Collect the inputs of a step with these ``contacts``: velocity bias, and the previous activations and contact
+        forces of ``memory``."""
+        previous_forces = self.points.transfer_forces(contacts.points, memory.points, memory.forces)
+        bias = self.solver.normal_bias(contacts, problem.dt)
+        return StepInputs(problem, contacts, bias, self.geometry.friction, memory.activations, previous_forces)
 
     def _plan(
         self, start: StepInputs, objectives: Sequence[AnyObjective], clock: StageClock
     ) -> tuple[ContactLinearization, Plan]:
-        """What is foreseen, and the plan about it: on a GPU at once, if all goes as usual."""
+        """Predict the end of the step and plan its activations about it. On a GPU the device planner does both at once;
+        where it returns None, or on a CPU, they are done one after the other.
+
+        Returns:
+            The contact linearisation at the predicted end, and the plan.
+        """
         if self._device_planner is not None:
-            found = self._device_planner.plan(start, objectives)
+            planned = self._device_planner.plan(start, objectives)
             clock.lap("plan")
-            if found is not None:
-                return found
-        prospect = self.predict(start)
+            if planned is not None:
+                return planned
+        predicted = self.predict(start)
         clock.lap("foresee")
-        return prospect.linearization, self.planner.plan(prospect, start.activations, objectives, clock)
+        return predicted.linearization, self.planner.plan(predicted, start.activations, objectives, clock)
 
     def _replan(
         self,
@@ -299,16 +366,20 @@ class LocomotionStepper:
         objectives: Sequence[AnyObjective],
         clock: StageClock,
     ) -> tuple[Plan, CoupledResult]:
-        """The muscles went further than the tangent knows the way: asked again from where they have brought it. Of the
-        two ends the one that costs the objectives less."""
+        """Plan again about the solved end of ``result``, with its tangent, and solve again. Strong muscles can move the
+        body beyond the range in which the linearisation about the predicted end is accurate.
+
+        Returns:
+            Plan and result with the lower objective value; the plan counts the QPs of both.
+        """
         response = result.linearization
-        shift = self.solver.normal_bias(result.contacts, problem.dt)
-        prospect = PredictedStep(response, shift, plan.activations, result.velocities, result.forces)
+        bias = self.solver.normal_bias(result.contacts, problem.dt)
+        predicted = PredictedStep(response, bias, plan.activations, result.velocities, result.forces)
         other = None
         if self._device_planner is not None:
-            other = self._device_planner.replan(prospect, memory.activations, objectives, self.geometry.friction)
+            other = self._device_planner.replan(predicted, memory.activations, objectives, self.geometry.friction)
         if other is None:
-            other = self.planner.plan(prospect, memory.activations, objectives, clock)
+            other = self.planner.plan(predicted, memory.activations, objectives, clock)
         end = self._solve(response, other)
         clock.lap("again")
         costs = [self._objective_value(problem, objectives, one.contacts, one) for one in (result, end)]
@@ -317,6 +388,7 @@ class LocomotionStepper:
         return plan.counting(plan, other), result
 
     def _solve(self, response: ContactLinearization, plan: Plan) -> CoupledResult:
+        """Solve motion and contact with the planned activations, starting at the end that the plan expects."""
         tension = MuscleEnergy.of(self.muscles, plan.activations)
         return self.solver.solve(response, tension, velocities=plan.velocities, forces=plan.forces)
 
@@ -327,9 +399,12 @@ class LocomotionStepper:
         contacts: ContactSet,
         end: Plan | CoupledResult,
     ) -> float:
+        """Return the objective value at ``end``, the expected end of a plan or the end of a solve."""
         return objectives_value(problem, contacts, objectives, end.velocities, end.forces, self.body.speed_unit)
 
     def _detect(self, problem: StepProblem, memory: WarmStart) -> ContactSet:
+        """Select the contacts of the step: points in use and points that the ballistic motion brings close to the
+        ground. Uses the prefetched selection of the linearizer where there is one."""
         loaded = memory.forces[:, 0] > 0.0
         contacts = self.linearizer.select_contacts(problem, memory.points, loaded)
         if contacts is not None:
@@ -339,39 +414,45 @@ class LocomotionStepper:
         return self.detector.contact_set(self.points.select(memory.points, loaded, gaps), problem.state.positions)
 
     def predict(self, start: StepInputs) -> PredictedStep:
-        """What its activations, those of the step before, would bring."""
-        problem, contacts, known = start.problem, start.contacts, start.forces
+        """Predict the end of the step under the activations of ``start``, those of the previous step (Eq. 12).
+
+        It starts from rigid motion of the whole body. One Newton step with the previous contact forces gives the
+        velocities at which the tangent is factored; the plan uses this tangent. Then ``PREDICTION_ITERATIONS`` Newton
+        steps solve for velocities and Coulomb forces. A step that would invert an element is discarded.
+        """
+        problem, contacts, previous_forces = start.problem, start.contacts, start.forces
         velocities, tension = problem.rigid_guess, MuscleEnergy.of(self.muscles, start.activations)
-        # What tension adds to the stiffness is left to the solve: what is foreseen serves no better with it.
+        # Without the stiffness of the muscles, which does not improve the prediction; only the solve uses it.
         tangent = problem.tangent(self.factors, velocities, None)
-        ahead = self.linearizer.predict_velocities(tangent, contacts, tension, velocities, known)
-        if ahead is not None:
-            velocities = ahead
+        newton_velocities = self.linearizer.predict_velocities(tangent, contacts, tension, velocities, previous_forces)
+        if newton_velocities is not None:
+            velocities = newton_velocities
             tangent = problem.tangent(self.factors, velocities, None)
         response = self.linearizer(tangent, contacts)
-        now = response.iterate_at(tension, velocities, known)
-        forces = known
+        iterate = response.iterate_at(tension, velocities, previous_forces)
+        forces = previous_forces
         for _ in range(PREDICTION_ITERATIONS):
-            stretch = now.newton_steps(start.normal_bias, start.friction)
-            forces = stretch.forces
-            if not stretch.trial.is_inversion_free:
+            newton_result = iterate.newton_steps(start.normal_bias, start.friction)
+            forces = newton_result.forces
+            if not newton_result.trial.is_inversion_free:
                 break
-            now = stretch.trial
-        return PredictedStep(response, start.normal_bias, start.activations, now.velocities, forces)
+            iterate = newton_result.trial
+        return PredictedStep(response, start.normal_bias, start.activations, iterate.velocities, forces)
 
     def _finish(
         self, problem: StepProblem, plan: Plan, result: CoupledResult, clock: StageClock
     ) -> tuple[BodyState, WarmStart, StepReport]:
+        """Build the state, warm start and report at the end of a solve, and prefetch the contacts of the next step."""
         end = problem.end_positions(result.velocities)
         after = BodyState(end, result.velocities, problem.state.time + problem.dt)
         if result.converged:
             self.linearizer.prefetch_contacts(after, problem.dt, result.contacts.points)
         if result.penetration is None:
-            least_gap = float(self.detector.gaps(end)[0].min())
+            min_gap = float(self.detector.gaps(end)[0].min())
             internal = problem.internal_gradient(result.velocities, MuscleEnergy.of(self.muscles, plan.activations))
             spin = problem.momentum_correction(internal)
         else:
-            least_gap, spin = (
+            min_gap, spin = (
                 result.penetration.min_gap,
                 problem.momentum_correction_from_torque(result.penetration.internal_torque),
             )
@@ -382,7 +463,7 @@ class LocomotionStepper:
             contacts=result.contacts,
             forces=result.forces,
             end_gaps=result.contacts.end_gaps(problem.dt, result.velocities),
-            min_gap=least_gap,
+            min_gap=min_gap,
             activations=plan.activations,
             qp_count=plan.qp_count,
             qp_infeasible=plan.qp_infeasible,
@@ -397,7 +478,7 @@ class LocomotionStepper:
 def _make_linearizer(
     factors: LinearSolver, body: SoftBody, muscles: MuscleSet, solver: CoupledSolver
 ) -> ContactLinearizer:
-    """Of tangents of ``body`` by ``factors``, for the ``solver``: on the host, or where these are."""
+    """Return the contact linearizer for tangents of ``body``: on the host, or on the device of ``factors``."""
     if isinstance(factors, MultifrontalLdl):
         return HostContactLinearizer()
     from egs_warp.contact.device_newton import DeviceContactLinearizer
@@ -405,25 +486,26 @@ def _make_linearizer(
     from egs_warp.fem.dense_cholesky import DenseCholesky
 
     assert isinstance(factors, DenseCholesky)
-    sight = DeviceContactSelector(solver.detector, solver.points, factors.stream, solver.penetration_tolerance)
-    return DeviceContactLinearizer(factors, body, muscles, sight)
+    selector = DeviceContactSelector(solver.detector, solver.points, factors.stream, solver.penetration_tolerance)
+    return DeviceContactLinearizer(factors, body, muscles, selector)
 
 
-def make_step_linearizer(respond: ContactLinearizer, muscles: MuscleSet, synergies: Synergies) -> StepLinearizer:
-    """Where the responses of contact are."""
-    if isinstance(respond, HostContactLinearizer):
+def make_step_linearizer(linearizer: ContactLinearizer, muscles: MuscleSet, synergies: Synergies) -> StepLinearizer:
+    """Return the step linearizer that matches ``linearizer``: on the host or on its device."""
+    if isinstance(linearizer, HostContactLinearizer):
         return HostStepLinearizer(muscles, synergies)
     from egs_warp.contact.device_newton import DeviceContactLinearizer
     from egs_warp.locomotion.device_linear_step import DeviceLinearSteps
 
-    assert isinstance(respond, DeviceContactLinearizer)
-    return DeviceLinearSteps(respond, muscles, synergies)
+    assert isinstance(linearizer, DeviceContactLinearizer)
+    return DeviceLinearSteps(linearizer, muscles, synergies)
 
 
-def _make_device_planner(planner: StepPlanner, respond: ContactLinearizer, solver: CoupledSolver) -> Any:
-    """Plans where the matrices are, if they are not on the host, and the search is a kernel; else None."""
+def _make_device_planner(planner: StepPlanner, linearizer: ContactLinearizer, solver: CoupledSolver) -> Any:
+    """Return a device planner, or None if the matrices are on the host or the strategy or the QP solver runs on the
+    host."""
     settings, device = planner.settings, planner.body.assembly.device
-    if isinstance(respond, HostContactLinearizer) or Strategy(settings.strategy) is not Strategy.MODES:
+    if isinstance(linearizer, HostContactLinearizer) or Strategy(settings.strategy) is not Strategy.MODES:
         return None
     if settings.qp_solver_on(device) is not QpSolver.ADMM:
         return None
@@ -431,5 +513,5 @@ def _make_device_planner(planner: StepPlanner, respond: ContactLinearizer, solve
     from egs_warp.locomotion.device_linear_step import DeviceLinearSteps
     from egs_warp.locomotion.device_plan import DevicePlanner
 
-    assert isinstance(respond, DeviceContactLinearizer) and isinstance(planner.linear_steps, DeviceLinearSteps)
-    return DevicePlanner(planner, respond, planner.linear_steps, solver.convergence_state)
+    assert isinstance(linearizer, DeviceContactLinearizer) and isinstance(planner.linear_steps, DeviceLinearSteps)
+    return DevicePlanner(planner, linearizer, planner.linear_steps, solver.convergence_state)

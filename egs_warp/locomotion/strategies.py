@@ -1,6 +1,6 @@
-"""Strategies that choose the contact states of a step's program (Eq. 13), and with them the activations.
+"""Strategies that search the activations of a step over contact modes or contact states (Eq. 13).
 
-See docs/concepts/locomotion.md.
+``search_program`` is the entry point. See docs/concepts/locomotion.md#contact-states.
 """
 
 from __future__ import annotations
@@ -37,43 +37,39 @@ from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, QpStatus, QuadraticProgram, quadratic_program
 
 STOP_GAP = 1.005
-"""A search ends when the objective is within this factor of its bound."""
+"""A search over states ends if the objective is within this factor of its lower bound."""
 RESTART_GAP = 1.2
-"""A search that ends further than this factor from its bound is done again from other states,
-with ``PATIENCE`` times as many QPs.
-"""
+"""A search restarts from other states, with ``RESTART_BUDGET`` times as many QPs, if the objective exceeds its lower
+bound by more than this factor."""
 NEGLIGIBLE_GAIN = 0.01
-"""Unless there is no more to gain than this share of what it costs to do nothing,
-to fall without muscles and ground.
-"""
+"""No restart if less than this fraction of the cost of doing nothing (no muscle and no contact force) could be
+gained."""
 RESTART_COST = 0.3
-"""Of the end of a step: what costs less is not doubted."""
+"""A mode search restarts only if the end of the step costs at least this."""
 LOADED_FORCE = 1e-3
-"""Body weights, of a contact that holds."""
+"""Body weights, normal force from which a contact counts as loaded."""
 RESTART_BUDGET = 3
-"""Feet that slide have many states that are nearly as likely."""
+"""Factor on the number of QPs for restarts: sliding feet have many states of similar cost."""
 
 
 class Strategy(Enum):
-    """How the contact states are found."""
+    """Search for the contact modes or states of a step."""
 
     MODES = "pieces"
-    """Contact is what the activations make of it: from the piece that stage 1 foresees over the bounds that hold the
-    optimum back (``contact_pieces``). The only one with the exact friction cone, and with no unknowns but activations.
-    """
+    """Search over contact modes (``contact_modes``) from the predicted modes. The only strategy with the exact friction
+    cone, and with no unknowns but the activations."""
     PAPER = "paper"
-    """The paper's: the QP in the states that stage 1 predicts (Eq. 12), then one contact at a time as its own
-    multipliers say."""
+    """The paper's: the QP in the predicted states (Eq. 12), then one contact at a time by its multipliers."""
     STATIC = "static"
-    """Every contact stays static: one QP."""
+    """All contacts static: one QP."""
     QPCC = "qpcc"
-    """From all-static, one contact at a time, as its own multipliers say (after Tan, Turk and Liu 2012)."""
+    """From all contacts static, one contact at a time by its multipliers (after Tan, Turk and Liu 2012)."""
     QPCC_OUR_MOVES = "qpcc-our-moves"
-    """The same from all-static with the moves of relaxed: what the moves alone are worth."""
+    """``qpcc`` with the moves of ``relaxed``, to measure the moves alone."""
     RELAXED = "relaxed"
-    """From where the optimum without complementarity would end up under true contact, several contacts at a time."""
+    """From the contact response to the activations of the relaxed optimum, several contacts at a time."""
     EXACT = "exact"
-    """The global optimum by branch and bound: for small problems."""
+    """Global optimum by branch and bound, for small problems."""
 
     @classmethod
     def _missing_(cls, value: object) -> Strategy:
@@ -82,41 +78,47 @@ class Strategy(Enum):
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What a strategy found."""
+    """Result of a search over contact states."""
 
     y: np.ndarray | None
-    """(variables,) obeys Eq. (9) to the QP solver's accuracy; None if no QP had a solution."""
+    """(variables,), satisfies Eq. (9) to the QP solver's accuracy; None if no QP had a solution."""
     relaxed: bool
-    """True where no states were found feasible: ``y`` then only obeys 0 <= x and 0 <= w."""
+    """True if no states were feasible: ``y`` then only satisfies 0 <= x and 0 <= w."""
     states: np.ndarray
-    """(n,)."""
+    """(n,) contact states."""
     objective: float
-    """With the program's constant; infinite without ``y``."""
+    """With the QP's constant; infinite without ``y``."""
     qp_count: int
+    """Number of QPs that were solved."""
     infeasible: int
-    """QPs without a solution among them."""
+    """Number of QPs without a solution."""
 
 
 @dataclass
 class _StateSearch:
-    """Solves for states, counts, and keeps the best."""
+    """Search over contact states: solves QPs, counts them, and stores the best solution."""
 
     program: ContactProgram
     qp: QuadraticProgram
     limit: int
+    """Maximum number of QPs, or ``RESTART_BUDGET`` times as many while the best is far from the bound."""
     zero: float = 1e-4
+    """Tolerance of zero in pairs and multipliers."""
     count: int = 0
     infeasible: int = 0
     relaxed: QpSolution | None = None
-    """Optimum without complementarity: no states give a lower objective."""
+    """Optimum without complementarity, a lower bound on the objective of all states."""
     best: QpSolution | None = None
     states: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    """(n,) states of ``best``."""
     moves: Callable[..., list[Pivot]] = proposed_pivots
+    """Function that proposes changes of state."""
     visited: set[bytes] = field(default_factory=set)
+    """States that were tried."""
 
     def try_states(self, states: np.ndarray) -> bool:
-        """Solve for ``states`` unless that was done before; whether it is the best so far."""
-        limit = self.limit if self.settled else RESTART_BUDGET * self.limit
+        """Solve the QP of ``states`` unless it was solved before; return True if it is the best so far."""
+        limit = self.limit if self.is_good_enough else RESTART_BUDGET * self.limit
         if self.count >= limit or states.tobytes() in self.visited:
             return False
         self.visited.add(states.tobytes())
@@ -131,7 +133,8 @@ class _StateSearch:
         return True
 
     def try_activations(self, activations: np.ndarray) -> bool:
-        """Solve for the states that follow from ``activations`` (M,), which have a solution; whether there is one."""
+        """Solve the QP of the states that follow from ``activations`` (M,), which is always feasible; return False if
+        the contact response to the activations was not found."""
         y = contact_response(self.program, activations)
         if y is None:
             return False
@@ -144,9 +147,8 @@ class _StateSearch:
         return True
 
     def is_within_gap(self, factor: float, share: float = 0.0) -> bool:
-        """Whether no states can be better by more than ``factor``,
-        or by more than a ``share`` of the cost of doing nothing.
-        """
+        """Return True if no states can be better by more than ``factor``, or by more than a ``share`` of the cost of
+        doing nothing."""
         if self.best is None or self.relaxed is None:
             return False
         constant = self.program.constant
@@ -154,19 +156,19 @@ class _StateSearch:
         return self.best.objective + constant <= max(factor * bound, bound + share * constant)
 
     @property
-    def settled(self) -> bool:
-        """Whether the best is good enough to stop looking elsewhere."""
+    def is_good_enough(self) -> bool:
+        """True if the best is good enough not to restart."""
         return self.is_within_gap(RESTART_GAP, NEGLIGIBLE_GAIN)
 
     def pivots(self) -> list[Pivot]:
-        """Of the best point."""
+        """Return the changes of state that are proposed at the best point, best first."""
         if self.best is None:
             return []
         x, w = self.program.pairs(self.best.x)
         return self.moves(self.program.layout, self.states, x, w, self.best.multipliers, zero=self.zero)
 
     def result(self) -> SearchResult:
-        """What was found."""
+        """Return the best point, or the relaxed optimum if no states were feasible."""
         point = self.best or self.relaxed
         if point is None:
             return SearchResult(None, True, self.states, float("inf"), self.count, self.infeasible)
@@ -177,114 +179,138 @@ class _StateSearch:
 
 @dataclass(frozen=True)
 class PredictedContact:
-    """Stage 1: what known activations, first those of the last step, would bring."""
+    """Predicted contact of a step (Eq. 12) in the units of the QP."""
 
     activations: np.ndarray
-    """(M,) in their bounds."""
+    """(M,) as fractions of their bounds."""
     forces: np.ndarray
-    """(n, 3) body weights: normal and two tangents of each contact."""
+    """(n, 3) body weights: normal and two tangential components of each contact."""
     velocities: np.ndarray
-    """(n, 3) sqrt(g H)."""
+    """(n, 3) in sqrt(g H), contact velocities at the predicted end."""
 
 
 def search_program(
     program: CoulombProgram,
     strategy: Strategy | str,
-    foreseen: PredictedContact,
+    predicted: PredictedContact,
     *,
     directions: int,
     qp_limit: int,
     solver: QpSolver | str = QpSolver.OSQP,
     device: Device = None,
 ) -> ModeSearchResult:
-    """Activations and contact forces of a step's program by ``strategy`` (or its name), with at most ``qp_limit`` QPs
-    (``PATIENCE`` times as many in doubt); all but ``PIECES`` have a friction pyramid of ``directions`` edges.
-    ``solver`` and ``device``: see ``quadratic_program``.
+    """Find activations and contact forces of a step by ``strategy`` (or its name).
+
+    Args:
+        program: the QP of the step.
+        predicted: predicted contact, from which the search starts.
+        directions: number of edges of the friction pyramid of all strategies but ``modes``.
+        qp_limit: maximum number of QPs; all strategies but ``modes`` may use ``RESTART_BUDGET`` times as many.
+        solver: QP solver, see ``quadratic_program``.
+        device: device of the solver ``admm``.
     """
     strategy = Strategy(strategy)
     if strategy is Strategy.MODES:
-        how = _SearchOptions(qp_limit, QpSolver(solver), device)
-        return _search_with_restart(program, _first_search(program, foreseen, how), foreseen.forces, how)
-    paired = ContactProgram.of(program, directions)
-    predicted = states_from_prediction(
-        foreseen.forces[:, 0], foreseen.forces[:, 1:], foreseen.velocities[:, 1:], program.friction, directions
+        options = _SearchOptions(qp_limit, QpSolver(solver), device)
+        return _search_with_restart(program, _first_search(program, predicted, options), predicted.forces, options)
+    pyramid_program = ContactProgram.of(program, directions)
+    predicted_states = states_from_prediction(
+        predicted.forces[:, 0], predicted.forces[:, 1:], predicted.velocities[:, 1:], program.friction, directions
     )
-    found = find_states(
-        paired, strategy, predicted, foreseen.activations, qp_limit=qp_limit, solver=solver, device=device
+    result = find_states(
+        pyramid_program,
+        strategy,
+        predicted_states,
+        predicted.activations,
+        qp_limit=qp_limit,
+        solver=solver,
+        device=device,
     )
-    x = None if found.y is None else paired.forces_of(found.y)
-    return ModeSearchResult(x, found.objective, found.qp_count, found.infeasible)
+    x = None if result.y is None else pyramid_program.forces_of(result.y)
+    return ModeSearchResult(x, result.objective, result.qp_count, result.infeasible)
 
 
 def needs_restart(objective: float, contacts: int) -> bool:
-    """Whether an end of a step may have a better one elsewhere."""
+    """Return True if a mode search with this ``objective`` should restart from the relaxed optimum."""
     return contacts > 0 and not objective < RESTART_COST
 
 
 @dataclass(frozen=True)
 class _SearchOptions:
-    """Pieces are searched."""
+    """Options of a mode search."""
 
     qp_limit: int
     solver: QpSolver
     device: Device
 
 
-def _first_search(program: CoulombProgram, foreseen: PredictedContact, how: _SearchOptions) -> ModeSearchResult:
-    """From what is foreseen."""
-    start = np.concatenate([foreseen.activations, foreseen.forces.ravel()])
-    return _search_from(program, start, foreseen.forces, how)
+def _first_search(program: CoulombProgram, predicted: PredictedContact, options: _SearchOptions) -> ModeSearchResult:
+    """Search from the predicted activations, in the predicted modes."""
+    start = np.concatenate([predicted.activations, predicted.forces.ravel()])
+    return _search_from(program, start, predicted.forces, options)
 
 
 def _search_with_restart(
-    program: CoulombProgram, found: ModeSearchResult, forces: np.ndarray, how: _SearchOptions
+    program: CoulombProgram, result: ModeSearchResult, forces: np.ndarray, options: _SearchOptions
 ) -> ModeSearchResult:
-    """``found``, or better if that costs so much that it is doubted."""
-    if not needs_restart(found.objective, program.contact_count):
-        return found
-    return _restart(program, found, forces, how)
+    """Return ``result``, or the better result of a restart if its objective is high."""
+    if not needs_restart(result.objective, program.contact_count):
+        return result
+    return _restart(program, result, forces, options)
 
 
 def _search_from(
-    program: CoulombProgram, start: np.ndarray, forces: np.ndarray, how: _SearchOptions
+    program: CoulombProgram, start: np.ndarray, forces: np.ndarray, options: _SearchOptions
 ) -> ModeSearchResult:
-    """From ``start`` (m + 3n,), in the piece of ``forces`` (n, 3), which are those of it or near them."""
-    modes, solver = ContactModes.of(forces, program.friction), how.solver
+    """Search from ``start`` (m + 3n,), in the modes of ``forces`` (n, 3). ``admm`` searches on the device; after a
+    numerical failure there, the host repeats the search with OSQP."""
+    modes, solver = ContactModes.of(forces, program.friction), options.solver
     if solver is QpSolver.ADMM:
-        found = search_modes_device(program, start, modes, qp_limit=how.qp_limit, device=wp.get_device(how.device))
-        if found is not None:
-            return found
+        result = search_modes_device(
+            program, start, modes, qp_limit=options.qp_limit, device=wp.get_device(options.device)
+        )
+        if result is not None:
+            return result
         solver = QpSolver.OSQP
-    return search_modes(program, start, modes, qp_limit=how.qp_limit, solver=solver, device=how.device)
+    return search_modes(program, start, modes, qp_limit=options.qp_limit, solver=solver, device=options.device)
 
 
 def _restart(
-    program: CoulombProgram, found: ModeSearchResult, forces: np.ndarray, how: _SearchOptions
+    program: CoulombProgram, result: ModeSearchResult, forces: np.ndarray, options: _SearchOptions
 ) -> ModeSearchResult:
-    """See ``better_elsewhere``; ``forces`` (n, 3) are a guess."""
-    # Thousands of iterations, one after the other, are not for a GPU.
-    bound_by = QpSolver.OSQP if how.solver is QpSolver.ADMM else how.solver
+    """Restart from the relaxed optimum, see ``restart_from_relaxation``; the Coulomb solve starts from ``forces`` (n,
+    3)."""
+    # On the host, because thousands of sequential iterations are slow on a GPU.
+    relaxed_solver = QpSolver.OSQP if options.solver is QpSolver.ADMM else options.solver
 
     def search(activations: np.ndarray) -> ModeSearchResult:
         start = program.contact_response(activations, forces)
-        return _search_from(program, start, start[program.activation_count :].reshape(-1, 3), how)
+        return _search_from(program, start, start[program.activation_count :].reshape(-1, 3), options)
 
-    return restart_from_relaxation(found, solve_relaxed(program, bound_by, device=how.device), search)
+    return restart_from_relaxation(result, solve_relaxed(program, relaxed_solver, device=options.device), search)
 
 
 def restart_from_relaxation(
-    found: ModeSearchResult,
+    result: ModeSearchResult,
     relaxed: tuple[np.ndarray, float] | None,
     search: Callable[[np.ndarray], ModeSearchResult],
 ) -> ModeSearchResult:
-    """The better of ``found`` and of a ``search`` from where the optimum without complementarity, ``relaxed`` (see
-    ``solve_relaxed``), would end up under true contact: from its activations (m,)."""
-    found = replace(found, qp_count=found.qp_count + 1)
-    if relaxed is None or found.objective <= RESTART_GAP * relaxed[1]:
-        return found
+    """Search again from the relaxed optimum if ``result`` costs more than ``RESTART_GAP`` times its objective.
+
+    Args:
+        result: result of the first search.
+        relaxed: activations (m,) and objective of the relaxed optimum, see ``solve_relaxed``.
+        search: search from activations (m,) and the contact forces that follow from them.
+
+    Returns:
+        The better result, with the number of QPs of both.
+    """
+    result = replace(result, qp_count=result.qp_count + 1)
+    if relaxed is None or result.objective <= RESTART_GAP * relaxed[1]:
+        return result
     other = search(relaxed[0])
-    best = min(found, other, key=lambda one: one.objective)
-    return replace(best, qp_count=found.qp_count + other.qp_count, infeasible=found.infeasible + other.infeasible)
+    best = min(result, other, key=lambda one: one.objective)
+    return replace(best, qp_count=result.qp_count + other.qp_count, infeasible=result.infeasible + other.infeasible)
 
 
 def find_states(
@@ -297,32 +323,39 @@ def find_states(
     solver: QpSolver | str = QpSolver.OSQP,
     device: Device = None,
 ) -> SearchResult:
-    """Contact states and the optimum for them by ``strategy`` (or its name), which is not ``PIECES``.
+    """Find contact states and the optimum for them by ``strategy`` (or its name), any but ``modes``.
 
-    ``predicted`` (n,) states of stage 1 (Eq. 12); ``activations`` (M,) of the last step, in their bounds. Where a
-    strategy's own first states have no solution, it starts from those that follow from ``activations``, which always
-    have one. ``solver`` and ``device``: see ``quadratic_program``.
+    If the first states of a strategy have no solution, it starts from the states that follow from ``activations``,
+    which always have one.
+
+    Args:
+        program: the QP with a friction pyramid.
+        predicted: (n,) predicted states (Eq. 12).
+        activations: (M,) of the prediction, as fractions of their bounds.
+        qp_limit: maximum number of QPs.
+        solver: QP solver, see ``quadratic_program``.
+        device: device of the solver ``admm``.
     """
     strategy = Strategy(strategy)
     if strategy is Strategy.EXACT:
-        found = exact_states(program, starts=(predicted,))
-        if found is None:
+        result = exact_states(program, starts=(predicted,))
+        if result is None:
             return SearchResult(None, True, predicted, float("inf"), 0, 0)
-        return SearchResult(found.y, False, found.states, found.objective, found.qp_count, 0)
+        return SearchResult(result.y, False, result.states, result.objective, result.qp_count, 0)
     qp = quadratic_program(program.P, program.q, program.A, solver=solver, device=device)
     search = _StateSearch(program, qp, qp_limit)
     if strategy is Strategy.RELAXED:
         _start_relaxed(search, predicted, activations)
         _move(search, together=True)
         for start in _other_starts(search, predicted):
-            if search.settled:
+            if search.is_good_enough:
                 break
-            kept = search.best, search.states
+            best = search.best, search.states
             search.best = None
             search.try_states(start)
             _move(search, together=True)
-            if kept[0] is not None and (search.best is None or search.best.objective > kept[0].objective):
-                search.best, search.states = kept
+            if best[0] is not None and (search.best is None or search.best.objective > best[0].objective):
+                search.best, search.states = best
         return search.result()
     search.try_states(predicted if strategy is Strategy.PAPER else np.full(program.layout.contacts, STATIC))
     if search.best is None:
@@ -334,11 +367,8 @@ def find_states(
 
 
 def contact_response(program: ContactProgram, activations: np.ndarray) -> np.ndarray | None:
-    """(variables,) what contact and friction make of given ``activations`` (M,): the y that obeys Eq. (9); None if none
-    is found.
-
-    There always is one, whatever the contacts: the starts that it gives never lose a frame.
-    """
+    """Return y (variables,), the contact response to ``activations`` (M,) that satisfies Eq. (9), by Lemke's method;
+    None if none is found. A solution always exists, so a step never fails for lack of a start."""
     layout = program.layout
     rows, offset = program.A[layout.variables :], program.offset[layout.variables :]
     x = lemke(rows[:, layout.activations :], offset + rows[:, : layout.activations] @ activations)
@@ -346,10 +376,8 @@ def contact_response(program: ContactProgram, activations: np.ndarray) -> np.nda
 
 
 def _start_relaxed(search: _StateSearch, predicted: np.ndarray, activations: np.ndarray) -> None:
-    """Begin where the optimum without complementarity, 0 <= x and 0 <= w alone, would end up under true contact.
-
-    Its objective is a bound on every state's; its activations are mostly right, its forces are not.
-    """
+    """Start from the contact response to the activations of the relaxed optimum, where only 0 <= x and 0 <= w hold. Its
+    objective bounds that of all states from below; its activations are mostly right, its forces are not."""
     program, layout = search.program, search.program.layout
     lower, upper = program.bounds(np.full(layout.contacts, STATIC))
     upper[layout.activations :] = np.inf
@@ -363,26 +391,25 @@ def _start_relaxed(search: _StateSearch, predicted: np.ndarray, activations: np.
 
 
 def _other_starts(search: _StateSearch, predicted: np.ndarray) -> Iterator[np.ndarray]:
-    """States (n,) worth another search: feet that hold where the best point without complementarity presses, or where
-    the prediction does, and the predicted states themselves."""
+    """Yield states (n,) for restarts: contacts static where the relaxed optimum has a normal force, then where the
+    prediction has one, and the predicted states."""
     if search.relaxed is not None:
         layout = search.program.layout
-        pressed = search.relaxed.x[layout.normal] > LOADED_FORCE
-        yield np.where(pressed, STATIC, SEPARATE)
+        loaded = search.relaxed.x[layout.normal] > LOADED_FORCE
+        yield np.where(loaded, STATIC, SEPARATE)
     yield np.where(predicted == SEPARATE, SEPARATE, STATIC)
     yield predicted
 
 
 def _move(search: _StateSearch, *, together: bool) -> None:
-    """Move contacts to their better states while that lowers the objective:
-    each contact's best move ``together``, else one by one.
-    """
+    """Change states by the proposed moves while that lowers the objective: first the best moves of all contacts at once
+    if ``together``, then one by one."""
     improved = search.best is not None
     while improved and not search.is_within_gap(STOP_GAP):
         pivots = search.pivots()
         trials = [_moved(search.states, [pivot]) for pivot in pivots]
         if together:
-            trials.insert(0, _moved(search.states, pivots[::-1]))  # the last word on a contact is its best
+            trials.insert(0, _moved(search.states, pivots[::-1]))  # the last move of a contact counts: its best
         improved = any(search.try_states(trial) for trial in trials)
 
 

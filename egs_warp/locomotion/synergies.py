@@ -1,4 +1,4 @@
-"""Muscles that act alike act together: fewer unknowns for the program of a step."""
+"""Synergies: groups of muscle segments that share one activation, so that the QP of a step has fewer variables."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from scipy.spatial.distance import squareform
 
 from egs_warp.muscles.muscle_set import MuscleSet
 
-MOST_SYNERGIES = 120
-_LEAST, _A_NODE = 80, 0.32
-"""Of a coarse body: as many as it has nodes for, and so many at least."""
+MAX_SYNERGIES = 120
+"""Maximum number of synergies."""
+_MIN_SYNERGY_LIMIT, _SYNERGIES_PER_NODE = 80, 0.32
+"""For coarse bodies: maximum number of synergies per node, and the lower limit of that maximum."""
 
 
 @dataclass(frozen=True)
 class Synergies:
-    """Groups of muscles that take the same activation, in their bounds."""
+    """Groups of muscle segments that share one activation, as a fraction of their bounds."""
 
     group_from_muscle: np.ndarray
-    """(M,) int32."""
+    """(M,) int32, group of each segment."""
 
     @cached_property
     def count(self) -> int:
@@ -31,7 +32,7 @@ class Synergies:
 
     @cached_property
     def members(self) -> sparse.csr_matrix:
-        """(M, groups) 1 where the muscle is of the group."""
+        """(M, groups) membership matrix: 1 where the segment is in the group."""
         count = len(self.group_from_muscle)
         return sparse.csr_matrix((np.ones(count), (np.arange(count), self.group_from_muscle)), (count, self.count))
 
@@ -40,29 +41,33 @@ class Synergies:
         return np.bincount(self.group_from_muscle, minlength=self.count)
 
     def mean(self, activations: np.ndarray) -> np.ndarray:
-        """(groups,) mean of ``activations`` (M,) over each."""
+        """Return (groups,), the mean of ``activations`` (M,) over each group."""
         return np.bincount(self.group_from_muscle, activations, minlength=self.count) / self._sizes
 
 
 def find_synergies(
-    muscles: MuscleSet, effects: np.ndarray, node_mass: np.ndarray, *, most: int | None = None
+    muscles: MuscleSet, effects: np.ndarray, node_mass: np.ndarray, *, max_count: int | None = None
 ) -> Synergies:
-    """At most ``most`` groups of muscles whose ``effects`` (3N, M), nodal velocities of each at its bound, point the
-    same way. If that is not told: from 80 of 250 nodes to 120 of 375 and more.
+    """Group muscle segments that accelerate the body in similar directions.
 
-    Average linkage on one minus the cosine between them, in the norm of the kinetic energy.
+    Average linkage on one minus the cosine between their effects, in the norm of the kinetic energy.
+
+    Args:
+        effects: (3N, M) m/s, nodal velocities that each segment causes at its bound.
+        node_mass: (N,) kg.
+        max_count: maximum number of groups. None selects 0.32 per node, at least 80 and at most 120.
     """
-    if most is None:
-        most = int(min(max(_LEAST, _A_NODE * len(node_mass)), MOST_SYNERGIES))
-    if muscles.segment_count <= most:
+    if max_count is None:
+        max_count = int(min(max(_MIN_SYNERGY_LIMIT, _SYNERGIES_PER_NODE * len(node_mass)), MAX_SYNERGIES))
+    if muscles.segment_count <= max_count:
         return Synergies(np.arange(muscles.segment_count, dtype=np.int32))
     weighted = effects * np.sqrt(np.repeat(node_mass, 3))[:, None]
     unit = weighted / np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
-    apart = np.clip(1.0 - unit.T @ unit, 0.0, 2.0)
-    np.fill_diagonal(apart, 0.0)
-    tree = linkage(squareform(0.5 * (apart + apart.T), checks=False), method="average")
-    groups = fcluster(tree, most, criterion="maxclust")
-    # Numbered by their first muscle.
+    distances = np.clip(1.0 - unit.T @ unit, 0.0, 2.0)
+    np.fill_diagonal(distances, 0.0)
+    tree = linkage(squareform(0.5 * (distances + distances.T), checks=False), method="average")
+    groups = fcluster(tree, max_count, criterion="maxclust")
+    # Number the groups by their first segment.
     _, first, inverse = np.unique(groups, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
     return Synergies(rank[inverse].astype(np.int32))

@@ -1,4 +1,4 @@
-"""Threads of linear algebra: the dense matrices of a step are small."""
+"""Limit on the threads of BLAS: the dense matrices of a step are too small for several."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from threadpoolctl import ThreadpoolController
 
 @cache
 def _libraries() -> ThreadpoolController:
-    # NumPy's and SciPy's own, both loaded by now; looking for them takes some milliseconds.
+    # The BLAS libraries of NumPy and SciPy, both loaded by now. Cached, because finding them takes milliseconds.
     return ThreadpoolController()
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """While it lasts, BLAS runs on one thread: more cost a step half as much again, and tenfold beside other work."""
+    """Return a context manager that limits BLAS to one thread. With more, a step takes half as long again, and ten
+    times as long when other processes use the cores."""
     return _libraries().limit(limits=1, user_api="blas")

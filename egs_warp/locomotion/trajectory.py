@@ -1,4 +1,4 @@
-"""What a simulation leaves behind: every solver step, its contacts, all that acted on the body; and what it reached."""
+"""Result of a simulation: every solver step, its contacts and external pushes; and the outcome of a motion."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egs_warp.io.arrays import read_npz
 from egs_warp.io.atomic import atomic_write
 
 SCHEMA = 2
-"""Of ``trajectory.npz`` (docs/guide/report.md)."""
+"""Version of ``trajectory.npz`` (docs/guide/report.md)."""
 STATES = ("time", "positions", "velocities", "min_gap")
 """Arrays of F+1 rows."""
 STEPS = ("dt", "activations")
@@ -31,127 +31,129 @@ CONTACTS = (
 )
 """Arrays of C rows."""
 KICKS = ("kick_step", "kick_velocity")
-"""Arrays of a row for each step that something from outside pushes in."""
+"""Arrays of one row for each step with external pushes."""
 FIRST_PART = "start.npz"
-"""Of a recording that goes on: what never changes, and the state it began at."""
+"""File of the first part of a recording: all that is constant, and the first state."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """F solver steps of N nodes with C contacts in all. Metres, seconds, kilograms, newtons; z is up, square to the
-    ground.
+    """Trajectory of F solver steps of N nodes with C contacts in all. Units: m, s, kg, N. The z axis points up,
+    orthogonal to the ground.
 
-    The frame is the body's own: where that lies in the capture, the last three fields say.
+    The frame is the body's own. ``body_axes``, ``body_origin`` and ``metres_per_unit`` place it in the capture.
     """
 
     time: np.ndarray
-    """(F+1,)."""
+    """(F+1,) s."""
     dt: np.ndarray
-    """(F,) of each step."""
+    """(F,) s, size of each step."""
     positions: np.ndarray
-    """(F+1, N, 3)."""
+    """(F+1, N, 3) m."""
     velocities: np.ndarray
-    """(F+1, N, 3)."""
+    """(F+1, N, 3) m/s."""
     rest_positions: np.ndarray
-    """(N, 3)."""
+    """(N, 3) m."""
     tets: np.ndarray
     """(T, 4) int32."""
     node_mass: np.ndarray
-    """(N,)."""
+    """(N,) kg."""
     gravity: np.ndarray
-    """(3,)."""
+    """(3,) m/s^2."""
     planes: np.ndarray
-    """(P, 4) rows n, d of n.x + d = 0; the first is the ground, or where it is not flat the level that its heights are
-    told from in the body's frame."""
+    """(P, 4) rows n, d of n.x + d = 0. The first is the ground; if the ground is not flat, the level from which its
+    heights are measured, in the body's frame."""
     solid_from_plane: np.ndarray
-    """(P,) int32: a point is inside a solid if it is below all of its planes; a solid of one plane is a half space."""
+    """(P,) int32, solid of each plane. A point is inside a solid if it is below all of its planes; a solid of one plane
+    is a half space."""
     friction: float
     drag: float
     """alpha of Rayleigh damping, 1/s."""
     young_modulus: float
-    """Pascals."""
+    """Pa."""
     poisson_ratio: float
     damping_time: float
     """beta of Rayleigh damping, s."""
     height: float
-    """H, metres."""
+    """H, m."""
     contact_step: np.ndarray
-    """(C,) int32: step i leads from time i to time i+1."""
+    """(C,) int32: step i goes from time i to time i+1."""
     contact_nodes: np.ndarray
     """(C, 4) int32."""
     contact_weights: np.ndarray
     """(C, 4)."""
     contact_plane: np.ndarray
-    """(C,) int32: row of ``planes``; 0 is the ground, flat or not."""
+    """(C,) int32, row of ``planes``; 0 is the ground, flat or not."""
     contact_normal: np.ndarray
-    """(C, 3) unit, of that plane, or of uneven ground where the contact was at the start of the step."""
+    """(C, 3) unit normal of that plane, or of uneven ground below the contact at the start of the step."""
     contact_force: np.ndarray
-    """(C, 3) newtons on the body, world axes."""
+    """(C, 3) N on the body, world axes."""
     contact_gap: np.ndarray
-    """(C,) metres at the end of the step, from the plane that it is held to in the step."""
+    """(C,) m, distance from the plane of the contact at the end of the step."""
     min_gap: np.ndarray
-    """(F+1,) metres, smallest gap of all contact Gaussians."""
+    """(F+1,) m, smallest gap of all contact Gaussians."""
     activations: np.ndarray
-    """(F, M) metres: a segment pulls with its stiffness times this, constant over the step."""
+    """(F, M) m: the tension of a segment is its stiffness times this, constant over the step."""
     muscle_end_starts: np.ndarray
-    """(K+1,) int32: end k of the muscles is the sum of weight times node over the entries ``starts[k]`` to
+    """(K+1,) int32: end k of the muscles is the sum of weight times node position over the entries ``starts[k]`` to
     ``starts[k + 1]``."""
     muscle_end_nodes: np.ndarray
     """(E,) int32."""
     muscle_end_weights: np.ndarray
     """(E,)."""
     muscle_segments: np.ndarray
-    """(M, 2) int32: the two ends of each segment."""
+    """(M, 2) int32, the two ends of each segment."""
     muscle_rest_lengths: np.ndarray
-    """(M,)."""
+    """(M,) m."""
     muscle_stiffness: np.ndarray
     """(M,) N/m."""
     ground_axes: np.ndarray = field(default_factory=lambda: np.eye(3))
-    """(3, 3) rows: along columns, rows and heights of uneven ground."""
+    """(3, 3) rows: axes along columns, rows and heights of uneven ground."""
     ground_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    """(3,) where its node (0, 0) lies at height 0."""
+    """(3,) m, position of grid node (0, 0) at height 0."""
     ground_spacing: float = 1.0
-    """Metres between its nodes."""
+    """m between grid nodes."""
     ground_coefficients: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    """(rows, columns) metres, of its biquadratic B-spline (``HeightField``); of none where the ground is flat."""
+    """(rows, columns) m, coefficients of its biquadratic B-spline (``HeightField``); empty if the ground is flat."""
     kick_step: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
-    """(K,) int32: steps in which something from outside pushed."""
+    """(K,) int32, steps with external pushes."""
     kick_velocity: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
-    """(K, N, 3) m/s that it gave the nodes as the step began."""
+    """(K, N, 3) m/s, velocities that they added to the nodes at the start of the step."""
     planned_com: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(F+1, 3) centre of mass as planned, NaN where nothing was; or no rows."""
+    """(F+1, 3) m, planned centre of mass, NaN where there was no plan; or no rows."""
     body_axes: np.ndarray = field(default_factory=lambda: np.eye(3))
     """(3, 3) rows: this frame's x, y and z in the capture's axes."""
     body_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    """(3,) this frame's origin in the capture, capture's units."""
+    """(3,) this frame's origin in the capture, in the capture's unit."""
     metres_per_unit: float = 1.0
-    """Of the capture's unit."""
+    """m, the capture's unit."""
 
     def in_capture(self, points: np.ndarray) -> np.ndarray:
-        """Points (..., 3) of this frame in the capture's frame and units."""
+        """Return ``points`` (..., 3) of this frame in the capture's frame and unit."""
         return BodyFrame(self.body_axes, self.body_origin, self.metres_per_unit).capture_points(points)
 
     def with_plan(self, planned_com: np.ndarray) -> Trajectory:
-        """The same trajectory beside where the centre of mass was planned to be, (F+1, 3)."""
+        """Return a copy with the planned centre of mass, (F+1, 3) m."""
         return replace(self, planned_com=planned_com)
 
     def save(self, path: Path) -> None:
-        """Write ``trajectory.npz``; the same trajectory gives the same bytes."""
+        """Write ``trajectory.npz``; equal trajectories give equal bytes."""
         write_arrays(path, {name: np.asarray(getattr(self, name)) for name in self.__dataclass_fields__})
 
     @classmethod
     def load(cls, path: Path) -> Trajectory:
-        """Read what ``save`` wrote, or as much of a run as there is in the folder of a ``Recorder``.
+        """Read a file of ``save``, or the steps so far in the folder of a ``Recorder``.
 
-        Raises ``ValueError`` for a file of another schema.
+        Raises:
+            ValueError: the file has another schema.
         """
         if not path.is_dir():
             return cls._of(read_arrays(path))
-        return cls.joined([read_arrays(part) for part in (path / FIRST_PART, *part_paths(path))])
+        return cls.from_parts([read_arrays(part) for part in (path / FIRST_PART, *part_paths(path))])
 
     @classmethod
-    def joined(cls, parts: Sequence[dict[str, np.ndarray]]) -> Trajectory:
-        """Of the parts of a recording, the first of which holds the start and all that never changes."""
+    def from_parts(cls, parts: Sequence[dict[str, np.ndarray]]) -> Trajectory:
+        """Concatenate the parts of a recording; the first one contains the start and all that is constant."""
         values = dict(parts[0])
         for name in (*STATES, *STEPS, *CONTACTS, *KICKS):
             values[name] = np.concatenate([part[name] for part in parts])
@@ -166,25 +168,29 @@ class Trajectory:
 
 
 def part_name(number: int) -> str:
-    """File of the steps of part ``number`` of a recording, counted from 0."""
+    """Return the file name of part ``number`` of a recording, counted from 0."""
     return f"steps-{number:06d}.npz"
 
 
 def part_paths(folder: Path) -> list[Path]:
-    """Files of the steps in the ``folder`` of a recording, in their order; one that is missing among them is named,
-    too.
-    """
+    """Return the files of the steps in the ``folder`` of a recording, in order, including names of missing ones in
+    between."""
     return [folder / part_name(number) for number in range(len(list(folder.glob("steps-*.npz"))))]
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write ``arrays`` by name, whole or not at all."""
+    """Write ``arrays`` by name; the file is complete or absent."""
     with atomic_write(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, schema=np.int64(SCHEMA), **arrays)  # pyright: ignore[reportArgumentType]
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """What ``write_arrays`` wrote. Raises ``ValueError`` for a file of another schema, and ``DAMAGES``."""
+    """Read the arrays of a file of ``write_arrays``.
+
+    Raises:
+        ValueError: the file has another schema.
+        READ_ERRORS: the file cannot be read.
+    """
     arrays = read_npz(path)
     schema = int(arrays.pop("schema", 1))
     if schema != SCHEMA:
@@ -194,27 +200,27 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class MotionOutcome:
-    """What a motion did; lengths in body heights."""
+    """Measured outcome of a motion; lengths are in body heights."""
 
     distance: float
     """Horizontal displacement of the centre of mass from start to end."""
     height: float
-    """Apex of the centre of mass minus its standing height."""
+    """Highest point of the centre of mass minus its height at the start."""
     heading_degrees: float
-    """Turn about the plane's normal; whole turns count."""
+    """Rotation about the plane's normal; full turns count."""
     tilt_degrees: float
-    """Angle between the up of the body's best-fit rotation and the normal, at the end."""
+    """Angle between the normal and the up axis of the body's best-fit rotation, at the end."""
     airborne_frames: float
-    """60 x the longest time during which every contact Gaussian is above the plane."""
+    """60 times the longest time in s during which every contact Gaussian is above the plane."""
 
 
 def measure(trajectory: Trajectory, *, first: int = 0, last: int = -1) -> MotionOutcome:
-    """What was reached between two states of the trajectory (indices into ``time``)."""
+    """Measure the outcome between the states ``first`` and ``last`` (indices into ``time``)."""
     t = trajectory
     last = last % len(t.time)
     up = -t.gravity / np.linalg.norm(t.gravity)
     com = np.einsum("n,fni->fi", t.node_mass, t.positions[first : last + 1]) / t.node_mass.sum()
-    moved = com[-1] - com[0]
+    displacement = com[-1] - com[0]
     upright = _best_fit(t, t.positions[last]) @ up
     heading = _headings(t, first, last, up)[-1]
     longest = run_start = 0.0
@@ -225,7 +231,7 @@ def measure(trajectory: Trajectory, *, first: int = 0, last: int = -1) -> Motion
             longest = max(longest, time - run_start)
         above = gap > 0.0
     return MotionOutcome(
-        distance=float(np.linalg.norm(moved - (moved @ up) * up) / t.height),
+        distance=float(np.linalg.norm(displacement - (displacement @ up) * up) / t.height),
         height=float(((com - com[0]) @ up).max() / t.height),
         heading_degrees=float(np.degrees(heading)),
         tilt_degrees=float(np.degrees(np.arccos(np.clip(upright @ up, -1.0, 1.0)))),
@@ -234,17 +240,20 @@ def measure(trajectory: Trajectory, *, first: int = 0, last: int = -1) -> Motion
 
 
 def _best_fit(t: Trajectory, positions: np.ndarray) -> np.ndarray:
+    """Return (3, 3), best-fit rotation from the rest positions to ``positions`` (Kabsch)."""
     rest = t.rest_positions - t.node_mass @ t.rest_positions / t.node_mass.sum()
     arms = positions - t.node_mass @ positions / t.node_mass.sum()
     return kabsch_rotation(t.node_mass, rest, arms)
 
 
 def _headings(t: Trajectory, first: int, last: int, up: np.ndarray) -> np.ndarray:
-    """(n,) radians about ``up`` since ``first``, followed from step to step so that whole turns count."""
+    """Return (n,) rad about ``up`` since ``first``, unwrapped so that full turns count."""
     start = _best_fit(t, t.positions[first])
     angles = []
     for positions in t.positions[first : last + 1]:
-        turn = _best_fit(t, positions) @ start.T
-        axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-        angles.append(np.arctan2(axis @ up, np.trace(turn) - up @ turn @ up))
+        rotation = _best_fit(t, positions) @ start.T
+        axis = np.array(
+            [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+        )
+        angles.append(np.arctan2(axis @ up, np.trace(rotation) - up @ rotation @ up))
     return np.unwrap(angles)

@@ -1,4 +1,4 @@
-"""Whether a trajectory that was read is one: its arrays fit each other, and what is drawn from them is finite."""
+"""Checks of a loaded trajectory: array shapes are consistent, and the values that are rendered are finite."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.limits import FURTHEST
 from egs_warp.locomotion.trajectory import Trajectory
 
-LONGEST = 86_400.0
-"""Seconds of a run, a day: it has so many pictures times sixty."""
+MAX_DURATION = 86_400.0
+"""s, maximum duration of a run, one day. The number of frames is 60 times as large."""
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     "time": ("states",),
     "dt": ("steps",),
@@ -44,7 +44,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "body_axes": (3, 3),
     "body_origin": (3,),
 }
-"""Extents of each array by name; those of one name are alike."""
+"""Extents of each array by name; extents of one name are equal."""
 _INDICES = {
     "tets": "nodes",
     "solid_from_plane": "planes",
@@ -55,27 +55,31 @@ _INDICES = {
     "muscle_segments": "ends",
     "kick_step": "steps",
 }
-"""Arrays of whole numbers, each below an extent."""
+"""Arrays of integers, each below this extent."""
 _POSITIVE = ("node_mass", "height", "metres_per_unit", "ground_spacing", "dt")
-_UNKNOWN = ("planned_com", "min_gap")
-"""May hold what is not finite: no plan, no point."""
+_MAY_BE_NAN = ("planned_com", "min_gap")
+"""May contain values that are not finite: no plan, no contact point."""
 
 
 def check_trajectory(t: Trajectory) -> None:
-    """Raise ``ValueError``, which names the array, for what cannot be drawn."""
+    """Check the arrays.
+
+    Raises:
+        ValueError: the trajectory cannot be rendered; the message names the array.
+    """
     extents = _extents(t)
     for name in t.__dataclass_fields__:
         values = np.asarray(getattr(t, name))
         if values.dtype.kind not in "iuf":
-            raise ValueError(f"{name} holds no numbers")
-        if name not in _UNKNOWN and not (np.abs(values) <= FURTHEST).all():
-            raise ValueError(f"{name} holds what is not finite or too large")
+            raise ValueError(f"{name} is not numeric")
+        if name not in _MAY_BE_NAN and not (np.abs(values) <= FURTHEST).all():
+            raise ValueError(f"{name} has values that are not finite or too large")
         if name in _POSITIVE and not (values > 0.0).all():
             raise ValueError(f"{name} is not positive")
     for name, below in _INDICES.items():
         values = getattr(t, name)
         if values.dtype.kind not in "iu" or (values.size and not 0 <= values.min() <= values.max() < extents[below]):
-            raise ValueError(f"{name} points at what is not there")
+            raise ValueError(f"{name} has an index out of range")
     starts = t.muscle_end_starts
     if (
         starts.dtype.kind not in "iu"
@@ -83,33 +87,33 @@ def check_trajectory(t: Trajectory) -> None:
         or starts[-1] != extents["entries"]
         or (np.diff(starts) < 0).any()
     ):
-        raise ValueError("muscle_end_starts points at what is not there")
-    if (np.diff(t.time) <= 0.0).any() or t.time[-1] - t.time[0] > LONGEST:
-        raise ValueError("time does not go on from step to step, or for more than a day")
+        raise ValueError("muscle_end_starts has an index out of range")
+    if (np.diff(t.time) <= 0.0).any() or t.time[-1] - t.time[0] > MAX_DURATION:
+        raise ValueError("time does not increase from step to step, or spans more than a day")
     if not (TetMesh(t.rest_positions, t.tets).volumes() > 0.0).all():
-        raise ValueError("tets have no volume in rest_positions")
+        raise ValueError("tets have no positive volume in rest_positions")
     if np.linalg.norm(t.gravity) == 0.0:
-        raise ValueError("gravity has no direction")
+        raise ValueError("gravity is zero")
     if np.abs(t.body_axes @ t.body_axes.T - np.eye(3)).max() > 1e-6:
-        raise ValueError("body_axes are no axes")
+        raise ValueError("body_axes are not orthonormal")
 
 
 def _extents(t: Trajectory) -> dict[str, int]:
-    """What the names of ``_SHAPES`` stand for."""
-    found: dict[str, int] = {}
+    """Return the value of each extent of ``_SHAPES``; raise ``ValueError`` for inconsistent shapes."""
+    extents: dict[str, int] = {}
     for name, shape in _SHAPES.items():
         values = getattr(t, name)
         if values.ndim != len(shape) or any(
-            found.setdefault(extent, have) != have if isinstance(extent, str) else extent != have
-            for extent, have in zip(shape, values.shape, strict=True)
+            extents.setdefault(extent, size) != size if isinstance(extent, str) else extent != size
+            for extent, size in zip(shape, values.shape, strict=True)
         ):
             raise ValueError(f"{name} has shape {values.shape}")
-    found["ends"] = found["offsets"] - 1
-    wrong = found["states"] != found["steps"] + 1 or found["planned"] not in (0, found["states"])
-    if wrong or min(found[name] for name in ("nodes", "tets", "planes", "offsets")) < 1:
+    extents["ends"] = extents["offsets"] - 1
+    is_wrong = extents["states"] != extents["steps"] + 1 or extents["planned"] not in (0, extents["states"])
+    if is_wrong or min(extents[name] for name in ("nodes", "tets", "planes", "offsets")) < 1:
         raise ValueError("its arrays do not fit each other")
-    # Of a run that nothing pushed it may be left out.
-    unpushed = found["kicks"] == 0 and t.kick_velocity.shape == (0, 0, 3)
-    if t.kick_velocity.shape != (found["kicks"], found["nodes"], 3) and not unpushed:
+    # May be absent if the run has no pushes.
+    has_no_pushes = extents["kicks"] == 0 and t.kick_velocity.shape == (0, 0, 3)
+    if t.kick_velocity.shape != (extents["kicks"], extents["nodes"], 3) and not has_no_pushes:
         raise ValueError(f"kick_velocity has shape {t.kick_velocity.shape}")
-    return found
+    return extents

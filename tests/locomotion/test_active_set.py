@@ -117,7 +117,7 @@ def test_what_costs_a_million_times_the_gain_counts_as_no_point(times: float, fe
 
 
 def test_a_hessian_that_holds_no_number_has_no_optimum() -> None:
-    """It is no error either: whoever asked goes on without."""
+    """A NaN in P raises no error: the result is None and the caller continues."""
     P, q, A, lower, upper = random_program(3)
     P[1, 1] = np.nan
     nothing = np.zeros(len(A), bool)
@@ -161,7 +161,7 @@ def test_rows_in_coordinates_in_which_distances_are_costs() -> None:
 
 
 def test_rows_of_two_programs_are_not_mixed_up() -> None:
-    """Which share their memory; an indefinite Hessian is refused."""
+    """Two QPs of one size share a workspace; an indefinite Hessian raises an error."""
     (P, q, A, *_), (Q, r, _, *_) = random_program(7), random_program(7)
     first, second = WhitenedQp.of(P, q, A), WhitenedQp.of(2.0 * Q, r + 1.0, A)
     units = second.unit_rows.copy()
@@ -175,8 +175,8 @@ def test_rows_of_two_programs_are_not_mixed_up() -> None:
 
 
 def test_as_many_rows_as_unknowns_and_one_that_contradicts_them() -> None:
-    """Rows that nearly repeat each other hold a corner, from which a further one is a ten-thousandth away: no point,
-    and no search that rounding leads astray."""
+    """Nearly dependent rows define a corner, and a further row is violated there by a ten-thousandth: the QP is
+    infeasible, and the search does not end in a numerical failure."""
     rng = np.random.default_rng(0)
     count = 40
     A = np.eye(count) + 1e-3 * rng.standard_normal((count, count))

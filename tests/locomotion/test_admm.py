@@ -10,7 +10,8 @@ from egs_warp.locomotion.operator_splitting import AdmmSplitting, OperatorSplitt
 
 
 def random_program(seed: int) -> tuple[DenseQp, np.ndarray, np.ndarray]:
-    """Of its own size, with rows from short to long, held, one-sided and free, and bounds that some point satisfies."""
+    """Return a QP of random size, with rows of different lengths, equality, one-sided and free rows, and feasible
+    bounds."""
     random = np.random.default_rng(seed)
     n, m = int(random.integers(2, 20)), int(random.integers(1, 50))
     root = random.normal(size=(n, n))
@@ -68,8 +69,8 @@ def test_iterations_are_those_of_osqp(device: str) -> None:
 
 
 def test_a_solved_program_is_where_the_next_begins(device: str) -> None:
-    """Where bounds hardly change, a fraction of the iterations; a start of one's own, x with the multipliers kept, as
-    OSQP takes it."""
+    """After a small change of the bounds a fraction of the iterations is enough; also with a given x and the previous
+    multipliers, as OSQP does it."""
     program, lower, upper = random_program(4)
     both: list[OperatorSplitting] = [
         OsqpSplitting(program.P, program.q, accuracy=1e-8),
@@ -89,7 +90,7 @@ def test_a_solved_program_is_where_the_next_begins(device: str) -> None:
 
 
 def test_bounds_that_no_point_satisfies_are_told_apart_and_forgotten(device: str) -> None:
-    """Two rows that exclude each other: a certificate, from both; the next solve begins anew."""
+    """Two rows that exclude each other give a certificate in both solvers; the next solve starts from zero."""
     for seed in range(10):
         program, lower, upper = random_program(seed)
         given = DenseQp(program.P, program.q, np.vstack([program.A, program.A[:1]]))
@@ -139,7 +140,7 @@ def test_what_is_no_number_is_no_solution(device: str) -> None:
 
 
 def test_a_singular_hessian_has_one_value_and_many_points(device: str) -> None:
-    """Where x is not unique, objective and rows are: those of OSQP."""
+    """If x is not unique, objective and row values equal those of OSQP."""
     random = np.random.default_rng(5)
     root = random.normal(size=(12, 4))
     A = np.vstack([np.eye(12), random.normal(size=(6, 12))])

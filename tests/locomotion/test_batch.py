@@ -24,7 +24,7 @@ from tests.support.creatures import coarse_pawn
 
 FRICTIONS = (0.8, 0.3, 1.2)
 STRENGTHS = (1.0, 0.9, 0.5)
-"""Of the recorded activations, for each world."""
+"""Factor on the recorded activations in each world."""
 FIRST, STEPS = 29, 30
 """Steps of the recorded jump: the body leaves the ground in its 34th and is back in its 56th."""
 
@@ -47,7 +47,7 @@ def alone(creature: Creature, friction: float) -> LocomotionStepper:
 def runs_alone(
     creature: Creature, starts: list[BodyState], activations: np.ndarray, dt: float
 ) -> list[list[list[StepReport]]]:
-    """Of each world and each step of ``activations`` (steps, worlds, M) the reports."""
+    """Return the reports of each world and each step of ``activations`` (steps, worlds, M)."""
     runs = []
     for world, (friction, state) in enumerate(zip(FRICTIONS, starts, strict=True)):
         stepper = alone(creature, friction)
@@ -184,9 +184,10 @@ def test_what_does_not_converge_is_done_in_halves_as_alone(creature: Creature) -
 
 @pytest.mark.slow
 def test_what_a_world_does_does_not_hang_on_its_neighbours(creature: Creature) -> None:
-    """Whatever the others do meanwhile: stand, fall, go in halves, or break. To rounding: products of fewer or more
-    worlds, and with more contacts, round otherwise. It stands on its rim: of 32 points on so coarse a base an operator
-    next to singular makes rounding a thousand times as large."""
+    """The steps of a world do not depend on the other worlds, which stand, fall, make half steps, or fail. Equal to
+    rounding: products with other numbers of worlds and contacts round differently. The body stands on its rim, because
+    with 32 points on so coarse a base the Delassus operator is nearly singular and amplifies rounding a thousandfold.
+    """
     starts, activations, dt = rough(creature)
     geometry = on_its_rim(creature.geometry)
     stood = starts[1]
@@ -236,7 +237,7 @@ def test_a_world_that_cannot_be_solved_is_told_and_leaves(creature: Creature) ->
 
 @pytest.mark.slow
 def test_a_world_that_never_converges_is_lost(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not even in its smallest parts, as where all accuracy is asked."""
+    """With a tolerance of zero not even the smallest part of the step converges."""
     monkeypatch.setattr("egs_warp.contact.coupled_step.CoupledSolver.tolerance", 0.0)
     dt, _ = solver_steps(creature.body)
     stepper = BatchStepper(*parts(creature), FRICTIONS)

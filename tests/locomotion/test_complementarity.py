@@ -24,7 +24,7 @@ from tests.support.contact_programs import FRICTION, optimum_of_each, small_prob
 
 
 def obeys(program: ContactProgram, y: np.ndarray, states: np.ndarray) -> bool:
-    """Whether ``y`` is a feasible point of these states."""
+    """Return True if ``y`` is a feasible point of these states."""
     lower, upper = program.bounds(states)
     rows = program.A @ y
     return bool((rows - lower).min() > -2e-5 and (upper - rows).min() > -2e-5)
@@ -142,9 +142,8 @@ def test_moves_are_feasible_and_almost_always_better() -> None:
 
 
 def test_moves_name_the_contact_that_helps() -> None:
-    """docs/concepts/locomotion.md: a closed contact that holds the body down is opened,
-    an open one that could help is closed to sliding.
-    """
+    """A closed contact that holds the body down opens, and an open one that could help closes to sliding
+    (docs/concepts/locomotion.md#moves)."""
     layout = ContactLayout(0, 1, 4)
     zeros, lam = np.zeros(6), slice(5, 6)
 
@@ -170,7 +169,7 @@ def test_moves_name_the_contact_that_helps() -> None:
 
 
 def test_plain_moves_go_where_a_multiplier_s_row_is_free() -> None:
-    """Of a contact whose free side is nothing, and of none whose is not: each multiplier by itself."""
+    """Moves of contacts whose free side is zero, and of no others, each by its own multiplier."""
     layout = ContactLayout(0, 1, 4)
     zeros, one = np.zeros(6), np.eye(6)
 

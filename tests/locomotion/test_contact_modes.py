@@ -1,4 +1,4 @@
-"""The program over activations alone: what it plans is what exact Coulomb contact answers (Eq. 9, 13)."""
+"""The QP over activations alone: its result satisfies exact Coulomb contact (Eq. 9, 13)."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def started(program: CoulombProgram) -> tuple[np.ndarray, ContactModes]:
 
 
 def larger_program(seed: int, activations: int, contacts: int) -> CoulombProgram:
-    """Of any size: what its matrices stand for is of no account, but that one is symmetric and contact can answer."""
+    """Return a random program of any size with a symmetric Hessian and a solvable contact operator."""
     rng = np.random.default_rng(seed)
     size = activations + 3 * contacts
     half, frame = rng.standard_normal((size, size)), rng.standard_normal((3 * contacts, 3 * contacts + 4))
@@ -142,10 +142,8 @@ def test_the_search_ends_where_no_activations_near_by_do_better(solver: QpSolver
 
 
 def test_what_costs_much_is_searched_from_elsewhere_too() -> None:
-    """Where forces need not be what contact answers, no end costs more than any under exact contact (a grid over all
-    activations); a search that begins there as well is never worse, now and then much better, and its end is one of
-    exact contact.
-    """
+    """The relaxed optimum is a lower bound on the objective under exact contact (a grid over all activations). A search
+    that restarts from it is never worse, at times much better, and its result satisfies exact contact."""
     grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 13)] * 2), axis=-1).reshape(-1, 2)
     better = worse = costly = 0
     for seed in range(40):

@@ -1,4 +1,4 @@
-"""Plans that are made at once on the device are those of one look after the other, on every device."""
+"""Plans of the device planner equal those of prediction and plan one after the other, on every device."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def begun(stepper: LocomotionStepper, state: BodyState, memory: WarmStart) -> St
 
 
 def on_its_edge(stepper: LocomotionStepper) -> BodyState:
-    """With few contacts, none of which another repeats: rounding does not lead their forces astray."""
+    """Return a state with few independent contacts, whose forces are not sensitive to rounding."""
     turned = Rotation.from_rotvec([0.1, 0.03, 0.0]).apply(stepper.body.mesh.nodes)
     up = -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
     return BodyState(turned - stepper.detector.gaps(turned)[0].min() * up, np.zeros_like(turned))
@@ -100,7 +100,7 @@ def is_the_host_s(
     np.testing.assert_allclose(plan.forces, expected.forces, rtol=0, atol=1e-6 * stepper.body.weight)
     scale = np.abs(delassus).max(initial=1e-300)
     np.testing.assert_allclose(delassus, prospect.linearization.delassus, rtol=0, atol=1e-9 * scale)
-    # Without muscles it is another place than the one that is at hand.
+    # Without muscles it is not the current iterate.
     assert isinstance(begun_at, DeviceNewtonIterate) and begun_at.tension is None
     return True
 
@@ -113,7 +113,7 @@ def test_plans_are_those_of_one_look_after_the_other(creature: Creature, stepper
         at_once += is_the_host_s(stepper, begun(stepper, state, memory), memory, objectives)
         state, memory, reports = stepper.advance(state, memory, objectives, DT)
         assert all(report.converged for report in reports), number
-    # This body's base has few points that do not repeat each other: the search goes astray at times.
+    # The contact points of this body are nearly redundant, so the search fails numerically at times.
     assert at_once >= 3
     up = -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
     flown = BodyState(creature.start.positions + 0.3 * stepper.body.height * up, state.velocities)
@@ -126,7 +126,7 @@ def test_plans_are_those_of_one_look_after_the_other(creature: Creature, stepper
 def test_the_solve_goes_on_from_the_plan_s_end(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing is asked there a second time: its first Newton step is on its way, and brings what asking brings."""
+    """The solve makes no second request: its first Newton step is already in flight, and equals a requested one."""
     memory = stepper.initial_memory()
     start = begun(stepper, creature.start, memory)
     found = planner_of(stepper).plan(start, asks(creature, 0.1))
@@ -192,14 +192,14 @@ def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: Locomoti
 def test_a_search_goes_on_as_the_host_s(
     what: str, beside: bool, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where its end costs so much that another may be better, and where that is: to the host's plan, at whose end the
-    solve begins, whether the second search is ``beside`` the first or after it. Only what is led astray the host
-    searches itself."""
+    """A restart, made if the first result costs much, leads to the plan of the host, and the solve starts at its end;
+    the second search runs concurrently with the first or after it. Only after a numerical failure does the host search.
+    """
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     monkeypatch.setattr(device_plan, "PARALLEL_RESTART_COST", 0.0 if beside else np.inf)
     if what != "astray":
         monkeypatch.setattr(device_plan, "RESTART_COST", 0.0)
-    planner_of(stepper)._rooms.clear()
+    planner_of(stepper)._workspaces.clear()
     start = begun(stepper, creature.start, memory)
     asked: list[str] = []
 
@@ -208,9 +208,9 @@ def test_a_search_goes_on_as_the_host_s(
 
     noted(device_plan, "search_modes", search_modes)
     noted(device_plan, "solve_relaxed", solve_relaxed)
-    noted(PlanWorkspace, "_enqueue_elsewhere", PlanWorkspace._enqueue_elsewhere)
+    noted(PlanWorkspace, "_enqueue_restart", PlanWorkspace._enqueue_restart)
     noted(PlanWorkspace, "_enqueue_from_point", PlanWorkspace._enqueue_from_point)
-    noted(PlanWorkspace, "_end_at", PlanWorkspace._end_at)
+    noted(PlanWorkspace, "_replace_end", PlanWorkspace._replace_end)
     if what != "astray":
         monkeypatch.setattr(strategies, "RESTART_COST", 0.0)
         monkeypatch.setattr(strategies, "RESTART_GAP", 0.0)
@@ -225,19 +225,19 @@ def test_a_search_goes_on_as_the_host_s(
         monkeypatch.setattr(device_plan, "FOUND", -1)
         monkeypatch.setattr(strategies, "search_modes_device", lambda *_, **__: None)
     elif what == "no bound":
-        monkeypatch.setattr(RelaxationWorkspace, "found", lambda _: None)
+        monkeypatch.setattr(RelaxationWorkspace, "parse_result", lambda _: None)
     elif what == "second astray":
         monkeypatch.setattr(ModeSearchWorkspace, "parse_result", lambda *_: None)
     assert is_the_host_s(stepper, start, memory, objectives)
     expected = {
-        "costly": ["_enqueue_elsewhere", "_end_at"],
-        "better": ["_enqueue_elsewhere", "_end_at"],
-        "kept": ["_enqueue_elsewhere"],
-        "astray": ["search_modes", "_end_at"],
-        "no bound": ["_enqueue_elsewhere", "solve_relaxed", "_enqueue_from_point", "_end_at"],
-        "second astray": ["_enqueue_elsewhere", "search_modes", "_end_at"],
+        "costly": ["_enqueue_restart", "_replace_end"],
+        "better": ["_enqueue_restart", "_replace_end"],
+        "kept": ["_enqueue_restart"],
+        "astray": ["search_modes", "_replace_end"],
+        "no bound": ["_enqueue_restart", "solve_relaxed", "_enqueue_from_point", "_replace_end"],
+        "second astray": ["_enqueue_restart", "search_modes", "_replace_end"],
     }
-    again = ["_enqueue_elsewhere"] if beside and what in ("astray", "no bound") else []
+    again = ["_enqueue_restart"] if beside and what in ("astray", "no bound") else []
     assert asked == again + expected[what]
     found = planner_of(stepper).plan(start, objectives)
     assert found is not None
@@ -257,8 +257,8 @@ def test_a_search_goes_on_as_the_host_s(
 def test_what_is_not_as_usual_is_left_to_the_host(
     what: str, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A matrix that is not definite, an element that is inverted, forces that miss their laws, while the contact is
-    foreseen or at the end of the search."""
+    """A matrix that is not positive definite, an inverted element, or a Coulomb violation, in the prediction or at the
+    end of the search."""
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     start = begun(stepper, creature.start, memory)
     assert planner_of(stepper).plan(start, objectives) is not None
@@ -266,7 +266,7 @@ def test_what_is_not_as_usual_is_left_to_the_host(
         **{"verdicts": ((0, 3), 0.0), "sizes": ((1, 2), np.nan), "missed": ((2, 1), 1.0)},
         **{"horizon": ((3, 0), 0.0), "end": ((3, 1), np.inf), "forces": ((3, 2), 1.0)},
     }[what]
-    room = planner_of(stepper)._room_for(start)
+    room = planner_of(stepper)._workspace_for(start)
     told = [part.copy() for part in room._parts]
     told[place[0]][place[1]] = value
     monkeypatch.setattr(room, "_parts", told)
@@ -287,7 +287,7 @@ def test_a_body_that_is_squeezed_flat_is_left_to_the_host(creature: Creature, st
 def test_a_step_that_goes_amiss_is_planned_again_on_the_device(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every step is asked for again: what comes of it is the host's."""
+    """Every step is replanned, with the result of the host."""
     monkeypatch.setattr(stepping, "_REPLAN_FACTOR", 0.0)
     monkeypatch.setattr(stepping, "_REPLAN_MARGIN", -1.0)
     planned: list[bool] = []
@@ -333,7 +333,7 @@ def test_the_same_body_on_other_ground_shares_what_it_works_with(
 def test_a_step_is_begun_when_the_one_before_has_ended(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Once; whatever else is done there meanwhile, it is begun again, and ends alike."""
+    """Once. If other work runs in between, it is started again and has the same end."""
     counted: list[StepInputs] = []
     begin = DevicePlanner.start
     monkeypatch.setattr(DevicePlanner, "start", lambda self, start: counted.append(start) or begin(self, start))

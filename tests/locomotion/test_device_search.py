@@ -36,7 +36,7 @@ FRICTION = 0.6
 
 
 def body_program(seed: int, activations: int, contacts: int, *, bias: float = 0.0) -> CoulombProgram:
-    """Activations and contacts of a random body, which ask for some of its velocities; ``bias`` presses it down."""
+    """Return the program of a random body with objectives on some of its velocities; ``bias`` presses it down."""
     rng = np.random.default_rng(seed)
     freedoms = activations + 2 * contacts + 6
     half = rng.standard_normal((freedoms, freedoms)) / np.sqrt(freedoms)
@@ -168,7 +168,8 @@ def test_contacts_without_a_pivot_are_left_to_the_host(own: float, device: str) 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("activations", "contacts"), [(1, 1), (5, 3), (9, 8), (23, 11)])
 def test_one_launch_finds_the_optimum_without_complementarity(activations: int, contacts: int, device: str) -> None:
-    """What the host finds, of the program that the search was told, in a room for more; no search ends lower."""
+    """The relaxed optimum equals that of the host, in a workspace of larger capacity; no search has a lower
+    objective."""
     search = ModeSearchWorkspace(activations, contacts + 2, device)
     room = RelaxationWorkspace(activations, contacts + 2, search)
     alike = apart = 0
@@ -176,7 +177,7 @@ def test_one_launch_finds_the_optimum_without_complementarity(activations: int, 
         program = body_program(seed, activations, contacts, bias=0.5 * (seed % 3))
         found = search.search(program, *entered(program), 12)
         room.enqueue()
-        there, here = room.found(), solve_relaxed(program, QpSolver.OSQP)
+        there, here = room.parse_result(), solve_relaxed(program, QpSolver.OSQP)
         assert here is not None
         if there is None:
             continue
@@ -232,15 +233,20 @@ def test_a_block_does_the_algebra(count: int, device: str) -> None:
 
 
 def test_bounds_give_way_by_as_much_as_on_the_host() -> None:
-    """These numbers stand in the kernels, which know nothing of the host's modules."""
-    there = (
+    """The kernels repeat these constants, because they do not import host modules."""
+    device_values = (
         block_mode_region.ROW_TOLERANCE,
         block_mode_region.BOUND_PADDING,
         mode_search.INFEASIBLE_COST,
         block_active_set.PIVOTS,
     )
-    here = active_set._BROKEN, solvers._BOUND_PADDING * 3e-5, active_set._HOPELESS, active_set._PIVOTS
-    assert [float(each) for each in there] == pytest.approx(here, rel=1e-12)
+    host_values = (
+        active_set._BOUND_TOLERANCE,
+        solvers._BOUND_PADDING * 3e-5,
+        active_set._INFEASIBLE_COST,
+        active_set._MAX_PIVOTS,
+    )
+    assert [float(each) for each in device_values] == pytest.approx(host_values, rel=1e-12)
 
 
 def filled(made: Any, device: str, **shapes: Any) -> Any:

@@ -20,7 +20,7 @@ from tests.support.slides import slide
 from tests.support.stances import DT
 
 CLOSES = 1e-6
-"""Of m g H, in every step."""
+"""Maximum residual of a step, in m g H."""
 IDLE = {"spin_after", "push_out"}
 """Flows that the slide does not have."""
 
@@ -89,7 +89,7 @@ def test_spin_that_is_added_after_a_step_counts(trajectory: Trajectory, share: f
 def one_step(
     trajectory: Trajectory, positions: list[np.ndarray], velocities: list[np.ndarray], activations: float = 0.0
 ) -> Trajectory:
-    """That of a step in the air between two states, all muscles at ``activations`` metres."""
+    """Return the trajectory of one step in the air between two states, with all muscles at ``activations`` m."""
     of_others = [name for name in vars(trajectory) if name.startswith(("contact_", "kick_"))]
     nothing = {name: getattr(trajectory, name)[:0] for name in of_others}
     return replace(

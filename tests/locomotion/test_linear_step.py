@@ -1,4 +1,4 @@
-"""Linear steps say of their end what it is: its speed, what is asked of it, and how its contacts move."""
+"""Linear steps: end velocities, objectives and contact velocities against direct evaluation."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_its_end_is_the_newton_step_s(creature: Creature) -> None:
 
 
 def objectives_of(count: int) -> list[Objective]:
-    """Of few rows, of one entry in each row, and of rows with several."""
+    """Return objectives with few rows, with one entry in each row, and with several."""
     random = np.random.default_rng(2)
     some = sparse.csr_matrix(random.standard_normal((9, count)) * (random.random((9, count)) < 0.2))
     shares = sparse.csr_matrix(sparse.diags(random.random(count)))

@@ -80,9 +80,8 @@ def test_node_rows_measure_the_mass_weighted_distance_from_the_target() -> None:
 
 
 def test_straining_rows_see_uniform_strain_alone_and_all_of_it() -> None:
-    """Of an affine motion the mean square of what is left without its rigid part; nothing of a rigid motion or of one
-    that changes no uniform strain.
-    """
+    """For an affine motion, the mean square of its non-rigid part; zero for a rigid motion and for one without uniform
+    strain."""
     rng = np.random.default_rng(4)
     state = shaken_state()
     target = rng.standard_normal(state.positions.shape)
@@ -120,9 +119,8 @@ def place(part: BodyPart, frame: Coordinates, positions: np.ndarray) -> np.ndarr
 @by_part
 @by_frame
 def test_part_rows_are_the_rate_of_the_parts_place(part: BodyPart, frame: Coordinates) -> None:
-    """Velocity, position and acceleration of a part: rows by differences;
-    a velocity that meets the target brings what is asked.
-    """
+    """Velocity, position and acceleration of a part: rows by differences; a velocity that meets the target gives the
+    requested motion."""
     state, dt = shaken_state(), 0.01
     v = np.random.default_rng(4).standard_normal(state.positions.shape)
     rate = rate_of(lambda x: place(part, frame, x), state, v)

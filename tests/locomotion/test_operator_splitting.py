@@ -48,7 +48,7 @@ def by_osqp(units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.n
 
 
 def test_they_are_those_of_osqp_whatever_was_asked_before() -> None:
-    """A solver that is kept, with rows to spare, and that was asked other things."""
+    """A reused solver with padding rows, after other QPs, gives the iterations of OSQP."""
     kept = OsqpWarmStart(32, 12)
     for seed in range(6):
         for rows in SIZES:

@@ -1,4 +1,4 @@
-"""What a step's activations cost, against the work of their muscles by hand, and what that is worth (Eq. 13)."""
+"""Cost of activations and of the work of their muscles, computed by hand, and its effect (Eq. 13)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def asked(stepper: LocomotionStepper, step: int) -> list[AnyObjective]:
 
 
 def thrust(steps: int) -> tuple[LocomotionStepper, list[BodyState], list[StepReport]]:
-    """A block that is ``asked`` for so many steps."""
+    """Make ``steps`` steps of a block with the objectives of ``asked``."""
     creature = coarse_creature(block_mesh(), forward=np.array([1.0, 0.0, 0.0]))
     stepper, states, memory = creature.stepper, [creature.start], creature.stepper.initial_memory()
     reports: list[StepReport] = []

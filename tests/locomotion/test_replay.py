@@ -35,12 +35,12 @@ class KilledError(Exception):
 
 
 def block() -> CoarseCreature:
-    """45 nodes, made anew: nothing of an earlier run is left in it."""
+    """Return a new creature of 45 nodes, without state of an earlier run."""
     return coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
 
 
 def walker() -> CoarseCreature:
-    """A stool, made anew."""
+    """Return a new stool."""
     return coarse_creature(coarse_stool(), forward=np.array([1.0, 0.0, 0.0]))
 
 
@@ -64,7 +64,7 @@ BODIES = {"jump": block, "walk 0.1": walker}
 
 @pytest.fixture(scope="module")
 def cut_off_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What is left of a jump that was cut off."""
+    """Return the parts of a jump that was cut off."""
     parts = tmp_path_factory.mktemp("cut") / "parts"
     with pytest.raises(KilledError):
         run(block(), killed_at=CUT, parts=lambda: parts)
@@ -92,7 +92,7 @@ def same_steps(one: tuple[StepReport, ...], other: tuple[StepReport, ...]) -> bo
 def test_a_run_goes_on_to_the_same_bits(
     script: str, cut_off: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Only what had not been written down is solved, by a body that is made anew."""
+    """Only steps that were not recorded are solved, by a new body."""
     body, folder = BODIES[script], cut_off
     whole = uninterrupted() if script == "jump" else run(body(), script)
     if script != "jump":
@@ -138,12 +138,12 @@ def test_a_run_goes_on_from_any_of_its_steps(tmp_path: Path, monkeypatch: pytest
 
 
 def test_parts_of_divided_steps_are_put_together_again(tmp_path: Path) -> None:
-    """Steps that did not converge at once: what was asked is asked once for all of their parts."""
+    """Steps that were divided because they did not converge: their parts have one digest."""
     slid = slide()
     recorder = slid.recorder(folder=lambda: tmp_path)
     reports = slid.reports
     for asked, (first, last) in enumerate([(0, 1), (1, 5), (5, 6), (6, 14), (14, 24)]):
-        recorder.add(reports[first:last], asked=asked)
+        recorder.add(reports[first:last], request_digest=asked)
     recorder.trajectory()
     replay = Replay(tmp_path, recorder.start, slid.stepper.detector)
     found = [replay.step(asked) for asked in range(5)]
@@ -155,7 +155,7 @@ def test_parts_of_divided_steps_are_put_together_again(tmp_path: Path) -> None:
 def test_another_run_is_refused(cut_off: Path) -> None:
     other = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.01)), forward=FORWARD)
     for made, script in ((other, "jump"), (block(), "jump 0.6")):
-        with pytest.raises(UserError, match="does not fit the run that is to go on: capture, flags, program or"):
+        with pytest.raises(UserError, match="belongs to another run: capture, flags, program or"):
             run(made, script, parts=lambda: cut_off, resume=cut_off)
 
 
@@ -169,7 +169,7 @@ def test_a_damaged_part_is_told_and_can_be_left_out(cut_off: Path) -> None:
     second.unlink()
     assert same_steps(run(block(), parts=lambda: cut_off, resume=cut_off).reports, uninterrupted().reports)
     (cut_off / "steps-000000.npz").unlink()
-    with pytest.raises(UserError, match=r"steps-000000\.npz: is missing; remove the parts after it to go on"):
+    with pytest.raises(UserError, match=r"steps-000000\.npz: is missing; remove the parts after it to continue"):
         run(block(), parts=lambda: cut_off, resume=cut_off)
     (cut_off / "start.npz").unlink()
     with pytest.raises(UserError, match=r"start\.npz: is missing; begin the run again"):
@@ -177,7 +177,7 @@ def test_a_damaged_part_is_told_and_can_be_left_out(cut_off: Path) -> None:
 
 
 def test_a_run_that_is_pushed_goes_on_and_another_push_is_refused(tmp_path: Path) -> None:
-    """The push comes before the cut; what is asked of its step is the same without it."""
+    """The push comes before the cut; the objectives of its step are the same without it."""
     made = block()
 
     def pushed(size: float) -> Any:
@@ -194,7 +194,7 @@ def test_a_run_that_is_pushed_goes_on_and_another_push_is_refused(tmp_path: Path
     for name in whole.trajectory.__dataclass_fields__:
         assert np.array_equal(getattr(again.trajectory, name), getattr(whole.trajectory, name)), name
     for other in (pushed(1.1), lambda time, dt: None):
-        with pytest.raises(UserError, match="does not fit the run that is to go on"):
+        with pytest.raises(UserError, match="belongs to another run"):
             run(block(), resume=parts, kicks=other)
 
 

@@ -76,7 +76,7 @@ def test_a_step_in_parts_hands_on_its_last(made: CoarseCreature, monkeypatch: py
 
 @pytest.mark.parametrize("before", [[], [True] * 5 + [False]], ids=["at once", "and goes on"])
 def test_what_has_finished_rests_before_it_ends(made: CoarseCreature, before: list[bool]) -> None:
-    """So many frames in a row: what goes on meanwhile begins anew."""
+    """``REST_FRAMES`` frames in a row: a motion that continues in between resets the count."""
     frames = iter(before + [True] * 100)
     nothing = np.zeros((100, made.stepper.muscles.segment_count))
     done = roll_out(

@@ -73,7 +73,7 @@ def test_a_program_beside_one_that_is_solved_needs_no_iterations(monkeypatch: py
         lower, upper = np.full(30, -0.1), np.full(30, 0.2)
         asked = quadratic_program(P, q, A).solve(lower, upper)
         with monkeypatch.context() as patch:
-            patch.setattr(operator_splitting, "_answer", None)
+            patch.setattr(operator_splitting, "_run_osqp", None)
             beside = quadratic_program(P, q, A).solve(lower, upper, beside=True)
             rows, below = np.vstack([A, A[:1]]), np.append(lower, 0.3)
             none = quadratic_program(P, q, rows).solve(below, np.append(upper, 1.0), beside=True)
@@ -88,7 +88,7 @@ def test_each_splitting_is_that_of_its_name(monkeypatch: pytest.MonkeyPatch) -> 
     P, q, A = random_program(0)
     lower, upper = np.r_[0.0, np.full(29, -0.1)], np.r_[0.0, np.full(29, 0.2)]
     expected = quadratic_program(P, q, A, solver="osqp").solve(lower, upper)
-    monkeypatch.setattr(operator_splitting, "_answer", None)
+    monkeypatch.setattr(operator_splitting, "_run_osqp", None)
     found = quadratic_program(P, q, A, solver="admm").solve(lower, upper)
     assert found.status is QpStatus.SOLVED and np.abs(found.x - expected.x).max() < 1e-3
     with pytest.raises(TypeError):
@@ -189,7 +189,7 @@ def test_same_solves_give_the_same_bits() -> None:
 
 
 def test_daqp_is_optional(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The engine does not need DAQP; whoever asks for it without having it is told what to do."""
+    """The engine does not need DAQP; without the package, selecting it gives an error that says what to do."""
     real = builtins.__import__
 
     def without(name: str, *rest: Any, **options: Any) -> ModuleType:

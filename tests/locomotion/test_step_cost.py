@@ -21,7 +21,7 @@ DT = 1 / 60
 
 
 def two_contacts() -> ContactSet:
-    """Of two corners of the block."""
+    """Return the contacts of two corners of the block."""
     soles = embed_points(BODY.mesh, BODY.mesh.nodes[BODY.mesh.nodes[:, 2] == 0.0][[0, -1]], device="cpu")
     floor = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
     geometry = ContactGeometry(BODY.mesh, (floor,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0)
@@ -73,7 +73,7 @@ def moved_on(problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, tim
 
 
 def test_effort_is_the_energy_ahead_and_convex() -> None:
-    """Value, slope and curvature at the unknowns that bring about what is foreseen, by differences of the energy."""
+    """Value, slope and curvature about the predicted end, by differences of the energy."""
     problem, linear, foreseen = example()
     horizon = 0.16
     time = horizon * np.sqrt(BODY.height / 9.81)
@@ -83,7 +83,7 @@ def test_effort_is_the_energy_ahead_and_convex() -> None:
     ahead = EffortModel.of(problem, foreseen.reshape(-1, 3), factors, horizon=horizon)
     cost = effort_cost(problem, linear, foreseen, ahead, weight=0.1)
     assert np.linalg.eigvalsh(cost.P).min() >= -1e-12 * np.abs(cost.P).max()
-    # About the end that is foreseen the model is the energy, to second order.
+    # About the predicted end the model equals the energy to second order.
     assert np.linalg.norm(cost.P) > 0.0
     still = LinearStep(np.column_stack([1e-2 * linear.columns, 0.0 * foreseen]), linear.torques)
     rest = np.zeros_like(foreseen)

@@ -1,6 +1,5 @@
-"""The stepper (Eq. 4, 9, 12, 13): every step audited by hand, bit-identical runs, a body that is carried where it is
-asked to go, subdivision of a step that fails.
-"""
+"""The stepper (Eq. 4, 9, 12, 13): every step audited by hand, bit-identical runs, a body that follows its objectives,
+subdivision of a step that fails."""
 
 from __future__ import annotations
 
@@ -279,7 +278,8 @@ def test_a_step_that_does_not_converge_is_subdivided(longest: float, parts: int)
 
 @pytest.mark.parametrize("planned_well", [True, False])
 def test_halves_are_made_under_the_activations_that_serve_better(planned_well: bool) -> None:
-    """Those planned for the whole of a step that does not converge, or, where these push the wrong way, the last."""
+    """The planned activations of a step that does not converge, or the previous ones if the planned ones push the wrong
+    way."""
     made = muscular_block()
     start = BodyState(made.body.mesh.nodes, np.zeros_like(made.body.mesh.nodes))
     with one_blas_thread():

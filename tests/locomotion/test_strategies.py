@@ -30,7 +30,7 @@ from egs_warp.locomotion.strategies import (
 from tests.support.contact_programs import FRICTION, optimum_of_each, small_problem
 
 PAIRED = [strategy for strategy in Strategy if strategy is not Strategy.MODES]
-"""Those that choose states of complementary pairs."""
+"""Strategies over states of complementary pairs."""
 
 
 def search(
@@ -166,8 +166,8 @@ def test_states_that_contradict_each_other_are_replaced() -> None:
 
 def test_every_strategy_solves_the_same_program() -> None:
     """Eq. (9), Eq. (13): each gives activations in their bounds, forces in the cone, the objective of its point, and
-    in the mean no more than where it begins; in a few QPs the pieces come nearer than those that change one contact at
-    a time from what the paper foresees.
+    in the mean no more than where it begins; in a few QPs ``modes`` comes nearer than the strategies that change one
+    contact at a time from the predicted states.
     """
     reached: dict[Strategy, list[float]] = {strategy: [] for strategy in Strategy}
     for seed in range(24):
@@ -210,8 +210,8 @@ def test_strategies_and_solvers_are_chosen_by_name() -> None:
 
 
 def test_strategies_begin_where_they_say() -> None:
-    """The paper's in the states that are foreseen, which it only betters; the static one with all static, whatever is
-    foreseen."""
+    """``paper`` starts from the predicted states, and only improves on them; ``static`` from all static, whatever the
+    prediction."""
     tried = 0
     for seed in range(40):
         program, foreseen = small_problem(seed).program, (0, 1)
@@ -228,8 +228,8 @@ def test_strategies_begin_where_they_say() -> None:
 
 @pytest.mark.parametrize("bound", [None, 1.0, 0.5])
 def test_pieces_are_searched_again_only_in_doubt(bound: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where what is found is within a fifth of what no contact can undercut, or that is not known, one QP more is all;
-    else there is a second search."""
+    """If the result is within 1.2 times the lower bound, or the bound is not known, there is one QP more; otherwise a
+    second search."""
     pieces = small_problem(3, contacts=3, directions=8, freedoms=14).pieces
     forces = np.zeros((3, 3))
     foreseen = PredictedContact(np.zeros(3), forces, forces)

@@ -28,7 +28,7 @@ def test_alike_are_grouped_and_few_are_left_alone() -> None:
     kinds = random.standard_normal((3 * len(body.node_mass), 5))
     group = np.arange(count) % 5
     effects = kinds[:, group] * random.uniform(0.5, 2.0, count) + 1e-3 * random.standard_normal((len(kinds), count))
-    found = find_synergies(muscles, effects, body.node_mass, most=5)
+    found = find_synergies(muscles, effects, body.node_mass, max_count=5)
     assert found.count == 5
     assert all(len(np.unique(found.group_from_muscle[group == g])) == 1 for g in range(5))
     values = random.standard_normal(count)
@@ -40,14 +40,13 @@ def test_alike_are_grouped_and_few_are_left_alone() -> None:
         many = replace(muscles, segments=np.tile(muscles.segments, (1 + 150 // count, 1)))
         made = random.standard_normal((3 * nodes, many.segment_count))
         assert find_synergies(many, made, np.ones(nodes)).count == most
-    alone = find_synergies(muscles, effects, body.node_mass, most=count)
+    alone = find_synergies(muscles, effects, body.node_mass, max_count=count)
     assert alone.count == count and np.array_equal(alone.group_from_muscle, np.arange(count))
 
 
 def test_muscles_are_grouped_by_what_they_do_in_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of sqrt(H / g) / 19: velocities whose impulse, by central differences of the equation of that step, is along the
-    pull's.
-    """
+    """Effects are velocities in a step of sqrt(H / g) / 19: their impulse, by central differences of the equation of
+    that step, is along that of the muscle."""
     given = []
     monkeypatch.setattr(module, "find_synergies", lambda *rest: given.append(rest) or find_synergies(*rest))
     stepper = coarse_creature(block_mesh(), forward=FORWARD, settled=False).stepper

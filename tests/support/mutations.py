@@ -346,7 +346,10 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("ledger: the arms of the torque that is taken off", "locomotion/ledger.py"),
-            *("given @ _momentum(mass, before, velocity)", "given @ _momentum(mass, after, t.velocities[step])"),
+            *(
+                "inner_spin @ _momentum(mass, before, velocity)",
+                "inner_spin @ _momentum(mass, after, t.velocities[step])",
+            ),
             "locomotion/test_ledger.py::test_every_step_closes",
         ),
         (

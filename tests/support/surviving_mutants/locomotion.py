@@ -19,8 +19,8 @@ LOCOMOTION = [
     ),
     Survivor(
         "locomotion/active_set.py",
-        "_HOPELESS = 1e6",
-        "_HOPELESS = 1000001.0",
+        "_INFEASIBLE_COST = 1e6",
+        "_INFEASIBLE_COST = 1000001.0",
         "a bound that is far beyond all that matters, by a millionth farther",
     ),
     Survivor(
@@ -85,8 +85,8 @@ LOCOMOTION = [
     ),
     Survivor(
         "locomotion/synergies.py",
-        "if muscles.segment_count <= most:",
-        "if muscles.segment_count < most:",
+        "if muscles.segment_count <= max_count:",
+        "if muscles.segment_count < max_count:",
         "as many groups as muscles: each is one of its own either way",
     ),
     Survivor(
