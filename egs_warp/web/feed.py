@@ -18,7 +18,7 @@ from egs_warp.motions.style import LEAST, MOST, PRESETS, Style
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.simulated_run import FILMED_FROM
-from egs_warp.web.messages import LEAST_SAG, MOST_FRICTION, MOST_SAG, read_message
+from egs_warp.web.messages import MIN_SAG, MAX_FRICTION, MAX_SAG, read_message
 from egs_warp.web.packets import Frame
 from egs_warp.web.recording import CURVES, creature_header, curve_facts
 from egs_warp.web.session import Session
@@ -61,7 +61,7 @@ class LiveFeed:
             "audit": {},
             "motion": [],
             "notes": [],
-            "limits": {"friction": [0.0, MOST_FRICTION], "sag": [LEAST_SAG, MOST_SAG], "style": [LEAST, MOST]},
+            "limits": {"friction": [0.0, MAX_FRICTION], "sag": [MIN_SAG, MAX_SAG], "style": [LEAST, MOST]},
             "styles": {"usual": vars(Style()), **{name: dict(style) for name, style in PRESETS.items()}},
         }
         planes = np.array([[*plane.normal, plane.offset] for plane in creature.geometry.planes])

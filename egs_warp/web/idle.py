@@ -9,10 +9,10 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.sequence import Stance
 
-_STILL = 2e-3
+_MAX_STILL_SPEED = 2e-3
 """sqrt(g H): a body whose nodes move no faster, root mean square, and that has nothing to do, is left at rest, without
 steps."""
-_STILL_TIME = 0.3
+_MIN_STILL_TIME = 0.3
 """Seconds for which that holds first."""
 
 
@@ -20,7 +20,7 @@ class RelaxMuscles:
     """Relaxes its muscles."""
 
     @property
-    def resting(self) -> bool:
+    def is_at_rest(self) -> bool:
         """Always."""
         return True
 
@@ -42,14 +42,14 @@ class StillnessDetector:
     def update(self, body: SoftBody, state: BodyState) -> None:
         """The state after a step."""
         speed = np.sqrt(body.node_mass @ (state.velocities**2).sum(axis=1) / body.mass)
-        if speed > _STILL * body.speed_unit:
+        if speed > _MAX_STILL_SPEED * body.speed_unit:
             self._since = None
         elif self._since is None:
             self._since = state.time
 
     def is_still(self, state: BodyState) -> bool:
         """Whether it has been still long enough, at the time of ``state``, to be left at rest."""
-        return self._since is not None and state.time - self._since >= _STILL_TIME
+        return self._since is not None and state.time - self._since >= _MIN_STILL_TIME
 
     def reset(self) -> None:
         """It begins anew."""

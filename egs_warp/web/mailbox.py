@@ -13,9 +13,9 @@ from egs_warp.web.packets import Frame
 
 News = Frame | dict[str, Any]
 
-_MOST_WAITING = 240
+_MAX_QUEUED_FRAMES = 240
 """Frames for a page that is slow to take them; older ones are dropped."""
-_MOST_ASKED = 1000
+_MAX_QUEUED_MESSAGES = 1000
 """Messages that wait for a step to end."""
 
 
@@ -27,11 +27,11 @@ class Mailbox:
         """Whether a page takes what is sent."""
         self.stopping = False
         """Whether the session is to end."""
-        self._inbox: deque[Message] = deque(maxlen=_MOST_ASKED)
+        self._inbox: deque[Message] = deque(maxlen=_MAX_QUEUED_MESSAGES)
         self._outbox: deque[News] = deque()
         self._changed = threading.Condition()
         self._wake: Callable[[], object] = lambda: None
-        self._told_state: dict[str, Any] = {}
+        self._last_state: dict[str, Any] = {}
 
     # For the page.
 
@@ -46,7 +46,7 @@ class Mailbox:
         with self._changed:
             self.watched, self._wake = True, wake
             self._outbox.clear()
-            self._told_state = {}
+            self._last_state = {}
             self._outbox.append(first())
             self._changed.notify_all()
         wake()
@@ -83,7 +83,7 @@ class Mailbox:
         """Wait while the session is ``held`` and has nothing to do or to tell, and call ``waited`` after each time;
         False at the end."""
         with self._changed:
-            while not self.stopping and held() and not self._inbox and self._told_state:
+            while not self.stopping and held() and not self._inbox and self._last_state:
                 self._changed.wait()
                 waited()
             return not self.stopping
@@ -102,7 +102,7 @@ class Mailbox:
             if not self.watched:
                 return
             self._outbox.append(news)
-            if len(self._outbox) > _MOST_WAITING:
+            if len(self._outbox) > _MAX_QUEUED_FRAMES:
                 oldest = next((one for one in self._outbox if isinstance(one, Frame)), None)
                 if oldest is not None:
                     self._outbox.remove(oldest)
@@ -122,8 +122,8 @@ class Mailbox:
         finally:
             self.send({"type": "busy", "on": False})
 
-    def tell_state(self, state: Mapping[str, Any]) -> None:
+    def send_state(self, state: Mapping[str, Any]) -> None:
         """How things stand, where that is new to who watches."""
-        if state != self._told_state:
-            self._told_state = dict(state)
+        if state != self._last_state:
+            self._last_state = dict(state)
             self.send(dict(state))

@@ -16,13 +16,13 @@ from egs_warp.motions.push import MAX_IMPULSE
 from egs_warp.motions.script import Script, motion
 from egs_warp.motions.style import LEAST, MOST, Style
 
-LONGEST_TEXT = 200
+MAX_TEXT_LENGTH = 200
 """Characters of motions asked for at once."""
-FURTHEST = 100.0
+MAX_DISTANCE = 100.0
 """Body heights from the start: nothing goes, or is pulled, further."""
-LEAST_SAG, MOST_SAG = 0.01, 0.1
+MIN_SAG, MAX_SAG = 0.01, 0.1
 """rho g H / E of a column: stiff and soft."""
-MOST_FRICTION = 2.0
+MAX_FRICTION = 2.0
 STYLE_NAMES = tuple(field.name for field in fields(Style))
 _MOTIONS = re.compile(r"[A-Za-z0-9_=+\-., ]+")
 
@@ -151,13 +151,13 @@ def read_message(message: Mapping[str, Any], *, height: float, node_count: int) 
     unknown = [name for name in message if name != "type" and name not in fields]
     if unknown:
         raise ValueError(f"{kind} has no {unknown[0][:40]!r}")
-    return read(message, FURTHEST * height, node_count)
+    return read(message, MAX_DISTANCE * height, node_count)
 
 
-def _perform(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+def _read_script(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
     text = message.get("text")
-    if not isinstance(text, str) or len(text) > LONGEST_TEXT:
-        raise ValueError(f"text: give motions in at most {LONGEST_TEXT} characters, as jump 0.5 0.2")
+    if not isinstance(text, str) or len(text) > MAX_TEXT_LENGTH:
+        raise ValueError(f"text: give motions in at most {MAX_TEXT_LENGTH} characters, as jump 0.5 0.2")
     # A script or key frames would be files of this machine.
     if not _MOTIONS.fullmatch(text) or re.search(r"\.(json|csv)", text, re.IGNORECASE):
         raise ValueError("text: give motions by name and number, as hop x3, twist 90")
@@ -167,72 +167,72 @@ def _perform(message: Mapping[str, Any], reach: float, node_count: int) -> Messa
     return PlayScript(script)
 
 
-def _go(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
-    return GoTo((_number(message, "x", -reach, reach), _number(message, "y", -reach, reach)))
+def _read_go(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+    return GoTo((_read_number(message, "x", -reach, reach), _read_number(message, "y", -reach, reach)))
 
 
-def _steer(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+def _read_steer(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
     names = ("forward", "sideways", "turn")
-    return Steer(Drive(*(_number(message, name, -FASTEST, FASTEST) if name in message else 0.0 for name in names)))
+    return Steer(Drive(*(_read_number(message, name, -FASTEST, FASTEST) if name in message else 0.0 for name in names)))
 
 
-def _pull(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+def _read_pull(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
     node = message.get("node")
     if not isinstance(node, int) or isinstance(node, bool) or not 0 <= node < node_count:
         raise ValueError(f"node: give a whole number from 0 to {node_count - 1}")
-    x, y, z = (_number(message, name, -reach, reach) for name in "xyz")
+    x, y, z = (_read_number(message, name, -reach, reach) for name in "xyz")
     return Pull(node, (x, y, z))
 
 
-def _hit(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
-    x, y, z = (_number(message, name, -MAX_IMPULSE, MAX_IMPULSE) for name in "xyz")
+def _read_push(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+    x, y, z = (_read_number(message, name, -MAX_IMPULSE, MAX_IMPULSE) for name in "xyz")
     if math.hypot(x, y, z) > MAX_IMPULSE:
         raise ValueError(f"push: give at most {MAX_IMPULSE:g} m sqrt(g H)")
-    return PushOnce((x, y, z), _number(message, "height", 0.0, 1.0) if "height" in message else None)
+    return PushOnce((x, y, z), _read_number(message, "height", 0.0, 1.0) if "height" in message else None)
 
 
-def _change(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+def _read_change(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
     given = [name for name in ("friction", "sag") if name in message]
     if not given:
         raise ValueError("set: give friction or sag")
-    spans = {"friction": (0.0, MOST_FRICTION), "sag": (LEAST_SAG, MOST_SAG)}
-    return Change(**{name: _number(message, name, *spans[name]) for name in given})
+    spans = {"friction": (0.0, MAX_FRICTION), "sag": (MIN_SAG, MAX_SAG)}
+    return Change(**{name: _read_number(message, name, *spans[name]) for name in given})
 
 
-def _restyle(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
-    return Restyle(Style(**{name: _number(message, name, LEAST, MOST) for name in STYLE_NAMES if name in message}))
+def _read_style(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+    return Restyle(Style(**{name: _read_number(message, name, LEAST, MOST) for name in STYLE_NAMES if name in message}))
 
 
-def _on(message: Mapping[str, Any]) -> bool:
+def _read_on(message: Mapping[str, Any]) -> bool:
     on = message.get("on")
     if not isinstance(on, bool):
         raise ValueError("on: give true or false")
     return on
 
 
-def _number(message: Mapping[str, Any], name: str, least: float, most: float) -> float:
+def _read_number(message: Mapping[str, Any], name: str, minimum: float, maximum: float) -> float:
     value = message.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{name}: give a number")
-    if not least <= value <= most or not math.isfinite(value):
-        raise ValueError(f"{name}: give a number from {least:g} to {most:g}")
+    if not minimum <= value <= maximum or not math.isfinite(value):
+        raise ValueError(f"{name}: give a number from {minimum:g} to {maximum:g}")
     return float(value)
 
 
 _Reader: TypeAlias = Callable[[Mapping[str, Any], float, int], Message]
 _READERS: dict[str, tuple[tuple[str, ...], _Reader]] = {
-    "motion": (("text",), _perform),
-    "go": (("x", "y"), _go),
-    "drive": (("forward", "sideways", "turn"), _steer),
-    "pull": (("node", "x", "y", "z"), _pull),
+    "motion": (("text",), _read_script),
+    "go": (("x", "y"), _read_go),
+    "drive": (("forward", "sideways", "turn"), _read_steer),
+    "pull": (("node", "x", "y", "z"), _read_pull),
     "release": ((), lambda *_: Release()),
-    "push": (("x", "y", "z", "height"), _hit),
-    "set": (("friction", "sag"), _change),
-    "style": (STYLE_NAMES, _restyle),
-    "pause": (("on",), lambda message, *_: Pause(_on(message))),
+    "push": (("x", "y", "z", "height"), _read_push),
+    "set": (("friction", "sag"), _read_change),
+    "style": (STYLE_NAMES, _read_style),
+    "pause": (("on",), lambda message, *_: Pause(_read_on(message))),
     "step": ((), lambda *_: Step()),
     "cancel": ((), lambda *_: Cancel()),
     "stand": ((), lambda *_: StandUp()),
-    "record": (("on",), lambda message, *_: Record(_on(message))),
+    "record": (("on",), lambda message, *_: Record(_read_on(message))),
     "script": ((), lambda *_: RequestScript()),
 }

@@ -13,7 +13,7 @@ from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.web.recording import Recording
 
 PAGE = Path(__file__).with_name("page.html")
-_PLACE = "<!-- runs -->"
+_RUNS_MARKER = "<!-- runs -->"
 
 
 def page_text() -> str:
@@ -40,7 +40,7 @@ def export_page(path: Path, recordings: Sequence[Recording]) -> int:
         f"{base64.b64encode(gzip.compress(recording.bytes(), mtime=0)).decode()}</script>"
         for number, recording in enumerate(recordings)
     ]
-    text = page_text().replace(_PLACE, "\n".join(scripts), 1)
+    text = page_text().replace(_RUNS_MARKER, "\n".join(scripts), 1)
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return len(text.encode())

@@ -32,15 +32,15 @@ def likely_poses(body: SoftBody) -> list[np.ndarray]:
     up = -body.gravity / np.linalg.norm(body.gravity)
     heights = nodes @ up
     free = heights > heights.min() + 0.05 * body.height
-    kept = np.flatnonzero(np.repeat(free, 3))
+    free_dofs = np.flatnonzero(np.repeat(free, 3))
     upper = body.assembly.matrix(body.assembly.hessian_entries(nodes))
-    stiffness = (upper + sparse.triu(upper, 1).T).tocsc()[kept][:, kept]
-    mass = sparse.diags(np.repeat(body.node_mass, 3)[kept]).tocsc()
-    _, modes = sparse_linalg.eigsh(stiffness, k=MODE_COUNT, M=mass, sigma=0.0, v0=np.ones(len(kept)))
+    stiffness = (upper + sparse.triu(upper, 1).T).tocsc()[free_dofs][:, free_dofs]
+    mass = sparse.diags(np.repeat(body.node_mass, 3)[free_dofs]).tocsc()
+    _, modes = sparse_linalg.eigsh(stiffness, k=MODE_COUNT, M=mass, sigma=0.0, v0=np.ones(len(free_dofs)))
     poses = []
     for mode in modes.T:
         moved = np.zeros(nodes.size)
-        moved[kept] = mode
+        moved[free_dofs] = mode
         moved = moved.reshape(-1, 3)
         moved *= MODE_AMPLITUDE * body.height / np.linalg.norm(moved, axis=1).max()
         poses += [nodes + moved, nodes - moved]

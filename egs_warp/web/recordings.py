@@ -23,7 +23,7 @@ from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import GaussianCounts, report_of_run
 
-LONGEST_TAKE = 120.0
+MAX_TAKE_SECONDS = 120.0
 """Seconds of the creature's own time, after which a take ends by itself."""
 SCRIPT = "script.json"
 

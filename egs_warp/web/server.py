@@ -1,4 +1,4 @@
-"""A server for this machine alone: the page, its runs, and a socket that sends frames as they are made."""
+"""A server for this machine alone: the page, its runs, and a socket that sends frames as they are listener."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from egs_warp.errors import ArgumentError
 from egs_warp.web.page import page_text
 
 HOST = "127.0.0.1"
-LARGEST_MESSAGE = 65_536
+MAX_MESSAGE_BYTES = 65_536
 """Bytes that a page may send at once; more closes its socket."""
-_NAMES = frozenset({"127.0.0.1", "localhost"})
+_HOST_NAMES = frozenset({"127.0.0.1", "localhost"})
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
@@ -47,7 +47,7 @@ class FrameFeed(Protocol):
         ...
 
     def packets(self) -> AsyncGenerator[bytes | str]:
-        """Frames (``Frame.packet``) as they are made, and news beside them, as JSON."""
+        """Frames (``Frame.packet``) as they are listener, and news beside them, as JSON."""
         ...
 
     def receive(self, message: dict[str, object]) -> None:
@@ -73,10 +73,10 @@ class PageServer:
         self.token = token or secrets.token_urlsafe(24)
         self._page = page_text()
         self._runs = list(runs)
-        self._made: dict[int, bytes] = {}
+        self._run_bytes: dict[int, bytes] = {}
         self._feed = feed
-        self._fed = False
-        self._socket = _listening(port)
+        self._has_client = False
+        self._socket = _bind(port)
         self.port: int = self._socket.getsockname()[1]
         secret = f"/{self.token}"
         routes: list[BaseRoute] = [
@@ -85,9 +85,9 @@ class PageServer:
         ]
         if feed is not None:
             routes.append(WebSocketRoute(f"{secret}/live", self._send_frames))
-        app = _SameMachine(Starlette(routes=routes), self.port)
+        app = _SameOriginOnly(Starlette(routes=routes), self.port)
         settings = uvicorn.Config(
-            app, log_level="warning", access_log=False, ws_max_size=LARGEST_MESSAGE, server_header=False, lifespan="off"
+            app, log_level="warning", access_log=False, ws_max_size=MAX_MESSAGE_BYTES, server_header=False, lifespan="off"
         )
         self._server = uvicorn.Server(settings)
 
@@ -113,29 +113,29 @@ class PageServer:
         number = int(request.path_params["number"])
         if number >= len(self._runs):
             return PlainTextResponse("there is no such run", 404, headers=_HEADERS)
-        if number not in self._made:
-            self._made[number] = await asyncio.to_thread(self._runs[number])
-        return Response(self._made[number], media_type="application/octet-stream", headers=_HEADERS)
+        if number not in self._run_bytes:
+            self._run_bytes[number] = await asyncio.to_thread(self._runs[number])
+        return Response(self._run_bytes[number], media_type="application/octet-stream", headers=_HEADERS)
 
     async def _send_frames(self, page: WebSocket) -> None:
         feed = self._feed
         assert feed is not None
         await page.accept()
-        if self._fed:
+        if self._has_client:
             await page.close(1013, "another page watches this run already; close it first")
             return
-        self._fed = True
+        self._has_client = True
         try:
             with contextlib.suppress(WebSocketDisconnect):
                 await page.send_bytes(await asyncio.to_thread(feed.header))
-                await _first_to_end(_listen(page, feed), _speak(page, feed))
+                await _first_to_end(_receive_messages(page, feed), _send_packets(page, feed))
         finally:
-            self._fed = False
+            self._has_client = False
 
 
-async def _first_to_end(*ways: Coroutine[None, None, None]) -> None:
+async def _first_to_end(*coroutines: Coroutine[None, None, None]) -> None:
     """Run all until one ends; raises what that one raised."""
-    tasks = [asyncio.create_task(way) for way in ways]
+    tasks = [asyncio.create_task(coroutine) for coroutine in coroutines]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
@@ -146,14 +146,14 @@ async def _first_to_end(*ways: Coroutine[None, None, None]) -> None:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _speak(page: WebSocket, feed: FrameFeed) -> None:
+async def _send_packets(page: WebSocket, feed: FrameFeed) -> None:
     async with contextlib.aclosing(feed.packets()) as packets:
         async for packet in packets:
             await (page.send_text(packet) if isinstance(packet, str) else page.send_bytes(packet))
     await page.close(1000, "the run is over")
 
 
-async def _listen(page: WebSocket, feed: FrameFeed) -> None:
+async def _receive_messages(page: WebSocket, feed: FrameFeed) -> None:
     while True:
         try:
             message = json.loads(await page.receive_text())
@@ -165,12 +165,12 @@ async def _listen(page: WebSocket, feed: FrameFeed) -> None:
             await page.send_text(json.dumps({"error": f"this message makes no sense: {str(error)[:200]}"}))
 
 
-class _SameMachine:
+class _SameOriginOnly:
     """Lets through only what a page of this very server asks: no other site gets at it by the user's browser."""
 
     def __init__(self, app: ASGIApp, port: int) -> None:
         self._app = app
-        self._hosts = {f"{name}:{port}" for name in _NAMES}
+        self._hosts = {f"{name}:{port}" for name in _HOST_NAMES}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -179,8 +179,8 @@ class _SameMachine:
         asked = HTTPConnection(scope)
         origin = asked.headers.get("origin")
         # Browsers always tell a socket's origin.
-        stranger = urlsplit(origin).netloc not in self._hosts if origin is not None else scope["type"] == "websocket"
-        if asked.headers.get("host") not in self._hosts or stranger:
+        is_foreign = urlsplit(origin).netloc not in self._hosts if origin is not None else scope["type"] == "websocket"
+        if asked.headers.get("host") not in self._hosts or is_foreign:
             if scope["type"] == "websocket":
                 await send({"type": "websocket.close", "code": 1008})
             else:
@@ -191,19 +191,19 @@ class _SameMachine:
 
 def check_port(port: int) -> None:
     """Raise the ``UserError`` of ``PageServer`` for a port that is taken, before any long work."""
-    _listening(port).close()
+    _bind(port).close()
 
 
-def _listening(port: int) -> socket.socket:
-    made = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+def _bind(port: int) -> socket.socket:
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         if os.name == "posix":
             # Elsewhere this would share the port with whoever has it.
-            made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        made.bind((HOST, port))
-        made.listen(16)
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((HOST, port))
+        listener.listen(16)
     except (OSError, OverflowError) as error:
-        made.close()
+        listener.close()
         reason = getattr(error, "strerror", None) or str(error)
         raise ArgumentError("port", f"cannot be used ({reason}); give another, or 0 for any", value=port) from error
-    return made
+    return listener

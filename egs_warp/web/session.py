@@ -43,8 +43,8 @@ from egs_warp.web.messages import (
     Step,
 )
 from egs_warp.web.packets import Frame
-from egs_warp.web.recordings import LONGEST_TAKE, SessionRecording, script_text
-from egs_warp.web.steering import FALLEN, MotionScheduler
+from egs_warp.web.recordings import MAX_TAKE_SECONDS, SessionRecording, script_text
+from egs_warp.web.steering import FALLEN_TILT, MotionScheduler
 from egs_warp.web.user_forces import UserForces
 
 
@@ -72,9 +72,9 @@ class Session:
         self._memory = creature.stepper.initial_memory()
         self._dt, _ = solver_steps(creature.body)
         self._place = initial_stance(creature)
-        self._post = Mailbox()
-        self.steering = MotionScheduler(self._place, self._post.send_line)
-        self._touches = UserForces()
+        self._mailbox = Mailbox()
+        self.steering = MotionScheduler(self._place, self._mailbox.send_line)
+        self._user_forces = UserForces()
         self._take: SessionRecording | None = None
         self._paused, self._single_steps = False, 0
         self._stillness = StillnessDetector()
@@ -90,58 +90,58 @@ class Session:
 
     def stop(self) -> None:
         """End the thread, and write the take that was going on."""
-        self._post.stop()
+        self._mailbox.stop()
         if self._thread.is_alive():
             self._thread.join()
 
     def put_request(self, message: Message) -> None:
         """Leave a message; it is obeyed before the next step."""
-        self._post.put_request(message)
+        self._mailbox.put_request(message)
 
     def subscribe(self, wake: Callable[[], object]) -> None:
         """Live on; ``wake`` is called, from the session's thread, when ``waiting`` has something: first how it is."""
-        self._post.subscribe(wake, self._frame)
+        self._mailbox.subscribe(wake, self._frame)
 
     def unsubscribe(self) -> None:
         """Nobody watches: hold still, and let go of what is pulled."""
-        self._post.unsubscribe()
+        self._mailbox.unsubscribe()
 
     def take_news(self) -> list[News]:
         """Frames and news since the last call."""
-        return self._post.take_news()
+        return self._mailbox.take_news()
 
     # Of the session's own thread.
 
     def _run_loop(self) -> None:
-        while self._post.wait_for_work(lambda: self._held, self._begin_time):
+        while self._mailbox.wait_for_work(lambda: self._is_suspended, self._reset_clock):
             self.process_requests()
-            if not self._held:
+            if not self._is_suspended:
                 self.advance()
-                self._keep_time()
-            self._post.tell_state(self.state_message())
+                self._wait_for_clock()
+            self._mailbox.send_state(self.state_message())
         if self._take is not None:
             self._end_take()
 
     @property
-    def _held(self) -> bool:
-        if not self._post.watched:
+    def _is_suspended(self) -> bool:
+        if not self._mailbox.watched:
             return True
         return self._single_steps == 0 and (self._paused or self.resting)
 
     @property
     def resting(self) -> bool:
         """Whether it stands still with nothing to do; the next thing asked for goes on from there."""
-        if not self.steering.idle or self._take is not None or self._touches.has_input:
+        if not self.steering.idle or self._take is not None or self._user_forces.has_input:
             return False
         return self._stillness.is_still(self.state)
 
-    def _begin_time(self) -> None:
+    def _reset_clock(self) -> None:
         """What was waited for is not caught up."""
         self._due = time.perf_counter()
 
-    def _keep_time(self) -> None:
+    def _wait_for_clock(self) -> None:
         self._due = max(self._due + self._dt, time.perf_counter() - 2.0 * self._dt)
-        self._post.wait_until(lambda: self._due - time.perf_counter())
+        self._mailbox.wait_until(lambda: self._due - time.perf_counter())
 
     def advance(self) -> None:
         """One step of the solver."""
@@ -150,7 +150,7 @@ class Session:
         try:
             with one_blas_thread():
                 objectives = self.steering.objectives(before, self.report, self._dt)
-            kick = self._touches.kick(self._place, before, self._dt)
+            kick = self._user_forces.kick(self._place, before, self._dt)
             stepper, start = self.creature.stepper, before.with_velocity_kick(kick)
             self.state, self._memory, reports = stepper.advance(start, self._memory, objectives, self._dt)
             if not np.isfinite(self.state.positions).all():
@@ -158,7 +158,7 @@ class Session:
         # A step that goes wrong must not end a session.
         except Exception as error:
             print(f"egs-warp: live: {type(error).__name__}: {error}", file=sys.stderr)
-            self._post.send_line("the solver found no way on; the creature stands where it began")
+            self._mailbox.send_line("the solver found no way on; the creature stands where it began")
             self.state = before
             self._stand_up()
             return
@@ -166,21 +166,21 @@ class Session:
         self._stillness.update(self.creature.body, self.state)
         if self._take is not None:
             self._take.add(reports, kick=kick)
-            if self._take.seconds >= LONGEST_TAKE:
-                self._post.send_line(f"a take has at most {LONGEST_TAKE:g} s")
+            if self._take.seconds >= MAX_TAKE_SECONDS:
+                self._mailbox.send_line(f"a take has at most {MAX_TAKE_SECONDS:g} s")
                 self._end_take()
         self._index += 1
-        self._post.send(self._frame())
+        self._mailbox.send(self._frame())
 
     def process_requests(self) -> None:
         """Do what the messages ask that came since."""
-        for message in self._post.take_requests():
+        for message in self._mailbox.take_requests():
             try:
                 self._do(message)
             # What goes wrong with one message must not end a session.
             except Exception as error:
                 print(f"egs-warp: live: {type(error).__name__}: {error}", file=sys.stderr)
-                self._post.send_line(f"that did not work: {str(error)[:200]}")
+                self._mailbox.send_line(f"that did not work: {str(error)[:200]}")
 
     def _do(self, message: Message) -> None:
         match message:
@@ -193,18 +193,18 @@ class Session:
             case Cancel():
                 self.steering.cancel()
             case Pull():
-                self._touches.pull(self.creature.body, message)
+                self._user_forces.pull(self.creature.body, message)
             case Release():
-                self._touches.release()
+                self._user_forces.release()
             case PushOnce():
-                self._touches.push(message)
+                self._user_forces.push(message)
             case Change():
                 self._change(message)
             case Restyle(style):
                 self.steering.style = style
             case Pause(on):
                 self._paused = on
-                self._begin_time()
+                self._reset_clock()
             case Step():
                 self._single_steps += 1 if self._paused else 0
             case StandUp():
@@ -213,18 +213,18 @@ class Session:
                 self._record(on)
             case RequestScript():
                 requests = self.steering.requests[-MOST_MOTIONS:]
-                self._post.send({"type": "script", "text": script_text(requests), "motions": len(requests)})
+                self._mailbox.send({"type": "script", "text": script_text(requests), "motions": len(requests)})
 
     def _stand_up(self) -> None:
         self._end_take()
-        self._touches.clear()
+        self._user_forces.clear()
         self._stillness.reset()
         stood = self.creature.start.positions.copy()
         self.state = BodyState(stood, np.zeros_like(stood), self.state.time)
         self.report, self._memory = None, self.creature.stepper.initial_memory()
         self.steering.stand(self._place)
         self._index += 1
-        self._post.send(self._frame())
+        self._mailbox.send(self._frame())
 
     def _change(self, wish: Change) -> None:
         """The same creature, as it stands, with another friction or stiffness."""
@@ -233,21 +233,21 @@ class Session:
         if (friction, sag) == (self.friction, self.sag):
             return
         self._end_take()
-        with self._post.send_busy():
+        with self._mailbox.send_busy():
             try:
                 muscles = self.options.muscles_file
                 made = changed_creature(self.creature, friction=friction, sag=sag, muscles_file=muscles)
                 place = initial_stance(made)
-                if sag != self.sag and tilt_degrees(self._place, made.start.positions) > FALLEN:
+                if sag != self.sag and tilt_degrees(self._place, made.start.positions) > FALLEN_TILT:
                     raise UserError(f"sag {sag:g}: so soft a body does not stand; choose a smaller one")
             except (UserError, FloatingPointError, np.linalg.LinAlgError) as error:
-                self._post.send_line(str(error))
+                self._mailbox.send_line(str(error))
                 return
             self.creature, self.friction, self.sag, self._place = made, friction, sag, place
             self._stillness.reset()
             # Contacts and activations of the old body are as good a guess as any for the new one.
             self.steering.place = place
-            self._begin_time()
+            self._reset_clock()
 
     def _record(self, on: bool) -> None:
         if on and self._take is None:
@@ -260,19 +260,19 @@ class Session:
         if take is None:
             return
         if not take.reports:
-            self._post.send_line("nothing has moved since the take began; there is nothing to write")
+            self._mailbox.send_line("nothing has moved since the take began; there is nothing to write")
             return
-        with self._post.send_busy():
+        with self._mailbox.send_busy():
             try:
                 path = take.write(
-                    *(self.options.takes, self.drawn_as, self.steering.begun, self.steering.requests),
+                    *(self.options.takes, self.drawn_as, self.steering.records, self.steering.requests),
                     source=self.options.source,
                     asked={"live": True, "friction": self.friction, "sag": self.sag},
-                    driven=[time for time in self.steering.driven if time >= take.start.time],
+                    driven=[time for time in self.steering.drive_starts if time >= take.start.time],
                 )
-                self._post.send_line(f"wrote {path} ({take.seconds:.1f} s); egs-warp view {path}")
+                self._mailbox.send_line(f"wrote {path} ({take.seconds:.1f} s); egs-warp view {path}")
             except (UserError, OSError) as error:
-                self._post.send_line(f"the take could not be written: {error}")
+                self._mailbox.send_line(f"the take could not be written: {error}")
 
     # What is sent.
 
@@ -292,10 +292,10 @@ class Session:
             "paused": self._paused,
             "resting": self.resting,
             "recording": self._take is not None,
-            "pulled": self._touches.is_pulling,
+            "pulled": self._user_forces.is_pulling,
             "friction": self.friction,
             "sag": self.sag,
             "style": vars(steering.style),
-            "motions": len(steering.begun),
+            "motions": len(steering.records),
             "step": self._dt,
         }

@@ -8,9 +8,9 @@ from egs_warp.fem.body import BodyState, SoftBody
 
 STIFFNESS = 3.0
 """Body weights for each body height that the spring is drawn out."""
-STRONGEST = 1.5
+MAX_FORCE = 1.5
 """Body weights."""
-GRIP = 0.25
+GRIP_RADIUS = 0.25
 """Body heights around the node, at rest, within which the body is held."""
 
 
@@ -20,7 +20,7 @@ class Spring:
     def __init__(self, body: SoftBody, node: int) -> None:
         self.node, self.target = node, np.zeros(3)
         nodes = body.mesh.nodes
-        near = np.linalg.norm(nodes - nodes[node], axis=1) / (GRIP * body.height)
+        near = np.linalg.norm(nodes - nodes[node], axis=1) / (GRIP_RADIUS * body.height)
         shares = np.maximum(1.0 - near**2, 0.0) ** 2
         self._body = body
         self._shares = shares / (body.node_mass @ shares)
@@ -34,7 +34,7 @@ class Spring:
         shares = self._body.node_mass * self._shares
         force = self._stiffness * (self.target - shares @ state.positions) - self._damping * (shares @ state.velocities)
         size = float(np.linalg.norm(force))
-        return force * min(1.0, STRONGEST * self._body.weight / max(size, 1e-12))
+        return force * min(1.0, MAX_FORCE * self._body.weight / max(size, 1e-12))
 
     def kick(self, state: BodyState, dt: float) -> np.ndarray:
         """(N, 3) m/s that a step of ``dt`` s from ``state`` gives the nodes."""

@@ -32,21 +32,21 @@ from egs_warp.motions.style import Style
 from egs_warp.motions.walk_posture import select_posture
 from egs_warp.web.idle import RelaxMuscles, tilt_degrees
 
-ARRIVED = 0.12
+ARRIVAL_DISTANCE = 0.12
 """Body heights from the middle of the feet to the point that it was sent to."""
-ASIDE = 15.0
+MAX_HEADING_ERROR = 15.0
 """Degrees: what lies further to the side is turned towards first."""
-_NEAR = 0.25
+_MIN_TURN_DISTANCE = 0.25
 """Body heights: for so short a way it does not turn."""
-_LONGEST_JUMP, _JUMP_HEIGHT = 0.5, 0.2
+_MAX_JUMP_DISTANCE, _JUMP_HEIGHT = 0.5, 0.2
 """Body heights."""
-_LONGEST_WALK = 0.8
+_MAX_WALK_DISTANCE = 0.8
 """Body heights, after which it looks where it has come to."""
-_FRUITLESS = 3
+_MAX_FAILED_LEGS = 3
 """Legs that bring it no nearer, after which it gives up."""
-FALLEN = 60.0
+FALLEN_TILT = 60.0
 """Degrees from upright beyond which no motion begins."""
-_DOWN = 1.0
+_FALL_TIME = 1.0
 """Of sqrt(H / g): for how long it is so tilted before it counts as fallen."""
 
 
@@ -104,7 +104,7 @@ class PointNavigation:
         """``goal`` (2,) metres; ``walks``: whether the body can walk."""
         self.goal = goal
         self._walks = walks
-        self._nearest, self._fruitless = np.inf, 0
+        self._nearest, self._failed_legs = np.inf, 0
 
     def next_part(self, place: Stance) -> Task | None:
         """What brings the body that stands at ``place`` nearer; None where it has arrived.
@@ -115,22 +115,22 @@ class PointNavigation:
         feet = sole_shares(place.body, place.ground, place.standing) @ place.standing
         way = np.array([*(self.goal - feet[:2]), 0.0])
         distance = float(np.linalg.norm(way)) / height
-        if distance <= ARRIVED:
+        if distance <= ARRIVAL_DISTANCE:
             return None
         if distance < self._nearest - 0.05:
-            self._nearest, self._fruitless = distance, 0
+            self._nearest, self._failed_legs = distance, 0
         else:
-            self._fruitless += 1
-        if self._fruitless > _FRUITLESS:
+            self._failed_legs += 1
+        if self._failed_legs > _MAX_FAILED_LEGS:
             raise UserError(f"go: it comes no nearer than {self._nearest:.2f} body heights; choose another point")
         x, y = place.ground.axes[:2] @ way
         if self._walks:
-            ahead, left = min(1.0, _LONGEST_WALK / distance) / height * np.array([x, y])
+            ahead, left = min(1.0, _MAX_WALK_DISTANCE / distance) / height * np.array([x, y])
             return self._task(f"walk to {ahead:.3f},{left:.3f}", height)
         aside = float(np.degrees(np.arctan2(y, x)))
-        if abs(aside) > ASIDE and distance > _NEAR:
+        if abs(aside) > MAX_HEADING_ERROR and distance > _MIN_TURN_DISTANCE:
             return self._task(f"twist {aside:.1f} 0 {_JUMP_HEIGHT}", height)
-        leap = distance / np.ceil(distance / _LONGEST_JUMP)
+        leap = distance / np.ceil(distance / _MAX_JUMP_DISTANCE)
         task = self._task(f"jump {leap:.3f} {_JUMP_HEIGHT}", height)
         begin = task.part.begin
         return replace(task, part=replace(task.part, begin=lambda at: begin(at.facing(way))))
@@ -148,7 +148,7 @@ class MotionScheduler:
         self.begun: list[MotionRecord] = []
         self.requests: list[MotionRequest] = []
         """Of ``begun``."""
-        self._tell = tell
+        self._send_line = tell
         self._tasks: deque[Task] = deque()
         self._journey: PointNavigation | None = None
         self._drive = Drive()
@@ -165,7 +165,7 @@ class MotionScheduler:
         self.cancel()
         self.place = place
         self._is_ball = place.base() is SupportKind.ROUND_BASE
-        self._act: _ActiveMotion = _ActiveMotion("stand", Stand(place), BodyStatus.STANDING)
+        self._active: _ActiveMotion = _ActiveMotion("stand", Stand(place), BodyStatus.STANDING)
         self._tilted_since: float | None = None
 
     def perform(self, script: Script) -> None:
@@ -192,7 +192,7 @@ class MotionScheduler:
     @property
     def doing(self) -> str:
         """Name of the motion."""
-        return self._act.name
+        return self._active.name
 
     @property
     def queued(self) -> str | None:
@@ -201,12 +201,12 @@ class MotionScheduler:
             return self._tasks[0].part.name
         if self._journey:
             return "go"
-        return None if self._drive.is_zero or isinstance(self._act.motion, LiveDrive) else "drive"
+        return None if self._drive.is_zero or isinstance(self._active.motion, LiveDrive) else "drive"
 
     @property
     def idle(self) -> bool:
         """Whether it stands or lies, and nothing is to come."""
-        return self._act.posture is not BodyStatus.MOVING and self._act.motion.is_at_rest and self.queued is None
+        return self._active.posture is not BodyStatus.MOVING and self._active.motion.is_at_rest and self.queued is None
 
     @property
     def goal(self) -> np.ndarray | None:
@@ -223,22 +223,22 @@ class MotionScheduler:
         """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
         if self._has_fallen(state):
             self._lie(state, report)
-        elif self._act.motion.is_at_rest and not (isinstance(self._act.motion, LiveDrive) and not self._drive.is_zero):
+        elif self._active.motion.is_at_rest and not (isinstance(self._active.motion, LiveDrive) and not self._drive.is_zero):
             self._begin_next(state, report)
-        if isinstance(self._act.motion, LiveDrive):
-            self._act.motion.command = self._drive
-        return self._act.motion.objectives(state, report, dt)
+        if isinstance(self._active.motion, LiveDrive):
+            self._active.motion.command = self._drive
+        return self._active.motion.objectives(state, report, dt)
 
     def _lie(self, state: BodyState, report: StepReport | None) -> None:
         """It lies, but for getting up where that is asked."""
-        if isinstance(self._act.motion, GetUp) and not self._act.motion.is_at_rest:
+        if isinstance(self._active.motion, GetUp) and not self._active.motion.is_at_rest:
             return
         if self._tasks and self._tasks[0].part.name == "get up":
             self._begin_next(state, report)
             return
-        if self._act.posture is not BodyStatus.LYING:
-            self._act = _ActiveMotion("fallen", RelaxMuscles(), BodyStatus.LYING)
-            self._tell("it has fallen; tell it to get up, or Backspace stands it up again")
+        if self._active.posture is not BodyStatus.LYING:
+            self._active = _ActiveMotion("fallen", RelaxMuscles(), BodyStatus.LYING)
+            self._send_line("it has fallen; tell it to get up, or Backspace stands it up again")
         self.cancel()
 
     def _begin_next(self, state: BodyState, report: StepReport | None) -> None:
@@ -250,18 +250,18 @@ class MotionScheduler:
             begun = task.part.begin(place) if task is not None else None
         except UserError as error:
             self.cancel()
-            self._tell(str(error))
+            self._send_line(str(error))
             task = begun = None
         if task is None and not self._drive.is_zero and self._begin_drive(place, state.time):
             return
         if task is None or begun is None:
             self._journey = None
-            if self._act.posture is not BodyStatus.STANDING:
+            if self._active.posture is not BodyStatus.STANDING:
                 self._say_notes()
-                self._act = _ActiveMotion("stand", Stand(place), BodyStatus.STANDING)
+                self._active = _ActiveMotion("stand", Stand(place), BodyStatus.STANDING)
             return
         self._say_notes()
-        self._act = _ActiveMotion(task.part.name, begun, BodyStatus.MOVING)
+        self._active = _ActiveMotion(task.part.name, begun, BodyStatus.MOVING)
         self.begun.append(MotionRecord(task.part.name, task.part.asked, begun, state.time))
         styled = MOTIONS[task.request.name].jumps and self.style != Style()
         self.requests.append(replace(task.request, style=self.style) if styled else task.request)
@@ -271,26 +271,26 @@ class MotionScheduler:
             driven = LiveDrive(place)
         except UserError as error:
             self.cancel()
-            self._tell(str(error))
+            self._send_line(str(error))
             return False
         self._say_notes()
-        self._act = _ActiveMotion("drive", driven, BodyStatus.MOVING)
+        self._active = _ActiveMotion("drive", driven, BodyStatus.MOVING)
         self.driven.append(time)
         return True
 
     def _say_notes(self) -> None:
-        for note in self._act.motion.notes():
-            self._tell(f"{self.doing}: {note}")
+        for note in self._active.motion.notes():
+            self._send_line(f"{self.doing}: {note}")
 
     def _has_fallen(self, state: BodyState) -> bool:
         # A ball cannot fall.
-        if self._is_ball or tilt_degrees(self.place, state.positions) <= FALLEN:
+        if self._is_ball or tilt_degrees(self.place, state.positions) <= FALLEN_TILT:
             self._tilted_since = None
             return False
         if self._tilted_since is None:
             self._tilted_since = state.time
         body = self.place.body
-        longest = _DOWN * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
+        longest = _FALL_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
         return state.time - self._tilted_since > longest
 
 

@@ -16,7 +16,7 @@ class UserForces:
 
     def __init__(self) -> None:
         self._spring: Spring | None = None
-        self._hits: list[PushOnce] = []
+        self._pushes: list[PushOnce] = []
 
     @property
     def is_pulling(self) -> bool:
@@ -26,7 +26,7 @@ class UserForces:
     @property
     def has_input(self) -> bool:
         """Whether the next step has something of a hand."""
-        return self.is_pulling or bool(self._hits)
+        return self.is_pulling or bool(self._pushes)
 
     def pull(self, body: SoftBody, asked: Pull) -> None:
         """Pull towards another place, or at another node."""
@@ -40,16 +40,16 @@ class UserForces:
 
     def push(self, asked: PushOnce) -> None:
         """Push in the next step."""
-        self._hits.append(asked)
+        self._pushes.append(asked)
 
     def clear(self) -> None:
         """Forget pull and pushes."""
         self._spring = None
-        self._hits.clear()
+        self._pushes.clear()
 
     def kick(self, place: Stance, state: BodyState, dt: float) -> np.ndarray | None:
         """(N, 3) m/s that they give the nodes in a step of ``dt`` s from ``state``; None if there are none."""
-        hits, self._hits = self._hits, []
+        hits, self._pushes = self._pushes, []
         kicks = [kick_of(place, np.array(hit.impulse), hit.height) for hit in hits]
         if self._spring is not None:
             kicks.append(self._spring.kick(state, dt))

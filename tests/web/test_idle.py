@@ -57,7 +57,7 @@ def test_one_that_is_thrown_over_lies_relaxed_and_stands_up_when_told(tmp_path: 
     played.ask("motion", text="get up")
     played.step()
     assert played.session.steering.doing == "get up"
-    assert [entry.name for entry in session.steering.begun] == ["get up"]
+    assert [entry.name for entry in session.steering.records] == ["get up"]
     played.step(10)
     assert played.session.steering.doing == "get up" and len(played.told) == 1
     played.ask("stand")

@@ -18,7 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 from egs_warp.errors import UserError
 from egs_warp.web.page import PAGE
 from egs_warp.web.recording import Recording
-from egs_warp.web.server import LARGEST_MESSAGE, PageServer
+from egs_warp.web.server import MAX_MESSAGE_BYTES, PageServer
 from tests.support.pages import RecordedFeed, served
 
 pytestmark = pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it")
@@ -167,7 +167,7 @@ def test_nonsense_is_answered_in_one_line_and_the_run_goes_on(server: PageServer
         assert isinstance(page.recv(timeout=20), bytes)
 
 
-@pytest.mark.parametrize("size", [LARGEST_MESSAGE + 1, 100_000_000])
+@pytest.mark.parametrize("size", [MAX_MESSAGE_BYTES + 1, 100_000_000])
 def test_a_message_that_is_too_large_closes_its_socket_alone(
     server: PageServer, size: int, capfd: pytest.CaptureFixture[str]
 ):

@@ -53,7 +53,7 @@ def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
         assert isinstance(seen[0], Frame) and seen[0].time == held
         rested = lambda: any(isinstance(one, dict) and one.get("resting") for one in seen)  # noqa: E731
         _wait(session, woken, seen, rested)
-        assert [entry.name for entry in session.steering.begun] == ["jump"]
+        assert [entry.name for entry in session.steering.records] == ["jump"]
         end = session.state.time
         assert end > held, "it went on to the end with nobody watching"
         time.sleep(0.2)
@@ -182,7 +182,7 @@ def test_a_solver_that_fails_does_not_end_the_session(
 
 
 def test_a_page_that_takes_nothing_loses_the_oldest_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("egs_warp.web.mailbox._MOST_WAITING", 5)
+    monkeypatch.setattr("egs_warp.web.mailbox._MAX_QUEUED_FRAMES", 5)
     session = session_of(coarse_pawn(), tmp_path)
     session.subscribe(lambda: None)
     for _ in range(8):
