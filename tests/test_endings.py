@@ -38,12 +38,12 @@ def ended(body: str) -> tuple[int, str]:
         (
             OSError(errno.ENOSPC, "No space left on device", "out/a.ply"),
             1,
-            "prog: out/a.ply: No space left on device; free some space, or choose another place\n",
+            "prog: out/a.ply: No space left on device; free some space, or choose another folder\n",
         ),
         (
             PermissionError(errno.EACCES, "Permission denied", "out/a.ply"),
             2,
-            "prog: out/a.ply: Permission denied; free some space, or choose another place\n",
+            "prog: out/a.ply: Permission denied; free some space, or choose another folder\n",
         ),
     ],
 )
@@ -75,7 +75,7 @@ def test_errors_of_our_own_keep_their_traceback() -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "status", "line"), [(signal.SIGINT, 130, "stopped"), (signal.SIGTERM, 143, "asked to")]
+    ("number", "status", "line"), [(signal.SIGINT, 130, "stopped"), (signal.SIGTERM, 143, "terminated by")]
 )
 def test_signals_unwind(number: signal.Signals, status: int, line: str, tmp_path: Path) -> None:
     body = f"""

@@ -63,12 +63,13 @@ def add_parser(commands: Commands) -> None:
         help="jump (default), hop, twist, walk, walk to, walk along, run, turn, drive, stand, get up, dance or "
         'trajectory; several, as "hop x3, twist 180"; or a script.json (docs/motions/index.md)',
     )
+    motion = animate.add_argument_group("motion")
+    body = animate.add_argument_group("body and ground")
     scene = animate.add_argument_group("object in a scene")
     camera = animate.add_argument_group("video")
     add_object_flags(scene, common=common)
     add_camera_flags(camera, size="512", common=common)
     common.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
-    motion = animate.add_argument_group("motion")
     motion.add_argument(
         "--distance",
         type=float,
@@ -103,7 +104,6 @@ def add_parser(commands: Commands) -> None:
         "--frames", type=int, help="number of frames at 60 Hz, the first at rest (default: until the body is at rest)"
     )
     motion.add_argument("--no-get-up", action="store_true", help="end the run if the body falls")
-    body = animate.add_argument_group("body and ground")
     body.add_argument(
         "--front",
         help="direction in which the body faces and moves: x,y,z or an axis, as --front=-x (default: estimated)",

@@ -30,7 +30,7 @@ def add_parser(commands: Commands) -> None:
         "--object", help="capture of the object: the hole is its footprint, or that in segment's plane.json"
     )
     inpaint.add_argument(
-        "--mask", help="mask.png of the object, or a folder of masks: the hole is the floor that no photo shows"
+        "--mask", help="mask.png of the object, or a folder of masks: the hole is the floor behind it in all photos"
     )
     inpaint.add_argument("--cameras", help="cameras of the masks: cameras.json, transforms.json or a COLMAP model")
     inpaint.add_argument("--view", help="name or number of the camera of a single mask")

@@ -33,8 +33,8 @@ def add_straddling_flag(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--straddling",
         choices=("finetune", "split", "remove", "none"),
-        help="treatment of the object's Gaussians that cross the plane: finetune (default, needs PyTorch), split, remove, "
-        "none",
+        help="treatment of the object's Gaussians that cross the plane: finetune (default, needs PyTorch), split, "
+        "remove, none",
     )
 
 

@@ -202,7 +202,7 @@ def test_what_cannot_go_on_is_told(tmp_path: Path, capsys: pytest.CaptureFixture
         manifest.write_text(broken)
         assert told(out) == f"egs-warp: {manifest}: is no manifest of a run; begin the run again\n"
     manifest.write_text(json.dumps(content | {"version": "0.1.0"}))
-    assert "run.yaml: is missing, the run was cut off before its first step; begin it again" in told(out)
+    assert "run.yaml: is missing; the run was interrupted before its first step; start it again" in told(out)
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=50, device="cpu").cloud)
     (out / "run.yaml").write_text("capture: ../pawn.ply\nup: z\ncapture_sha256: 0\n")
-    assert "pawn.ply: is not the file that the run had; bring that back, or begin the run again" in told(out)
+    assert "pawn.ply: differs from the capture of the run; restore that file, or start the run again" in told(out)

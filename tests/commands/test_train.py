@@ -48,11 +48,12 @@ def test_ctrl_c_tells_how_to_go_on(
 
         patch.setattr("egs_warp.commands.train._Progress.step", stop)
         assert main(line(posed, out)) == 130
-    assert capsys.readouterr().err.splitlines()[-1].endswith("; --resume beside the same flags goes on")
+    assert capsys.readouterr().err.splitlines()[-1].endswith("; continue with --resume and the same flags")
     assert sorted(os.listdir(out.parent)) == ["a.training.npz"]
     assert main(line(posed, out)) == 2
     assert capsys.readouterr().err == (
-        f"egs-warp: --out {out}: a training was cut off here; --resume goes on with it, --overwrite begins again\n"
+        f"egs-warp: --out {out}: an interrupted training is here; give --resume to continue it, or --overwrite to start"
+        " again\n"
     )
     assert main([*line(posed, out), "--resume"]) == 0
     assert bits(out.parent) == bits(whole.parent)

@@ -50,7 +50,7 @@ def test_one_that_is_thrown_over_lies_relaxed_and_stands_up_when_told(tmp_path: 
     lying[:, 2] -= lying[:, 2].min()
     session.state = BodyState(lying, np.tile([0.0, 0.0, -0.2], (len(lying), 1)), session.state.time)
     played.until(lambda: session.steering.doing == "fallen", most=5)
-    assert played.told == ["it has fallen; tell it to get up, or Backspace stands it up again"]
+    assert played.told == ["the body has fallen; type get up, or press Backspace to put it back at its start"]
     played.ask("motion", text="jump")
     played.step(10)
     assert played.session.steering.doing == "fallen" and played.session.steering.queued is None

@@ -68,7 +68,7 @@ def test_motions_are_those_of_scripts():
 @pytest.mark.parametrize(
     ("message", "said"),
     [
-        ({}, "type 'None'; known are motion, go"),
+        ({}, "type 'None' is unknown; known types are motion, go"),
         ({"type": ["go"]}, r"type \"\['go'\]\""),
         ({"type": "fly"}, "type 'fly'"),
         ({"type": "step", "count": 3}, "step has no 'count'"),

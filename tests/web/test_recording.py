@@ -190,7 +190,7 @@ def test_a_folder_that_is_no_run_is_told_in_one_line(
 
 def test_three_runs_are_one_too_many(run_folder: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["view", *[str(run_folder)] * 3]) == 2
-    assert "at most two runs" in capsys.readouterr().err
+    assert "only two runs can be shown" in capsys.readouterr().err
 
 
 def test_without_the_page_it_is_said_how_to_build_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -151,7 +151,7 @@ def test_a_second_page_is_told_and_the_first_goes_on(server: PageServer):
         assert closed.value.rcvd is not None
         assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (
             1013,
-            "another page watches this run already; close it first",
+            "another page already shows this session; close it first",
         )
         assert first.recv(timeout=20)
 
@@ -162,7 +162,7 @@ def test_nonsense_is_answered_in_one_line_and_the_run_goes_on(server: PageServer
         page.recv(timeout=20)
         page.send(message)
         answer = _next_text(page)
-        assert answer["error"].startswith("this message makes no sense") and "\n" not in answer["error"]
+        assert answer["error"].startswith("invalid message: ") and "\n" not in answer["error"]
         page.send('{"type": "pause"}')
         assert isinstance(page.recv(timeout=20), bytes)
 

@@ -174,7 +174,7 @@ def test_a_solver_that_fails_does_not_end_the_session(
     with monkeypatch.context() as broken:
         broken.setattr(type(played.session.creature.stepper), "advance", fail)
         played.step()
-    assert played.told == ["the solver found no way on; the creature stands where it began"]
+    assert played.told == ["the solver failed; the creature is back at its start"]
     assert capsys.readouterr().err == "egs-warp: live: FloatingPointError: no definite matrix\n"
     np.testing.assert_array_equal(played.session.state.positions, played.session.creature.start.positions)
     played.step(2)
@@ -220,7 +220,7 @@ def test_a_push_strikes_it_in_the_next_step_and_its_take_passes_the_audit(tmp_pa
     assert t.kick_step.tolist() == [0, 5]
     np.testing.assert_allclose(given, [[0.05, -0.1, 0.0], [0.0, 0.15, 0.0]], atol=1e-9)
     assert {name for name, value in report["audit"].items() if not value <= AUDIT_LIMITS[name]} == set()
-    assert report["notes"] == ["the user pulled at it or pushed it, which script.json does not repeat"]
+    assert report["notes"] == ["the user pulled or pushed the body; script.json does not repeat this"]
 
 
 def test_a_push_that_waits_is_dropped_where_the_creature_stands_up_anew(tmp_path: Path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from egs_warp.fem.body import BodyState
-from egs_warp.web.spring import STIFFNESS, MAX_FORCE, Spring
+from egs_warp.web.spring import MAX_FORCE, STIFFNESS, Spring
 from tests.support.live_sessions import coarse_pawn
 
 

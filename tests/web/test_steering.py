@@ -123,7 +123,7 @@ def test_a_journey_turns_first_and_then_jumps_straight_at_its_goal():
 def test_a_journey_that_comes_no_nearer_is_given_up():
     place = initial_stance(coarse_pawn())
     journey = PointNavigation(np.array([3.0, 0.0]), walks=False)
-    with pytest.raises(UserError, match="go: it comes no nearer than"):
+    with pytest.raises(UserError, match="go: the body gets no nearer than"):
         for _ in range(10):
             journey.next_part(place)
 
