@@ -37,7 +37,7 @@ def test_cited_pages_exist() -> None:
 
 
 def test_no_page_that_is_not_in_the_tree_is_cited() -> None:
-    """Such as the DESIGN of the first days, whose content is docs/concepts."""
+    """No text refers to the former page DESIGN, whose content is in docs/concepts."""
     elsewhere = re.compile(r"\bDESIGN\b(?! of the first days)")
     assert not [str(path) for path in TEXTS if elsewhere.search(path.read_text())]
 
@@ -65,7 +65,7 @@ def test_the_gallery_opens_the_pages_that_the_script_makes_and_has_no_dead_link(
     hook = runpy.run_path(str(DOCS / "page_links.py"))["on_page_markdown"]
 
     class Files:
-        """Of a site that has one of them."""
+        """Files of a site that contains one of the pages."""
 
         def get_file_from_path(self, path: str) -> str | None:
             return path if path == "assets/pages/jump.html" else None

@@ -113,7 +113,7 @@ def _parse_location(text: str, posed: Sequence[PosedImage] | None, view: str | N
     try:
         numbers = np.array([float(part) for part in text.split(",")])
     except ValueError:
-        raise UserError(f"{flag} {text}: not an existing file and not numbers; {_HELP}") from None
+        raise UserError(f"{flag} {text}: no such file, and not numbers; {_HELP}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
         raise UserError(f"{flag} {text}: {len(numbers)} numbers; {_HELP}")
     if np.abs(numbers).max() > FURTHEST:
@@ -132,7 +132,7 @@ def _pixel(text: str, cloud: GaussianCloud, posed: Sequence[PosedImage] | None, 
     try:
         finite = np.isfinite([float(u), float(v)]).all()
     except ValueError:
-        raise UserError(f"{flag} {text}: not an existing file and not numbers; {_HELP}") from None
+        raise UserError(f"{flag} {text}: no such file, and not numbers; {_HELP}") from None
     if not finite:
         raise UserError(f"{flag} {text}: not two numbers; {_HELP}")
     if not posed:

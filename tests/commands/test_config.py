@@ -31,7 +31,7 @@ def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.Ca
     assert cli.main(again) == 0
     for name in ("jump.mp4", "sheet.png", "trajectory.npz", "creature.npz", "run.yaml"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
-    # So many pictures, the first at rest, as asked.
+    # The requested number of frames, the first at rest.
     assert count_frames_and_secs(str(tmp_path / "a" / "jump.mp4"))[0] == 4
     run = FinishedRun.read(tmp_path / "a")
     assert len(run.steps) == run.report["asked"]["frames"] == 4

@@ -1,4 +1,4 @@
-"""Captures in other formats: what is told to be lost is lost, and nothing else."""
+"""Conversion of captures: exactly the reported losses occur."""
 
 from __future__ import annotations
 

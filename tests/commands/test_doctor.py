@@ -1,4 +1,4 @@
-"""What ``egs-warp doctor`` says is so, and what it compiles is all that a run needs."""
+"""``egs-warp doctor``: the report is correct, and ``--warm`` compiles all kernels that a run needs."""
 
 from __future__ import annotations
 

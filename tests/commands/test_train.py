@@ -63,7 +63,7 @@ def test_ctrl_c_tells_how_to_go_on(
 
 
 def test_an_earlier_training_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its report and sheet, too, which nobody has named."""
+    """The report and the sheet, which no flag names, are protected, too."""
     posed, out = posed_folder(tmp_path / "posed"), tmp_path / "a.ply"
     (tmp_path / "a.sheet.png").write_bytes(b"sheet")
     assert main(line(posed, out)) == 2
@@ -80,8 +80,9 @@ def test_an_earlier_training_is_kept(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 @pytest.mark.slow
 def test_random_moments(tmp_path: Path, device: str) -> None:
-    """SIGKILL at any time, every other one once there is something to go on from; else the training is begun again. On
-    a GPU, too, the capture has the bits of one that was not cut off: there are no atomic sums of floats.
+    """SIGKILL at any time, every other one after the first checkpoint; without a checkpoint the training starts again.
+
+    The capture is bitwise that of an uninterrupted training, also on a GPU, because no float sums are atomic.
     """
     posed, whole = posed_folder(tmp_path / "posed"), tmp_path / "whole" / "a.ply"
     command = [sys.executable, "-c", OFTEN]

@@ -1,4 +1,4 @@
-"""What lies between a session and its page: nothing is told twice, nothing but old frames is lost."""
+"""Mailbox of a session: no state is sent twice, and only old frames are dropped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the page is sent of a run."""
+"""Packets of a finished run."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_a_frame_is_as_small_as_documented(run_folder: Path):
 
 
 def test_the_creature_file_draws_what_the_film_drew(run_folder: Path):
-    """The embedding is made anew from the splats of the file and the rest cage of the trajectory."""
+    """The embedding is computed again from the splats of the file and the rest cage of the trajectory."""
     recording = Recording.read(run_folder)
     t, made = recording.trajectory, recording.creature
     deformer = Deformer(made.splats, embed_gaussians(made.splats, TetMesh(t.rest_positions, t.tets)))

@@ -1,4 +1,4 @@
-"""What is recorded of a session."""
+"""Takes of a live session."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_an_empty_take_and_a_folder_that_cannot_be_written_are_told(tmp_path: Pa
 def test_each_opening_and_renaming_of_a_take_fails_once(
     reason: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is told, nothing half-written stays, what is there is not called finished, and the session goes on."""
+    """The error is reported, no half-written or finished take is left, and the session continues."""
     for number in range(100):
         folder = tmp_path / str(number)
         played = SteppedSession(coarse_pawn(), folder)

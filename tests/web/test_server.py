@@ -106,7 +106,7 @@ def _socket(server: PageServer, origin: str | None = "own"):
 
 
 def _taken_up_again(server: PageServer) -> bool:
-    """Whether a page that tries again, as pages do, is soon sent the run."""
+    """Return True if a page that reconnects, as pages do, receives the header."""
     for _ in range(50):
         with _socket(server) as page:
             try:
@@ -137,7 +137,7 @@ def test_a_socket_of_another_site_is_refused(server: PageServer, origin: str | N
 
 
 def test_a_socket_under_another_name_is_refused(server: PageServer):
-    """One that somebody has made to lead here."""
+    """A foreign host name may resolve to this machine."""
     own: Any = f"http://127.0.0.1:{server.port}"
     with socket.create_connection(("127.0.0.1", server.port)) as line, pytest.raises(InvalidStatus):
         connect(f"ws://evil.example:{server.port}/{server.token}/live", sock=line, origin=own)

@@ -45,7 +45,7 @@ def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
         assert isinstance(message, PlayScript)
         session.put_request(message)
         _wait(session, woken, seen, lambda: any(isinstance(one, dict) and one.get("doing") == "jump" for one in seen))
-        # Nobody watches: it waits where it is, and goes on from there.
+        # Without a page the session is suspended; it continues from the same state.
         session.unsubscribe()
         held = _held(session)
         session.subscribe(woken.set)
@@ -149,7 +149,7 @@ def test_friction_and_stiffness_change_under_it(tmp_path: Path):
         assert played.session.report is not None and played.session.report.converged
     assert played.session.steering.doing == "jump"
     assert played.session.state_message()["friction"] == 0.3 and played.session.state_message()["sag"] == 0.025
-    # What is asked again changes nothing.
+    # A repeated request changes nothing.
     made = played.session.creature
     played.ask("set", sag=0.025)
     assert played.session.creature is made
@@ -193,7 +193,7 @@ def test_a_page_that_takes_nothing_loses_the_oldest_frames(tmp_path: Path, monke
 
 @pytest.mark.slow
 def test_a_push_strikes_it_in_the_next_step_and_its_take_passes_the_audit(tmp_path: Path):
-    """What is told moves the centre of mass, the head turns it; whoever is at rest wakes, and keeps its feet."""
+    """A push moves the centre of mass, and rotates the body if it hits the head; a body at rest does not fall."""
     played = SteppedSession(coarse_pawn(), tmp_path)
     session, body = played.session, played.session.creature.body
     played.until(lambda: session.resting)

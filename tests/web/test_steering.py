@@ -1,4 +1,4 @@
-"""What a creature does next."""
+"""Scheduling of the motions of a live creature."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_what_was_driven_stands_once_it_is_told_to(tmp_path: Path):
 
 
 def test_a_style_is_of_the_motions_that_begin_after_it(tmp_path: Path):
-    """A jump that goes on keeps its own; what stands up anew, or is made anew, keeps the style."""
+    """The active jump keeps its style; after standing up or a rebuild, the new style stays."""
     played = SteppedSession(coarse_pawn(), tmp_path)
     session = played.session
     played.ask("motion", text="jump 0 0.1, jump 0 0.1")
