@@ -41,7 +41,7 @@ def add_parser(commands: Commands) -> None:
         type=named_path,
         help="image of before, after and depth, .png (default: --out with the ending .png)",
     )
-    add_overwrite_flag(inpaint, "the same files")
+    add_overwrite_flag(inpaint, "--out and --picture")
     add_inpainter_flags(inpaint, default="patch")
     inpaint.add_argument(
         "--steps", type=int, help="training steps against the inpainted image (100); 0 needs no PyTorch"

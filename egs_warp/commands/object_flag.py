@@ -165,7 +165,7 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str) -> Pos
         if len(posed) == 1:
             return posed[0]
         raise UserError(f"--object {what}: {len(posed)} cameras; choose one by --view NAME or NUMBER")
-    # The length limit excludes numbers with thousands of digits, which int() rejects.
+    # isdecimal excludes superscript digits, and the limit numbers of thousands of digits; int() rejects both.
     if view.isdecimal() and len(view) < _MAX_DIGITS and int(view) < len(posed):
         return posed[int(view)]
     for one in posed:
@@ -191,7 +191,7 @@ def _read_masks(path: Path, posed: Sequence[PosedImage] | None, view: str | None
         # Checked before decoding: a small file can contain a very large image.
         if size != (camera.width, camera.height):
             raise UserError(
-                f"{file}: the mask has {size[0]} x {size[1]} pixels, the photo {one.name} "
+                f"{file}: the mask is {size[0]} x {size[1]} pixels, the photo {one.name} "
                 f"{camera.width} x {camera.height}; give a mask of the photo's size"
             )
         mask = read_mask(file)

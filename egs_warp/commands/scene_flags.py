@@ -38,11 +38,11 @@ def add_flat_flag(parser: argparse._ActionsContainer) -> None:
 
 
 def add_overwrite_flag(parser: argparse._ActionsContainer, where: str) -> None:
-    """Add the flag that allows an earlier run to be moved; ``where`` names the output for the help."""
+    """Add the flag that allows an earlier run to be moved; ``where`` names its flag for the help."""
     parser.add_argument(
         "--overwrite",
         action="store_true",
-        help=f"move an earlier run in {where} into earlier-1, earlier-2, ...",
+        help=f"move an earlier result at {where} into earlier-1, earlier-2, ...",
     )
 
 

@@ -39,7 +39,7 @@ def add_parser(commands: Commands) -> None:
         type=named_path,
         help="output file for the capture: .ply, .compressed.ply, .spz, .sog, .splat or .glb",
     )
-    add_overwrite_flag(train, "the same files")
+    add_overwrite_flag(train, "--out")
     train.add_argument(
         "--resume", action="store_true", help="continue an interrupted training; give the same flags again"
     )
@@ -92,7 +92,7 @@ def _train(args: argparse.Namespace) -> int:
             " again"
         )
     outputs = (args.out, sheet, report_path)
-    # With --resume, existing outputs belong to the interrupted training or were already to be replaced.
+    # With --resume, existing outputs belong to the interrupted training, or the user allowed it to move them.
     overwrite = args.overwrite or (args.resume and checkpoint.exists())
     check_named_files(*outputs, overwrite=overwrite)
     import warp as wp

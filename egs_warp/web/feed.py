@@ -56,7 +56,7 @@ class LiveFeed:
             "height": body.height,
             "weight": body.weight,
             "friction": creature.geometry.friction,
-            # The momentum residual needs the next velocity; it is computed for takes only.
+            # The momentum residual is known only after a step; only takes contain its curve.
             "curves": curve_facts([curve for curve in CURVES if curve[0] != "residual"]),
             "audit": {},
             "motion": [],

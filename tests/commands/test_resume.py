@@ -112,7 +112,7 @@ def test_a_run_that_is_killed_again_and_again(tmp_path: Path, capsys: pytest.Cap
     assert ended_by(first, signal.SIGKILL, parts / "start.npz", 0.2 * moments.random())[0] == -signal.SIGKILL
     status, said = ended_by(again, signal.SIGINT, parts / "steps-000001.npz", 0.2 * moments.random())
     told = "egs-warp: stopped; finished files are whole, unfinished ones are gone"
-    assert status == 130 and said.splitlines()[-1] == f"{told}; egs-warp resume {out} goes on"
+    assert status == 130 and said.splitlines()[-1] == f"{told}; egs-warp resume {out} continues it"
     assert not [name for name in os.listdir(out) if name.startswith(".egs-")]
     assert ended_by(again, signal.SIGKILL, out / "plots.png", 0.0)[0] == -signal.SIGKILL
     assert not json.loads((out / MANIFEST).read_text())["finished"]
