@@ -230,7 +230,7 @@ def mask_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of a mask file without decoding it. Raises ``UserError`` if it is not an image."""
     size = picture_size(read_bytes(path), f"{path}: it")
     if size is None:
-        raise UserError(f"{path}: not a readable image; give a mask as PNG")
+        raise UserError(f"{path}: not a readable picture; give a mask as PNG")
     check_pixels(*size, f"{path}: it")
     return size
 
@@ -249,7 +249,7 @@ def read_mask(path: Path) -> np.ndarray:
             values = np.array(picture)
     # The decoder reads untrusted bytes, and its errors share no base class.
     except Exception as error:
-        raise UserError(f"{path}: not a readable image; give a mask as PNG") from error
+        raise UserError(f"{path}: not a readable picture; give a mask as PNG") from error
     if values.ndim == 3:
         values = values[..., 3] if np.ptp(values[..., 3]) > 0 else values[..., :3].sum(axis=2, dtype=np.uint16)
     return values > 0.5 * values.max() if values.max() > 0 else np.zeros(values.shape, bool)

@@ -43,7 +43,7 @@ def test_a_pushed_body_comes_back_over_its_feet(tmp_path: Path):
 
 def test_one_that_is_thrown_over_lies_relaxed_and_stands_up_when_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """At once, where a pawn on its side would else get up again."""
-    monkeypatch.setattr(steering, "_DOWN", 0.0)
+    monkeypatch.setattr(steering, "_FALL_TIME", 0.0)
     played = SteppedSession(coarse_pawn(), tmp_path)
     session = played.session
     lying = Rotation.from_euler("y", 90.0, degrees=True).apply(session.state.positions)
