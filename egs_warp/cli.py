@@ -1,4 +1,4 @@
-"""The command ``egs-warp``."""
+"""Entry point of the command ``egs-warp``: builds the parsers and runs the sub-command."""
 
 from __future__ import annotations
 
@@ -17,69 +17,80 @@ from egs_warp.version import __version__
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; whatever stops it prints one line (``commands.exit_handling``) and is told by the status."""
-    # The matrices of a step are small: threads cost more than they bring, and tenfold beside other work.
+    """Run the command with ``arguments`` (default: ``sys.argv[1:]``) and return its exit status.
+
+    Errors and signals print one line (``commands.exit_handling``).
+    """
+    # The matrices of a step are small: threads cost more than they gain, and ten times as much on a loaded machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         with one_line_errors("egs-warp"):
-            given = _joined(sys.argv[1:] if arguments is None else arguments)
+            words = _attach_negative_values(sys.argv[1:] if arguments is None else arguments)
             parser, commands = _parsers()
-            command = commands.get(given[0]) if given else None
-            if command is not None and "--config" in command.format_usage():
-                given = [given[0], *with_config(given[1:], command)]
-            chosen = parser.parse_args(given)
-            return chosen.run(chosen)
-    except HandledExit as ended:
-        assert isinstance(ended.code, int)
-        return ended.code
+            command = commands.get(words[0]) if words else None
+            if command is not None and "--config" in command._option_string_actions:
+                words = [words[0], *with_config(words[1:], command)]
+            args = parser.parse_args(words)
+            return args.run(args)
+    except HandledExit as end:
+        assert isinstance(end.code, int)
+        return end.code
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says in one line what is wrong with the flags."""
+    """Argument parser that reports an error in one line, without the usage."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
 class _Overview(_Parser):
-    """Lists the commands in their groups."""
+    """Top-level parser whose help lists the commands by group."""
 
     def format_help(self) -> str:
-        """What ``egs-warp --help`` prints."""
+        """Return the text of ``egs-warp --help``."""
         subparsers = next(action for action in self._actions if isinstance(action, argparse._SubParsersAction))
         helps = {action.dest: action.help for action in subparsers._get_subactions()}
         lines = [f"usage: {self.prog} [--version] COMMAND ...", "", str(self.description)]
         for group, names in GROUPS.items():
             lines += ["", f"{group}:", *(f"  {name:<10}{helps[name]}" for name in names)]
-        lines += ["", f"{self.prog} COMMAND --help says more of each, with examples.", "", "try:"]
-        lines += [f"  {self.prog} {example}" for example in _FIRST]
-        return "\n".join([*lines, "", _STATUSES, ""])
+        lines += [
+            "",
+            f"{self.prog} COMMAND --help describes the flags of a command, with examples.",
+            "",
+            "first steps:",
+        ]
+        lines += [f"  {self.prog} {example}" for example in _FIRST_EXAMPLES]
+        return "\n".join([*lines, "", _EXIT_STATUSES, ""])
 
 
-_FIRST = ("doctor", "samples samples", "animate samples/pawn.ply --up z --out out/jump", "view out/jump")
-_STATUSES = """exit status:
+_FIRST_EXAMPLES = ("doctor", "samples samples", "animate samples/pawn.ply --up z --out out/jump", "view out/jump")
+_EXIT_STATUSES = """exit status:
   0    done
-  1    memory or disk gave out; of doctor: something is missing without which nothing works
-  2    bad input, told in one line
-  3    of animate, resume: written, but the body has fallen or a step could not be solved
-  130  Ctrl-C; 143 SIGTERM: one line, no half-written file"""
+  1    out of memory or disk space, or a disk error; doctor: a required component is missing
+  2    invalid input; the message says what to change
+  3    animate, resume: the files are written, but the body has fallen or a step could not be solved
+  130  stopped by Ctrl-C; no half-written file is left
+  143  stopped by SIGTERM; no half-written file is left"""
 
 
-def _joined(arguments: Sequence[str]) -> list[str]:
-    """``--up -y`` as ``--up=-y``: a value that begins with a minus would be taken for a flag."""
-    joined: list[str] = []
+def _attach_negative_values(arguments: Sequence[str]) -> list[str]:
+    """Rewrite ``--up -y`` as ``--up=-y``: argparse would read a value that begins with a minus as a flag."""
+    result: list[str] = []
     for argument in arguments:
-        flag = joined[-1] if joined else ""
+        flag = result[-1] if result else ""
         if flag.startswith("--") and "=" not in flag and re.fullmatch(r"-([\d.].*|[xyz])", argument, re.IGNORECASE):
-            joined[-1] = f"{flag}={argument}"
+            result[-1] = f"{flag}={argument}"
         else:
-            joined.append(argument)
-    return joined
+            result.append(argument)
+    return result
 
 
 def _parsers() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
-    """The whole parser, and those of the commands by name."""
-    parser = _Overview(prog="egs-warp", description="Still objects in 3DGS captures walk, jump and twist.")
+    """Return the top-level parser, and the parsers of the commands by name."""
+    parser = _Overview(
+        prog="egs-warp", description="Make still objects in 3D Gaussian Splatting captures walk, jump and twist."
+    )
     parser.add_argument("--version", action="version", version=f"egs-warp {__version__}")
     subparsers = parser.add_subparsers(dest="command", required=True, parser_class=_Parser)
     for name in COMMANDS:
@@ -88,7 +99,7 @@ def _parsers() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentP
         command = subparsers.choices[name]
         command.formatter_class = argparse.RawDescriptionHelpFormatter
         examples = "\n".join(f"  {command.prog} {example}".rstrip() for example in module.EXAMPLES)
-        command.epilog = f"examples:\n{examples}\n\n{_STATUSES}"
+        command.epilog = f"examples:\n{examples}\n\n{_EXIT_STATUSES}"
     return parser, subparsers.choices
 
 

@@ -90,7 +90,7 @@ def test_bad_input_is_one_line(
         (["--up", "-w"], "argument --up: expected one argument"),
         (["--frames", "many"], "argument --frames: invalid int value: 'many'; see egs-warp animate --help"),
         (["--nonsense"], "unrecognized arguments: --nonsense"),
-        (["--out", ""], "argument --out: nothing is given; give a name"),
+        (["--out", ""], "argument --out: the name is empty; give a name"),
         (["--out", "{tmp}/file/out"], "file is a file); choose another one"),
     ],
 )
@@ -169,13 +169,13 @@ def test_a_plot_needs_the_name_of_a_picture(tmp_path: Path, name: str, capsys: p
 
 
 def test_a_plot_goes_where_there_is_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Told before the capture is read."""
+    """The error is reported before the capture is read."""
     assert main(["muscles", str(tmp_path / "nothing.ply"), "--plot", str(tmp_path / "gone" / "a.png")]) == 2
     assert f"a.png: its folder does not exist; create {tmp_path / 'gone'} first" in capsys.readouterr().err
 
 
 def test_no_flag_takes_an_empty_path() -> None:
-    """As of an unset variable: it would be the folder where one stands."""
+    """An empty path, for example of an unset variable, would be the working folder."""
     taken = [action.type for command in _parsers()[1].values() for action in command._actions]
     assert named_path in taken and Path not in taken
 
@@ -191,7 +191,7 @@ def test_seeds_are_checked(line: str, number: str, capsys: pytest.CaptureFixture
 
 
 def test_choices_of_flags_are_those_of_the_library() -> None:
-    """They are written down a second time, for a wrong flag is told before anything heavy is imported."""
+    """The choices are duplicated so that a wrong flag is reported before heavy packages are imported."""
 
     def choices(command: str, flag: str) -> set[str]:
         (action,) = [action for action in _parsers()[1][command]._actions if flag in action.option_strings]

@@ -53,7 +53,7 @@ COMMANDS = {
 }
 SCENES = {"plane", "segment", "inpaint", "train"}
 SLOW = {"samples", "info", "muscles", "pictures", *SCENES}
-"""Where there is much to do before each file, or many files."""
+"""Commands that compute for long before each file, or write many files."""
 Command = Callable[[str, Path], int]
 
 
@@ -76,7 +76,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def photos(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Of which a stand-in for pycolmap finds the poses."""
+    """Folder of photos, whose poses a stand-in for pycolmap returns."""
     reconstruct_by(monkeypatch, model)
     return photos_of_noise(tmp_path_factory.mktemp("photos") / "photos")
 

@@ -37,7 +37,7 @@ def test_cited_pages_exist() -> None:
 
 
 def test_no_page_that_is_not_in_the_tree_is_cited() -> None:
-    """Such as the DESIGN of the first days, whose content is docs/concepts."""
+    """No text refers to the DESIGN of the first days, whose content is in docs/concepts."""
     elsewhere = re.compile(r"\bDESIGN\b(?! of the first days)")
     assert not [str(path) for path in TEXTS if elsewhere.search(path.read_text())]
 
@@ -65,7 +65,7 @@ def test_the_gallery_opens_the_pages_that_the_script_makes_and_has_no_dead_link(
     hook = runpy.run_path(str(DOCS / "page_links.py"))["on_page_markdown"]
 
     class Files:
-        """Of a site that has one of them."""
+        """Files of a site that contains one of the pages."""
 
         def get_file_from_path(self, path: str) -> str | None:
             return path if path == "assets/pages/jump.html" else None
@@ -93,11 +93,11 @@ def test_pages_start_from_captures_and_keys_that_can_be_read(tmp_path: Path, mon
     assert {key.part for key in read_keyframes(ROOT / "examples" / "bow.csv")} == {"head"}
 
 
-def test_every_room_says_what_comes_in_what_goes_out_and_which_part_of_the_paper_it_is() -> None:
-    rooms = sorted((ROOT / "egs_warp").glob("*/__init__.py"))
-    assert len(rooms) > 15
-    for room in rooms:
-        told = ast.get_docstring(ast.parse(room.read_text())) or ""
-        assert "In: " in told and "Out: " in told, room.parent.name
-        assert re.search(r"sections? \d|Eq\. \d|paper", told), room.parent.name
-        assert len(told.splitlines()) <= 4, room.parent.name
+def test_every_package_docstring_names_input_output_and_the_part_of_the_paper() -> None:
+    packages = sorted((ROOT / "egs_warp").glob("*/__init__.py"))
+    assert len(packages) > 15
+    for package in packages:
+        text = ast.get_docstring(ast.parse(package.read_text())) or ""
+        assert re.search(r"\bIn(put)?: ", text) and re.search(r"\bOut(put)?: ", text), package.parent.name
+        assert re.search(r"sections? \d|Eq\. \d|paper", text), package.parent.name
+        assert len(text.splitlines()) <= 4, package.parent.name

@@ -38,12 +38,12 @@ def ended(body: str) -> tuple[int, str]:
         (
             OSError(errno.ENOSPC, "No space left on device", "out/a.ply"),
             1,
-            "prog: out/a.ply: No space left on device; free some space, or choose another place\n",
+            "prog: out/a.ply: No space left on device; free some space, or choose another folder\n",
         ),
         (
             PermissionError(errno.EACCES, "Permission denied", "out/a.ply"),
             2,
-            "prog: out/a.ply: Permission denied; free some space, or choose another place\n",
+            "prog: out/a.ply: Permission denied; free some space, or choose another folder\n",
         ),
     ],
 )
@@ -75,7 +75,7 @@ def test_errors_of_our_own_keep_their_traceback() -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "status", "line"), [(signal.SIGINT, 130, "stopped"), (signal.SIGTERM, 143, "asked to")]
+    ("number", "status", "line"), [(signal.SIGINT, 130, "stopped"), (signal.SIGTERM, 143, "terminated by")]
 )
 def test_signals_unwind(number: signal.Signals, status: int, line: str, tmp_path: Path) -> None:
     body = f"""
@@ -133,7 +133,7 @@ def test_a_closed_pipe_only_silences() -> None:
 def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
     """Status and output of a command of the shell, in which ``egs-warp`` stands for the program."""
     line = command.replace("egs-warp", f"{sys.executable} -m egs_warp.cli")
-    # Unbuffered, as some machines have it, all would be told where it is written.
+    # Unbuffered output, the default of some machines, would report each error at its write.
     environment = os.environ | {"PYTHONIOENCODING": encoding, "PYTHONUNBUFFERED": ""}
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env=environment, timeout=120)
     return done.returncode, done.stdout, done.stderr
@@ -150,20 +150,20 @@ def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
     ],
 )
 def test_output_that_goes_nowhere_changes_no_status(command: str, status: int) -> None:
-    """But where what was asked for is itself the output."""
+    """The exception is a command whose result is its output."""
     ended, _, said = told_by(command)
     assert ended == status and "Traceback" not in said and said.count("\n") <= 1
 
 
 def test_files_are_not_opened_in_the_place_of_closed_streams() -> None:
-    """What a library prints would go into them."""
+    """Otherwise libraries would print into these files."""
     code = "from egs_warp.commands.exit_handling import one_line_errors\nwith one_line_errors('prog'):\n"
     code += " import os, tempfile\n with tempfile.TemporaryFile() as file: os._exit(file.fileno())"
     assert told_by(f'{sys.executable} -c "$(cat <<"END"\n{code}\nEND\n)" <&- >&- 2>&-')[0] > 2
 
 
 def test_letters_that_a_terminal_does_not_know(tmp_path: Path) -> None:
-    """Of a folder's name, told when all is written."""
+    """The name of a folder is printed after everything is written."""
     status, said, error = told_by(f"egs-warp samples '{tmp_path}/é'", encoding="ascii")
     assert status == 0 and "\\xe9" in said and error == ""
 

@@ -56,7 +56,7 @@ def definitions(path: Path) -> dict[str, str]:
 
 @dataclass
 class Reached:
-    """What a test uses, directly or through what it uses."""
+    """Definitions that a test uses, directly or indirectly."""
 
     definitions: set[tuple[Path, str]] = field(default_factory=set)
     """(file, function, class or variable)."""

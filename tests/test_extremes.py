@@ -39,7 +39,7 @@ log_scales = st.sampled_from([-0.99 * LARGEST, -1e3, -104.0, -88.0, -45.0, -20.0
 
 @st.composite
 def changes(draw: st.DrawFn) -> dict[str, tuple[int, float]]:
-    """Of one or two attributes of the odd Gaussian, how many numbers, and to what."""
+    """Draw changes of one or two attributes of the odd Gaussian: the number of values and the new value."""
     names = draw(st.sets(st.sampled_from(NAMES), min_size=1, max_size=2))
     chosen = {name: log_scales if name == "log_scales" else numbers for name in NAMES}
     return {name: (draw(st.integers(1, 4)), draw(chosen[name])) for name in sorted(names)}
@@ -148,7 +148,7 @@ def test_numbers_that_single_precision_cannot_square_are_refused(name: str, valu
 
 @pytest.mark.parametrize("size", [1e-320, 1e-200, 1e-40, 1e-10, 1.0, 1e10, 1e200, 1e300])
 def test_only_the_direction_of_a_quaternion_counts(size: float) -> None:
-    """Of length 0 it is the identity."""
+    """A quaternion of length 0 is the identity."""
     along = np.array([[0.6, -0.0, 0.0, 0.8], [-0.5, 0.5, 0.5, 0.5], [0.0, 0.0, 0.0, 0.0]])
     expected = np.array([along[0], along[1], [1.0, 0.0, 0.0, 0.0]])
     np.testing.assert_allclose(unit_quaternions(size * along), expected, atol=1e-3 if size < 1e-300 else 1e-7)

@@ -43,7 +43,7 @@ def test_the_face_is_what_the_docs_teach() -> None:
 
 
 def classes_of(annotation: object) -> list[set[str]]:
-    """Of each alternative of an annotation that is not None, the package's classes in it."""
+    """Return the classes of the package in each alternative of an annotation except None."""
     alternatives = re.split(r"\|(?![^\[]*\])", str(annotation))
     return [set(re.findall(r"\w+", text)) & PACKAGE_CLASSES for text in alternatives if text.strip() != "None"]
 

@@ -176,7 +176,7 @@ def test_beside_on_one_thread_is_one_after_the_other(told: str, monkeypatch: pyt
 
 
 def test_what_goes_on_beside_an_error_has_ended_when_that_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What both work with may be used again at once."""
+    """The data of both tasks can be reused at once."""
     monkeypatch.setenv(THREADS, "2")
     begun, ended = threading.Event(), threading.Event()
 
@@ -208,7 +208,7 @@ def test_each_thread_keeps_its_own() -> None:
 
 
 def test_mirrors_bring_and_fetch_what_lies_there_now(device: str) -> None:
-    """What is brought twice, or is no number, and what has changed there since it was fetched."""
+    """Cases: unchanged values, NaN, and device values that have changed since the last read-back."""
     arrays = [wp.zeros(3, dtype=wp.float64, device=device) for _ in range(2)]
     one, other = mirrors = [PinnedMirror(array) for array in arrays]
     for values in ([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [0.0, np.nan, 3.0], [0.0, np.nan, 3.0], [0.0, 0.0, 0.0]):

@@ -1,4 +1,4 @@
-"""What goes with a release: every package with its hash, who needs whom, and what the page holds."""
+"""Bill of materials of a release: every package with its hash, the dependencies, and the contents of the page."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_the_bill_names_every_part_and_who_needs_it(wheel: Path) -> None:
 
 
 def test_every_dependency_is_pinned() -> None:
-    """Of the package and of all its extras, by the names in ``pyproject.toml``."""
+    """Check the dependencies of the package and of all extras in ``pyproject.toml``."""
     import tomllib
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

@@ -1,4 +1,4 @@
-"""Threads that help: each work is done once, by whoever is free, and Ctrl-C at any moment ends the process."""
+"""Worker threads: each task is executed once, by any idle thread, and Ctrl-C at any time ends the process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ while time.monotonic() < began + 60.0:
 
 
 def test_each_work_is_done_once() -> None:
-    """By a helper or by who wants it, more of them than there are threads; no more threads than may be."""
+    """More tasks than threads: a worker or the caller executes each, and the number of threads stays limited."""
     many, done = WorkerThreads(2), []
     before = threading.active_count()
     tasks = [many.begin(lambda number=number: done.append(number) or number) for number in range(300)]
@@ -77,7 +77,7 @@ def test_what_was_settled_never_begins() -> None:
 
 
 def test_an_error_is_told_to_who_wants_the_result() -> None:
-    """And to nobody else: the thread goes on."""
+    """Only the caller receives the error; the thread continues."""
     one = WorkerThreads(1)
     for _ in range(3):
         begun = threading.Event()

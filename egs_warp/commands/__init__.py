@@ -1,15 +1,16 @@
-"""The sub-commands of ``egs-warp``: each module adds its parser with ``add_parser``; heavy imports wait for its run.
+"""Sub-commands of ``egs-warp``. Each module adds its parser with ``add_parser``; heavy imports happen when it runs.
 
-In: flags. Out: files and an exit status. Beside the paper; nothing else in the package speaks of flags.
+Input: command-line flags. Output: files and an exit status. No other package handles flags. Not part of the paper.
 """
 
 GROUPS = {
-    "begin": ("doctor", "samples"),
+    "getting started": ("doctor", "samples"),
     "captures": ("pose", "train", "convert"),
     "scenes": ("plane", "segment", "inpaint"),
     "motion": ("info", "muscles", "animate", "resume", "live"),
     "finished runs": ("render", "view", "export"),
 }
-"""Names of the commands, as ``egs-warp --help`` lists them."""
+"""Command names by group, in the order of ``egs-warp --help``."""
 
 COMMANDS = tuple(name for names in GROUPS.values() for name in names)
+"""All command names; each is a module of this package."""

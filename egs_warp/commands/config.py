@@ -1,4 +1,4 @@
-"""``--config run.yaml``: the flags of a run, as a file that each run writes and another begins with."""
+"""``--config run.yaml``: the flags of a run as a YAML file. Every run writes one, and another run can read it."""
 
 from __future__ import annotations
 
@@ -15,33 +15,37 @@ from egs_warp.commands.camera_flags import TRANSPARENT
 from egs_warp.errors import UserError
 
 NAME = "run.yaml"
+"""Name of the file in the run folder."""
 _CHECKSUM = "capture_sha256"
 _PATHS = ("capture", "object", "plane", "cameras", "background", "terrain", "muscles", "inpainter", "camera", "beats")
-"""Flags that may name files: in the file these are relative to its own folder."""
+"""Flags that may name files. In the YAML file, these paths are relative to its folder."""
 _WORDS = ("fixed", "follow", "orbit", "patch", "telea", "ns", TRANSPARENT)
-"""Values of such flags that are no files."""
+"""Values of these flags that do not name files."""
 _IN_MOTION = re.compile(r"\S+\.(?:json|csv)", re.IGNORECASE)
+"""File names within ``--motion``."""
 _NEVER = ("help", "out", "overwrite", "config", "trust")
-"""Not kept: where a run goes is its own, and whether a file may run programs is not for another file to say."""
+"""Flags that the file does not store: each run has its own output folder, and only the user may set ``--trust``."""
 
 
-def add_config_flag(parser: argparse.ArgumentParser) -> None:
+def add_config_flag(parser: argparse._ActionsContainer) -> None:
     """Add the flag that ``with_config`` reads."""
     parser.add_argument(
-        "--config", help="run.yaml of an earlier run, or your own: flags as keys; flags given beside it go before it"
+        "--config",
+        help="run.yaml of an earlier run, or your own YAML file with flags as keys; flags on the command line take "
+        "precedence",
     )
 
 
 def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> list[str]:
-    """``arguments`` of ``parser`` behind those of the file that they name by ``--config``; without it as they are.
+    """Return ``arguments`` of ``parser`` preceded by those of the file that ``--config`` names; unchanged without it.
 
-    Raises ``UserError`` for a file that is none, unknown keys, and values that are no text, number or yes and no.
+    Raises ``UserError`` for an unreadable file, unknown keys, and values that are not a text, number or boolean.
     """
-    found = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    found.add_argument("--config")
+    config_parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    config_parser.add_argument("--config")
     try:
-        named, rest = found.parse_known_args(list(arguments))
-    # The command's own parser says what is wrong.
+        named, rest = config_parser.parse_known_args(list(arguments))
+    # The parser of the command reports the error.
     except argparse.ArgumentError:
         return list(arguments)
     if named.config is None:
@@ -55,60 +59,60 @@ def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> li
             continue
         if name not in actions:
             near = ", ".join(sorted(actions))
-            raise UserError(f"{path}: unknown key {_shown(key)}; give some of {near}")
+            raise UserError(f"{path}: unknown key {_short(key)}; known keys are {near}")
         if value is None or value is False:
             continue
         action = actions[name]
         if isinstance(action, argparse._AppendAction):
             option, texts = action.option_strings[0], value if isinstance(value, list) else [value]
             if not all(isinstance(one, str | int | float) for one in texts):
-                raise UserError(f"{path}: {key} is {_shown(value)}; give a text or a list of texts")
-            # Given beside it, none of the file's: they would mean both.
+                raise UserError(f"{path}: {key} is {_short(value)}; give a text or a list of texts")
+            # The command line replaces all values of the file: argparse would append to them.
             if not any(argument == option or argument.startswith(f"{option}=") for argument in rest):
                 flags += [f"{option}={_from_file(name, str(one), path.parent)}" for one in texts]
             continue
         if (value is True) != (action.nargs == 0) or not isinstance(value, bool | int | float | str):
-            wanted = "true" if action.nargs == 0 else "a text or a number"
-            raise UserError(f"{path}: {key} is {_shown(value)}; give {wanted}")
+            expected = "true" if action.nargs == 0 else "a text or a number"
+            raise UserError(f"{path}: {key} is {_short(value)}; give {expected}")
         text = _from_file(name, str(value), path.parent)
         if not action.option_strings:
             positional.append(text)
         else:
             flags.append(action.option_strings[0] if value is True else f"{action.option_strings[0]}={text}")
-    # A capture given beside the file goes before that in it; both would be one too many.
-    left = parser.parse_known_args([*positional, *flags, *rest, "--out=x"])[1] if positional else []
-    if any(not argument.startswith("-") for argument in left):
+    # A capture on the command line replaces that of the file; argparse would reject two.
+    surplus = parser.parse_known_args([*positional, *flags, *rest, "--out=x"])[1] if positional else []
+    if any(not argument.startswith("-") for argument in surplus):
         positional = []
     return [*flags, *positional, *rest, f"--config={path}"]
 
 
 def changed_capture(config: str, capture: str) -> bool:
-    """Whether ``capture`` is another file than that which the run of the file ``config`` had."""
-    wanted = _read(Path(config)).get(_CHECKSUM)
-    return wanted is not None and wanted != _checksum(Path(capture))
+    """Return True if the checksum of ``capture`` differs from that in the file ``config``; False if it has none."""
+    expected = _read(Path(config)).get(_CHECKSUM)
+    return expected is not None and expected != _checksum(Path(capture))
 
 
-def write_config(path: Path, chosen: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Write what was chosen, defaults among it, such that a run with it has the same bits."""
+def write_config(path: Path, args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """Write what was args, defaults among it, such that a run with it has the same bits."""
     import yaml
 
     from egs_warp.io.atomic import atomic_write
     from egs_warp.version import __version__
 
-    kept: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for name in _actions(parser):
-        value = getattr(chosen, name)
+        value = getattr(args, name)
         if value is None or value is False:
             continue
         if isinstance(value, list):
             texts = [_for_file(name, str(one), path.parent) for one in value]
-            kept[name] = texts if len(texts) > 1 else texts[0]
+            values[name] = texts if len(texts) > 1 else texts[0]
             continue
-        kept[name] = _for_file(name, str(value), path.parent) if isinstance(value, str | Path) else value
-    kept[_CHECKSUM] = _checksum(Path(chosen.capture))
-    lines = f"# egs-warp {__version__}; again: egs-warp {chosen.command} --config {NAME} --out OTHER\n"
+        values[name] = _for_file(name, str(value), path.parent) if isinstance(value, str | Path) else value
+    values[_CHECKSUM] = _checksum(Path(args.capture))
+    header = f"# egs-warp {__version__}; to repeat: egs-warp {args.command} --config {NAME} --out OTHER\n"
     with atomic_write(path) as temporary:
-        temporary.write_text(lines + yaml.safe_dump(kept, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        temporary.write_text(header + yaml.safe_dump(values, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
 def _actions(parser: argparse.ArgumentParser) -> dict[str, argparse.Action]:
@@ -121,7 +125,7 @@ def _read(path: Path) -> dict[Any, Any]:
     from egs_warp.io.text import read_text
 
     class Plain(yaml.SafeLoader):
-        """Without aliases: a few lines of them stand for more than fits into any memory."""
+        """YAML loader without aliases: a few lines of nested aliases expand to more than any memory holds."""
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
@@ -136,36 +140,38 @@ def _read(path: Path) -> dict[Any, Any]:
             raise
         raise UserError(f"{path}: not YAML ({' '.join(str(error).split())}); correct it") from error
     if not isinstance(tree, dict):
-        raise UserError(f"{path}: no keys and values; write one flag a line, as motion: jump")
+        raise UserError(f"{path}: no keys and values; write one flag per line, as motion: jump")
     return tree
 
 
-def _shown(value: Any) -> str:
-    """For a message, not in full where it is long."""
+def _short(value: Any) -> str:
+    """Return ``value`` as text for a message, shortened if it is long."""
     short = reprlib.Repr()
     short.maxstring = short.maxother = 80
     return short.repr(value)
 
 
 def _from_file(name: str, value: str, folder: Path) -> str:
-    """A path of the file as one from here; what is no file is left as it is."""
+    """Return a value of the YAML file in ``folder``: a path relative to the working folder, other values unchanged."""
     if name == "motion":
-        return _IN_MOTION.sub(lambda found: str(folder / found[0]), value)
+        return _IN_MOTION.sub(lambda match: str(folder / match[0]), value)
     is_file = name in _PATHS and value not in _WORDS and os.path.lexists(folder / value)
     return str(folder / value) if is_file else value
 
 
 def _for_file(name: str, value: str, folder: Path) -> str:
+    """Return a value for a YAML file in ``folder``: a path relative to it, other values unchanged."""
+
     def relative(text: str) -> str:
         return os.path.relpath(text, folder) if os.path.lexists(text) else text
 
     if name == "motion":
-        return _IN_MOTION.sub(lambda found: relative(found[0]), value)
+        return _IN_MOTION.sub(lambda match: relative(match[0]), value)
     return relative(value) if name in _PATHS and value not in _WORDS else value
 
 
 def _checksum(path: Path) -> str | None:
-    """None of a folder."""
+    """Return the SHA-256 checksum of a file; None if it cannot be read, for example a folder."""
     try:
         with open(path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,4 +1,4 @@
-"""``egs-warp convert``: a capture, or numbered ones, in another format."""
+"""``egs-warp convert``: write a capture, or a folder of numbered captures, in another format."""
 
 from __future__ import annotations
 
@@ -20,24 +20,28 @@ EXAMPLES = (
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
-    convert = commands.add_parser("convert", help="write a capture in another format, and say what is lost")
+    convert = commands.add_parser("convert", help="write a capture in another format, and report what is lost")
     convert.add_argument(
         "capture",
         metavar="in",
         type=named_path,
-        help=".ply, compressed .ply, .spz, .splat, .sog, .glb, a SOG folder, or with --to a folder of numbered files",
+        help=".ply, compressed .ply, .spz, .splat, .sog, .glb, a SOG folder, or, with --to, a folder of numbered files",
     )
     convert.add_argument(
         "out",
         type=named_path,
-        help="by its ending .ply, .compressed.ply, .spz (version 3), .sog, .splat, .glb; of numbered files a folder",
+        help="output file, .ply, .compressed.ply, .spz (version 3), .sog, .splat or .glb; for numbered files, a folder",
     )
-    convert.add_argument("--to", choices=SPLAT_FILES, help="write this: spz4 is .spz of version 4; for numbered files")
-    convert.add_argument("--degree", type=int, choices=(0, 1, 2, 3), help="bands of colour to keep (all)")
+    convert.add_argument(
+        "--to", choices=SPLAT_FILES, help="output format, required for numbered files; spz4 is .spz version 4"
+    )
+    convert.add_argument(
+        "--degree", type=int, choices=(0, 1, 2, 3), help="highest degree of spherical harmonics to write (all)"
+    )
     convert.set_defaults(run=_convert)
 
 
-def _convert(chosen: argparse.Namespace) -> int:
+def _convert(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from egs_warp.geometry.gaussians import with_degree
@@ -49,45 +53,46 @@ def _convert(chosen: argparse.Namespace) -> int:
     from egs_warp.launching import use_device
     from egs_warp.pipelines.progress import conversion_bar
 
-    if chosen.to is None or chosen.capture.is_file():
-        write = writer_of(chosen.out, kind=chosen.to)
-        # A long reading must not end in vain.
-        if not chosen.out.absolute().parent.is_dir():
-            raise UserError(f"{chosen.out}: its folder does not exist; create {chosen.out.parent} first")
-        if chosen.out.exists() and chosen.capture.exists() and chosen.out.samefile(chosen.capture):
-            raise UserError(f"{chosen.out}: is what is read; give another name")
-        check_no_file_of_a_run(chosen.out)
-        pairs = [(chosen.capture, chosen.out)]
+    if args.to is None or args.capture.is_file():
+        write = writer_of(args.out, kind=args.to)
+        # Checked before a capture is read, which may take long.
+        if not args.out.absolute().parent.is_dir():
+            raise UserError(f"{args.out}: its folder does not exist; create {args.out.parent} first")
+        if args.out.exists() and args.capture.exists() and args.out.samefile(args.capture):
+            raise UserError(f"{args.out}: is the input file; give another name")
+        check_no_file_of_a_run(args.out)
+        pairs = [(args.capture, args.out)]
     else:
-        ending, write = WRITERS[chosen.to]
-        sources = numbered_captures(chosen.capture)
-        if chosen.out.exists() and chosen.out.samefile(chosen.capture):
-            raise UserError(f"{chosen.out}: is the folder that is read; give another one")
-        folder = writable_folder(chosen.out)
+        ending, write = WRITERS[args.to]
+        sources = numbered_captures(args.capture)
+        if args.out.exists() and args.out.samefile(args.capture):
+            raise UserError(f"{args.out}: is the input folder; give another one")
+        folder = writable_folder(args.out)
         pairs = [(source, folder / f"{source.name.split('.')[0]}{ending}") for source in sources]
     use_device("cpu")
-    told: list[str] = []
+    losses: list[str] = []
     notes: list[str] = []
     for source, target in tqdm(pairs, desc="convert", unit="file", disable=len(pairs) == 1, file=sys.stderr):
         before = read_capture(source)
         with conversion_bar(target.name, quiet=len(pairs) > 1) as begins:
             begins("write")
-            write(target, with_degree(before.cloud, chosen.degree))
-            if not told:
+            write(target, with_degree(before.cloud, args.degree))
+            if not losses:
                 notes = [f"{source}: {note}" for note in before.notes]
                 begins("compare")
-                told = conversion_loss(before, read_capture(target))
+                losses = conversion_loss(before, read_capture(target))
     for note in notes:
         print_note(note)
-    size, was = (sum(_size(pair[k]) for pair in pairs) for k in (1, 0))
+    size, input_size = (sum(_size(pair[k]) for pair in pairs) for k in (1, 0))
     names = str(pairs[0][1]) if len(pairs) == 1 else f"{pairs[0][1]} to {pairs[-1][1].name}"
-    print(f"wrote {names} ({size / 1e6:.2f} MB from {was / 1e6:.2f} MB)")
-    for line in told:
-        print(f"  {line}" if len(pairs) == 1 else f"  of the first: {line}")
+    print(f"wrote {names} ({size / 1e6:.2f} MB from {input_size / 1e6:.2f} MB)")
+    for line in losses:
+        print(f"  {line}" if len(pairs) == 1 else f"  first file: {line}")
     return 0
 
 
 def _size(path: Path) -> int:
+    """Return the size of a file, or of all files of a folder, in bytes."""
     return (
         sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) if path.is_dir() else path.stat().st_size
     )

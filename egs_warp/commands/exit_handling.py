@@ -1,7 +1,7 @@
-"""How a program ends: whatever stops it, it says one line, leaves no half-written file and has a status of its own.
+"""Exit handling: every error or signal prints one line, leaves no half-written file and sets the exit status.
 
-0 done, 1 memory or disk gave out, 2 bad input, 3 written, but fallen or stopped (``animate``), 130 ended by
-Ctrl-C, 143 asked to end (SIGTERM).
+Exit statuses: 0 done, 1 out of memory or disk space, 2 invalid input, 3 files written but body fallen or simulation
+stopped (``animate``, ``resume``), 130 Ctrl-C, 143 SIGTERM.
 """
 
 from __future__ import annotations
@@ -19,29 +19,36 @@ from typing import Any, NoReturn, TextIO
 from egs_warp.commands.flags import flag_of
 from egs_warp.errors import UserError
 
-_GAVE_OUT = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
-"""What a machine runs out of: no input is at fault."""
-_REFUSED = (errno.EROFS, errno.EACCES, errno.EPERM)
-"""Places that are not this user's to write or read. Errors that are in neither are ours, and keep their traceback."""
+_EXHAUSTED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+"""Error numbers of an exhausted or failing machine; the input is not the cause."""
+_NOT_PERMITTED = (errno.EROFS, errno.EACCES, errno.EPERM)
+"""Error numbers of paths that the user may not read or write. Other errors are bugs and keep their traceback."""
 
-_AGAIN = 0.05
-"""Seconds after which a signal that was lost comes again."""
+_RESEND_DELAY = 0.05
+"""Seconds after which a signal whose exception was dropped is sent again."""
 
 
 class HandledExit(SystemExit):
-    """The program has told why it ends."""
+    """Exit of the program after the reason has been printed."""
 
 
 class _TerminatedError(BaseException):
-    """SIGTERM."""
+    """Raised by SIGTERM."""
 
 
 @contextmanager
 def one_line_errors(program: str) -> Iterator[None]:
-    """Whatever stops the ``program`` within prints one line and ends it with a status (``docs/reliability.md``).
+    """Context manager that turns errors and signals into one line on stderr and an exit status.
 
-    Bad input names flags and ends it with 2, or with 1 where a machine that gave out is behind it. Ctrl-C and SIGTERM
-    unwind once: a second Ctrl-C ends it at once. A pipe that is closed at its other end only silences the program.
+    Invalid input gives status 2, or 1 if its cause is an exhausted machine; the message names flags. The first Ctrl-C
+    or SIGTERM unwinds the stack, a second one ends the process at once. A closed pipe only silences the output. See
+    ``docs/reliability.md``.
+
+    Args:
+        program: name at the beginning of the line.
+
+    Raises:
+        HandledExit: after the line has been printed.
     """
 
     def end(status: int, line: str) -> NoReturn:
@@ -49,82 +56,83 @@ def one_line_errors(program: str) -> Iterator[None]:
             print(f"{program}: {line}", file=sys.stderr)
         raise HandledExit(status) from None
 
-    with _signals() as came, _deaf_streams():
+    with _signals() as raised, _tolerant_streams():
         try:
-            with _unwinding(came):
+            with _unwinding(raised):
                 yield
-                # What is still buffered may not find room either.
+                # Flush here: writing the buffered output may fail, too.
                 sys.stdout.flush()
         except UserError as error:
-            end(1 if _gave_out(error.__cause__) else 2, error.format_message(flag_of))
+            end(1 if _is_exhausted(error.__cause__) else 2, error.format_message(flag_of))
         except KeyboardInterrupt as error:
             end(130, _noted("stopped; finished files are whole, unfinished ones are gone", error))
         except _TerminatedError as error:
-            end(143, _noted("asked to end; finished files are whole, unfinished ones are gone", error))
+            end(143, _noted("terminated by SIGTERM; finished files are whole, unfinished ones are gone", error))
         except MemoryError:
             end(1, "not enough memory; give a smaller capture, picture or number of Gaussians")
         except OSError as error:
-            if error.errno not in (*_GAVE_OUT, *_REFUSED, errno.ENAMETOOLONG):
+            if error.errno not in (*_EXHAUSTED, *_NOT_PERMITTED, errno.ENAMETOOLONG):
                 raise
             if error.errno == errno.ENAMETOOLONG:
-                # Python's own look whether a file is there raises it.
+                # Path.exists of Python raises this error.
                 end(2, f"{str(error.filename)[:60]}...: no such file or folder, the name is too long; check the path")
-            place = f"{error.filename}: " if error.filename else ""
-            end(1 if _gave_out(error) else 2, f"{place}{error.strerror}; free some space, or choose another place")
+            path = f"{error.filename}: " if error.filename else ""
+            end(1 if _is_exhausted(error) else 2, f"{path}{error.strerror}; free some space, or choose another folder")
 
 
-def _gave_out(cause: BaseException | None) -> bool:
-    """Whether an error, or the one behind it, is that the machine has no more of something."""
-    return isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in _GAVE_OUT)
+def _is_exhausted(cause: BaseException | None) -> bool:
+    """Return True if ``cause`` says that memory, disk space or file handles are exhausted."""
+    return isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in _EXHAUSTED)
 
 
 def _noted(line: str, error: BaseException) -> str:
-    """The ``line`` with what was noted on the ``error`` on its way."""
+    """Return ``line`` followed by the notes of ``error``."""
     return "; ".join([line, *getattr(error, "__notes__", [])])
 
 
 @contextmanager
-def _unwinding(came: list[type[BaseException]]) -> Iterator[None]:
-    """What a signal has raised goes on as that: of what is raised while it is imported, a library in C makes an error
-    of its own ("initialization failed").
+def _unwinding(raised: list[type[BaseException]]) -> Iterator[None]:
+    """Raise the exception of a signal again if a C extension has replaced it.
+
+    An extension that is interrupted during its import raises its own error ("initialization failed").
     """
     try:
         yield
     except (ImportError, SystemError) as error:
-        # Others keep their own line: what fails after a Ctrl-C that ended a server, say.
-        if came:
-            raise came[0] from error
+        # Only these errors: other errors after a Ctrl-C, for example one that ended a server, keep their own line.
+        if raised:
+            raise raised[0] from error
         raise
 
 
 @contextmanager
 def _signals() -> Iterator[list[type[BaseException]]]:
-    """Ctrl-C and SIGTERM raise within, once; yields what they have raised."""
-    came: list[type[BaseException]] = []
+    """Raise an exception on the first Ctrl-C or SIGTERM; yields the list of exceptions that were raised."""
+    raised: list[type[BaseException]] = []
     if threading.current_thread() is not threading.main_thread():
-        yield came
+        yield raised
         return
 
     def stop(number: int, _: object) -> None:
-        if came:
-            # What is left over, the next run sweeps.
+        if raised:
+            # The next run removes the temporary files.
             os._exit(128 + number)
-        came.append(KeyboardInterrupt if number == signal.SIGINT else _TerminatedError)
-        raise came[0]
+        raised.append(KeyboardInterrupt if number == signal.SIGINT else _TerminatedError)
+        raise raised[0]
 
-    def unraisable(lost: Any) -> None:
-        # Raised inside a destructor or a callback, where Python drops it: it is raised again from a better place.
-        if lost.exc_type in (KeyboardInterrupt, _TerminatedError):
-            came.clear()
-            number = signal.SIGINT if lost.exc_type is KeyboardInterrupt else signal.SIGTERM
-            threading.Timer(_AGAIN, os.kill, (os.getpid(), number)).start()
+    def unraisable(unraised: Any) -> None:
+        # Python drops an exception that is raised in a destructor or callback: send the signal again.
+        if unraised.exc_type in (KeyboardInterrupt, _TerminatedError):
+            raised.clear()
+            number = signal.SIGINT if unraised.exc_type is KeyboardInterrupt else signal.SIGTERM
+            threading.Timer(_RESEND_DELAY, os.kill, (os.getpid(), number)).start()
         else:
-            before_hook(lost)
+            before_hook(unraised)
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     before_hook, sys.unraisablehook = sys.unraisablehook, unraisable
     try:
-        yield came
+        yield raised
     finally:
         sys.unraisablehook = before_hook
         for number, handler in before.items():
@@ -132,16 +140,17 @@ def _signals() -> Iterator[list[type[BaseException]]]:
 
 
 @contextmanager
-def _deaf_streams() -> Iterator[None]:
-    """Output within goes on in silence where nobody reads it any more, or ever did; what cannot be told on stderr stops
-    nothing.
+def _tolerant_streams() -> Iterator[None]:
+    """Make writes to closed output streams succeed silently.
+
+    Writes to a closed stdout pipe and all failing writes to stderr are dropped.
     """
     _open_standard_files()
     before = sys.stdout, sys.stderr
-    # Python has none where the shell has closed it.
-    with open(os.devnull, "w") as nowhere:
-        sys.stdout = stdout = _Stream(before[0] or nowhere, BrokenPipeError)
-        sys.stderr = _Stream(before[1] or nowhere, OSError)
+    # Python sets a stream to None if the shell has closed it.
+    with open(os.devnull, "w") as null:
+        sys.stdout = stdout = _Stream(before[0] or null, BrokenPipeError)
+        sys.stderr = _Stream(before[1] or null, OSError)
         try:
             yield
         finally:
@@ -150,55 +159,56 @@ def _deaf_streams() -> Iterator[None]:
 
 
 def _open_standard_files() -> None:
-    """Those that the shell has closed lead nowhere: the next file that is opened would get their number, and with it
-    whatever libraries print.
+    """Open the standard file descriptors that the shell has closed on the null device.
+
+    Otherwise the next opened file gets their number, and libraries print into it.
     """
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            # The lowest that is free: this one.
+            # open returns the lowest free number, which is this one.
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
 
 
 class _Stream:
-    """A text stream whose reader may go away, or know fewer letters."""
+    """Text stream that tolerates a closed reader and characters that the encoding lacks."""
 
-    def __init__(self, stream: TextIO, lost: type[OSError]) -> None:
-        """``lost``: errors at which it falls silent."""
-        self._stream, self._lost = stream, lost
+    def __init__(self, stream: TextIO, ignored: type[OSError]) -> None:
+        """Wrap ``stream``; errors of the type ``ignored`` silence it."""
+        self._stream, self._ignored = stream, ignored
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """As that of the stream."""
+        """Write ``text``; characters that the encoding lacks are escaped."""
         try:
             return self._stream.write(text)
         except UnicodeEncodeError as error:
-            # The name of a folder, say, at the end of hours of work.
+            # For example the name of a folder, at the end of hours of work.
             return self._stream.write(text.encode(error.encoding, "backslashreplace").decode(error.encoding))
-        except self._lost:
+        except self._ignored:
             self._silence()
             return len(text)
 
     def flush(self) -> None:
-        """As that of the stream."""
+        """Flush the stream."""
         try:
             self._stream.flush()
-        except self._lost:
+        except self._ignored:
             self._silence()
 
     def settle(self) -> None:
-        """Flush; what cannot be written is not tried again when Python ends."""
+        """Flush; if that fails, drop the buffered output so that Python does not write it at its end."""
         try:
             self._stream.flush()
         except OSError:
             self._silence()
 
     def _silence(self) -> None:
-        # What is still buffered goes nowhere, now and when Python ends.
+        # Redirect to the null device: the buffered output is dropped now and at the end of Python.
         with contextlib.suppress(OSError, ValueError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, self._stream.fileno())
+            os.close(null)

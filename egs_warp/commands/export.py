@@ -1,4 +1,4 @@
-"""``egs-warp export``: a run as files that other tools open."""
+"""``egs-warp export``: write a run as files for other tools."""
 
 from __future__ import annotations
 
@@ -23,37 +23,44 @@ def add_parser(commands: Commands) -> None:
         "--to",
         required=True,
         choices=(*SPLAT_FILES, "usd", "bundle"),
-        help="numbered splat files, one USD stage, or one .npz",
+        help="output format: numbered splat files, one USD stage (usd), or one .npz file (bundle)",
     )
     export.add_argument(
-        "--out", required=True, type=named_path, help="folder of numbered files; .usdc or .usda of usd, .npz of bundle"
+        "--out",
+        required=True,
+        type=named_path,
+        help="folder for numbered files, a .usdc or .usda file for usd, or an .npz file for bundle",
     )
-    export.add_argument("--every", type=int, default=1, help="so many frames at 60 Hz one is written (1)")
-    export.add_argument("--frame", type=int, help="this one alone, from 0; -1 is the last; not of usd and bundle")
-    export.add_argument("--degree", type=int, choices=(0, 1, 2, 3), help="bands of colour to keep (all)")
+    export.add_argument("--every", type=int, default=1, metavar="N", help="write every N-th frame of the 60 Hz run (1)")
+    export.add_argument(
+        "--frame", type=int, help="write only this frame, counted from 0, -1 is the last; not for usd and bundle"
+    )
+    export.add_argument(
+        "--degree", type=int, choices=(0, 1, 2, 3), help="highest degree of spherical harmonics to write (all)"
+    )
     export.set_defaults(run=_export)
 
 
-def _export(chosen: argparse.Namespace) -> int:
+def _export(args: argparse.Namespace) -> int:
     from egs_warp.launching import use_device
     from egs_warp.pipelines.bundle import export_bundle
     from egs_warp.pipelines.export import export_splats
     from egs_warp.pipelines.finished_run import FinishedRun
     from egs_warp.pipelines.usd import export_usd
 
-    if chosen.to in ("usd", "bundle") and chosen.frame is not None:
-        what = "USD stage" if chosen.to == "usd" else "bundle"
-        raise UserError(f"--frame: a {what} holds all frames; leave it out, or give --every")
+    if args.to in ("usd", "bundle") and args.frame is not None:
+        format_name = "USD stage" if args.to == "usd" else "bundle"
+        raise UserError(f"--frame: a {format_name} contains all frames; leave --frame out, or give --every")
     use_device("cpu")
-    run = FinishedRun.read(chosen.folder)
-    if chosen.to == "usd":
-        export_usd(run, chosen.out, every=chosen.every, degree=chosen.degree)
-        paths = [chosen.out]
-    elif chosen.to == "bundle":
-        export_bundle(run, chosen.out, every=chosen.every, degree=chosen.degree)
-        paths = [chosen.out]
+    run = FinishedRun.read(args.folder)
+    if args.to == "usd":
+        export_usd(run, args.out, every=args.every, degree=args.degree)
+        paths = [args.out]
+    elif args.to == "bundle":
+        export_bundle(run, args.out, every=args.every, degree=args.degree)
+        paths = [args.out]
     else:
-        paths = export_splats(run, chosen.out, chosen.to, frame=chosen.frame, every=chosen.every, degree=chosen.degree)
+        paths = export_splats(run, args.out, args.to, frame=args.frame, every=args.every, degree=args.degree)
     size = sum(path.stat().st_size for path in paths)
     named = str(paths[0]) if len(paths) == 1 else f"{paths[0]} to {paths[-1].name}"
     print(f"wrote {named} ({size / 1e6:.1f} MB)")

@@ -1,4 +1,4 @@
-"""Flags that several commands share: how they are read, and which argument of the library each one gives."""
+"""Flags shared by several commands: their parsing, and the library argument that each one sets."""
 
 from __future__ import annotations
 
@@ -17,67 +17,75 @@ if TYPE_CHECKING:
     from egs_warp.io.capture import Capture
 
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
-"""What a command adds its parser to."""
+"""Subparsers that a command adds its parser to."""
 
 SPLAT_FILES = ("ply", "compressed-ply", "spz", "spz4", "sog", "splat", "glb")
-"""Names of ``egs_warp.io.writing.WRITERS``, which is slow to import."""
+"""Keys of ``egs_warp.io.writing.WRITERS``, repeated here because that module is slow to import."""
 QP_SOLVERS = ("osqp", "admm", "daqp")
-"""Names of ``egs_warp.locomotion.solvers.QpSolver``, which is slow to import."""
+"""Values of ``egs_warp.locomotion.solvers.QpSolver``, repeated here because that module is slow to import."""
 _AXES = {"x": 0, "y": 1, "z": 2}
+"""Index of each axis name."""
 _FLAGS = {"muscles_file": "--muscles", "solids": "--terrain"}
-"""Of arguments whose flags are called otherwise."""
+"""Flags of the library arguments whose names differ."""
 
 
 def flag_of(argument: str) -> str:
-    """The flag that gives ``argument`` of a function of the library."""
+    """Return the flag that sets ``argument`` of a library function."""
     return _FLAGS.get(argument, f"--{argument.replace('_', '-')}")
 
 
 def named_path(text: str) -> Path:
-    """The path that a flag gives. An empty one, as of an unset variable, would be the working folder."""
+    """Return ``text`` as a path. Raises ``ArgumentTypeError`` for an empty text, which would be the working folder."""
     if not text.strip():
-        raise argparse.ArgumentTypeError("nothing is given; give a name")
+        raise argparse.ArgumentTypeError("the name is empty; give a name")
     return Path(text)
 
 
 def seed(text: str) -> int:
-    """The number that a flag gives, as generators of random numbers take it."""
+    """Return ``text`` as a seed of random numbers. Raises ``ArgumentTypeError`` outside of 0 to 2^32 - 1."""
     number = int(text)
     if not 0 <= number < 1 << 32:
-        raise argparse.ArgumentTypeError(f"{text} is not from 0 to {(1 << 32) - 1}")
+        raise argparse.ArgumentTypeError(f"{text}: give a whole number from 0 to {(1 << 32) - 1}")
     return number
 
 
 def add_qp_flag(parser: argparse._ActionsContainer) -> None:
-    """Add the flag that names the ``qp_solver`` of ``LocomotionSettings``."""
+    """Add the flag for ``LocomotionSettings.qp_solver``."""
     parser.add_argument(
         "--qp",
         choices=QP_SOLVERS,
-        help="who solves the QPs of a step: osqp, on the host; admm, its iterations on --device; daqp, if installed"
-        " (osqp on cpu, admm on cuda:0)",
+        help="QP solver of a step: osqp on the host; admm, with its iterations on --device; daqp, if installed"
+        " (default: osqp on cpu, admm on cuda:0)",
     )
 
 
 def add_inpainter_flags(parser: argparse._ActionsContainer, *, default: str | None) -> None:
     """Add the flags that ``chosen_inpainter`` reads."""
-    parser.add_argument("--inpainter", default=default, help="patch (default), telea, ns, or LaMa's ONNX file")
     parser.add_argument(
-        "--trust", action="store_true", help="let --inpainter be a TorchScript file, which may run any program"
+        "--inpainter",
+        default=default,
+        help="method that fills the floor: patch (default), telea, ns, or the ONNX file of LaMa",
+    )
+    parser.add_argument(
+        "--trust", action="store_true", help="allow a TorchScript file for --inpainter; such a file can run any program"
     )
 
 
-def chosen_inpainter(chosen: argparse.Namespace, *, seed: int = 0) -> Inpainter:
-    """What ``--inpainter`` names. Raises ``UserError`` for a file that is no network, or that is not trusted."""
+def chosen_inpainter(args: argparse.Namespace, *, seed: int = 0) -> Inpainter:
+    """Return the inpainter of ``--inpainter``, with ``seed`` for its patch search.
+
+    Raises ``UserError`` for a file that is not a network, and for a TorchScript file without ``--trust``.
+    """
     from egs_warp.inpainting.inpainters import TorchScriptInpainter, inpainter_by_name
 
-    inpainter = inpainter_by_name(chosen.inpainter or "patch", seed=seed, device=chosen.device, trust=chosen.trust)
+    inpainter = inpainter_by_name(args.inpainter or "patch", seed=seed, device=args.device, trust=args.trust)
     if isinstance(inpainter, TorchScriptInpainter):
-        print(f"egs-warp: warning: {inpainter.path} is trusted to run any program that it carries", file=sys.stderr)
+        print(f"egs-warp: warning: {inpainter.path} is a TorchScript file and can run any program", file=sys.stderr)
     return inpainter
 
 
 def parse_up(text: str) -> np.ndarray:
-    """(3,) unit vector of an axis name such as ``-y``. Raises ``UserError`` otherwise."""
+    """Return the (3,) unit vector of an axis name such as ``-y``. Raises ``UserError`` for other texts."""
     import numpy as np
 
     name = text.strip().lower().lstrip("+-")
@@ -89,7 +97,10 @@ def parse_up(text: str) -> np.ndarray:
 
 
 def parse_direction(flag: str, text: str) -> np.ndarray:
-    """(3,) unit vector from ``x,y,z``, or of an axis name such as ``-y``. Raises ``UserError`` otherwise."""
+    """Return the (3,) unit vector of ``x,y,z`` or of an axis name such as ``-y``.
+
+    Raises ``UserError``, which names ``flag``, for other texts.
+    """
     import numpy as np
 
     if text.strip().lower().lstrip("+-") in _AXES:
@@ -106,7 +117,7 @@ def parse_direction(flag: str, text: str) -> np.ndarray:
 
 
 def parse_plane(text: str) -> Plane:
-    """Plane from ``nx,ny,nz,d``. Raises ``UserError`` otherwise."""
+    """Return the plane n.x + d = 0 of ``nx,ny,nz,d``. Raises ``UserError`` for other texts."""
     from egs_warp.geometry.plane import Plane
     from egs_warp.io.limits import FURTHEST
 
@@ -121,11 +132,11 @@ def parse_plane(text: str) -> Plane:
 
 
 def guessed_up(capture: Capture) -> tuple[np.ndarray, str]:
-    """(3,) up of a ``Capture`` whose file cannot tell, and what to say about it."""
+    """Estimate the up direction of a capture; return the (3,) unit vector and a note for the user."""
     import numpy as np
 
     from egs_warp.segmentation.base_plane import guess_up
 
     up, reason = guess_up(capture.cloud, capture.up)
     axis = "xyz"[int(np.argmax(np.abs(up)))]
-    return up, f"up is taken to be {'-' if up.sum() < 0 else '+'}{axis} ({reason}); if not, give --up"
+    return up, f"up is estimated as {'-' if up.sum() < 0 else '+'}{axis} ({reason}); if that is wrong, give --up"

@@ -1,4 +1,4 @@
-"""``egs-warp inpaint``: new floor where the object stood."""
+"""``egs-warp inpaint``: fill the hole in the floor under a removed object."""
 
 from __future__ import annotations
 
@@ -23,28 +23,36 @@ EXAMPLES = (
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
-    inpaint = commands.add_parser("inpaint", help="close the hole in the floor that an object leaves")
-    inpaint.add_argument("background", help="capture without the object, as segment writes it; any format")
-    inpaint.add_argument("--plane", required=True, help="plane.json, as plane writes it, or nx,ny,nz,d")
+    inpaint = commands.add_parser("inpaint", help="fill the hole in the floor under a removed object")
+    inpaint.add_argument("background", help="capture without the object, as segment writes it, in any format")
+    inpaint.add_argument("--plane", required=True, help="floor plane: plane.json of plane or segment, or nx,ny,nz,d")
     inpaint.add_argument(
-        "--object", help="capture of the object: the hole is under its foot, as segment's plane.json says"
+        "--object", help="capture of the object: the hole is its footprint, or that in segment's plane.json"
     )
-    inpaint.add_argument("--mask", help="PNG of the object, or a folder of them: the floor that none of them sees")
-    inpaint.add_argument("--cameras", help="cameras of the masks: cameras.json, transforms.json, a COLMAP model")
+    inpaint.add_argument(
+        "--mask", help="mask.png of the object, or a folder of masks: the hole is the floor behind it in all photos"
+    )
+    inpaint.add_argument("--cameras", help="cameras of the masks: cameras.json, transforms.json or a COLMAP model")
     inpaint.add_argument("--view", help="name or number of the camera of a single mask")
-    inpaint.add_argument("--hole", help="x,y,z,radius of a round hole, scene units")
-    inpaint.add_argument("--out", required=True, type=named_path, help="filled capture to write, .ply")
-    inpaint.add_argument("--picture", type=named_path, help="before, after and depth as PNG (--out with .png)")
-    add_overwrite_flag(inpaint, "their place")
+    inpaint.add_argument("--hole", help="round hole as x,y,z,radius in scene units")
+    inpaint.add_argument("--out", required=True, type=named_path, help="output file for the filled capture, .ply")
+    inpaint.add_argument(
+        "--picture",
+        type=named_path,
+        help="image of before, after and depth, .png (default: --out with the ending .png)",
+    )
+    add_overwrite_flag(inpaint, "--out and --picture")
     add_inpainter_flags(inpaint, default="patch")
-    inpaint.add_argument("--steps", type=int, help="of training against the inpainted picture (100); 0: no PyTorch")
-    inpaint.add_argument("--margin", type=float, help="by how much the hole is made larger, of its side (0.01)")
-    inpaint.add_argument("--seed", type=seed, default=0, help="of the patch search (0)")
+    inpaint.add_argument(
+        "--steps", type=int, help="training steps against the inpainted image (100); 0 needs no PyTorch"
+    )
+    inpaint.add_argument("--margin", type=float, help="enlargement of the hole, as a fraction of its side (0.01)")
+    inpaint.add_argument("--seed", type=seed, default=0, help="seed of the patch search (0)")
     inpaint.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
     inpaint.set_defaults(run=_inpaint)
 
 
-def _inpaint(chosen: argparse.Namespace) -> int:
+def _inpaint(args: argparse.Namespace) -> int:
     from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
     from egs_warp.inpainting.picture import before_and_after
     from egs_warp.io import read_capture, write_ply
@@ -52,45 +60,45 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.progress import scene_bar
 
-    given = {"steps": chosen.steps, "margin": chosen.margin, "seed": chosen.seed}
-    options = InpaintOptions(**{name: value for name, value in given.items() if value is not None})
-    if chosen.out.suffix.lower() != ".ply":
-        raise UserError(f"--out {chosen.out}: give the name of a .ply file")
-    picture = chosen.picture or chosen.out.with_suffix(".png")
+    values = {"steps": args.steps, "margin": args.margin, "seed": args.seed}
+    options = InpaintOptions(**{name: value for name, value in values.items() if value is not None})
+    if args.out.suffix.lower() != ".ply":
+        raise UserError(f"--out {args.out}: give the name of a .ply file")
+    picture = args.picture or args.out.with_suffix(".png")
     if picture.suffix.lower() != ".png":
         raise UserError(f"--picture {picture}: give the name of a .png file")
-    for file in (chosen.out, picture):
+    for file in (args.out, picture):
         if not file.parent.is_dir():
             raise UserError(f"{file}: its folder does not exist; create {file.parent} first")
-    check_named_files(chosen.out, picture, overwrite=chosen.overwrite)
-    plane, recorded = _plane(chosen.plane)
-    said = sum([chosen.object is not None, chosen.mask is not None, chosen.hole is not None])
-    if said > 1 or (said == 0 and recorded is None):
+    check_named_files(args.out, picture, overwrite=args.overwrite)
+    plane, recorded = _plane(args.plane)
+    hole_flags = sum([args.object is not None, args.mask is not None, args.hole is not None])
+    if hole_flags > 1 or (hole_flags == 0 and recorded is None):
         raise UserError(
-            "inpaint: say where the hole is by one of --object, --mask with --cameras, or --hole,"
-            " or give the plane.json that segment wrote by --plane"
+            "inpaint: the hole is not defined; give one of --object, --mask with --cameras, or --hole,"
+            " or the plane.json of segment as --plane"
         )
-    start_device(chosen.device)
-    inpainter = chosen_inpainter(chosen, seed=chosen.seed)
-    background = read_capture(chosen.background, device=chosen.device)
-    hole = _hole(chosen, plane, recorded, background.cloud)
+    start_device(args.device)
+    inpainter = chosen_inpainter(args, seed=args.seed)
+    background = read_capture(args.background, device=args.device)
+    hole = _hole(args, plane, recorded, background.cloud)
     assert hole is not None, "one of them was given"
-    with named_files(chosen.out, picture, overwrite=chosen.overwrite) as files:
-        with scene_bar({"inpaint": options.steps > 0}) as told:
-            painted = lambda done: told("inpaint", done)  # noqa: E731
+    with named_files(args.out, picture, overwrite=args.overwrite) as files:
+        with scene_bar({"inpaint": options.steps > 0}) as show_progress:
+            painted = lambda done: show_progress("inpaint", done)  # noqa: E731
             result = inpaint(background.cloud, hole, inpainter=inpainter, options=options, progress=painted)
         compared = before_and_after(result)
         files.begin()
-        write_ply(chosen.out, result.cloud)
+        write_ply(args.out, result.cloud)
         write_png(picture, compared)
     for note in (*background.notes, *result.notes):
         print(f"note: {note}")
-    print(f"wrote {chosen.out} and {picture} in {sum(result.seconds.values()):.1f} s")
+    print(f"wrote {args.out} and {picture} in {sum(result.seconds.values()):.1f} s")
     return 0
 
 
 def _plane(text: str) -> tuple[Plane, Hole | None]:
-    """The plane, and the hole that ``segment`` found in it, if it did."""
+    """Return the plane, and the hole that ``segment`` recorded in its plane.json, if any."""
     if not text.lower().endswith(".json"):
         return parse_plane(text), None
     from egs_warp.inpainting.holes import Hole
@@ -100,30 +108,31 @@ def _plane(text: str) -> tuple[Plane, Hole | None]:
     return known.plane, Hole.of_outline(known.plane, known.hole) if known.hole is not None else None
 
 
-def _hole(chosen: argparse.Namespace, plane: Plane, recorded: Hole | None, background: GaussianCloud) -> Hole | None:
+def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, background: GaussianCloud) -> Hole | None:
+    """Return the hole that the flags define, else the ``recorded`` one."""
     import numpy as np
 
     from egs_warp.commands.object_flag import read_object
     from egs_warp.inpainting.holes import disc, footprint, unseen
     from egs_warp.io import read_cameras, read_capture
 
-    if chosen.object is not None:
-        thing = read_capture(chosen.object, device=chosen.device).cloud
-        # The hole may be another object's.
-        if recorded is None or not recorded.window.sample(recorded.mask, thing.means.numpy()).any():
-            return footprint(thing, plane)
+    if args.object is not None:
+        cloud = read_capture(args.object, device=args.device).cloud
+        # The recorded hole may belong to another object.
+        if recorded is None or not recorded.window.sample(recorded.mask, cloud.means.numpy()).any():
+            return footprint(cloud, plane)
         return recorded
-    if chosen.hole is not None:
+    if args.hole is not None:
         try:
-            x, y, z, radius = (float(part) for part in chosen.hole.split(","))
+            x, y, z, radius = (float(part) for part in args.hole.split(","))
         except ValueError as error:
-            raise UserError(f"--hole {chosen.hole}: give four numbers x,y,z,radius") from error
+            raise UserError(f"--hole {args.hole}: give four numbers x,y,z,radius") from error
         return disc(plane, np.array([x, y, z]), radius)
-    if chosen.mask is None:
+    if args.mask is None:
         return recorded
-    if not Path(chosen.mask).exists():
-        raise UserError(f"--mask {chosen.mask}: no such file or folder; give a PNG or a folder of them")
-    if chosen.cameras is None:
-        raise UserError("--mask: give the cameras that the masks were painted for by --cameras")
-    spec = read_object(chosen.mask, background, read_cameras(chosen.cameras), view=chosen.view)
+    if not Path(args.mask).exists():
+        raise UserError(f"--mask {args.mask}: no such file or folder; give a PNG or a folder of them")
+    if args.cameras is None:
+        raise UserError("--mask: a mask needs its camera; give --cameras")
+    spec = read_object(args.mask, background, read_cameras(args.cameras), view=args.view)
     return unseen(plane, spec.masks)

@@ -1,4 +1,4 @@
-"""``egs-warp live``: a creature in the browser that does what keys, clicks and sliders ask while it lives."""
+"""``egs-warp live``: simulate a creature and control it in the browser by keys, clicks and sliders."""
 
 from __future__ import annotations
 
@@ -23,58 +23,68 @@ EXAMPLES = (
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
-    live = commands.add_parser("live", help="steer a creature in the browser while it lives")
+    live = commands.add_parser("live", help="simulate a creature and control it in the browser")
     live.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
     live.add_argument(
-        "--out", type=named_path, default=Path("out/live"), help="folder for what is recorded: take-1, ... (out/live)"
+        "--out", type=named_path, default=Path("out/live"), help="folder for recorded takes: take-1, ... (out/live)"
     )
     live.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
     add_qp_flag(live)
     body = live.add_argument_group("body and ground")
-    body.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
+    body.add_argument("--up", help="axis that points up: x, y, z, -x, -y or -z, as --up=-y (default: estimated)")
     body.add_argument(
-        "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units, or a plane.json; else it is found"
+        "--plane",
+        help="ground plane n.x + d = 0 as nx,ny,nz,d in the capture's units, or a plane.json (default: estimated)",
     )
     body.add_argument(
-        "--nodes", type=int, default=250, help="of the cage, about; fewer are faster, 500 are what animate takes (250)"
+        "--nodes",
+        type=int,
+        default=250,
+        help="approximate number of cage nodes (250); fewer are faster; animate uses 500",
     )
-    body.add_argument("--friction", type=float, default=0.8, help="Coulomb coefficient to begin with (0.8)")
-    body.add_argument("--metres-per-unit", type=float, help="true scale; else the body is 1 m tall")
-    body.add_argument("--muscles", type=named_path, help="JSON with fibres (docs/motions/muscles.md)")
-    body.add_argument("--front", help="x,y,z or an axis: the way it faces and moves, as --front=-x; else it is guessed")
+    body.add_argument("--friction", type=float, default=0.8, help="initial Coulomb friction coefficient (0.8)")
+    body.add_argument(
+        "--metres-per-unit", type=float, help="scale of the capture (default: such that the body is 1 m tall)"
+    )
+    body.add_argument("--muscles", type=named_path, help="JSON file with muscle fibres (docs/motions/muscles.md)")
+    body.add_argument(
+        "--front",
+        help="direction in which the body faces and moves: x,y,z or an axis, as --front=-x (default: estimated)",
+    )
     page = live.add_argument_group("page")
-    page.add_argument("--background", type=named_path, help="capture behind the creature, as background.ply of a run")
-    page.add_argument("--port", type=int, default=0, help="of this machine's own address (any that is free)")
-    page.add_argument("--no-browser", action="store_true", help="only print the address")
+    page.add_argument("--background", type=named_path, help="background capture, for example background.ply of a run")
+    page.add_argument("--port", type=int, default=0, help="port on 127.0.0.1 (default: any free port)")
+    page.add_argument("--no-browser", action="store_true", help="print the address, but do not open the browser")
     live.set_defaults(run=_live)
 
 
-def _live(chosen: argparse.Namespace) -> int:
+def _live(args: argparse.Namespace) -> int:
     from egs_warp.io import read_capture
     from egs_warp.launching import reserve_core
     from egs_warp.web.feed import LiveFeed
     from egs_warp.web.page import page_text
     from egs_warp.web.server import PageServer, check_port
 
-    # What can be told at once, before any long work.
+    # Errors that can be detected before any long work.
     page_text()
-    check_port(chosen.port)
-    start_device(chosen.device)
-    behind = read_capture(chosen.background, device=chosen.device).cloud if chosen.background is not None else None
-    session = _session(chosen)
-    scene = session.creature.placed(behind) if behind is not None else None
-    server = PageServer([], port=chosen.port, feed=LiveFeed(session, scene=scene))
+    check_port(args.port)
+    start_device(args.device)
+    background = read_capture(args.background, device=args.device).cloud if args.background is not None else None
+    session = _session(args)
+    scene = session.creature.placed(background) if background is not None else None
+    server = PageServer([], port=args.port, feed=LiveFeed(session, scene=scene))
     with reserve_core():
-        _serve(session, server, opens=not chosen.no_browser)
+        _serve(session, server, open_browser=not args.no_browser)
     return 0
 
 
-def _serve(session: Session, server: PageServer, *, opens: bool) -> None:
+def _serve(session: Session, server: PageServer, *, open_browser: bool) -> None:
+    """Run the session and its page until Ctrl-C."""
     import webbrowser
 
     session.start()
     print(f"open {server.address}\nend with Ctrl-C", flush=True)
-    if opens:
+    if open_browser:
         webbrowser.open(server.address)
     try:
         server.serve()
@@ -82,7 +92,8 @@ def _serve(session: Session, server: PageServer, *, opens: bool) -> None:
         session.stop()
 
 
-def _session(chosen: argparse.Namespace) -> Session:
+def _session(args: argparse.Namespace) -> Session:
+    """Read the capture, build its creature and return a session that is not started."""
     from egs_warp.commands.scene_input import ground_of, plane_of
     from egs_warp.io import read_capture
     from egs_warp.io.run_folder import check_out
@@ -95,15 +106,15 @@ def _session(chosen: argparse.Namespace) -> Session:
     from egs_warp.web.presplit import presplit_gaussians
     from egs_warp.web.session import Session, SessionOptions
 
-    check_out(chosen.out)
-    check_nodes(chosen.nodes)
-    if chosen.muscles is not None:
-        parse_json(read_text(chosen.muscles), chosen.muscles)
-    options = CreatureOptions(friction=chosen.friction, metres_per_unit=chosen.metres_per_unit)
-    up = parse_up(chosen.up) if chosen.up is not None else None
-    plane = plane_of(chosen.plane) if chosen.plane is not None else None
-    front = parse_direction("front", chosen.front) if chosen.front is not None else None
-    capture = read_capture(chosen.capture, device=chosen.device)
+    check_out(args.out)
+    check_nodes(args.nodes)
+    if args.muscles is not None:
+        parse_json(read_text(args.muscles), args.muscles)
+    options = CreatureOptions(friction=args.friction, metres_per_unit=args.metres_per_unit)
+    up = parse_up(args.up) if args.up is not None else None
+    plane = plane_of(args.plane) if args.plane is not None else None
+    front = parse_direction("front", args.front) if args.front is not None else None
+    capture = read_capture(args.capture, device=args.device)
     if plane is None and up is None:
         up, note = guessed_up(capture)
         print_note(note)
@@ -114,11 +125,11 @@ def _session(chosen: argparse.Namespace) -> Session:
             plane=plane,
             options=replace(
                 options,
-                ground=ground_of(chosen.plane, flat=False),
+                ground=ground_of(args.plane, flat=False),
                 front=front,
-                muscles_file=chosen.muscles,
-                settings=LocomotionSettings(qp_solver=chosen.qp),
-                nodes=chosen.nodes,
+                muscles_file=args.muscles,
+                settings=LocomotionSettings(qp_solver=args.qp),
+                nodes=args.nodes,
             ),
             progress=begins,
         )
@@ -126,5 +137,5 @@ def _session(chosen: argparse.Namespace) -> Session:
         drawn_as = drawn_creature(creature, presplit_gaussians(creature))
     if front is None:
         print_note(creature.front.told(creature.frame))
-    made = SessionOptions(source=Path(chosen.capture).name, takes=chosen.out, muscles_file=chosen.muscles)
-    return Session(creature, drawn_as, made)
+    session_options = SessionOptions(source=Path(args.capture).name, takes=args.out, muscles_file=args.muscles)
+    return Session(creature, drawn_as, session_options)

@@ -1,4 +1,4 @@
-"""``egs-warp muscles``: the fibres of a body, drawn."""
+"""``egs-warp muscles``: draw the muscle fibres of a body."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ EXAMPLES = ("pawn.ply --plot muscles.png",)
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
-    muscles = commands.add_parser("muscles", help="draw the muscles of a capture's body, automatic ones or your own")
+    muscles = commands.add_parser("muscles", help="draw the muscles of a body, automatic ones or your own")
     muscles.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
     muscles.add_argument(
-        "--plot", required=True, type=named_path, help="picture (.png, .jpg, ...) with the body from three sides"
+        "--plot", required=True, type=named_path, help="image (.png, .jpg, ...) that shows the body from three sides"
     )
     muscles.add_argument(
         "--muscles",
         type=named_path,
-        help="JSON with fibres (docs/motions/muscles.md); else they are made automatically",
+        help="JSON file with muscle fibres (docs/motions/muscles.md; default: placed automatically)",
     )
-    muscles.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
+    muscles.add_argument("--up", help="axis that points up: x, y, z, -x, -y or -z, as --up=-y (default: estimated)")
     muscles.add_argument(
-        "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units, or a plane.json; else it is found"
+        "--plane",
+        help="ground plane n.x + d = 0 as nx,ny,nz,d in the capture's units, or a plane.json (default: estimated)",
     )
     muscles.set_defaults(run=_muscles)
 
 
-def _muscles(chosen: argparse.Namespace) -> int:
+def _muscles(args: argparse.Namespace) -> int:
     from egs_warp.commands.scene_input import plane_of
     from egs_warp.fem.body import make_body
     from egs_warp.geometry.body_frame import GROUND
@@ -39,10 +40,10 @@ def _muscles(chosen: argparse.Namespace) -> int:
     from egs_warp.pipelines.progress import info_bar
 
     start_device("cpu")
-    check_picture_name(chosen.plot)
-    up = parse_up(chosen.up) if chosen.up else None
-    plane = plane_of(chosen.plane) if chosen.plane else None
-    capture = read_capture(chosen.capture)
+    check_picture_name(args.plot)
+    up = parse_up(args.up) if args.up else None
+    plane = plane_of(args.plane) if args.plane else None
+    capture = read_capture(args.capture)
     for note in capture.notes:
         print_note(note)
     if plane is None and up is None:
@@ -53,7 +54,7 @@ def _muscles(chosen: argparse.Namespace) -> int:
         standing = place_cage(capture.cloud, up=up, plane=plane)
         begins("muscles")
         body = make_body(standing.cage.mesh, GROUND)
-        muscles = body_muscles(body, chosen.muscles, standing.frame)
-    plot_muscles(body.mesh, muscles, chosen.plot, up=GROUND.normal)
-    print(f"{muscles.fibre_count} fibres, {muscles.segment_count} segments; wrote {chosen.plot}")
+        muscles = body_muscles(body, args.muscles, standing.frame)
+    plot_muscles(body.mesh, muscles, args.plot, up=GROUND.normal)
+    print(f"{muscles.fibre_count} fibres, {muscles.segment_count} segments; wrote {args.plot}")
     return 0

@@ -1,4 +1,4 @@
-"""What the user says about the object on the command line: masks, a box, a point or clicks."""
+"""Parse the object selection of the command line: masks, a box, a point, a pixel or clicks."""
 
 from __future__ import annotations
 
@@ -22,15 +22,17 @@ from egs_warp.segmentation.propagated_masks import masks_of_clicks, salient_mask
 from egs_warp.segmentation.votes import MaskedView
 
 MAX_MASK_SIDE = 800
-"""Pixels: larger masks are read at half, a third, ... of their size."""
+"""Pixels, maximum side of a mask; larger masks are reduced to a half, a third, ... of their size."""
 _HELP = (
-    "give a mask.png, a folder of masks, x,y,z on it, a box x0,y0,z0,x1,y1,z1, a pixel u,v with --view, or clicks "
-    "+u,v@photo on it and -u,v@photo beside it"
+    "give a mask.png, a folder of masks, a point x,y,z, a box x0,y0,z0,x1,y1,z1, a pixel u,v with --view, or clicks "
+    "+u,v@photo on the object and -u,v@photo next to it"
 )
-_MOST_DIGITS = 10
-"""Of the number of a camera."""
+_MAX_DIGITS = 10
+"""Maximum length of a camera number."""
 _SALIENT = "salient"
+"""Value that selects the salient object of each photo."""
 _CLICK = re.compile(r"([+-]?)([0-9.]+),([0-9.]+)@(.+)", re.DOTALL)
+"""A click: sign, u, v and photo."""
 
 
 def read_object(
@@ -42,69 +44,80 @@ def read_object(
     flag: str = "--object",
     mask_model: Path | None = None,
 ) -> ObjectSpec:
-    """What ``--object TEXT`` means, given once or several times, or that of another ``flag``: a mask's file, a folder
-    of masks, a point, a box, or a pixel of the view ``view``; clicks, which alone will do; or ``salient``.
+    """Parse the values of ``--object``.
 
-    With ``mask_model``, a network's file, clicks become masks. Masks belong to the camera whose photo has the same
-    name. Raises ``UserError`` with one line for anything else.
+    A value is a mask file, a folder of masks, a point, a box, a pixel, a click or ``salient``. Clicks may be combined
+    with one value of another kind. A mask belongs to the camera whose photo has the same name.
+
+    Args:
+        texts: the values, in the order of the flags.
+        cloud: the capture, in which pixels and clicks are located.
+        posed: cameras of the capture; None if there are none.
+        view: name or number of the camera of a single mask or of a pixel.
+        flag: name of the flag for messages.
+        mask_model: file of a network that turns clicks into masks; None to use the clicks themselves.
+
+    Raises:
+        UserError: for values of another form, and for cameras that are missing or unknown.
     """
-    given = [texts] if isinstance(texts, str) else list(texts)
-    found: list[ObjectSpec] = []
+    values = [texts] if isinstance(texts, str) else list(texts)
+    specs: list[ObjectSpec] = []
     clicks: list[Click] = []
-    for text in given:
+    for text in values:
         if not text.strip():
-            raise UserError(f"{flag}: nothing is given; {_HELP}")
-        click = None if _is_there(text) else _CLICK.fullmatch(text)
+            raise UserError(f"{flag}: the value is empty; {_HELP}")
+        click = None if _path_exists(text) else _CLICK.fullmatch(text)
         if click is not None:
             one = _view_named(posed or (), click[4], text)
             clicks.append(_click(cloud, one, click[2], click[3], text, inside=click[1] != "-"))
-        elif not _is_there(text) and text.count(",") == 1:
+        elif not _path_exists(text) and text.count(",") == 1:
             clicks.append(_pixel(text, cloud, posed, view, flag))
-        elif text == _SALIENT and not _is_there(text):
-            found.append(_salient(cloud, posed, flag))
+        elif text == _SALIENT and not _path_exists(text):
+            specs.append(_salient(cloud, posed, flag))
         else:
-            found.append(_parse_location(text, posed, view, flag))
-    if len(found) > 1:
-        raise UserError(
-            f"{flag}: {len(found)} places, {given[0]} and others; give one, and clicks +u,v@photo beside it"
-        )
+            specs.append(_parse_location(text, posed, view, flag))
+    if len(specs) > 1:
+        raise UserError(f"{flag}: {len(specs)} objects, {values[0]} and others; give one, and clicks +u,v@photo")
     if mask_model is not None:
-        if found or not clicks:
-            raise UserError(f"--mask-model {mask_model}: it makes masks from clicks; give {flag} +u,v@photo alone")
+        if specs or not clicks:
+            raise UserError(
+                f"--mask-model {mask_model}: it needs clicks and no other object; give only {flag} +u,v@photo"
+            )
         model = OnnxClickModel.read(mask_model)
         masks = masks_of_clicks(cloud, clicks, [one.camera for one in posed or ()], model)
         return ObjectSpec(masks=tuple(masks), clicks=tuple(clicks))
-    return replace(found[0], clicks=tuple(clicks)) if found else ObjectSpec.of_clicks(clicks)
+    return replace(specs[0], clicks=tuple(clicks)) if specs else ObjectSpec.of_clicks(clicks)
 
 
-def _is_there(text: str) -> bool:
+def _path_exists(text: str) -> bool:
+    """Return True if ``text`` is the path of an existing file or folder."""
     try:
         return Path(text).exists()
-    # A name that is too long.
+    # The name is too long for a path.
     except OSError:
         return False
 
 
 def _salient(cloud: GaussianCloud, posed: Sequence[PosedImage] | None, flag: str) -> ObjectSpec:
-    """Masks of what stands out of the photos' pictures."""
+    """Return masks of the salient object in each photo."""
     if not posed:
-        raise UserError(f"{flag} {_SALIENT}: needs pictures to look at; give --cameras, or a point x,y,z")
+        raise UserError(f"{flag} {_SALIENT}: needs cameras; give --cameras, or a point x,y,z")
     masks = salient_masks(cloud, [one.camera for one in posed], SalientModel.installed())
     return ObjectSpec(masks=tuple(masks))
 
 
 def _parse_location(text: str, posed: Sequence[PosedImage] | None, view: str | None, flag: str) -> ObjectSpec:
-    """Masks, a point or a box."""
-    if _is_there(text):
+    """Parse a mask path, a point or a box."""
+    if _path_exists(text):
         return ObjectSpec(masks=tuple(_read_masks(Path(text), posed, view)))
     try:
         numbers = np.array([float(part) for part in text.split(",")])
     except ValueError:
-        raise UserError(f"{flag} {text}: no such file, nor numbers; {_HELP}") from None
+        raise UserError(f"{flag} {text}: no such file, and not numbers; {_HELP}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
         raise UserError(f"{flag} {text}: {len(numbers)} numbers; {_HELP}")
     if np.abs(numbers).max() > FURTHEST:
-        raise UserError(f"{flag} {text}: further than {FURTHEST:g} units from the origin, where nothing lies; {_HELP}")
+        raise UserError(f"{flag} {text}: further than {FURTHEST:g} units from the origin; {_HELP}")
     if len(numbers) == 3:
         return ObjectSpec(point=numbers)
     low, high = np.minimum(numbers[:3], numbers[3:]), np.maximum(numbers[:3], numbers[3:])
@@ -114,12 +127,12 @@ def _parse_location(text: str, posed: Sequence[PosedImage] | None, view: str | N
 
 
 def _pixel(text: str, cloud: GaussianCloud, posed: Sequence[PosedImage] | None, view: str | None, flag: str) -> Click:
-    """A click on the object in the view ``view``."""
+    """Parse a pixel ``u,v`` as a click on the object in ``view``."""
     u, _, v = text.lstrip("+").partition(",")
     try:
         finite = np.isfinite([float(u), float(v)]).all()
     except ValueError:
-        raise UserError(f"{flag} {text}: no such file, nor numbers; {_HELP}") from None
+        raise UserError(f"{flag} {text}: no such file, and not numbers; {_HELP}") from None
     if not finite:
         raise UserError(f"{flag} {text}: not two numbers; {_HELP}")
     if not posed:
@@ -128,91 +141,93 @@ def _pixel(text: str, cloud: GaussianCloud, posed: Sequence[PosedImage] | None, 
 
 
 def _click(cloud: GaussianCloud, one: PosedImage, u: str, v: str, text: str, *, inside: bool) -> Click:
+    """Locate a click on the capture; ``inside`` is True for a click on the object."""
     camera = one.camera
     try:
         x, y = float(u), float(v)
     except ValueError:
-        raise UserError(f"--object {text}: {u},{v} is no pixel; {_HELP}") from None
+        raise UserError(f"--object {text}: {u},{v} is not a pixel; {_HELP}") from None
     if one.lens is not None:
         x, y = Undistortion.of(camera, one.lens).pixel(x, y)
     if not (0.0 <= x < camera.width and 0.0 <= y < camera.height):
-        raise UserError(f"--object {text}: outside of the view's {camera.width} x {camera.height} pixels")
-    found = click_at(cloud, camera, x, y, inside=inside)
-    if found is None:
-        raise UserError(f"--object {text}: the capture shows nothing there; click on what is meant")
-    return found
+        raise UserError(f"--object {text}: outside of the {camera.width} x {camera.height} pixels of the view")
+    click = click_at(cloud, camera, x, y, inside=inside)
+    if click is None:
+        raise UserError(f"--object {text}: no Gaussian is visible at this pixel; click on the object")
+    return click
 
 
 def _view_named(posed: Sequence[PosedImage], view: str | None, what: str) -> PosedImage:
+    """Return the camera with the name or number ``view``; ``what`` is the value of ``--object``, for messages."""
     if not posed:
         raise UserError(f"--object {what}: a pixel needs cameras; give --cameras, or a point x,y,z")
     if view is None:
         if len(posed) == 1:
             return posed[0]
-        raise UserError(f"--object {what}: {len(posed)} cameras; say which with --view NAME or NUMBER")
-    # Digits of other scripts, and thousands of them, are no number of a camera.
-    if view.isdecimal() and len(view) < _MOST_DIGITS and int(view) < len(posed):
+        raise UserError(f"--object {what}: {len(posed)} cameras; choose one by --view NAME or NUMBER")
+    # isdecimal excludes superscript digits, and the limit numbers of thousands of digits; int() rejects both.
+    if view.isdecimal() and len(view) < _MAX_DIGITS and int(view) < len(posed):
         return posed[int(view)]
     for one in posed:
         if view in (one.name, Path(one.name).name, Path(one.name).stem):
             return one
     names = ", ".join(Path(one.name).name for one in posed[:3])
-    asked = f"--object {what}" if what.endswith(f"@{view}") else f"--view {view}"
-    raise UserError(f"{asked}: no such camera; there are {len(posed)}: {names}, ...")
+    flag = f"--object {what}" if what.endswith(f"@{view}") else f"--view {view}"
+    raise UserError(f"{flag}: no such camera; the {len(posed)} cameras are {names}, ...")
 
 
 def _read_masks(path: Path, posed: Sequence[PosedImage] | None, view: str | None) -> list[MaskedView]:
+    """Read a mask file or a folder of masks, undistorted and reduced to at most ``MAX_MASK_SIDE`` pixels."""
     files = sorted(path.glob("*.png")) if path.is_dir() else [path]
     if not files:
         raise UserError(f"--object {path}: no .png in this folder; {_HELP}")
     if not posed:
-        raise UserError(
-            f"--object {path}: a mask needs the camera that it was drawn in; give --cameras, or a point or box"
-        )
+        raise UserError(f"--object {path}: a mask needs its camera; give --cameras, or a point or box")
     masks = []
     for file in files:
         one = _camera_of(file, posed, view if len(files) == 1 else None)
         camera = one.camera
         size = mask_size(file)
-        # Before it is decoded: a small file may hold a very large picture.
+        # Checked before decoding: a small file can contain a very large image.
         if size != (camera.width, camera.height):
             raise UserError(
                 f"{file}: the mask is {size[0]} x {size[1]} pixels, the photo {one.name} "
-                f"{camera.width} x {camera.height}; make it at the photo's size"
+                f"{camera.width} x {camera.height}; give a mask of the photo's size"
             )
         mask = read_mask(file)
         if one.lens is not None:
-            # Drawn on the photo as the lens bent it.
+            # The mask was drawn on the distorted photo.
             mask = Undistortion.of(camera, one.lens).mask(mask)
         small = downscale(camera, MAX_MASK_SIDE)
         factor = camera.width // small.width
-        # The middle pixel of each block; a mask's edge is not known better than that.
+        # Take the middle pixel of each block; the edges of masks are no more accurate than that.
         mask = mask[factor // 2 :: factor, factor // 2 :: factor][: small.height, : small.width]
         masks.append(MaskedView(small, mask, str(file)))
     return masks
 
 
 def _camera_of(file: Path, posed: Sequence[PosedImage], view: str | None) -> PosedImage:
+    """Return the camera of a mask file: ``view``, else the one whose photo has a matching name, else the only one."""
     if view is not None:
         return _view_named(posed, view, str(file))
     stems = [(Path(one.name).stem, one) for one in posed]
     for stem, one in stems:
         if stem == file.stem:
             return one
-    # Segmenters add to the photo's name: IMG_01_mask.png, IMG_01.jpg.png.
+    # Segmentation tools append to the photo's name: IMG_01_mask.png, IMG_01.jpg.png.
     longer = [(stem, one) for stem, one in stems if stem and file.stem.startswith(stem)]
     if longer:
         return max(longer, key=lambda entry: len(entry[0]))[1]
     if len(posed) == 1:
         return posed[0]
     raise UserError(
-        f"{file}: no camera's photo is called {file.stem} (there are {stems[0][0]}, {stems[-1][0]}, ...); "
-        "rename the mask, or say which with --view"
+        f"{file}: no photo has the name {file.stem} (photos are {stems[0][0]}, {stems[-1][0]}, ...); "
+        "rename the mask, or choose its camera by --view"
     )
 
 
 def mask_size(path: Path) -> tuple[int, int]:
-    """Width and height of a mask's file, not decoded. Raises ``UserError`` for what is no picture."""
+    """Return (width, height) of a mask file without decoding it. Raises ``UserError`` if it is not an image."""
     size = picture_size(read_bytes(path), f"{path}: it")
     if size is None:
         raise UserError(f"{path}: not a readable picture; give a mask as PNG")
@@ -221,9 +236,9 @@ def mask_size(path: Path) -> tuple[int, int]:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """(H, W) bool of a mask's file: its alpha where it has one, else the brighter half of its values.
+    """Read a mask file as (H, W) bool: its alpha channel if it has one, else the values above half of the maximum.
 
-    Raises ``UserError`` for what is no picture.
+    Raises ``UserError`` if it is not an image.
     """
     from PIL import Image
 
@@ -232,7 +247,7 @@ def read_mask(path: Path) -> np.ndarray:
         with Image.open(path) as opened:
             picture = opened if opened.mode in ("P", "1", "L", "I", "I;16", "F") else opened.convert("RGBA")
             values = np.array(picture)
-    # The decoder is handed a stranger's bytes, and its errors share no base class.
+    # The decoder reads untrusted bytes, and its errors share no base class.
     except Exception as error:
         raise UserError(f"{path}: not a readable picture; give a mask as PNG") from error
     if values.ndim == 3:

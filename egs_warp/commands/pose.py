@@ -1,4 +1,4 @@
-"""``egs-warp pose``: camera poses of photos or of a video."""
+"""``egs-warp pose``: estimate the camera poses of photos or of a video."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from egs_warp.commands.flags import Commands, named_path, seed
 from egs_warp.commands.scene_flags import add_overwrite_flag
 from egs_warp.errors import UserError
 
-_NAMED = 5
-"""Photos without a pose that are named; the rest is counted."""
+_MAX_NAMES = 5
+"""Maximum number of photos without a pose that are listed by name; the others are counted."""
 
 
 EXAMPLES = (
@@ -22,52 +22,57 @@ EXAMPLES = (
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
-    pose = commands.add_parser("pose", help="find where photos were taken from")
+    pose = commands.add_parser("pose", help="estimate the camera poses of photos")
     pose.add_argument("photos", help="folder of photos, or a video")
     pose.add_argument(
-        "--out", required=True, type=named_path, help="new folder for images and sparse/0, which train reads"
+        "--out", required=True, type=named_path, help="new folder for images and sparse/0, the input of train"
     )
     add_overwrite_flag(pose, "--out")
-    pose.add_argument("--frames", type=int, default=150, help="of a video, the sharpest evenly in time (150)")
-    pose.add_argument("--max-side", type=int, default=1600, help="pixels at which features are found (1600)")
-    pose.add_argument("--seed", type=seed, default=0, help="of the reconstruction (0)")
+    pose.add_argument(
+        "--frames", type=int, default=150, help="number of frames taken from a video, sharp and evenly spaced (150)"
+    )
+    pose.add_argument(
+        "--max-side", type=int, default=1600, help="longer side in pixels at which features are detected (1600)"
+    )
+    pose.add_argument("--seed", type=seed, default=0, help="seed of the reconstruction (0)")
     pose.set_defaults(run=_pose)
 
 
-def _pose(chosen: argparse.Namespace) -> int:
+def _pose(args: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import check_run_folder
     from egs_warp.pipelines.pose_photos import pose_photos
 
-    for flag, value, least in (("--frames", chosen.frames, 3), ("--max-side", chosen.max_side, 64)):
-        if value < least:
-            raise UserError(f"{flag} {value}: give a whole number of at least {least}")
-    check_run_folder(chosen.out, overwrite=chosen.overwrite)
-    shown = _Progress()
+    for flag, value, minimum in (("--frames", args.frames, 3), ("--max-side", args.max_side, 64)):
+        if value < minimum:
+            raise UserError(f"{flag} {value}: give a whole number of at least {minimum}")
+    check_run_folder(args.out, overwrite=args.overwrite)
+    progress = _Progress()
     result = pose_photos(
-        chosen.photos,
-        chosen.out,
-        frames=chosen.frames,
-        max_side=chosen.max_side,
-        seed=chosen.seed,
-        overwrite=chosen.overwrite,
-        stage=shown.say,
-        progress=shown.step,
+        args.photos,
+        args.out,
+        frames=args.frames,
+        max_side=args.max_side,
+        seed=args.seed,
+        overwrite=args.overwrite,
+        stage=progress.say,
+        progress=progress.step,
     )
-    shown.end()
+    progress.end()
     print(
-        f"posed {result.registered} of {result.photos} photos ({100 * result.registered / result.photos:.0f} %),"
+        f"estimated the poses of {result.registered} of {result.photos} photos"
+        f" ({100 * result.registered / result.photos:.0f} %),"
         f" {result.points} points, reprojection error {result.error:.2f} pixels"
     )
     if result.without_pose:
-        names = ", ".join(result.without_pose[:_NAMED])
-        more = len(result.without_pose) - _NAMED
+        names = ", ".join(result.without_pose[:_MAX_NAMES])
+        more = len(result.without_pose) - _MAX_NAMES
         print(f"without a pose: {names}{f' and {more} more' if more > 0 else ''}")
-    print(f"wrote {chosen.out}; next: egs-warp train {chosen.out} --out capture.ply")
+    print(f"wrote {args.out}; next step: egs-warp train {args.out} --out capture.ply")
     return 0
 
 
 class _Progress:
-    """One line on stderr that is rewritten on a terminal, a line every fifth of a stage elsewhere."""
+    """Progress on stderr: one updated line on a terminal, otherwise a line for every fifth of a stage."""
 
     def __init__(self) -> None:
         self._terminal = sys.stderr.isatty()
@@ -76,25 +81,25 @@ class _Progress:
         self._began = time.perf_counter()
 
     def say(self, stage: str) -> None:
-        """A new stage."""
+        """Report the start of ``stage``."""
         self.end()
         self._fifth = -1
         print(f"egs-warp: {stage}", file=sys.stderr)
 
-    def step(self, stage: str, done: int, of: int) -> None:
-        """How far the stage is."""
-        fifth = 5 * done // max(of, 1)
+    def step(self, stage: str, done: int, total: int) -> None:
+        """Report that ``done`` of ``total`` items of ``stage`` are done."""
+        fifth = 5 * done // max(total, 1)
         if not self._terminal and fifth == self._fifth:
             return
         self._fifth = fifth
         seconds = round(time.perf_counter() - self._began)
-        text = f"egs-warp: {stage} {done}/{of}, {seconds // 60}:{seconds % 60:02d}"
+        text = f"egs-warp: {stage} {done}/{total}, {seconds // 60}:{seconds % 60:02d}"
         end = "" if self._terminal else "\n"
         print(f"\r{text}\x1b[K" if self._terminal else text, end=end, file=sys.stderr, flush=True)
         self._open = self._terminal
 
     def end(self) -> None:
-        """Leave the line that is rewritten."""
+        """End the updated line."""
         if self._open:
             print(file=sys.stderr)
             self._open = False

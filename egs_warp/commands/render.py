@@ -1,4 +1,4 @@
-"""``egs-warp render``: the film of a finished run again, from anywhere."""
+"""``egs-warp render``: film a finished run again with another camera."""
 
 from __future__ import annotations
 
@@ -18,39 +18,37 @@ EXAMPLES = (
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
-    render = commands.add_parser("render", help="film a finished run again: any camera, any size, depth, alpha")
+    render = commands.add_parser("render", help="film a finished run again: any camera and size, depth, alpha")
     render.add_argument("folder", metavar="run", type=named_path, help="folder that animate wrote")
     render.add_argument(
         "--out",
         required=True,
         type=named_path,
-        help=".mp4, .mov (ProRes 4444), .webm (VP9), or a folder of PNGs; all but .mp4 can be transparent",
+        help="output: .mp4, .mov (ProRes 4444), .webm (VP9), or a folder of PNGs; all but .mp4 can be transparent",
     )
     camera = render.add_argument_group("camera")
-    add_camera_flags(camera, size="as the film's")
+    add_camera_flags(camera, size="as in the run's video")
     camera.add_argument(
-        "--turntable", type=int, metavar="FRAME", help="hold this frame (60 Hz, -1 is the last) and go around it once"
+        "--turntable", type=int, metavar="FRAME", help="freeze this frame (60 Hz, -1 is the last) and orbit it once"
     )
     camera.add_argument(
         "--show",
         choices=("colour", "depth", "alpha"),
         default="colour",
-        help="colour (default); depth, near is white, as PNG 16 bits of millimetres; alpha",
+        help="colour (default); depth, near is white, in PNGs as 16-bit millimetres; or alpha",
     )
-    render.add_argument("--no-shadow", action="store_true", help="no shadow on the ground under the object")
+    render.add_argument("--no-shadow", action="store_true", help="draw no shadow under the object")
     render.set_defaults(run=_render)
 
 
-def _render(chosen: argparse.Namespace) -> int:
+def _render(args: argparse.Namespace) -> int:
     from egs_warp.launching import use_device
     from egs_warp.pipelines.finished_run import FinishedRun
     from egs_warp.pipelines.render_run import Show, render_run
 
-    shot, background = shot_of(chosen)
+    shot, background = shot_of(args)
     use_device("cpu")
-    run = FinishedRun.read(chosen.folder, background=Path(background) if background is not None else None)
-    count = render_run(
-        run, chosen.out, shot, show=Show(chosen.show), hold=chosen.turntable, shadow=not chosen.no_shadow
-    )
-    print(f"wrote {chosen.out} ({count} frames)")
+    run = FinishedRun.read(args.folder, background=Path(background) if background is not None else None)
+    count = render_run(run, args.out, shot, show=Show(args.show), hold=args.turntable, shadow=not args.no_shadow)
+    print(f"wrote {args.out} ({count} frames)")
     return 0

@@ -1,4 +1,4 @@
-"""``egs-warp samples``: a small built-in capture and scene to try the commands on."""
+"""``egs-warp samples``: write a small built-in capture and scene to try the commands on."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import shlex
 from egs_warp.commands.flags import Commands, named_path
 
 _GAUSSIANS = 6000
-"""Of the object alone: a jump of it takes about half as long as that of the whole pawn."""
+"""Number of Gaussians of the object alone; its jump takes about half as long as that of the full pawn."""
 
 
 EXAMPLES = ("out/samples",)
@@ -17,25 +17,25 @@ EXAMPLES = ("out/samples",)
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     samples = commands.add_parser("samples", help="write a small built-in capture and scene to try")
-    samples.add_argument("folder", type=named_path, help="folder to write into, made where it is missing")
+    samples.add_argument("folder", type=named_path, help="output folder, created if it is missing")
     samples.set_defaults(run=_samples)
 
 
-def _samples(chosen: argparse.Namespace) -> int:
+def _samples(args: argparse.Namespace) -> int:
     from egs_warp.assets import pawn, scene
     from egs_warp.io import write_ply
     from egs_warp.io.atomic import writable_folder
     from egs_warp.io.run_folder import check_out
     from egs_warp.launching import use_device
 
-    check_out(chosen.folder)
+    check_out(args.folder)
     use_device("cpu")
-    folder = writable_folder(chosen.folder)
+    folder = writable_folder(args.folder)
     capture, whole = folder / "pawn.ply", folder / "pawn_on_its_board.ply"
-    made = scene("pawn")
+    pawn_scene = scene("pawn")
     write_ply(capture, pawn(gaussian_count=_GAUSSIANS).cloud)
-    write_ply(whole, made.whole()[0])
-    print(f"wrote {capture}, an object alone, and {whole}, the object in a scene; z is up; now try")
+    write_ply(whole, pawn_scene.whole()[0])
+    print(f"wrote {capture}, an object alone, and {whole}, the object in a scene; z is up; next steps:")
     for flags in (
         [str(capture), "--up", "z", "--size", "256", "--out", str(folder / "jump")],
         [str(whole), "--up", "z", "--object", "0,0,0.5", "--size", "256", "--out", str(folder / "scene")],

@@ -1,4 +1,4 @@
-"""What the flags of the commands that start from a scene mean."""
+"""Read the scene that the flags describe: capture, cameras, object, plane and up direction."""
 
 from __future__ import annotations
 
@@ -29,36 +29,43 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SceneInput:
-    """What the user has given."""
+    """Scene with the user's selections, in scene units."""
 
     cloud: GaussianCloud
+    """The whole scene."""
     posed: Sequence[PosedImage]
+    """Cameras of ``--cameras`` with their photos; empty without that flag."""
     spec: ObjectSpec | None
+    """Selection of ``--object``; None without that flag."""
     up: np.ndarray | None
+    """(3,) unit vector, from ``--up`` or the capture file; None if unknown."""
     plane: Plane | None
+    """Plane of ``--plane``; None to estimate it."""
     notes: tuple[str, ...]
+    """Notes of the reader for the user."""
 
     @property
     def object(self) -> ObjectSpec:
-        """What was said about it. Raises ``UserError`` if nothing was."""
+        """Selection of the object. Raises ``UserError`` without ``--object``."""
         if self.spec is None:
-            raise UserError("--object: nothing is given; say where the object is")
+            raise UserError("--object: the value is missing; select the object of the scene")
         return self.spec
 
     @property
     def cameras(self) -> list[Camera]:
-        """The capture's own."""
+        """Cameras without their photos."""
         return [one.camera for one in self.posed]
 
     def prepared(self, options: SceneOptions) -> PreparedScene:
-        """Taken apart, fine-tuned against the photos beside the cameras where there are any: ``prepare_scene``, with a
-        bar.
+        """Segment the scene with ``prepare_scene`` and show a progress bar.
+
+        Photos next to the cameras, if any, serve for fine-tuning.
         """
         from egs_warp.pipelines.prepare_scene import prepare_scene
         from egs_warp.pipelines.progress import scene_bar
         from egs_warp.training.photo_colours import photographs_in_colours_of
 
-        with scene_bar(options.stages) as told:
+        with scene_bar(options.stages) as show_progress:
             return prepare_scene(
                 self.cloud,
                 self.object,
@@ -67,36 +74,36 @@ class SceneInput:
                 up=self.up,
                 plane=self.plane,
                 options=options,
-                progress=told,
+                progress=show_progress,
             )
 
 
 def plane_of(text: str) -> Plane:
-    """The first plane of a file, or one of four numbers. Raises ``UserError`` otherwise."""
+    """Return the first plane of a plane.json, or the plane ``nx,ny,nz,d``. Raises ``UserError`` for other texts."""
     if text.endswith(".json") or Path(text).is_file():
         return read_planes(text)[0].plane
     return parse_plane(text)
 
 
 def ground_of(text: str | None, *, flat: bool) -> HeightField | None:
-    """The ground that is not flat of the first plane of a file, if it tells of one and ``flat`` does not forbid it."""
+    """Return the uneven ground of the first plane of a plane.json; None if it has none or ``flat`` is True."""
     if flat or text is None or not (text.endswith(".json") or Path(text).is_file()):
         return None
     return read_planes(text)[0].ground
 
 
-def read_scene(chosen: argparse.Namespace) -> SceneInput:
-    """Read what the flags name. Raises ``UserError`` with one line for whatever is wrong."""
-    start_device(chosen.device)
-    up = parse_up(chosen.up) if chosen.up is not None else None
-    plane = plane_of(chosen.plane) if chosen.plane is not None else None
-    capture = read_capture(chosen.capture, device=chosen.device)
-    posed = read_cameras(chosen.cameras) if chosen.cameras else []
+def read_scene(args: argparse.Namespace) -> SceneInput:
+    """Select the device and read the files that the flags name. Raises ``UserError`` for invalid flags and files."""
+    start_device(args.device)
+    up = parse_up(args.up) if args.up is not None else None
+    plane = plane_of(args.plane) if args.plane is not None else None
+    capture = read_capture(args.capture, device=args.device)
+    posed = read_cameras(args.cameras) if args.cameras else []
     spec = None
-    if chosen.object is None and chosen.mask_model is not None:
-        raise UserError("--mask-model: it makes masks from clicks; give --object +u,v@photo")
-    if chosen.object is not None:
-        spec = read_object(chosen.object, capture.cloud, posed, view=chosen.view, mask_model=chosen.mask_model)
+    if args.object is None and args.mask_model is not None:
+        raise UserError("--mask-model: it needs clicks; give --object +u,v@photo")
+    if args.object is not None:
+        spec = read_object(args.object, capture.cloud, posed, view=args.view, mask_model=args.mask_model)
     if up is None and capture.up is not None:
         up = np.asarray(capture.up, dtype=float)
     return SceneInput(capture.cloud, posed, spec, up, plane, capture.notes)

@@ -1,4 +1,4 @@
-"""The planes of a scene, as the command asks for them: under the object, in a mask, and the other wide ones."""
+"""Find the planes of a scene for ``egs-warp plane``: under the object or in a mask, then other wide planes."""
 
 from __future__ import annotations
 
@@ -28,39 +28,48 @@ from egs_warp.segmentation.seen_surface import SeenSurface
 
 @dataclass(frozen=True)
 class ScenePlanes:
-    """What was found; scene units."""
+    """Planes of a scene, in scene units."""
 
     known: list[PlaneRecord]
-    """The one that was asked for, then others."""
+    """The requested plane, then the others."""
     centre: np.ndarray
-    """(3,) of the object, or of what the masks show."""
+    """(3,) centre of the object, or of the masked ground."""
     size: float
+    """Size of the object, or of the masked ground."""
     notes: tuple[str, ...]
+    """Notes for the user."""
 
     @property
     def planes(self) -> list[Plane]:
-        """The planes alone."""
+        """Planes without their records."""
         return [one.plane for one in self.known]
 
     def write(self, path: Path) -> None:
-        """``plane.json``."""
+        """Write the planes as ``plane.json``."""
         write_planes(path, self.known)
 
 
-def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | None, count: int) -> ScenePlanes:
-    """The plane under the object of ``given``, or in ``plane_mask``; and up to ``count`` - 1 other wide level ones.
+def planes_of_scene(scene: SceneInput, *, plane_mask: str | None, view: str | None, count: int) -> ScenePlanes:
+    """Find the requested plane and up to ``count`` - 1 other wide planes parallel to it.
 
-    Raises ``UserError`` where there is none in sight.
+    Args:
+        scene: the scene; without ``plane_mask`` it has an object.
+        plane_mask: mask file or folder of masks to which the plane is fitted; None for the plane under the object.
+        view: name or number of the camera of a single mask.
+        count: maximum number of planes, at least 1.
+
+    Raises:
+        UserError: if no plane is visible, or ``plane_mask`` is not a mask.
     """
     if plane_mask is None:
-        assert given.spec is not None
-        located = locate_plane(given.cloud, given.spec, cameras=given.cameras, up=given.up, plane=given.plane)
+        assert scene.spec is not None
+        located = locate_plane(scene.cloud, scene.spec, cameras=scene.cameras, up=scene.up, plane=scene.plane)
         first, centre, size, notes = located.known(), located.centre, located.size, located.notes
     else:
-        masks = read_object(plane_mask, given.cloud, given.posed, view=view, flag="--plane-mask").masks
+        masks = read_object(plane_mask, scene.cloud, scene.posed, view=view, flag="--plane-mask").masks
         if not masks:
             raise UserError(f"--plane-mask {plane_mask}: give a mask.png or a folder of masks")
-        seen = [SeenSurface.of(given.cloud, mask.camera) for mask in masks]
+        seen = [SeenSurface.of(scene.cloud, mask.camera) for mask in masks]
         fit = fit_plane([PlaneView(one.camera, one.depth, mask.mask) for one, mask in zip(seen, masks, strict=True)])
         views = [
             PlaneView(one.camera, one.depth_over(fit.plane), mask.mask) for one, mask in zip(seen, masks, strict=True)
@@ -68,23 +77,23 @@ def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | No
         fit = fit_plane(views)
         points = np.concatenate(
             [
-                one.camera.centre + one.depth[held][:, None] * camera_rays(one.camera)[held]
+                one.camera.centre + one.depth[valid][:, None] * camera_rays(one.camera)[valid]
                 for one in views
-                for held in [one.mask & (one.depth > 0.0)]
+                for valid in [one.mask & (one.depth > 0.0)]
             ]
         )
         first, centre = known_of_fit(fit), np.median(points, axis=0)
         size = 2.0 * float(np.median(np.linalg.norm(points - centre, axis=1)))
         notes = ()
-    others = further_planes(given.cloud, first.plane, size, count - 1) if count > 1 else []
+    others = further_planes(scene.cloud, first.plane, size, count - 1) if count > 1 else []
     known = [first, *(PlaneRecord(one.plane, support=one.support) for one in others)]
     if len(known) < count:
-        notes = (*notes, f"{len(known)} of {count} planes found")
+        notes = (*notes, f"found {len(known)} of {count} planes")
     return ScenePlanes(known, centre, size, notes)
 
 
 def write_ring(run: RunFolder, cloud: GaussianCloud, plane: Plane, centre: np.ndarray, size: float) -> None:
-    """``cameras.json`` and ``images/`` of a ring about the object, for a segmenter to make masks of."""
+    """Write ``cameras.json`` and ``images/`` of a ring of cameras around the object, on which masks can be drawn."""
     cameras = ring_cameras(plane, centre, 0.6 * size, count=12, size=512)
     names = [f"ring{number:02d}.png" for number in range(len(cameras))]
     images = writable_folder(run.folder("images"))

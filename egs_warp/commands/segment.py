@@ -1,4 +1,4 @@
-"""``egs-warp segment``: an object and the rest of a scene, apart."""
+"""``egs-warp segment``: separate an object from the rest of a scene."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EXAMPLES = (
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
-    segment = commands.add_parser("segment", help="take an object out of a scene")
+    segment = commands.add_parser("segment", help="separate an object from the rest of a scene")
     add_scene_flags(segment)
     add_straddling_flag(segment)
     add_flat_flag(segment)
@@ -33,18 +33,19 @@ def add_straddling_flag(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--straddling",
         choices=("finetune", "split", "remove", "none"),
-        help="Gaussians across the plane: finetune them clear of it (default, needs PyTorch), split, remove, none",
+        help="treatment of the object's Gaussians that cross the plane: finetune (default, needs PyTorch), split, "
+        "remove, none",
     )
 
 
-def clearing_of(chosen: argparse.Namespace) -> StraddlingPolicy | None:
-    """What ``--straddling`` asks for; None without it."""
+def clearing_of(args: argparse.Namespace) -> StraddlingPolicy | None:
+    """Return the policy of ``--straddling``; None without that flag."""
     from egs_warp.segmentation.clearance import StraddlingPolicy
 
-    return StraddlingPolicy(chosen.straddling) if chosen.straddling else None
+    return StraddlingPolicy(args.straddling) if args.straddling else None
 
 
-def _segment(chosen: argparse.Namespace) -> int:
+def _segment(args: argparse.Namespace) -> int:
     from egs_warp.commands.scene_input import read_scene
     from egs_warp.errors import UserError
     from egs_warp.io.planes import read_planes
@@ -54,23 +55,23 @@ def _segment(chosen: argparse.Namespace) -> int:
     from egs_warp.pipelines.prepare_scene import SceneOptions
     from egs_warp.pipelines.segmentation_warnings import segmentation_warnings
 
-    if not chosen.object:
-        raise UserError("segment: give --object: a mask, a point, a box or a pixel")
-    check_run_folder(chosen.out, overwrite=chosen.overwrite, writes=_WRITES)
-    given = read_scene(chosen)
-    known = read_planes(chosen.plane) if chosen.plane and Path(chosen.plane).is_file() else []
-    with run_folder(chosen.out, command="segment", overwrite=chosen.overwrite) as run:
-        scene = given.prepared(SceneOptions(clearing=clearing_of(chosen), flat=chosen.flat, inpaint=False))
-        for note in (*given.notes, *scene.notes):
+    if not args.object:
+        raise UserError("segment: give --object: a mask, a point, a box, a pixel or clicks")
+    check_run_folder(args.out, overwrite=args.overwrite, writes=_WRITES)
+    scene_input = read_scene(args)
+    known = read_planes(args.plane) if args.plane and Path(args.plane).is_file() else []
+    with run_folder(args.out, command="segment", overwrite=args.overwrite) as run:
+        scene = scene_input.prepared(SceneOptions(clearing=clearing_of(args), flat=args.flat, inpaint=False))
+        for note in (*scene_input.notes, *scene.notes):
             print_note(note)
         scene.write(run, known)
-        cameras = picture_cameras(scene.plane, scene.located.centre, scene.located.size, given.cameras)
-        words = segmentation_warnings(given.cloud, scene.located, scene.object, cameras)
-        for line in words:
+        cameras = picture_cameras(scene.plane, scene.located.centre, scene.located.size, scene_input.cameras)
+        warnings = segmentation_warnings(scene_input.cloud, scene.located, scene.object, cameras)
+        for line in warnings:
             print_note(f"the object {line}")
-        picture = segmentation_picture(given.cloud, scene.object, scene.background, cameras, words)
+        picture = segmentation_picture(scene_input.cloud, scene.object, scene.background, cameras, warnings)
         write_png(run.file("segment.png"), picture)
         run.finish()
     print(f"object: {scene.object.count} Gaussians, background: {scene.background.count}")
-    print(f"wrote object.ply, background.ply, plane.json, segment.png into {chosen.out}")
+    print(f"wrote object.ply, background.ply, plane.json, segment.png into {args.out}")
     return 0

@@ -1,4 +1,4 @@
-"""``egs-warp train``: a capture from photos with known camera poses."""
+"""``egs-warp train``: train a capture on photos with known camera poses."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.train_capture import TrainResult
 
 _SHEET_PHOTOS = 6
+"""Maximum number of photos in the comparison sheet."""
 _DEFAULTS = {"cpu": (2000, 20_000, 360), "cuda": (7000, None, 1600)}
-"""Iterations, Gaussians, longer side in pixels: a preview on two cores, a capture on a GPU."""
+"""Iterations, maximum number of Gaussians and longer side in pixels: a preview on two cores, a capture on a GPU."""
 
 
 EXAMPLES = (
@@ -30,69 +31,75 @@ EXAMPLES = (
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
-    train = commands.add_parser("train", help="make a capture from posed photos")
-    train.add_argument("posed", help="COLMAP model, transforms.json or cameras.json, or a folder that holds one")
+    train = commands.add_parser("train", help="train a capture on posed photos")
+    train.add_argument("posed", help="COLMAP model, transforms.json or cameras.json, or a folder that contains one")
     train.add_argument(
         "--out",
         required=True,
         type=named_path,
-        help="capture to write: .ply, .compressed.ply, .spz, .sog, .splat or .glb",
+        help="output file for the capture: .ply, .compressed.ply, .spz, .sog, .splat or .glb",
     )
-    add_overwrite_flag(train, "its place")
+    add_overwrite_flag(train, "--out")
     train.add_argument(
-        "--resume", action="store_true", help="go on with a training that was cut off; give its flags again"
+        "--resume", action="store_true", help="continue an interrupted training; give the same flags again"
     )
     train.add_argument("--iterations", type=int, help="optimiser steps, one photo each (cpu 2000, cuda 7000)")
+    train.add_argument("--gaussians", type=int, help="maximum number of Gaussians (cpu 20000, cuda unlimited)")
     train.add_argument(
-        "--gaussians", type=int, help="at most this many (cpu 20000, cuda as many as the photos gain by)"
+        "--max-side", type=int, help="longer side in pixels to which photos are reduced (cpu 360, cuda 1600)"
     )
-    train.add_argument("--max-side", type=int, help="photos are reduced to this many pixels (cpu 360, cuda 1600)")
-    train.add_argument("--sh-degree", type=int, default=3, help="how colours depend on the view, 0 to 3 (3)")
+    train.add_argument(
+        "--sh-degree", type=int, default=3, help="degree of the spherical harmonics of the colours, 0 to 3 (3)"
+    )
     train.add_argument(
         "--background",
-        help="r,g,b from 0 to 1 or #rrggbb behind the capture (white for photos with alpha, else their border's)",
+        help="background colour r,g,b from 0 to 1 or #rrggbb (default: white for photos with alpha, else the colour of "
+        "their borders)",
     )
-    train.add_argument("--seed", type=seed, default=0, help="of the first cloud and the order of photos (0)")
+    train.add_argument(
+        "--seed", type=seed, default=0, help="seed of the initial Gaussians and of the order of photos (0)"
+    )
     train.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
     train.set_defaults(run=_train)
 
 
-def _train(chosen: argparse.Namespace) -> int:
-    background = parse_colour(chosen.background) if chosen.background is not None else None
-    if background is None and chosen.background is not None:
-        raise UserError(f"--background {chosen.background}: {COLOURS}")
-    for flag, value, least in (
-        ("--iterations", chosen.iterations, 1),
-        ("--gaussians", chosen.gaussians, 100),
-        ("--max-side", chosen.max_side, 16),
+def _train(args: argparse.Namespace) -> int:
+    background = parse_colour(args.background) if args.background is not None else None
+    if background is None and args.background is not None:
+        raise UserError(f"--background {args.background}: {COLOURS}")
+    for flag, value, minimum in (
+        ("--iterations", args.iterations, 1),
+        ("--gaussians", args.gaussians, 100),
+        ("--max-side", args.max_side, 16),
     ):
-        if value is not None and value < least:
-            raise UserError(f"{flag} {value}: give a whole number of at least {least}")
-    if not 0 <= chosen.sh_degree <= 3:
-        raise UserError(f"--sh-degree {chosen.sh_degree}: give 0, 1, 2 or 3")
+        if value is not None and value < minimum:
+            raise UserError(f"{flag} {value}: give a whole number of at least {minimum}")
+    if not 0 <= args.sh_degree <= 3:
+        raise UserError(f"--sh-degree {args.sh_degree}: give 0, 1, 2 or 3")
     from egs_warp.io.named_files import check_named_files, named_files
     from egs_warp.io.writing import writer_of
 
-    write = writer_of(chosen.out)
-    stem = chosen.out.name.split(".")[0]
-    sheet, told = chosen.out.with_name(f"{stem}.sheet.png"), chosen.out.with_name(f"{stem}.report.json")
-    checkpoint = chosen.out.with_name(f"{stem}.training.npz")
-    if chosen.resume and chosen.out.exists() and not checkpoint.exists():
-        print(f"{chosen.out}: this training has finished")
+    write = writer_of(args.out)
+    stem = args.out.name.split(".")[0]
+    sheet, report_path = args.out.with_name(f"{stem}.sheet.png"), args.out.with_name(f"{stem}.report.json")
+    checkpoint = args.out.with_name(f"{stem}.training.npz")
+    if args.resume and args.out.exists() and not checkpoint.exists():
+        print(f"{args.out}: this training has finished")
         return 0
-    if checkpoint.exists() and not (chosen.resume or chosen.overwrite):
+    if checkpoint.exists() and not (args.resume or args.overwrite):
         raise UserError(
-            f"--out {chosen.out}: a training was cut off here; --resume goes on with it, --overwrite begins again"
+            f"--out {args.out}: an interrupted training is here; give --resume to continue it, or --overwrite to start"
+            " again"
         )
-    outputs = (chosen.out, sheet, told)
-    # Of a training that goes on what is there was said to be moved aside, or is its own last work.
-    overwrite = chosen.overwrite or (chosen.resume and checkpoint.exists())
+    outputs = (args.out, sheet, report_path)
+    # With --resume, existing outputs belong to the interrupted training, or the user allowed it to move them.
+    overwrite = args.overwrite or (args.resume and checkpoint.exists())
     check_named_files(*outputs, overwrite=overwrite)
     import warp as wp
 
     from egs_warp.launching import use_device
 
-    use_device(chosen.device)
+    use_device(args.device)
     wp.config.log_level = wp.LOG_ERROR
     try:
         from egs_warp.pipelines.train_capture import train
@@ -102,55 +109,55 @@ def _train(chosen: argparse.Namespace) -> int:
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.train_report import TrainReport
 
-    # Poses that cannot be read must not leave a new folder behind.
-    read_cameras(chosen.posed)
-    iterations, gaussians, side = _DEFAULTS["cuda" if chosen.device.startswith("cuda") else "cpu"]
-    iterations = chosen.iterations or iterations
+    # Read first: unreadable poses must not leave a new folder.
+    read_cameras(args.posed)
+    iterations, gaussians, side = _DEFAULTS["cuda" if args.device.startswith("cuda") else "cpu"]
+    iterations = args.iterations or iterations
     progress = _Progress(iterations)
     began = time.perf_counter()
     with named_files(*outputs, overwrite=overwrite) as files:
         try:
             result = train(
-                chosen.posed,
+                args.posed,
                 iterations=iterations,
-                max_gaussians=chosen.gaussians or gaussians,
-                sh_degree=chosen.sh_degree,
+                max_gaussians=args.gaussians or gaussians,
+                sh_degree=args.sh_degree,
                 background=background,
-                max_side=chosen.max_side or side,
-                seed=chosen.seed,
-                device=chosen.device,
+                max_side=args.max_side or side,
+                seed=args.seed,
+                device=args.device,
                 checkpoint=checkpoint,
-                resume=chosen.resume,
+                resume=args.resume,
                 progress=progress.step,
                 stage=progress.say,
             )
         except BaseException as error:
             if checkpoint.is_file():
-                error.add_note("--resume beside the same flags goes on")
+                error.add_note("continue with --resume and the same flags")
             raise
-        progress.say(f"writing {chosen.out}")
+        progress.say(f"writing {args.out}")
         report = TrainReport.of(
             result,
             seconds=time.perf_counter() - began,
             frames_per_second=progress.frames_per_second,
-            device=chosen.device,
-            seed=chosen.seed,
-            sh_degree=chosen.sh_degree,
+            device=args.device,
+            seed=args.seed,
+            sh_degree=args.sh_degree,
         )
-        compared = _sheet(result)
+        comparison = _sheet(result)
         files.begin()
-        write(chosen.out, result.cloud)
-        report.write(told)
-        write_png(sheet, compared)
-        # What is needed only to go on.
+        write(args.out, result.cloud)
+        report.write(report_path)
+        write_png(sheet, comparison)
+        # Only needed to resume.
         checkpoint.unlink(missing_ok=True)
-    wrote = f"wrote {chosen.out} ({result.cloud.count} Gaussians), {stem}.sheet.png, {stem}.report.json"
+    wrote = f"wrote {args.out} ({result.cloud.count} Gaussians), {stem}.sheet.png, {stem}.report.json"
     print(*report.summary(), wrote, sep="\n")
     return 0
 
 
 class _Progress:
-    """Stage, speed and time left on stderr: one line that is rewritten on a terminal, a line every tenth elsewhere."""
+    """Progress on stderr: one updated line on a terminal, otherwise a line for every tenth of the training."""
 
     def __init__(self, iterations: int) -> None:
         self._iterations = iterations
@@ -159,13 +166,14 @@ class _Progress:
         self._before = 0
         self._shown = 0.0
         self.frames_per_second = 0.0
+        """Training steps per second, without the first."""
 
     def say(self, stage: str) -> None:
-        """A new stage."""
+        """Report the start of ``stage``."""
         print(f"egs-warp: {stage}", file=sys.stderr)
 
     def step(self, step: int, loss: float) -> None:
-        """Called after every step. The first is not timed: kernels may be compiled in it."""
+        """Report step ``step`` and its ``loss``. The first step is not timed, because it may compile kernels."""
         now = time.perf_counter()
         done = step + 1
         if self._first is None:
@@ -187,7 +195,7 @@ class _Progress:
 
 
 def _sheet(result: TrainResult) -> np.ndarray:
-    """(H, W, 3) uint8: photo beside render, of photos held out where there are any."""
+    """Return (H, W, 3) uint8, photos next to renders, of held-out photos if there are any."""
     import numpy as np
 
     from egs_warp.io.video import contact_sheet

@@ -1,4 +1,4 @@
-"""``egs-warp view``: a run in the browser, or as one file that opens in any."""
+"""``egs-warp view``: show a run in the browser, or write it as one HTML file."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ EXAMPLES = (
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
-    view = commands.add_parser("view", help="see a run in the browser, from any side")
+    view = commands.add_parser("view", help="show a run in the browser, from any side")
     view.add_argument(
         "runs", metavar="run", type=named_path, nargs="+", help="folder that animate wrote; two are shown side by side"
     )
-    view.add_argument("--export", type=named_path, help="write one HTML file that opens without a server, and end")
     view.add_argument(
-        "--background", type=named_path, help="capture behind the creature; else background.ply of the run"
+        "--export", type=named_path, help="write one HTML file that needs no server, instead of opening the browser"
     )
-    view.add_argument("--port", type=int, default=0, help="of this machine's own address (any that is free)")
-    view.add_argument("--no-browser", action="store_true", help="only print the address")
+    view.add_argument("--background", type=named_path, help="background capture (default: background.ply of the run)")
+    view.add_argument("--port", type=int, default=0, help="port on 127.0.0.1 (default: any free port)")
+    view.add_argument("--no-browser", action="store_true", help="print the address, but do not open the browser")
     view.set_defaults(run=_view)
 
 
-def _view(chosen: argparse.Namespace) -> int:
+def _view(args: argparse.Namespace) -> int:
     from egs_warp.launching import use_device
     from egs_warp.web.page import export_page
     from egs_warp.web.recording import Recording
 
-    folders: list[Path] = chosen.runs
+    folders: list[Path] = args.runs
     if len(folders) > 2:
-        raise UserError(f"{folders[2]}: at most two runs are shown side by side; leave this one out")
+        raise UserError(f"{folders[2]}: only two runs can be shown side by side; leave this one out")
     use_device("cpu")
-    recordings = [Recording.read(folder, background=chosen.background) for folder in folders]
-    if chosen.export is not None:
-        size = export_page(chosen.export, recordings)
-        print(f"wrote {chosen.export} ({size / 1e6:.1f} MB)")
+    recordings = [Recording.read(folder, background=args.background) for folder in folders]
+    if args.export is not None:
+        size = export_page(args.export, recordings)
+        print(f"wrote {args.export} ({size / 1e6:.1f} MB)")
         return 0
     import webbrowser
 
     from egs_warp.web.server import PageServer
 
-    server = PageServer([recording.bytes for recording in recordings], port=chosen.port)
+    server = PageServer([recording.bytes for recording in recordings], port=args.port)
     print(f"open {server.address}\nend with Ctrl-C", flush=True)
-    if not chosen.no_browser:
+    if not args.no_browser:
         webbrowser.open(server.address)
     server.serve()
     return 0

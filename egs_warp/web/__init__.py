@@ -1,5 +1,5 @@
-"""The page that shows a run in a browser, or a creature that lives, beside the paper: what it is sent, its server.
+"""Browser page that shows a finished run or a live simulation: its data packets and its server. Not part of the paper.
 
-In: a run's folder, or a creature and its solver (``session``). Out: a local address or one HTML file. The
-page's own sources (TypeScript) lie in ``client/``; npm builds them into ``page.html``.
+Input: a run folder, or a creature and its solver (``session``). Output: a page at a local address, or one HTML file.
+The TypeScript sources of the page are in ``client/``; npm builds them into ``page.html``.
 """

@@ -1,4 +1,4 @@
-"""One moment of a live creature as the page is sent it."""
+"""Encode a state of a live creature as a frame of the page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,14 @@ from egs_warp.web.packets import Frame
 
 
 def encode_frame(index: int, state: BodyState, report: StepReport | None, creature: Creature) -> Frame:
-    """What the page is sent of ``state``, to which the step of ``report`` led; curves as those of a recording."""
+    """Build the frame of a state, with the curves ``recording.CURVES`` except the momentum residual.
+
+    Args:
+        index: number of the frame.
+        state: state at the end of the step.
+        report: report of the step; None for the initial state.
+        creature: creature of the state.
+    """
     body, muscles = creature.body, creature.muscles
     height = float(-body.gravity @ body.centre_of_mass(state.positions)) / float(np.linalg.norm(body.gravity))
     if report is None:
@@ -20,8 +27,8 @@ def encode_frame(index: int, state: BodyState, report: StepReport | None, creatu
     contacts = report.contacts
     points = np.einsum("nw,nwi->ni", contacts.weights, state.positions[contacts.nodes])
     forces = np.einsum("na,nai->ni", report.forces, contacts.axes)
-    rubbed = float(np.linalg.norm(report.forces[:, 1:], axis=1).sum())
-    pressed = creature.geometry.friction * float(report.forces[:, 0].sum())
+    tangential_force = float(np.linalg.norm(report.forces[:, 1:], axis=1).sum())
+    friction_limit = creature.geometry.friction * float(report.forces[:, 0].sum())
     return Frame(
         index,
         state.time,
@@ -32,7 +39,7 @@ def encode_frame(index: int, state: BodyState, report: StepReport | None, creatu
             [
                 height / body.height,
                 float(np.linalg.norm(forces.sum(axis=0))) / body.weight,
-                rubbed / max(pressed, 1e-9 * body.weight),
+                tangential_force / max(friction_limit, 1e-9 * body.weight),
                 report.min_gap / body.height,
             ]
         ),

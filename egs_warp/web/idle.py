@@ -1,4 +1,4 @@
-"""Between two motions: a body lies where it fell, or tells how it stands."""
+"""Idle states of a live body: relaxed after a fall, standing still, and its tilt."""
 
 from __future__ import annotations
 
@@ -9,55 +9,59 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.sequence import Stance
 
-_STILL = 2e-3
-"""sqrt(g H): a body whose nodes move no faster, root mean square, and that has nothing to do, is left at rest, without
-steps."""
-_STILL_TIME = 0.3
-"""Seconds for which that holds first."""
+_MAX_STILL_SPEED = 2e-3
+"""sqrt(g H), root mean square speed of the nodes below which an idle body is still; a still body is not simulated."""
+_MIN_STILL_TIME = 0.3
+"""Seconds for which the speed must be below the limit."""
 
 
 class RelaxMuscles:
-    """Relaxes its muscles."""
+    """Motion of a fallen body: all muscles are relaxed."""
 
     @property
-    def resting(self) -> bool:
-        """Always."""
+    def is_at_rest(self) -> bool:
+        """True: a relaxed body has no task to complete."""
         return True
 
     def notes(self) -> list[str]:
-        """None: it has no target."""
+        """Return no notes: the motion has no target."""
         return []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """None."""
+        """Return no objectives."""
         return []
 
 
 class StillnessDetector:
-    """Since when a body has been still."""
+    """Detects how long a body has been still."""
 
     def __init__(self) -> None:
         self._since: float | None = None
 
     def update(self, body: SoftBody, state: BodyState) -> None:
-        """The state after a step."""
+        """Update with the state after a step."""
         speed = np.sqrt(body.node_mass @ (state.velocities**2).sum(axis=1) / body.mass)
-        if speed > _STILL * body.speed_unit:
+        if speed > _MAX_STILL_SPEED * body.speed_unit:
             self._since = None
         elif self._since is None:
             self._since = state.time
 
     def is_still(self, state: BodyState) -> bool:
-        """Whether it has been still long enough, at the time of ``state``, to be left at rest."""
-        return self._since is not None and state.time - self._since >= _STILL_TIME
+        """Return True if, at the time of ``state``, the body has been still for ``_MIN_STILL_TIME``."""
+        return self._since is not None and state.time - self._since >= _MIN_STILL_TIME
 
     def reset(self) -> None:
-        """It begins anew."""
+        """Restart the detection."""
         self._since = None
 
 
 def tilt_degrees(place: Stance, positions: np.ndarray) -> float:
-    """How far nodes at ``positions`` (N, 3) are from upright, as the body stands at ``place``."""
-    turn = place.body.best_fit_rotation(positions) @ place.body.best_fit_rotation(place.standing).T
+    """Return the angle in degrees between the up axis of the body and that of its stance ``place``.
+
+    Args:
+        place: upright stance.
+        positions: (N, 3) m, nodes of the tilted body.
+    """
+    rotation = place.body.best_fit_rotation(positions) @ place.body.best_fit_rotation(place.standing).T
     up = place.ground.axes[2]
-    return float(np.degrees(np.arccos(np.clip(up @ turn @ up, -1.0, 1.0))))
+    return float(np.degrees(np.arccos(np.clip(up @ rotation @ up, -1.0, 1.0))))

@@ -1,4 +1,4 @@
-"""Between the thread of a live session and that of its page: what is asked, and what is to be sent."""
+"""Thread-safe queues between a live session and its page: messages to the session, frames and events to the page."""
 
 from __future__ import annotations
 
@@ -12,97 +12,110 @@ from egs_warp.web.messages import Message, Release
 from egs_warp.web.packets import Frame
 
 News = Frame | dict[str, Any]
+"""A frame, or an event as a JSON object."""
 
-_MOST_WAITING = 240
-"""Frames for a page that is slow to take them; older ones are dropped."""
-_MOST_ASKED = 1000
-"""Messages that wait for a step to end."""
+_MAX_QUEUED_FRAMES = 240
+"""Maximum number of frames and events that are queued for a slow page; the oldest frames are dropped."""
+_MAX_QUEUED_MESSAGES = 1000
+"""Maximum number of messages that are queued during a step; the oldest are dropped."""
 
 
 class Mailbox:
-    """Two boxes and one condition, which is told of whatever is put in."""
+    """Queue of messages and queue of news, with one condition that signals every change."""
 
     def __init__(self) -> None:
         self.watched = False
-        """Whether a page takes what is sent."""
+        """True if a page is subscribed."""
         self.stopping = False
-        """Whether the session is to end."""
-        self._inbox: deque[Message] = deque(maxlen=_MOST_ASKED)
+        """True if the session is to end."""
+        self._inbox: deque[Message] = deque(maxlen=_MAX_QUEUED_MESSAGES)
         self._outbox: deque[News] = deque()
         self._changed = threading.Condition()
         self._wake: Callable[[], object] = lambda: None
-        self._told_state: dict[str, Any] = {}
+        self._last_state: dict[str, Any] = {}
 
-    # For the page.
+    # Called by the page.
 
     def put_request(self, message: Message) -> None:
-        """Leave a message."""
+        """Queue a message for the session."""
         with self._changed:
             self._inbox.append(message)
             self._changed.notify_all()
 
     def subscribe(self, wake: Callable[[], object], first: Callable[[], Frame]) -> None:
-        """``wake`` is called, from the session's thread, when ``waiting`` has something. It begins with ``first``."""
+        """Subscribe a page.
+
+        Args:
+            wake: called from the thread of the session when ``take_news`` has something new.
+            first: returns the first frame to send.
+        """
         with self._changed:
             self.watched, self._wake = True, wake
             self._outbox.clear()
-            self._told_state = {}
+            self._last_state = {}
             self._outbox.append(first())
             self._changed.notify_all()
         wake()
 
     def unsubscribe(self) -> None:
-        """Nobody watches: let go of what is pulled."""
+        """Unsubscribe the page, and release a pull of its user."""
         with self._changed:
             self.watched, self._wake = False, lambda: None
             self._inbox.append(Release())
 
     def take_news(self) -> list[News]:
-        """Frames and news since the last call."""
+        """Return and remove the queued frames and events."""
         with self._changed:
-            taken = list(self._outbox)
+            news = list(self._outbox)
             self._outbox.clear()
-        return taken
+        return news
 
     def stop(self) -> None:
-        """End what waits."""
+        """End the session: wake its thread and make ``wait_for_work`` return False."""
         with self._changed:
             self.stopping = True
             self._changed.notify_all()
 
-    # For the session.
+    # Called by the session.
 
     def take_requests(self) -> list[Message]:
-        """Messages since the last call."""
+        """Return and remove the queued messages."""
         with self._changed:
             messages = list(self._inbox)
             self._inbox.clear()
         return messages
 
-    def wait_for_work(self, held: Callable[[], bool], waited: Callable[[], object]) -> bool:
-        """Wait while the session is ``held`` and has nothing to do or to tell, and call ``waited`` after each time;
-        False at the end."""
+    def wait_for_work(self, is_suspended: Callable[[], bool], on_wake: Callable[[], object]) -> bool:
+        """Block while the session is suspended, has no messages, and has sent its state.
+
+        Args:
+            is_suspended: returns True if the session needs no step.
+            on_wake: called after each wait.
+
+        Returns:
+            False if the session is to end.
+        """
         with self._changed:
-            while not self.stopping and held() and not self._inbox and self._told_state:
+            while not self.stopping and is_suspended() and not self._inbox and self._last_state:
                 self._changed.wait()
-                waited()
+                on_wake()
             return not self.stopping
 
-    def wait_until(self, left: Callable[[], float]) -> None:
-        """Wait while there are seconds ``left``, or until something is asked."""
-        while (seconds := left()) > 0.0 and not self.stopping:
+    def wait_until(self, seconds_left: Callable[[], float]) -> None:
+        """Block while ``seconds_left`` is positive and no message is queued."""
+        while (seconds := seconds_left()) > 0.0 and not self.stopping:
             with self._changed:
                 if self._inbox:
                     return
                 self._changed.wait(seconds)
 
     def send(self, news: News) -> None:
-        """Put it with what waits for the page, if one watches."""
+        """Queue a frame or an event for the page, if one is subscribed."""
         with self._changed:
             if not self.watched:
                 return
             self._outbox.append(news)
-            if len(self._outbox) > _MOST_WAITING:
+            if len(self._outbox) > _MAX_QUEUED_FRAMES:
                 oldest = next((one for one in self._outbox if isinstance(one, Frame)), None)
                 if oldest is not None:
                     self._outbox.remove(oldest)
@@ -110,20 +123,20 @@ class Mailbox:
         wake()
 
     def send_line(self, line: str) -> None:
-        """One line for the user."""
+        """Send one line of text to the user."""
         self.send({"type": "told", "text": line})
 
     @contextmanager
     def send_busy(self) -> Iterator[None]:
-        """The page shows that it takes a while."""
+        """Show on the page that the session is busy while the context is open."""
         self.send({"type": "busy", "on": True})
         try:
             yield
         finally:
             self.send({"type": "busy", "on": False})
 
-    def tell_state(self, state: Mapping[str, Any]) -> None:
-        """How things stand, where that is new to who watches."""
-        if state != self._told_state:
-            self._told_state = dict(state)
+    def send_state(self, state: Mapping[str, Any]) -> None:
+        """Send ``state`` if it differs from the last state that the page received."""
+        if state != self._last_state:
+            self._last_state = dict(state)
             self.send(dict(state))

@@ -1,6 +1,6 @@
-"""What the page asks of a live session: small JSON objects, checked before anything is done with them.
+"""Messages of the page to a live session: JSON objects, validated and converted to records.
 
-Each has a ``type``; docs/guide/live.md lists them all.
+Each has a ``type``; docs/guide/live.md lists all types.
 """
 
 from __future__ import annotations
@@ -16,51 +16,57 @@ from egs_warp.motions.push import MAX_IMPULSE
 from egs_warp.motions.script import Script, motion
 from egs_warp.motions.style import LEAST, MOST, Style
 
-LONGEST_TEXT = 200
-"""Characters of motions asked for at once."""
-FURTHEST = 100.0
-"""Body heights from the start: nothing goes, or is pulled, further."""
-LEAST_SAG, MOST_SAG = 0.01, 0.1
-"""rho g H / E of a column: stiff and soft."""
-MOST_FRICTION = 2.0
+MAX_TEXT_LENGTH = 200
+"""Maximum number of characters of the motions in one message."""
+MAX_DISTANCE = 100.0
+"""Body heights, maximum distance from the start of goals and pulls."""
+MIN_SAG, MAX_SAG = 0.01, 0.1
+"""Sag rho g H / E of a column: stiffest and softest."""
+MAX_FRICTION = 2.0
+"""Coulomb coefficient."""
 STYLE_NAMES = tuple(field.name for field in fields(Style))
+"""Names of the style factors."""
 _MOTIONS = re.compile(r"[A-Za-z0-9_=+\-., ]+")
+"""Characters allowed in the text of motions."""
 
 
 @dataclass(frozen=True)
 class PlayScript:
-    """Do these motions next, in place of what was to come."""
+    """Perform these motions next; they replace the queued motions."""
 
     script: Script
+    """The motions."""
 
 
 @dataclass(frozen=True)
 class GoTo:
-    """Go to a point of the ground, in place of what was to come."""
+    """Go to a point on the ground; this replaces the queued motions."""
 
     point: tuple[float, float]
-    """Metres, frame of the body."""
+    """(x, y) m, frame of the body."""
 
 
 @dataclass(frozen=True)
 class Steer:
-    """Go so until told otherwise, in place of what was to come; told to stand, it stops."""
+    """Move at these speeds until the next command; this replaces the queued motions. Zero speeds stop the body."""
 
     command: Drive
+    """The speeds."""
 
 
 @dataclass(frozen=True)
 class Pull:
-    """Pull at a node by a spring, until ``Release``."""
+    """Pull a node by a spring until ``Release``."""
 
     node: int
+    """Index of the cage node."""
     target: tuple[float, float, float]
-    """Metres, frame of the body."""
+    """(x, y, z) m, frame of the body, to which the spring pulls."""
 
 
 @dataclass(frozen=True)
 class Release:
-    """Let go of what is pulled."""
+    """Release the pull."""
 
 
 @dataclass(frozen=True)
@@ -68,60 +74,63 @@ class PushOnce:
     """Push the body in the next step."""
 
     impulse: tuple[float, float, float]
-    """m sqrt(g H), frame of the body."""
+    """(x, y, z) m sqrt(g H), frame of the body."""
     height: float | None = None
-    """Body heights over the sole of the standing body, around which nodes take it; None: all alike."""
+    """Body heights above the sole of the standing body, around which the push acts; None: equally on all nodes."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """Another friction or stiffness; None: as it is."""
+    """Change friction or stiffness; None leaves a value unchanged."""
 
     friction: float | None = None
     """Coulomb coefficient."""
     sag: float | None = None
-    """rho g H / E of a column."""
+    """Sag rho g H / E of a column."""
 
 
 @dataclass(frozen=True)
 class Restyle:
-    """Jump so from the next motion on."""
+    """Set the style of jumps from the next motion on."""
 
     style: Style
+    """The factors."""
 
 
 @dataclass(frozen=True)
 class Pause:
-    """Hold still, or go on."""
+    """Pause or continue the simulation."""
 
     on: bool
+    """True to pause."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One solver step, while it holds still."""
+    """Compute one solver step while the simulation is paused."""
 
 
 @dataclass(frozen=True)
 class Cancel:
-    """Drop what was to come; what is being done is done to its end."""
+    """Cancel the queued motions; the active motion is completed."""
 
 
 @dataclass(frozen=True)
 class StandUp:
-    """Put it back where it stood at first."""
+    """Put the body back upright at its start."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """Begin a take, or end it and write it."""
+    """Start a take, or end and write it."""
 
     on: bool
+    """True to start."""
 
 
 @dataclass(frozen=True)
 class RequestScript:
-    """Say what it has done, as a script."""
+    """Request the script of the motions so far."""
 
 
 Message: TypeAlias = (
@@ -140,99 +149,116 @@ Message: TypeAlias = (
     | Record
     | RequestScript
 )
+"""A validated message."""
 
 
 def read_message(message: Mapping[str, Any], *, height: float, node_count: int) -> Message:
-    """The record of a JSON object, for a body of ``height`` metres. Raises ``ValueError`` for what makes no sense."""
+    """Validate a JSON object and return its record.
+
+    Args:
+        message: the object.
+        height: height of the body, m.
+        node_count: number of cage nodes.
+
+    Raises:
+        ValueError: for an unknown type or field, and for values that are missing or out of range.
+    """
     kind = message.get("type")
     if not isinstance(kind, str) or kind not in _READERS:
-        raise ValueError(f"type {str(kind)[:40]!r}; known are {', '.join(_READERS)}")
+        raise ValueError(f"type {str(kind)[:40]!r} is unknown; known types are {', '.join(_READERS)}")
     fields, read = _READERS[kind]
     unknown = [name for name in message if name != "type" and name not in fields]
     if unknown:
-        raise ValueError(f"{kind} has no {unknown[0][:40]!r}")
-    return read(message, FURTHEST * height, node_count)
+        raise ValueError(f"{kind} has no field {unknown[0][:40]!r}")
+    return read(message, MAX_DISTANCE * height, node_count)
 
 
-def _perform(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+def _read_script(message: Mapping[str, Any], max_distance: float, node_count: int) -> Message:
     text = message.get("text")
-    if not isinstance(text, str) or len(text) > LONGEST_TEXT:
-        raise ValueError(f"text: give motions in at most {LONGEST_TEXT} characters, as jump 0.5 0.2")
-    # A script or key frames would be files of this machine.
+    if not isinstance(text, str) or len(text) > MAX_TEXT_LENGTH:
+        raise ValueError(f"text: give motions in at most {MAX_TEXT_LENGTH} characters, as jump 0.5 0.2")
+    # Scripts and key frames are files of this machine, which a page must not read.
     if not _MOTIONS.fullmatch(text) or re.search(r"\.(json|csv)", text, re.IGNORECASE):
         raise ValueError("text: give motions by name and number, as hop x3, twist 90")
     script = motion(text)
     if any(request.file is not None for request in script.requests):
-        raise ValueError("text: motions that need a file are for egs-warp animate")
+        raise ValueError("text: motions that need a file are not available here; use egs-warp animate")
     return PlayScript(script)
 
 
-def _go(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
-    return GoTo((_number(message, "x", -reach, reach), _number(message, "y", -reach, reach)))
+def _read_go(message: Mapping[str, Any], max_distance: float, node_count: int) -> Message:
+    return GoTo(
+        (
+            _read_number(message, "x", -max_distance, max_distance),
+            _read_number(message, "y", -max_distance, max_distance),
+        )
+    )
 
 
-def _steer(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+def _read_steer(message: Mapping[str, Any], max_distance: float, node_count: int) -> Message:
     names = ("forward", "sideways", "turn")
-    return Steer(Drive(*(_number(message, name, -FASTEST, FASTEST) if name in message else 0.0 for name in names)))
+    return Steer(Drive(*(_read_number(message, name, -FASTEST, FASTEST) if name in message else 0.0 for name in names)))
 
 
-def _pull(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+def _read_pull(message: Mapping[str, Any], max_distance: float, node_count: int) -> Message:
     node = message.get("node")
     if not isinstance(node, int) or isinstance(node, bool) or not 0 <= node < node_count:
         raise ValueError(f"node: give a whole number from 0 to {node_count - 1}")
-    x, y, z = (_number(message, name, -reach, reach) for name in "xyz")
+    x, y, z = (_read_number(message, name, -max_distance, max_distance) for name in "xyz")
     return Pull(node, (x, y, z))
 
 
-def _hit(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
-    x, y, z = (_number(message, name, -MAX_IMPULSE, MAX_IMPULSE) for name in "xyz")
+def _read_push(message: Mapping[str, Any], max_distance: float, node_count: int) -> Message:
+    x, y, z = (_read_number(message, name, -MAX_IMPULSE, MAX_IMPULSE) for name in "xyz")
     if math.hypot(x, y, z) > MAX_IMPULSE:
         raise ValueError(f"push: give at most {MAX_IMPULSE:g} m sqrt(g H)")
-    return PushOnce((x, y, z), _number(message, "height", 0.0, 1.0) if "height" in message else None)
+    return PushOnce((x, y, z), _read_number(message, "height", 0.0, 1.0) if "height" in message else None)
 
 
-def _change(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
-    given = [name for name in ("friction", "sag") if name in message]
-    if not given:
+def _read_change(message: Mapping[str, Any], max_distance: float, node_count: int) -> Message:
+    names = [name for name in ("friction", "sag") if name in message]
+    if not names:
         raise ValueError("set: give friction or sag")
-    spans = {"friction": (0.0, MOST_FRICTION), "sag": (LEAST_SAG, MOST_SAG)}
-    return Change(**{name: _number(message, name, *spans[name]) for name in given})
+    spans = {"friction": (0.0, MAX_FRICTION), "sag": (MIN_SAG, MAX_SAG)}
+    return Change(**{name: _read_number(message, name, *spans[name]) for name in names})
 
 
-def _restyle(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
-    return Restyle(Style(**{name: _number(message, name, LEAST, MOST) for name in STYLE_NAMES if name in message}))
+def _read_style(message: Mapping[str, Any], max_distance: float, node_count: int) -> Message:
+    return Restyle(Style(**{name: _read_number(message, name, LEAST, MOST) for name in STYLE_NAMES if name in message}))
 
 
-def _on(message: Mapping[str, Any]) -> bool:
+def _read_on(message: Mapping[str, Any]) -> bool:
     on = message.get("on")
     if not isinstance(on, bool):
         raise ValueError("on: give true or false")
     return on
 
 
-def _number(message: Mapping[str, Any], name: str, least: float, most: float) -> float:
+def _read_number(message: Mapping[str, Any], name: str, minimum: float, maximum: float) -> float:
     value = message.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{name}: give a number")
-    if not least <= value <= most or not math.isfinite(value):
-        raise ValueError(f"{name}: give a number from {least:g} to {most:g}")
+    if not minimum <= value <= maximum or not math.isfinite(value):
+        raise ValueError(f"{name}: give a number from {minimum:g} to {maximum:g}")
     return float(value)
 
 
 _Reader: TypeAlias = Callable[[Mapping[str, Any], float, int], Message]
+"""Reader of one type of message, with the maximum distance in metres and the number of nodes."""
 _READERS: dict[str, tuple[tuple[str, ...], _Reader]] = {
-    "motion": (("text",), _perform),
-    "go": (("x", "y"), _go),
-    "drive": (("forward", "sideways", "turn"), _steer),
-    "pull": (("node", "x", "y", "z"), _pull),
+    "motion": (("text",), _read_script),
+    "go": (("x", "y"), _read_go),
+    "drive": (("forward", "sideways", "turn"), _read_steer),
+    "pull": (("node", "x", "y", "z"), _read_pull),
     "release": ((), lambda *_: Release()),
-    "push": (("x", "y", "z", "height"), _hit),
-    "set": (("friction", "sag"), _change),
-    "style": (STYLE_NAMES, _restyle),
-    "pause": (("on",), lambda message, *_: Pause(_on(message))),
+    "push": (("x", "y", "z", "height"), _read_push),
+    "set": (("friction", "sag"), _read_change),
+    "style": (STYLE_NAMES, _read_style),
+    "pause": (("on",), lambda message, *_: Pause(_read_on(message))),
     "step": ((), lambda *_: Step()),
     "cancel": ((), lambda *_: Cancel()),
     "stand": ((), lambda *_: StandUp()),
-    "record": (("on",), lambda message, *_: Record(_on(message))),
+    "record": (("on",), lambda message, *_: Record(_read_on(message))),
     "script": ((), lambda *_: RequestScript()),
 }
+"""Fields and reader of each ``type``."""

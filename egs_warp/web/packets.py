@@ -1,8 +1,8 @@
-"""The bytes that the page reads, from a file or from a socket alike: one header, then a packet for each frame.
+"""Binary format of the page, the same for files and sockets: one header, then one packet for each frame.
 
-All numbers are little-endian. A header is the 8 bytes ``EGSPAGE1``, the uint32 length of a JSON text, that text in
-UTF-8, zeros up to a multiple of 8, then the arrays that the text lists. Where frames follow in the same file, each
-comes after its uint32 length. ``Frame.packet`` writes a frame; ``client/src/packets.ts`` reads all of it.
+All numbers are little-endian. A header consists of the 8 bytes ``EGSPAGE1``, the uint32 length of a JSON text, the text
+in UTF-8, zeros up to a multiple of 8 bytes, and the arrays that the text lists. In a file, the uint32 length of a
+packet precedes each packet. ``client/src/packets.ts`` reads the format.
 """
 
 from __future__ import annotations
@@ -15,10 +15,14 @@ from typing import Any
 import numpy as np
 
 MAGIC = b"EGSPAGE1"
+"""First bytes of a header."""
 
 
 def header(facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Facts (JSON) and arrays of float32, int32 or uint8, each at a multiple of 8 bytes after the text."""
+    """Return a header of JSON ``facts`` and named ``arrays``.
+
+    The arrays are float32, int32 or uint8; each starts at a multiple of 8 bytes after the text.
+    """
     listed, pieces, start = {}, [], 0
     for name, values in arrays.items():
         data = np.ascontiguousarray(values).tobytes()
@@ -32,22 +36,23 @@ def header(facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
 
 @dataclass(frozen=True)
 class Frame:
-    """What the page is told of one moment; metres and newtons, in the frame of the body."""
+    """State of a creature at one time, in the frame of the body."""
 
     index: int
+    """Number of the frame."""
     time: float
-    """Seconds."""
+    """s."""
     positions: np.ndarray
-    """(N, 3) nodes of the cage."""
+    """(N, 3) m, nodes of the cage."""
     activations: np.ndarray
-    """(M,) -1 to 1, of the most that each segment can do."""
+    """(M,) -1 to 1, activation of each segment divided by its bound."""
     contacts: np.ndarray
-    """(C, 9): point, unit normal, force on the body."""
+    """(C, 9): point in m, unit normal, force on the body in N."""
     curves: np.ndarray
-    """(K,) in the order of the header's ``curves``."""
+    """(K,) values, in the order of ``curves`` in the header."""
 
     def packet(self) -> bytes:
-        """32 + 12 N + M (to a multiple of 4) + 36 C + 4 K bytes."""
+        """Return the packet: 32 + 12 N + M (padded to a multiple of 4) + 36 C + 4 K bytes."""
         counts = (len(self.positions), len(self.activations), len(self.contacts), len(self.curves), 0, 0)
         levels = np.rint(127.0 * np.clip(self.activations, -1.0, 1.0)).astype(np.int8).tobytes()
         return b"".join(
@@ -64,5 +69,5 @@ class Frame:
 
 
 def with_length(packet: bytes) -> bytes:
-    """A frame as it stands in a file."""
+    """Return the packet preceded by its length, as in a file."""
     return np.uint32(len(packet)).tobytes() + packet

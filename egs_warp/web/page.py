@@ -1,4 +1,4 @@
-"""The page as one file: as npm built it, and with runs inside, for any browser and any host."""
+"""The page as one HTML file: as npm builds it, or with runs embedded."""
 
 from __future__ import annotations
 
@@ -13,34 +13,36 @@ from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.web.recording import Recording
 
 PAGE = Path(__file__).with_name("page.html")
-_PLACE = "<!-- runs -->"
+"""The page that npm builds."""
+_RUNS_MARKER = "<!-- runs -->"
+"""Text of the page that the runs replace."""
 
 
 def page_text() -> str:
-    """The page without a run. Raises ``UserError`` in a source tree where it has not been built."""
+    """Return the page without a run. Raises ``UserError`` if it has not been built."""
     try:
         return PAGE.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise UserError(
-            f"{PAGE}: the page is not built; run make web in the source tree (it needs node 20 or newer), or install"
-            " the egs-warp wheel, which holds it"
+            f"{PAGE}: the page is not built; run make web in the source tree (needs node 20 or newer), or install the"
+            " egs-warp wheel, which contains it"
         ) from error
 
 
 def export_page(path: Path, recordings: Sequence[Recording]) -> int:
-    """Write ``recordings`` and the page that shows them as one HTML file; returns its size in bytes.
+    """Write the page with ``recordings`` embedded as one HTML file; return its size in bytes.
 
-    The same runs give the same file. Raises ``UserError`` for another ending than .html, and a file of a run.
+    The same runs give the same bytes. Raises ``UserError`` if ``path`` does not end in .html or is a file of a run.
     """
     if path.suffix.lower() not in (".html", ".htm"):
-        raise UserError(f"{path}: give a name that ends in .html")
+        raise UserError(f"{path}: give a file name that ends in .html")
     check_no_file_of_a_run(path)
     scripts = [
         f'<script type="application/octet-stream" data-run="{number}">'
         f"{base64.b64encode(gzip.compress(recording.bytes(), mtime=0)).decode()}</script>"
         for number, recording in enumerate(recordings)
     ]
-    text = page_text().replace(_PLACE, "\n".join(scripts), 1)
+    text = page_text().replace(_RUNS_MARKER, "\n".join(scripts), 1)
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return len(text.encode())

@@ -1,6 +1,7 @@
-"""Gaussians of a live creature are split before it moves, for poses that it is likely to take.
+"""Split the Gaussians of a live creature before it moves.
 
-What it will do is not known; but whatever it does, its softest modes bend most.
+The motion is not known in advance. The Gaussians are split for deformations along the softest modes of the body, which
+bend most in any motion.
 """
 
 from __future__ import annotations
@@ -16,32 +17,36 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.pipelines.creature import Creature
 
 MODE_COUNT = 6
+"""Number of modes."""
 MODE_AMPLITUDE = 0.3
-"""Body heights that the node which moves furthest is moved by."""
+"""Body heights, largest nodal displacement of a mode."""
 
 
 def presplit_gaussians(creature: Creature) -> GaussianCloud:
-    """The creature's splats at rest, those that its softest modes bend in parts."""
+    """Return the Gaussians of the creature at rest; those that the softest modes bend are split."""
     embedding = embed_gaussians(creature.cloud, creature.cage.mesh)
     return split_for_motion(creature.cloud, embedding, likely_poses(creature.body)).cloud
 
 
 def likely_poses(body: SoftBody) -> list[np.ndarray]:
-    """(N, 3) nodes each, metres: the ``MODES`` softest modes of the body held at its feet, either way."""
+    """Return poses, (N, 3) m each: the ``MODE_COUNT`` softest modes of the body fixed at its feet, in both directions.
+
+    Nodes below 0.05 body heights are fixed.
+    """
     nodes = body.mesh.nodes
     up = -body.gravity / np.linalg.norm(body.gravity)
     heights = nodes @ up
     free = heights > heights.min() + 0.05 * body.height
-    kept = np.flatnonzero(np.repeat(free, 3))
+    free_dofs = np.flatnonzero(np.repeat(free, 3))
     upper = body.assembly.matrix(body.assembly.hessian_entries(nodes))
-    stiffness = (upper + sparse.triu(upper, 1).T).tocsc()[kept][:, kept]
-    mass = sparse.diags(np.repeat(body.node_mass, 3)[kept]).tocsc()
-    _, modes = sparse_linalg.eigsh(stiffness, k=MODE_COUNT, M=mass, sigma=0.0, v0=np.ones(len(kept)))
+    stiffness = (upper + sparse.triu(upper, 1).T).tocsc()[free_dofs][:, free_dofs]
+    mass = sparse.diags(np.repeat(body.node_mass, 3)[free_dofs]).tocsc()
+    _, modes = sparse_linalg.eigsh(stiffness, k=MODE_COUNT, M=mass, sigma=0.0, v0=np.ones(len(free_dofs)))
     poses = []
     for mode in modes.T:
-        moved = np.zeros(nodes.size)
-        moved[kept] = mode
-        moved = moved.reshape(-1, 3)
-        moved *= MODE_AMPLITUDE * body.height / np.linalg.norm(moved, axis=1).max()
-        poses += [nodes + moved, nodes - moved]
+        displacement = np.zeros(nodes.size)
+        displacement[free_dofs] = mode
+        displacement = displacement.reshape(-1, 3)
+        displacement *= MODE_AMPLITUDE * body.height / np.linalg.norm(displacement, axis=1).max()
+        poses += [nodes + displacement, nodes - displacement]
     return poses

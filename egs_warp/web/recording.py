@@ -1,4 +1,4 @@
-"""A finished run as the page is sent it: ``trajectory.npz``, ``creature.npz``, ``report.json`` and the scene behind."""
+"""Encode a finished run for the page: trajectory, creature, report and background scene."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ CURVES = (
     ("gap", "Smallest gap", "H"),
     ("residual", "Momentum residual", "m g"),
 )
-"""Name, what the page calls it, and its unit."""
+"""Name, title on the page, and unit of each curve."""
 
 
 @dataclass(frozen=True)
 class Recording(FinishedRun):
-    """A finished run as packets."""
+    """A finished run that is encoded as packets."""
 
     def header(self) -> bytes:
-        """All that does not change from frame to frame."""
+        """Return the header: everything that is constant over the frames."""
         t, report = self.trajectory, self.report
         facts = {
             "title": self.title,
@@ -47,11 +47,11 @@ class Recording(FinishedRun):
             "notes": report.get("notes", []),
         }
         plan = {"plan": t.planned_com[self.steps].astype(np.float32)} if len(t.planned_com) else {}
-        made = (self.creature, self.mesh, t.node_mass, t.planes, self.deformer(), self.scene)
-        return creature_header(facts, *made, more=plan)
+        constants = (self.creature, self.mesh, t.node_mass, t.planes, self.deformer(), self.scene)
+        return creature_header(facts, *constants, more=plan)
 
     def frames(self) -> Iterator[Frame]:
-        """At 60 Hz."""
+        """Yield the frames at 60 Hz."""
         t = self.trajectory
         curves = _curves(t)
         for index, step in enumerate(self.steps):
@@ -65,18 +65,18 @@ class Recording(FinishedRun):
             )
 
     def bytes(self) -> bytes:
-        """The whole run in one piece."""
+        """Return the header and all frames, as in a file."""
         return b"".join([self.header(), *(with_length(frame.packet()) for frame in self.frames())])
 
 
 def curve_facts(curves: Sequence[tuple[str, str, str]]) -> list[dict[str, str]]:
-    """``curves`` as a header tells them."""
+    """Return ``curves`` in the form of the header."""
     return [{"name": name, "title": title, "unit": unit} for name, title, unit in curves]
 
 
 def creature_header(
     facts: Mapping[str, Any],
-    made: RenderData,
+    render_data: RenderData,
     mesh: TetMesh,
     node_mass: np.ndarray,
     planes: np.ndarray,
@@ -85,21 +85,30 @@ def creature_header(
     *,
     more: Mapping[str, np.ndarray] | None = None,
 ) -> bytes:
-    """The header of a creature that is drawn as ``made``: its ``facts`` with those of muscles and camera.
+    """Return the header of a creature.
 
-    ``mesh`` is the rest cage; ``planes`` (P, 4) are rows n, d; ``deformer`` carries the splats; ``scene`` is behind;
-    ``more``: further arrays.
+    Args:
+        facts: JSON values of the run; those of the muscles and the camera are added.
+        render_data: Gaussians, muscles, feet and camera.
+        mesh: cage at rest.
+        node_mass: (N,) kg.
+        planes: (P, 4) rows n, d of the ground planes.
+        deformer: embedding of the Gaussians in the cage.
+        scene: background; None for none.
+        more: further arrays by name.
     """
-    camera = made.camera
+    camera = render_data.camera
     facts = {
         **facts,
-        "fibres": [{"name": n, "kind": k} for n, k in zip(made.fibre_names, made.fibre_kinds, strict=True)],
+        "fibres": [
+            {"name": n, "kind": k} for n, k in zip(render_data.fibre_names, render_data.fibre_kinds, strict=True)
+        ],
         "camera": {
             "position": camera.centre.tolist(),
             "forward": camera.rotation[2].tolist(),
             "fov": float(np.degrees(2.0 * np.arctan(0.5 * camera.height / camera.fy))),
         },
-        "degree": {"splats": made.splats.sh_degree, "scene": scene.sh_degree if scene else 0},
+        "degree": {"splats": render_data.splats.sh_degree, "scene": scene.sh_degree if scene else 0},
     }
     arrays = {
         "rest": mesh.nodes.astype(np.float32),
@@ -108,15 +117,15 @@ def creature_header(
         "planes": planes.astype(np.float32),
         "surface": mesh.boundary_faces().astype(np.int32),
         "edges": _edges(mesh.boundary_faces()),
-        "muscle_end_starts": made.muscle_ends.indptr.astype(np.int32),
-        "muscle_end_nodes": made.muscle_ends.indices.astype(np.int32),
-        "muscle_end_weights": made.muscle_ends.data.astype(np.float32),
-        "muscle_segments": made.muscle_segments.astype(np.int32),
-        "fibre_from_segment": made.fibre_from_segment.astype(np.int32),
-        "foot_from_node": made.foot_from_node.astype(np.int32),
+        "muscle_end_starts": render_data.muscle_ends.indptr.astype(np.int32),
+        "muscle_end_nodes": render_data.muscle_ends.indices.astype(np.int32),
+        "muscle_end_weights": render_data.muscle_ends.data.astype(np.float32),
+        "muscle_segments": render_data.muscle_segments.astype(np.int32),
+        "fibre_from_segment": render_data.fibre_from_segment.astype(np.int32),
+        "foot_from_node": render_data.foot_from_node.astype(np.int32),
         "mean_tets": deformer.plan.mean_tets.numpy(),
         "arms": _arms(deformer),
-        **_splat_arrays("splats", made.splats),
+        **_splat_arrays("splats", render_data.splats),
         **(more or {}),
     }
     if scene is not None:
@@ -125,13 +134,15 @@ def creature_header(
 
 
 def _edges(faces: np.ndarray) -> np.ndarray:
+    """Return the (E, 2) int32 edges of triangles (F, 3)."""
     pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     return np.unique(pairs, axis=0).astype(np.int32)
 
 
 def _arms(deformer: Deformer) -> np.ndarray:
-    """(n', 15) float32: six tetrahedra, six shares and three bulges of those Gaussians that no one tetrahedron carries
-    alone, in their order.
+    """Return (n', 15) float32: six tetrahedra, six inside fractions and three smoothing lengths.
+
+    One row for each of the n' Gaussians that extend over several tetrahedra, in their order.
     """
     plan = deformer.plan
     rows = plan.mean_tets.numpy() < 0
@@ -140,7 +151,11 @@ def _arms(deformer: Deformer) -> np.ndarray:
 
 
 def _splat_arrays(name: str, cloud: GaussianCloud) -> dict[str, np.ndarray]:
-    """Higher bands of the colour as bytes: 128 + 127 v over the largest of all splats for each coefficient."""
+    """Return the arrays of ``cloud``, whose names begin with ``name``.
+
+    SH coefficients of degree 1 and above are bytes, 128 + 127 v / s, where s is the maximum of each coefficient over
+    all Gaussians.
+    """
     sh = cloud.sh.numpy()
     rest = sh[:, 1:]
     scale = np.maximum(np.abs(rest).max(axis=(0, 2), initial=0.0), 1e-6).astype(np.float32)
@@ -156,7 +171,7 @@ def _splat_arrays(name: str, cloud: GaussianCloud) -> dict[str, np.ndarray]:
 
 
 def _curves(t: Trajectory) -> np.ndarray:
-    """(F+1, K) in the order of ``CURVES``; definitions in docs/guide/report.md."""
+    """Return the curves, (F+1, K) in the order of ``CURVES``; docs/guide/report.md defines them."""
     mass = float(t.node_mass.sum())
     gravity = float(np.linalg.norm(t.gravity))
     weight, steps = mass * gravity, len(t.time) - 1
@@ -169,16 +184,16 @@ def _curves(t: Trajectory) -> np.ndarray:
     kicked = np.zeros((steps, 3))
     if len(t.kick_step):
         np.add.at(kicked, t.kick_step, np.einsum("n,kni->ki", t.node_mass, t.kick_velocity) / t.dt[t.kick_step, None])
-    pressed, rubbed = np.zeros(steps), np.zeros(steps)
-    np.add.at(pressed, t.contact_step, normal)
-    np.add.at(rubbed, t.contact_step, tangent)
+    normal_force, tangential_force = np.zeros(steps), np.zeros(steps)
+    np.add.at(normal_force, t.contact_step, normal)
+    np.add.at(tangential_force, t.contact_step, tangent)
     momentum = np.einsum("n,fni->fi", t.node_mass, t.velocities)
-    outside = mass * t.gravity + force + kicked - t.drag * momentum[1:]
-    residual = np.diff(momentum, axis=0) / np.diff(t.time)[:, None] - outside
-    used = rubbed / np.maximum(t.friction * pressed, 1e-9 * weight)
-    of_steps = np.stack(
+    external_force = mass * t.gravity + force + kicked - t.drag * momentum[1:]
+    residual = np.diff(momentum, axis=0) / np.diff(t.time)[:, None] - external_force
+    used = tangential_force / np.maximum(t.friction * normal_force, 1e-9 * weight)
+    per_step = np.stack(
         [np.linalg.norm(force, axis=1) / weight, used, np.linalg.norm(residual, axis=1) / weight], axis=1
     )
-    # The first state has no step before it.
-    padded = np.concatenate([of_steps[:1] if steps else np.zeros((1, 3)), of_steps])
+    # The initial state has no step; it gets the values of the first step.
+    padded = np.concatenate([per_step[:1] if steps else np.zeros((1, 3)), per_step])
     return np.stack([com @ up / t.height, padded[:, 0], padded[:, 1], t.min_gap / t.height, padded[:, 2]], axis=1)

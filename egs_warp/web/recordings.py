@@ -1,4 +1,4 @@
-"""A take: some seconds of a live session, kept as the folder of a run, as ``egs-warp animate`` writes one."""
+"""Takes: parts of a live session, written as run folders in the format of ``egs-warp animate``."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import GaussianCounts, report_of_run
 
-LONGEST_TAKE = 120.0
-"""Seconds of the creature's own time, after which a take ends by itself."""
+MAX_TAKE_SECONDS = 120.0
+"""Seconds of simulated time after which a take ends."""
 SCRIPT = "script.json"
+"""File of a take that contains its motions."""
 
 
 def script_text(requests: Sequence[MotionRequest]) -> str:
-    """A script of motions, one after the other, for ``egs-warp animate --motion script.json``."""
+    """Return ``requests`` as a script for ``egs-warp animate --motion script.json``."""
     styles = [{} if request.style is None else {"style": str(request.style)} for request in requests]
     lines = [
         json.dumps({"motion": request.name, **request.asked, **style})
@@ -40,11 +41,14 @@ def script_text(requests: Sequence[MotionRequest]) -> str:
 
 @dataclass
 class SessionRecording:
-    """Gathers the steps of a session from ``start`` on."""
+    """Recorder of the steps of a session."""
 
     creature: Creature
+    """Creature of the session."""
     start: BodyState
+    """State at the start of the recording."""
     reports: list[StepReport] = field(default_factory=list)
+    """Reports of the recorded steps."""
 
     def __post_init__(self) -> None:
         stepper = self.creature.stepper
@@ -61,11 +65,16 @@ class SessionRecording:
 
     @property
     def seconds(self) -> float:
-        """Its length so far."""
+        """Recorded simulated time, s."""
         return self.reports[-1].state.time - self.start.time if self.reports else 0.0
 
     def add(self, reports: Sequence[StepReport], *, kick: np.ndarray | None) -> None:
-        """The next steps, and (N, 3) m/s that the user's pulls and pushes gave the nodes as the first began."""
+        """Append steps.
+
+        Args:
+            reports: reports of the steps; more than one if a step was repeated with a smaller step size.
+            kick: (N, 3) m/s, velocities that pulls and pushes of the user added before the first step; None for none.
+        """
         self.reports += reports
         self._recorder.add(reports, kick=kick)
 
@@ -73,50 +82,57 @@ class SessionRecording:
         self,
         folder: Path,
         drawn_as: RenderData,
-        begun: Sequence[MotionRecord],
+        records: Sequence[MotionRecord],
         requests: Sequence[MotionRequest],
         *,
         source: str,
-        asked: Mapping[str, Any],
-        driven: Sequence[float] = (),
+        requested: Mapping[str, Any],
+        drive_starts: Sequence[float] = (),
     ) -> Path:
-        """Write trajectory, creature, report and script into the first free ``folder/take-N``, which it returns.
+        """Write trajectory, creature, report and script into the first free folder ``take-N``; return its path.
 
-        ``begun`` are the motions of the session, ``requests`` how a script asks for them;
-        ``driven`` the times, seconds, at which it was steered by speeds.
+        Args:
+            folder: parent folder.
+            drawn_as: render data of the creature.
+            records: all motions of the session; those that start during the recording are written.
+            requests: request of each motion.
+            source: name of the capture, for the report.
+            requested: options of the session, for the report.
+            drive_starts: times in s at which the user started to drive the body.
         """
         trajectory = self._recorder.trajectory()
-        chosen = [
+        recorded = [
             (entry, request)
-            for entry, request in zip(begun, requests, strict=True)
+            for entry, request in zip(records, requests, strict=True)
             if trajectory.time[0] - 1e-9 <= entry.start_time < trajectory.time[-1]
         ]
-        touched = len(trajectory.kick_step) > 0
-        notes = [f"the user pulled at it or pushed it, which {SCRIPT} does not repeat"] if touched else []
-        if driven:
-            notes.append(f"the user drove it, which {SCRIPT} does not repeat")
+        has_kicks = len(trajectory.kick_step) > 0
+        notes = [f"the user pulled or pushed the body; {SCRIPT} does not repeat this"] if has_kicks else []
+        if drive_starts:
+            notes.append(f"the user drove the body; {SCRIPT} does not repeat this")
         report = report_of_run(
             *(self.creature, trajectory, self.reports, np.arange(len(trajectory.time))),
-            *([entry for entry, _ in chosen], energy_balance(trajectory)),
+            *([entry for entry, _ in recorded], energy_balance(trajectory)),
             gaussians=GaussianCounts.of(self.creature, drawn_as.splats.count),
             drawing={},
             source=source,
             notes=notes,
             seed=0,
-            asked=asked,
+            asked=requested,
         )
         path = _next_folder(folder)
         with run_folder(path) as run:
             trajectory.save(run.file("trajectory.npz"))
             drawn_as.save(run.file(render_data.FILE))
             with atomic_write(run.file(SCRIPT)) as temporary:
-                temporary.write_text(script_text([request for _, request in chosen]))
+                temporary.write_text(script_text([request for _, request in recorded]))
             report.write(run.file("report.json"))
             run.finish()
         return path
 
 
 def _next_folder(folder: Path) -> Path:
+    """Return the first ``take-N`` without a finished run."""
     number = 1
     while (folder / f"take-{number}" / MANIFEST).exists():
         number += 1

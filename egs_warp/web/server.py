@@ -1,4 +1,7 @@
-"""A server for this machine alone: the page, its runs, and a socket that sends frames as they are made."""
+"""Local server of the page, its runs, and a socket that sends frames of a live session.
+
+Only this machine can connect, and only pages of this server.
+"""
 
 from __future__ import annotations
 
@@ -24,15 +27,17 @@ from egs_warp.errors import ArgumentError
 from egs_warp.web.page import page_text
 
 HOST = "127.0.0.1"
-LARGEST_MESSAGE = 65_536
-"""Bytes that a page may send at once; more closes its socket."""
-_NAMES = frozenset({"127.0.0.1", "localhost"})
+"""Address that the server binds."""
+MAX_MESSAGE_BYTES = 65_536
+"""Bytes, maximum size of a message; a larger one closes the socket."""
+_HOST_NAMES = frozenset({"127.0.0.1", "localhost"})
+"""Host names that requests may use."""
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
-    # Spark's module is WebAssembly in a worker, both within the page.
+    # Spark is WebAssembly in a worker; both are part of the page.
     "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob: data:;"
     " worker-src blob: data:; style-src 'unsafe-inline'; img-src data: blob:; media-src blob:; connect-src 'self' data:"
     " blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
@@ -40,23 +45,23 @@ _HEADERS = {
 
 
 class FrameFeed(Protocol):
-    """What a socket is sent from: a recording, or a solver that runs."""
+    """Source of the frames of a socket: a recording or a running solver."""
 
     def header(self) -> bytes:
-        """All that does not change (``packets.header``)."""
+        """Return the header (``packets.header``)."""
         ...
 
     def packets(self) -> AsyncGenerator[bytes | str]:
-        """Frames (``Frame.packet``) as they are made, and news beside them, as JSON."""
+        """Yield frames (``Frame.packet``) and events (JSON texts) as they come."""
         ...
 
     def receive(self, message: dict[str, object]) -> None:
-        """Something that the page asks. Raises ``ValueError`` for what makes no sense."""
+        """Handle a message of the page. Raises ``ValueError`` for an invalid message."""
         ...
 
 
 class PageServer:
-    """The page at a secret address of this machine."""
+    """Server of the page at a secret local address."""
 
     def __init__(
         self,
@@ -66,17 +71,24 @@ class PageServer:
         feed: FrameFeed | None = None,
         token: str | None = None,
     ) -> None:
-        """``runs`` make the bytes of each run, once; ``port`` 0 is any that is free; ``feed`` is sent to one client.
+        """Bind the port.
 
-        Raises ``UserError`` for a port that is taken.
+        Args:
+            runs: functions that return the bytes of each run; each is called once.
+            port: port to bind; 0 selects a free one.
+            feed: source of a live session, sent to one client at a time; None for none.
+            token: secret part of the address; None for a random one.
+
+        Raises:
+            UserError: if the port cannot be used.
         """
         self.token = token or secrets.token_urlsafe(24)
         self._page = page_text()
         self._runs = list(runs)
-        self._made: dict[int, bytes] = {}
+        self._run_bytes: dict[int, bytes] = {}
         self._feed = feed
-        self._fed = False
-        self._socket = _listening(port)
+        self._has_client = False
+        self._socket = _bind(port)
         self.port: int = self._socket.getsockname()[1]
         secret = f"/{self.token}"
         routes: list[BaseRoute] = [
@@ -85,25 +97,30 @@ class PageServer:
         ]
         if feed is not None:
             routes.append(WebSocketRoute(f"{secret}/live", self._send_frames))
-        app = _SameMachine(Starlette(routes=routes), self.port)
+        app = _SameOriginOnly(Starlette(routes=routes), self.port)
         settings = uvicorn.Config(
-            app, log_level="warning", access_log=False, ws_max_size=LARGEST_MESSAGE, server_header=False, lifespan="off"
+            app,
+            log_level="warning",
+            access_log=False,
+            ws_max_size=MAX_MESSAGE_BYTES,
+            server_header=False,
+            lifespan="off",
         )
         self._server = uvicorn.Server(settings)
 
     @property
     def address(self) -> str:
-        """Of the page; who has it may see the run."""
+        """Address of the page; everyone who knows it can see the run."""
         query = "?live" if self._feed is not None else f"?runs={len(self._runs)}" if len(self._runs) > 1 else ""
         return f"http://{HOST}:{self.port}/{self.token}/{query}"
 
     def serve(self) -> None:
-        """Until ``stop``, or an interrupt from the keyboard."""
+        """Serve until ``stop`` or Ctrl-C."""
         with contextlib.suppress(KeyboardInterrupt):
             self._server.run(sockets=[self._socket])
 
     def stop(self) -> None:
-        """End ``serve``, from any thread."""
+        """End ``serve``; can be called from any thread."""
         self._server.should_exit = True
 
     async def _send_page(self, request: Request) -> Response:
@@ -113,29 +130,29 @@ class PageServer:
         number = int(request.path_params["number"])
         if number >= len(self._runs):
             return PlainTextResponse("there is no such run", 404, headers=_HEADERS)
-        if number not in self._made:
-            self._made[number] = await asyncio.to_thread(self._runs[number])
-        return Response(self._made[number], media_type="application/octet-stream", headers=_HEADERS)
+        if number not in self._run_bytes:
+            self._run_bytes[number] = await asyncio.to_thread(self._runs[number])
+        return Response(self._run_bytes[number], media_type="application/octet-stream", headers=_HEADERS)
 
     async def _send_frames(self, page: WebSocket) -> None:
         feed = self._feed
         assert feed is not None
         await page.accept()
-        if self._fed:
-            await page.close(1013, "another page watches this run already; close it first")
+        if self._has_client:
+            await page.close(1013, "another page already shows this session; close it first")
             return
-        self._fed = True
+        self._has_client = True
         try:
             with contextlib.suppress(WebSocketDisconnect):
                 await page.send_bytes(await asyncio.to_thread(feed.header))
-                await _first_to_end(_listen(page, feed), _speak(page, feed))
+                await _first_to_end(_receive_messages(page, feed), _send_packets(page, feed))
         finally:
-            self._fed = False
+            self._has_client = False
 
 
-async def _first_to_end(*ways: Coroutine[None, None, None]) -> None:
-    """Run all until one ends; raises what that one raised."""
-    tasks = [asyncio.create_task(way) for way in ways]
+async def _first_to_end(*coroutines: Coroutine[None, None, None]) -> None:
+    """Run the coroutines until one ends, then cancel the others; raises the error of the one that ended."""
+    tasks = [asyncio.create_task(coroutine) for coroutine in coroutines]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
@@ -146,14 +163,16 @@ async def _first_to_end(*ways: Coroutine[None, None, None]) -> None:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _speak(page: WebSocket, feed: FrameFeed) -> None:
+async def _send_packets(page: WebSocket, feed: FrameFeed) -> None:
+    """Send the packets of ``feed``, then close the socket."""
     async with contextlib.aclosing(feed.packets()) as packets:
         async for packet in packets:
             await (page.send_text(packet) if isinstance(packet, str) else page.send_bytes(packet))
-    await page.close(1000, "the run is over")
+    await page.close(1000, "the session has ended")
 
 
-async def _listen(page: WebSocket, feed: FrameFeed) -> None:
+async def _receive_messages(page: WebSocket, feed: FrameFeed) -> None:
+    """Pass the messages of the page to ``feed``; answer an invalid one with an error."""
     while True:
         try:
             message = json.loads(await page.receive_text())
@@ -161,49 +180,53 @@ async def _listen(page: WebSocket, feed: FrameFeed) -> None:
                 raise ValueError("not an object")
             feed.receive(message)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            # One line back, and the run goes on.
-            await page.send_text(json.dumps({"error": f"this message makes no sense: {str(error)[:200]}"}))
+            # Answer in one line and continue.
+            await page.send_text(json.dumps({"error": f"invalid message: {str(error)[:200]}"}))
 
 
-class _SameMachine:
-    """Lets through only what a page of this very server asks: no other site gets at it by the user's browser."""
+class _SameOriginOnly:
+    """Middleware that rejects requests of other sites in the user's browser.
+
+    It compares the host and the origin of each request with the address of this server.
+    """
 
     def __init__(self, app: ASGIApp, port: int) -> None:
         self._app = app
-        self._hosts = {f"{name}:{port}" for name in _NAMES}
+        self._hosts = {f"{name}:{port}" for name in _HOST_NAMES}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        asked = HTTPConnection(scope)
-        origin = asked.headers.get("origin")
-        # Browsers always tell a socket's origin.
-        stranger = urlsplit(origin).netloc not in self._hosts if origin is not None else scope["type"] == "websocket"
-        if asked.headers.get("host") not in self._hosts or stranger:
+        connection = HTTPConnection(scope)
+        origin = connection.headers.get("origin")
+        # Browsers always send the origin of a socket.
+        is_foreign = urlsplit(origin).netloc not in self._hosts if origin is not None else scope["type"] == "websocket"
+        if connection.headers.get("host") not in self._hosts or is_foreign:
             if scope["type"] == "websocket":
                 await send({"type": "websocket.close", "code": 1008})
             else:
-                await PlainTextResponse("not from here", 403, headers=_HEADERS)(scope, receive, send)
+                await PlainTextResponse("request from another site", 403, headers=_HEADERS)(scope, receive, send)
             return
         await self._app(scope, receive, send)
 
 
 def check_port(port: int) -> None:
-    """Raise the ``UserError`` of ``PageServer`` for a port that is taken, before any long work."""
-    _listening(port).close()
+    """Raise ``UserError`` if the port cannot be used, before any long work."""
+    _bind(port).close()
 
 
-def _listening(port: int) -> socket.socket:
-    made = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+def _bind(port: int) -> socket.socket:
+    """Return a listening socket at ``port``."""
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         if os.name == "posix":
-            # Elsewhere this would share the port with whoever has it.
-            made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        made.bind((HOST, port))
-        made.listen(16)
+            # On Windows this option would share the port with another process.
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((HOST, port))
+        listener.listen(16)
     except (OSError, OverflowError) as error:
-        made.close()
+        listener.close()
         reason = getattr(error, "strerror", None) or str(error)
         raise ArgumentError("port", f"cannot be used ({reason}); give another, or 0 for any", value=port) from error
-    return made
+    return listener

@@ -1,6 +1,7 @@
-"""A creature that lives while it is watched: its solver steps in a thread and does what messages ask.
+"""Live session: a thread that simulates a creature and handles the messages of its page.
 
-A step takes the time that it takes; where that is less than the time that it covers, the thread waits for the clock.
+If a step takes less time than it covers, the thread waits for the clock; otherwise the simulation is slower than real
+time. Nothing is simulated while no page is subscribed.
 """
 
 from __future__ import annotations
@@ -43,28 +44,36 @@ from egs_warp.web.messages import (
     Step,
 )
 from egs_warp.web.packets import Frame
-from egs_warp.web.recordings import LONGEST_TAKE, SessionRecording, script_text
-from egs_warp.web.steering import FALLEN, MotionScheduler
+from egs_warp.web.recordings import MAX_TAKE_SECONDS, SessionRecording, script_text
+from egs_warp.web.steering import FALLEN_TILT, MotionScheduler
 from egs_warp.web.user_forces import UserForces
 
 
 @dataclass(frozen=True)
 class SessionOptions:
-    """What does not change while it lives."""
+    """Options that are constant over a session."""
 
     source: str = "capture"
     """Name of the capture, for reports."""
     takes: Path = Path("out/live")
-    """Folder for what is recorded."""
+    """Folder for recorded takes."""
     muscles_file: Path | None = None
+    """JSON file with muscle fibres; None for automatic ones."""
     sag: float = DEFAULT_SAG
-    """With which ``creature`` was made."""
+    """Sag rho g H / E with which the creature was built."""
 
 
 class Session:
-    """One creature, its thread, and what is to be sent of it."""
+    """A simulated creature, its thread, and its queue of news for the page."""
 
     def __init__(self, creature: Creature, drawn_as: RenderData, options: SessionOptions | None = None) -> None:
+        """Create a session that is not started.
+
+        Args:
+            creature: creature at its initial stance.
+            drawn_as: render data of the creature, for the page and the takes.
+            options: constant options; None for the defaults.
+        """
         self.options = options or SessionOptions()
         self.creature, self.drawn_as = creature, drawn_as
         self.sag, self.friction = self.options.sag, creature.geometry.friction
@@ -72,9 +81,9 @@ class Session:
         self._memory = creature.stepper.initial_memory()
         self._dt, _ = solver_steps(creature.body)
         self._place = initial_stance(creature)
-        self._post = Mailbox()
-        self.steering = MotionScheduler(self._place, self._post.send_line)
-        self._touches = UserForces()
+        self._mailbox = Mailbox()
+        self.steering = MotionScheduler(self._place, self._mailbox.send_line)
+        self._user_forces = UserForces()
         self._take: SessionRecording | None = None
         self._paused, self._single_steps = False, 0
         self._stillness = StillnessDetector()
@@ -82,83 +91,88 @@ class Session:
         self._thread = threading.Thread(target=self._run_loop, name="session", daemon=True)
         self._due = time.perf_counter()
 
-    # Of any thread.
+    # Called from any thread.
 
     def start(self) -> None:
-        """Begin to live; nothing moves until it is watched."""
+        """Start the thread; the simulation starts when a page subscribes."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread, and write the take that was going on."""
-        self._post.stop()
+        """End the thread, and write the active take."""
+        self._mailbox.stop()
         if self._thread.is_alive():
             self._thread.join()
 
     def put_request(self, message: Message) -> None:
-        """Leave a message; it is obeyed before the next step."""
-        self._post.put_request(message)
+        """Queue a message; it is handled before the next step."""
+        self._mailbox.put_request(message)
 
     def subscribe(self, wake: Callable[[], object]) -> None:
-        """Live on; ``wake`` is called, from the session's thread, when ``waiting`` has something: first how it is."""
-        self._post.subscribe(wake, self._frame)
+        """Subscribe a page and continue the simulation.
+
+        ``wake`` is called from the thread of the session when ``take_news`` has something new, first the current frame.
+        """
+        self._mailbox.subscribe(wake, self._frame)
 
     def unsubscribe(self) -> None:
-        """Nobody watches: hold still, and let go of what is pulled."""
-        self._post.unsubscribe()
+        """Unsubscribe the page: suspend the simulation and release a pull."""
+        self._mailbox.unsubscribe()
 
     def take_news(self) -> list[News]:
-        """Frames and news since the last call."""
-        return self._post.take_news()
+        """Return and remove the queued frames and events."""
+        return self._mailbox.take_news()
 
-    # Of the session's own thread.
+    # Called from the thread of the session.
 
     def _run_loop(self) -> None:
-        while self._post.wait_for_work(lambda: self._held, self._begin_time):
+        while self._mailbox.wait_for_work(lambda: self._is_suspended, self._reset_clock):
             self.process_requests()
-            if not self._held:
+            if not self._is_suspended:
                 self.advance()
-                self._keep_time()
-            self._post.tell_state(self.state_message())
+                self._wait_for_clock()
+            self._mailbox.send_state(self.state_message())
         if self._take is not None:
             self._end_take()
 
     @property
-    def _held(self) -> bool:
-        if not self._post.watched:
+    def _is_suspended(self) -> bool:
+        """True if no step is to be computed: no page, paused, or at rest."""
+        if not self._mailbox.watched:
             return True
         return self._single_steps == 0 and (self._paused or self.resting)
 
     @property
     def resting(self) -> bool:
-        """Whether it stands still with nothing to do; the next thing asked for goes on from there."""
-        if not self.steering.idle or self._take is not None or self._touches.has_input:
+        """True if the body is still and has no task; the simulation continues at the next message."""
+        if not self.steering.idle or self._take is not None or self._user_forces.has_input:
             return False
         return self._stillness.is_still(self.state)
 
-    def _begin_time(self) -> None:
-        """What was waited for is not caught up."""
+    def _reset_clock(self) -> None:
+        """Restart the clock now, so that a pause is not caught up."""
         self._due = time.perf_counter()
 
-    def _keep_time(self) -> None:
+    def _wait_for_clock(self) -> None:
+        """Wait until the next step is due; at most two steps are caught up."""
         self._due = max(self._due + self._dt, time.perf_counter() - 2.0 * self._dt)
-        self._post.wait_until(lambda: self._due - time.perf_counter())
+        self._mailbox.wait_until(lambda: self._due - time.perf_counter())
 
     def advance(self) -> None:
-        """One step of the solver."""
+        """Compute one step and send its frame. If the step fails, put the body back at its start."""
         self._single_steps = max(self._single_steps - 1, 0)
         before = self.state
         try:
             with one_blas_thread():
                 objectives = self.steering.objectives(before, self.report, self._dt)
-            kick = self._touches.kick(self._place, before, self._dt)
+            kick = self._user_forces.kick(self._place, before, self._dt)
             stepper, start = self.creature.stepper, before.with_velocity_kick(kick)
             self.state, self._memory, reports = stepper.advance(start, self._memory, objectives, self._dt)
             if not np.isfinite(self.state.positions).all():
                 raise FloatingPointError("positions are not finite")
-        # A step that goes wrong must not end a session.
+        # A failing step must not end the session.
         except Exception as error:
             print(f"egs-warp: live: {type(error).__name__}: {error}", file=sys.stderr)
-            self._post.send_line("the solver found no way on; the creature stands where it began")
+            self._mailbox.send_line("the solver failed; the creature is back at its start")
             self.state = before
             self._stand_up()
             return
@@ -166,21 +180,21 @@ class Session:
         self._stillness.update(self.creature.body, self.state)
         if self._take is not None:
             self._take.add(reports, kick=kick)
-            if self._take.seconds >= LONGEST_TAKE:
-                self._post.send_line(f"a take has at most {LONGEST_TAKE:g} s")
+            if self._take.seconds >= MAX_TAKE_SECONDS:
+                self._mailbox.send_line(f"the take has ended: its maximum length is {MAX_TAKE_SECONDS:g} s")
                 self._end_take()
         self._index += 1
-        self._post.send(self._frame())
+        self._mailbox.send(self._frame())
 
     def process_requests(self) -> None:
-        """Do what the messages ask that came since."""
-        for message in self._post.take_requests():
+        """Handle all queued messages."""
+        for message in self._mailbox.take_requests():
             try:
                 self._do(message)
-            # What goes wrong with one message must not end a session.
+            # A failing message must not end the session.
             except Exception as error:
                 print(f"egs-warp: live: {type(error).__name__}: {error}", file=sys.stderr)
-                self._post.send_line(f"that did not work: {str(error)[:200]}")
+                self._mailbox.send_line(f"the command failed: {str(error)[:200]}")
 
     def _do(self, message: Message) -> None:
         match message:
@@ -193,18 +207,18 @@ class Session:
             case Cancel():
                 self.steering.cancel()
             case Pull():
-                self._touches.pull(self.creature.body, message)
+                self._user_forces.pull(self.creature.body, message)
             case Release():
-                self._touches.release()
+                self._user_forces.release()
             case PushOnce():
-                self._touches.push(message)
+                self._user_forces.push(message)
             case Change():
                 self._change(message)
             case Restyle(style):
                 self.steering.style = style
             case Pause(on):
                 self._paused = on
-                self._begin_time()
+                self._reset_clock()
             case Step():
                 self._single_steps += 1 if self._paused else 0
             case StandUp():
@@ -213,41 +227,42 @@ class Session:
                 self._record(on)
             case RequestScript():
                 requests = self.steering.requests[-MOST_MOTIONS:]
-                self._post.send({"type": "script", "text": script_text(requests), "motions": len(requests)})
+                self._mailbox.send({"type": "script", "text": script_text(requests), "motions": len(requests)})
 
     def _stand_up(self) -> None:
+        """Put the body back upright at its start."""
         self._end_take()
-        self._touches.clear()
+        self._user_forces.clear()
         self._stillness.reset()
-        stood = self.creature.start.positions.copy()
-        self.state = BodyState(stood, np.zeros_like(stood), self.state.time)
+        positions = self.creature.start.positions.copy()
+        self.state = BodyState(positions, np.zeros_like(positions), self.state.time)
         self.report, self._memory = None, self.creature.stepper.initial_memory()
         self.steering.stand(self._place)
         self._index += 1
-        self._post.send(self._frame())
+        self._mailbox.send(self._frame())
 
-    def _change(self, wish: Change) -> None:
-        """The same creature, as it stands, with another friction or stiffness."""
-        friction = self.friction if wish.friction is None else wish.friction
-        sag = self.sag if wish.sag is None else wish.sag
+    def _change(self, change: Change) -> None:
+        """Rebuild the creature in its current pose with another friction or stiffness."""
+        friction = self.friction if change.friction is None else change.friction
+        sag = self.sag if change.sag is None else change.sag
         if (friction, sag) == (self.friction, self.sag):
             return
         self._end_take()
-        with self._post.send_busy():
+        with self._mailbox.send_busy():
             try:
                 muscles = self.options.muscles_file
-                made = changed_creature(self.creature, friction=friction, sag=sag, muscles_file=muscles)
-                place = initial_stance(made)
-                if sag != self.sag and tilt_degrees(self._place, made.start.positions) > FALLEN:
-                    raise UserError(f"sag {sag:g}: so soft a body does not stand; choose a smaller one")
+                changed = changed_creature(self.creature, friction=friction, sag=sag, muscles_file=muscles)
+                place = initial_stance(changed)
+                if sag != self.sag and tilt_degrees(self._place, changed.start.positions) > FALLEN_TILT:
+                    raise UserError(f"sag {sag:g}: a body this soft does not stand; choose a smaller sag")
             except (UserError, FloatingPointError, np.linalg.LinAlgError) as error:
-                self._post.send_line(str(error))
+                self._mailbox.send_line(str(error))
                 return
-            self.creature, self.friction, self.sag, self._place = made, friction, sag, place
+            self.creature, self.friction, self.sag, self._place = changed, friction, sag, place
             self._stillness.reset()
-            # Contacts and activations of the old body are as good a guess as any for the new one.
+            # Contacts and activations of the old body are a good initial guess for the new one.
             self.steering.place = place
-            self._begin_time()
+            self._reset_clock()
 
     def _record(self, on: bool) -> None:
         if on and self._take is None:
@@ -260,27 +275,27 @@ class Session:
         if take is None:
             return
         if not take.reports:
-            self._post.send_line("nothing has moved since the take began; there is nothing to write")
+            self._mailbox.send_line("nothing has moved since the take started; no take is written")
             return
-        with self._post.send_busy():
+        with self._mailbox.send_busy():
             try:
                 path = take.write(
-                    *(self.options.takes, self.drawn_as, self.steering.begun, self.steering.requests),
+                    *(self.options.takes, self.drawn_as, self.steering.records, self.steering.requests),
                     source=self.options.source,
-                    asked={"live": True, "friction": self.friction, "sag": self.sag},
-                    driven=[time for time in self.steering.driven if time >= take.start.time],
+                    requested={"live": True, "friction": self.friction, "sag": self.sag},
+                    drive_starts=[time for time in self.steering.drive_starts if time >= take.start.time],
                 )
-                self._post.send_line(f"wrote {path} ({take.seconds:.1f} s); egs-warp view {path}")
+                self._mailbox.send_line(f"wrote {path} ({take.seconds:.1f} s); to show it: egs-warp view {path}")
             except (UserError, OSError) as error:
-                self._post.send_line(f"the take could not be written: {error}")
+                self._mailbox.send_line(f"the take cannot be written: {error}")
 
-    # What is sent.
+    # Frames and events for the page.
 
     def _frame(self) -> Frame:
         return encode_frame(self._index, self.state, self.report, self.creature)
 
     def state_message(self) -> Mapping[str, Any]:
-        """How things stand, beside the frames."""
+        """Return the event ``state``; docs/guide/live.md lists its fields."""
         steering, goal = self.steering, self.steering.goal
         return {
             "type": "state",
@@ -292,10 +307,10 @@ class Session:
             "paused": self._paused,
             "resting": self.resting,
             "recording": self._take is not None,
-            "pulled": self._touches.is_pulling,
+            "pulled": self._user_forces.is_pulling,
             "friction": self.friction,
             "sag": self.sag,
             "style": vars(steering.style),
-            "motions": len(steering.begun),
+            "motions": len(steering.records),
             "step": self._dt,
         }

@@ -1,7 +1,7 @@
-"""What a live creature does next: motions that were asked for, a way to a point, or nothing but standing.
+"""Schedule the motions of a live creature: requested motions, navigation to a point, driving, or standing.
 
-A motion that has begun is done to its end; what is asked for meanwhile takes the place of what was to come, and begins
-as soon as the body is calm.
+A motion that has started is completed. A new request replaces the queued motions and starts as soon as the body is at
+rest.
 """
 
 from __future__ import annotations
@@ -32,42 +32,44 @@ from egs_warp.motions.style import Style
 from egs_warp.motions.walk_posture import select_posture
 from egs_warp.web.idle import RelaxMuscles, tilt_degrees
 
-ARRIVED = 0.12
-"""Body heights from the middle of the feet to the point that it was sent to."""
-ASIDE = 15.0
-"""Degrees: what lies further to the side is turned towards first."""
-_NEAR = 0.25
-"""Body heights: for so short a way it does not turn."""
-_LONGEST_JUMP, _JUMP_HEIGHT = 0.5, 0.2
-"""Body heights."""
-_LONGEST_WALK = 0.8
-"""Body heights, after which it looks where it has come to."""
-_FRUITLESS = 3
-"""Legs that bring it no nearer, after which it gives up."""
-FALLEN = 60.0
-"""Degrees from upright beyond which no motion begins."""
-_DOWN = 1.0
-"""Of sqrt(H / g): for how long it is so tilted before it counts as fallen."""
+ARRIVAL_DISTANCE = 0.12
+"""Body heights, distance from the centre of the feet to the goal at which the goal is reached."""
+MAX_HEADING_ERROR = 15.0
+"""Degrees; if the direction to the goal differs more from the heading, the body turns first."""
+_MIN_TURN_DISTANCE = 0.25
+"""Body heights; for shorter distances to the goal the body does not turn."""
+_MAX_JUMP_DISTANCE, _JUMP_HEIGHT = 0.5, 0.2
+"""Body heights, maximum length and height of a jump towards the goal."""
+_MAX_WALK_DISTANCE = 0.8
+"""Body heights, maximum length of a walk before the next is planned."""
+_MAX_FAILED_LEGS = 3
+"""Number of consecutive legs without progress after which navigation stops."""
+FALLEN_TILT = 60.0
+"""Degrees from upright beyond which a body counts as fallen."""
+_FALL_TIME = 1.0
+"""sqrt(H / g), time for which a body must be tilted to count as fallen."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A motion to come, and how a script asks for it."""
+    """A queued motion and its request."""
 
     part: MotionTask
+    """The motion."""
     request: MotionRequest
+    """The request, for a script."""
 
 
 class BodyStatus(Enum):
-    """What a body is about."""
+    """State of a body between and during motions."""
 
     STANDING = "standing"
     MOVING = "moving"
     LYING = "lying"
 
 
-class _Steered(Protocol):
-    """A motion, as far as it is steered."""
+class _SchedulableMotion(Protocol):
+    """Interface of the motions that the scheduler runs."""
 
     @property
     def is_at_rest(self) -> bool: ...
@@ -79,16 +81,18 @@ class _Steered(Protocol):
 
 @dataclass(frozen=True)
 class _ActiveMotion:
-    """What it does now."""
+    """The active motion."""
 
     name: str
-    """As the user reads it."""
-    motion: _Steered
+    """Name that the user reads."""
+    motion: _SchedulableMotion
+    """The motion itself."""
     posture: BodyStatus
+    """State of the body during the motion."""
 
 
 def tasks_of(script: Script, height: float) -> list[Task]:
-    """Of a body of ``height`` metres, in their order."""
+    """Return the motions of ``script`` in their order, for a body of ``height`` m."""
     tasks = []
     for request in script.requests:
         once = replace(request, repeat=1)
@@ -97,43 +101,42 @@ def tasks_of(script: Script, height: float) -> list[Task]:
 
 
 class PointNavigation:
-    """The way to a point: walk there, or turn towards it and jump; each leg is planned from where the last one
-    ended."""
+    """Navigation to a point by walking, or by turns and jumps. Each leg is planned from the end of the last one."""
 
     def __init__(self, goal: np.ndarray, *, walks: bool) -> None:
-        """``goal`` (2,) metres; ``walks``: whether the body can walk."""
+        """Navigate to ``goal`` (2,) m; ``walks`` is True if the body can walk."""
         self.goal = goal
         self._walks = walks
-        self._nearest, self._fruitless = np.inf, 0
+        self._nearest, self._failed_legs = np.inf, 0
 
     def next_part(self, place: Stance) -> Task | None:
-        """What brings the body that stands at ``place`` nearer; None where it has arrived.
+        """Return the next motion of a body at ``place``; None if the goal is reached.
 
-        Raises ``UserError`` where several legs did not.
+        Raises ``UserError`` after several legs without progress.
         """
         height = place.body.height
         feet = sole_shares(place.body, place.ground, place.standing) @ place.standing
-        way = np.array([*(self.goal - feet[:2]), 0.0])
-        distance = float(np.linalg.norm(way)) / height
-        if distance <= ARRIVED:
+        to_goal = np.array([*(self.goal - feet[:2]), 0.0])
+        distance = float(np.linalg.norm(to_goal)) / height
+        if distance <= ARRIVAL_DISTANCE:
             return None
         if distance < self._nearest - 0.05:
-            self._nearest, self._fruitless = distance, 0
+            self._nearest, self._failed_legs = distance, 0
         else:
-            self._fruitless += 1
-        if self._fruitless > _FRUITLESS:
-            raise UserError(f"go: it comes no nearer than {self._nearest:.2f} body heights; choose another point")
-        x, y = place.ground.axes[:2] @ way
+            self._failed_legs += 1
+        if self._failed_legs > _MAX_FAILED_LEGS:
+            raise UserError(f"go: the body gets no nearer than {self._nearest:.2f} body heights; choose another point")
+        x, y = place.ground.axes[:2] @ to_goal
         if self._walks:
-            ahead, left = min(1.0, _LONGEST_WALK / distance) / height * np.array([x, y])
+            ahead, left = min(1.0, _MAX_WALK_DISTANCE / distance) / height * np.array([x, y])
             return self._task(f"walk to {ahead:.3f},{left:.3f}", height)
         aside = float(np.degrees(np.arctan2(y, x)))
-        if abs(aside) > ASIDE and distance > _NEAR:
+        if abs(aside) > MAX_HEADING_ERROR and distance > _MIN_TURN_DISTANCE:
             return self._task(f"twist {aside:.1f} 0 {_JUMP_HEIGHT}", height)
-        leap = distance / np.ceil(distance / _LONGEST_JUMP)
+        leap = distance / np.ceil(distance / _MAX_JUMP_DISTANCE)
         task = self._task(f"jump {leap:.3f} {_JUMP_HEIGHT}", height)
         begin = task.part.begin
-        return replace(task, part=replace(task.part, begin=lambda at: begin(at.facing(way))))
+        return replace(task, part=replace(task.part, begin=lambda at: begin(at.facing(to_goal))))
 
     @staticmethod
     def _task(text: str, height: float) -> Task:
@@ -141,158 +144,172 @@ class PointNavigation:
 
 
 class MotionScheduler:
-    """Holds the motion of a body and chooses the next; itself a motion."""
+    """Runs the motions of a body one after the other; is itself a motion."""
 
-    def __init__(self, place: Stance, tell: Callable[[str], object]) -> None:
-        """``place``: where the body stands at first; ``tell`` is given each line for the user."""
-        self.begun: list[MotionRecord] = []
+    def __init__(self, place: Stance, send_line: Callable[[str], object]) -> None:
+        """Stand at ``place``; ``send_line`` sends one line of text to the user."""
+        self.records: list[MotionRecord] = []
+        """Motions that have been started."""
         self.requests: list[MotionRequest] = []
-        """Of ``begun``."""
-        self._tell = tell
+        """Request of each entry of ``records``."""
+        self._send_line = send_line
         self._tasks: deque[Task] = deque()
         self._journey: PointNavigation | None = None
         self._drive = Drive()
-        """How it is to go."""
-        self.driven: list[float] = []
-        """Seconds at which it began to be driven."""
+        """Requested speeds."""
+        self.drive_starts: list[float] = []
+        """Times in s at which the user started to drive the body."""
         self.style = Style()
-        """Of the next motion that begins."""
+        """Style of the next motion."""
         self.stand(place)
         self.walks = _walks(place)
 
     def stand(self, place: Stance) -> None:
-        """Stand at ``place``, and drop all else."""
+        """Stand at ``place``, and cancel everything else."""
         self.cancel()
         self.place = place
         self._is_ball = place.base() is SupportKind.ROUND_BASE
-        self._act: _ActiveMotion = _ActiveMotion("stand", Stand(place), BodyStatus.STANDING)
+        self._active: _ActiveMotion = _ActiveMotion("stand", Stand(place), BodyStatus.STANDING)
         self._tilted_since: float | None = None
 
     def perform(self, script: Script) -> None:
-        """Do its motions next."""
+        """Queue the motions of ``script`` in place of the queued ones."""
         self.cancel()
         self._tasks.extend(tasks_of(script, self.place.body.height))
 
     def go(self, goal: np.ndarray) -> None:
-        """Go to ``goal`` (2,) next, metres."""
+        """Go to ``goal`` (2,) m next, in place of the queued motions."""
         self.cancel()
         self._journey = PointNavigation(goal, walks=self.walks)
 
     def drive(self, command: Drive) -> None:
-        """Go so from now on, once what it does is done; until another command, or anything else that is asked."""
+        """Move at the speeds of ``command`` after the active motion, until the next request."""
         self.cancel()
         self._drive = command
 
     def cancel(self) -> None:
-        """Drop what was to come; what is driven stops."""
+        """Cancel the queued motions, the navigation and the driving."""
         self._drive = Drive()
         self._tasks.clear()
         self._journey = None
 
     @property
     def doing(self) -> str:
-        """Name of the motion."""
-        return self._act.name
+        """Name of the active motion."""
+        return self._active.name
 
     @property
     def queued(self) -> str | None:
-        """Name of what comes next."""
+        """Name of the next motion; None if there is none."""
         if self._tasks:
             return self._tasks[0].part.name
         if self._journey:
             return "go"
-        return None if self._drive.is_zero or isinstance(self._act.motion, LiveDrive) else "drive"
+        return None if self._drive.is_zero or isinstance(self._active.motion, LiveDrive) else "drive"
 
     @property
     def idle(self) -> bool:
-        """Whether it stands or lies, and nothing is to come."""
-        return self._act.posture is not BodyStatus.MOVING and self._act.motion.is_at_rest and self.queued is None
+        """True if the body stands or lies, and no motion is queued."""
+        return self._active.posture is not BodyStatus.MOVING and self._active.motion.is_at_rest and self.queued is None
 
     @property
     def goal(self) -> np.ndarray | None:
-        """(2,) metres, where it is going."""
+        """(2,) m, goal of the navigation; None if there is none."""
         return self._journey.goal if self._journey else None
 
     def facing(self, positions: np.ndarray) -> np.ndarray:
-        """(2,) unit vector of its way forward, with its nodes at ``positions`` (N, 3)."""
+        """Return the (2,) unit vector of the forward direction, for nodes at ``positions`` (N, 3) m."""
         place = self.place if self._is_ball else self.place.moved_to(positions)
         forward = place.ground.axes[0, :2]
         return forward / max(float(np.linalg.norm(forward)), 1e-12)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
+        """Return the objectives of the active motion, after starting the next motion if that is due.
+
+        Args:
+            state: state at the start of the step.
+            report: report of the last step; None if there is none.
+            dt: step size, s.
+        """
         if self._has_fallen(state):
             self._lie(state, report)
-        elif self._act.motion.is_at_rest and not (isinstance(self._act.motion, LiveDrive) and not self._drive.is_zero):
+        elif self._active.motion.is_at_rest and not (
+            isinstance(self._active.motion, LiveDrive) and not self._drive.is_zero
+        ):
             self._begin_next(state, report)
-        if isinstance(self._act.motion, LiveDrive):
-            self._act.motion.command = self._drive
-        return self._act.motion.objectives(state, report, dt)
+        if isinstance(self._active.motion, LiveDrive):
+            self._active.motion.command = self._drive
+        return self._active.motion.objectives(state, report, dt)
 
     def _lie(self, state: BodyState, report: StepReport | None) -> None:
-        """It lies, but for getting up where that is asked."""
-        if isinstance(self._act.motion, GetUp) and not self._act.motion.is_at_rest:
+        """Handle a fallen body: get up if that is active or queued, otherwise relax and cancel the queued motions."""
+        if isinstance(self._active.motion, GetUp) and not self._active.motion.is_at_rest:
             return
         if self._tasks and self._tasks[0].part.name == "get up":
             self._begin_next(state, report)
             return
-        if self._act.posture is not BodyStatus.LYING:
-            self._act = _ActiveMotion("fallen", RelaxMuscles(), BodyStatus.LYING)
-            self._tell("it has fallen; tell it to get up, or Backspace stands it up again")
+        if self._active.posture is not BodyStatus.LYING:
+            self._active = _ActiveMotion("fallen", RelaxMuscles(), BodyStatus.LYING)
+            self._send_line("the body has fallen; type get up, or press Backspace to put it back at its start")
         self.cancel()
 
     def _begin_next(self, state: BodyState, report: StepReport | None) -> None:
+        """Start the next motion: queued, navigation, drive or, without any, stand."""
         place = replace(self.place.next_stance(state.positions, report), style=self.style)
         if self._is_ball:
             self.place = place
         try:
             task = self._tasks.popleft() if self._tasks else self._journey.next_part(place) if self._journey else None
-            begun = task.part.begin(place) if task is not None else None
+            next_motion = task.part.begin(place) if task is not None else None
         except UserError as error:
             self.cancel()
-            self._tell(str(error))
-            task = begun = None
+            self._send_line(str(error))
+            task = next_motion = None
         if task is None and not self._drive.is_zero and self._begin_drive(place, state.time):
             return
-        if task is None or begun is None:
+        if task is None or next_motion is None:
             self._journey = None
-            if self._act.posture is not BodyStatus.STANDING:
-                self._say_notes()
-                self._act = _ActiveMotion("stand", Stand(place), BodyStatus.STANDING)
+            if self._active.posture is not BodyStatus.STANDING:
+                self._send_notes()
+                self._active = _ActiveMotion("stand", Stand(place), BodyStatus.STANDING)
             return
-        self._say_notes()
-        self._act = _ActiveMotion(task.part.name, begun, BodyStatus.MOVING)
-        self.begun.append(MotionRecord(task.part.name, task.part.asked, begun, state.time))
-        styled = MOTIONS[task.request.name].jumps and self.style != Style()
-        self.requests.append(replace(task.request, style=self.style) if styled else task.request)
+        self._send_notes()
+        self._active = _ActiveMotion(task.part.name, next_motion, BodyStatus.MOVING)
+        self.records.append(MotionRecord(task.part.name, task.part.asked, next_motion, state.time))
+        has_style = MOTIONS[task.request.name].jumps and self.style != Style()
+        self.requests.append(replace(task.request, style=self.style) if has_style else task.request)
 
     def _begin_drive(self, place: Stance, time: float) -> bool:
+        """Start driving; return False, after a line to the user, if the body cannot be driven."""
         try:
-            driven = LiveDrive(place)
+            drive = LiveDrive(place)
         except UserError as error:
             self.cancel()
-            self._tell(str(error))
+            self._send_line(str(error))
             return False
-        self._say_notes()
-        self._act = _ActiveMotion("drive", driven, BodyStatus.MOVING)
-        self.driven.append(time)
+        self._send_notes()
+        self._active = _ActiveMotion("drive", drive, BodyStatus.MOVING)
+        self.drive_starts.append(time)
         return True
 
-    def _say_notes(self) -> None:
-        for note in self._act.motion.notes():
-            self._tell(f"{self.doing}: {note}")
+    def _send_notes(self) -> None:
+        """Send the notes of the active motion to the user."""
+        for note in self._active.motion.notes():
+            self._send_line(f"{self.doing}: {note}")
 
     def _has_fallen(self, state: BodyState) -> bool:
+        """Return True if the body has been tilted beyond ``FALLEN_TILT`` for ``_FALL_TIME``."""
         # A ball cannot fall.
-        if self._is_ball or tilt_degrees(self.place, state.positions) <= FALLEN:
+        if self._is_ball or tilt_degrees(self.place, state.positions) <= FALLEN_TILT:
             self._tilted_since = None
             return False
         if self._tilted_since is None:
             self._tilted_since = state.time
         body = self.place.body
-        longest = _DOWN * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
-        return state.time - self._tilted_since > longest
+        max_time = _FALL_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
+        return state.time - self._tilted_since > max_time
 
 
 def _walks(place: Stance) -> bool:
+    """Return True if a body at ``place`` can walk, crawl or roll."""
     return place.base() in (SupportKind.LYING, SupportKind.ROUND_BASE) or len(select_posture(place)[0]) > 0

@@ -1,4 +1,4 @@
-"""What the hand of a user does to a body: a pull that lasts until it is released, and pushes of the next step."""
+"""Forces of the user on a body: a pull that lasts until it is released, and pushes in the next step."""
 
 from __future__ import annotations
 
@@ -12,45 +12,51 @@ from egs_warp.web.spring import Spring
 
 
 class UserForces:
-    """The pull that goes on, and the pushes since the last step."""
+    """The active pull, and the pushes since the last step."""
 
     def __init__(self) -> None:
         self._spring: Spring | None = None
-        self._hits: list[PushOnce] = []
+        self._pushes: list[PushOnce] = []
 
     @property
     def is_pulling(self) -> bool:
-        """Whether a pull goes on."""
+        """True if a pull is active."""
         return self._spring is not None
 
     @property
     def has_input(self) -> bool:
-        """Whether the next step has something of a hand."""
-        return self.is_pulling or bool(self._hits)
+        """True if a pull or a push acts in the next step."""
+        return self.is_pulling or bool(self._pushes)
 
-    def pull(self, body: SoftBody, asked: Pull) -> None:
-        """Pull towards another place, or at another node."""
-        if self._spring is None or self._spring.node != asked.node:
-            self._spring = Spring(body, asked.node)
-        self._spring.target = np.array(asked.target)
+    def pull(self, body: SoftBody, request: Pull) -> None:
+        """Start a pull, or move its target or node."""
+        if self._spring is None or self._spring.node != request.node:
+            self._spring = Spring(body, request.node)
+        self._spring.target = np.array(request.target)
 
     def release(self) -> None:
         """End the pull."""
         self._spring = None
 
-    def push(self, asked: PushOnce) -> None:
+    def push(self, request: PushOnce) -> None:
         """Push in the next step."""
-        self._hits.append(asked)
+        self._pushes.append(request)
 
     def clear(self) -> None:
-        """Forget pull and pushes."""
+        """Remove the pull and all pushes."""
         self._spring = None
-        self._hits.clear()
+        self._pushes.clear()
 
     def kick(self, place: Stance, state: BodyState, dt: float) -> np.ndarray | None:
-        """(N, 3) m/s that they give the nodes in a step of ``dt`` s from ``state``; None if there are none."""
-        hits, self._hits = self._hits, []
-        kicks = [kick_of(place, np.array(hit.impulse), hit.height) for hit in hits]
+        """Return the (N, 3) m/s that pull and pushes add to the nodal velocities; None if there are none.
+
+        Args:
+            place: stance of the body, for the height at which a push acts.
+            state: state at the start of the step.
+            dt: step size, s.
+        """
+        pushes, self._pushes = self._pushes, []
+        kicks = [kick_of(place, np.array(push.impulse), push.height) for push in pushes]
         if self._spring is not None:
             kicks.append(self._spring.kick(state, dt))
         return np.sum(kicks, axis=0) if kicks else None

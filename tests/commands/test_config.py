@@ -31,16 +31,16 @@ def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.Ca
     assert cli.main(again) == 0
     for name in ("jump.mp4", "sheet.png", "trajectory.npz", "creature.npz", "run.yaml"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
-    # So many pictures, the first at rest, as asked.
+    # The requested number of frames, the first at rest.
     assert count_frames_and_secs(str(tmp_path / "a" / "jump.mp4"))[0] == 4
     run = FinishedRun.read(tmp_path / "a")
     assert len(run.steps) == run.report["asked"]["frames"] == 4
     assert run.trajectory.time[-1] == pytest.approx(3 / 60)
     assert '"run.yaml"' in (tmp_path / "a" / "manifest.json").read_text()
-    assert "is not the file" not in capsys.readouterr().err
+    assert "differs from the capture" not in capsys.readouterr().err
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=4100).cloud)
     assert cli.main([*again[:-1], str(tmp_path / "c"), "--frames", "2"]) == 0
-    assert "is not the file that the run of" in capsys.readouterr().err
+    assert "differs from the capture of the run in" in capsys.readouterr().err
     assert yaml.safe_load((tmp_path / "c" / "run.yaml").read_text())["frames"] == 2
 
 
@@ -121,7 +121,7 @@ def test_clicks_are_a_list_and_those_given_beside_the_file_go_alone(tmp_path: Pa
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("speed: 3", "unknown key 'speed'; give some of background, beats, camera,"),
+        ("speed: 3", "unknown key 'speed'; known keys are background, beats, camera,"),
         ("trust: true", "unknown key 'trust'"),
         ("motion: [jump]", "motion is ['jump']; give a text or a number"),
         ("motion: true", "motion is True; give a text or a number"),
@@ -187,4 +187,4 @@ def test_help_names_every_command_and_its_examples_are_valid(capsys: pytest.Capt
         assert examples and "exit status:" in text
         for example in examples:
             if "--config" not in example:
-                parser.parse_args([name, *cli._joined(shlex.split(example))])
+                parser.parse_args([name, *cli._attach_negative_values(shlex.split(example))])

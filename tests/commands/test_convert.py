@@ -1,4 +1,4 @@
-"""Captures in other formats: what is told to be lost is lost, and nothing else."""
+"""Conversion of captures: exactly the reported losses occur."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     before = (tmp_path / "a.ply").read_bytes()
     for flags, said in (
         (["a.ply", "b.xyz"], "b.xyz: give a name that ends in .compressed.ply, .ply, .spz, .sog, .splat, .glb"),
-        (["a.ply", "a.ply"], "a.ply: is what is read; give another name"),
+        (["a.ply", "a.ply"], "a.ply: is the input file; give another name"),
         (["a.ply", "no/b.ply"], "its folder does not exist"),
         (["none.ply", "b.ply"], "none.ply: no such file"),
         (["a.ply", "out", "--to", "spz4"], "out: give a name that ends in .spz"),

@@ -1,4 +1,4 @@
-"""What ``egs-warp doctor`` says is so, and what it compiles is all that a run needs."""
+"""``egs-warp doctor``: the report is correct, and ``--warm`` compiles all kernels that a run needs."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ def test_after_warm_a_run_compiles_nothing(tmp_path: Path) -> None:
         return subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=400).stdout
 
     before = run("doctor")
-    assert "kernels 0/" in before and "wait to be compiled for cpu" in before
+    assert "kernels 0/" in before and "kernel files are not compiled for cpu" in before
     warm = run("doctor", "--warm")
-    assert "wait to be compiled" not in warm
+    assert "are not compiled" not in warm
     there = {path for path in (tmp_path / "cache").rglob("*.o")}
     code = (
         "import sys; from egs_warp.assets.pawn import pawn; from egs_warp.pipelines.animate import *;"

@@ -42,7 +42,7 @@ KEYS = [{"time": 0.4, "part": "head", "quantity": "position", "value": [0, 0, -0
 
 
 def made(folder: Path) -> Path:
-    """What the commands take."""
+    """Write the input files of the commands into ``folder``."""
     write_ply(folder / "pawn.ply", pawn(gaussian_count=2000, device="cpu").cloud)
     (folder / "keys.json").write_text(json.dumps(KEYS))
     return folder
@@ -56,7 +56,7 @@ def animate(name: str, folder: Path, out: Path) -> list[str]:
 
 
 def bits(folder: Path) -> dict[str, bytes | str]:
-    """Of all files, but for the milliseconds of the report and so the checksum of it."""
+    """Return the contents of all files, without the timings of the report and its checksum."""
     found: dict[str, bytes | str] = {path.name: path.read_bytes() for path in folder.iterdir()}
     report = json.loads(found["report.json"])
     found["report.json"] = json.dumps(report | {"timing": None})
@@ -78,7 +78,7 @@ def finishes(arguments: Sequence[str]) -> int:
 
 
 def has_begun(out: Path) -> bool:
-    """Whether ``resume`` takes it: a manifest alone, of a run that was killed before its first file, is no run yet."""
+    """Return True if ``out`` contains a run that can be resumed; a manifest without other files is not one."""
     try:
         has_finished(out)
     except UserError as error:
@@ -112,7 +112,7 @@ def test_a_run_that_is_killed_again_and_again(tmp_path: Path, capsys: pytest.Cap
     assert ended_by(first, signal.SIGKILL, parts / "start.npz", 0.2 * moments.random())[0] == -signal.SIGKILL
     status, said = ended_by(again, signal.SIGINT, parts / "steps-000001.npz", 0.2 * moments.random())
     told = "egs-warp: stopped; finished files are whole, unfinished ones are gone"
-    assert status == 130 and said.splitlines()[-1] == f"{told}; egs-warp resume {out} goes on"
+    assert status == 130 and said.splitlines()[-1] == f"{told}; egs-warp resume {out} continues it"
     assert not [name for name in os.listdir(out) if name.startswith(".egs-")]
     assert ended_by(again, signal.SIGKILL, out / "plots.png", 0.0)[0] == -signal.SIGKILL
     assert not json.loads((out / MANIFEST).read_text())["finished"]
@@ -130,9 +130,7 @@ def test_a_run_that_is_killed_again_and_again(tmp_path: Path, capsys: pytest.Cap
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_random_moments(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """SIGKILL at any time, preparation and film included, and Ctrl-C; a run that had not begun to write is begun
-    again.
-    """
+    """SIGKILL and Ctrl-C at any time, including preparation and video; a run without files is started again."""
     folder, whole = made(tmp_path), tmp_path / "whole"
     if name == "walk":
         # A coarser stool has no four feet.
@@ -156,7 +154,10 @@ def test_random_moments(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_each_opening_and_renaming_of_what_goes_on_fails_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a run that was cut off at its film: one line, nothing half-written, not finished, and ``resume`` goes on."""
+    """Resume a run that was interrupted during the video: an error is one line and leaves nothing half-written.
+
+    The folder does not count as finished. A second ``resume`` completes the run.
+    """
     folder, whole, cut, out = made(tmp_path), tmp_path / "whole", tmp_path / "cut", tmp_path / "out"
     assert coarse_main(animate("jump", folder, whole)) == 0
     with monkeypatch.context() as patch:
@@ -202,7 +203,7 @@ def test_what_cannot_go_on_is_told(tmp_path: Path, capsys: pytest.CaptureFixture
         manifest.write_text(broken)
         assert told(out) == f"egs-warp: {manifest}: is no manifest of a run; begin the run again\n"
     manifest.write_text(json.dumps(content | {"version": "0.1.0"}))
-    assert "run.yaml: is missing, the run was cut off before its first step; begin it again" in told(out)
+    assert "run.yaml: is missing; the run was interrupted before its first step; start it again" in told(out)
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=50, device="cpu").cloud)
     (out / "run.yaml").write_text("capture: ../pawn.ply\nup: z\ncapture_sha256: 0\n")
-    assert "pawn.ply: is not the file that the run had; bring that back, or begin the run again" in told(out)
+    assert "pawn.ply: differs from the capture of the run; restore that file, or start the run again" in told(out)

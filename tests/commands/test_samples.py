@@ -1,4 +1,4 @@
-"""What ``egs-warp samples`` writes can be read, and what it says to type is what the command takes."""
+"""``egs-warp samples``: its files can be read, and its suggested commands are valid."""
 
 from __future__ import annotations
 

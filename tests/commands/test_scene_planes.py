@@ -22,7 +22,7 @@ def test_further_planes_are_level_patches_in_colours_of_their_own() -> None:
     found = planes_of_scene(given, plane_mask=None, view=None, count=5)
     assert [-one.offset for one in found.planes] == pytest.approx([0.0, 0.52, 0.68], abs=0.01)
     assert all(one.normal[2] > np.cos(np.radians(1.0)) for one in found.planes)
-    assert found.notes[-1] == "3 of 5 planes found"
+    assert found.notes[-1] == "found 3 of 5 planes"
     cameras = picture_cameras(made.plane, found.centre, found.size)[1:2]
     picture = plane_picture(cloud, found.planes[:2], cameras, centre=found.centre, size=found.size).astype(float)
     red, green, _ = np.moveaxis(picture, -1, 0)
@@ -46,4 +46,4 @@ def test_a_capture_with_nothing_flat_has_one_plane() -> None:
     )
     given = SceneInput(cloud, [], ObjectSpec(point=np.array([0.0, 0.0, 0.3])), None, FLOOR, ())
     found = planes_of_scene(given, plane_mask=None, view=None, count=2)
-    assert len(found.planes) == 1 and found.notes[-1] == "1 of 2 planes found"
+    assert len(found.planes) == 1 and found.notes[-1] == "found 1 of 2 planes"

@@ -27,7 +27,7 @@ from tests.support.scenes import FLOOR, write_scene
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """scene.ply, cameras.json, and the mask of its second view."""
+    """Folder with scene.ply, cameras.json and the mask of the second view."""
     path = tmp_path_factory.mktemp("scene")
     mask = write_scene(path, views=6, size=96)
     corner = np.zeros_like(mask)
@@ -102,7 +102,7 @@ def test_a_mask_of_the_plane_is_called_by_its_flag(
 ) -> None:
     flags = ["--plane-mask", "gone.png", "--cameras", str(folder / "cameras.json"), "--out", str(tmp_path / "out")]
     assert main(["plane", str(folder / "scene.ply"), *flags]) == 2
-    assert "--plane-mask gone.png: no such file, nor numbers; give a mask.png" in capsys.readouterr().err
+    assert "--plane-mask gone.png: no such file, and not numbers; give a mask.png" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_a_mask_of_the_plane_is_called_by_its_flag(
         (["--object", "{folder}/sky/photo1.png", "--cameras", "{folder}/cameras.json"], "nothing of the capture shows"),
         (
             ["--object", "{folder}/short/photo1.png", "--cameras", "{folder}/cameras.json"],
-            "make it at the photo's size",
+            "give a mask of the photo's size",
         ),
         (
             ["--object", "{folder}/white/photo1.png", "--cameras", "{folder}/cameras.json"],

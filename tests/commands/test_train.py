@@ -48,11 +48,12 @@ def test_ctrl_c_tells_how_to_go_on(
 
         patch.setattr("egs_warp.commands.train._Progress.step", stop)
         assert main(line(posed, out)) == 130
-    assert capsys.readouterr().err.splitlines()[-1].endswith("; --resume beside the same flags goes on")
+    assert capsys.readouterr().err.splitlines()[-1].endswith("; continue with --resume and the same flags")
     assert sorted(os.listdir(out.parent)) == ["a.training.npz"]
     assert main(line(posed, out)) == 2
     assert capsys.readouterr().err == (
-        f"egs-warp: --out {out}: a training was cut off here; --resume goes on with it, --overwrite begins again\n"
+        f"egs-warp: --out {out}: an interrupted training is here; give --resume to continue it, or --overwrite to start"
+        " again\n"
     )
     assert main([*line(posed, out), "--resume"]) == 0
     assert bits(out.parent) == bits(whole.parent)
@@ -62,7 +63,7 @@ def test_ctrl_c_tells_how_to_go_on(
 
 
 def test_an_earlier_training_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its report and sheet, too, which nobody has named."""
+    """The report and the sheet, which no flag names, are protected, too."""
     posed, out = posed_folder(tmp_path / "posed"), tmp_path / "a.ply"
     (tmp_path / "a.sheet.png").write_bytes(b"sheet")
     assert main(line(posed, out)) == 2
@@ -79,8 +80,9 @@ def test_an_earlier_training_is_kept(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 @pytest.mark.slow
 def test_random_moments(tmp_path: Path, device: str) -> None:
-    """SIGKILL at any time, every other one once there is something to go on from; else the training is begun again. On
-    a GPU, too, the capture has the bits of one that was not cut off: there are no atomic sums of floats.
+    """SIGKILL at any time, every other one after the first checkpoint; without a checkpoint the training starts again.
+
+    The capture is bitwise that of an uninterrupted training, also on a GPU, because no float sums are atomic.
     """
     posed, whole = posed_folder(tmp_path / "posed"), tmp_path / "whole" / "a.ply"
     command = [sys.executable, "-c", OFTEN]

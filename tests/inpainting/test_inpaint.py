@@ -282,13 +282,13 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         ([*quick, str(tmp_path / "gone" / "a.png")], "a.png: its folder does not exist; create"),
         ([*quick, str(tmp_path / "a.jpg")], "a.jpg: give the name of a .png file"),
         ([*files, str(tmp_path / "gone" / "a.ply"), *where], "a.ply: its folder does not exist; create"),
-        ([*files, "a.ply"], "say where the hole is by one of --object, --mask with --cameras, or --hole"),
+        ([*files, "a.ply"], "the hole is not defined; give one of --object, --mask with --cameras, or --hole"),
         ([*files, "a.txt", *where], "--out a.txt: give the name of a .ply file"),
         ([*files, "a.ply", "--hole", "1,2"], "--hole 1,2: give four numbers x,y,z,radius"),
         ([*files, "a.ply", "--mask", "gone.png"], "--mask gone.png: no such file or folder"),
         (
             [*files, "a.ply", "--mask", files[0]],
-            "--mask: give the cameras that the masks were painted for by --cameras",
+            "--mask: a mask needs its camera; give --cameras",
         ),
         (
             [*files, "a.ply", *where, "--inpainter", "magic"],

@@ -67,7 +67,7 @@ def test_it_needs_numpy_alone_and_fits_the_capture(
     ("flags", "said"),
     [
         (["--out", "a.zip"], "a.zip: give a name that ends in .npz"),
-        (["--out", "a.npz", "--frame", "2"], "--frame: a bundle holds all frames"),
+        (["--out", "a.npz", "--frame", "2"], "--frame: a bundle contains all frames"),
         (["--out", "a.npz", "--every", "0"], "--every 0: give a whole number of at least 1"),
     ],
 )

@@ -160,7 +160,7 @@ def test_usd_is_read_back_by_openusd_with_the_right_samples(run: FinishedRun, tm
     [
         (["--to", "ply", "--frame", "13"], "--frame 13: the run has 13 frames; give 0 to 12, or -1 for the last"),
         (["--to", "ply", "--every", "0"], "--every 0: give a whole number of at least 1"),
-        (["--to", "usd", "--frame", "1"], "--frame: a USD stage holds all frames"),
+        (["--to", "usd", "--frame", "1"], "--frame: a USD stage contains all frames"),
         (["--to", "usd"], "give a name that ends in .usdc or .usda"),
     ],
 )

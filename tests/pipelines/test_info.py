@@ -107,7 +107,7 @@ def test_the_command_prints_the_lines_and_writes_the_picture(
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--plot", "info.jpg"], "--plot info.jpg: give the name of a .png"),
+        (["--plot", "info.jpg"], "--plot info.jpg: give a file name that ends in .png"),
         (["--up", "z", "--front", "0,0,1"], "--front 0,0,1: points up or down; give a direction along the ground"),
         (["--metres-per-unit", "-1"], "--metres-per-unit -1.0: give a positive number"),
     ],

@@ -136,7 +136,7 @@ def test_photos_of_a_room_get_the_poses_that_they_had(
     out = tmp_path / "posed"
     assert main(["pose", str(photos), "--out", str(out), "--max-side", "800"]) == 0
     printed = capsys.readouterr()
-    assert "posed 12 of 12 photos (100 %)" in printed.out
+    assert "estimated the poses of 12 of 12 photos (100 %)" in printed.out
     assert "features 12/12" in printed.err and "matches 66/66" in printed.err
     found = {view.name: view for view in read_cameras(out)}
     assert all(view.image is not None and view.camera.width == 800 for view in found.values())

@@ -48,9 +48,9 @@ def prepared() -> PreparedScene:
         (["--terrain", "{tmp}/no.json"], "no.json: no such file or folder"),
         (["--inpainter", "lama"], "--inpainter lama: give patch, telea, ns or an ONNX file"),
         (["--inpainter", "ns", "--no-inpaint"], "--inpainter: --no-inpaint leaves the floor as captured"),
-        (["--object", ""], "--object: nothing is given; give a mask.png"),
+        (["--object", ""], "--object: the value is empty; give a mask.png"),
         (["--object", "0,0,0.5", "--up", ""], "--up : give one of x, y, z"),
-        (["--background", "{tmp}/no.ply"], "--background: with --object the rest of the scene is behind the object"),
+        (["--background", "{tmp}/no.ply"], "--background: with --object the rest of the scene is the background"),
     ],
 )
 def test_a_slip_is_told_before_the_scene_is_taken_apart(

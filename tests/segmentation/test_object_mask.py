@@ -159,19 +159,19 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     assert clicked is not None
     np.testing.assert_allclose(np.linalg.norm(clicked - [0.0, 0.0, 0.5]), 0.5, atol=0.04)
     for text, given, view, message in (
-        ("nothing.png", posed, None, "--object nothing.png: no such file, nor numbers"),
+        ("nothing.png", posed, None, "--object nothing.png: no such file, and not numbers"),
         ("1,2,3,4", posed, None, "--object 1,2,3,4: 4 numbers"),
         ("1e300,2,3", posed, None, "--object 1e300,2,3: further than 1e.12 units from the origin"),
         ("1,2,3,1,5,6", posed, None, "the box is flat"),
         ("5,5", [], None, "a pixel needs cameras"),
-        ("5,5", posed, None, "3 cameras; say which with --view"),
-        ("5,5", posed, "\u00b2", "--view \u00b2: no such camera; there are 3"),
-        ("+5,5@" + "1" * 5000, posed, None, "no such camera; there are 3"),
-        ("5,5", posed, "nobody", "--view nobody: no such camera; there are 3"),
-        ("1,1", posed, "2", "the capture shows nothing there"),
-        ("99,1", posed, "2", "outside of the view's 64 x 64 pixels"),
-        (str(tmp_path / "other.png"), posed, None, "no camera's photo is called other"),
-        (str(tmp_path / "other.png"), [], None, "a mask needs the camera that it was drawn in"),
+        ("5,5", posed, None, "3 cameras; choose one by --view"),
+        ("5,5", posed, "\u00b2", "--view \u00b2: no such camera; the 3 cameras are"),
+        ("+5,5@" + "1" * 5000, posed, None, "no such camera; the 3 cameras are"),
+        ("5,5", posed, "nobody", "--view nobody: no such camera; the 3 cameras are"),
+        ("1,1", posed, "2", "no Gaussian is visible at this pixel"),
+        ("99,1", posed, "2", "outside of the 64 x 64 pixels of the view"),
+        (str(tmp_path / "other.png"), posed, None, "no photo has the name other"),
+        (str(tmp_path / "other.png"), [], None, "a mask needs its camera"),
         (str(tmp_path / "cameras.json"), posed, "0", "not a readable picture"),
     ):
         with pytest.raises(UserError, match=message):

@@ -194,6 +194,6 @@ def test_a_mask_model_at_the_command_line(
     assert (
         main(["segment", str(tmp_path / "scene.ply"), "--object=-0.5,0,0.5", *shared[:-1], str(tmp_path / "no")]) == 2
     )
-    assert "alike.onnx: it makes masks from clicks; give --object +u,v@photo alone" in capsys.readouterr().err
+    assert "alike.onnx: it needs clicks and no other object; give only --object +u,v@photo" in capsys.readouterr().err
     assert main(["segment", str(tmp_path / "scene.ply"), "--object", "salient", "--out", str(tmp_path / "no")]) == 2
-    assert "--object salient: needs pictures to look at; give --cameras" in capsys.readouterr().err
+    assert "--object salient: needs cameras; give --cameras" in capsys.readouterr().err

@@ -22,7 +22,7 @@ def chromium() -> Iterator[Any]:
 
 @pytest.fixture
 def session(tmp_path: Path) -> Iterator[Session]:
-    """Of a coarse pawn, in its thread."""
+    """Session of a coarse pawn that runs in its thread."""
     made = session_of(coarse_pawn(), tmp_path)
     made.start()
     yield made

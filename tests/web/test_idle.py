@@ -43,21 +43,21 @@ def test_a_pushed_body_comes_back_over_its_feet(tmp_path: Path):
 
 def test_one_that_is_thrown_over_lies_relaxed_and_stands_up_when_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """At once, where a pawn on its side would else get up again."""
-    monkeypatch.setattr(steering, "_DOWN", 0.0)
+    monkeypatch.setattr(steering, "_FALL_TIME", 0.0)
     played = SteppedSession(coarse_pawn(), tmp_path)
     session = played.session
     lying = Rotation.from_euler("y", 90.0, degrees=True).apply(session.state.positions)
     lying[:, 2] -= lying[:, 2].min()
     session.state = BodyState(lying, np.tile([0.0, 0.0, -0.2], (len(lying), 1)), session.state.time)
     played.until(lambda: session.steering.doing == "fallen", most=5)
-    assert played.told == ["it has fallen; tell it to get up, or Backspace stands it up again"]
+    assert played.told == ["the body has fallen; type get up, or press Backspace to put it back at its start"]
     played.ask("motion", text="jump")
     played.step(10)
     assert played.session.steering.doing == "fallen" and played.session.steering.queued is None
     played.ask("motion", text="get up")
     played.step()
     assert played.session.steering.doing == "get up"
-    assert [entry.name for entry in session.steering.begun] == ["get up"]
+    assert [entry.name for entry in session.steering.records] == ["get up"]
     played.step(10)
     assert played.session.steering.doing == "get up" and len(played.told) == 1
     played.ask("stand")

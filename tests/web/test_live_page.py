@@ -130,7 +130,7 @@ def test_a_second_page_is_told_in_one_line(chromium: Any, session: Session):
         first, complaints = opened(chromium, server.address)
         second = chromium.new_page()
         second.goto(server.address)
-        second.wait_for_selector("[role=alert]:has-text('another page watches this run already; close it first')")
+        second.wait_for_selector("[role=alert]:has-text('another page already shows this session; close it first')")
         second.close()
         first.keyboard.press(" ")
         wait_until(first, "egs.live.state?.doing === 'jump'")

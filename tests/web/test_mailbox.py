@@ -1,4 +1,4 @@
-"""What lies between a session and its page: nothing is told twice, nothing but old frames is lost."""
+"""Mailbox of a session: no state is sent twice, and only old frames are dropped."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _watched() -> Mailbox:
 def test_nobody_is_sent_anything_and_who_comes_begins_with_how_it_is():
     post, woken = Mailbox(), []
     post.send_line("lost")
-    post.tell_state({"doing": "jump"})
+    post.send_state({"doing": "jump"})
     assert post.take_news() == [] and not post.watched
     post.subscribe(lambda: woken.append(True), lambda: _frame(7))
     (first,) = post.take_news()
@@ -42,16 +42,16 @@ def test_nobody_is_sent_anything_and_who_comes_begins_with_how_it_is():
 def test_a_state_is_told_when_it_is_new_or_who_watches_is():
     post = _watched()
     for state in ({"doing": "jump"}, {"doing": "jump"}, {"doing": "stand"}):
-        post.tell_state(state)
+        post.send_state(state)
     assert post.take_news() == [{"doing": "jump"}, {"doing": "stand"}]
     post.subscribe(lambda: None, lambda: _frame(1))
-    post.tell_state({"doing": "stand"})
+    post.send_state({"doing": "stand"})
     assert post.take_news()[1:] == [{"doing": "stand"}]
 
 
 def test_of_what_waits_the_oldest_frames_go_and_no_news():
     post = _watched()
-    with patch("egs_warp.web.mailbox._MOST_WAITING", 4):
+    with patch("egs_warp.web.mailbox._MAX_QUEUED_FRAMES", 4):
         post.send_line("first")
         for index in range(1, 6):
             post.send(_frame(index))
@@ -72,7 +72,7 @@ def test_busy_ends_whatever_goes_wrong():
 
 def test_a_session_that_is_held_wakes_when_asked_and_ends_when_stopped():
     post, turns = _watched(), []
-    post.tell_state({"doing": "stand"})
+    post.send_state({"doing": "stand"})
     # Not held, nothing told or something asked: no waiting.
     assert post.wait_for_work(lambda: False, lambda: None)
     thread = threading.Thread(target=lambda: turns.append(post.wait_for_work(lambda: True, lambda: None)))

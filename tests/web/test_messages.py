@@ -1,4 +1,4 @@
-"""What a page may ask, and what is refused."""
+"""Messages of the page: valid ones are read, invalid ones are refused."""
 
 from __future__ import annotations
 
@@ -68,10 +68,10 @@ def test_motions_are_those_of_scripts():
 @pytest.mark.parametrize(
     ("message", "said"),
     [
-        ({}, "type 'None'; known are motion, go"),
+        ({}, "type 'None' is unknown; known types are motion, go"),
         ({"type": ["go"]}, r"type \"\['go'\]\""),
         ({"type": "fly"}, "type 'fly'"),
-        ({"type": "step", "count": 3}, "step has no 'count'"),
+        ({"type": "step", "count": 3}, "step has no field 'count'"),
         ({"type": "drive", "forward": 3}, "forward: give a number from -2 to 2"),
         ({"type": "motion"}, "text: give motions in at most 200"),
         ({"type": "motion", "text": "hop, " * 100}, "text: give motions in at most 200"),
@@ -99,13 +99,13 @@ def test_motions_are_those_of_scripts():
         ({"type": "push", "x": 8, "y": 8, "z": 0}, r"push: give at most 10 m sqrt\(g H\)"),
         ({"type": "push", "x": 1, "y": 0, "z": 0, "height": 2}, "height: give a number from 0 to 1"),
         ({"type": "push", "x": 1, "y": 0, "z": 0, "height": None}, "height: give a number"),
-        ({"type": "push", "x": 1, "y": 0, "z": 0, "node": 3}, "push has no 'node'"),
+        ({"type": "push", "x": 1, "y": 0, "z": 0, "node": 3}, "push has no field 'node'"),
         ({"type": "set"}, "set: give friction or sag"),
         ({"type": "set", "friction": -0.1}, "friction: give a number from 0 to 2"),
         ({"type": "set", "sag": 0.5}, "sag: give a number from 0.01 to 0.1"),
         ({"type": "style", "squash": 2.5}, "squash: give a number from 0.5 to 2"),
         ({"type": "style", "timing": "quick"}, "timing: give a number"),
-        ({"type": "style", "wobble": 1}, "style has no 'wobble'"),
+        ({"type": "style", "wobble": 1}, "style has no field 'wobble'"),
         ({"type": "pause", "on": 1}, "on: give true or false"),
         ({"type": "record"}, "on: give true or false"),
     ],

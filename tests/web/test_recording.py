@@ -1,4 +1,4 @@
-"""What the page is sent of a run."""
+"""Packets of a finished run."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_a_frame_is_as_small_as_documented(run_folder: Path):
 
 
 def test_the_creature_file_draws_what_the_film_drew(run_folder: Path):
-    """The embedding is made anew from the splats of the file and the rest cage of the trajectory."""
+    """The embedding is computed again from the splats of the file and the rest cage of the trajectory."""
     recording = Recording.read(run_folder)
     t, made = recording.trajectory, recording.creature
     deformer = Deformer(made.splats, embed_gaussians(made.splats, TetMesh(t.rest_positions, t.tets)))
@@ -190,7 +190,7 @@ def test_a_folder_that_is_no_run_is_told_in_one_line(
 
 def test_three_runs_are_one_too_many(run_folder: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["view", *[str(run_folder)] * 3]) == 2
-    assert "at most two runs" in capsys.readouterr().err
+    assert "only two runs can be shown" in capsys.readouterr().err
 
 
 def test_without_the_page_it_is_said_how_to_build_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

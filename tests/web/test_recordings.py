@@ -1,4 +1,4 @@
-"""What is recorded of a session."""
+"""Takes of a live session."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_a_take_with_a_pull_passes_the_audit_and_a_second_take_is_another_folder
         played.ask("record", on=False)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["take-1", "take-2"]
     report = json.loads((tmp_path / "take-2" / "report.json").read_text())
-    assert report["notes"] == ["the user pulled at it or pushed it, which script.json does not repeat"]
+    assert report["notes"] == ["the user pulled or pushed the body; script.json does not repeat this"]
     assert {name for name, value in report["audit"].items() if not value <= AUDIT_LIMITS[name]} == set()
     assert Trajectory.load(tmp_path / "take-2" / "trajectory.npz").kick_step.tolist() == [2, 3, 4]
     # It is no small thing that the books hold.
@@ -118,12 +118,12 @@ def test_an_empty_take_and_a_folder_that_cannot_be_written_are_told(tmp_path: Pa
     played = SteppedSession(coarse_pawn(), tmp_path / "file" / "takes")
     played.ask("record", on=True)
     played.ask("record", on=False)
-    assert played.told[-1] == "nothing has moved since the take began; there is nothing to write"
+    assert played.told[-1] == "nothing has moved since the take started; no take is written"
     (tmp_path / "file").write_text("")
     played.ask("record", on=True)
     played.step()
     played.ask("record", on=False)
-    assert played.told[-1].startswith("the take could not be written: ")
+    assert played.told[-1].startswith("the take cannot be written: ")
     assert not played.session.state_message()["recording"]
 
 
@@ -138,7 +138,7 @@ def test_an_empty_take_and_a_folder_that_cannot_be_written_are_told(tmp_path: Pa
 def test_each_opening_and_renaming_of_a_take_fails_once(
     reason: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is told, nothing half-written stays, what is there is not called finished, and the session goes on."""
+    """The error is reported, no half-written or finished take is left, and the session continues."""
     for number in range(100):
         folder = tmp_path / str(number)
         played = SteppedSession(coarse_pawn(), folder)
@@ -151,7 +151,7 @@ def test_each_opening_and_renaming_of_a_take_fails_once(
         assert not list(folder.rglob(".egs-*"))
         if not failed:
             break
-        assert played.told[-1].startswith("the take could not be written: ") and os.strerror(reason) in played.told[-1]
+        assert played.told[-1].startswith("the take cannot be written: ") and os.strerror(reason) in played.told[-1]
         assert not finished and not played.session.state_message()["recording"]
         played.step()
     assert number > 8 and len(finished) == 1 and played.told[-1].startswith("wrote ")

@@ -18,7 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 from egs_warp.errors import UserError
 from egs_warp.web.page import PAGE
 from egs_warp.web.recording import Recording
-from egs_warp.web.server import LARGEST_MESSAGE, PageServer
+from egs_warp.web.server import MAX_MESSAGE_BYTES, PageServer
 from tests.support.pages import RecordedFeed, served
 
 pytestmark = pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it")
@@ -106,7 +106,7 @@ def _socket(server: PageServer, origin: str | None = "own"):
 
 
 def _taken_up_again(server: PageServer) -> bool:
-    """Whether a page that tries again, as pages do, is soon sent the run."""
+    """Return True if a page that reconnects, as pages do, receives the header."""
     for _ in range(50):
         with _socket(server) as page:
             try:
@@ -137,7 +137,7 @@ def test_a_socket_of_another_site_is_refused(server: PageServer, origin: str | N
 
 
 def test_a_socket_under_another_name_is_refused(server: PageServer):
-    """One that somebody has made to lead here."""
+    """A foreign host name may resolve to this machine."""
     own: Any = f"http://127.0.0.1:{server.port}"
     with socket.create_connection(("127.0.0.1", server.port)) as line, pytest.raises(InvalidStatus):
         connect(f"ws://evil.example:{server.port}/{server.token}/live", sock=line, origin=own)
@@ -151,7 +151,7 @@ def test_a_second_page_is_told_and_the_first_goes_on(server: PageServer):
         assert closed.value.rcvd is not None
         assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (
             1013,
-            "another page watches this run already; close it first",
+            "another page already shows this session; close it first",
         )
         assert first.recv(timeout=20)
 
@@ -162,12 +162,12 @@ def test_nonsense_is_answered_in_one_line_and_the_run_goes_on(server: PageServer
         page.recv(timeout=20)
         page.send(message)
         answer = _next_text(page)
-        assert answer["error"].startswith("this message makes no sense") and "\n" not in answer["error"]
+        assert answer["error"].startswith("invalid message: ") and "\n" not in answer["error"]
         page.send('{"type": "pause"}')
         assert isinstance(page.recv(timeout=20), bytes)
 
 
-@pytest.mark.parametrize("size", [LARGEST_MESSAGE + 1, 100_000_000])
+@pytest.mark.parametrize("size", [MAX_MESSAGE_BYTES + 1, 100_000_000])
 def test_a_message_that_is_too_large_closes_its_socket_alone(
     server: PageServer, size: int, capfd: pytest.CaptureFixture[str]
 ):

@@ -45,7 +45,7 @@ def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
         assert isinstance(message, PlayScript)
         session.put_request(message)
         _wait(session, woken, seen, lambda: any(isinstance(one, dict) and one.get("doing") == "jump" for one in seen))
-        # Nobody watches: it waits where it is, and goes on from there.
+        # Without a page the session is suspended; it continues from the same state.
         session.unsubscribe()
         held = _held(session)
         session.subscribe(woken.set)
@@ -53,7 +53,7 @@ def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
         assert isinstance(seen[0], Frame) and seen[0].time == held
         rested = lambda: any(isinstance(one, dict) and one.get("resting") for one in seen)  # noqa: E731
         _wait(session, woken, seen, rested)
-        assert [entry.name for entry in session.steering.begun] == ["jump"]
+        assert [entry.name for entry in session.steering.records] == ["jump"]
         end = session.state.time
         assert end > held, "it went on to the end with nobody watching"
         time.sleep(0.2)
@@ -149,7 +149,7 @@ def test_friction_and_stiffness_change_under_it(tmp_path: Path):
         assert played.session.report is not None and played.session.report.converged
     assert played.session.steering.doing == "jump"
     assert played.session.state_message()["friction"] == 0.3 and played.session.state_message()["sag"] == 0.025
-    # What is asked again changes nothing.
+    # A repeated request changes nothing.
     made = played.session.creature
     played.ask("set", sag=0.025)
     assert played.session.creature is made
@@ -174,7 +174,7 @@ def test_a_solver_that_fails_does_not_end_the_session(
     with monkeypatch.context() as broken:
         broken.setattr(type(played.session.creature.stepper), "advance", fail)
         played.step()
-    assert played.told == ["the solver found no way on; the creature stands where it began"]
+    assert played.told == ["the solver failed; the creature is back at its start"]
     assert capsys.readouterr().err == "egs-warp: live: FloatingPointError: no definite matrix\n"
     np.testing.assert_array_equal(played.session.state.positions, played.session.creature.start.positions)
     played.step(2)
@@ -182,7 +182,7 @@ def test_a_solver_that_fails_does_not_end_the_session(
 
 
 def test_a_page_that_takes_nothing_loses_the_oldest_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("egs_warp.web.mailbox._MOST_WAITING", 5)
+    monkeypatch.setattr("egs_warp.web.mailbox._MAX_QUEUED_FRAMES", 5)
     session = session_of(coarse_pawn(), tmp_path)
     session.subscribe(lambda: None)
     for _ in range(8):
@@ -193,7 +193,7 @@ def test_a_page_that_takes_nothing_loses_the_oldest_frames(tmp_path: Path, monke
 
 @pytest.mark.slow
 def test_a_push_strikes_it_in_the_next_step_and_its_take_passes_the_audit(tmp_path: Path):
-    """What is told moves the centre of mass, the head turns it; whoever is at rest wakes, and keeps its feet."""
+    """A push moves the centre of mass, and rotates the body if it hits the head; a body at rest does not fall."""
     played = SteppedSession(coarse_pawn(), tmp_path)
     session, body = played.session, played.session.creature.body
     played.until(lambda: session.resting)
@@ -220,7 +220,7 @@ def test_a_push_strikes_it_in_the_next_step_and_its_take_passes_the_audit(tmp_pa
     assert t.kick_step.tolist() == [0, 5]
     np.testing.assert_allclose(given, [[0.05, -0.1, 0.0], [0.0, 0.15, 0.0]], atol=1e-9)
     assert {name for name, value in report["audit"].items() if not value <= AUDIT_LIMITS[name]} == set()
-    assert report["notes"] == ["the user pulled at it or pushed it, which script.json does not repeat"]
+    assert report["notes"] == ["the user pulled or pushed the body; script.json does not repeat this"]
 
 
 def test_a_push_that_waits_is_dropped_where_the_creature_stands_up_anew(tmp_path: Path):

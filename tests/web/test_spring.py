@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from egs_warp.fem.body import BodyState
-from egs_warp.web.spring import STIFFNESS, STRONGEST, Spring
+from egs_warp.web.spring import MAX_FORCE, STIFFNESS, Spring
 from tests.support.live_sessions import coarse_pawn
 
 
@@ -22,9 +22,9 @@ def test_force_is_that_of_a_spring_up_to_its_strongest():
     spring.target = held + away
     before = spring.force(rest)
     spring.target = held + away + 0.01 * away
-    np.testing.assert_allclose(spring.force(rest) - before, 0.0, atol=STRONGEST * body.weight)
+    np.testing.assert_allclose(spring.force(rest) - before, 0.0, atol=MAX_FORCE * body.weight)
     spring.target = 100.0 * np.ones(3)
-    assert np.linalg.norm(spring.force(rest)) == pytest.approx(STRONGEST * body.weight)
+    assert np.linalg.norm(spring.force(rest)) == pytest.approx(MAX_FORCE * body.weight)
     moving = BodyState(rest.positions, np.tile([0.0, 0.0, 0.3], (len(rest.positions), 1)))
     resting = Spring(body, spring.node)
     resting.target = rest.positions[spring.node]

@@ -22,7 +22,7 @@ _AWAY = """() => {
     const { camera } = egs.viewers[0], way = camera.getWorldDirection(camera.position.clone());
     return [way.x, way.y].map((part) => part / Math.hypot(way.x, way.y));
 }"""
-"""Where the eye looks along the ground."""
+"""JavaScript that returns the horizontal view direction of the camera."""
 
 
 @in_browser

@@ -1,4 +1,4 @@
-"""What a creature does next."""
+"""Scheduling of the motions of a live creature."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egs_warp.motions.script import motion
 from egs_warp.motions.stance import sole_shares
 from egs_warp.motions.style import PRESETS, Style
 from egs_warp.pipelines.creature import initial_stance
-from egs_warp.web.steering import ARRIVED, ASIDE, MotionScheduler, PointNavigation
+from egs_warp.web.steering import ARRIVAL_DISTANCE, MAX_HEADING_ERROR, MotionScheduler, PointNavigation
 from tests.support.creatures import coarse_creature
 from tests.support.live_sessions import SteppedSession, coarse_pawn
 from tests.support.meshes import stool
@@ -29,13 +29,13 @@ def test_what_is_asked_meanwhile_takes_the_place_of_what_was_to_come(tmp_path: P
     played.ask("motion", text="twist 20 0 0.1")
     assert played.session.steering.queued == "twist"
     played.until(lambda: played.session.steering.doing == "twist")
-    assert [entry.name for entry in played.session.steering.begun] == ["jump", "twist"]
+    assert [entry.name for entry in played.session.steering.records] == ["jump", "twist"]
     played.ask("motion", text="hop")
     assert played.session.steering.queued == "hop"
     played.ask("cancel")
     played.step()
     assert (played.session.steering.doing, played.session.steering.queued) == ("twist", None)
-    assert [entry.name for entry in played.session.steering.begun] == ["jump", "twist"]
+    assert [entry.name for entry in played.session.steering.records] == ["jump", "twist"]
 
 
 def test_it_is_driven_until_something_else_is_asked(tmp_path: Path):
@@ -45,12 +45,12 @@ def test_it_is_driven_until_something_else_is_asked(tmp_path: Path):
     played.ask("drive", forward=0.1)
     assert steering.queued == "drive" and not steering.idle
     played.step(2)
-    driven = steering._act.motion
+    driven = steering._active.motion
     assert steering.doing == "drive" and steering.queued is None and isinstance(driven, LiveDrive)
-    assert driven.command == Drive(0.1) and steering.driven == [0.0] and steering.begun == []
+    assert driven.command == Drive(0.1) and steering.drive_starts == [0.0] and steering.records == []
     played.ask("drive", turn=0.1)
     played.step()
-    assert driven.command == Drive(turn=0.1) and steering._act.motion is driven
+    assert driven.command == Drive(turn=0.1) and steering._active.motion is driven
     played.ask("motion", text="jump 0 0.1")
     played.step()
     assert driven.command.is_zero and (steering.doing, steering.queued) == ("drive", "jump")
@@ -67,21 +67,21 @@ def test_what_was_driven_stands_once_it_is_told_to(tmp_path: Path):
 
 
 def test_a_style_is_of_the_motions_that_begin_after_it(tmp_path: Path):
-    """A jump that goes on keeps its own; what stands up anew, or is made anew, keeps the style."""
+    """The active jump keeps its style; after standing up or a rebuild, the new style stays."""
     played = SteppedSession(coarse_pawn(), tmp_path)
     session = played.session
     played.ask("motion", text="jump 0 0.1, jump 0 0.1")
     played.step()
-    usual = session.steering._act.motion
+    usual = session.steering._active.motion
     assert isinstance(usual, Jump)
     played.ask("style", **PRESETS["heavy"])
     played.step()
-    assert session.steering._act.motion is usual and session.state_message()["style"] == PRESETS["heavy"]
+    assert session.steering._active.motion is usual and session.state_message()["style"] == PRESETS["heavy"]
     played.ask("stand")
     played.ask("set", friction=0.5)
     played.ask("motion", text="jump 0 0.1, walk 0.1")
     played.step()
-    heavy = session.steering._act.motion
+    heavy = session.steering._active.motion
     assert isinstance(heavy, Jump)
     assert heavy.plan.crouch_depth == pytest.approx(1.3 * usual.plan.crouch_depth, rel=0.3)
     assert heavy.plan.crouch_time > 1.4 * usual.plan.crouch_time
@@ -95,7 +95,7 @@ def test_a_motion_that_the_body_cannot_do_is_told(tmp_path: Path):
     played.step()
     assert played.told == ["walk: the path takes more than 400 steps; choose a shorter one"]
     assert played.session.steering.idle or played.session.steering.doing == "stand"
-    assert played.session.steering.begun == []
+    assert played.session.steering.records == []
 
 
 def test_a_journey_turns_first_and_then_jumps_straight_at_its_goal():
@@ -110,11 +110,11 @@ def test_a_journey_turns_first_and_then_jumps_straight_at_its_goal():
     aside = leg(1.0 * left)
     assert aside is not None and aside.request.name == "twist"
     assert aside.request.asked["heading_degrees"] == pytest.approx(90.0, abs=0.1)
-    slant = np.radians(ASIDE - 1.0)
+    slant = np.radians(MAX_HEADING_ERROR - 1.0)
     straight = leg(np.cos(slant) * ahead + np.sin(slant) * left)
     assert straight is not None and straight.request.name == "jump"
     assert straight.request.asked["distance"] == pytest.approx(0.5, abs=1e-3)
-    assert leg(0.9 * ARRIVED * left) is None
+    assert leg(0.9 * ARRIVAL_DISTANCE * left) is None
     # So near, it does not turn.
     near = leg(0.2 * left)
     assert near is not None and near.request.name == "jump"
@@ -123,7 +123,7 @@ def test_a_journey_turns_first_and_then_jumps_straight_at_its_goal():
 def test_a_journey_that_comes_no_nearer_is_given_up():
     place = initial_stance(coarse_pawn())
     journey = PointNavigation(np.array([3.0, 0.0]), walks=False)
-    with pytest.raises(UserError, match="go: it comes no nearer than"):
+    with pytest.raises(UserError, match="go: the body gets no nearer than"):
         for _ in range(10):
             journey.next_part(place)
 
@@ -156,6 +156,6 @@ def test_a_click_sends_it_there(tmp_path: Path):
     played.ask("go", x=goal[0], y=goal[1])
     played.until_idle(most=900)
     end = feet @ played.session.state.positions
-    assert np.linalg.norm((end - goal)[:2]) < ARRIVED * body.height
+    assert np.linalg.norm((end - goal)[:2]) < ARRIVAL_DISTANCE * body.height
     assert played.session.steering.goal is None
-    assert {entry.name for entry in played.session.steering.begun} == {"walk to"}
+    assert {entry.name for entry in played.session.steering.records} == {"walk to"}
