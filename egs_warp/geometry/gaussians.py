@@ -136,9 +136,15 @@ class GaussianCloud:
         )
 
     def subset(self, chosen: np.ndarray) -> GaussianCloud:
-        """The Gaussians picked by a boolean mask or an index array."""
+        """Return the Gaussians that a boolean mask or an index array selects.
+
+        Raises ``UserError`` if it selects none.
+        """
+        means = self.means.numpy()[chosen]
+        if len(means) == 0:
+            raise UserError(f"selection: it holds none of the {self.count} Gaussians; select at least one")
         return GaussianCloud.from_numpy(
-            self.means.numpy()[chosen],
+            means,
             self.rotations.numpy()[chosen],
             self.log_scales.numpy()[chosen],
             self.opacity_logits.numpy()[chosen],

@@ -136,6 +136,8 @@ def inpaint(
     grown, known, stained = _without_stain(grown, known, before)
     # A stain is on the floor: what is deep under it is a table's side.
     junk |= _in_hole(background, window, grown, hole.bounds()[1], depth=_THICKNESS)
+    if junk.all():
+        raise UserError("inpaint: the hole takes the whole capture; make it smaller")
     kept = background.subset(~junk)
     clock.lap("rectify")
     # Where nothing was stained, nothing shades the floor, and what is dark is its own.
@@ -151,12 +153,23 @@ def inpaint(
         spacing=spacing,
         device=str(background.device),
     )
+    if new is None:
+        raise UserError(
+            f"inpaint: the hole is too narrow: none of its {int(grown.sum())} texels lie in a block of {spacing} x"
+            f" {spacing}, the spacing of new Gaussians; make it wider"
+        )
     if options.steps > 0:
         progress(_PAINTING)
         trained = lambda step, _: progress(_PAINTING + (1.0 - _PAINTING) * (step + 1) / options.steps)  # noqa: E731
         new = _trained(kept, new, window, grown, painted, thickness, options, trained)
     clock.lap("train")
     floor = near_plane(kept, window.plane, thickness) & (kept.opacities() > _SOLID)
+    if not floor.any():
+        raise UserError(
+            f"inpaint: no floor is left around the hole: none of the {kept.count} remaining Gaussians within"
+            f" {thickness:.3g} scene units of the plane is more opaque than {_SOLID:g}; make the hole smaller or check"
+            " plane and hole"
+        )
     new = with_gloss(new, kept.subset(floor), window)
     cloud = concatenate(kept, new)
     clock.lap("join")

@@ -63,10 +63,21 @@ def flat_gaussians(
     *,
     spacing: int,
     device: str | None = None,
-) -> GaussianCloud:
-    """Gaussians of SH degree 0 every ``spacing`` texels over ``hole`` (rows, columns) and its ``known`` rim, in the
-    colours of ``painted`` (rows, columns, 3), at ``heights`` (rows, columns) above the plane; those of the rim a little
-    lower, where they only show through gaps."""
+) -> GaussianCloud | None:
+    """Create flat Gaussians of SH degree 0 over a hole and its known rim.
+
+    Those of the rim lie a little lower, so that they show through gaps only. None if the hole is narrower than a block
+    of ``spacing`` x ``spacing`` texels everywhere.
+
+    Args:
+        window: the plane and its grid of texels.
+        hole: (rows, columns) bool, on the window.
+        known: (rows, columns) bool, where the old floor is known.
+        painted: (rows, columns, 3) colours of the new floor, 0 to 1.
+        heights: (rows, columns) heights of the new floor above the plane, scene units.
+        spacing: distance between Gaussians, texels.
+        device: Warp device of the result.
+    """
     size = (np.array(hole.shape) // spacing) * spacing
 
     def blocks(values: np.ndarray) -> np.ndarray:
@@ -77,6 +88,8 @@ def flat_gaussians(
     coloured = blocks(hole | known)[..., 0] == 1.0
     rows, columns = np.nonzero(ndimage.binary_dilation(inner, iterations=_SKIRT) & coloured)
     count = len(rows)
+    if count == 0:
+        return None
     first, second = window.plane.tangents()
     step = spacing * window.texel
     log_scales = np.full((count, 3), np.log(_WIDTH * step))

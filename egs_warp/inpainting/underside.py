@@ -60,11 +60,13 @@ def with_underside(thing: GaussianCloud, ground: HeightField, size: float) -> tu
     inside = depth_inside(np.asarray(ndimage.binary_fill_holes(distance_to(seen) <= _BRIDGED))) > _BRIDGED
     near = nearest_set(seen)
     unseen = inside & ~covered
-    if unseen.sum() < _FOOT * inside.sum():
+    if not unseen.any() or unseen.sum() < _FOOT * inside.sum():
         return thing, 0
     film = laplace_fill(heights[tuple(near)], unseen)
     painted = laplace_fill(colours[tuple(near)], unseen)
     new = flat_gaussians(window, unseen, seen, painted, film, spacing=_SPACING, device=str(thing.device))
+    if new is None:
+        return thing, 0
     return concatenate(thing, _of_degree(new, thing.sh.shape[1])), new.count
 
 

@@ -12,6 +12,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from egs_warp.deformation.splitting import SplitRule, child_layout, child_opacities
+from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
@@ -112,7 +113,7 @@ def clear_plane(
     if method is StraddlingPolicy.NONE or not straddling.any():
         return cloud
     if method is StraddlingPolicy.REMOVE:
-        return cloud.subset(~straddling)
+        return _nonempty_subset(cloud, ~straddling, "all of them straddle the plane and are removed")
     if method is StraddlingPolicy.SPLIT:
         return half_space(cloud, plane, straddling)
     if views is None:
@@ -122,7 +123,9 @@ def clear_plane(
     for _ in range(options.subdivisions):
         fine = _subdivided(fine, plane, options.reach, fine_reach)
     tuned = _finetuned(fine, plane, views, surroundings, options, progress)
-    tuned = tuned.subset(plane.heights(tuned.means.numpy()) > 0.0)
+    tuned = _nonempty_subset(
+        tuned, plane.heights(tuned.means.numpy()) > 0.0, "after the fine-tune all of their means lie below the plane"
+    )
     heights, reach = plane_extents(tuned, plane, options.reach)
     rest = np.abs(heights) < reach
     return half_space(tuned, plane, rest) if options.cut_rest and rest.any() else tuned
@@ -214,7 +217,19 @@ def _subdivided(cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure, fine_r
         means, rotations, log_scales, sh = out
         split = GaussianCloud(means, rotations, log_scales, wp.array(logits), sh)
     launch_rows(split_kernel, len(source), inputs=[*plan, shrink, *fields], outputs=out, device=cloud.device)
-    return split.subset(plane.heights(split.means.numpy()) > 0.0)
+    return _nonempty_subset(
+        split, plane.heights(split.means.numpy()) > 0.0, "after splitting all of their means lie below the plane"
+    )
+
+
+def _nonempty_subset(cloud: GaussianCloud, chosen: np.ndarray, reason: str) -> GaussianCloud:
+    """Return the ``chosen`` (n,) bool Gaussians. Raises ``UserError`` with the ``reason`` if there are none."""
+    if not chosen.any():
+        raise UserError(
+            f"clear: none of the object's {cloud.count} Gaussians is left: {reason}; clear by another method (split)",
+            check=("plane",),
+        )
+    return cloud.subset(chosen)
 
 
 def _finetuned(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from egs_warp.errors import UserError
 from egs_warp.geometry.bitmaps import connected_parts, depth_inside
 from egs_warp.geometry.camera import Camera, downscale
 from egs_warp.geometry.camera_ring import ring_cameras
@@ -114,6 +115,11 @@ def measure_ground(
     above = [downscale(camera, _SIDE) for camera in cameras if plane.heights(camera.centre) > 0.2 * size]
     if len(above) < _LEAST_VIEWS:
         above = ring_cameras(plane, middle, 1.2 * size, count=_VIEWS - 1, elevations=_ELEVATIONS, size=_SIDE)
+    if thing.all():
+        raise UserError(
+            f"segment: all {cloud.count} Gaussians of the capture are the object, so there is no ground to measure;"
+            " animate the capture itself, or mark less of it"
+        )
     bare = cloud.subset(~thing)
     looks = []
     for camera in above[:: -(-len(above) // _VIEWS)]:

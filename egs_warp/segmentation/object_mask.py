@@ -91,6 +91,14 @@ def segment(
         raise
 
 
+def _nothing_left(reason: str, count: int) -> str:
+    """Message for an object of ``count`` Gaussians of which segmentation leaves none."""
+    return (
+        f"segment: none of the object's {count} Gaussians is left: {reason}; mark the object by masks, or click on"
+        " more of it"
+    )
+
+
 def _masked(scene: SceneAbovePlane, spec: ObjectSpec) -> tuple[np.ndarray, np.ndarray]:
     """(n,) bool: Gaussians that masks and clicks mean, and (n,) bool: those that nobody knows of."""
     votes = votes_of_masks(scene.cloud, spec.masks)
@@ -136,6 +144,8 @@ def _of_size(
     object_mask[veils] = False
     ghosts = np.zeros_like(object_mask)
     ghosts[veils] = _of_its_own(scene, veils, object_mask & scene.is_opaque, size)
+    if not object_mask.any():
+        raise UserError(_nothing_left("haze and the clicks beside the object remove all of it", int(chosen.sum())))
     lowest = float(np.quantile(scene.heights[object_mask], 0.002))
     if lowest > hover * size:
         raise UserError(
@@ -150,6 +160,8 @@ def _of_size(
         shreds = floor_remnants(scene, object_mask, size)
         for click in spec.clicks:
             shreds[click.hits] = False
+        if not (object_mask & ~shreds).any():
+            raise UserError(_nothing_left("all of it has the colours of the floor", int(object_mask.sum())))
         object_mask &= ~shreds
         halo |= shreds
     floaters = (halo | ghosts | (claimed & above)) & ~object_mask & ~buried & ~cut_off
@@ -222,6 +234,8 @@ def _body(
     low = FOOTPRINT_HEIGHT * min(size, _diagonal(scene.means[chosen]))
     cut_off[nodes[removed_by_clicks(scene.cloud, nodes, spec.clicks, scene.heights[nodes], low)]] = True
     chosen &= ~cut_off
+    if not chosen.any():
+        raise UserError(_nothing_left("the clicks beside the object remove all of it", int(cut_off.sum())))
     # Strays far out, joined by some huge one, would stretch what follows over the whole room.
     chosen &= _within(scene.means, chosen, size)
     # Loose matter inside a hollow body would stay behind as a ghost. The floor closes the body from below: its mirror

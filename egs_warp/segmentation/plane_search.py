@@ -192,6 +192,11 @@ def _surfaces(
 ) -> list[SeenSurface]:
     above = [camera for camera in cameras if plane.heights(camera.centre) > 0.1 * radius]
     # The object is left out of the picture only where it is known: its foot would bend the plane up.
+    if object_mask is not None and object_mask.all():
+        raise UserError(
+            f"segment: all {cloud.count} Gaussians of the capture are the object, so no plane is in sight; give the"
+            " plane, or mark less of the capture"
+        )
     bare = cloud if object_mask is None else cloud.subset(~object_mask)
     return [SeenSurface.of(bare, camera) for camera in above[:: max(1, -(-len(above) // _VIEWS))]]
 
@@ -243,7 +248,10 @@ def further_planes(cloud: GaussianCloud, plane: Plane, size: float, count: int) 
 
 def _is_one_patch(level: GaussianCloud, plane: Plane, cell: float) -> bool:
     """Whether one patch of well covered cells (scene units) holds most of what lies near ``plane``."""
-    near = level.subset(near_plane(level, plane, 0.5 * cell))
+    chosen = near_plane(level, plane, 0.5 * cell)
+    if not chosen.any():
+        return False
+    near = level.subset(chosen)
     flat = near.means.numpy() @ np.stack(plane.tangents(), axis=1)
     area = near.opacities() * np.exp(np.sort(near.log_scales.numpy(), axis=1)[:, 1:].sum(axis=1))
     place = np.floor((flat - flat.min(axis=0)) / cell).astype(int)

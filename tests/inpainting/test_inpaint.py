@@ -15,6 +15,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.laplace_fill import laplace_fill
+from egs_warp.inpainting import inpaint as inpaint_module
 from egs_warp.inpainting.holes import Hole, disc, footprint, unseen
 from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
 from egs_warp.inpainting.inpainters import OpenCvInpainter
@@ -244,6 +245,17 @@ def test_what_hangs_over_the_hole_stays() -> None:
 def test_holes_that_cannot_be_filled(place: tuple[float, float], radius: float, message: str) -> None:
     with pytest.raises(UserError, match=message):
         inpaint(floor(spacing=0.05), disc(PLANE, on_plane(*place), radius), options=InpaintOptions(steps=0))
+
+
+def test_a_hole_narrower_than_the_new_gaussians_names_the_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inpaint_module, "flat_gaussians", lambda *_, **__: None)
+    with pytest.raises(UserError, match=r"^inpaint: the hole is too narrow: none of its \d+ texels lie in a block of"):
+        inpaint(
+            floor(spacing=0.05),
+            disc(PLANE, on_plane(0.0, 0.0), 0.3),
+            inpainter=OpenCvInpainter(),
+            options=InpaintOptions(steps=0),
+        )
 
 
 def test_bad_options_and_objects() -> None:

@@ -63,6 +63,26 @@ def test_shreds_of_the_floor_do_not_go_along() -> None:
     assert (truth & (cloud.means.numpy()[:, 2] > 0.05) & ~found.object_mask[: cloud.count]).sum() == 0
 
 
+def test_an_object_that_segmentation_leaves_empty_is_an_error_of_that_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whichever step removes the last Gaussian: floor remnants, haze or clicks."""
+    cloud, _ = ball_on_floor()
+    spec = ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "floor_remnants", lambda scene, chosen, size: np.ones(len(chosen), bool))
+        with pytest.raises(UserError, match=r"^segment: none of the object's \d+ Gaussians is left: all of it has the"):
+            segment(cloud, FLOOR, spec)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_veils", lambda scene, object_cloud, size: object_cloud)
+        with pytest.raises(
+            UserError, match=r"^segment: none of the object's \d+ Gaussians is left: haze and the clicks"
+        ):
+            segment(cloud, FLOOR, spec)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "removed_by_clicks", lambda cloud, nodes, *_: np.ones(len(nodes), bool))
+        with pytest.raises(UserError, match=r"^segment: none of the object's \d+ Gaussians is left: the clicks beside"):
+            segment(cloud, FLOOR, spec)
+
+
 def test_fine_specks_in_the_floor_s_colour_are_no_shreds_of_it() -> None:
     """Thrice as wide as others at the foot, but less than a hundredth of the object; those of a thirtieth are."""
     thing, floor = shell(), level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.05)

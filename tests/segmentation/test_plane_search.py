@@ -75,6 +75,7 @@ def test_a_plane_is_one_patch_or_none() -> None:
     above = level((-1.0, -1.0), (7.0, 1.0), 0.4, 0.03)
     assert _is_one_patch(lying(one), FLOOR, 0.1)
     assert not _is_one_patch(lying(np.concatenate([apart, above])), FLOOR, 0.1)
+    assert not _is_one_patch(lying(one), Plane(FLOOR.normal, FLOOR.offset - 1.0), 0.1)
 
 
 @pytest.mark.parametrize("scale", [1.0, 10.0])
