@@ -264,7 +264,7 @@ def test_bad_options_and_objects() -> None:
     with pytest.raises(UserError, match=r"margin 2: give a number from 0 to 1"):
         InpaintOptions(margin=2)
     window = disc(PLANE, on_plane(0, 0), 0.1).window
-    with pytest.raises(UserError, match="the hole is empty; give the object, a mask, or a place on the plane"):
+    with pytest.raises(UserError, match="the hole is empty; give the object, a mask, or a point on the plane"):
         Hole(window, np.zeros((256, 256), bool))
     pawn = scene("pawn")
     high = replace(pawn.plane, offset=pawn.plane.offset - 5.0)
