@@ -114,7 +114,7 @@ def test_a_mask_of_the_plane_is_called_by_its_flag(
             "no.json: no such file or folder; make it with",
         ),
         (["--object", "0,0,0.5", "--plane", "0,0,1,-5"], "nothing of it lies above the plane"),
-        (["--object", "0,0,0.5", "--plane", "0,0,1,0.9"], "it touches no plane: its lowest part is"),
+        (["--object", "0,0,0.5", "--plane", "0,0,1,0.9"], "it does not touch the plane: its lowest part is"),
         (["--object", "0,0,0.5", "--cameras", "{folder}/away.json"], "no camera sees it around the object"),
         (["--object", "{folder}/photo1.png", "--cameras", "{folder}/away.json"], "the masks' cameras see nothing"),
         (

@@ -237,7 +237,7 @@ def test_up_of_a_huge_capture_is_told_by_few_of_its_gaussians(monkeypatch: pytes
     foot = random.uniform([-0.6, -0.6, 0.0], [0.6, 0.6, 0.02], (3000, 3))
     table = opaque(np.concatenate([top, leg, foot])[:, [2, 0, 1]])
     whole = guess_up(table)[0]
-    monkeypatch.setattr("egs_warp.segmentation.base_plane._ENOUGH", 4000)
+    monkeypatch.setattr("egs_warp.segmentation.base_plane._MAX_GAUSSIANS", 4000)
     up, reason = guess_up(table)
     np.testing.assert_array_equal(up, whole)
     assert reason == guess_up(table.subset(random.permutation(table.count)))[1]

@@ -222,7 +222,7 @@ def test_clicks_as_the_user_writes_them(tmp_path: Path) -> None:
     with_box = read_object(["-1,-1,0,1,1,2", "-32,60@b"], cloud, posed)
     assert with_box.box is not None and with_box.point is None and len(with_box.clicks) == 1
     for texts, message in (
-        (["-32,60@b"], "every click takes something away; click on the object itself"),
+        (["-32,60@b"], "every click removes something; click on the object itself"),
         (["+32,32@c"], r"--object \+32,32@c: no such camera; there are 2"),
         (["+1,1@b"], r"--object \+1,1@b: the capture shows nothing there"),
         (["+64,1@b"], "outside of the view's 64 x 64 pixels"),

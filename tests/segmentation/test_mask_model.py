@@ -147,7 +147,7 @@ def test_what_stands_out_is_stretched_to_all_of_its_range() -> None:
 def test_where_nothing_that_proposes_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(
-        UserError, match=r"nothing is installed that proposes one; install egs-warp\[salient\], or click"
+        UserError, match=r"no network for proposing an object is installed; install egs-warp\[salient\], or click"
     ):
         SalientModel.installed()
 

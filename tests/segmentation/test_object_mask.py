@@ -72,7 +72,7 @@ def test_an_object_that_segmentation_leaves_empty_is_an_error_of_that_stage(monk
         with pytest.raises(UserError, match=r"^segment: none of the object's \d+ Gaussians is left: all of it has the"):
             segment(cloud, FLOOR, spec)
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_veils", lambda scene, object_cloud, size: object_cloud)
+        patch.setattr(module, "_haze_indices", lambda scene, object_cloud, size: object_cloud)
         with pytest.raises(
             UserError, match=r"^segment: none of the object's \d+ Gaussians is left: haze and the clicks"
         ):
@@ -138,7 +138,7 @@ def test_what_no_mask_can_mean_is_said() -> None:
     with pytest.raises(UserError, match="nothing of it lies above the plane"):
         segment(cloud, FLOOR, ObjectSpec(box=Box(np.array([5.0, 5.0, 0.0]), np.array([6.0, 6.0, 1.0]))))
     hovering, _ = ball_on_floor(lift=0.6)
-    with pytest.raises(UserError, match=r"it touches no plane: its lowest part is 0\.\d+ of its size above"):
+    with pytest.raises(UserError, match=r"it does not touch the plane: its lowest part is 0\.\d+ of its size above"):
         segment(hovering, FLOOR, ObjectSpec(point=np.array([0.0, -0.5, 1.1])))
 
 
@@ -369,5 +369,5 @@ def test_what_hovers_over_the_only_floor_is_taken_and_said() -> None:
     assert located.segmentation.object_mask[truth].mean() > 0.99
     assert any("its lowest part hangs 0.2" in note for note in located.notes)
     higher, _ = ball_on_floor(lift=0.7)
-    with pytest.raises(UserError, match=r"it touches no plane: its lowest part is 0\.4"):
+    with pytest.raises(UserError, match=r"it does not touch the plane: its lowest part is 0\.4"):
         locate_plane(higher, ObjectSpec(point=np.array([0.0, -0.5, 1.2])), up=FLOOR.normal)

@@ -129,7 +129,7 @@ def test_what_nothing_can_be_made_of_is_told(cameras: list[Camera]) -> None:
         def mask(self, picture: np.ndarray, points: np.ndarray, inside: np.ndarray) -> np.ndarray:
             return np.zeros(picture.shape[:2], bool)
 
-    with pytest.raises(UserError, match="the network marks nothing where it was clicked on"):
+    with pytest.raises(UserError, match="the network finds nothing where it was clicked"):
         masks_of_clicks(cloud, [on], cameras, Blind())
 
 
@@ -173,7 +173,7 @@ def test_what_stands_out_of_most_views_is_taken(cameras: list[Camera]) -> None:
         def mask(self, picture: np.ndarray) -> np.ndarray:
             return np.ones(picture.shape[:2], bool)
 
-    with pytest.raises(UserError, match="nothing stands out of the pictures; click on it"):
+    with pytest.raises(UserError, match="nothing is salient in the pictures; click on it"):
         salient_masks(cloud, cameras, Nothing.__new__(Nothing))
 
 
