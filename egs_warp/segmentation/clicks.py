@@ -120,7 +120,7 @@ def removed_by_clicks(
 def cut_by_clicks(
     cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], *, required: np.ndarray | None = None
 ) -> np.ndarray:
-    """(m,) bool, the ``nodes`` (m,), indices of ``cloud``, that the ``clicks`` leave; ``required`` (m,) bool nodes stay.
+    """(m,) bool, the ``nodes`` (m,), indices of ``cloud``, that the ``clicks`` leave; ``required`` (m,) bool stay.
 
     The score of each Gaussian prefers the clicks that are nearer along links between neighbours, which are longer the
     more their colours differ, and the side on which its colour is more common. The labels are the minimum cut. Nothing

@@ -76,7 +76,7 @@ class OnnxClickModel:
         places, labels = np.zeros((1, 1, POINTS, 2), np.float32), np.full((1, 1, POINTS), -1.0, np.float32)
         places[0, 0, :count], labels[0, 0, :count] = scale * points[:count], inside[:count]
         given = (np.ascontiguousarray(square.transpose(2, 0, 1)[None]), places, labels)
-        answer = self.network.run(dict(zip(self.names, given, strict=True)), wanted=_ADVICE)
+        answer = self.network.run(dict(zip(self.names, given, strict=True)), expected=_ADVICE)
         masks: np.ndarray = answer[0] if answer else np.zeros(0)
         if masks.ndim != 5 or masks.shape[:2] != (1, 1) or masks.size == 0 or not np.isfinite(masks).all():
             raise UserError(
@@ -118,7 +118,7 @@ class SalientModel:
         small = cv2.resize(picture.astype(np.float32), (_SALIENT_SIDE, _SALIENT_SIDE), interpolation=cv2.INTER_AREA)
         small = (small / max(float(small.max()), 1e-6) - _MEAN) / _DEVIATION
         given = {self.network.inputs[0]: np.ascontiguousarray(small.transpose(2, 0, 1)[None], np.float32)}
-        answer = self.network.run(given, wanted="u2netp.onnx as its wheel brings it")[0].reshape(-1, *small.shape[:2])
+        answer = self.network.run(given, expected="u2netp.onnx as its wheel brings it")[0].reshape(-1, *small.shape[:2])
         low, high = float(answer[0].min()), float(answer[0].max())
         # As in its training: outputs are scaled from their minimum to their maximum.
         share = (answer[0] - low) / max(high - low, 1e-6)

@@ -71,29 +71,27 @@ def find_planes(
     area = opacity * scales[:, 1] * scales[:, 2]
     # A few blurred Gaussians behind everything would outweigh the rest.
     area = np.minimum(area, np.quantile(area, 0.95))
-    remaining = np.flatnonzero((opacity >= _MIN_OPACITY) & (area > 0.0))
-    if len(remaining) < 10:
+    rest = np.flatnonzero((opacity >= _MIN_OPACITY) & (area > 0.0))
+    if len(rest) < 10:
         return []
-    low, high = np.quantile(means[remaining], [0.02, 0.98], axis=0)
+    low, high = np.quantile(means[rest], [0.02, 0.98], axis=0)
     band = thickness or 0.01 * float(np.linalg.norm(high - low))
     up = np.asarray(up, float) / np.linalg.norm(up)
-    total = float(area[remaining].sum())
+    total = float(area[rest].sum())
     found: list[FoundPlane] = []
     for _ in range(count):
-        if len(remaining) < 10:
+        if len(rest) < 10:
             break
-        few = random.choice(
-            remaining, min(_SAMPLE, len(remaining)), replace=False, p=area[remaining] / area[remaining].sum()
-        )
+        few = random.choice(rest, min(_SAMPLE, len(rest)), replace=False, p=area[rest] / area[rest].sum())
         plane = _best_plane(means[few], up, np.cos(np.radians(tilt_degrees)), band, random)
         if plane is None:
             break
-        near = np.abs(plane.heights(means[remaining])) < band
-        plane = _levelled(means[remaining[near]], area[remaining[near]], up, plane)
-        near = np.abs(plane.heights(means[remaining])) < 2.0 * band
-        support = float(area[remaining[np.abs(plane.heights(means[remaining])) < band]].sum()) / total
+        near = np.abs(plane.heights(means[rest])) < band
+        plane = _levelled(means[rest[near]], area[rest[near]], up, plane)
+        near = np.abs(plane.heights(means[rest])) < 2.0 * band
+        support = float(area[rest[np.abs(plane.heights(means[rest])) < band]].sum()) / total
         found.append(FoundPlane(plane, support))
-        remaining = remaining[~near]
+        rest = rest[~near]
     return sorted(found, key=lambda one: -one.support)
 
 

@@ -89,7 +89,7 @@ def test_without_cameras_a_ring_is_used_and_written(
     assert main(again) == 2
     assert "plane: it has an earlier run, which would be mixed with this one" in capsys.readouterr().err
     assert main(["resume", str(out)]) == 2
-    assert f"{out}: egs-warp plane wrote here, which cannot go on; begin it again" in capsys.readouterr().err
+    assert f"{out}: egs-warp plane wrote here, which cannot be resumed; start it again" in capsys.readouterr().err
     assert main([*again, "--overwrite"]) == 0
     assert (out / "earlier-1" / "images" / "ring11.png").is_file() and len(list((out / "images").iterdir())) == 12
     # What was written can be clicked on.

@@ -288,7 +288,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (tmp_path / "filled.png").stat().st_size > 10_000
     before = (tmp_path / "filled.ply").read_bytes()
     assert main(["inpaint", *files, str(tmp_path / "filled.ply"), *where, "--steps", "0"]) == 2
-    assert f"--out {tmp_path / 'filled.ply'}: it is there already; choose another name" in capsys.readouterr().err
+    assert f"--out {tmp_path / 'filled.ply'}: it exists already; choose another name" in capsys.readouterr().err
     quick = [*files, str(tmp_path / "other.ply"), *where, "--steps", "0", "--inpainter", "telea", "--picture"]
     for flags, message in (
         ([*quick, str(tmp_path / "gone" / "a.png")], "a.png: its folder does not exist; create"),

@@ -54,7 +54,7 @@ def _box_surface(low: tuple[float, ...], high: tuple[float, ...], count: int, se
 
 
 def _check(cage: Cage, plane: Plane, *, flat: float = 1e-9) -> None:
-    """What every cage holds."""
+    """Check the properties of all cages."""
     height = cage.height(plane)
     above = plane.heights(cage.mesh.nodes)
     assert above.min() >= -flat * height

@@ -109,7 +109,7 @@ def test_up_of_the_format_wins() -> None:
 
 
 def test_no_height() -> None:
-    """A sheet square to up has no base plane."""
+    """A sheet orthogonal to up has no base plane."""
     cloud = pawn(gaussian_count=500).cloud
     flat = GaussianCloud.from_numpy(
         cloud.means.numpy() * [1, 1, 0],
@@ -123,7 +123,7 @@ def test_no_height() -> None:
 
 
 def test_a_bevel_above_the_sole_is_not_the_support() -> None:
-    """Of two levels of the underside the lower one is, though more columns end at the other."""
+    """The lower of two levels of the underside is found, though more columns end at the other."""
     random = np.random.default_rng(0)
     bottoms = np.concatenate([random.normal(0.0, 0.001, 60), random.normal(0.08, 0.001, 100)])
     heights = np.concatenate([bottoms, random.uniform(0.1, 1.0, 2000)])

@@ -1,4 +1,4 @@
-"""What reaches across the plane: its measure, the half above, and the loss that pushes it off (Eq. 20, 21)."""
+"""Gaussians that straddle the plane: their extent, the half above, and the loss that clears the plane (Eq. 20, 21)."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def test_cameras_about_the_foot_look_at_it_from_low_down() -> None:
 
 @pytest.mark.parametrize("above", [True, False])
 def test_a_camera_under_the_plane_says_nothing_of_what_it_sees_through_it(above: bool) -> None:
-    """Of a ball over the floor pixels count from above; from below those alone that show nothing."""
+    """From above, all pixels of a ball over the floor count; from below, only those that show nothing."""
     pytest.importorskip("torch")
     ball = round_ones(shell() + [0.0, 0.0, 0.2], 0.04)
     eye = np.array([2.0, 0.0, 2.0 if above else -2.0])

@@ -186,7 +186,7 @@ def test_specks_of_ground_are_left_out() -> None:
 
 @pytest.mark.parametrize("count", [5, 12])
 def test_medians_of_what_is_nearest_to_each_node(count: int) -> None:
-    """Of odd and even numbers of points; none of those off the grid, nor any where there are none."""
+    """For odd and even numbers of points; points off the grid are ignored, and empty nodes are NaN."""
     random = np.random.default_rng(0)
     spacing, origin = 0.25, np.array([0.3, -0.2, 0.1])
     axes = np.linalg.qr(random.standard_normal((3, 3)))[0]

@@ -19,7 +19,7 @@ NAMES = ("batched_images", "batched_point_coords", "batched_point_labels")
 
 @pytest.fixture(params=["OpenCV", "onnxruntime"])
 def program(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """What computes networks; the second where it is installed."""
+    """Program that evaluates networks; the second one if it is installed."""
     if request.param == "onnxruntime":
         pytest.importorskip("onnxruntime")
     else:

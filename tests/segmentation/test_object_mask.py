@@ -31,7 +31,7 @@ def check(cloud: GaussianCloud, truth: np.ndarray, spec: ObjectSpec) -> None:
     found = segment(cloud, FLOOR, spec)
     heights = FLOOR.heights(cloud.means.numpy())
     clear = heights > 0.05
-    # A few of the floor's at the very point of contact, which nobody can tell apart.
+    # A few of the floor's Gaussians at the point of contact cannot be separated.
     assert (found.object_mask & ~truth & (np.abs(heights) > 0.01)).sum() == 0
     assert (found.object_mask & ~truth).sum() <= 4
     assert (truth & clear & ~found.object_mask).sum() == 0
@@ -143,7 +143,7 @@ def test_what_no_mask_can_mean_is_said() -> None:
 
 
 def test_plane_and_object_from_a_click_alone() -> None:
-    """Nobody says where the plane is, nor which way is up."""
+    """Neither the plane nor the up direction is given."""
     cloud, _ = ball_on_floor()
     located = locate_plane(cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
     assert located.plane.normal[2] > np.cos(np.radians(0.3))
@@ -205,7 +205,8 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     "name", ["pawn", *(pytest.param(name, marks=pytest.mark.slow) for name in ("stool", "figurine"))]
 )
 def test_built_in_scenes_come_apart(name: str) -> None:
-    """Against the known object: all of it above the foot, and none of the room but what nobody can see."""
+    """Compared with the known object: all of it above the foot is found, and nothing of the room except unseen
+    Gaussians."""
     made = scene(name)
     cloud, truth = made.whole()
     camera = made.camera(width=200, height=200)
@@ -265,9 +266,8 @@ def test_a_click_finds_what_is_flat_in_a_room() -> None:
 
 
 def test_the_unit_of_length_changes_nothing() -> None:
-    """A ball on its floor, wide shreds of the floor at its foot, and what is buried under it: in metres as in
-    millimetres.
-    """
+    """A ball on its floor, wide floor remnants at its foot, and buried Gaussians under it, in metres and in
+    millimetres."""
     cloud, truth = ball_on_floor()
     angles = np.arange(6)
     shreds = np.column_stack([0.3 * np.cos(angles), 0.3 * np.sin(angles), np.full(6, 0.09)])
