@@ -28,7 +28,7 @@ def conversion_loss(before: Capture, after: Capture) -> list[str]:
     if before.up is not None and after.up is None:
         lines.append("the up direction is lost")
     if after.up is not None and (before.up is None or not np.allclose(before.up, after.up)):
-        lines.append("the axes are unchanged, but viewers of this format take +y as up")
+        lines.append("the axes are unchanged, but this format's viewers take +y as up")
     differences = _differences(old, new)
     if not lines and not differences:
         return ["nothing is lost: every bit is the same"]

@@ -53,5 +53,5 @@ def check_named_files(*paths: Path, overwrite: bool = False) -> None:
             raise UserError(f"{path}: is a folder; give the name of a file")
         if path.exists() and not overwrite:
             what = "it exists" if path == paths[0] else f"{path.name} exists"
-            advice = f"{what} already; choose another name, or back it up"
+            advice = f"{what} already; choose another name, or move it aside"
             raise ArgumentError("out", advice, value=paths[0], check=("overwrite",))

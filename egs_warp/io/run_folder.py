@@ -116,7 +116,7 @@ def back_up(folder: Path, names: Sequence[str]) -> None:
             os.replace(folder / name, backup / name)
     except OSError as error:
         raise UserError(
-            f"{folder}: the earlier run cannot be backed up ({error.strerror}); choose another folder"
+            f"{folder}: the earlier run cannot be moved aside ({error.strerror}); choose another folder"
         ) from error
 
 
@@ -233,7 +233,7 @@ def _exists(path: Path) -> bool:
 
 
 def _occupied(out: Path | str, what: str) -> UserError:
-    problem = f"{what}, which would be mixed with this one; choose another folder, or back it up"
+    problem = f"{what}, which would be mixed with this one; choose another folder, or move it aside"
     return ArgumentError("out", problem, value=out, check=("overwrite",))
 
 

@@ -197,7 +197,9 @@ def test_what_cannot_go_on_is_told(tmp_path: Path, capsys: pytest.CaptureFixture
     (out / "trajectory.parts").mkdir()
     content["files"] |= {"trajectory.parts": None}
     manifest.write_text(json.dumps(content))
-    assert "the run was started by egs-warp 0.0.1, this is 0.1.0, whose steps are others; begin the run" in told(out)
+    assert "the run was started by egs-warp 0.0.1, this is 0.1.0, which may compute other steps; start the run" in told(
+        out
+    )
     for broken in ("[]", "{}", json.dumps({"files": {"../a": None}})):
         manifest.write_text(broken)
         assert told(out) == f"egs-warp: {manifest}: not a manifest of a run; start the run again\n"

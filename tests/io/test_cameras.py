@@ -314,12 +314,15 @@ def test_transforms_without_a_size(tmp_path: Path) -> None:
 def test_bad_colmap(tmp_path: Path) -> None:
     colmap_text(tmp_path, camera="3 EUCM 640 480 500 500 320 240 0.01 0.02")
     assert message(tmp_path).startswith(
-        "cameras.txt: camera 3 of model EUCM with 6 parameters is not known; give one of SIMPLE_PINHOLE, PINHOLE, "
+        "cameras.txt: camera 3 of model EUCM with 6 parameters is unknown; give one of SIMPLE_PINHOLE, PINHOLE, "
     )
     colmap_text(tmp_path, camera="4 PINHOLE 640 480 500 510 320 240")
-    assert message(tmp_path) == "images.txt: image sub/with space.jpg has camera 3, missing in cameras.txt"
+    assert (
+        message(tmp_path)
+        == "images.txt: image sub/with space.jpg has camera 3, which is missing in cameras.txt; export the model again"
+    )
     colmap_text(tmp_path, camera="3 PINHOLE 640 480 500 510 320")
-    assert message(tmp_path).startswith("cameras.txt: camera 3 of model PINHOLE with 3 parameters is not known")
+    assert message(tmp_path).startswith("cameras.txt: camera 3 of model PINHOLE with 3 parameters is unknown")
     colmap_text(tmp_path, camera="3 PINHOLE wide")
     assert message(tmp_path) == "cameras.txt: malformed camera line '3 PINHOLE wide'; export the model again"
     (tmp_path / "cameras.txt").unlink()

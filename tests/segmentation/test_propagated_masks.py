@@ -122,7 +122,7 @@ def test_what_nothing_can_be_made_of_is_told(cameras: list[Camera]) -> None:
     beside = click_at(cloud, cameras[0], *pixel_of(cameras[0], (0.5, 0.0, 0.9)), inside=False)
     on = click_at(cloud, cameras[0], *pixel_of(cameras[0], (-0.5, 0.0, 0.9)))
     assert beside is not None and on is not None
-    with pytest.raises(UserError, match="no click on it for the network to go by"):
+    with pytest.raises(UserError, match="the network needs a click on it"):
         masks_of_clicks(cloud, [beside], cameras, ByTone())
 
     class Blind(ByTone):
