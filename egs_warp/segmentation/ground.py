@@ -99,7 +99,7 @@ class MeasuredGround:
 
 def measure_ground(
     cloud: GaussianCloud,
-    object_cloud: np.ndarray,
+    object_mask: np.ndarray,
     plane: Plane,
     *,
     cameras: Sequence[Camera] = (),
@@ -131,12 +131,12 @@ def measure_ground(
     above = [downscale(camera, _SIDE) for camera in cameras if plane.heights(camera.centre) > 0.2 * size]
     if len(above) < _MIN_VIEWS:
         above = ring_cameras(plane, middle, 1.2 * size, count=_VIEWS - 1, elevations=_ELEVATIONS, size=_SIDE)
-    if object_cloud.all():
+    if object_mask.all():
         raise UserError(
             f"segment: all {cloud.count} Gaussians of the capture are the object, so there is no ground to measure;"
             " animate the capture itself, or mark less of it"
         )
-    bare = cloud.subset(~object_cloud)
+    bare = cloud.subset(~object_mask)
     maps = []
     for camera in above[:: -(-len(above) // _VIEWS)]:
         points = _seen_points(cloud, bare, camera, plane)
