@@ -35,7 +35,7 @@ def with_underside(object_cloud: GaussianCloud, ground: HeightField, size: float
     Heights and colours solve Laplace's equation with the values of the rim.
 
     Args:
-        thing: Gaussians of the object, scene units.
+        object_cloud: Gaussians of the object, scene units.
         ground: the ground under it.
         size: size of the object, scene units.
     """

@@ -78,9 +78,9 @@ class SplatGraph:
         """Compute the labels of minimum cost.
 
         Args:
-            leaning: (n,) cost of excluding a Gaussian, or, if negative, of including it.
-            held: (n,) bool, always included.
-            dropped: (n,) bool, always excluded.
+            score: (n,) cost of excluding a Gaussian, or, if negative, of including it.
+            included: (n,) bool, always included.
+            excluded: (n,) bool, always excluded.
             smoothness: factor of the links' strength, the cost of cutting them.
 
         Returns:

@@ -79,7 +79,7 @@ class MeasuredGround:
         The top of a fold under an object is unseen, and the harmonic continuation misses it.
 
         Args:
-            thing: Gaussians of the object.
+            object_cloud: Gaussians of the object.
             size: its size, scene units.
         """
         points = object_cloud.means.numpy()[object_cloud.opacities() > _SOLID].astype(np.float64)
@@ -114,7 +114,7 @@ def measure_ground(
 
     Args:
         cloud: the capture.
-        thing: (n,) bool, Gaussians of the object.
+        object_mask: (n,) bool, Gaussians of the object.
         plane: the plane under it.
         cameras: cameras of the capture, if known.
         centre: (3,) centre of the object.

@@ -40,7 +40,7 @@ def resting_plane(
 
     Args:
         cloud: the capture.
-        thing: (n,) bool, the known part of the object.
+        object_mask: (n,) bool, the known part of the object.
         plane: a plane that may cut through it.
         up: (3,) up direction.
         degrees: maximum angle to ``up``.
