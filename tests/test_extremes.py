@@ -16,7 +16,7 @@ from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.deformation.splitting import split_for_motion
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import LARGEST, LARGEST_LOG_SCALE, GaussianCloud, unit_quaternions
+from egs_warp.geometry.gaussians import MAX_LOG_SCALE, MAX_VALUE, GaussianCloud, unit_quaternions
 from egs_warp.render import render_gaussians
 from tests.support.deformation_scenes import bent, box
 from tests.support.properties import examples
@@ -32,9 +32,9 @@ CAMERA = Camera.look_at(np.array([0.5, 0.5, -2.5]), MIDDLE, UP, width=48, height
 CAGE = box((8, 2, 2), (1.0, 1.0, 1.0))
 MOTIONS = (CAGE.nodes, bent(CAGE.nodes, 0.7), CAGE.nodes * [1.0, 1.0, -1.0], CAGE.nodes * [1.0, 1.0, 0.0])
 
-magnitudes = st.sampled_from([0.0, 1e-45, 1e-40, 1e-30, 1e-20, 1.0, 1e3, 1e6, 1e12, 0.99 * LARGEST])
+magnitudes = st.sampled_from([0.0, 1e-45, 1e-40, 1e-30, 1e-20, 1.0, 1e3, 1e6, 1e12, 0.99 * MAX_VALUE])
 numbers = st.builds(lambda size, sign: sign * size, magnitudes, st.sampled_from([-1.0, 1.0]))
-log_scales = st.sampled_from([-0.99 * LARGEST, -1e3, -104.0, -88.0, -45.0, -20.0, 0.0, 5.0, 20.0, LARGEST_LOG_SCALE])
+log_scales = st.sampled_from([-0.99 * MAX_VALUE, -1e3, -104.0, -88.0, -45.0, -20.0, 0.0, 5.0, 20.0, MAX_LOG_SCALE])
 
 
 @st.composite

@@ -1,5 +1,6 @@
-"""What every room speaks of: Gaussian clouds, cameras, planes, tetrahedra, frames (the paper's section 3.1).
+"""Types that all packages share: Gaussian clouds, cameras, planes, tetrahedral meshes, frames (the paper's section
+3.1).
 
-In: arrays. Out: frozen records of them, shapes and units under each field. Nothing here reads a file or launches a
-kernel.
+Input: arrays. Output: frozen records of them, with shapes and units under each field. Nothing here reads a file; no
+kernels are launched.
 """

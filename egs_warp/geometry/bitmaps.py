@@ -1,4 +1,4 @@
-"""Distances and connected parts of masks (rows, columns) of bool, in pixels."""
+"""Distances and connected parts of bool masks (rows, columns), in pixels."""
 
 from __future__ import annotations
 
@@ -9,25 +9,30 @@ from scipy import ndimage
 
 
 def depth_inside(mask: np.ndarray) -> np.ndarray:
-    """(rows, columns) float64: distance of each set pixel to the nearest one that is not set; 0 elsewhere."""
+    """(rows, columns) float64, distance of each set pixel to the nearest unset one; 0 for unset pixels."""
     return np.asarray(cast(Any, ndimage.distance_transform_edt(mask)))
 
 
 def distance_to(mask: np.ndarray) -> np.ndarray:
-    """(rows, columns) float64: distance of each pixel to the nearest set one."""
+    """(rows, columns) float64, distance of each pixel to the nearest set one."""
     return depth_inside(~mask)
 
 
 def nearest_set(mask: np.ndarray) -> np.ndarray:
-    """(2, rows, columns) int: row and column of the set pixel nearest to each pixel."""
-    found: Any = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
-    return np.asarray(found)
+    """(2, rows, columns) int, row and column of the set pixel nearest to each pixel."""
+    result: Any = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    return np.asarray(result)
 
 
 def connected_parts(mask: np.ndarray, *, corners: bool = False) -> tuple[np.ndarray, int]:
-    """(rows, columns) int, 0 where not set and else the number of the connected part from 1; and how many there are.
+    """Label the connected parts of a mask.
 
-    ``corners`` lets pixels that touch at a corner hang together.
+    Args:
+        mask: (rows, columns) bool.
+        corners: pixels that touch at a corner are connected.
+
+    Returns:
+        (rows, columns) int, 0 where not set and else the number of the part from 1; and the number of parts.
     """
-    found: Any = ndimage.label(mask, np.ones((3, 3)) if corners else None)
-    return np.asarray(found[0]), int(found[1])
+    result: Any = ndimage.label(mask, np.ones((3, 3)) if corners else None)
+    return np.asarray(result[0]), int(result[1])

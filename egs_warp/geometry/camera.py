@@ -42,9 +42,8 @@ class Camera:
         near: float = 0.01,
         far: float = 1e6,
     ) -> Camera:
-        """Camera at ``eye`` that looks at ``target`` with ``up`` (not parallel to the view)
-        pointing up in the image.
-        """
+        """Create a camera at ``eye`` that looks at ``target``; ``up`` (not parallel to the view) points up in the
+        image."""
         forward = np.asarray(target, float) - np.asarray(eye, float)
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, np.asarray(up, float))
@@ -66,7 +65,7 @@ class Camera:
 
 
 def downscale(camera: Camera, side: int) -> Camera:
-    """The same view with its sides divided by the least whole number that makes them at most ``side`` pixels."""
+    """Return the same view with both sides divided by the smallest integer that makes them at most ``side`` pixels."""
     factor = -(-max(camera.width, camera.height) // side)
     if factor <= 1:
         return camera
@@ -83,7 +82,7 @@ def downscale(camera: Camera, side: int) -> Camera:
 
 
 def camera_rays(camera: Camera) -> np.ndarray:
-    """(H, W, 3) world-space rays r = R^T K^-1 [u, v, 1] of Eq. (18), of z-depth 1."""
+    """(H, W, 3) world-space rays r = R^T K^-1 [u, v, 1] of Eq. (18), with z-depth 1."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
     return rays @ camera.rotation

@@ -1,4 +1,4 @@
-"""Cameras around an object, where a capture comes without any; and their file."""
+"""Cameras on rings around an object, for captures without cameras."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ ELEVATIONS = (12.0, 30.0, 52.0)
 
 
 def ring_camera(
-    way: np.ndarray, centre: np.ndarray, radius: float, up: np.ndarray, *, size: int, vertical_fov_degrees: float
+    direction: np.ndarray, centre: np.ndarray, radius: float, up: np.ndarray, *, size: int, vertical_fov_degrees: float
 ) -> Camera:
-    """The camera that holds the ball of ``radius`` about ``centre`` (3,) and stands the ``way`` (3,) from it; ``size``
-    in pixels, both sides.
-    """
+    """Return the camera in ``direction`` (3,) from ``centre`` (3,) that sees the ball of ``radius`` about it. ``size``
+    is in pixels, both sides."""
     distance = radius / np.sin(np.radians(vertical_fov_degrees / 2.0))
-    eye = centre + distance * way / np.linalg.norm(way)
+    eye = centre + distance * direction / np.linalg.norm(direction)
     return Camera.look_at(
         eye, centre, up, width=size, height=size, vertical_fov_degrees=vertical_fov_degrees, near=0.01 * distance
     )
@@ -37,9 +36,10 @@ def ring_cameras(
     vertical_fov_degrees: float = 40.0,
     margin: float = 1.25,
 ) -> list[Camera]:
-    """``count`` cameras on rings above ``plane`` that hold the ball of ``radius`` about ``centre`` (3,) with a margin.
+    """Return ``count`` cameras on rings above ``plane`` that see the ball of ``radius`` about ``centre`` (3,) with a
+    margin.
 
-    The elevations take turns, so that neighbours differ in both angles. ``size`` is in pixels, both sides.
+    The elevations alternate, so that neighbours differ in both angles. ``size`` is in pixels, both sides.
     """
     first, second = plane.tangents()
     distance = margin * radius / np.sin(np.radians(vertical_fov_degrees / 2.0))

@@ -14,14 +14,14 @@ from egs_warp.launching import device_of
 
 SH_BAND_0 = 0.28209479177387814
 """Spherical harmonic of band 0: a colour is 1/2 + SH_BAND_0 x its coefficient, higher bands apart."""
-LARGEST, LARGEST_LOG_SCALE = 1e18, 41.0
-"""Of any number of a cloud, and of the logarithm of a standard deviation: their squares are finite in single precision.
-"""
+MAX_VALUE, MAX_LOG_SCALE = 1e18, 41.0
+"""Limits for any number of a cloud and for the logarithm of a standard deviation: their squares are finite in single
+precision."""
 
 
 @dataclass(frozen=True)
 class GaussianCloud:
-    """A 3DGS capture. All arrays live on one device; torch sees them without copies through ``wp.to_torch``."""
+    """A 3DGS capture. All arrays live on one device; ``wp.to_torch`` gives torch views without copies."""
 
     means: wp.array
     """(n,) vec3, scene units (metres once animated)."""
@@ -47,8 +47,8 @@ class GaussianCloud:
     ) -> GaussianCloud:
         """Upload (n, 3), (n, 4), (n, 3), (n,), (n, K, 3) arrays; quaternions are normalised.
 
-        Raises ``UserError`` for zero Gaussians, mismatched counts, and for a value that is not finite or beyond
-        ``LARGEST``, which it names.
+        Raises ``UserError`` for zero Gaussians and mismatched counts, and for a value that is not finite or exceeds
+        ``MAX_VALUE``; the message names it.
         """
         count = len(means)
         if count == 0:
@@ -62,22 +62,22 @@ class GaussianCloud:
         }
         for name, (values, shape) in named.items():
             if np.shape(values) != shape:
-                raise UserError(f"capture: {name} has shape {np.shape(values)}, expected {shape}")
-            bad = np.flatnonzero(~np.isfinite(values).reshape(count, -1).all(axis=1))
-            if len(bad):
+                raise UserError(f"capture: {name} has shape {np.shape(values)}, expected {shape}; export it again")
+            not_finite = np.flatnonzero(~np.isfinite(values).reshape(count, -1).all(axis=1))
+            if len(not_finite):
                 raise UserError(
-                    f"capture: {name} of {len(bad)} Gaussians is not finite (first: number {bad[0]}); "
+                    f"capture: {name} of {len(not_finite)} Gaussians is not finite (first: number {not_finite[0]}); "
                     "remove them and export again"
                 )
-            # Of a quaternion only the direction counts.
-            most = {"log_scales": LARGEST_LOG_SCALE, "rotations": np.inf}.get(name, LARGEST)
-            large = np.reshape(values, (count, -1)).max(axis=1) > most
+            # Only the direction of a quaternion counts.
+            limit = {"log_scales": MAX_LOG_SCALE, "rotations": np.inf}.get(name, MAX_VALUE)
+            too_large = np.reshape(values, (count, -1)).max(axis=1) > limit
             if name != "log_scales":
-                large |= np.reshape(values, (count, -1)).min(axis=1) < -most
-            if large.any():
+                too_large |= np.reshape(values, (count, -1)).min(axis=1) < -limit
+            if too_large.any():
                 raise UserError(
-                    f"capture: {name} of {np.count_nonzero(large)} Gaussians is too large for single precision"
-                    f" (first: number {np.argmax(large)}); remove them and export again"
+                    f"capture: {name} of {np.count_nonzero(too_large)} Gaussians is too large for single precision"
+                    f" (first: number {np.argmax(too_large)}); remove them and export again"
                 )
         if np.shape(sh)[1] not in (1, 4, 9, 16):
             raise UserError(f"capture: {np.shape(sh)[1]} SH coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
@@ -94,7 +94,7 @@ class GaussianCloud:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """The numbers, and where they lie."""
+        """Pickle by the host arrays and the device's name."""
         arrays = (self.means, self.rotations, self.log_scales, self.opacity_logits, self.sh)
         return partial(GaussianCloud.from_numpy, device=str(self.device)), tuple(array.numpy() for array in arrays)
 
@@ -105,7 +105,7 @@ class GaussianCloud:
 
     @property
     def sh_degree(self) -> int:
-        """0 to 3."""
+        """SH degree, 0 to 3."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     @property
@@ -119,13 +119,12 @@ class GaussianCloud:
             return 1.0 / (1.0 + np.exp(-self.opacity_logits.numpy().astype(np.float64)))
 
     def breadths(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """(m,) float64 on the host: the middle standard deviation of those ``rows``, scene units; of a flat one how far
-        it reaches across.
-        """
+        """(m,) float64 on the host, the middle standard deviation of those ``rows``, scene units. For a flat Gaussian
+        it is the width across."""
         return np.exp(np.median(self.log_scales.numpy()[rows].astype(np.float64), axis=1))
 
     def scaled(self, factor: float) -> GaussianCloud:
-        """The same capture with every length multiplied by ``factor``."""
+        """Return the same capture with every length multiplied by ``factor``."""
         return GaussianCloud.from_numpy(
             self.means.numpy() * factor,
             self.rotations.numpy(),
@@ -136,9 +135,15 @@ class GaussianCloud:
         )
 
     def subset(self, chosen: np.ndarray) -> GaussianCloud:
-        """The Gaussians picked by a boolean mask or an index array."""
+        """Return the Gaussians that a boolean mask or an index array selects.
+
+        Raises ``UserError`` if it selects none.
+        """
+        means = self.means.numpy()[chosen]
+        if len(means) == 0:
+            raise UserError(f"selection: it holds none of the {self.count} Gaussians; select at least one")
         return GaussianCloud.from_numpy(
-            self.means.numpy()[chosen],
+            means,
             self.rotations.numpy()[chosen],
             self.log_scales.numpy()[chosen],
             self.opacity_logits.numpy()[chosen],
@@ -148,27 +153,27 @@ class GaussianCloud:
 
 
 def unit_quaternions(quaternions: np.ndarray) -> np.ndarray:
-    """(n, 4) float32 of unit length; those of length 0 become the identity (w first).
+    """(n, 4) float32 quaternions of unit length; those of length 0 become the identity (w first).
 
-    Quaternions that are unit already, to rounding, keep their bits, so that a capture survives any number of copies.
+    Quaternions that are already unit to rounding keep their bits, so that a capture survives any number of copies.
     """
     lengths = np.sqrt(np.einsum("ni,ni->n", quaternions, quaternions, dtype=np.float64))
     far = ~np.isfinite(lengths) | (lengths < 1e-150)
     if far.any():
-        # Doubles whose squares are no numbers, or none at all, and zeros.
+        # Doubles whose squares overflow or underflow, and zeros.
         largest = np.abs(quaternions[far]).max(axis=1, keepdims=True)
         quaternions = np.array(quaternions, dtype=np.float64)
         quaternions[far] /= np.where(largest > 0.0, largest, 1.0)
         lengths[far] = np.linalg.norm(quaternions[far], axis=1)
-    off = np.abs(lengths - 1.0) > 2.0**-22
+    not_unit = np.abs(lengths - 1.0) > 2.0**-22
     unit = np.array(quaternions, dtype=np.float32)
-    unit[off] = quaternions[off] / np.maximum(lengths[off], 1e-300)[:, None]
+    unit[not_unit] = quaternions[not_unit] / np.maximum(lengths[not_unit], 1e-300)[:, None]
     unit[lengths == 0.0] = (1.0, 0.0, 0.0, 0.0)
     return unit
 
 
 def concatenate(*clouds: GaussianCloud) -> GaussianCloud:
-    """One cloud with all Gaussians in turn; all of the same SH degree."""
+    """Return one cloud with the Gaussians of all ``clouds`` in turn; all must have the same SH degree."""
 
     def stack(name: str) -> np.ndarray:
         return np.concatenate([getattr(cloud, name).numpy() for cloud in clouds])
@@ -184,7 +189,7 @@ def concatenate(*clouds: GaussianCloud) -> GaussianCloud:
 
 
 def with_degree(cloud: GaussianCloud, degree: int | None) -> GaussianCloud:
-    """``cloud`` with colour bands up to ``degree``, all of them where that is None."""
+    """Return ``cloud`` with colour bands up to ``degree``; None keeps all of them."""
     if degree is None or degree >= cloud.sh_degree:
         return cloud
     return replace(cloud, sh=cloud.sh[:, : (degree + 1) ** 2].contiguous())

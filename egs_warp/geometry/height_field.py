@@ -1,4 +1,4 @@
-"""Ground that is not flat: heights over a plane, smooth enough to have a normal everywhere."""
+"""Uneven ground: heights over a plane, smooth enough to have a normal everywhere."""
 
 from __future__ import annotations
 
@@ -10,51 +10,51 @@ from scipy import ndimage
 from egs_warp.errors import UserError
 from egs_warp.geometry.plane import Plane
 
-_FIT = "mirror"
-_TOP_STEPS = 8
-_DAMAGED = "ground: it is damaged; make it again"
-_MOST_NODES = 1 << 22
-"""Of a grid."""
+_BOUNDARY = "mirror"
+_NEWTON_STEPS = 8
+_DAMAGED = "ground: its height field is damaged; make it again with egs-warp segment"
+_MAX_NODES = 1 << 22
+"""Maximum number of nodes of a grid."""
 
 
 @dataclass(frozen=True)
 class HeightField:
-    """A biquadratic B-spline over a square grid: heights and slopes are continuous, so is the normal.
+    """A biquadratic B-spline over a square grid: heights and slopes are continuous, and so is the normal.
 
-    Beyond the grid its edge goes on level. Lengths are those of the frame that it lies in.
+    Outside the grid, the edge continues level. Lengths are in the units of the frame that it lies in.
     """
 
     axes: np.ndarray
     """(3, 3) rows: the grid's columns run along the first, its rows along the second, heights along the third;
     right-handed."""
     origin: np.ndarray
-    """(3,) where node (0, 0) lies at height 0."""
+    """(3,) position of node (0, 0) at height 0."""
     spacing: float
-    """Of the nodes."""
+    """Distance between nodes."""
     coefficients: np.ndarray
-    """(rows, columns) float64, of the spline."""
+    """(rows, columns) float64, coefficients of the spline."""
 
     @classmethod
     def through(cls, axes: np.ndarray, origin: np.ndarray, spacing: float, heights: np.ndarray) -> HeightField:
-        """The field that has ``heights`` (rows, columns) at its nodes."""
-        return cls(axes, origin, spacing, ndimage.spline_filter(heights, order=2, output=np.float64, mode=_FIT))
+        """Create the field with ``heights`` (rows, columns) at its nodes."""
+        return cls(axes, origin, spacing, ndimage.spline_filter(heights, order=2, output=np.float64, mode=_BOUNDARY))
 
     @property
     def normal(self) -> np.ndarray:
-        """(3,) unit, of the plane that heights are told from."""
+        """(3,) unit normal of the reference plane."""
         return self.axes[2]
 
     @property
     def plane(self) -> Plane:
-        """The plane that heights are told from."""
+        """The reference plane, from which heights are measured."""
         return Plane(self.axes[2], -float(self.axes[2] @ self.origin))
 
     def tangents(self) -> tuple[np.ndarray, np.ndarray]:
-        """Two unit vectors (3,) that span that plane."""
+        """Return two unit vectors (3,) that span the reference plane."""
         return self.axes[0], self.axes[1]
 
     def ground_height(self, points: np.ndarray) -> np.ndarray:
-        """(...,) height of the ground over its plane, under or over ``points`` (..., 3)."""
+        """(...,) height of the ground over its plane, below or above ``points`` (..., 3)."""
         return self._spline(np.asarray(points, float))[0]
 
     def heights(self, points: np.ndarray) -> np.ndarray:
@@ -63,17 +63,17 @@ class HeightField:
         return (points - self.origin) @ self.axes[2] - self._spline(points)[0]
 
     def gaps(self, points: np.ndarray) -> np.ndarray:
-        """(...,) distance of ``points`` (..., 3) from the tangent plane under them; negative inside.
+        """(...,) distance of ``points`` (..., 3) from the tangent plane of the ground under them; negative inside.
 
-        It is zero on the ground, where its gradient is the normal; off it, it is the distance to first order.
+        It is zero on the ground, where its gradient is the normal; elsewhere it is the distance to first order.
         """
         points = np.asarray(points, float)
         height, (first, second) = self._spline(points)
         return ((points - self.origin) @ self.axes[2] - height) / np.sqrt(1.0 + first**2 + second**2)
 
     def frames(self, points: np.ndarray) -> np.ndarray:
-        """(n, 3, 3) rows: the ground's normal under ``points`` (n, 3) and two tangents, unit, right-handed after it;
-        they turn with it without a jump."""
+        """(n, 3, 3) rows: the ground's normal under ``points`` (n, 3) and two tangents, unit, right-handed in this
+        order. They vary continuously."""
         _, (first, second) = self._spline(np.asarray(points, float))
         zero, one = np.zeros_like(first), np.ones_like(first)
         normal = np.stack([-first, -second, one], axis=1) / np.sqrt(1.0 + first**2 + second**2)[:, None]
@@ -81,28 +81,29 @@ class HeightField:
         return np.stack([normal, along, np.cross(normal, along)], axis=1) @ self.axes
 
     def distance_along(self, point: np.ndarray, up: np.ndarray) -> float:
-        """How far along ``up`` (3,) from ``point`` (3,) the ground is."""
-        way = 0.0
-        for _ in range(_TOP_STEPS):
-            way -= float(self.heights(point + way * up)) / float(up @ self.axes[2])
-        return way
+        """Return the distance to the ground from ``point`` (3,) along ``up`` (3,), by Newton's method."""
+        distance = 0.0
+        for _ in range(_NEWTON_STEPS):
+            distance -= float(self.heights(point + distance * up)) / float(up @ self.axes[2])
+        return distance
 
     def flatten(self, points: np.ndarray) -> np.ndarray:
-        """``points`` (n, 3) moved along the plane's normal until their heights over the ground are over the plane."""
+        """Move ``points`` (n, 3) along the plane's normal so that their heights over the ground become heights over the
+        plane."""
         return points - self.ground_height(points)[:, None] * self.axes[2]
 
     def unflatten(self, points: np.ndarray) -> np.ndarray:
-        """The inverse of ``levelled``."""
+        """Inverse of ``flatten``."""
         return points + self.ground_height(points)[:, None] * self.axes[2]
 
     def nodes(self) -> np.ndarray:
-        """(rows, columns, 3) the nodes, on the ground."""
+        """(rows, columns, 3) positions of the nodes, on the ground."""
         at = np.stack(np.meshgrid(*(np.arange(count) for count in self.coefficients.shape[::-1])), axis=-1)
         flat = self.origin + self.spacing * (at @ self.axes[:2])
         return flat + self._spline(flat)[0][..., None] * self.axes[2]
 
     def scaled(self, factor: float) -> HeightField:
-        """The same ground after all lengths are multiplied by ``factor``."""
+        """Return the same ground with all lengths multiplied by ``factor``."""
         return replace(
             self,
             origin=factor * self.origin,
@@ -111,16 +112,18 @@ class HeightField:
         )
 
     def moved(self, shift: np.ndarray) -> HeightField:
-        """The same ground after all points have moved by ``shift`` (3,)."""
+        """Return the same ground moved by ``shift`` (3,)."""
         return replace(self, origin=self.origin + shift)
 
     def coarser(self, spacing: float) -> HeightField:
-        """The ground without what is narrower than two of ``spacing``; itself if it is as coarse already."""
+        """Return the ground smoothed to nodes ``spacing`` apart; itself if it is as coarse already. Features narrower
+        than two ``spacing`` are removed."""
         if spacing <= self.spacing:
             return self
         ratio = spacing / self.spacing
         heights = (self.nodes() - self.origin) @ self.axes[2]
-        # Half a spacing wide: what is two spacings long keeps 30 % of its height, four 74 %.
+        # The blur is half a spacing wide: features two spacings long keep 30 % of their height, features four spacings
+        # long 74 %.
         smooth = np.asarray(ndimage.gaussian_filter(heights, 0.5 * ratio, mode="nearest"))
         rows, columns = (max(int(np.ceil((count - 1) / ratio)) + 1, 3) for count in heights.shape)
         at = np.stack(np.meshgrid(ratio * np.arange(rows), ratio * np.arange(columns), indexing="ij"))
@@ -128,7 +131,7 @@ class HeightField:
         return HeightField.through(self.axes, self.origin, spacing, sampled)
 
     def _spline(self, points: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """(...,) height and its two slopes at ``points`` (..., 3)."""
+        """Return the height (...,) at ``points`` (..., 3) and its two slopes."""
         away = (points - self.origin) / self.spacing
         (column, across), (row, along) = (_weights(away @ axis) for axis in self.axes[:2])
         rows, columns = self.coefficients.shape
@@ -143,20 +146,21 @@ class HeightField:
 
 
 def check_grid(field: HeightField) -> None:
-    """Raises ``UserError`` for a field that is no ground: too small or large, not finite, or with skewed axes."""
+    """Raise ``UserError`` for an invalid field: too small or large, not finite, or with skewed axes."""
     if field.coefficients.ndim != 2:
         raise UserError(_DAMAGED)
     rows, columns = field.coefficients.shape
     finite = np.isfinite(field.coefficients).all() and np.isfinite(field.origin).all() and 0.0 < field.spacing < np.inf
     square = np.abs(field.axes @ field.axes.T - np.eye(3)).max() < 1e-6 if np.isfinite(field.axes).all() else False
-    if not (min(rows, columns) >= 3 and rows * columns <= _MOST_NODES and finite and square):
+    if not (min(rows, columns) >= 3 and rows * columns <= _MAX_NODES and finite and square):
         raise UserError(_DAMAGED)
 
 
 def _weights(place: np.ndarray) -> tuple[np.ndarray, tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]]:
-    """Nearest node of each ``place`` (in spacings), weights of it and its neighbours, and their derivatives."""
+    """Return the nearest node of each ``place`` (in spacings), the weights of it and its neighbours, and their
+    derivatives."""
     nearest = np.floor(place + 0.5)
     f = place - nearest
     weights = (0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2)
-    # Far out the index is of no account, but it has to be one.
+    # Far from the grid the index does not matter, but it must be a valid integer.
     return np.clip(nearest, -2.0, 1e9).astype(np.int64), (weights, (f - 0.5, -2.0 * f, f + 0.5))

@@ -1,4 +1,4 @@
-"""The smoothest continuation of a picture into a hole."""
+"""Harmonic continuation of a picture into a hole."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from scipy.sparse.linalg import spsolve
 
 
 def laplace_fill(values: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """(rows, columns) or (rows, columns, channels) ``values`` with the solution of Laplace's equation in ``hole``
-    (rows, columns)."""
+    """Return ``values`` (rows, columns) or (rows, columns, channels) with the solution of Laplace's equation in
+    ``hole`` (rows, columns)."""
     index = np.full(hole.shape, -1)
     index[hole] = np.arange(hole.sum())
     rows, columns, sums = [], [], np.zeros((int(hole.sum()), *values.shape[2:]))
@@ -27,6 +27,6 @@ def laplace_fill(values: np.ndarray, hole: np.ndarray) -> np.ndarray:
         sums[fixed] += values[there[fixed, 0], there[fixed, 1]]
     row, column = np.concatenate(rows), np.concatenate(columns)
     matrix = sparse.diags(degree) - sparse.coo_array((np.ones(len(row)), (row, column)), shape=(len(at), len(at)))
-    film = values.astype(np.float64).copy()
-    film[hole] = np.asarray(spsolve(sparse.csc_array(matrix), sums))
-    return film
+    filled = values.astype(np.float64).copy()
+    filled[hole] = np.asarray(spsolve(sparse.csc_array(matrix), sums))
+    return filled

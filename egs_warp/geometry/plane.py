@@ -12,7 +12,7 @@ from egs_warp.geometry.frames import orthonormal_basis
 
 @dataclass(frozen=True)
 class Plane:
-    """N.x + d = 0 with |N| = 1 and N pointing to the object's side (up)."""
+    """The plane N.x + d = 0 with |N| = 1 and N pointing to the object's side (up)."""
 
     normal: np.ndarray
     """(3,) float64, unit."""
@@ -21,8 +21,9 @@ class Plane:
 
     @classmethod
     def from_coefficients(cls, nx: float, ny: float, nz: float, d: float) -> Plane:
-        """Plane nx x + ny y + nz z + d = 0, scaled to a unit normal.
-        Raises ``UserError`` for a zero or non-finite one.
+        """Create the plane nx x + ny y + nz z + d = 0, scaled to a unit normal.
+
+        Raises ``UserError`` for a zero or non-finite normal.
         """
         normal = np.array([nx, ny, nz], dtype=np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -34,17 +35,17 @@ class Plane:
         return cls(normal / length, float(d) / length)
 
     def heights(self, points: np.ndarray) -> np.ndarray:
-        """(...,) signed distance of ``points`` (..., 3); positive above."""
+        """(...,) signed distance of ``points`` (..., 3), positive above."""
         return np.asarray(points, float) @ self.normal + self.offset
 
     def scaled(self, factor: float) -> Plane:
-        """The same plane after all lengths are multiplied by ``factor``."""
+        """Return the same plane with all lengths multiplied by ``factor``."""
         return Plane(self.normal, self.offset * factor)
 
     def moved(self, shift: np.ndarray) -> Plane:
-        """The same plane after all points have moved by ``shift`` (3,)."""
+        """Return the same plane moved by ``shift`` (3,)."""
         return Plane(self.normal, self.offset - float(self.normal @ shift))
 
     def tangents(self) -> tuple[np.ndarray, np.ndarray]:
-        """Two unit vectors (3,) that span the plane; (t1, t2, N) is right-handed."""
+        """Return two unit vectors (3,) that span the plane; (t1, t2, N) is right-handed."""
         return orthonormal_basis(self.normal)

@@ -17,13 +17,13 @@ class TetMesh:
     """Nodes and tetrahedra; every tetrahedron has positive volume."""
 
     nodes: np.ndarray
-    """(N, 3) float64, metres."""
+    """(N, 3) float64, m."""
     tets: np.ndarray
     """(T, 4) int32, node indices; (x1-x0, x2-x0, x3-x0) is right-handed."""
 
     @classmethod
     def oriented(cls, nodes: np.ndarray, tets: np.ndarray) -> TetMesh:
-        """The mesh with each left-handed tetrahedron (fTetWild's winding) turned right-handed.
+        """Create the mesh with each left-handed tetrahedron (fTetWild's winding) made right-handed.
 
         Raises ``UserError`` if an element has no volume.
         """
@@ -39,20 +39,20 @@ class TetMesh:
         return cls(nodes, tets)
 
     def volumes(self) -> np.ndarray:
-        """(T,) float64, cubic metres, positive."""
+        """(T,) float64, m^3, positive."""
         return _signed_volumes(self.nodes, self.tets)
 
     def lumped_masses(self, density: float) -> np.ndarray:
-        """(N,) float64, kg: a quarter of each tetrahedron's mass on each of its nodes. ``density`` in kg/m^3."""
+        """(N,) float64, kg: a quarter of each tetrahedron's mass on each of its nodes. ``density`` is in kg/m^3."""
         masses = np.zeros(len(self.nodes))
         np.add.at(masses, self.tets.ravel(), np.repeat(density * self.volumes() / 4.0, 4))
         return masses
 
     def boundary_faces(self) -> np.ndarray:
-        """(B, 3) int32 node indices of the surface triangles, wound outwards; not to be written to."""
+        """(B, 3) int32 node indices of the surface triangles, wound outwards; the array is read-only."""
         return self._surface
 
-    # Motions ask for both each time that they begin, when somebody may be waiting.
+    # Both are cached, as each motion requests them when it starts.
     @cached_property
     def _surface(self) -> np.ndarray:
         faces = self.tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
@@ -66,7 +66,7 @@ class TetMesh:
         return float(edge_graph(self).data.mean())
 
     def min_dihedral_degrees(self) -> float:
-        """Smallest dihedral angle between two faces of one tetrahedron, degrees."""
+        """Return the smallest dihedral angle between two faces of one tetrahedron, degrees."""
         corners = self.nodes[self.tets]
         normals = np.stack(
             [
@@ -92,7 +92,7 @@ def _signed_volumes(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
 
 
 def edge_graph(mesh: TetMesh) -> sp.csr_matrix:
-    """(N, N) symmetric; entry (a, b) is the length in metres of the edge from node a to node b."""
+    """(N, N) symmetric, entry (a, b) is the length in metres of the edge from node a to node b."""
     pairs = mesh.tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2)
     pairs = np.unique(np.sort(pairs, axis=1), axis=0)
     lengths = np.linalg.norm(mesh.nodes[pairs[:, 0]] - mesh.nodes[pairs[:, 1]], axis=1)
@@ -101,5 +101,5 @@ def edge_graph(mesh: TetMesh) -> sp.csr_matrix:
 
 
 def mean_edge_length(mesh: TetMesh) -> float:
-    """Mean length in metres of the edges of ``mesh``."""
+    """Return the mean edge length of ``mesh``, m."""
     return mesh._mean_edge

@@ -1,5 +1,5 @@
-"""The floor where the object stood (section 3.7).
+"""New floor where the object stood (section 3.7).
 
-In: a background, the hole in its plane, an inpainter of pictures. Out: the background with new flat Gaussians in the
-hole.
+Input: a background, the hole in its plane and an inpainter of pictures. Output: the background with new flat Gaussians
+in the hole.
 """

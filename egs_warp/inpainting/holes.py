@@ -1,4 +1,4 @@
-"""Where the floor is missing: under the object's foot, where no view sees it, or where the user says."""
+"""Holes in the floor: under the object's foot, where no view sees the floor, or where the user marks one."""
 
 from __future__ import annotations
 
@@ -23,50 +23,49 @@ from egs_warp.segmentation.object_spec import Segmentation
 from egs_warp.segmentation.votes import MaskedView, check_size
 
 _TEXELS = 256
-"""Across the window in which a hole is drawn."""
+"""Texels across the window on which a hole is drawn."""
 _CONTACT = 0.05
-"""Of the object's height: what of it lies lower hides the floor from every side."""
+"""Fraction of the object's height. The part of the object below it hides the floor from every side."""
 _LOW = 0.08
-"""Of the object's size: under what it has below this height the floor is unseen,
-or seen so badly that it is smeared.
-"""
+"""Fraction of the object's size. Under parts of the object that are lower than this, the floor is unseen, or seen so
+badly that it is smeared."""
 _LOW_TEXELS = 200
-"""Across the window of the hole under an object."""
+"""Texels across the window of the hole under an object."""
 _BRIDGED = 0.1
-"""Of the footprint's span: gaps twice as wide are bridged."""
+"""Fraction of the footprint's span. Gaps up to twice as wide are bridged."""
 
 
 @dataclass(frozen=True)
 class Hole:
-    """A region of a plane, drawn on a window of it."""
+    """A region of a plane, drawn on a window of the plane."""
 
     window: PlaneWindow
     mask: np.ndarray
-    """(rows, columns) bool; none of it on the window's edge."""
+    """(rows, columns) bool, no texel at the window's edge."""
 
     def __post_init__(self) -> None:
         if not self.mask.any():
-            raise UserError("inpaint: the hole is empty; give the object, a mask, or a place on the plane")
+            raise UserError("inpaint: the hole is empty; give the object, a mask, or a point on the plane")
 
     @property
     def plane(self) -> Plane:
-        """What it is a hole in."""
+        """The plane with the hole."""
         return self.window.plane
 
     @property
     def area(self) -> float:
-        """Scene units squared."""
+        """Area in scene units squared."""
         return float(self.mask.sum()) * self.window.texel**2
 
     def bounds(self) -> tuple[np.ndarray, float]:
-        """Middle (3,) of its bounding square on the plane and that square's side, scene units."""
+        """Return the centre (3,) of the bounding square on the plane and the square's side, scene units."""
         rows, columns = np.nonzero(self.mask)
         middle = np.array([[columns.min() + columns.max() + 1, rows.min() + rows.max() + 1]]) / 2.0
         side = max(np.ptp(rows), np.ptp(columns)) + 1
         return self.window.points(middle)[0], float(side) * self.window.texel
 
     def outline(self) -> HoleOutline:
-        """What ``plane.json`` says of it."""
+        """Return the outline for ``plane.json``."""
         outlines, _ = cv2.findContours(self.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
         rows, columns = self.mask.shape
         corners = tuple(outline[:, 0] for outline in outlines)
@@ -74,7 +73,7 @@ class Hole:
 
     @classmethod
     def of_outline(cls, plane: Plane, outline: HoleOutline) -> Hole:
-        """The hole in ``plane`` that ``outline`` tells of. Raises ``UserError`` for one that cannot be drawn."""
+        """Create the hole in ``plane`` from its ``outline``. Raises ``UserError`` if the outline cannot be drawn."""
         rows, columns = outline.texels
         try:
             mask = np.zeros((rows, columns), np.uint8)
@@ -85,7 +84,7 @@ class Hole:
         return cls(PlaneWindow(plane, outline.centre, outline.texel, rows, columns), mask > 0)
 
     def drawn_on(self, window: PlaneWindow) -> np.ndarray:
-        """(rows, columns) bool: the hole on another window of the same plane."""
+        """(rows, columns) bool, the hole resampled on another window of the same plane."""
         columns, rows = np.meshgrid(np.arange(window.columns) + 0.5, np.arange(window.rows) + 0.5)
         places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
         at = self.window.pixels(places) - 0.5
@@ -94,7 +93,8 @@ class Hole:
 
 
 def disc(plane: Plane, centre: np.ndarray, radius: float) -> Hole:
-    """A round hole about ``centre`` (3,), dropped onto the plane.
+    """Return a round hole about ``centre`` (3,), projected onto the plane.
+
     Raises ``UserError`` unless the radius is positive.
     """
     if not (np.isfinite(radius) and radius > 0.0 and np.isfinite(centre).all()):
@@ -104,14 +104,17 @@ def disc(plane: Plane, centre: np.ndarray, radius: float) -> Hole:
     return Hole(window, np.hypot(columns - 0.5 * _TEXELS, rows - 0.5 * _TEXELS) * window.texel < radius)
 
 
-def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
-    """What an object that stands on ``plane`` hides from every side: its lowest part, seen from above, and what that
-    encloses. Raises ``UserError`` where the object does not reach down to the plane."""
-    means, opacity = thing.means.numpy(), thing.opacities()
+def footprint(object_cloud: GaussianCloud, plane: Plane) -> Hole:
+    """Return the part of the plane that an object standing on it hides from every side.
+
+    This is the object's lowest part, seen from above, and what it encloses. Raises ``UserError`` if the object does not
+    reach down to the plane.
+    """
+    means, opacity = object_cloud.means.numpy(), object_cloud.opacities()
     heights = plane.heights(means)
     solid = opacity > 0.3
     if not solid.any():
-        raise UserError("inpaint: the object has no opaque Gaussian; give another object, a mask, or a place")
+        raise UserError("inpaint: the object has no opaque Gaussian; give another object, a mask, or a point")
     top = float(np.quantile(heights[solid], 0.99))
     low = solid & (heights < _CONTACT * top) & (heights > -0.5 * top)
     if top <= 0.0 or not low.any():
@@ -120,14 +123,14 @@ def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
             f" {top:.3g} scene units above it); check the plane"
         )
     middle = 0.5 * (means[low].min(axis=0) + means[low].max(axis=0))
-    # Splats reach beyond their means.
-    margin = 3.0 * float(np.exp(np.quantile(np.max(thing.log_scales.numpy()[low], axis=1), 0.9)))
+    # Splats extend beyond their means.
+    margin = 3.0 * float(np.exp(np.quantile(np.max(object_cloud.log_scales.numpy()[low], axis=1), 0.9)))
     first, second = plane.tangents()
     span = max(np.ptp(means[low] @ first), np.ptp(means[low] @ second)) + 2.0 * margin
     window = _window(plane, middle, float(span))
-    above = render_gaussians(thing.subset(low), window.camera())
+    above = render_gaussians(object_cloud.subset(low), window.camera())
     covered = np.pad(above.alpha.numpy() > 0.5, _TEXELS // 2)
-    # Feet stay apart, but a sole is whole, though its Gaussians, which nobody has seen, are a sieve.
+    # Separate feet stay separate, but a sole is closed: no view has seen its Gaussians, so they are sparse.
     reach = _BRIDGED * _TEXELS
     wide = distance_to(covered) <= reach
     closed = (depth_inside(wide) > reach) | covered
@@ -135,12 +138,11 @@ def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
     return Hole(window, np.asarray(ndimage.binary_fill_holes(closed))[inner])
 
 
-def hole_under(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> Hole | None:
-    """Where the floor is missing: the outline of the object's low part and of what was dropped from under it, filled;
-    None under an object that hangs above it.
-    """
+def hole_under(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> Hole | None:
+    """Return the outline of the object's low part and of what was removed from under it, filled; None for an object
+    that hangs above the floor."""
     means = cloud.means.numpy().astype(np.float64)
-    low = found.buried_mask | (found.object_mask & (plane.heights(means) < _LOW * found.size))
+    low = segmentation.buried_mask | (segmentation.object_mask & (plane.heights(means) < _LOW * segmentation.size))
     if not low.any():
         return None
     middle = 0.5 * (means[low].min(axis=0) + means[low].max(axis=0))
@@ -150,26 +152,27 @@ def hole_under(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> Hole 
     window = PlaneWindow(plane, middle - plane.heights(middle) * plane.normal, texel, _LOW_TEXELS, _LOW_TEXELS)
     columns, rows = np.meshgrid(np.arange(_LOW_TEXELS) + 0.5, np.arange(_LOW_TEXELS) + 0.5)
     places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
-    inside = enclosed(places @ tangents, flat, found.size / CELLS)
+    inside = enclosed(places @ tangents, flat, segmentation.size / CELLS)
     return Hole(window, inside.reshape(_LOW_TEXELS, _LOW_TEXELS))
 
 
 def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
-    """The floor that stands behind the object in every view that has it in sight, which more than half of them must.
+    """Return the floor that stands behind the object in every view of it. More than half of the views must show that
+    floor.
 
-    Raises ``UserError`` for masks that do not fit their cameras, are all empty, or between them hide no common floor.
+    Raises ``UserError`` if masks do not fit their cameras, all are empty, or they hide no common floor.
     """
     for view in views:
         check_size(view)
     name = views[0].name
-    # Where the object is out of sight its mask is empty, and says nothing.
+    # A mask is empty where the object is out of sight, and is then ignored.
     views = [view for view in views if view.mask.any()]
     if not views:
         raise UserError(f"{name}: the mask is empty; mark the object in it")
     shadows = [_on_plane(plane, view.camera, view.mask) for view in views]
     if any(len(shadow) == 0 for shadow in shadows):
         raise UserError("inpaint: the floor is not in sight inside a mask; the hole is off the plane, check the plane")
-    # The common floor lies inside every shadow's bounds; the smallest shadow has the finest window.
+    # The common floor lies inside the bounds of every shadow; the smallest shadow has the finest window.
     smallest = min(shadows, key=lambda shadow: float(np.ptp(shadow, axis=0).max()))
     middle = 0.5 * (smallest.min(axis=0) + smallest.max(axis=0))
     first, second = plane.tangents()
@@ -187,14 +190,14 @@ def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
         inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         hidden[inside] &= mask[row[inside], column[inside]]
         looks += inside
-    found = (hidden & (2 * looks > len(views))).reshape(_TEXELS, _TEXELS)
-    if not found.any():
+    common = (hidden & (2 * looks > len(views))).reshape(_TEXELS, _TEXELS)
+    if not common.any():
         raise UserError("inpaint: the masks hide no floor in common; check that they show one object and the plane")
-    return Hole(window, found)
+    return Hole(window, common)
 
 
 def _on_plane(plane: Plane, camera: Camera, mask: np.ndarray) -> np.ndarray:
-    """(n, 3) points of the plane behind the pixels of ``mask``; none for those that miss it."""
+    """(n, 3) points where the rays through the pixels of ``mask`` meet the plane; rays that miss it are left out."""
     rays = camera_rays(camera)[mask]
     slope = rays @ plane.normal
     height = float(plane.heights(camera.centre))
@@ -204,5 +207,5 @@ def _on_plane(plane: Plane, camera: Camera, mask: np.ndarray) -> np.ndarray:
 
 def _window(plane: Plane, middle: np.ndarray, span: float) -> PlaneWindow:
     centre = middle - float(plane.heights(middle)) * plane.normal
-    # A few texels stay free all around.
+    # Leave a margin of a few texels on every side.
     return PlaneWindow(plane, centre, span / (_TEXELS - 16), _TEXELS, _TEXELS)

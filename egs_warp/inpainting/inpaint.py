@@ -1,7 +1,7 @@
-"""New floor where the object stood: flat Gaussians on the plane, coloured by a 2D inpainter on the plane seen face-on.
+"""Create new floor where the object stood: flat Gaussians on the plane, coloured by a 2D inpainter in a face-on view.
 
-Paper section 3.7: depth of the hole from the plane, Eq. (18), a dense cloud of flat Gaussians there, then about 100
-steps of training against the one inpainted picture.
+Paper section 3.7: the depth of the hole comes from the plane, Eq. (18); a dense cloud of flat Gaussians is placed there
+and trained for about 100 steps against the one inpainted picture. The kernels are in ``egs_warp/kernels/inpainting``.
 """
 
 from __future__ import annotations
@@ -27,50 +27,51 @@ from egs_warp.inpainting.stains import shaded, stain_around
 from egs_warp.segmentation.plane_search import near_plane
 
 _MARGIN = 0.01
-"""Of the hole's side: the floor at its very edge is stained by the object and by its shadow; gaps in the floor that
-touch the hole join it anyway. With 0.03 and more, a sheet under a plush toy lost part of its edge."""
+"""Fraction of the hole's side by which the hole is enlarged: the floor at its edge is stained by the object and by its
+shadow. Gaps in the floor that touch the hole are added in any case. With 0.03 and more, a sheet under a plush toy lost
+part of its edge."""
 _THICKNESS = 0.15
-"""Of the hole's side: what lies nearer to the plane is floor."""
+"""Fraction of the hole's side. Gaussians nearer to the plane than this are floor."""
 _HAZE = 0.25
-"""Of the hole's side: what lies lower over the hole is floor or haze at the object's foot."""
+"""Fraction of the hole's side. Gaussians over the hole and lower than this are floor, or haze at the object's foot."""
 _KNOWN = 0.6
 """Opacity of the floor above which its colour is trusted."""
 _SOLID = 0.3
-"""Opacity from which a Gaussian counts as floor."""
+"""Opacity above which a Gaussian counts as floor."""
 _TEXELS_ACROSS = 120.0
-"""On the side of the hole, whatever its size: so does the time not depend on it."""
+"""Texels along the side of the hole, for any size, so that the computing time does not depend on the size."""
 _WINDOW = 3.0
-"""Side of the window, in sides of the hole: the hole and what may be copied from."""
+"""Side of the window, in sides of the hole. It contains the hole and the floor that may be copied."""
 _SHARPNESS = 0.5
-"""Spacing of the new Gaussians, in widths of the floor's own fine ones."""
-_MOST_SPACING = 3
-"""Texels."""
+"""Spacing of the new Gaussians, in widths of the floor's fine Gaussians."""
+_MAX_SPACING = 3
+"""Largest spacing of new Gaussians, texels."""
 _RIM = 12
-"""Texels around the hole that take part in the training."""
+"""Width of the rim around the hole that takes part in the training, texels."""
 _GAP_REACH = 0.25
-"""Of the hole's side: gaps in the floor are followed this far from the hole."""
+"""Fraction of the hole's side. Gaps in the floor are followed up to this distance from the hole."""
 _GAP_EDGE = 6.0
 """Texels around such a gap that are not trusted either."""
 _CHANNEL = 9.0
-"""Half width, in texels, up to which a gap does not count as open to what lies beyond the floor."""
-_LEAST_RIM = 0.4
-"""Of the hole's edge must be floor."""
-_SHRED = 0.15
-"""Of the hole's area: floor that the hole encloses is given up if it is smaller."""
-_LEASH = 4.0
-"""Weight of the squared distance of a Gaussian's colour from what was painted there."""
+"""Half width in texels up to which a gap does not count as connected to the space beyond the floor."""
+_MIN_RIM_FRACTION = 0.4
+"""Minimum fraction of the hole's edge that must be floor."""
+_MAX_ISLAND_AREA = 0.15
+"""Fraction of the hole's area. Floor enclosed by the hole is discarded if it is smaller."""
+_COLOUR_WEIGHT = 4.0
+"""Weight of the squared distance between a Gaussian's colour and the painted colour."""
 _PAINTING = 0.5
-"""Share of the time that is over when training begins."""
+"""Progress, 0 to 1, at which training begins."""
 
 
 @dataclass(frozen=True)
 class InpaintOptions:
-    """What may be chosen."""
+    """Options of ``inpaint``."""
 
     steps: int = 100
-    """Of training against the inpainted picture; 0 leaves it out, and PyTorch is not needed."""
+    """Training steps against the inpainted picture. With 0 there is no training, and PyTorch is not needed."""
     margin: float = _MARGIN
-    """By how much the hole is made larger, of its side."""
+    """Fraction of the hole's side by which the hole is enlarged."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -87,23 +88,23 @@ class InpaintResult:
     """A background with new floor."""
 
     cloud: GaussianCloud
-    """Scene units; what was kept, then what is new."""
+    """Scene units; first the retained Gaussians, then the new ones."""
     is_new: np.ndarray
-    """(n,) bool."""
+    """(n,) bool, True for new Gaussians."""
     removed: int
-    """Gaussians of the background that lay in the hole."""
+    """Number of Gaussians removed from the background because they lay in the hole."""
     window: PlaneWindow
-    """Where the floor was looked at face-on."""
+    """Window of the face-on view."""
     hole: np.ndarray
     """(rows, columns) bool, on the window."""
     before: RectifiedImage
     """The floor with its hole."""
     painted: np.ndarray
-    """(rows, columns, 3) float32: what the inpainter made of it."""
+    """(rows, columns, 3) float32, the inpainter's result."""
     seconds: dict[str, float]
-    """Of each stage."""
+    """Duration of each stage, s."""
     notes: tuple[str, ...]
-    """For the user."""
+    """Messages for the user."""
 
 
 def inpaint(
@@ -114,31 +115,40 @@ def inpaint(
     options: InpaintOptions | None = None,
     progress: Callable[[float], None] = lambda done: None,
 ) -> InpaintResult:
-    """Close ``hole`` in the floor of ``background`` (scene units); what lies in it or just above and below is replaced.
+    """Close ``hole`` in the floor of ``background`` (scene units), replacing what lies in it or just above and below.
 
-    ``progress`` is told about which share of the time is over. Raises ``UserError`` for a hole that is off the floor or
-    that leaves nothing of the floor to learn from.
+    Args:
+        background: the capture without the object.
+        hole: region of the floor to fill.
+        inpainter: fills the face-on picture; ``PatchSynthesis`` by default.
+        options: see ``InpaintOptions``.
+        progress: called with the approximate share of the time that has passed, 0 to 1.
+
+    Raises:
+        UserError: the hole is off the floor, too narrow, or leaves no floor to copy from.
     """
     options = options or InpaintOptions()
     inpainter = inpainter or PatchSynthesis(seed=options.seed, device=str(background.device))
     clock = _Clock()
-    window, grown, spacing = _look(background, hole, options.margin)
+    window, grown, spacing = _window_around(background, hole, options.margin)
     thickness = _THICKNESS * hole.bounds()[1]
     junk = _in_hole(background, window, grown, hole.bounds()[1])
     if junk.all():
         raise UserError("inpaint: the hole takes the whole capture; make it smaller")
-    kept = background.subset(~junk)
-    before = rectify(kept, window, thickness=thickness)
+    retained = background.subset(~junk)
+    before = rectify(retained, window, thickness=thickness)
     grown, known = _closed(grown, before.alpha)
     _check(grown, known)
-    # The gaps that joined the hole hold some haze, too.
+    # The gaps that were added to the hole contain haze, too.
     junk = _in_hole(background, window, grown, hole.bounds()[1])
     grown, known, stained = _without_stain(grown, known, before)
-    # A stain is on the floor: what is deep under it is a table's side.
+    # Stains lie on the floor; Gaussians far below it belong to a table's side.
     junk |= _in_hole(background, window, grown, hole.bounds()[1], depth=_THICKNESS)
-    kept = background.subset(~junk)
+    if junk.all():
+        raise UserError("inpaint: the hole takes the whole capture; make it smaller")
+    retained = background.subset(~junk)
     clock.lap("rectify")
-    # Where nothing was stained, nothing shades the floor, and what is dark is its own.
+    # Without a stain there is no shadow either, and dark floor keeps its own colour.
     shade = shaded(grown, known, before.colour) if stained else None
     painted = inpainter.fill(np.where(known[..., None], before.colour, 0.0), grown, known, shade)
     clock.lap("inpaint")
@@ -151,27 +161,40 @@ def inpaint(
         spacing=spacing,
         device=str(background.device),
     )
+    if new is None:
+        raise UserError(
+            f"inpaint: the hole is too narrow: none of its {int(grown.sum())} texels lie in a block of {spacing} x"
+            f" {spacing}, the spacing of new Gaussians; make it wider"
+        )
     if options.steps > 0:
         progress(_PAINTING)
         trained = lambda step, _: progress(_PAINTING + (1.0 - _PAINTING) * (step + 1) / options.steps)  # noqa: E731
-        new = _trained(kept, new, window, grown, painted, thickness, options, trained)
+        new = _trained(retained, new, window, grown, painted, thickness, options, trained)
     clock.lap("train")
-    floor = near_plane(kept, window.plane, thickness) & (kept.opacities() > _SOLID)
-    new = with_gloss(new, kept.subset(floor), window)
-    cloud = concatenate(kept, new)
+    floor = near_plane(retained, window.plane, thickness) & (retained.opacities() > _SOLID)
+    if not floor.any():
+        raise UserError(
+            f"inpaint: no floor is left around the hole: none of the {retained.count} remaining Gaussians within"
+            f" {thickness:.3g} scene units of the plane is more opaque than {_SOLID:g}; make the hole smaller or check"
+            " plane and hole"
+        )
+    new = with_gloss(new, retained.subset(floor), window)
+    cloud = concatenate(retained, new)
     clock.lap("join")
     notes = (
         f"{int(junk.sum())} Gaussians in the hole were replaced by {new.count} on the plane",
         f"the hole is {grown.sum() * window.texel**2:.3g} square scene units, {window.texel:.3g} a texel",
         *((f"{100 * stained:.0f} % of it was floor that the object's shadow or foot had stained",) if stained else ()),
     )
-    is_new = np.arange(cloud.count) >= kept.count
+    is_new = np.arange(cloud.count) >= retained.count
     return InpaintResult(cloud, is_new, int(junk.sum()), window, grown, before, painted, clock.seconds, notes)
 
 
-def _look(background: GaussianCloud, hole: Hole, margin: float) -> tuple[PlaneWindow, np.ndarray, int]:
-    """A window about the hole; the hole, made larger by its margin, on it; and how many texels apart new Gaussians are,
-    so that they are as sharp as the floor."""
+def _window_around(background: GaussianCloud, hole: Hole, margin: float) -> tuple[PlaneWindow, np.ndarray, int]:
+    """Return a window about the hole, the enlarged hole on it, and the spacing of new Gaussians in texels.
+
+    The spacing makes the new floor as sharp as the old one.
+    """
     plane = hole.plane
     centre, side = hole.bounds()
     full = side * (1.0 + 2.0 * margin)
@@ -183,42 +206,47 @@ def _look(background: GaussianCloud, hole: Hole, margin: float) -> tuple[PlaneWi
     floor &= window.sample(np.ones(mask.shape, bool), means)
     if not floor.any():
         raise UserError("inpaint: the hole is off the floor: nothing lies on the plane around it; check plane and hole")
-    # The smallest axis of a floor's Gaussian stands upright; the middle one tells what detail it can show.
+    # The smallest axis of a floor's Gaussian is vertical; the middle one limits the detail it can show.
     width = float(np.quantile(background.breadths(floor), 0.25))
-    return window, mask, int(np.clip(round(_SHARPNESS * width / window.texel), 1, _MOST_SPACING))
+    return window, mask, int(np.clip(round(_SHARPNESS * width / window.texel), 1, _MAX_SPACING))
 
 
 def _in_hole(
     background: GaussianCloud, window: PlaneWindow, mask: np.ndarray, side: float, *, depth: float = 1.0
 ) -> np.ndarray:
-    """(n,) bool: Gaussians of the floor or of haze over the hole, not what hangs higher; and those under it, to a
-    ``depth`` of its ``side`` (scene units), which show beyond a thin floor's edge."""
+    """(n,) bool, Gaussians of the floor or of haze over the hole, and those under the hole.
+
+    Gaussians that hang higher are not included. Those below are included to ``depth`` times the ``side`` of the hole
+    (scene units), as they show beyond the edge of a thin floor.
+    """
     means = background.means.numpy()
     heights = window.plane.heights(means)
     return window.sample(mask, means) & (heights > -depth * side) & (heights < _HAZE * side)
 
 
 def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The hole with the gaps in the floor that touch it and the shreds between them, and where the floor is known; both
-    (rows, columns) bool."""
+    """Return the hole with adjacent gaps and enclosed islands of floor, and the known floor; both (rows, columns)
+    bool."""
     # Pinholes between splats are no gaps.
     closed: Any = ndimage.binary_closing(np.pad(alpha > _KNOWN, 4, mode="edge"), iterations=2)
     solid = np.asarray(closed[4:-4, 4:-4])
     near = distance_to(mask) < _GAP_REACH * _TEXELS_ACROSS
     gaps, _ = connected_parts(mask | (~solid & near & ~_void(~solid & ~mask)))
     touching = np.isin(gaps, np.unique(gaps[mask])) & ~mask
-    # Where the floor thins out, it is stained.
+    # Where the floor becomes thin, it is stained.
     hole = mask | (distance_to(touching) < _GAP_EDGE if touching.any() else touching)
     parts, count = connected_parts(~hole)
     sizes = np.bincount(parts.ravel(), minlength=count + 1)
-    shreds = (sizes < _SHRED * hole.sum()) & (np.arange(count + 1) > 0)
-    hole |= shreds[parts]
+    islands = (sizes < _MAX_ISLAND_AREA * hole.sum()) & (np.arange(count + 1) > 0)
+    hole |= islands[parts]
     return hole, solid & ~hole
 
 
 def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) -> tuple[np.ndarray, np.ndarray, float]:
-    """The hole with the stains around it, where enough of the floor is left to fill it from; where the floor is known;
-    both (rows, columns) bool; and the share of the hole that was stained."""
+    """Add the stains around the hole, if enough floor remains to fill it from.
+
+    Returns the hole and the known floor, both (rows, columns) bool, and the fraction of the hole that was stained.
+    """
     stain = stain_around(hole, known, before.colour)
     if not stain.any():
         return hole, known, 0.0
@@ -226,14 +254,14 @@ def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) 
     try:
         _check(whole, left)
     except UserError:
-        # A stain is better than no floor.
+        # Stained floor is better than no floor.
         return hole, known, 0.0
     return whole, left, float((whole & ~hole).sum() / whole.sum())
 
 
 def _void(missing: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool: the part of ``missing`` floor that lies beyond the floor's edge. What hangs together with
-    it by a thin channel only is a gap."""
+    """(rows, columns) bool, the part of the ``missing`` floor that lies beyond the floor's edge. Parts that are
+    connected to it by a narrow channel only are gaps."""
     wide, _ = connected_parts(depth_inside(np.pad(missing, 1, mode="edge")) > _CHANNEL)
     edges = np.concatenate([wide[0], wide[-1], wide[:, 0], wide[:, -1]])
     outside = np.isin(wide, np.unique(edges[edges > 0]))[1:-1, 1:-1]
@@ -245,7 +273,7 @@ def _check(hole: np.ndarray, known: np.ndarray) -> None:
         raise UserError("inpaint: the hole covers nearly all of the floor; make it smaller or show more of the floor")
     ring = ndimage.binary_dilation(hole, iterations=4) & ~hole
     share = float(known[ring].mean()) if ring.any() else 0.0
-    if share < _LEAST_RIM:
+    if share < _MIN_RIM_FRACTION:
         raise UserError(
             f"inpaint: the hole is off the floor: only {100 * share:.0f} % of its edge touches visible floor;"
             " check plane and hole"
@@ -253,7 +281,7 @@ def _check(hole: np.ndarray, known: np.ndarray) -> None:
 
 
 def _trained(
-    kept: GaussianCloud,
+    retained: GaussianCloud,
     new: GaussianCloud,
     window: PlaneWindow,
     hole: np.ndarray,
@@ -262,7 +290,8 @@ def _trained(
     options: InpaintOptions,
     progress: Callable[[int, float], None],
 ) -> GaussianCloud:
-    """``new`` after training against the inpainted picture, between what lies around the hole; degree 0."""
+    """Train ``new`` against the inpainted picture, together with the floor around the hole. The result has SH degree
+    0."""
     try:
         from egs_warp.training.finetune import FinetuneOptions, GaussianTensors, LearningRates, TrainingView, finetune
     except ImportError as error:
@@ -270,17 +299,17 @@ def _trained(
         raise ArgumentError("steps", advice, value=options.steps) from error
 
     crop, box = _crop(window, hole)
-    nearby = near_plane(kept, window.plane, thickness) & (
-        np.abs(crop.pixels(kept.means.numpy()) - 0.5 * np.array([crop.columns, crop.rows])).max(axis=1)
+    nearby = near_plane(retained, window.plane, thickness) & (
+        np.abs(crop.pixels(retained.means.numpy()) - 0.5 * np.array([crop.columns, crop.rows])).max(axis=1)
         < max(crop.rows, crop.columns)
     )
-    around = diffuse_only(kept.subset(nearby), window.plane) if nearby.any() else None
+    around = diffuse_only(retained.subset(nearby), window.plane) if nearby.any() else None
     whole = concatenate(around, new) if around is not None else new
     trainable = np.arange(whole.count) >= whole.count - new.count
-    wanted = wp.to_torch(new.sh)
+    target = wp.to_torch(new.sh)
 
-    def leash(tensors: GaussianTensors) -> Any:
-        return _LEASH * SH_BAND_0**2 * (tensors.sh_band_0[-new.count :] - wanted).square().mean()
+    def colour_penalty(tensors: GaussianTensors) -> Any:
+        return _COLOUR_WEIGHT * SH_BAND_0**2 * (tensors.sh_band_0[-new.count :] - target).square().mean()
 
     weight = ndimage.gaussian_filter(hole[box].astype(np.float32), 1.0)
     result = finetune(
@@ -288,19 +317,19 @@ def _trained(
         [TrainingView(crop.camera(), painted[box], weight=(weight > 0.02) * (0.2 + 0.8 * weight))],
         options=FinetuneOptions(
             iterations=options.steps,
-            # Places and directions are the plane's; only how it is painted is learnt.
+            # Positions and directions are given by the plane; only the appearance is trained.
             rates=LearningRates(
                 means=0.0, rotations=0.0, log_scales=5e-3, opacity_logits=2e-2, sh_band_0=2e-2, sh_rest=0.0
             ),
             background=(0.5, 0.5, 0.5),
             seed=options.seed,
         ),
-        extra_loss=leash,
+        extra_loss=colour_penalty,
         trainable=trainable,
         progress=progress,
     )
     trained = result.cloud.subset(trainable)
-    # Thickness does not show face-on, so what training did to it is noise.
+    # Thickness is not visible face-on, so its training gradient is noise.
     log_scales = trained.log_scales.numpy()
     log_scales[:, 2] = new.log_scales.numpy()[:, 2]
     return GaussianCloud.from_numpy(
@@ -309,12 +338,12 @@ def _trained(
         log_scales,
         trained.opacity_logits.numpy(),
         trained.sh.numpy(),
-        device=str(kept.device),
+        device=str(retained.device),
     )
 
 
 def _crop(window: PlaneWindow, hole: np.ndarray) -> tuple[PlaneWindow, tuple[slice, slice]]:
-    """The part of the window that holds the hole and its rim."""
+    """Return the part of the window that contains the hole and its rim, and its slices of rows and columns."""
     rows, columns = np.nonzero(hole)
     low = np.maximum([rows.min() - _RIM, columns.min() - _RIM], 0)
     high = np.minimum([rows.max() + 1 + _RIM, columns.max() + 1 + _RIM], hole.shape)

@@ -1,4 +1,4 @@
-"""What can fill a hole in a picture: one small protocol and four that keep it."""
+"""Inpainters that fill a hole in a picture: a protocol and its implementations."""
 
 from __future__ import annotations
 
@@ -16,48 +16,54 @@ from egs_warp.io.onnx import OnnxFile, read_onnx
 
 _PAD = 8
 """LaMa takes pictures whose sides are multiples of this."""
-_BRIGHTEST = 4.0
-"""A network that answers more than this counts to 255, not to 1."""
+_MAX_UNIT_OUTPUT = 4.0
+"""A network with outputs above this uses the range 0 to 255, not 0 to 1."""
 
 
 class Inpainter(Protocol):
-    """Fills a hole in a picture of a plane seen face-on."""
+    """Fills a hole in a face-on picture of a plane."""
 
     def fill(
         self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
     ) -> np.ndarray:
-        """(H, W, 3) float32, 0 to 1, that equals ``image`` outside ``hole``.
+        """Fill the hole and return the picture.
 
-        ``image`` (H, W, 3) float32 is to be trusted where ``known`` (H, W) and not ``hole`` (H, W, both bool); what
-        lies in the ``shade`` (H, W) bool is better not copied to places that do not.
+        Args:
+            image: (H, W, 3) float32, 0 to 1.
+            hole: (H, W) bool, the pixels to fill.
+            known: (H, W) bool, where ``image`` can be trusted outside the hole.
+            shade: (H, W) bool, shaded pixels that should not be copied to places in the light.
+
+        Returns:
+            (H, W, 3) float32, 0 to 1, equal to ``image`` outside ``hole``.
         """
         ...
 
 
 class OpenCvMethod(enum.Enum):
-    """What ``cv2.inpaint`` offers."""
+    """Methods of ``cv2.inpaint``."""
 
     TELEA = "telea"
     """Fast marching (Telea 2004)."""
     NAVIER_STOKES = "ns"
-    """Isophotes carried into the hole (Bertalmio et al. 2001)."""
+    """Isophotes continued into the hole (Bertalmio et al. 2001)."""
 
 
 @dataclass(frozen=True)
 class OpenCvInpainter:
-    """``cv2.inpaint``: smooth, so for small holes or plain floors."""
+    """Inpainting by ``cv2.inpaint``: smooth, so for small holes or plain floors."""
 
     method: OpenCvMethod = OpenCvMethod.TELEA
     radius: float = 5.0
-    """Pixels around each one that are looked at."""
+    """Radius of the neighbourhood of each pixel, in pixels."""
 
     def fill(
         self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
     ) -> np.ndarray:
-        """As ``Inpainter.fill``."""
+        """Fill the hole; see ``Inpainter.fill``."""
         flag = cv2.INPAINT_TELEA if self.method is OpenCvMethod.TELEA else cv2.INPAINT_NS
         missing = (hole | ~known).astype(np.uint8)
-        # One channel at a time it takes 16 bits; of float32 pictures its fast marching rounds to whole numbers.
+        # Single channels may have 16 bits. On float32 pictures, OpenCV's fast marching rounds to whole numbers.
         coded = np.rint(65535.0 * np.clip(image, 0.0, 1.0)).astype(np.uint16)
         channels = [cv2.inpaint(np.ascontiguousarray(coded[..., k]), missing, self.radius, flag) for k in range(3)]
         return _pasted(image, hole, np.stack(channels, axis=-1).astype(np.float32) / np.float32(65535.0))
@@ -65,10 +71,10 @@ class OpenCvInpainter:
 
 @dataclass(frozen=True)
 class OnnxInpainter:
-    """LaMa (Suvorov et al. 2022), or any network that takes (1, 3, H, W) in 0 to 1 and a (1, 1, H, W) mask of the hole
-    and returns (1, 3, H, W) in 0 to 1 or in 0 to 255, as an ONNX file of the user's.
+    """LaMa (Suvorov et al. 2022) or a compatible network, read from an ONNX file.
 
-    Such a file carries no code. OpenCV computes it, on the CPU.
+    The network takes a picture (1, 3, H, W) in 0 to 1 and a mask (1, 1, H, W) of the hole, and returns a picture (1, 3,
+    H, W) in 0 to 1 or in 0 to 255. An ONNX file contains no code. OpenCV evaluates it on the CPU.
     """
 
     path: Path
@@ -76,7 +82,7 @@ class OnnxInpainter:
     def fill(
         self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
     ) -> np.ndarray:
-        """As ``Inpainter.fill``. Raises ``UserError`` for a file that is no such network."""
+        """Fill the hole; see ``Inpainter.fill``. Raises ``UserError`` if the file is not such a network."""
         file, network = self._load()
         picture, missing = _padded(image, hole, known)
         masks = [name for name in file.inputs if "mask" in name.lower()]
@@ -101,29 +107,30 @@ class OnnxInpainter:
             return file, cv2.dnn.readNetFromONNX(np.frombuffer(file.data, np.uint8))
         except cv2.error as error:
             raise UserError(
-                f"{self.path}: OpenCV does not know this network ({_last_line(error)}); export it as ONNX again"
+                f"{self.path}: OpenCV cannot read this network ({_last_line(error)}); export it as ONNX again"
             ) from error
 
 
 @dataclass(frozen=True)
 class TorchScriptInpainter:
-    """The same network as a TorchScript file. Loading one runs whatever program it carries: for trusted files only."""
+    """LaMa or a compatible network, read from a TorchScript file. Loading the file runs the program in it: use trusted
+    files only."""
 
     path: Path
     device: str = "cpu"
-    """Of torch."""
+    """PyTorch device."""
 
     def fill(
         self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
     ) -> np.ndarray:
-        """As ``Inpainter.fill``. Raises ``UserError`` for a file that is no such network."""
+        """Fill the hole; see ``Inpainter.fill``. Raises ``UserError`` if the file is not such a network."""
         torch, network = self._load()
         picture, missing = _padded(image, hole, known)
         try:
             with torch.no_grad():
                 answer = network(torch.from_numpy(picture).to(self.device), torch.from_numpy(missing).to(self.device))
             values = np.asarray(answer.detach().cpu().numpy(), np.float32)
-        # TorchScript raises plain RuntimeErrors of many lines; AttributeError when the answer is no tensor.
+        # TorchScript raises plain RuntimeErrors of many lines, and AttributeError if the output is no tensor.
         except (RuntimeError, AttributeError, TypeError) as error:
             raise _failed(self.path, error, "LaMa's TorchScript file") from error
         return _answer(self.path, values, image, hole, missing.shape[2:])
@@ -144,17 +151,18 @@ class TorchScriptInpainter:
 
 
 def inpainter_by_name(name: str, *, seed: int = 0, device: str = "cpu", trust: bool = False) -> Inpainter:
-    """``patch``, ``telea``, ``ns`` or the path of an ONNX file, which is tried.
+    """Create an inpainter from ``patch``, ``telea``, ``ns`` or the path of a network's file, which is loaded as a
+    check.
 
-    A TorchScript file runs the program that it carries when it is loaded, so it is refused unless you ``trust`` it.
-    Raises ``UserError`` for anything else.
+    A TorchScript file runs the program in it when it is loaded, so it is rejected unless ``trust`` is set. Raises
+    ``UserError`` for other names.
     """
     if name == "patch":
         return PatchSynthesis(seed=seed, device=device)
     if name in (method.value for method in OpenCvMethod):
         return OpenCvInpainter(OpenCvMethod(name))
     path = Path(name)
-    # A wrong file is told now, not after the minutes that come before the filling.
+    # Report a wrong file now, not minutes later when the hole is filled.
     if path.suffix in (".pt", ".pth", ".ts"):
         if not trust:
             advice = (
@@ -172,7 +180,8 @@ def inpainter_by_name(name: str, *, seed: int = 0, device: str = "cpu", trust: b
 
 
 def _padded(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(1, 3, H, W) and (1, 1, H, W) float32: picture and mask of what is missing, in whole blocks of ``_PAD``."""
+    """Return the picture (1, 3, H, W) and the mask of missing pixels (1, 1, H, W), float32, padded to multiples of
+    ``_PAD``."""
     rows, columns = hole.shape
     pad = ((0, -rows % _PAD), (0, -columns % _PAD))
     missing = np.pad(hole | ~known, pad, mode="symmetric").astype(np.float32)
@@ -180,10 +189,10 @@ def _padded(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[np.
     return np.ascontiguousarray(picture.transpose(2, 0, 1)[None]), missing[None, None]
 
 
-def _failed(path: Path, error: Exception, wanted: str) -> UserError:
+def _failed(path: Path, error: Exception, advice: str) -> UserError:
     return UserError(
         f"{path}: the network failed on an image (1, 3, H, W) and a mask (1, 1, H, W) ({_last_line(error)});"
-        f" give {wanted}"
+        f" give {advice}"
     )
 
 
@@ -200,8 +209,8 @@ def _answer(path: Path, values: np.ndarray, image: np.ndarray, hole: np.ndarray,
         )
     rows, columns = hole.shape
     filled = values[0].transpose(1, 2, 0)[:rows, :columns]
-    # Some exports of LaMa count to 255.
-    return _pasted(image, hole, filled / np.float32(255.0) if filled.max() > _BRIGHTEST else filled)
+    # Some exports of LaMa use the range 0 to 255.
+    return _pasted(image, hole, filled / np.float32(255.0) if filled.max() > _MAX_UNIT_OUTPUT else filled)
 
 
 def _pasted(image: np.ndarray, hole: np.ndarray, filled: np.ndarray) -> np.ndarray:

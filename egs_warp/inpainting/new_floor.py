@@ -1,4 +1,4 @@
-"""Flat Gaussians that make a piece of floor: where they lie, and what gloss they have."""
+"""Flat Gaussians for a piece of floor: their positions, and their view-dependent colour."""
 
 from __future__ import annotations
 
@@ -18,23 +18,25 @@ _WIDTH = 0.62
 """Standard deviation along the plane, in spacings."""
 _OPACITY = 0.97
 _SKIRT = 2
-"""Spacings by which the new floor runs on under the old one, so that no gap shows between them."""
+"""Number of spacings by which the new floor continues under the old one, so that no gap shows between them."""
 _SKIRT_DROP = 0.5
-"""Spacings by which it lies lower there."""
+"""Number of spacings by which it lies lower there."""
 _RIM_SMOOTHING = 3.0
-"""Texels: the floor's height at the rim is taken from about this far around."""
+"""Standard deviation, in texels, of the blur of the floor's height at the rim."""
 _OUTLIER = 2.0
-"""Deviations from the tilted plane through the rim beyond which heights are clipped: cracks and blades of grass."""
+"""Heights are clipped at this many deviations from the tilted plane through the rim, as for cracks and blades of grass.
+"""
 _NEIGHBOURS = 512
-"""Gaussians of the old floor that a new one takes its gloss from: of few at one place of the rim some are haze."""
+"""Gaussians of the old floor that a new one takes its gloss from. Few from one part of the rim could be mostly haze."""
 _GLOSS_CELL = 4.0
-"""Texels: new Gaussians nearer to each other than this have the same."""
+"""Cell size in texels. New Gaussians in one cell have the same gloss."""
 
 
 def rim_heights(before: RectifiedImage, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """(rows, columns) height of the new floor above the plane: what its rim has, carried inwards as a soap film.
+    """(rows, columns) height of the new floor above the plane: Laplace's equation in the hole, with the heights of its
+    rim.
 
-    A real floor is not quite the fitted plane; without this its edge would be a step that a low view shows.
+    A real floor differs from the fitted plane; without this, its edge would be a step that shows in low views.
     """
     ring = ndimage.binary_dilation(hole, iterations=round(3 * _RIM_SMOOTHING)) & known
     rows, columns = np.indices(hole.shape) / max(hole.shape) - 0.5
@@ -63,10 +65,21 @@ def flat_gaussians(
     *,
     spacing: int,
     device: str | None = None,
-) -> GaussianCloud:
-    """Gaussians of SH degree 0 every ``spacing`` texels over ``hole`` (rows, columns) and its ``known`` rim, in the
-    colours of ``painted`` (rows, columns, 3), at ``heights`` (rows, columns) above the plane; those of the rim a little
-    lower, where they only show through gaps."""
+) -> GaussianCloud | None:
+    """Create flat Gaussians of SH degree 0 over a hole and its known rim.
+
+    Those of the rim lie a little lower, so that they show through gaps only. None if the hole is narrower than a block
+    of ``spacing`` x ``spacing`` texels everywhere.
+
+    Args:
+        window: the plane and its grid of texels.
+        hole: (rows, columns) bool, on the window.
+        known: (rows, columns) bool, where the old floor is known.
+        painted: (rows, columns, 3) colours of the new floor, 0 to 1.
+        heights: (rows, columns) heights of the new floor above the plane, scene units.
+        spacing: distance between Gaussians, texels.
+        device: Warp device of the result.
+    """
     size = (np.array(hole.shape) // spacing) * spacing
 
     def blocks(values: np.ndarray) -> np.ndarray:
@@ -77,10 +90,12 @@ def flat_gaussians(
     coloured = blocks(hole | known)[..., 0] == 1.0
     rows, columns = np.nonzero(ndimage.binary_dilation(inner, iterations=_SKIRT) & coloured)
     count = len(rows)
+    if count == 0:
+        return None
     first, second = window.plane.tangents()
     step = spacing * window.texel
     log_scales = np.full((count, 3), np.log(_WIDTH * step))
-    # The paper's thickness, unless the scene is so small that this were no longer flat.
+    # The paper's thickness, unless the scene is so small that this would not be flat.
     log_scales[:, 2] = min(-10.0, float(np.log(0.05 * step)))
     height = blocks(heights)[rows, columns] - np.where(inner[rows, columns], 0.0, _SKIRT_DROP * step)[:, None]
     places = window.points((np.stack([columns, rows], axis=1) + 0.5) * spacing)
@@ -96,8 +111,10 @@ def flat_gaussians(
 
 
 def with_gloss(new: GaussianCloud, floor: GaussianCloud, window: PlaneWindow) -> GaussianCloud:
-    """``new`` (SH degree 0) with the gloss of ``floor``: the higher bands of its nearest Gaussians, while the mean
-    colour from all around stays."""
+    """Return ``new`` (SH degree 0) with the gloss of ``floor``: the higher SH bands of its nearest Gaussians.
+
+    The mean colour over all directions is unchanged.
+    """
     coefficients = floor.sh.shape[1]
     if coefficients == 1:
         return new

@@ -1,4 +1,4 @@
-"""Which offset to copy each pixel of a hole from: few good offsets, chosen by graph cuts.
+"""Choice of the offset from which each pixel of a hole is copied: few good offsets, assigned by graph cuts.
 
 He and Sun 2012 (statistics of offsets), Kwatra et al. 2003 (cost of a seam), Boykov, Veksler, Zabih 2001 (expansion).
 """
@@ -16,47 +16,57 @@ from egs_warp.geometry.bitmaps import connected_parts, depth_inside
 from egs_warp.inpainting.rim_colours import RimColours
 
 _PIECES = (5, 10)
-"""Radii, in pixels, of the pieces of the rim whose like is looked for, besides the whole rim."""
+"""Radii, in pixels, of the pieces of the rim for which similar regions are searched, in addition to the whole rim."""
 _RING = 6
-"""Pixels around the hole that are compared."""
-_FEWEST = 15
-"""Pixels that a piece must have."""
-_BEST = 3
-"""An offset is kept if it is among this many best ones for some pixel."""
+"""Width in pixels of the ring around the hole that is compared."""
+_MIN_PIXELS = 15
+"""Minimum number of pixels of a piece."""
+_OFFSETS_PER_PIXEL = 3
+"""An offset is retained if it is among this many best ones for some pixel."""
 _RIM = 3
-"""Pixels around the hole that a copy must also explain."""
+"""Width in pixels of the rim around the hole that a copy must also explain."""
 _COST_UNIT = 2000.0
-"""Capacities are whole numbers: colour differences are counted in units of 1 / 2000."""
+"""Capacities are integers: colour differences are counted in units of 1 / 2000."""
 _PRIOR = 0.5
-"""Weight of how well an offset explains what is known around a pixel, against what its seams cost."""
+"""Weight of the agreement of an offset with the known surroundings of a pixel, relative to the cost of seams."""
 _SEAM = 0.03
-"""Price of a seam that does not show, as a colour difference: it keeps copies in large pieces."""
+"""Cost of an invisible seam, as a colour difference; it favours large pieces."""
 _SWEEPS = 3
-"""Rounds of expansion over all offsets, at most."""
+"""Maximum number of rounds of expansion over all offsets."""
 _ATTEMPTS = 4
-"""At a picture without islands of colours that the rim does not have."""
+"""Maximum number of attempts to paint the hole without islands of colours that its rim does not have."""
 _ALIKE = 0.05
-"""Mean colour difference around a pixel below which an offset may bring any colour there: the picture repeats."""
+"""Mean colour difference around a pixel below which an offset may paint it in any colour, because the picture repeats.
+"""
 _FORBIDDEN = 50_000_000
 
 
 @dataclass(frozen=True)
 class Offsets:
-    """Candidates to copy from."""
+    """Candidate offsets to copy from."""
 
     steps: np.ndarray
-    """(k, 2) int rows and columns from a pixel to its source."""
+    """(k, 2) int, rows and columns from a pixel to its source."""
     shifts: np.ndarray
-    """(k, 3) float32 colour that is added to the source."""
+    """(k, 3) float32, colour added to the source."""
 
 
 def labelled_sources(
     image: np.ndarray, hole: np.ndarray, known: np.ndarray, is_source: np.ndarray, *, shift_limit: float
 ) -> np.ndarray:
-    """(H, W, 2) int: the source of every pixel of ``hole`` and its rim, with seams where they show least.
+    """Choose the source of every pixel of ``hole`` and its rim so that seams are least visible.
 
-    ``image`` (H, W, 3) float32 is known where ``known`` (H, W) and not ``hole`` (H, W); sources are taken from
-    ``is_source`` (H, W). Other pixels, and holes around which nothing repeats, are given themselves.
+    Pixels outside, and pixels of holes around which nothing repeats, get themselves as source.
+
+    Args:
+        image: (H, W, 3) float32.
+        hole: (H, W) bool.
+        known: (H, W) bool; ``image`` is valid where ``known`` and not ``hole``.
+        is_source: (H, W) bool, allowed sources.
+        shift_limit: largest change of colour of a copy.
+
+    Returns:
+        (H, W, 2) int, row and column of each source.
     """
     place = np.moveaxis(np.indices(hole.shape), 0, -1)
     sources = place.copy()
@@ -72,7 +82,8 @@ def labelled_sources(
 
 
 def _candidates(image: np.ndarray, part: np.ndarray, hole: np.ndarray, known: np.ndarray, limit: float) -> Offsets:
-    """Offsets under which pieces of the rim of ``part``, of several sizes, look most alike somewhere else."""
+    """Return the offsets under which pieces of the rim of ``part``, of several sizes, are most similar to other
+    places."""
     usable = (known & ~hole).astype(np.float32)
     rim = np.argwhere(np.logical_and(ndimage.binary_dilation(part), usable > 0.0))
     found: dict[tuple[int, int], np.ndarray] = {}
@@ -90,7 +101,8 @@ def _candidates(image: np.ndarray, part: np.ndarray, hole: np.ndarray, known: np
 
 
 def _spread_out(points: np.ndarray, spacing: float) -> np.ndarray:
-    """A subset of ``points`` (n, 2) that are at least ``spacing`` apart and leave none farther away than that."""
+    """Return a subset of ``points`` (n, 2) that are at least ``spacing`` apart and leave none farther away than
+    that."""
     left, chosen = points, []
     while len(left):
         chosen.append(left[0])
@@ -101,18 +113,18 @@ def _spread_out(points: np.ndarray, spacing: float) -> np.ndarray:
 def _alike(
     image: np.ndarray, part: np.ndarray, usable: np.ndarray, centre: np.ndarray, radius: int, count: int, limit: float
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Best ``count`` offsets, and the colour shift of each, for what is known within ``radius`` of ``centre`` and near
-    ``part``."""
+    """Return the best ``count`` offsets, and the colour shift of each, for the known pixels within ``radius`` of
+    ``centre`` and near ``part``."""
     low = np.maximum(centre - radius, 0)
     high = np.minimum(centre + radius + 1, part.shape)
     window = (slice(low[0], high[0]), slice(low[1], high[1]))
     mask = ndimage.binary_dilation(part[window], iterations=_RING).astype(np.float32) * usable[window]
     total = float(mask.sum())
-    if total < _FEWEST:
+    if total < _MIN_PIXELS:
         return []
     template = image[window]
     score = cv2.matchTemplate(image, template, cv2.TM_SQDIFF, mask=np.repeat(mask[..., None], 3, axis=2))
-    # Where something that is needed would be read from what is not known.
+    # Exclude positions at which a required pixel would be read from an unknown one.
     missing = cv2.matchTemplate(1.0 - usable, np.maximum(mask, part[window].astype(np.float32)), cv2.TM_CCORR)
     score[missing > 0.5] = np.inf
     found = []
@@ -135,7 +147,8 @@ def _label(
     domain: np.ndarray,
     offsets: Offsets,
 ) -> np.ndarray:
-    """(n, 2) offset of each pixel (n, 2) of ``domain`` by expansion moves over ``offsets``, and such as these lack."""
+    """(n, 2) offset of each pixel of ``domain`` (n, 2), by expansion moves over ``offsets`` and over added ones that
+    provide missing colours."""
     in_hole = hole[domain[:, 0], domain[:, 1]]
     colours = RimColours(image, known & ~hole, domain)
     place, allowed = _places(domain, offsets, is_source)
@@ -148,13 +161,15 @@ def _label(
         )
         place, allowed = _places(domain, offsets, is_source)
     colour = image[place[..., 0], place[..., 1]] + offsets.shifts
-    misfit = np.linalg.norm(colour - image[domain[:, 0], domain[:, 1]][:, None], axis=-1)
-    within = _PRIOR * _surround_misfit(image, hole, known, domain, offsets)
-    data = _COST_UNIT * np.where(in_hole[:, None], within, misfit)
+    copy_error = np.linalg.norm(colour - image[domain[:, 0], domain[:, 1]][:, None], axis=-1)
+    within = _PRIOR * _surround_error(image, hole, known, domain, offsets)
+    data = _COST_UNIT * np.where(in_hole[:, None], within, copy_error)
     data = np.where(allowed, data, _FORBIDDEN).astype(np.int64)
-    ranked = np.argsort(data, axis=1, kind="stable")[:, :_BEST]
-    kept = np.unique(np.concatenate([ranked.ravel(), np.arange(len(offsets.steps) - len(added), len(offsets.steps))]))
-    data, colour, place = data[:, kept], colour[:, kept], place[:, kept]
+    ranked = np.argsort(data, axis=1, kind="stable")[:, :_OFFSETS_PER_PIXEL]
+    retained = np.unique(
+        np.concatenate([ranked.ravel(), np.arange(len(offsets.steps) - len(added), len(offsets.steps))])
+    )
+    data, colour, place = data[:, retained], colour[:, retained], place[:, retained]
     index = np.full(hole.shape, -1)
     index[domain[:, 0], domain[:, 1]] = np.arange(len(domain))
     pairs = []
@@ -175,12 +190,19 @@ def _label(
         if not islands.any():
             break
         data[islands[:, None] & ~common] = _FORBIDDEN
-    return offsets.steps[kept[labels]]
+    return offsets.steps[retained[labels]]
 
 
 def _expanded(labels: np.ndarray, data: np.ndarray, colour: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """``labels`` (n,) improved by expansion moves: ``data`` (n, k) is the price of each label, ``colour`` (n, k, 3)
-    what it paints; seams are between neighbours ``p`` and ``q`` (m,)."""
+    """Improve ``labels`` (n,) by expansion moves.
+
+    Args:
+        labels: (n,) start.
+        data: (n, k) cost of each label.
+        colour: (n, k, 3) colour that each label paints.
+        p: (m,) first pixel of each pair of neighbours.
+        q: (m,) second pixel.
+    """
 
     def seam(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         cost = np.linalg.norm(colour[p, a] - colour[p, b], axis=-1) + np.linalg.norm(
@@ -213,18 +235,17 @@ def _expanded(labels: np.ndarray, data: np.ndarray, colour: np.ndarray, p: np.nd
 
 
 def _places(domain: np.ndarray, offsets: Offsets, is_source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, k, 2) where each offset leads from each pixel, kept inside the picture;
-    and (n, k) bool whether to a source.
-    """
+    """Return the position (n, k, 2) that each offset leads to from each pixel, clipped to the picture, and (n, k) bool:
+    True if it is a source."""
     place = domain[:, None] + offsets.steps[None]
     bounded = np.clip(place, 0, np.array(is_source.shape) - 1)
     return bounded, (place == bounded).all(axis=-1) & is_source[bounded[..., 0], bounded[..., 1]]
 
 
-def _surround_misfit(
+def _surround_error(
     image: np.ndarray, hole: np.ndarray, known: np.ndarray, domain: np.ndarray, offsets: Offsets
 ) -> np.ndarray:
-    """(n, k): mean colour difference of each offset over what is known around each pixel of ``domain`` (n, 2)."""
+    """(n, k) mean colour difference of each offset over the known surroundings of each pixel of ``domain`` (n, 2)."""
     width = float(depth_inside(hole).max())
     margin = int(2 * width) + 4
     low = np.maximum(domain.min(axis=0) - margin, 0)
@@ -246,7 +267,7 @@ def _surround_misfit(
 
 
 def _cut(unary: np.ndarray, p: np.ndarray, q: np.ndarray, pairwise: np.ndarray) -> np.ndarray:
-    """(n,) bool x that minimises sum unary x + sum pairwise (1 - x_p) x_q."""
+    """(n,) bool x that minimises sum unary x + sum pairwise (1 - x_p) x_q, by maximum flow."""
     count = len(unary)
     source, sink = count, count + 1
     plus, minus = np.flatnonzero(unary > 0), np.flatnonzero(unary < 0)

@@ -1,7 +1,8 @@
-"""Holes filled from the rest of the same picture: patch search and voting over a pyramid.
+"""Patch-based inpainting from the rest of the same picture: patch search and voting over a pyramid.
 
 Wexler, Shechtman, Irani 2007 (voting over scales); Barnes et al. 2009 (PatchMatch); He and Sun 2012 (few good offsets
-as a start); Darabi et al. 2012 (a colour shift for each patch, so that light may change across the hole).
+as a start); Darabi et al. 2012 (a colour shift for each patch, so that light may change across the hole). The kernels
+are in ``egs_warp/kernels/inpainting/patch_synthesis.py``.
 """
 
 from __future__ import annotations
@@ -23,39 +24,40 @@ from egs_warp.launching import launch_rows, zeros
 _COARSEST_HALF_WIDTH = 16.0
 """Half width, in pixels, of the hole at the coarsest level, where offsets are chosen."""
 _STRIDES = (8, 4, 2, 1, 8, 4, 2, 1)
-"""Of the neighbours that are asked in one search."""
+"""Distances of the neighbours whose sources are tried in one search, pixels."""
 _TOLERANCE = 0.5
-"""Patches this many times worse than the median one count 1 / e."""
-_LEAST_LIT = 0.5
-"""Share of the sources that must be left for those in the shade not to be copied from."""
+"""A patch that is this many median costs worse is weighted by 1 / e."""
+_MIN_LIT_FRACTION = 0.5
+"""Fraction of the sources that must remain when shaded ones are excluded."""
 _SCREEN = 0.01
-"""Pull of the voted colours against the gradients of the sources: within about 1 / sqrt of it, in pixels, they hold."""
+"""Weight of the voted colours against the gradients of the sources. The colours dominate beyond about 1 / sqrt(weight)
+pixels."""
 _STRICT_TOLERANCE = 0.25
-"""The same for the last vote of each level, so that the result is as sharp as its sources."""
+"""Tolerance of the last vote of each level, so that the result is as sharp as its sources."""
 
 
 @dataclass(frozen=True)
 class PatchSynthesis:
-    """The default inpainter; see ``Inpainter``."""
+    """Default inpainter: patch search and voting over a pyramid."""
 
     rounds: int = 4
-    """Of search and voting at each level."""
+    """Rounds of search and voting at each level."""
     shift_limit: float = 0.02
-    """Largest change of colour of a patch, 0 to 1. A large one turns one colour of a pattern into the other."""
+    """Largest change of colour of a patch, 0 to 1. A large value turns one colour of a pattern into the other."""
     seed: int = 0
     device: str | None = None
 
     def fill(
         self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
     ) -> np.ndarray:
-        """As ``Inpainter.fill``. Raises ``UserError`` where no whole patch is known outside the hole."""
+        """Fill the hole; see ``Inpainter.fill``. Raises ``UserError`` if no whole patch is known outside the hole."""
         work = None
         wide = _with_half_turn(image, hole, known, np.zeros_like(hole) if shade is None else shade)
         for depth, level in enumerate(reversed(_pyramid(*wide))):
             if not level.is_source.any():
                 continue
-            # The picture of each level is first copied by the offsets of the one before: enlarging that one's would
-            # blur it, and a blurred guess attracts blurred patches.
+            # Each level starts from its own picture, copied by the offsets of the coarser level. An enlarged coarse
+            # picture would be blurred and attract blurred patches.
             sources = _start(level, self.shift_limit) if work is None else _doubled(work.sources(), level)
             work = _Work(level, sources, self)
             work.copy()
@@ -68,8 +70,8 @@ class PatchSynthesis:
                 " make the hole smaller or show more of the floor"
             )
         _, wide_hole, wide_known, _ = wide
-        melded = poisson_blend(work.picture, wide_hole, wide_known | wide_hole, work.sources())[:, : hole.shape[1]]
-        return np.where(hole[..., None], np.clip(melded, 0.0, 1.0), image).astype(np.float32)
+        blended = poisson_blend(work.picture, wide_hole, wide_known | wide_hole, work.sources())[:, : hole.shape[1]]
+        return np.where(hole[..., None], np.clip(blended, 0.0, 1.0), image).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -88,16 +90,16 @@ class _Level:
         usable = known & ~hole
         is_source = ndimage.binary_erosion(usable, square, border_value=0)
         lit = is_source & ~shade
-        if lit.sum() >= _LEAST_LIT * is_source.sum():
+        if lit.sum() >= _MIN_LIT_FRACTION * is_source.sum():
             is_source = lit
         targets = ndimage.binary_dilation(hole, square)
-        # Deep in the hole the guess counts less than what stands near its rim.
+        # Deep in the hole the current guess counts less than near its rim.
         confidence = np.where(hole, 1.3 ** -depth_inside(hole), np.where(known, 1.0, 0.0))
         return cls(image, hole, known, is_source, targets, np.maximum(confidence, 1e-4).astype(np.float32), shade)
 
 
 def _pyramid(image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray) -> list[_Level]:
-    """Finest first; each half the size of the one before."""
+    """Return the levels, finest first; each has half the size of the one before."""
     levels = [_Level.of(image.astype(np.float32), hole, known, shade)]
     while depth_inside(np.pad(levels[-1].hole, 1)).max() > _COARSEST_HALF_WIDTH:
         fine = levels[-1]
@@ -116,40 +118,45 @@ def _pyramid(image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.n
 def _with_half_turn(
     image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The picture and, to copy from, the same turned by 180 degrees beside it: the like of an edge or a corner is often
-    found only the other way round. A strip between the two keeps patches apart."""
+    """Append the picture rotated by 180 degrees, as a source of patches.
 
-    def beside(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    Matches of an edge or a corner often occur in the opposite direction only. A strip between the two separates the
+    patches.
+    """
+
+    def side_by_side(first: np.ndarray, second: np.ndarray) -> np.ndarray:
         strip = np.zeros((first.shape[0], 2 * RADIUS, *first.shape[2:]), first.dtype)
         return np.concatenate([first, strip, second[::-1, ::-1]], axis=1)
 
-    here = beside(image, image), beside(hole, np.zeros_like(hole)), beside(known, known & ~hole)
-    return *here, beside(shade, shade)
+    wide = side_by_side(image, image), side_by_side(hole, np.zeros_like(hole)), side_by_side(known, known & ~hole)
+    return *wide, side_by_side(shade, shade)
 
 
 def _start(level: _Level, shift_limit: float) -> np.ndarray:
-    """(H, W, 2) int32: a source with a whole known patch for every pixel, from the offsets that explain the rim."""
+    """(H, W, 2) int32, a source with a whole known patch for every pixel, from the offsets that explain the rim."""
     sources = labelled_sources(level.image, level.hole, level.known, level.is_source, shift_limit=shift_limit)
     return _with_whole_patches(sources, level)
 
 
 def _doubled(sources: np.ndarray, level: _Level) -> np.ndarray:
-    """The sources of the coarser level, carried over."""
+    """Return the sources of the coarser level, transferred to ``level``."""
     rows, columns = np.indices(level.hole.shape)
     coarse = sources[np.minimum(rows // 2, sources.shape[0] - 1), np.minimum(columns // 2, sources.shape[1] - 1)]
     return _with_whole_patches(2 * coarse + np.stack([rows % 2, columns % 2], axis=-1), level)
 
 
 def _with_whole_patches(sources: np.ndarray, level: _Level) -> np.ndarray:
-    """Each source, or the nearest one around which a whole patch is known."""
+    """Return each source, or the nearest one around which a whole patch is known."""
     nearest = nearest_set(level.is_source)
     inside = np.clip(sources, 0, np.array(level.hole.shape) - 1)
     return np.stack([nearest[k][inside[..., 0], inside[..., 1]] for k in (0, 1)], axis=-1).astype(np.int32)
 
 
 def poisson_blend(picture: np.ndarray, hole: np.ndarray, known: np.ndarray, sources: np.ndarray) -> np.ndarray:
-    """(H, W, 3): ``picture`` (H, W, 3) in the hole with the gradients of its ``sources`` (H, W, 2), so that pieces from
-    differently lit places join without a seam: a screened Poisson equation (Bhat et al. 2008)."""
+    """(H, W, 3) ``picture`` (H, W, 3), in the hole with the gradients of its ``sources`` (H, W, 2).
+
+    A screened Poisson equation (Bhat et al. 2008) joins pieces from differently lit places without a seam.
+    """
     at = np.argwhere(hole)
     index = np.full(hole.shape, -1)
     index[hole] = np.arange(len(at))
@@ -164,7 +171,7 @@ def poisson_blend(picture: np.ndarray, hole: np.ndarray, known: np.ndarray, sour
         rise = picture[ahead[:, 0], ahead[:, 1]].astype(np.float64) - picture[source[:, 0], source[:, 1]]
         other = index[there[:, 0], there[:, 1]]
         free = inside & (other >= 0)
-        # Between two pixels of the hole both sources have a say.
+        # Between two pixels of the hole, the gradient is the mean of both sources.
         from_other = sources[there[:, 0], there[:, 1]]
         behind = np.clip(from_other - step, 0, limit)
         of_other = picture[from_other[:, 0], from_other[:, 1]].astype(np.float64) - picture[behind[:, 0], behind[:, 1]]
@@ -180,13 +187,13 @@ def poisson_blend(picture: np.ndarray, hole: np.ndarray, known: np.ndarray, sour
         (np.concatenate(matrix_values), (np.concatenate(matrix_rows), np.concatenate(matrix_columns))),
         shape=(len(at), len(at)),
     )
-    melded = picture.copy()
-    melded[hole] = splu(sparse.csc_array(matrix)).solve(right)
-    return melded
+    blended = picture.copy()
+    blended[hole] = splu(sparse.csc_array(matrix)).solve(right)
+    return blended
 
 
 class _Work:
-    """The arrays of one level on the device."""
+    """Arrays of one level on the device."""
 
     def __init__(self, level: _Level, sources: np.ndarray, options: PatchSynthesis) -> None:
         self._device = wp.get_device(options.device)
@@ -218,7 +225,7 @@ class _Work:
         self._image = wp.array(self.picture, dtype=wp.vec3, device=self._device)
 
     def search(self, *, seed: int) -> None:
-        """Better sources, if there are any."""
+        """Improve the sources by propagation and random search."""
         for number, stride in enumerate(_STRIDES):
             launch_rows(
                 search_kernel,
@@ -233,7 +240,7 @@ class _Work:
             self._sources, self._next = self._next, self._sources
 
     def vote(self, tolerance: float) -> None:
-        """Paint the hole by what the sources say; ``tolerance`` is in median costs."""
+        """Paint the hole with the weighted mean of the overlapping patches. ``tolerance`` is in median costs."""
         costs = self._cost.numpy()[self._targets_at[:, 0], self._targets_at[:, 1]]
         launch_rows(
             vote_kernel,
@@ -249,5 +256,5 @@ class _Work:
         self._image = wp.array(self.picture, dtype=wp.vec3, device=self._device)
 
     def sources(self) -> np.ndarray:
-        """(H, W, 2) int32."""
+        """(H, W, 2) int32, row and column of each source."""
         return self._sources.numpy()

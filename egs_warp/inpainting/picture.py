@@ -1,4 +1,4 @@
-"""A picture that shows whether inpainting worked."""
+"""Pictures that show the result of inpainting."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from egs_warp.io.video import contact_sheet
 from egs_warp.render import render_gaussians
 
 _DISTANCE = 3.2
-"""Of the cameras from the hole, in sides of the hole."""
+"""Distance of the cameras from the hole, in sides of the hole."""
 
 
 def before_and_after(result: InpaintResult, *, size: int = 384) -> np.ndarray:
-    """(2 size, 4 size, 3) uint8: from two sides before, after and the depth of the new floor, and the floor face-on
-    before and after."""
+    """(2 size, 4 size, 3) uint8: before, after and depth of the new floor from two sides, and the floor face-on before
+    and after."""
     kept = result.cloud.subset(~result.is_new)
     tiles, labels = [], []
     for number, camera in enumerate(_cameras(result, size)):
@@ -30,7 +30,8 @@ def before_and_after(result: InpaintResult, *, size: int = 384) -> np.ndarray:
 
 
 def depth_colours(depth: np.ndarray, near: float | None = None, far: float | None = None) -> np.ndarray:
-    """(H, W, 3) uint8 RGB: near is dark blue, far is yellow, nothing is white. The range defaults to the picture's."""
+    """(H, W, 3) uint8 RGB: near is dark blue, far is yellow, empty is white. The range defaults to that of the
+    picture."""
     seen = depth > 0.0
     if not seen.any():
         return np.full((*depth.shape, 3), 255, np.uint8)
@@ -42,7 +43,7 @@ def depth_colours(depth: np.ndarray, near: float | None = None, far: float | Non
 
 
 def _cameras(result: InpaintResult, size: int) -> list[Camera]:
-    """A high and a low one, from two sides."""
+    """Return a high and a low camera, on two sides."""
     window = result.window
     rows, columns = np.nonzero(result.hole)
     middle = window.points(np.array([[columns.mean(), rows.mean()]]))[0]

@@ -1,4 +1,4 @@
-"""Which colours a hole may have where, judged by what its rim has."""
+"""Colours that each part of a hole may have, judged by the colours of its rim."""
 
 from __future__ import annotations
 
@@ -10,26 +10,29 @@ from egs_warp.geometry.bitmaps import connected_parts, nearest_set
 from egs_warp.geometry.laplace_fill import laplace_fill
 
 _SHADE = 0.1
-"""Colours nearer to each other than this are the same."""
+"""Colours closer to each other than this are the same."""
 _LINE = 5
-"""Pixels: what is narrower than half of this is not judged, for lines cross a hole though little of its rim has their
+"""Pixels. Structure narrower than half of this is not judged: lines cross a hole although little of its rim has their
 colour."""
 _COMMON = 0.55
-"""A colour at least this likely, compared with the likeliest, may stand alone."""
+"""A colour at least this likely, relative to the most likely one, may stand alone."""
 _PATTERN = 0.5
-"""Where no colour is likelier than this, the floor has a pattern and nothing is unusual."""
+"""If no colour is more likely than this, the floor has a pattern and no colour is unusual."""
 _TOUCH = 2
-"""Pixels around an island in which the rim is looked at."""
-_MOST_ADDED = 12
-"""Offsets, for one hole."""
+"""Pixels around an island in which the rim is examined."""
+_MAX_ADDED = 12
+"""Maximum number of added offsets for one hole."""
 
 
 class RimColours:
-    """The colours of a picture (H, W, 3) in shades, and how likely each shade is at the pixels ``domain`` (n, 2) of a
-    hole: as likely as a walker that sets out there at random ends on a rim of that shade."""
+    """Colours of a picture (H, W, 3) in shades, and the likelihood of each shade at the pixels ``domain`` (n, 2) of a
+    hole.
+
+    The likelihood is the probability that a random walk from the pixel ends at a rim pixel of that shade.
+    """
 
     def __init__(self, image: np.ndarray, usable: np.ndarray, domain: np.ndarray) -> None:
-        """``usable`` (H, W) bool is where the picture is known."""
+        """Compute the likelihoods. ``usable`` (H, W) bool is where the picture is known."""
         rows, columns = nearest_set(usable)
         self._broad = cv2.medianBlur(image[rows, columns], _LINE)
         shades, index = np.unique(np.rint(self._broad / _SHADE).astype(int).reshape(-1, 3), axis=0, return_inverse=True)
@@ -40,12 +43,15 @@ class RimColours:
         self._common = (film > _COMMON * top) | (top < _PATTERN)
 
     def common(self, place: np.ndarray) -> np.ndarray:
-        """(n, k) bool: whether the colour at ``place`` (n, k, 2) is nothing unusual at each pixel of the domain."""
+        """(n, k) bool, True if the colour at ``place`` (n, k, 2) is not unusual at the pixel of the domain."""
         return np.take_along_axis(self._common, self._shade[place[..., 0], place[..., 1]], axis=1)
 
     def islands(self, place: np.ndarray) -> np.ndarray:
-        """(n,) bool: pixels of an unusual colour that are part of an island, or of a tongue longer than it is wide, if
-        each pixel of the domain is painted as ``place`` (n, 2). What reaches the rim in two places is none."""
+        """(n,) bool, pixels of an unusual colour in an island, or in a tongue longer than it is wide.
+
+        The pixels of the domain are painted as ``place`` (n, 2). A region that reaches the rim in two places is no
+        island.
+        """
         rows, columns = self._domain.T
         painted = self._broad.copy()
         painted[rows, columns] = self._broad[place[:, 0], place[:, 1]]
@@ -68,20 +74,20 @@ class RimColours:
         return found[rows, columns]
 
     def offsets_for(self, uncovered: np.ndarray, is_source: np.ndarray) -> list[np.ndarray]:
-        """(2,) int offsets under which the ``uncovered`` (n,) bool pixels find common colours at ``is_source`` (H, W),
-        in pieces as large as can be."""
+        """Return offsets (2,) int under which the ``uncovered`` (n,) bool pixels get common colours from ``is_source``
+        (H, W), in pieces as large as possible."""
         uncovered, found = uncovered.copy(), []
-        while uncovered.any() and len(found) < _MOST_ADDED:
+        while uncovered.any() and len(found) < _MAX_ADDED:
             at, common = self._domain[uncovered], self._common[uncovered]
             low, size = at.min(axis=0), np.ptp(at, axis=0) + 1
             if (size > is_source.shape).any():
                 break
             total: np.ndarray | float = 0.0
             for shade in np.flatnonzero(common.any(axis=0)):
-                wanted = np.zeros(size, np.float32)
-                wanted[tuple((at[common[:, shade]] - low).T)] = 1.0
+                pattern = np.zeros(size, np.float32)
+                pattern[tuple((at[common[:, shade]] - low).T)] = 1.0
                 there = (is_source & (self._shade == shade)).astype(np.float32)
-                total = total + cv2.matchTemplate(there, wanted, cv2.TM_CCORR)
+                total = total + cv2.matchTemplate(there, pattern, cv2.TM_CCORR)
             step = np.array(np.unravel_index(np.argmax(total), np.shape(total))) - low
             row, column = (at + step).T
             fits = is_source[row, column] & common[np.arange(len(at)), self._shade[row, column]]

@@ -1,4 +1,4 @@
-"""The underside of an object that stood on uneven or soft ground: no view has seen it, so it is closed."""
+"""Closing of the underside of an object that stood on uneven or soft ground, as no view has seen it."""
 
 from __future__ import annotations
 
@@ -16,60 +16,68 @@ from egs_warp.inpainting.new_floor import flat_gaussians
 from egs_warp.inpainting.rectified import PlaneWindow
 
 _LOW = 0.03
-"""Of the object's size: what of it is nearer to the ground is its rim there."""
+"""Fraction of the object's size. Gaussians closer to the ground are the object's rim."""
 _TEXELS = 128
-"""Across the rim."""
+"""Texels across the rim."""
 _SPACING = 2
 """Texels between new Gaussians."""
 _BRIDGED = 8.0
-"""Texels: gaps in the rim that are twice as wide are bridged."""
+"""Texels. Gaps in the rim up to twice as wide are bridged."""
 _REACH = 2.0
-"""Standard deviations of a splat that cover."""
+"""Standard deviations of a splat that count as covered."""
 _FOOT = 0.05
-"""Of the texels that the rim encloses: fewer unseen ones are no underside."""
+"""Fraction of the texels that the rim encloses. With fewer unseen texels there is no open underside."""
 
 
-def with_underside(thing: GaussianCloud, ground: HeightField, size: float) -> tuple[GaussianCloud, int]:
-    """``thing``, of ``size`` (scene units), with flat Gaussians over what its rim at the ``ground`` encloses, and how
-    many these are: a soap film through the rim, in the rim's colours.
+def with_underside(object_cloud: GaussianCloud, ground: HeightField, size: float) -> tuple[GaussianCloud, int]:
+    """Return the object with flat Gaussians over the opening that its rim at the ground encloses, and their number.
+
+    Heights and colours solve Laplace's equation with the values of the rim.
+
+    Args:
+        object_cloud: Gaussians of the object, scene units.
+        ground: the ground under it.
+        size: size of the object, scene units.
     """
-    means = thing.means.numpy().astype(np.float64)
-    low = (ground.heights(means) < _LOW * size) & (thing.opacities() > 0.3)
+    means = object_cloud.means.numpy().astype(np.float64)
+    low = (ground.heights(means) < _LOW * size) & (object_cloud.opacities() > 0.3)
     if low.sum() < 3:
-        return thing, 0
+        return object_cloud, 0
     plane, rim = ground.plane, means[low]
     tangents = np.stack(plane.tangents(), axis=1)
     flat = rim @ tangents
     texel = 1.2 * float(np.ptp(flat, axis=0).max()) / _TEXELS
     middle = 0.5 * (rim.min(axis=0) + rim.max(axis=0))
     if texel <= 0.0:
-        return thing, 0
+        return object_cloud, 0
     window = PlaneWindow(plane, middle - plane.heights(middle) * plane.normal, texel, _TEXELS, _TEXELS)
     column, row = np.floor(window.pixels(rim)).astype(int).T
     heights = np.full((_TEXELS, _TEXELS), np.inf)
     np.minimum.at(heights, (row, column), plane.heights(rim))
     seen = np.isfinite(heights)
     colours = np.zeros((_TEXELS, _TEXELS, 3))
-    # The lowest of each texel comes last, and counts.
+    # The lowest Gaussian of each texel comes last and determines the colour.
     order = np.argsort(-plane.heights(rim), kind="stable")
-    colours[row[order], column[order]] = thing.sh.numpy()[low][order, 0] * SH_BAND_0 + 0.5
-    # Splats cover what is between their middles.
-    width = float(np.median(thing.breadths(low)))
+    colours[row[order], column[order]] = object_cloud.sh.numpy()[low][order, 0] * SH_BAND_0 + 0.5
+    # Splats cover the space between their means.
+    width = float(np.median(object_cloud.breadths(low)))
     covered = distance_to(seen) <= _REACH * width / texel
-    # Filled while swollen, since the rim is a sieve.
+    # The region is dilated before it is filled, because the rim has gaps.
     inside = depth_inside(np.asarray(ndimage.binary_fill_holes(distance_to(seen) <= _BRIDGED))) > _BRIDGED
     near = nearest_set(seen)
     unseen = inside & ~covered
-    if unseen.sum() < _FOOT * inside.sum():
-        return thing, 0
+    if not unseen.any() or unseen.sum() < _FOOT * inside.sum():
+        return object_cloud, 0
     film = laplace_fill(heights[tuple(near)], unseen)
     painted = laplace_fill(colours[tuple(near)], unseen)
-    new = flat_gaussians(window, unseen, seen, painted, film, spacing=_SPACING, device=str(thing.device))
-    return concatenate(thing, _of_degree(new, thing.sh.shape[1])), new.count
+    new = flat_gaussians(window, unseen, seen, painted, film, spacing=_SPACING, device=str(object_cloud.device))
+    if new is None:
+        return object_cloud, 0
+    return concatenate(object_cloud, _of_degree(new, object_cloud.sh.shape[1])), new.count
 
 
 def _of_degree(cloud: GaussianCloud, coefficients: int) -> GaussianCloud:
-    """``cloud``, of SH degree 0, with as many ``coefficients`` as another has."""
+    """Return ``cloud``, of SH degree 0, with ``coefficients`` SH coefficients for each Gaussian."""
     sh = np.zeros((cloud.count, coefficients, 3), np.float32)
     sh[:, 0] = cloud.sh.numpy()[:, 0]
     return replace(cloud, sh=wp.array(sh, dtype=wp.vec3, device=cloud.device))

@@ -1,6 +1,6 @@
-"""Files of others, in and out, beside the paper: captures, camera poses, planes, texts, pictures and videos.
+"""Reading and writing of files: captures, camera poses, planes, text, pictures and videos.
 
-In: paths. Out: the records of ``geometry``; each file is written whole or not at all.
+Input: paths. Output: the records of ``geometry``. Each file is written completely or not at all.
 """
 
 from egs_warp.io.atomic import atomic_write, writable_folder

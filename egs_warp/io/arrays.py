@@ -1,6 +1,7 @@
-"""Arrays by name in one file: ``.npz`` as ``numpy.savez`` writes it.
+"""Named arrays in one file: ``.npz`` as ``numpy.savez`` writes it.
 
-Such files may be damaged or a stranger's: what a file declares is compared with how large it is before memory is taken.
+Such files may be damaged or untrusted: the sizes that a file declares are compared with its own size before memory is
+allocated.
 """
 
 from __future__ import annotations
@@ -19,21 +20,21 @@ READ_ERRORS = (
     *(OSError, EOFError, RuntimeError, KeyError, IndexError, ValueError, TypeError, OverflowError),
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error),
 )
-"""What reading a damaged file of arrays, or using what it holds, ends in."""
+"""Errors that reading a damaged file of arrays, or using its content, may raise."""
 _NUMBERS = "biufU"
-"""Kinds of arrays that are read: numbers, truths and texts."""
+"""Kinds of arrays that are read: numbers, booleans and text."""
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of the file. Raises ``DAMAGES``."""
+    """Read all arrays of the file. Raises ``READ_ERRORS``."""
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         if any(member.compress_type != zipfile.ZIP_STORED for member in members):
             raise ValueError("its arrays are compressed")
-        # Members may overlap: each would be read whole.
+        # Members may overlap, and each would be read completely.
         if sum(member.file_size for member in members) > path.stat().st_size:
             raise ValueError("its arrays are larger than the file")
-        # Each member is read whole, which compares its checksum, before anything of it is believed.
+        # Each member is read completely, which verifies its checksum, before its content is used.
         return {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in members}
 
 

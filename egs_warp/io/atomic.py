@@ -1,4 +1,4 @@
-"""Files appear whole or not at all."""
+"""Atomic writing of files, and file locks."""
 
 from __future__ import annotations
 
@@ -16,24 +16,25 @@ from egs_warp.errors import UserError
 try:
     import fcntl
 except ImportError:
-    # Windows: nothing is locked, and nothing swept.
+    # Windows: nothing is locked, and no leftover files are removed.
     fcntl = None
 
 _TEMPORARY = re.compile(r"\.egs-[0-9a-f]{16}(\..*)?")
-_TOLD = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES)
-_YOUNGEST = 2.0
-"""Seconds: a file that is younger may not have been locked yet."""
+_SYSTEM_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES)
+_MIN_AGE = 2.0
+"""Seconds. A younger file may not have been locked yet."""
 
 
 @contextmanager
 def atomic_write(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``, with its suffix; move it onto ``path`` when the block ends without error.
+    """Yield a temporary path beside ``path``, with its suffix; move the file to ``path`` when the block ends without
+    error.
 
-    Whatever goes wrong inside the block, a file that was at ``path`` before stays as it was and the temporary one is
-    removed; one that a killed process leaves is removed by the next ``sweep``. Raises ``UserError`` where the folder is
-    missing or the file cannot be written.
+    If the block fails, an existing file at ``path`` stays unchanged and the temporary one is removed; one that a killed
+    process leaves is removed by the next ``sweep``. Raises ``UserError`` if the folder is missing or the file cannot be
+    written.
     """
-    # A link is written through, as with an ordinary open(); os.replace would put a file in the link's place.
+    # A link is followed, as by open(); os.replace would replace the link itself.
     target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
         raise UserError(f"{path}: its folder does not exist; create {target.parent} first")
@@ -42,9 +43,9 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
     temporary = _temporary_name(target.parent, target.suffix)
     descriptor = None
     try:
-        # Nobody else's file, and no link that somebody has put there.
+        # O_EXCL: never an existing file, nor a link placed by another process.
         descriptor = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
-        if not _locked(descriptor):
+        if not _try_lock(descriptor):
             os.close(descriptor)
             descriptor = None
         yield temporary
@@ -58,7 +59,8 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
 
 
 def writable_folder(path: Path | str) -> Path:
-    """Create folder ``path`` where it is missing and return it, swept. Raises ``UserError`` if files cannot be made."""
+    """Create folder ``path`` if it is missing, remove leftovers in it, and return it. Raises ``UserError`` if it is not
+    writable."""
     folder = Path(path)
     probe = _temporary_name(folder, "")
     try:
@@ -75,8 +77,10 @@ def writable_folder(path: Path | str) -> Path:
 
 
 def sweep(folder: Path) -> bool:
-    """Remove what ``atomic_write`` of killed processes has left in ``folder``; those of living ones are locked. Returns
-    whether there is any that is too young to be told from those.
+    """Remove files in ``folder`` that ``atomic_write`` of killed processes has left; those of running processes are
+    locked.
+
+    Returns True if there are files too young to be distinguished from those.
     """
     young = False
     if fcntl is None:
@@ -85,36 +89,36 @@ def sweep(folder: Path) -> bool:
         try:
             if not _TEMPORARY.fullmatch(entry.name) or not entry.is_file(follow_symlinks=False):
                 continue
-            if abs(time.time() - entry.stat(follow_symlinks=False).st_mtime) < _YOUNGEST:
+            if abs(time.time() - entry.stat(follow_symlinks=False).st_mtime) < _MIN_AGE:
                 young = True
                 continue
             descriptor = os.open(entry.path, os.O_RDWR)
             try:
-                if _locked(descriptor):
+                if _try_lock(descriptor):
                     os.unlink(entry.path)
             finally:
                 os.close(descriptor)
-        # Another process was faster, or may do what we may not.
+        # Another process was faster, or has other permissions.
         except OSError:
             continue
     return young
 
 
 def sweep_all(folder: Path) -> None:
-    """``sweep``, waiting for what is too young, seconds at most: a program that a killed process had started, such as
-    ffmpeg, may have written to the last.
-    """
-    give_up = time.monotonic() + 2.0 * _YOUNGEST
-    while sweep(folder) and time.monotonic() < give_up:
-        time.sleep(0.05 * _YOUNGEST)
+    """Call ``sweep`` until no file is too young, for a few seconds at most: a program that a killed process had
+    started, such as ffmpeg, may have written until the end."""
+    deadline = time.monotonic() + 2.0 * _MIN_AGE
+    while sweep(folder) and time.monotonic() < deadline:
+        time.sleep(0.05 * _MIN_AGE)
 
 
 @contextmanager
 def lock(path: Path) -> Iterator[bool]:
-    """Whether this process alone holds ``path``, a file made for the purpose, which goes when the block ends."""
+    """Yield True if this process holds the lock file ``path``, which is removed when the block ends, and False if
+    another process holds it."""
     while True:
         descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
-        if fcntl is not None and not _locked(descriptor):
+        if fcntl is not None and not _try_lock(descriptor):
             os.close(descriptor)
             yield False
             return
@@ -124,7 +128,7 @@ def lock(path: Path) -> Iterator[bool]:
             same = False
         if same:
             break
-        # Its last holder has removed it in between.
+        # Its last holder removed it in the meantime.
         os.close(descriptor)
     try:
         yield True
@@ -134,8 +138,8 @@ def lock(path: Path) -> Iterator[bool]:
         os.close(descriptor)
 
 
-def _locked(descriptor: int) -> bool:
-    """Whether the open file could be locked; the lock goes with the process, however that ends."""
+def _try_lock(descriptor: int) -> bool:
+    """Return True if the open file could be locked. The lock ends with the process."""
     if fcntl is None:
         return False
     try:
@@ -149,11 +153,10 @@ def _temporary_name(folder: Path, suffix: str) -> Path:
     return folder / f".egs-{uuid.uuid4().hex[:16]}{suffix}"
 
 
-def system_error(told: str) -> OSError | None:
-    """What other programs and libraries tell of the system, such as a full disk, as the error that Python has for it;
-    None where they tell of something else.
-    """
-    number = next((number for number in _TOLD if os.strerror(number) in told), None)
+def system_error(message: str) -> OSError | None:
+    """Return the error of the operating system, such as a full disk, that the ``message`` of a program or library
+    names; None if it names none."""
+    number = next((number for number in _SYSTEM_ERRORS if os.strerror(number) in message), None)
     return None if number is None else OSError(number, os.strerror(number))
 
 

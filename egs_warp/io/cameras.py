@@ -16,7 +16,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.colmap import SparsePoints, read_colmap_model, read_colmap_points
-from egs_warp.io.limits import FURTHEST, LARGEST_TEXT, check_pixels, picture_size, read_bytes
+from egs_warp.io.limits import FURTHEST, MAX_TEXT_BYTES, check_pixels, picture_size, read_bytes
 from egs_warp.io.ply import read_point_ply
 from egs_warp.io.text import whole_number
 
@@ -26,33 +26,33 @@ _LENSES = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
     *("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
 )
-"""Of ``camera_model`` in transforms.json."""
+"""Values of ``camera_model`` in transforms.json."""
 _JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
-_LONGEST_FOCAL = 1e3
-"""Sides of the photo; the shortest focal length is as small a part."""
-_FURTHEST_MIDDLE = 10.0
-"""Sides of the photo."""
+_MAX_FOCAL = 1e3
+"""Maximum focal length in sides of the photo; the minimum is the reciprocal."""
+_MAX_CENTRE = 10.0
+"""Maximum distance of the principal point, in sides of the photo."""
 _COLMAP_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 
 
 @dataclass(frozen=True)
 class PosedImage:
-    """One photo and where it was taken from."""
+    """A photo and its camera."""
 
     name: str
     camera: Camera
     image: Path | None
-    """The photo's file; None where it is not beside the poses."""
+    """The photo's file; None if it is not beside the poses."""
     lens: Lens | None = None
-    """What bends the photo's lines; ``camera`` is then that of the photo straightened, at the same size."""
+    """Distortion of the photo; ``camera`` is then that of the undistorted photo, of the same size."""
 
 
 def read_cameras(path: Path | str) -> list[PosedImage]:
     """Read INRIA ``cameras.json``, NeRF-synthetic or nerfstudio ``transforms.json``, or a COLMAP sparse model.
 
-    ``path`` is the .json, the folder of a COLMAP model (text or binary), or a folder that holds one of these. Poses are
-    kept in the file's world frame; nerfstudio's ``applied_transform`` is not undone. Raises ``UserError`` for missing
-    or malformed files and for lenses that are not known here.
+    ``path`` is the .json, the folder of a COLMAP model (text or binary), or a folder that contains one of these. Poses
+    stay in the file's world frame; nerfstudio's ``applied_transform`` is not undone. Raises ``UserError`` for missing
+    or malformed files and for unknown lens models.
     """
     source = _pose_file(Path(path))
     if source.is_dir():
@@ -72,58 +72,55 @@ def read_cameras(path: Path | str) -> list[PosedImage]:
 
 
 def read_points(path: Path | str) -> SparsePoints | None:
-    """The points triangulated from the photos of ``path``; None where there are none.
+    """Read the points triangulated from the photos of ``path``; None if there are none.
 
-    COLMAP's, or the .ply that nerfstudio (``ply_file_path``) and INRIA (``input.ply``) put beside their poses. Raises
-    ``UserError`` for malformed files.
+    They are COLMAP's, or the .ply that nerfstudio (``ply_file_path``) and INRIA (``input.ply``) place beside their
+    poses. Raises ``UserError`` for malformed files.
     """
     source = _pose_file(Path(path))
     if source.is_dir():
         return read_colmap_points(source)
     tree = _tree(source)
     name = tree.get("ply_file_path") if isinstance(tree, dict) else "input.ply"
-    if not isinstance(name, str) or not _below(name) or not os.path.isfile(source.parent / name):
+    if not isinstance(name, str) or not _is_inside(name) or not os.path.isfile(source.parent / name):
         return None
     positions, colours = read_point_ply(source.parent / name)
     return SparsePoints(positions, colours) if len(positions) else None
 
 
 def _tree(source: Path) -> Any:
-    """What a .json of poses holds."""
-    data = read_bytes(source, at_most=LARGEST_TEXT)
+    """Parse a .json of poses."""
+    data = read_bytes(source, at_most=MAX_TEXT_BYTES)
     try:
         return json.loads(data, parse_int=whole_number)
     except (ValueError, RecursionError) as error:
         raise UserError(f"{source}: not readable JSON; give a cameras.json or a transforms.json") from error
 
 
-def _below(name: str) -> bool:
-    """Whether ``name`` stays in the folder that it is relative to."""
+def _is_inside(name: str) -> bool:
+    """Return True if the relative path ``name`` does not leave its folder."""
     path = PurePath(name)
     return "\0" not in name and not path.is_absolute() and not path.drive and ".." not in path.parts
 
 
 def _checked(camera: Camera, what: str) -> Camera:
-    """``camera``, if one can have taken a photo with it; ``what`` begins the message."""
+    """Return ``camera`` if its values are plausible. Raises ``UserError``, whose message begins with ``what``."""
     check_pixels(camera.width, camera.height, what)
     side = max(camera.width, camera.height)
     focal = np.array([camera.fx, camera.fy]) / side
     middle = np.array([camera.cx, camera.cy]) / side
-    if (
-        not ((focal > 1.0 / _LONGEST_FOCAL) & (focal < _LONGEST_FOCAL)).all()
-        or not (abs(middle) < _FURTHEST_MIDDLE).all()
-    ):
+    if not ((focal > 1.0 / _MAX_FOCAL) & (focal < _MAX_FOCAL)).all() or not (abs(middle) < _MAX_CENTRE).all():
         raise UserError(
             f"{what}: focal lengths {camera.fx:g}, {camera.fy:g} and middle {camera.cx:g}, {camera.cy:g} fit no photo"
             f" of {camera.width} x {camera.height} pixels; export the poses again"
         )
     if not (abs(camera.translation) < FURTHEST).all():
-        raise UserError(f"{what}: it lies further than {FURTHEST:g} units out; export the poses again")
+        raise UserError(f"{what}: it lies more than {FURTHEST:g} units from the origin; export the poses again")
     return camera
 
 
 def _pose_file(source: Path) -> Path:
-    """The folder of a COLMAP model, or the .json, that ``source`` is or holds."""
+    """Return the folder of a COLMAP model, or the .json, that ``source`` is or contains."""
     if not source.is_dir():
         return source
     for folder in (source / name for name in _COLMAP_FOLDERS):
@@ -157,16 +154,16 @@ def _from_colmap(folder: Path) -> list[PosedImage]:
             translation=view.translation,
         )
         _checked(camera, f"{folder}: the camera of image {view.name}")
-        # COLMAP keeps the photos' folder to itself; these are the usual places around sparse/0.
+        # COLMAP does not store the photos' folder; these are the common places around sparse/0.
         places = [parent / "images" for parent in (folder, folder.parent, folder.parent.parent)]
-        places = places if _below(view.name) else []
+        places = places if _is_inside(view.name) else []
         image = next((place / view.name for place in places if os.path.isfile(place / view.name)), None)
         posed.append(PosedImage(view.name, camera, image, view.lens))
     return posed
 
 
 def _inria(source: Path, number: int, entry: object) -> PosedImage:
-    """``position`` and ``rotation`` are camera to world, in OpenCV axes."""
+    """Convert a camera: ``position`` and ``rotation`` are camera to world, in OpenCV axes."""
     record = _Record(source, f"camera {number}", entry)
     name = record.text("img_name")
     width, height = record.size("width"), record.size("height")
@@ -185,7 +182,8 @@ def _inria(source: Path, number: int, entry: object) -> PosedImage:
 
 
 def _transform(source: Path, number: int, shared: dict, entry: object) -> PosedImage:
-    """``transform_matrix`` is camera to world, y up and z backwards; intrinsics stand in the frame or are shared."""
+    """Convert a frame: ``transform_matrix`` is camera to world, y up and z backwards; intrinsics are in the frame or
+    shared."""
     own = entry if isinstance(entry, dict) else {}
     record = _Record(source, f"frame {number}", {**shared, **own})
     name = record.text("file_path")
@@ -221,24 +219,23 @@ def _lens(record: _Record) -> Lens | None:
     model = record.fields.get("camera_model", "OPENCV_FISHEYE" if record.fields.get("is_fisheye") else "OPENCV")
     if model not in _LENSES:
         raise UserError(
-            f"{record.source}: {record.where} has the lens model {model!r}, which is not known;"
-            f" give one of {', '.join(_LENSES)}"
+            f"{record.source}: {record.where} has the unknown lens model {model!r}; give one of {', '.join(_LENSES)}"
         )
-    given = {key: float(record.numbers(key, ())) for key in _DISTORTIONS if record.fields.get(key)}
-    return Lens.named(model, given)
+    values = {key: float(record.numbers(key, ())) for key in _DISTORTIONS if record.fields.get(key)}
+    return Lens.named(model, values)
 
 
 def _find_image(folder: Path, name: str) -> Path | None:
-    """The photo ``name`` in ``folder``; None where it is not there: what lies elsewhere is not looked for."""
-    if not _below(name):
+    """Return the photo ``name`` in ``folder``; None if it is not there. Other folders are not searched."""
+    if not _is_inside(name):
         return None
     path = folder / name
-    # os.path answers False where Path.is_file raises: names too long or not of this world.
+    # os.path returns False where Path.is_file raises: for names that are too long or invalid.
     return next((Path(f"{path}{suffix}") for suffix in _IMAGE_SUFFIXES if os.path.isfile(f"{path}{suffix}")), None)
 
 
 def _shared_size(source: Path, tree: dict) -> dict[str, int]:
-    """``w`` and ``h`` of sets that leave them out: those of the first photo that can be read."""
+    """Return ``w`` and ``h`` for files without them: those of the first readable photo."""
     frames = [frame for frame in tree["frames"] if isinstance(frame, dict)]
     if "w" in tree or all("w" in frame for frame in frames):
         return {}
@@ -248,7 +245,7 @@ def _shared_size(source: Path, tree: dict) -> dict[str, int]:
         size = picture_size(image, f"{image}: it") if image is not None else None
         if size is not None:
             return {"w": size[0], "h": size[1]}
-    raise UserError(f"{source}: it has no w and h, and none of its photos can be read; add either")
+    raise UserError(f"{source}: it has no w and h, and none of its photos can be read; add w and h, or the photos")
 
 
 class _Record:
@@ -262,7 +259,7 @@ class _Record:
         self.fields: dict = fields
 
     def numbers(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
-        """Array of ``shape``, float64, finite."""
+        """Return an array of ``shape``, float64, finite."""
         try:
             values = np.array(self.fields.get(key), dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
@@ -273,35 +270,35 @@ class _Record:
         return values
 
     def focal(self, key: str) -> float:
-        """A length in pixels."""
+        """Return a length in pixels."""
         value = float(self.numbers(key, ()))
         if value <= 0:
             raise self._wrong(key, "a positive number")
         return value
 
     def angle(self, key: str) -> float:
-        """A field of view in radians."""
+        """Return a field of view in rad."""
         value = float(self.numbers(key, ()))
         if not 0 < value < np.pi:
             raise self._wrong(key, "an angle between 0 and pi")
         return value
 
     def size(self, key: str) -> int:
-        """A number of pixels."""
+        """Return a number of pixels."""
         value = float(self.numbers(key, ()))
         if value < 1 or value != int(value):
             raise self._wrong(key, "a number of pixels")
         return int(value)
 
     def text(self, key: str) -> str:
-        """A name."""
+        """Return a name."""
         value = self.fields.get(key)
         if not isinstance(value, str) or not value or "\0" in value:
             raise self._wrong(key, "a name")
         return value
 
     def rotation(self, matrix: np.ndarray) -> np.ndarray:
-        """``matrix`` (3, 3), if it is a rotation."""
+        """Return ``matrix`` (3, 3) if it is a rotation."""
         if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) or np.linalg.det(matrix) < 0:
             raise UserError(f"{self.source}: {self.where}: the pose is not a rotation; export the poses again")
         return matrix
@@ -311,7 +308,8 @@ class _Record:
 
 
 def write_cameras(path: Path | str, cameras: Sequence[Camera], names: Sequence[str]) -> None:
-    """INRIA ``cameras.json``, which ``read_cameras`` and most tools read; principal points must be in the middle."""
+    """Write INRIA ``cameras.json``, which ``read_cameras`` and most tools read. Principal points must be in the
+    middle."""
     entries = [
         {
             "id": number,

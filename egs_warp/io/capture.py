@@ -1,4 +1,4 @@
-"""Reading a capture of any format."""
+"""Reading of captures of all supported formats."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.compressed_ply import decode_compressed_ply, is_compressed
 from egs_warp.io.gltf import decode_glb, decode_gltf, is_glb
-from egs_warp.io.limits import FREE_BYTES, INFLATION, LARGEST_TEXT, read_bytes
+from egs_warp.io.limits import FREE_BYTES, INFLATION, MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.outliers import without_outliers
 from egs_warp.io.ply import decode_ply, read_header
 from egs_warp.io.raw import EXTREME_LOGIT, RawCapture, check_finite
@@ -27,32 +27,33 @@ _META, _STREAMED_META = "meta.json", "lod-meta.json"
 
 @dataclass(frozen=True)
 class Capture:
-    """A capture as read from disk. Its axes and units are the file's own."""
+    """A capture as read from disk, in the axes and units of its file."""
 
     cloud: GaussianCloud
     source: Path
     format: str
-    """For the user, such as ``.spz version 2``."""
+    """Name for the user, such as ``.spz version 2``."""
     infinite_opacities: int
-    """Gaussians whose opacity logit is infinite in the file (opacity 0 or 1), or beyond 500; read as -16 or +16.
-    Formats that store opacity in a byte have none: their 0 and 255 stand for ranges."""
+    """Number of Gaussians whose opacity logit in the file is infinite (opacity 0 or 1) or beyond 500; read as -16 or
+    +16. Formats that store opacity in a byte have none, as their 0 and 255 stand for ranges."""
     up: np.ndarray | None
-    """(3,) float64 unit vector where the format defines which way is up, else None."""
+    """(3,) float64 unit vector if the format defines the up direction, else None."""
     antialiased: bool
-    """Whether the file says that it was trained with antialiasing (.spz and SOG can): draw it with that, too."""
+    """True if the file states that it was trained with antialiasing (.spz and SOG can); render it with antialiasing,
+    too."""
     notes: tuple[str, ...]
-    """What was left out or repaired, for the user."""
+    """Gaussians left out and values repaired, for the user."""
 
 
 def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
     """Read an INRIA or PlayCanvas compressed .ply, .spz, .splat, .sog, an unbundled SOG (its folder or meta.json), or
     glTF with splats (.glb, .gltf).
 
-    The format is told by content; only .splat, which has no mark, and .gltf by their names. Raises ``UserError``
-    with one line for anything that cannot be read.
+    The format is determined by content; .splat, which has no magic number, and .gltf by their names. Raises
+    ``UserError`` with one line for anything that cannot be read.
     """
     source = Path(path)
-    # Values too large for float32 and broken floats need no warning: check_finite names them.
+    # Values too large for float32 and broken floats need no warning: check_finite reports them.
     with np.errstate(over="ignore", invalid="ignore"):
         raw = _decode(source)
     check_finite(raw, source)
@@ -90,7 +91,7 @@ def _decode(source: Path) -> RawCapture:
     if is_glb(data):
         return decode_glb(data, source)
     if data[:1] == b"{" and source.suffix.lower() == ".gltf":
-        return decode_gltf(read_bytes(source, at_most=LARGEST_TEXT), source)
+        return decode_gltf(read_bytes(source, at_most=MAX_TEXT_BYTES), source)
     if data[:1] == b"{":
         return _decode_meta(source)
     if not data:
@@ -102,17 +103,16 @@ def _decode(source: Path) -> RawCapture:
     )
 
 
-_LONG = (b"NGSP", b"glTF", b"PK\x03\x04", b"\x1f\x8b\x08")
-"""First bytes that are no coordinate but by a very rare chance."""
+_MAGIC_NUMBERS = (b"NGSP", b"glTF", b"PK\x03\x04", b"\x1f\x8b\x08")
+"""First bytes that are a coordinate only by a rare coincidence."""
 
 
 def _may_be_splat(data: bytes, source: Path) -> bool:
-    """Whether a file that is called .splat, which has no magic number, may be one: its first bytes are a coordinate,
-    and may be those by which zip, gzip or JSON are told.
-    """
+    """Return True if a file named .splat, which has no magic number, may be one: its first bytes are a coordinate, and
+    may equal those of zip, gzip or JSON."""
     whole = len(data) > 0 and len(data) % SPLAT_ROW == 0
     text = data[:1] == b"{" and data[:SPLAT_ROW].isascii() and b"\0" not in data[:SPLAT_ROW]
-    return source.suffix.lower() == ".splat" and whole and not text and not data.startswith(_LONG)
+    return source.suffix.lower() == ".splat" and whole and not text and not data.startswith(_MAGIC_NUMBERS)
 
 
 def _decode_folder(folder: Path) -> RawCapture:
@@ -129,11 +129,11 @@ def _decode_meta(meta: Path) -> RawCapture:
     def read(name: str) -> bytes:
         return read_bytes(meta.parent / _inside(name, meta))
 
-    return _decode_sog_or_streamed(meta, read_bytes(meta, at_most=LARGEST_TEXT), read)
+    return _decode_sog_or_streamed(meta, read_bytes(meta, at_most=MAX_TEXT_BYTES), read)
 
 
 def _decode_zip(source: Path) -> RawCapture:
-    # zipfile raises errors of a dozen classes for corrupted archives; every one means the same to the user.
+    # zipfile raises a dozen classes of errors for corrupted archives; all mean the same to the user.
     try:
         with zipfile.ZipFile(source) as archive:
             members = {info.filename: info for info in archive.infolist() if not info.is_dir()}
@@ -144,14 +144,14 @@ def _decode_zip(source: Path) -> RawCapture:
                     f"{source}: a zip without meta.json; give a .sog, or unpack it if it holds another capture"
                 )
 
-            # Only what is named is inflated, and only to the size that its entry was checked by.
+            # Only requested members are inflated, and only to the size that was checked.
             def read(name: str) -> bytes:
                 inside = str(PurePosixPath(metas[0]).parent / _inside(name, source))
                 if inside not in members:
                     raise UserError(f"{source}: {inside} is missing from the zip; copy or export the file again")
                 member = members[inside]
                 text = PurePosixPath(inside).suffix == ".json"
-                if member.file_size > (LARGEST_TEXT if text else INFLATION * member.compress_size + FREE_BYTES):
+                if member.file_size > (MAX_TEXT_BYTES if text else INFLATION * member.compress_size + FREE_BYTES):
                     raise UserError(
                         f"{source}: {inside} inflates from {member.compress_size} to {member.file_size} bytes, which is"
                         " more than a capture needs; export it again"

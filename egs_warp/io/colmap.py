@@ -36,9 +36,9 @@ _MODELS = {
 }
 _PARAMETERS = {name: parameters.split() for name, parameters in _MODELS.values()}
 _POINT_BYTES = 24
-"""Of a point seen in a photo."""
+"""Bytes of one point in the list of a photo."""
 _TRACK_BYTES = 8
-"""Of a photo that a point is seen in."""
+"""Bytes of one photo in the list of a point."""
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,12 @@ class ColmapView:
     translation: np.ndarray
     """(3,) world to camera."""
     lens: Lens | None
-    """What bends the photo; None for a pinhole."""
+    """Distortion of the photo; None for a pinhole."""
 
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Points that were triangulated from the photos."""
+    """Points triangulated from the photos."""
 
     positions: np.ndarray
     """(n, 3) float64, world units."""
@@ -89,9 +89,9 @@ class _Pose:
 
 
 def read_colmap_model(folder: Path) -> list[ColmapView]:
-    """The photos of the model in ``folder``, in the order of its file; binary where both kinds exist.
+    """Read the photos of the model in ``folder``, in the order of its file; binary files are preferred.
 
-    Raises ``UserError`` for a model that is incomplete or malformed, and for lenses that are not known here.
+    Raises ``UserError`` for a model that is incomplete or malformed, and for unknown lens models.
     """
     suffix = ".bin" if (folder / "images.bin").is_file() else ".txt"
     cameras_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
@@ -103,7 +103,8 @@ def read_colmap_model(folder: Path) -> list[ColmapView]:
     for pose in poses:
         if pose.camera not in cameras:
             raise UserError(
-                f"{images_file}: image {pose.name} has camera {pose.camera}, missing in {cameras_file.name}"
+                f"{images_file}: image {pose.name} has camera {pose.camera}, which is missing in"
+                f" {cameras_file.name}; export the model again"
             )
         values = np.array(pose.values)
         if not np.isfinite(values).all() or not 1e-3 < np.abs(values[:4]).max() < 1e3:
@@ -113,7 +114,7 @@ def read_colmap_model(folder: Path) -> list[ColmapView]:
 
 
 def read_colmap_points(folder: Path) -> SparsePoints | None:
-    """The points of the model in ``folder``; None where it has none. Raises ``UserError`` for a malformed file."""
+    """Read the points of the model in ``folder``; None if it has none. Raises ``UserError`` for a malformed file."""
     for name, parse in (("points3D.bin", _binary_points), ("points3D.txt", _text_points)):
         if (folder / name).is_file():
             values = parse(_read(folder / name), folder / name)
@@ -132,7 +133,7 @@ def _intrinsics(
     names = _PARAMETERS.get(model)
     if names is None or len(parameters) != len(names):
         raise UserError(
-            f"{path}: camera {number} of model {model} with {len(parameters)} parameters is not known;"
+            f"{path}: camera {number} of model {model} with {len(parameters)} parameters is unknown;"
             f" give one of {', '.join(_PARAMETERS)}"
         )
     values = dict(zip(names, parameters, strict=True))
@@ -143,7 +144,7 @@ def _intrinsics(
 
 
 def _text_lines(data: bytes, path: Path) -> Iterator[str]:
-    """One at a time: a list of all would take far more memory than the file."""
+    """Return the lines one at a time, as a list of all would take far more memory than the file."""
     try:
         text = data.decode()
     except UnicodeDecodeError as error:
@@ -178,13 +179,13 @@ def _text_poses(data: bytes, path: Path) -> list[_Pose]:
             poses.append(_Pose(name, int(words[8]), tuple(float(word) for word in words[1:8])))
         except (ValueError, IndexError) as error:
             raise UserError(f"{path}: malformed image line {line[:60]!r}; export the model again") from error
-        # The points seen in the image follow on a line of their own, which may be empty.
+        # The points seen in the image are on the next line, which may be empty.
         next(lines, None)
     return poses
 
 
 class _Cursor:
-    """Reads a binary file from front to back."""
+    """Reads a binary file sequentially."""
 
     def __init__(self, data: bytes, path: Path) -> None:
         self.data = data
@@ -192,7 +193,7 @@ class _Cursor:
         self.offset = 0
 
     def take(self, layout: str) -> tuple:
-        """The next values of ``struct`` layout."""
+        """Return the next values of ``struct`` layout."""
         try:
             values = struct.unpack_from("<" + layout, self.data, self.offset)
         except struct.error as error:
@@ -201,7 +202,7 @@ class _Cursor:
         return values
 
     def text(self) -> str:
-        """The next null-terminated string."""
+        """Return the next null-terminated string."""
         end = self.data.find(b"\0", self.offset)
         if end < 0:
             raise self.truncated()
@@ -209,13 +210,13 @@ class _Cursor:
         return self.data[start:end].decode(errors="replace")
 
     def skip(self, size: int) -> None:
-        """Leave out ``size`` bytes."""
+        """Skip ``size`` bytes."""
         self.offset += size
         if self.offset > len(self.data):
             raise self.truncated()
 
     def truncated(self) -> UserError:
-        """The error of a file that is too short."""
+        """Return the error for a file that is too short."""
         return UserError(f"{self.path}: truncated at {len(self.data)} bytes; copy or export it again")
 
 
@@ -226,7 +227,7 @@ def _binary_cameras(data: bytes, path: Path) -> dict[int, _Intrinsics]:
         number, model, width, height = cursor.take("iiQQ")
         if model not in _MODELS:
             raise UserError(
-                f"{path}: camera {number} has model {model}, which is not known; give one of {', '.join(_PARAMETERS)}"
+                f"{path}: camera {number} has model {model}, which is unknown; give one of {', '.join(_PARAMETERS)}"
             )
         name = _MODELS[model][0]
         cameras[number] = _intrinsics(path, number, name, width, height, cursor.take(f"{len(_PARAMETERS[name])}d"))

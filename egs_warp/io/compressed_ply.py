@@ -1,9 +1,9 @@
-"""PlayCanvas compressed .ply: chunks of 256 Gaussians, each value packed between the chunk's least and greatest.
+"""PlayCanvas compressed .ply: chunks of 256 Gaussians, each value quantised between the chunk's minimum and maximum.
 
 Public description: https://blog.playcanvas.com/compressing-gaussian-splats and the SuperSplat documentation. Per chunk
 18 floats (bounds of position, log scale and colour); per Gaussian four uint32: position and scale 11-10-11 bits,
-rotation 2 bits (which component is the largest) and three of 10, colour and opacity 8-8-8-8; f_rest as uint8 over
--4 ... 4.
+rotation 2 bits (index of the largest component) and three of 10, colour and opacity 8-8-8-8; f_rest as uint8 over -4
+... 4.
 """
 
 from __future__ import annotations
@@ -39,12 +39,13 @@ _POSITION_FIELDS = ((21, 11), (11, 10), (0, 11))
 _ROTATION_FIELDS = ((20, 10), (10, 10), (0, 10))
 _COLOUR_FIELDS = ((24, 8), (16, 8), (8, 8))
 _SH_RANGE = 8.0
-# The format's other writers clamp log scales here, so that one broken Gaussian does not cost its chunk all precision.
+# Other writers of this format clamp log scales here, so that one broken Gaussian does not spoil the precision of its
+# chunk.
 _SCALE_LIMIT = 20.0
 
 
 def is_compressed(header: PlyHeader) -> bool:
-    """Whether a .ply is of this kind."""
+    """Return True if a .ply is of this kind."""
     vertex = header.element("vertex")
     return (
         header.element("chunk") is not None
@@ -55,13 +56,13 @@ def is_compressed(header: PlyHeader) -> bool:
 
 
 def decode_compressed_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
-    """Unpack the Gaussians. Raises ``UserError`` for a file that is cut short or lacks a property."""
+    """Decode the Gaussians. Raises ``UserError`` for a file that is truncated or lacks a property."""
     sh_element = header.element("sh")
     elements = read_elements(data, header, ["chunk", "vertex"] + (["sh"] if sh_element else []), source)
     chunk, vertex = elements.get("chunk"), elements.get("vertex")
     chunk_names = (chunk.dtype.names or ()) if chunk is not None else ()
     vertex_names = (vertex.dtype.names or ()) if vertex is not None else ()
-    # Files of 2023 have no bounds of colour: it then lies in 0 ... 1.
+    # Files of 2023 have no bounds of colour; the range is then 0 ... 1.
     bounds = _BOUNDS if "min_r" in chunk_names else _BOUNDS[:12]
     missing = [n for n in bounds if n not in chunk_names] + [n for n in _PACKED if n not in vertex_names]
     if chunk is None or vertex is None or missing:
@@ -74,7 +75,8 @@ def decode_compressed_ply(data: bytes, header: PlyHeader, source: Path) -> RawCa
     limits = np.tile(np.array([0, 0, 0, 1, 1, 1], np.float32), (len(chunk), 3))
     limits[:, : len(bounds)] = columns_as_float32(chunk, bounds)
     limits = limits.reshape(-1, 3, 2, 3)[np.arange(len(vertex)) // _CHUNK]
-    # The words of a text .ply arrive as float64, those of a big-endian one in that order; both hold the same integers.
+    # The words of a text .ply arrive as float64, those of a big-endian one in that order; both represent the same
+    # integers.
     words = {name: vertex[name].astype(np.uint32) for name in _PACKED}
     means = _between(limits[:, 0], _fields(words["packed_position"], _POSITION_FIELDS))
     log_scales = _between(limits[:, 1], _fields(words["packed_scale"], _POSITION_FIELDS))
@@ -119,10 +121,10 @@ def _decode_rest(rows: np.ndarray, count: int, source: Path) -> np.ndarray:
 
 
 def write_compressed_ply(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = False) -> None:
-    """Write ``cloud`` as a compressed .ply, about 16 bytes a Gaussian and one more for each higher SH number.
+    """Write ``cloud`` as a compressed .ply, about 16 bytes per Gaussian and one more for each higher SH number.
 
     Lossy: positions to 1/1024 of their chunk's size, SH to 1/32, opacity to 1/255. Gaussians are sorted in space, which
-    keeps chunks small, unless ``keep_order``. Raises ``UserError`` if the file cannot be written.
+    keeps chunks small, unless ``keep_order`` is set. Raises ``UserError`` if the file cannot be written.
     """
     means = cloud.means.numpy()
     order = np.arange(cloud.count) if keep_order else morton_order(means)

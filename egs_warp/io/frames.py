@@ -1,4 +1,4 @@
-"""Frames of a video that are worth a photo: sharp, and evenly spread over its time."""
+"""Selection of video frames to use as photos: sharp, and evenly spread over time."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from egs_warp.errors import UserError
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
 _BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
 _MARKS = (b"\x1a\x45\xdf\xa3", b"RIFF")
-_JUDGED_SIDE = 480
-"""Pixels: a frame's sharpness is judged at this size, where noise counts less than edges."""
+_SHARPNESS_SIDE = 480
+"""Longer side in pixels at which sharpness is measured; noise counts less than edges there."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Frame:
     """One frame of a video."""
 
     number: int
-    """From 0."""
+    """Index from 0."""
     pixels: np.ndarray
     """(H, W, 3) uint8, BGR, upright."""
     sharpness: float
@@ -31,7 +31,7 @@ class Frame:
 
 
 def select_sharp_frames(video: Path, count: int) -> Iterator[Frame]:
-    """The sharpest frame of each of ``count`` equal parts of the ``video``; all frames where it has fewer.
+    """Yield the sharpest frame of each of ``count`` equal parts of the ``video``; all frames if it has fewer.
 
     Raises ``UserError`` for a file that is no video.
     """
@@ -53,7 +53,7 @@ def select_sharp_frames(video: Path, count: int) -> Iterator[Frame]:
 
 
 def _check(video: Path) -> None:
-    """Refuse what is no video by its first bytes: a playlist would have other files and addresses opened."""
+    """Reject files that are no videos by their first bytes: a playlist could open other files and addresses."""
     if not video.is_file():
         raise UserError(f"{video}: no such file; give a video or a folder of photos")
     try:
@@ -61,7 +61,8 @@ def _check(video: Path) -> None:
             start = file.read(12)
     except OSError as error:
         raise UserError(f"{video}: cannot be read ({error.strerror}); check the path") from error
-    # QuickTime and MPEG-4 begin with a size and a name, Matroska and RIFF with a mark, transport streams with a G.
+    # QuickTime and MPEG-4 begin with a size and a name, Matroska and RIFF with a magic number, transport streams with a
+    # G.
     if not (start[4:8] in _BOXES or start[:4] in _MARKS or start[:1] == b"G" or start[4:5] == b"G"):
         raise UserError(f"{video}: no video that can be read; give an .mp4 or .mov, or a folder of photos")
 
@@ -79,7 +80,7 @@ def _frames(video: Path) -> Iterator[np.ndarray]:
 
 
 def _length(video: Path) -> int:
-    """Number of frames, counted: what the header says may be wrong."""
+    """Return the number of frames by counting, as the header may be wrong."""
     reader = cv2.VideoCapture(str(video))
     try:
         length = 0
@@ -94,7 +95,7 @@ def _length(video: Path) -> int:
 
 def _sharpness(pixels: np.ndarray) -> float:
     grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
-    factor = _JUDGED_SIDE / max(grey.shape)
+    factor = _SHARPNESS_SIDE / max(grey.shape)
     if factor < 1:
         grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())

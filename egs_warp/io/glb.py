@@ -1,7 +1,7 @@
-"""Binary glTF 2.0 with splats as points: KHR_gaussian_splatting, as ratified.
+"""Writing of binary glTF 2.0 with splats as points: KHR_gaussian_splatting, as ratified.
 
-Scales and opacities are as they are, not logarithms; quaternions x, y, z, w; glTF's y is up, which is the
-caller's care.
+Scales and opacities are stored directly, not as logarithms; quaternions are x, y, z, w. glTF's y axis is up, which the
+caller must provide.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""glTF 2.0 with splats read: KHR_gaussian_splatting as ratified, in one .glb, or a .gltf with its buffers beside it."""
+"""Reading of glTF 2.0 with splats: KHR_gaussian_splatting as ratified, in one .glb, or a .gltf with its buffers beside
+it."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
-from egs_warp.io.limits import LARGEST_TEXT, read_bytes
+from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.raw import EXTREME_LOGIT, RawCapture
 from egs_warp.io.text import parse_json
 
@@ -26,12 +27,12 @@ _Y_UP = np.array([0.0, 1.0, 0.0])
 
 
 def is_glb(data: bytes) -> bool:
-    """Whether ``data`` begins as a binary glTF."""
+    """Return True if ``data`` begins as a binary glTF."""
     return data[:4] == b"glTF"
 
 
 def decode_glb(data: bytes, source: Path) -> RawCapture:
-    """Decode a .glb. Raises ``UserError`` for a damaged one, or one without splats of a kind that is known here."""
+    """Decode a .glb. Raises ``UserError`` for a damaged one, or one without splats of a supported kind."""
     if len(data) < 20 or int.from_bytes(data[4:8], "little") != 2:
         raise UserError(f"{source}: no .glb of version 2, or truncated; export it again")
     chunks: dict[int, bytes] = {}
@@ -39,17 +40,17 @@ def decode_glb(data: bytes, source: Path) -> RawCapture:
     while place + 8 <= len(data):
         size, kind = (int.from_bytes(data[place + k : place + k + 4], "little") for k in (0, 4))
         if place + 8 + size > len(data):
-            raise UserError(f"{source}: truncated: a chunk of {size} bytes ends behind the file; copy it again")
+            raise UserError(f"{source}: truncated: a chunk of {size} bytes extends beyond the file; copy it again")
         chunks.setdefault(kind, data[place + 8 : place + 8 + size])
         place += 8 + size
     text = chunks.get(_JSON, b"")
-    if not text or len(text) > LARGEST_TEXT:
-        raise UserError(f"{source}: .glb without a JSON chunk of at most {LARGEST_TEXT} bytes; export it again")
+    if not text or len(text) > MAX_TEXT_BYTES:
+        raise UserError(f"{source}: .glb without a JSON chunk of at most {MAX_TEXT_BYTES} bytes; export it again")
     return _decode(text, source, lambda uri: chunks.get(_BINARY, b"") if uri is None else _buffer(uri, source))
 
 
 def decode_gltf(text: bytes, source: Path) -> RawCapture:
-    """Decode a .gltf whose buffers lie beside it or in it. Raises ``UserError`` as ``decode_glb``."""
+    """Decode a .gltf with buffers beside it or embedded. Raises ``UserError`` as ``decode_glb``."""
 
     def read(uri: str | None) -> bytes:
         if uri is None:
@@ -67,7 +68,7 @@ def _buffer(uri: str, source: Path) -> bytes:
             raise UserError(f"{source}: a buffer that is no base64 ({error}); export it again") from error
     name = PurePosixPath(unquote(uri))
     if name.is_absolute() or ".." in name.parts or ":" in uri or "\0" in str(name):
-        raise UserError(f"{source}: it names {uri!r}, which lies outside of its folder; export it again")
+        raise UserError(f"{source}: it names {uri!r}, which lies outside its folder; export it again")
     return read_bytes(source.parent / name)
 
 
@@ -75,7 +76,7 @@ def _decode(text: bytes, source: Path, read: Callable[[str | None], bytes]) -> R
     try:
         tree = parse_json(text.decode("utf-8"), source)
         return _Asset(source, tree, read).capture()
-    # A stranger's tree may have anything anywhere: whatever is not as glTF says ends here.
+    # An untrusted tree may contain anything anywhere; all deviations from glTF end here.
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         if isinstance(error, UserError):
             raise
@@ -89,26 +90,26 @@ class _Asset:
     read: Callable[[str | None], bytes]
 
     def capture(self) -> RawCapture:
-        """All splats of the file in the axes of their mesh."""
-        found = [
+        """Return all splats of the file in the axes of their mesh."""
+        primitives = [
             (number, primitive)
             for number, mesh in enumerate(self.tree.get("meshes", []))
             for primitive in mesh["primitives"]
             if EXTENSION in primitive.get("extensions", {})
         ]
-        if not found:
+        if not primitives:
             raise UserError(f"{self.source}: glTF without splats ({EXTENSION}); export it as splats, or as .ply")
-        turns = [self._turn(number) for number, _ in found]
+        turns = [self._scene_transform(number) for number, _ in primitives]
         if any(not np.allclose(turn, turns[0], atol=1e-6) for turn in turns[1:]):
             raise UserError(
                 f"{self.source}: its splats lie under different transforms; apply them, and export it again"
             )
-        parts = [self._primitive(primitive) for _, primitive in found]
+        parts = [self._primitive(primitive) for _, primitive in primitives]
         notes = []
         if not np.allclose(turns[0], np.eye(4), atol=1e-6):
-            notes.append("the transform of glTF's nodes was left out: the capture lies as its mesh does")
-        kept = min(part["sh"].shape[1] for part in parts)
-        if any(part["sh"].shape[1] != kept for part in parts):
+            notes.append("the transforms of glTF's nodes were ignored: the capture is in the axes of its mesh")
+        coefficients = min(part["sh"].shape[1] for part in parts)
+        if any(part["sh"].shape[1] != coefficients for part in parts):
             notes.append("bands of colour that only some meshes have were left out")
         up = np.linalg.inv(turns[0][:3, :3]) @ _Y_UP
         return RawCapture(
@@ -117,23 +118,26 @@ class _Asset:
             rotations=np.concatenate([part["rotations"] for part in parts]),
             log_scales=np.concatenate([part["log_scales"] for part in parts]),
             opacity_logits=np.concatenate([part["opacity_logits"] for part in parts]),
-            sh=np.concatenate([part["sh"][:, :kept] for part in parts]),
+            sh=np.concatenate([part["sh"][:, :coefficients] for part in parts]),
             up=up / np.linalg.norm(up),
             notes=tuple(notes),
         )
 
     def _primitive(self, primitive: dict[str, Any]) -> dict[str, np.ndarray]:
-        said = primitive["extensions"][EXTENSION]
-        packed = [name for name in said.get("extensions", {}) if "compression" in name]
+        extension = primitive["extensions"][EXTENSION]
+        packed = [name for name in extension.get("extensions", {}) if "compression" in name]
         if packed:
             raise UserError(
                 f"{self.source}: splats packed by {packed[0]} are not read; export them unpacked, or as .spz"
             )
-        if said.get("kernel", "ellipse") != "ellipse":
-            raise UserError(f"{self.source}: splats of the kernel {said['kernel']!r} are not read; export ellipses")
-        if not str(said.get("colorSpace", "srgb_rec709_display")).startswith("srgb"):
+        if extension.get("kernel", "ellipse") != "ellipse":
             raise UserError(
-                f"{self.source}: splats in the colour space {said['colorSpace']!r}; export them in srgb_rec709_display"
+                f"{self.source}: splats of the kernel {extension['kernel']!r} are not read; export ellipses"
+            )
+        if not str(extension.get("colorSpace", "srgb_rec709_display")).startswith("srgb"):
+            raise UserError(
+                f"{self.source}: splats in the colour space {extension['colorSpace']!r}; export"
+                " them in srgb_rec709_display"
             )
         attributes = primitive["attributes"]
 
@@ -168,7 +172,7 @@ class _Asset:
         }
 
     def _accessor(self, number: int) -> np.ndarray:
-        """(n, width) float32, as the standard unpacks it."""
+        """(n, width) float32, unpacked according to the standard."""
         accessor = self.tree["accessors"][number]
         view = self.tree["bufferViews"][accessor["bufferView"]]
         kind, width, count = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]], accessor["count"]
@@ -177,16 +181,18 @@ class _Asset:
         data = self.read(self.tree["buffers"][view["buffer"]].get("uri"))
         end = start + (count - 1) * stride + kind.itemsize * width
         if "sparse" in accessor or min(start, count - 1) < 0 or stride < kind.itemsize * width or end > len(data):
-            raise UserError(f"{self.source}: accessor {number} ends behind its buffer, or is sparse; export it again")
+            raise UserError(
+                f"{self.source}: accessor {number} extends beyond its buffer, or is sparse; export it again"
+            )
         values = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
         if kind.kind == "f":
             return values.astype(np.float32)
         if not accessor.get("normalized", False):
-            raise UserError(f"{self.source}: accessor {number} has whole numbers, not normalized; export it again")
+            raise UserError(f"{self.source}: accessor {number} has integers that are not normalized; export it again")
         return np.maximum(values / np.float32(np.iinfo(kind).max), -1.0).astype(np.float32)
 
-    def _turn(self, mesh: int) -> np.ndarray:
-        """(4, 4) from the mesh to the scene, by the nodes above it."""
+    def _scene_transform(self, mesh: int) -> np.ndarray:
+        """(4, 4) transform from the mesh to the scene, by the nodes above it."""
         nodes = self.tree.get("nodes", [])
         above = {child: number for number, node in enumerate(nodes) for child in node.get("children", [])}
         number = next((number for number, node in enumerate(nodes) if node.get("mesh") == mesh), None)

@@ -1,7 +1,7 @@
-"""How much a stranger's file may ask for, checked before anything is allocated.
+"""Limits for untrusted files, checked before anything is allocated.
 
-What a file declares (Gaussians, pixels, inflated bytes) is compared with how large the file is and with the limits of
-this module; docs/reliability.md lists them.
+The sizes that a file declares (Gaussians, pixels, inflated bytes) are compared with the size of the file and with the
+limits of this module; docs/reliability.md lists them.
 """
 
 from __future__ import annotations
@@ -14,64 +14,69 @@ from pathlib import Path
 
 from egs_warp.errors import UserError
 
-LARGEST_TEXT = 32 << 20
-"""Bytes of a JSON or another text: parsed, they take some thirty times as many."""
-MOST_PIXELS = 178_956_970
-"""Of one picture or camera: Pillow's own bound."""
-LONGEST_SIDE = 1 << 15
-"""Pixels of one side of a picture or camera."""
+MAX_TEXT_BYTES = 32 << 20
+"""Maximum size of JSON and other text in bytes; parsed, they take some thirty times as much memory."""
+MAX_PIXELS = 178_956_970
+"""Maximum number of pixels of a picture or camera: Pillow's own limit."""
+MAX_SIDE = 1 << 15
+"""Maximum side of a picture or camera, pixels."""
 
 
 FURTHEST = 1e12
-"""Units: nothing lies further out."""
+"""Maximum coordinate, scene units."""
 FREE_GAUSSIANS = 1 << 16
-"""So many Gaussians a packed capture may hold whatever its size."""
+"""Number of Gaussians that a packed capture of any size may declare."""
 INFLATION = 4
-"""A picture in a zip inflates to at most so many times its bytes, and ``FREE_BYTES``: WebP hardly deflates."""
+"""Maximum inflation of a picture in a zip, in addition to ``FREE_BYTES``: WebP hardly deflates."""
 FREE_BYTES = 1 << 16
 
 
 def check_count(count: int, size: int, source: Path) -> None:
-    """Refuse more Gaussians than a packed file of ``size`` bytes can hold: positions do not pack below a byte each."""
+    """Raise ``UserError`` for more Gaussians than a packed file of ``size`` bytes can contain: positions need at least
+    a byte each."""
     if count > size + FREE_GAUSSIANS:
-        raise UserError(f"{source}: it says that it has {count} Gaussians, in {size} bytes; copy or export it again")
+        raise UserError(f"{source}: it declares {count} Gaussians in {size} bytes; copy or export it again")
 
 
-def check_pixels(width: int, height: int, what: str, *, at_most: int = MOST_PIXELS) -> None:
-    """Refuse a picture or camera of too many pixels; ``what`` begins the message."""
-    if max(width, height) > LONGEST_SIDE or width * height > at_most:
+def check_pixels(width: int, height: int, what: str, *, at_most: int = MAX_PIXELS) -> None:
+    """Raise ``UserError`` for a picture or camera with too many pixels; the message begins with ``what``."""
+    if max(width, height) > MAX_SIDE or width * height > at_most:
         raise UserError(
-            f"{what} has {width} x {height} pixels; at most {LONGEST_SIDE} a side and {at_most} in all are read"
+            f"{what} has {width} x {height} pixels; at most {MAX_SIDE} a side and {at_most} in all are read"
         )
 
 
 def picture_size(data: bytes | Path, what: str) -> tuple[int, int] | None:
-    """Width and height that the header of a picture says; None where Pillow knows no such picture.
+    """Return width and height from the header of a picture; None if Pillow does not recognise it.
 
-    Raises ``UserError``, which begins with ``what``, for too many pixels.
+    Raises ``UserError``, whose message begins with ``what``, for too many pixels.
     """
     from PIL import Image
 
-    # Its warning of large pictures comes before our limit.
+    # Pillow warns of large pictures before this limit applies.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             with Image.open(io.BytesIO(data) if isinstance(data, bytes) else data) as image:
                 return image.size
         except Image.DecompressionBombError:
-            raise UserError(f"{what} has more than {MOST_PIXELS} pixels; make it smaller") from None
-        # The decoder is handed a stranger's bytes, and its errors share no base class.
+            raise UserError(f"{what} has more than {MAX_PIXELS} pixels; make it smaller") from None
+        # The decoder reads untrusted bytes, and its errors share no base class.
         except Exception:
             return None
 
 
 def read_bytes(path: Path | str, *, at_most: int | None = None, missing: str = "check the path") -> bytes:
-    """What a regular file holds. Raises ``UserError`` for anything else: folders, pipes and devices never end.
+    """Return the content of a regular file. Raises ``UserError`` for anything else, as folders, pipes and devices have
+    no end.
 
-    ``missing`` says what to do where there is no such file; files of more than ``at_most`` bytes are refused.
+    Args:
+        path: the file.
+        at_most: maximum size in bytes.
+        missing: advice in the message if there is no such file.
     """
     try:
-        # A pipe would wait for its other end.
+        # O_NONBLOCK, as opening a pipe would block until its other end is opened.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
         with os.fdopen(descriptor, "rb") as file:
             status = os.fstat(descriptor)
@@ -79,7 +84,7 @@ def read_bytes(path: Path | str, *, at_most: int | None = None, missing: str = "
                 raise UserError(f"{path}: not a regular file; give a file")
             if at_most is not None and status.st_size > at_most:
                 raise UserError(
-                    f"{path}: {status.st_size} bytes, of which at most {at_most} are read; give a smaller one"
+                    f"{path}: the file has {status.st_size} bytes, the limit is {at_most}; give a smaller one"
                 )
             return file.read()
     except FileNotFoundError as error:

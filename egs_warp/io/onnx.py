@@ -1,7 +1,7 @@
-"""What an ONNX file is made of, as far as trusting it needs.
+"""Structure of ONNX files, as far as it is needed to trust them.
 
-Public description: https://onnx.ai/onnx/repo-docs/IR.html and ``onnx.proto``. An ONNX file holds numbers and a graph of
-known operations, no code; but its tensors may lie in other files that it names, which is refused.
+Public description: https://onnx.ai/onnx/repo-docs/IR.html and ``onnx.proto``. An ONNX file contains numbers and a graph
+of known operations, no code. Its tensors may be in other files that it names; this is rejected.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from pathlib import Path
 from egs_warp.errors import UserError
 from egs_warp.io.limits import read_bytes
 
-LARGEST_NETWORK = 2 << 30
-"""Bytes; protocol buffers hold no more."""
-_MOST_NESTED = 32
-"""Graphs in attributes of graphs."""
-# Fields of each message that hold messages which may hold tensors, by number.
+MAX_NETWORK_BYTES = 2 << 30
+"""Maximum size in bytes; protocol buffers contain no more."""
+_MAX_DEPTH = 32
+"""Maximum depth of graphs in attributes of graphs."""
+# Fields of each message that contain messages which may contain tensors, by number.
 _MESSAGES = {
     "Model": {7: "Graph", 20: "Training", 25: "Function"},
     "Graph": {1: "Node", 5: "Tensor", 11: "Input", 15: "SparseTensor"},
@@ -28,21 +28,21 @@ _MESSAGES = {
     "SparseTensor": {1: "Tensor", 2: "Tensor"},
 }
 _EXTERNAL_DATA, _DATA_LOCATION = 13, 14
-"""Of a tensor: where its numbers lie, if not in the file."""
+"""Fields of a tensor that tell where its numbers are, if not in the file."""
 
 
 @dataclass(frozen=True)
 class OnnxFile:
-    """A network that carries no code and needs no other file."""
+    """A network without code that needs no other file."""
 
     data: bytes
     inputs: tuple[str, ...]
-    """Names of what it is given, constants apart."""
+    """Names of the inputs, without constants."""
 
 
 def read_onnx(path: Path) -> OnnxFile:
-    """Raises ``UserError`` for a file that is no ONNX, or whose numbers lie in other files."""
-    data = read_bytes(path, at_most=LARGEST_NETWORK)
+    """Read an ONNX file. Raises ``UserError`` if it is not ONNX or if its tensors are in other files."""
+    data = read_bytes(path, at_most=MAX_NETWORK_BYTES)
     walk = _Walk(path)
     try:
         walk.message(memoryview(data), "Model", 0)
@@ -55,7 +55,7 @@ def read_onnx(path: Path) -> OnnxFile:
 
 
 class _Walk:
-    """Visits every tensor. Malformed data end in ``IndexError``."""
+    """Visits all tensors. Malformed data raise ``IndexError``."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -63,7 +63,7 @@ class _Walk:
         self.constants: set[str] = set()
 
     def message(self, data: memoryview, kind: str, depth: int) -> None:
-        if depth > _MOST_NESTED:
+        if depth > _MAX_DEPTH:
             raise UserError(f"{self._path}: graphs within graphs, too deep to read; export the network again")
         for number, value in _fields(data):
             if kind == "Tensor":
@@ -90,7 +90,7 @@ def _text(value: memoryview | int) -> str:
 
 
 def _fields(data: memoryview) -> Iterator[tuple[int, memoryview | int]]:
-    """Number and value of each field of a protocol buffer; fixed-width values as bytes."""
+    """Yield number and value of each field of a protocol buffer; fixed-width values as bytes."""
     place = 0
     while place < len(data):
         key, place = _varint(data, place)

@@ -1,6 +1,6 @@
-"""A network of the user's, computed: by onnxruntime where that is installed, else by OpenCV; on the CPU.
+"""Evaluation of a user's network on the CPU: by onnxruntime if it is installed, else by OpenCV.
 
-The file is read by ``read_onnx`` first: it carries no code, and what it needs of other files is refused.
+The file is first checked by ``read_onnx``: it contains no code, and references to other files are rejected.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ Inputs = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class OnnxNetwork:
-    """What ``load_network`` has read."""
+    """A network loaded by ``load_network``."""
 
     path: Path
     inputs: tuple[str, ...]
-    """Names of what it is given."""
+    """Names of the inputs."""
     compute: Callable[[Inputs], list[np.ndarray]]
-    """All outputs, in the file's order. Raises what the program behind it raises."""
+    """Compute all outputs, in the file's order. Raises the errors of onnxruntime or OpenCV."""
 
-    def run(self, given: Inputs, *, wanted: str) -> list[np.ndarray]:
-        """All outputs, in the file's order. Raises ``UserError`` where it fails; ``wanted`` says what to give
-        instead.
-        """
+    def run(self, inputs: Inputs, *, expected: str) -> list[np.ndarray]:
+        """Compute all outputs, in the file's order. Raises ``UserError`` on failure; the message recommends the file
+        ``expected``."""
         try:
-            return [np.asarray(value) for value in self.compute(given)]
-        # OpenCV and onnxruntime have errors of their own, which share no base class.
+            return [np.asarray(value) for value in self.compute(inputs)]
+        # Errors of OpenCV and onnxruntime share no base class.
         except Exception as error:
-            shapes = ", ".join(f"{name} {value.shape}" for name, value in given.items())
+            shapes = ", ".join(f"{name} {value.shape}" for name, value in inputs.items())
             raise UserError(
-                f"{self.path}: the network failed on {shapes} ({_last_line(error)}); give {wanted}"
+                f"{self.path}: the network failed on {shapes} ({_last_line(error)}); give {expected}"
             ) from error
 
 
 def load_network(path: Path) -> OnnxNetwork:
-    """Raises ``UserError`` for a file that is no ONNX, or whose operations the program at hand does not know."""
+    """Load a network. Raises ``UserError`` if the file is not ONNX, or has operations that onnxruntime or OpenCV does
+    not support."""
     file = read_onnx(path)
     try:
         import onnxruntime  # type: ignore[import-not-found]
@@ -54,9 +54,9 @@ def load_network(path: Path) -> OnnxNetwork:
         session = onnxruntime.InferenceSession(file.data, options, providers=["CPUExecutionProvider"])
     except Exception as error:
         raise UserError(
-            f"{path}: onnxruntime does not know this network ({_last_line(error)}); export it as ONNX again"
+            f"{path}: onnxruntime cannot read this network ({_last_line(error)}); export it as ONNX again"
         ) from error
-    return OnnxNetwork(path, file.inputs, lambda given: list(session.run(None, dict(given))))
+    return OnnxNetwork(path, file.inputs, lambda inputs: list(session.run(None, dict(inputs))))
 
 
 def _by_opencv(path: Path, data: bytes) -> Callable[[Inputs], list[np.ndarray]]:
@@ -67,11 +67,11 @@ def _by_opencv(path: Path, data: bytes) -> Callable[[Inputs], list[np.ndarray]]:
         names = list(network.getUnconnectedOutLayersNames())
     except cv2.error as error:
         raise UserError(
-            f"{path}: OpenCV does not know this network ({_last_line(error)}); install onnxruntime, or export it again"
+            f"{path}: OpenCV cannot read this network ({_last_line(error)}); install onnxruntime, or export it again"
         ) from error
 
-    def compute(given: Inputs) -> list[np.ndarray]:
-        for name, value in given.items():
+    def compute(inputs: Inputs) -> list[np.ndarray]:
+        for name, value in inputs.items():
             network.setInput(np.ascontiguousarray(value), name)
         return list(network.forward(names))
 

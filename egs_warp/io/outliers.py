@@ -1,7 +1,7 @@
-"""Gaussians that no capture means to have: far out, larger than everything, brighter than any light.
+"""Outlier Gaussians that are errors of a capture: far away, larger than everything, or brighter than any light.
 
 One of them is enough to stall a simulation or to overflow single precision. They are found by bounds that such
-Gaussians do not move themselves (medians), left out, and told.
+Gaussians do not affect (medians), left out, and reported.
 """
 
 from __future__ import annotations
@@ -15,41 +15,44 @@ from egs_warp.errors import UserError
 from egs_warp.io.limits import FURTHEST
 from egs_warp.io.raw import RawCapture
 
-FURTHEST_SIZES = 1e4
-"""Sizes of the capture from its middle: skies are some hundred sizes out."""
-LARGEST_SIZES = 1e2
-"""Sizes of the capture: standard deviation of its largest Gaussian."""
-LARGEST_SH = 1e3
-"""A coefficient of a colour; a white surface has 1.8."""
-LEAST_LOG_SCALE = -100.0
+MAX_DISTANCE_RATIO = 1e4
+"""Maximum distance from the capture's middle, in sizes of the capture: skies are some hundred sizes away."""
+MAX_SCALE_RATIO = 1e2
+"""Maximum standard deviation of a Gaussian, in sizes of the capture."""
+MAX_SH = 1e3
+"""Maximum coefficient of a colour; that of a white surface is 1.8."""
+MIN_LOG_SCALE = -100.0
 """Below, exp gives 0 in single precision."""
-LARGEST_LOGIT = 500.0
-"""An opacity beyond is 0 or 1, as an infinite one."""
-_MOST_LEFT_OUT = 0.5
+MAX_LOGIT = 500.0
+"""An opacity logit beyond this is treated as infinite."""
+_MAX_OUTLIER_FRACTION = 0.5
 _SHOWN = 3
 
 
 def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
-    """``raw`` (finite) without what lies further than ``FURTHEST_SIZES`` out, is larger than ``LARGEST_SIZES`` or has a
-    colour beyond ``LARGEST_SH``, with a note that tells how many.
+    """Return ``raw`` (finite) without outliers, with a note of their number.
 
-    The size of the capture is the median distance of its Gaussians from their median, or their median standard
-    deviation if that is more. Raises ``UserError`` for a capture that is too large, or mostly of such Gaussians.
+    Outliers are farther out than ``MAX_DISTANCE_RATIO``, larger than ``MAX_SCALE_RATIO``, or have a colour beyond
+    ``MAX_SH``. The size of the capture is the median distance of its Gaussians from their median, or their median
+    standard deviation if that is larger. Raises ``UserError`` for a capture that is too large, or consists mostly of
+    outliers.
     """
     means = raw.means.astype(np.float64)
-    # A log scale that exp cannot hold in double precision is out in any capture.
+    # A log scale whose exp overflows in double precision is an outlier in any capture.
     scales = np.exp(np.minimum(raw.log_scales.max(axis=1).astype(np.float64), 700.0))
     middle = np.median(means, axis=0)
     distance = np.sqrt(np.einsum("ni,ni->n", means - middle, means - middle))
     size = max(float(np.median(distance)), float(np.median(scales)))
     reach = max(size, float(np.abs(middle).max()))
     if reach > FURTHEST:
-        raise UserError(f"{source}: it reaches {reach:.3g} units out, at most {FURTHEST:g} are read; export it again")
-    far, large = distance > FURTHEST_SIZES * size, scales > LARGEST_SIZES * size
-    bright = np.asarray((np.abs(raw.sh) > LARGEST_SH).any(axis=(1, 2)))
+        raise UserError(
+            f"{source}: it extends {reach:.3g} units from the origin, the limit is {FURTHEST:g}; export it again"
+        )
+    far, large = distance > MAX_DISTANCE_RATIO * size, scales > MAX_SCALE_RATIO * size
+    bright = np.asarray((np.abs(raw.sh) > MAX_SH).any(axis=(1, 2)))
     out = far | large | bright
     count = int(out.sum())
-    if count > _MOST_LEFT_OUT * len(out):
+    if count > _MAX_OUTLIER_FRACTION * len(out):
         raise UserError(f"{source}: {count} of {len(out)} Gaussians {_why(far, large, bright)}; export it again")
     notes = raw.notes
     if count:
@@ -57,20 +60,20 @@ def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
         numbers += ", ..." if count > _SHOWN else ""
         why = f"{_why(far, large, bright)} (number {numbers}; the capture's size is {size:.3g})"
         notes = (*notes, f"{count} Gaussians left out that {why}")
-    flat = int(np.count_nonzero((raw.log_scales < LEAST_LOG_SCALE).any(axis=1) & ~out))
+    flat = int(np.count_nonzero((raw.log_scales < MIN_LOG_SCALE).any(axis=1) & ~out))
     if flat:
-        notes = (*notes, f"{flat} Gaussians with a log scale below {LEAST_LOG_SCALE:g} read as that")
-    turnless = int(np.count_nonzero((raw.rotations == 0.0).all(axis=1) & ~out))
-    if turnless:
-        notes = (*notes, f"{turnless} Gaussians with a rotation of length 0 read as not turned")
+        notes = (*notes, f"{flat} Gaussians with a log scale below {MIN_LOG_SCALE:g} read as that")
+    without_rotation = int(np.count_nonzero((raw.rotations == 0.0).all(axis=1) & ~out))
+    if without_rotation:
+        notes = (*notes, f"{without_rotation} Gaussians with a rotation of length 0 read as unrotated")
     kept = slice(None) if not count else ~out
     logits = raw.opacity_logits[kept]
     return replace(
         raw,
         means=raw.means[kept],
         rotations=raw.rotations[kept],
-        log_scales=np.maximum(raw.log_scales[kept], np.float32(LEAST_LOG_SCALE)),
-        opacity_logits=np.where(np.abs(logits) > LARGEST_LOGIT, np.copysign(np.float32(np.inf), logits), logits),
+        log_scales=np.maximum(raw.log_scales[kept], np.float32(MIN_LOG_SCALE)),
+        opacity_logits=np.where(np.abs(logits) > MAX_LOGIT, np.copysign(np.float32(np.inf), logits), logits),
         sh=raw.sh[kept],
         notes=notes,
     )
@@ -78,8 +81,8 @@ def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
 
 def _why(far: np.ndarray, large: np.ndarray, bright: np.ndarray) -> str:
     reasons = (
-        (far, f"lie further than {FURTHEST_SIZES:g} sizes of the capture out"),
-        (large, f"are larger than {LARGEST_SIZES:g} sizes of the capture"),
-        (bright, f"have a colour beyond {LARGEST_SH:g}"),
+        (far, f"lie more than {MAX_DISTANCE_RATIO:g} sizes of the capture away"),
+        (large, f"are larger than {MAX_SCALE_RATIO:g} sizes of the capture"),
+        (bright, f"have a colour beyond {MAX_SH:g}"),
     )
-    return " or ".join(said for which, said in reasons if which.any())
+    return " or ".join(reason for which, reason in reasons if which.any())

@@ -1,4 +1,4 @@
-"""Photos as pinhole cameras would have taken them, whatever the file and the lens are."""
+"""Photos converted to those of pinhole cameras, for all files and lenses."""
 
 from __future__ import annotations
 
@@ -13,50 +13,50 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Undistortion
 from egs_warp.io.cameras import PosedImage
-from egs_warp.io.limits import MOST_PIXELS, check_pixels, picture_size
+from egs_warp.io.limits import MAX_PIXELS, check_pixels, picture_size
 
 _ORIENTATION = 0x0112
-"""The EXIF tag that says how a viewer must turn the picture."""
+"""EXIF tag of the orientation in which a viewer must show the picture."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _CHUNK = 12
-"""Bytes of a chunk of a PNG around what it holds."""
-_LARGER_SIDES = 16
-"""A photo has at most so many times the side of its camera."""
+"""Bytes of a PNG chunk in addition to its content."""
+_MAX_SIDE_RATIO = 16
+"""Maximum side of a photo, in sides of its camera."""
 _SAME_ASPECT = 0.01
-"""Relative difference up to which a photo is its camera's at another size."""
+"""Relative difference of aspect ratio up to which a photo is its camera's at another size."""
 
 
 @dataclass(frozen=True)
 class Photo:
-    """One photo, straightened and upright as its camera has it."""
+    """A photo, undistorted and with the orientation of its camera."""
 
     camera: Camera
-    """At the photo's size."""
+    """The camera at the photo's size."""
     colour: np.ndarray
     """(H, W, 3) float32, 0 to 1, display-referred."""
     alpha: np.ndarray | None
-    """(H, W) float32: the photo's own, or that of its mask; None without either."""
+    """(H, W) float32, the photo's own, or that of its mask; None without either."""
     known: np.ndarray | None
-    """(H, W) bool: False where the straightened photo shows what the lens did not see; None where it sees all."""
+    """(H, W) bool, False where the undistorted photo shows what the lens did not see; None if it sees everything."""
 
 
 def read_photo(posed: PosedImage, *, max_side: int | None = None) -> Photo:
-    """The photo of ``posed``; one larger than ``max_side`` pixels is reduced.
+    """Read the photo of ``posed``; one larger than ``max_side`` pixels is reduced.
 
-    Pixels are turned as EXIF says where only then they fit the camera. Alpha is the photo's own or, as COLMAP has it,
-    that of ``masks/PHOTO.png`` (or ``masks/`` with the photo's own name) beside the photos' folder: white is kept.
-    Raises ``UserError`` for a photo that is missing, unreadable or of another shape than its camera.
+    The EXIF orientation is applied only if the pixels would not fit the camera otherwise. Alpha is the photo's own or,
+    as in COLMAP, that of ``masks/PHOTO.png`` (or ``masks/`` with the photo's own name) beside the photos' folder, where
+    white is opaque. Raises ``UserError`` for a photo that is missing, unreadable or of another shape than its camera.
     """
     if posed.image is None:
         raise UserError(f"{posed.name}: the photo is not beside the poses; put it there")
     size = picture_size(posed.image, f"{posed.image}: it")
     if size is not None:
-        # Before it is decoded: a small file may hold a very large picture.
-        most = _LARGER_SIDES**2 * posed.camera.width * posed.camera.height
-        check_pixels(*size, f"{posed.image}: it", at_most=min(most, MOST_PIXELS))
-        _turn_to_fit(posed, size[::-1])
+        # Before decoding: a small file may contain a very large picture.
+        limit = _MAX_SIDE_RATIO**2 * posed.camera.width * posed.camera.height
+        check_pixels(*size, f"{posed.image}: it", at_most=min(limit, MAX_PIXELS))
+        _orientation_to_fit(posed, size[::-1])
     pixels = decoded(posed.image)
-    turn = _turn_to_fit(posed, pixels.shape[:2])
+    turn = _orientation_to_fit(posed, pixels.shape[:2])
     shape = pixels.shape[:2]
     pixels = apply_orientation(pixels, turn)
     full = {"uint8": 255.0, "uint16": 65535.0}.get(pixels.dtype.name, 1.0)
@@ -77,7 +77,7 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None) -> Photo:
         camera = at_size(camera, width, height)
         cover = None if alpha is None and known is None else np.ones(colour.shape[:2], np.float32)
         if cover is not None:
-            # Transparent and unknown pixels hold any colour: it must not bleed into their neighbours.
+            # Transparent and unknown pixels may have any colour, which must not bleed into their neighbours.
             cover = cover * (1.0 if alpha is None else alpha) * (1.0 if known is None else known)
             reduced = cv2.resize(cover, (width, height), interpolation=cv2.INTER_AREA)
             colour = cv2.resize(colour * cover[:, :, None], (width, height), interpolation=cv2.INTER_AREA)
@@ -92,7 +92,7 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None) -> Photo:
 
 
 def at_size(camera: Camera, width: int, height: int) -> Camera:
-    """The camera for its photo at another size; poses are often of the full photo and images reduced."""
+    """Return the camera for its photo at another size; poses are often of the full photo and images reduced."""
     x, y = width / camera.width, height / camera.height
     return replace(
         camera,
@@ -106,30 +106,30 @@ def at_size(camera: Camera, width: int, height: int) -> Camera:
 
 
 def orientation(image: Path) -> int:
-    """How the file asks to be turned: EXIF's 1 (as it is) to 8."""
+    """Return the orientation that the file requests: EXIF's 1 (unchanged) to 8."""
     from PIL import Image
 
     try:
         with Image.open(image) as opened:
             turn = opened.getexif().get(_ORIENTATION, 1)
-    # The decoder is handed a stranger's bytes, and its errors share no base class.
+    # The decoder reads untrusted bytes, and its errors share no base class.
     except Exception:
         return 1
     return turn if turn in range(1, 9) else 1
 
 
 def apply_orientation(pixels: np.ndarray, turn: int) -> np.ndarray:
-    """``pixels`` (H, W, ...) as EXIF's orientation ``turn`` wants them shown."""
+    """Return ``pixels`` (H, W, ...) in EXIF's orientation ``turn``."""
     if turn >= 5:
         pixels = pixels.swapaxes(0, 1)
-    # Which axes run backwards after the swap.
+    # Axes that run backwards after the swap.
     rows = -1 if turn in (3, 4, 7, 8) else 1
     columns = -1 if turn in (2, 3, 6, 7) else 1
     return np.ascontiguousarray(pixels[::rows, ::columns])
 
 
 def decoded(image: Path) -> np.ndarray:
-    """(H, W) or (H, W, C) as stored, BGR, not turned. Raises ``UserError`` for what is not a whole picture."""
+    """(H, W) or (H, W, C) as stored, BGR, without rotation. Raises ``UserError`` if the picture is damaged."""
     from PIL import Image
 
     size = picture_size(image, f"{image}: it")
@@ -140,7 +140,7 @@ def decoded(image: Path) -> np.ndarray:
         raise UserError(f"{image}: not a readable picture; export it again as PNG or JPEG")
     if image.suffix.lower() in (".jpg", ".jpeg"):
         try:
-            # OpenCV fills the rest of a JPEG that ends early with grey.
+            # OpenCV fills the rest of a truncated JPEG with grey.
             with Image.open(image) as opened:
                 opened.load()
         except Exception as error:
@@ -148,10 +148,10 @@ def decoded(image: Path) -> np.ndarray:
     return pixels
 
 
-def _pixels(image: Path, how: int) -> np.ndarray | None:
-    """What OpenCV makes of a file, None if nothing.
+def _pixels(image: Path, flags: int) -> np.ndarray | None:
+    """Decode a file by OpenCV; None if it cannot.
 
-    It allocates what a chunk of a PNG claims to hold, so that is checked before.
+    OpenCV allocates the size that a PNG chunk declares, so that is checked first.
     """
     with open(image, "rb") as file:
         left = os.fstat(file.fileno()).st_size - len(_PNG)
@@ -164,11 +164,12 @@ def _pixels(image: Path, how: int) -> np.ndarray | None:
                 if start[4:] == b"IEND":
                     break
                 file.seek(length + 4, os.SEEK_CUR)
-    return cv2.imread(str(image), how)
+    return cv2.imread(str(image), flags)
 
 
-def _turn_to_fit(posed: PosedImage, shape: tuple[int, ...]) -> int:
-    """EXIF orientation to apply; raises ``UserError`` where the photo fits its camera neither way."""
+def _orientation_to_fit(posed: PosedImage, shape: tuple[int, ...]) -> int:
+    """Return the EXIF orientation to apply. Raises ``UserError`` if the photo does not fit its camera in either
+    orientation."""
     assert posed.image is not None
     camera, (height, width) = posed.camera, shape
     if _same_aspect(camera, width, height):
@@ -188,7 +189,7 @@ def _same_aspect(camera: Camera, width: int, height: int) -> bool:
 
 def _mask_of(image: Path, name: str, shape: tuple[int, ...], turn: int) -> np.ndarray | None:
     """(H, W) float32 from the photo's mask file, if there is one; ``shape`` is the photo's as stored."""
-    # COLMAP's names may hold folders, which the masks repeat.
+    # COLMAP's names may contain folders, which the masks repeat.
     depth = min(len(Path(name).parts), len(image.parents) - 1)
     relative = image.relative_to(image.parents[depth - 1])
     places = (
@@ -211,7 +212,7 @@ def _mask_of(image: Path, name: str, shape: tuple[int, ...], turn: int) -> np.nd
     if pixels is None:
         raise UserError(f"{path}: not a readable picture; export the mask again")
     if pixels.shape == shape:
-        # Drawn on the photo as stored.
+        # The mask was made for the photo as stored.
         pixels = apply_orientation(pixels, turn)
     elif pixels.shape != (shape if turn < 5 else shape[::-1]):
         raise UserError(

@@ -1,4 +1,4 @@
-"""Planes on disk: ``plane.json``, which every step of the way from a scene to an animation reads."""
+"""Planes on disk: ``plane.json``, which is read at each stage from a scene to an animation."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.height_field import HeightField, check_grid
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
-from egs_warp.io.limits import FURTHEST, LARGEST_TEXT, read_bytes
+from egs_warp.io.limits import FURTHEST, MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.text import whole_number
 
-_MOST_TEXELS = 1 << 13
-"""Rows or columns of a hole's window."""
+_MAX_TEXELS = 1 << 13
+"""Maximum number of rows or columns of a hole's window."""
 
 
 @dataclass(frozen=True)
@@ -26,16 +26,16 @@ class HoleOutline:
     """A hole in a plane: its outlines, in columns and rows of a window on the plane."""
 
     centre: np.ndarray
-    """(3,) middle of the window, scene units."""
+    """(3,) centre of the window, scene units."""
     texel: float
-    """Scene units."""
+    """Side of a texel, scene units."""
     texels: tuple[int, int]
     """Rows and columns of the window."""
     outlines: tuple[np.ndarray, ...]
     """Each (k, 2) int."""
 
     def to_json(self) -> dict[str, Any]:
-        """The entry ``hole`` of a plane."""
+        """Return the entry ``hole`` of a plane."""
         return {
             "centre": self.centre.tolist(),
             "texel": self.texel,
@@ -45,13 +45,13 @@ class HoleOutline:
 
     @classmethod
     def from_json(cls, entry: Any, path: Path) -> HoleOutline:
-        """What ``to_json`` gave. Raises ``UserError`` where something is amiss."""
+        """Inverse of ``to_json``. Raises ``UserError`` for invalid data."""
         try:
             rows, columns = (int(count) for count in entry["texels"])
             outlines = tuple(np.array(outline, np.int32).reshape(-1, 2) for outline in entry["outlines"])
             centre, texel = np.array(entry["centre"], dtype=float).reshape(3), float(entry["texel"])
             inside = all((outline >= 0).all() and (outline < [columns, rows]).all() for outline in outlines)
-            if not (1 <= rows <= _MOST_TEXELS and 1 <= columns <= _MOST_TEXELS and inside):
+            if not (1 <= rows <= _MAX_TEXELS and 1 <= columns <= _MAX_TEXELS and inside):
                 raise ValueError
             if not (0.0 < texel < np.inf and np.isfinite(centre).all()):
                 raise ValueError
@@ -62,35 +62,35 @@ class HoleOutline:
 
 @dataclass(frozen=True)
 class PlaneRecord:
-    """A plane and what was found out about it, as far as it is known; scene units."""
+    """A plane and its known properties; scene units."""
 
     plane: Plane
     centre: np.ndarray | None = None
-    """(3,) middle of the object that stands on it."""
+    """(3,) centre of the object that stands on it."""
     size: float | None = None
-    """Of that object: diagonal of its bounding box."""
+    """Diagonal of that object's bounding box."""
     noise: float | None = None
-    """Of the depth that the plane was fitted to, relative."""
+    """Relative noise of the depth that the plane was fitted to."""
     inlier_share: float | None = None
     pixels: int | None = None
-    """That it was fitted to."""
+    """Number of pixels that it was fitted to."""
     support: float | None = None
     """Share of the visible surface that lies on it."""
     hole: HoleOutline | None = None
-    """Where the object has left it open."""
+    """The region that the object has left open."""
     ground: HeightField | None = None
-    """What is there where it is not flat."""
+    """The ground, if it is uneven."""
     others: Mapping[str, Any] = field(default_factory=dict)
-    """Further entries of the file, which go along as they are."""
+    """Further entries of the file, which are passed on unchanged."""
 
     def merged_with(self, known: PlaneRecord) -> PlaneRecord:
-        """This plane; what is not found out about it is as ``known`` before."""
+        """Return this plane; its unknown properties are taken from ``known``."""
         facts = {name: value for name in _FACTS if (value := getattr(self, name)) is not None}
         earlier = {name: getattr(known, name) for name in _FACTS}
         return PlaneRecord(self.plane, **(earlier | facts), others={**known.others, **self.others})
 
     def to_json(self) -> dict[str, Any]:
-        """An entry of ``planes``."""
+        """Return an entry of ``planes``."""
         facts = {name: value for name in _FACTS if (value := getattr(self, name)) is not None}
         if self.centre is not None:
             facts["centre"] = self.centre.tolist()
@@ -102,7 +102,7 @@ class PlaneRecord:
 
     @classmethod
     def from_json(cls, entry: Any, path: Path, number: int) -> PlaneRecord:
-        """What ``to_json`` gave. Raises ``UserError`` where something is amiss."""
+        """Inverse of ``to_json``. Raises ``UserError`` for invalid data."""
         try:
             normal = np.array(entry["normal"], dtype=float).reshape(3)
             offset = float(entry["offset"])
@@ -129,11 +129,11 @@ class PlaneRecord:
         except (TypeError, ValueError, OverflowError) as error:
             if isinstance(error, UserError):
                 raise
-            raise UserError(f"{path}: the facts of plane {number} are damaged; make it again") from error
+            raise UserError(f"{path}: the properties of plane {number} are damaged; make it again") from error
 
 
 def _ground_to_json(ground: HeightField) -> dict[str, Any]:
-    # A thousandth of a node's spacing is far below what depth tells.
+    # A thousandth of a node's spacing is far below the accuracy of depth.
     digits = max(0, 3 - int(np.floor(np.log10(ground.spacing))))
     return {
         "axes": ground.axes.tolist(),
@@ -144,7 +144,7 @@ def _ground_to_json(ground: HeightField) -> dict[str, Any]:
 
 
 def _ground_from_json(entry: Any, path: Path) -> HeightField:
-    """What ``_ground_to_json`` gave. Raises ``UserError`` where something is amiss."""
+    """Inverse of ``_ground_to_json``. Raises ``UserError`` for invalid data."""
     try:
         ground = HeightField(
             np.array(entry["axes"], dtype=float).reshape(3, 3),
@@ -163,17 +163,17 @@ _FACTS = tuple(one.name for one in fields(PlaneRecord) if one.name not in ("plan
 
 
 def write_planes(path: Path | str, planes: Sequence[PlaneRecord]) -> None:
-    """Write ``planes`` (capture's units), the first being the one that the object rests on."""
+    """Write ``planes`` (capture's units); the object rests on the first one."""
     entries = [known.to_json() for known in planes]
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps({"planes": entries}, indent=1))
 
 
 def read_planes(path: Path | str) -> list[PlaneRecord]:
-    """The planes of a ``plane.json``. Raises ``UserError`` for anything else."""
+    """Read the planes of a ``plane.json``. Raises ``UserError`` for anything else."""
     path = Path(path)
     try:
-        data = read_bytes(path, at_most=LARGEST_TEXT, missing="make it with egs-warp plane, or give nx,ny,nz,d")
+        data = read_bytes(path, at_most=MAX_TEXT_BYTES, missing="make it with egs-warp plane, or give nx,ny,nz,d")
         tree = json.loads(data, parse_int=whole_number)
     except UserError:
         raise

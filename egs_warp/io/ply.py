@@ -32,7 +32,7 @@ _TYPES = {
     **{name: "f8" for name in ("double", "float64")},
 }
 _BYTE_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": None}
-# A block of rows this long stays in cache while its columns are gathered one by one.
+# A block of this many rows stays in the cache while its columns are gathered one by one.
 _BLOCK_ROWS = 16384
 
 
@@ -42,28 +42,28 @@ class PlyElement:
 
     name: str
     count: int
-    """Rows, as the header says."""
+    """Number of rows that the header declares."""
     dtype: np.dtype | None
-    """Structured type of one row; None where it holds a list, so that its size is not known beforehand."""
+    """Structured type of one row; None if it contains a list, so that its size is unknown."""
 
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What stands before the data of a .ply."""
+    """Header of a .ply."""
 
     byte_order: str | None
     """``<`` or ``>``; None for text."""
     elements: tuple[PlyElement, ...]
     size: int
-    """Bytes up to the data."""
+    """Size of the header in bytes."""
 
     def element(self, name: str) -> PlyElement | None:
-        """The element called ``name``, if there is one."""
+        """Return the element called ``name``, or None."""
         return next((element for element in self.elements if element.name == name), None)
 
 
 def read_header(data: bytes, source: Path) -> PlyHeader:
-    """Parse a .ply header. Raises ``UserError`` for one that is cut short or malformed."""
+    """Parse a .ply header. Raises ``UserError`` for one that is truncated or malformed."""
     end = re.search(rb"^end_header[ \t]*\r?\n", data, re.MULTILINE)
     if end is None:
         raise UserError(f"{source}: truncated: the .ply header has no end_header line; copy or export the file again")
@@ -87,7 +87,7 @@ def read_header(data: bytes, source: Path) -> PlyHeader:
                 raise UserError(f"{source}: malformed .ply header, line {shown!r}; export the file again")
     names = [name for name, _, _ in elements]
     if len(set(names)) < len(names):
-        raise UserError(f"{source}: malformed .ply header, an element is there twice; export the file again")
+        raise UserError(f"{source}: malformed .ply header, an element occurs twice; export the file again")
     if byte_order == "":
         raise UserError(f"{source}: malformed .ply header, no format line; export the file again")
     return PlyHeader(byte_order, tuple(_element(source, byte_order, *element) for element in elements), end.end())
@@ -106,14 +106,15 @@ def _element(
     return PlyElement(name, count, np.dtype([(n, f"{byte_order or '<'}{kind}") for n, kind in properties]))
 
 
-def read_elements(data: bytes, header: PlyHeader, wanted: list[str], source: Path) -> dict[str, np.ndarray]:
-    """Structured arrays of the ``wanted`` elements. Raises ``UserError`` for data that ends early or is no number."""
+def read_elements(data: bytes, header: PlyHeader, names: list[str], source: Path) -> dict[str, np.ndarray]:
+    """Return structured arrays of the ``names`` elements. Raises ``UserError`` for data that are truncated or not
+    numeric."""
     if header.byte_order is None:
-        return _read_text(data, header, wanted, source)
-    found: dict[str, np.ndarray] = {}
+        return _read_text(data, header, names, source)
+    arrays: dict[str, np.ndarray] = {}
     offset = header.size
     for element in header.elements:
-        if not set(wanted) - set(found):
+        if not set(names) - set(arrays):
             break
         if element.dtype is None:
             raise UserError(f"{source}: element {element.name} before the Gaussians holds a list; export it again")
@@ -123,24 +124,24 @@ def read_elements(data: bytes, header: PlyHeader, wanted: list[str], source: Pat
                 f"{source}: truncated: {element.count} rows of element {element.name} need a file of {end} bytes, "
                 f"found {len(data)}; copy or export it again"
             )
-        if element.name in wanted:
-            found[element.name] = np.frombuffer(data, element.dtype, element.count, offset)
+        if element.name in names:
+            arrays[element.name] = np.frombuffer(data, element.dtype, element.count, offset)
         offset = end
-    return found
+    return arrays
 
 
-def _read_text(data: bytes, header: PlyHeader, wanted: list[str], source: Path) -> dict[str, np.ndarray]:
+def _read_text(data: bytes, header: PlyHeader, names: list[str], source: Path) -> dict[str, np.ndarray]:
     # One line at a time: a list of all would take far more memory than the file.
     lines = re.finditer(rb"[^\r\n]*[^\s][^\r\n]*", memoryview(data)[header.size :])
-    found: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray] = {}
     end = 0
     for element in header.elements:
-        if not set(wanted) - set(found):
+        if not set(names) - set(arrays):
             break
         count, start = 0, end
         for line in islice(lines, element.count):
             count, end = count + 1, line.end()
-        if element.name not in wanted or element.dtype is None:
+        if element.name not in names or element.dtype is None:
             continue
         if count < element.count:
             raise UserError(
@@ -149,7 +150,7 @@ def _read_text(data: bytes, header: PlyHeader, wanted: list[str], source: Path) 
             )
         columns = len(element.dtype.names or ())
         with warnings.catch_warnings():
-            # numpy only warns of text that is not a number; newer ones raise ValueError.
+            # numpy only warns about text that is not a number; newer versions raise ValueError.
             warnings.simplefilter("error", DeprecationWarning)
             try:
                 text: Any = bytes(memoryview(data)[header.size + start : header.size + end])
@@ -160,8 +161,8 @@ def _read_text(data: bytes, header: PlyHeader, wanted: list[str], source: Path) 
             raise UserError(
                 f"{source}: element {element.name} is not {element.count} lines of {columns} numbers; export it again"
             )
-        found[element.name] = values.view([(name, "f8") for name in element.dtype.names or ()])
-    return found
+        arrays[element.name] = values.view([(name, "f8") for name in element.dtype.names or ()])
+    return arrays
 
 
 def columns_as_float32(rows: np.ndarray, names: list[str]) -> np.ndarray:
@@ -175,9 +176,10 @@ def columns_as_float32(rows: np.ndarray, names: list[str]) -> np.ndarray:
 
 
 def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
-    """INRIA layout: the Gaussians are the rows of element ``vertex``, properties in any order and of any number type.
+    """Decode the INRIA layout: the Gaussians are the rows of element ``vertex``, with properties in any order and of
+    any numeric type.
 
-    Raises ``UserError`` for a file of another kind, naming the properties it lacks.
+    Raises ``UserError`` for a file of another kind, with the missing properties.
     """
     vertex = header.element("vertex")
     present = set((vertex.dtype.names or ()) if vertex is not None and vertex.dtype is not None else ())
@@ -205,9 +207,10 @@ def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
 
 
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (n, 3) float64 and colours (n, 3) float64, 0 to 1, of a .ply of coloured points; grey without colours.
+    """Read positions (n, 3) float64 and colours (n, 3) float64, 0 to 1, of a .ply of coloured points; grey without
+    colours.
 
-    Raises ``UserError`` for one that is malformed or has no positions.
+    Raises ``UserError`` if it is malformed or has no positions.
     """
     data = read_bytes(path)
     rows = read_elements(data, read_header(data, path), ["vertex"], path).get("vertex")
@@ -225,15 +228,15 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def write_ply(path: Path | str, cloud: GaussianCloud) -> None:
     """Write ``cloud`` as an INRIA .ply, binary little-endian, float32: reading it gives the same bits.
 
-    Normals, always 0, are included because some viewers rely on the place of each property. Raises ``UserError`` if the
-    file cannot be written.
+    Normals, always 0, are included because some viewers rely on the position of each property. Raises ``UserError`` if
+    the file cannot be written.
     """
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write(ply_bytes(cloud))
 
 
 def ply_bytes(cloud: GaussianCloud) -> bytes:
-    """What ``write_ply`` writes."""
+    """Return the content of the file that ``write_ply`` writes."""
     sh = cloud.sh.numpy()
     count = cloud.count
     rest_count = 3 * ((cloud.sh_degree + 1) ** 2 - 1)

@@ -1,4 +1,4 @@
-"""What every capture format is decoded to before it becomes a GaussianCloud."""
+"""Common record to which all capture formats are decoded before they become a ``GaussianCloud``."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import unit_quaternions
 
 EXTREME_LOGIT = 16.0
-"""Stands for an opacity logit of infinity: 1 - opacity is then 1e-7, below half a step of float32 at 1."""
+"""Value for an infinite opacity logit: 1 - opacity is then 1e-7, below half a step of float32 at 1."""
 
 
 @dataclass(frozen=True)
 class RawCapture:
-    """Host arrays in float32 as the file holds them, not yet checked. Axes are the file's own."""
+    """Host arrays in float32 as the file contains them, not yet checked. Axes are the file's own."""
 
     format: str
     """Name of the format, as shown to the user."""
@@ -31,15 +31,16 @@ class RawCapture:
     sh: np.ndarray
     """(n, (degree+1)^2, 3) float32, coefficient-major."""
     up: np.ndarray | None = None
-    """(3,) float64 unit, where the format defines which way is up."""
+    """(3,) float64 unit vector, if the format defines the up direction."""
     antialiased: bool = False
-    """Whether the file says that it was trained with antialiasing."""
+    """True if the file states that it was trained with antialiasing."""
     notes: tuple[str, ...] = ()
-    """What the reader left out or repaired, for the user."""
+    """Gaussians left out and values repaired, for the user."""
 
 
 def property_names(coefficient_count: int) -> dict[str, list[str]]:
-    """Names, as in the INRIA .ply, of the columns of each array of ``RawCapture``, flattened to (n, columns)."""
+    """Return the names, as in the INRIA .ply, of the columns of each array of ``RawCapture``, flattened to (n,
+    columns)."""
     rest = coefficient_count - 1
     return {
         "means": ["x", "y", "z"],
@@ -51,7 +52,7 @@ def property_names(coefficient_count: int) -> dict[str, list[str]]:
 
 
 def check_finite(raw: RawCapture, source: Path) -> None:
-    """Raise ``UserError`` that names the first property with a value that is not finite; an opacity may be infinite."""
+    """Raise ``UserError`` for the first property with a value that is not finite; an opacity may be infinite."""
     count = len(raw.means)
     if count == 0:
         raise UserError(f"{source}: it has no Gaussians; export it again from the tool that made it")
@@ -61,15 +62,15 @@ def check_finite(raw: RawCapture, source: Path) -> None:
         if finite.all():
             continue
         column = int(np.flatnonzero(~finite.all(axis=0))[0])
-        bad = np.flatnonzero(~finite[:, column])
+        not_finite = np.flatnonzero(~finite[:, column])
         raise UserError(
-            f"{source}: {names[column]} of {len(bad)} Gaussians is not finite (first: number {bad[0]}); "
+            f"{source}: {names[column]} of {len(not_finite)} Gaussians is not finite (first: number {not_finite[0]}); "
             "remove them and export again"
         )
 
 
 def logits_from_bytes(alphas: np.ndarray) -> np.ndarray:
-    """Opacity logits float32 of opacities stored as uint8 / 255; 0 and 255 give -+``EXTREME_LOGIT``."""
+    """Float32 opacity logits of opacities stored as uint8 / 255; 0 and 255 give -+``EXTREME_LOGIT``."""
     opacity = np.arange(1, 255) / 255.0
     table = np.concatenate([[-EXTREME_LOGIT], np.log(opacity / (1.0 - opacity)), [EXTREME_LOGIT]])
     return table.astype(np.float32)[alphas]
@@ -86,28 +87,29 @@ def byte(values: np.ndarray) -> np.ndarray:
 
 
 def largest_dropped(quaternions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) the smaller components in order, signed so that the largest is positive; (n,) uint32 index of that."""
+    """Return (n, 3) the three smaller components in order, with signs such that the largest is positive, and (n,)
+    uint32 the index of the largest."""
     unit = unit_quaternions(quaternions).astype(np.float64)
     largest = np.argmax(np.abs(unit), axis=1)
     rows = np.arange(len(unit))
     unit *= np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
-    kept = np.ones(unit.shape, bool)
-    kept[rows, largest] = False
-    return unit[kept].reshape(-1, 3), largest.astype(np.uint32)
+    is_smaller = np.ones(unit.shape, bool)
+    is_smaller[rows, largest] = False
+    return unit[is_smaller].reshape(-1, 3), largest.astype(np.uint32)
 
 
 def largest_restored(three: np.ndarray, largest: np.ndarray) -> np.ndarray:
     """Inverse of ``largest_dropped``: (n, 4) float32 unit quaternions."""
     quaternions = np.empty((len(three), 4))
-    kept = np.ones(quaternions.shape, bool)
+    is_smaller = np.ones(quaternions.shape, bool)
     rows = np.arange(len(three))
-    kept[rows, largest] = False
-    quaternions[kept] = three.ravel()
+    is_smaller[rows, largest] = False
+    quaternions[is_smaller] = three.ravel()
     quaternions[rows, largest] = np.sqrt(np.maximum(0.0, 1.0 - np.einsum("ni,ni->n", three, three)))
     return unit_quaternions(quaternions)
 
 
 def bit_field(words: np.ndarray, shift: int, bits: int) -> np.ndarray:
-    """``bits`` bits of uint32 ``words`` from ``shift`` up, as 0 ... 1 in float64."""
+    """Extract ``bits`` bits of uint32 ``words`` from ``shift`` up, as 0 ... 1 in float64."""
     mask = (1 << bits) - 1
     return ((words >> np.uint32(shift)) & np.uint32(mask)) / mask

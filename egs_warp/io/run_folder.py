@@ -1,7 +1,8 @@
-"""A folder of results belongs to one run: locked while it is written, described by a manifest that comes last.
+"""A folder of results belongs to one run: it is locked while it is written, and described by a manifest that is written
+last.
 
-``manifest.json`` holds ``schema``, ``version``, ``command``, ``finished`` and ``files``: size and SHA-256 of each file
-by its name, below a folder of the run too; null for the files and folders of a run that has not finished.
+``manifest.json`` contains ``schema``, ``version``, ``command``, ``finished`` and ``files``: size and SHA-256 of each
+file by its name, also in folders of the run; null for the files and folders of an unfinished run.
 """
 
 from __future__ import annotations
@@ -17,43 +18,43 @@ from typing import Any
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.atomic import atomic_write, lock, sweep, sweep_all, writable_folder
-from egs_warp.io.limits import LARGEST_TEXT, read_bytes
+from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.version import __version__
 
 MANIFEST = "manifest.json"
 ANIMATE = "animate"
-"""The command whose runs ``resume`` goes on with."""
+"""The command whose runs can be resumed."""
 _LOCK = ".egs-run.lock"
 _SCHEMA = 1
 
 
 class RunFolder:
-    """What one run writes; made by ``run_folder``."""
+    """Output of one run, created by ``run_folder``."""
 
     def __init__(
         self, path: Path, *, command: str = ANIMATE, overwrite: bool = False, names: Sequence[str] = ()
     ) -> None:
-        """``names``: files of a run that was cut off and goes on."""
+        """Open the folder. ``names`` are the files of an interrupted run that is resumed."""
         self.path = path
         self.resumed = bool(names)
         self._command = command
         self._overwrite = overwrite
-        self._kept: set[str] = set()
+        self._result_folders: set[str] = set()
         self._names = list(names)
         self._begin: Callable[[], object] | None = None
 
     def begin_with(self, begin: Callable[[], object]) -> None:
-        """Have ``begin`` write its files before the first other one: an interrupted run has them, too. One that goes on
-        has them already.
-        """
+        """Let ``begin`` write its files before any other file, so that an interrupted run has them, too. A resumed run
+        has them already."""
         if not self.resumed:
             self._begin = begin
 
     def file(self, name: str) -> Path:
-        """Where the run's file ``name`` goes. Before the first one, an earlier run is moved aside, if that was allowed.
+        """Return the path of the run's file ``name``. Before the first one, an earlier run is backed up, if that is
+        allowed.
 
-        Raises ``UserError`` for a file of this name that is no run's, unless files may be overwritten.
+        Raises ``UserError`` for an existing file of this name that belongs to no run, unless files may be overwritten.
         """
         begin, self._begin = self._begin, None
         if begin is not None:
@@ -70,23 +71,22 @@ class RunFolder:
         return self.path / name
 
     def folder(self, name: str) -> Path:
-        """Where the run's folder ``name`` goes, all of whose files are results: as ``file``."""
-        self._kept.add(name)
+        """Return the path of the run's folder ``name``, as ``file``. All files in it are results."""
+        self._result_folders.add(name)
         return self.file(name)
 
     def finish(self) -> None:
-        """Describe all files; the manifest says from now on that the run has finished. Folders of ``file``, which a run
-        needs only to go on, are gone then; those of ``folder`` stay.
-        """
+        """Write the final manifest, which describes all files and marks the run as finished. Folders of ``file``,
+        needed only for resuming, are removed; those of ``folder`` stay."""
         files = {name: self.path / name for name in self._names}
-        for name in self._kept:
+        for name in self._result_folders:
             files |= {path.relative_to(self.path).as_posix(): path for path in sorted(files[name].rglob("*"))}
         facts = {name: _facts(path) for name, path in files.items() if path.is_file()}
         self._write_manifest(facts, finished=True)
         for name in self._names:
-            if name not in facts and name not in self._kept:
+            if name not in facts and name not in self._result_folders:
                 shutil.rmtree(self.path / name, ignore_errors=True)
-        # What the run that was cut off has left was too young when this one began, perhaps.
+        # Leftovers of the interrupted run may have been too young when this one started.
         sweep_all(self.path)
 
     def _write_manifest(self, files: dict[str, Any], *, finished: bool) -> None:
@@ -97,61 +97,63 @@ class RunFolder:
 
 
 def back_up(folder: Path, names: Sequence[str]) -> None:
-    """Into the first free of ``earlier-1``, ``earlier-2``, ... below ``folder`` go the files ``names`` that are there.
+    """Move the existing files ``names`` into the first unused folder of ``earlier-1``, ``earlier-2``, ... in
+    ``folder``.
 
-    Raises ``UserError`` where that cannot be done.
+    Raises ``UserError`` if that fails.
     """
-    there = [name for name in names if (folder / name).exists()]
-    if not there:
+    existing = [name for name in names if (folder / name).exists()]
+    if not existing:
         return
     number = 1
     while (folder / f"earlier-{number}").exists():
         number += 1
-    aside = folder / f"earlier-{number}"
+    backup = folder / f"earlier-{number}"
     try:
-        aside.mkdir()
-        # The manifest goes last: until then it names what is still to be moved.
-        for name in there:
-            os.replace(folder / name, aside / name)
+        backup.mkdir()
+        # The manifest is moved last: until then it lists the files that are still to be moved.
+        for name in existing:
+            os.replace(folder / name, backup / name)
     except OSError as error:
-        raise UserError(f"{folder}: the earlier run cannot be moved aside ({error.strerror})") from error
+        raise UserError(
+            f"{folder}: the earlier run cannot be moved aside ({error.strerror}); choose another folder"
+        ) from error
 
 
 @contextmanager
 def run_folder(
     out: Path | str | RunFolder, *, command: str = ANIMATE, overwrite: bool = False, resume: bool = False
 ) -> Iterator[RunFolder]:
-    """The folder ``out``, made where it is missing and locked, for one run of ``command``; a ``RunFolder`` is handed on
-    as it is.
+    """Open the folder ``out`` for one run of ``command``, creating and locking it; a ``RunFolder`` is returned
+    unchanged.
 
-    Raises ``UserError`` where another run is writing, or where an earlier run lies and may not be moved aside
-    (``overwrite``); of a run that goes on (``resume``), where there is none, or none that was cut off.
+    Raises ``UserError`` if another run is writing, if an earlier run exists and may not be backed up (``overwrite``),
+    or if there is no interrupted run to ``resume``.
     """
     if isinstance(out, RunFolder):
         yield out
         return
     _check(out, overwrite=overwrite, resume=resume)
     folder = writable_folder(out)
-    with lock(folder / _LOCK) as free:
-        if not free:
+    with lock(folder / _LOCK) as acquired:
+        if not acquired:
             raise UserError(f"{out}: another run is writing into this folder; wait for it, or choose another folder")
-        # What came between the check and the lock.
+        # Files may have been created between the check and the lock.
         _check(out, overwrite=overwrite, resume=resume)
         sweep(folder)
         yield RunFolder(folder, command=command, overwrite=overwrite, names=_known(folder)[:-1] if resume else ())
 
 
 def clean_up(out: Path | str, scratch: str) -> None:
-    """Remove what a run that was killed as it ended has left in the folder ``out`` beside its files: its folder
-    ``scratch``, its lock, half-written files. Of one that still runs it removes nothing.
-    """
+    """Remove leftovers in the folder ``out`` of a run that was killed at its end: its folder ``scratch``, its lock,
+    unfinished files. Nothing is removed while a run is active."""
     folder = Path(out)
     try:
-        with lock(folder / _LOCK) as free:
-            if free:
+        with lock(folder / _LOCK) as acquired:
+            if acquired:
                 shutil.rmtree(folder / scratch, ignore_errors=True)
                 sweep(folder)
-    # Where one may not write nothing is removed.
+    # Nothing is removed where there is no permission.
     except OSError:
         pass
 
@@ -160,37 +162,35 @@ def _check(out: Path | str, *, overwrite: bool, resume: bool) -> None:
     if not resume:
         check_run_folder(out, overwrite=overwrite)
     elif has_finished(out):
-        raise UserError(f"{out}: this run has finished; there is nothing to go on with")
+        raise UserError(f"{out}: this run has finished; there is nothing to resume")
 
 
 def has_finished(out: Path | str) -> bool:
-    """Whether the run in the folder ``out`` has written all of its files. Raises ``UserError`` where there is none that
-    could go on, or one of another version.
-    """
+    """Return True if the run in the folder ``out`` has written all of its files. Raises ``UserError`` if there is no
+    run that can be resumed, or one of another version."""
     check_out(out)
     path = Path(out) / MANIFEST
     if not path.is_file() or _is_unfinished(Path(out)):
-        raise UserError(f"{out}: no run has begun to write here; begin it")
+        raise UserError(f"{out}: no run has written here; start one without resuming")
     manifest = parse_json(read_text(path), path)
     if not isinstance(manifest, dict) or not _names_in(manifest):
-        raise UserError(f"{path}: is no manifest of a run; begin the run again")
+        raise UserError(f"{path}: not a manifest of a run; start the run again")
     command = manifest.get("command", ANIMATE)
     if command != ANIMATE:
-        raise UserError(f"{out}: egs-warp {command} wrote here, which cannot go on; begin it again")
+        raise UserError(f"{out}: egs-warp {command} wrote here, which cannot be resumed; start it again")
     if manifest.get("finished") is True:
         return True
     if manifest.get("version") != __version__:
         raise UserError(
-            f"{path}: the run was begun by egs-warp {manifest.get('version')}, this is {__version__}, whose steps are"
-            " others; begin the run again"
+            f"{path}: the run was started by egs-warp {manifest.get('version')}, this is {__version__}, which may"
+            " compute other steps; start the run again"
         )
     return False
 
 
 def check_run_folder(out: Path | str, *, overwrite: bool = False, writes: Sequence[str] = ()) -> None:
-    """Raise the ``UserError`` of ``run_folder``, and of the files that the run ``writes``, as far as it can be known,
-    and make nothing: before any long work.
-    """
+    """Raise the ``UserError`` of ``run_folder``, and of the files that the run ``writes``, as far as it is predictable,
+    without creating anything, before any long computation."""
     check_out(out)
     if overwrite:
         return
@@ -202,21 +202,21 @@ def check_run_folder(out: Path | str, *, overwrite: bool = False, writes: Sequen
 
 
 def check_no_file_of_a_run(path: Path | str) -> None:
-    """Raise ``UserError`` where ``path`` is a file that a run has written: its checksum would be another's."""
+    """Raise ``UserError`` if ``path`` is a file of a run: its checksum would become wrong."""
     path = Path(path)
     if path.exists() and (path.parent / MANIFEST).is_file() and path.name in _known(path.parent):
         raise UserError(f"{path}: is a file of the run in {path.parent}; choose another name")
 
 
 def check_out(out: Path | str) -> None:
-    """Raise ``UserError`` for a folder that cannot be made or written, and make nothing."""
+    """Raise ``UserError`` for a folder that cannot be created or written, without creating anything."""
     if not str(out).strip():
         raise ArgumentError("out", "give the name of a folder", value=repr(str(out)))
     folder = Path(out)
-    there = next(parent for parent in (folder, *folder.absolute().parents) if _exists(parent))
-    if not there.is_dir():
-        raise UserError(f"{out}: cannot write into this folder ({there} is a file); choose another one")
-    if not os.access(there, os.W_OK | os.X_OK):
+    existing = next(parent for parent in (folder, *folder.absolute().parents) if _exists(parent))
+    if not existing.is_dir():
+        raise UserError(f"{out}: cannot write into this folder ({existing} is a file); choose another one")
+    if not os.access(existing, os.W_OK | os.X_OK):
         raise UserError(f"{out}: cannot write into this folder (Permission denied); choose another one")
 
 
@@ -225,7 +225,7 @@ def _exists(path: Path) -> bool:
         path.lstat()
     except (FileNotFoundError, NotADirectoryError):
         return False
-    # Names too long, or with null bytes.
+    # Names that are too long or contain null bytes.
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise UserError(f"{path}: cannot be made ({reason}); choose another place") from error
@@ -233,35 +233,36 @@ def _exists(path: Path) -> bool:
 
 
 def _occupied(out: Path | str, what: str) -> UserError:
-    problem = f"{what}, which would be mixed with this one; choose another folder, or have it moved aside"
+    problem = f"{what}, which would be mixed with this one; choose another folder, or move it aside"
     return ArgumentError("out", problem, value=out, check=("overwrite",))
 
 
 def _known(folder: Path) -> list[str]:
-    """Files of the earlier run in ``folder`` by its manifest, which comes last."""
+    """Return the files of the earlier run in ``folder`` by its manifest, which comes last."""
     if not (folder / MANIFEST).is_file() or _is_unfinished(folder):
         return []
     return [*_names_in(_manifest(folder)), MANIFEST]
 
 
 def _is_unfinished(folder: Path) -> bool:
-    """Whether the manifest in ``folder`` is of a run that was killed between it and its first file: of no run."""
+    """Return True if the manifest in ``folder`` is of a run that was killed between it and its first file. It then
+    counts as no run."""
     manifest = _manifest(folder)
     names = _names_in(manifest)
-    begun = isinstance(manifest, dict) and manifest.get("finished") is False
-    return begun and bool(names) and not any((folder / name).exists() for name in names)
+    unfinished = isinstance(manifest, dict) and manifest.get("finished") is False
+    return unfinished and bool(names) and not any((folder / name).exists() for name in names)
 
 
 def _manifest(folder: Path) -> Any:
-    """None of one that is damaged."""
+    """Return the manifest; None if it is damaged."""
     try:
-        return json.loads(read_bytes(folder / MANIFEST, at_most=LARGEST_TEXT))
+        return json.loads(read_bytes(folder / MANIFEST, at_most=MAX_TEXT_BYTES))
     except (ValueError, RecursionError):
         return None
 
 
 def _names_in(manifest: Any) -> list[str]:
-    """Files and folders that a manifest tells of; not those of other folders."""
+    """Return the files and folders that a manifest lists, without those of other folders."""
     files = manifest.get("files") if isinstance(manifest, dict) else None
     names = files if isinstance(files, dict) else {}
     first = dict.fromkeys(part for name in names for part in PurePosixPath(name).parts[:1])

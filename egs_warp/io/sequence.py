@@ -1,4 +1,4 @@
-"""Numbered captures, which SuperSplat and the PlayCanvas player show as an animation: written, and found again."""
+"""Numbered captures, which SuperSplat and the PlayCanvas player show as an animation: writing and finding them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ from egs_warp.io.run_folder import MANIFEST
 def write_ply_sequence(
     folder: Path | str, clouds: Iterable[GaussianCloud], *, prefix: str = "frame", compressed: bool = False
 ) -> list[Path]:
-    """Write ``frame0001.ply``, ``frame0002.ply``, ... into ``folder``, made where missing; return their paths.
+    """Write ``frame0001.ply``, ``frame0002.ply``, ... into ``folder``, which is created if missing. Returns their
+    paths.
 
-    ``clouds`` may be a generator: one frame is held at a time. ``compressed`` files are a quarter as large and end in
-    ``.compressed.ply``. Files of an earlier, longer sequence stay. Raises ``UserError`` if it cannot be written.
+    ``clouds`` may be a generator: only one frame is in memory at a time. ``compressed`` files are a quarter as large
+    and end in ``.compressed.ply``. Files of an earlier, longer sequence stay. Raises ``UserError`` if a file cannot be
+    written.
     """
     target = writable_folder(folder)
     paths = []
@@ -35,16 +37,20 @@ def write_ply_sequence(
 
 
 def frame_paths(folder: Path | str, numbers: Iterable[int], ending: str, *, alone: bool = True) -> list[Path]:
-    """``frame0000`` + ``ending`` and so on in ``folder``, made where missing, one for each of ``numbers``.
+    """Return the paths ``frame0000`` + ``ending`` and so on in ``folder``, which is created if missing, one for each of
+    ``numbers``.
 
-    ``alone``: raises ``UserError`` where it holds other frames of this ending, which players would show between them.
+    With ``alone``, raises ``UserError`` if it contains other frames with this ending, which players would show between
+    them.
     """
     if (Path(folder) / MANIFEST).is_file():
         raise UserError(f"{folder}: it is the folder of a run, which these would be mixed with; choose another folder")
     paths = [Path(folder) / f"frame{number:04d}{ending}" for number in numbers]
     writable_folder(folder)
-    there = {path for path in Path(folder).iterdir() if re.fullmatch(rf"frame\d{{4,}}{re.escape(ending)}", path.name)}
-    if alone and (others := sorted(there - set(paths))):
+    existing = {
+        path for path in Path(folder).iterdir() if re.fullmatch(rf"frame\d{{4,}}{re.escape(ending)}", path.name)
+    }
+    if alone and (others := sorted(existing - set(paths))):
         raise UserError(f"{folder}: it has other frames ({others[0].name}, ...); choose another folder")
     return paths
 
@@ -55,22 +61,23 @@ _NUMBERED = re.compile(
 
 
 def numbered_captures(folder: Path | str) -> list[Path]:
-    """The files of a sequence in ``folder``, in the order of their numbers: ``frame0001.ply``, ``frame0002.ply``, ...
+    """Return the files of a sequence in ``folder``, in the order of their numbers: ``frame0001.ply``,
+    ``frame0002.ply``, ...
 
-    Gaps are allowed; files of other names are left alone. ``read_capture`` reads each. Raises ``UserError`` where there
-    are none, or those of two sequences.
+    Gaps are allowed; files with other names are ignored. ``read_capture`` reads each. Raises ``UserError`` if there are
+    none, or those of two sequences.
     """
     place = Path(folder)
     if not place.is_dir():
-        raise UserError(f"{folder}: is no folder; give one of numbered captures")
+        raise UserError(f"{folder}: not a folder; give a folder of numbered captures")
     found = [(match, path) for path in place.iterdir() if (match := _NUMBERED.fullmatch(path.name)) and path.is_file()]
     kinds = sorted({(match["prefix"], match["ending"].lower()) for match, _ in found})
     if not kinds:
-        raise UserError(f"{folder}: it has no numbered captures such as frame0001.ply; give a folder of some")
+        raise UserError(f"{folder}: it has no numbered captures such as frame0001.ply; give a folder that has some")
     if len(kinds) > 1:
         names = " and ".join(f"{prefix}0001{ending}" for prefix, ending in kinds[:2])
         raise UserError(f"{folder}: it has two sequences ({names}); put each into a folder of its own")
     numbers = [int(match["number"]) for match, _ in found]
     if len(set(numbers)) != len(numbers):
-        raise UserError(f"{folder}: two of its captures have one number; remove one of them")
+        raise UserError(f"{folder}: two of its captures have the same number; remove one of them")
     return [path for _, (_, path) in sorted(zip(numbers, found, strict=True), key=lambda pair: pair[0])]

@@ -1,8 +1,8 @@
 """SOG: Gaussians as pixels of WebP images described by meta.json, in a folder or in a zip (.sog).
 
 Public description: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog (version 2, code books)
-and https://github.com/playcanvas/sogs (version 1, linear ranges). The axes are kept as they are in the file; the
-description says +y is up, but its own tool keeps the axes of the .ply it reads, so that no direction can be relied on.
+and https://github.com/playcanvas/sogs (version 1, linear ranges). The axes stay those of the file. The description says
++y is up, but its own tool keeps the axes of the .ply it reads, so the direction is unreliable.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from egs_warp.io.raw import RawCapture, largest_restored, logits_from_bytes
 
 _SH_COUNTS = (0, 3, 8, 15)
 LABELS_PER_ROW = 64
-_MOST_LABELS = 1 << 16
-_SPARE, _FREE_PIXELS = 2, 1 << 12
-"""A picture has at most so many pixels a value, and so many more."""
+_MAX_LABELS = 1 << 16
+_PIXELS_PER_VALUE, _FREE_PIXELS = 2, 1 << 12
+"""Maximum number of pixels per value of a picture, and the number of additional pixels."""
 FIRST_TAG = 252
 
 
 @dataclass(frozen=True)
 class SogFiles:
-    """Where the parts of one SOG are: a folder or a zip."""
+    """Access to the parts of one SOG, in a folder or a zip."""
 
     source: Path
-    """For messages."""
+    """Name for messages."""
     read: Callable[[str], bytes]
-    """The bytes of a file by its name in meta.json; raises ``UserError`` where it is missing or corrupted."""
+    """Return the bytes of a file by its name in meta.json. Raises ``UserError`` if it is missing or corrupted."""
 
     def image(self, name: str, count: int) -> np.ndarray:
-        """(pixels, 4) uint8 RGBA of an image of ``count`` values, row by row from the top, and nothing lost."""
-        return self.image_rows(name, at_most=_SPARE * count + _FREE_PIXELS).reshape(-1, 4)
+        """(pixels, 4) uint8 RGBA of an image of ``count`` values, row by row from the top, lossless."""
+        return self.image_rows(name, at_most=_PIXELS_PER_VALUE * count + _FREE_PIXELS).reshape(-1, 4)
 
     def image_rows(self, name: str, *, at_most: int) -> np.ndarray:
-        """(height, width, 4) uint8 RGBA of an image of at most so many pixels."""
+        """(height, width, 4) uint8 RGBA of an image of at most ``at_most`` pixels."""
         # Imported here because only this format needs it.
         from PIL import Image
 
@@ -52,7 +52,7 @@ class SogFiles:
         try:
             with Image.open(io.BytesIO(data)) as image:
                 return np.asarray(image.convert("RGBA"))
-        # The decoder is handed a stranger's bytes, and its errors share no base class.
+        # The decoder reads untrusted bytes, and its errors share no base class.
         except Exception as error:
             raise UserError(f"{self.source}: {name} is not a readable image; export the capture again") from error
 
@@ -68,7 +68,7 @@ class SogMeta:
             raise UserError(f"{source}: meta.json is not readable JSON; copy or export the capture again") from error
 
     def entry(self, *keys: str) -> object:
-        """The value under nested ``keys``, or None."""
+        """Return the value under nested ``keys``, or None."""
         value: object = self.tree
         for key in keys:
             value = value.get(key) if isinstance(value, dict) else None
@@ -84,7 +84,7 @@ class SogMeta:
         return np.array(numbers, dtype=np.float64)
 
     def code_book(self, key: str) -> np.ndarray:
-        """(256,) float64. An early writer left the first entry empty; it is then continued from the others."""
+        """(256,) float64. An early writer left the first entry empty; it is then extrapolated from the others."""
         book = self.entry(key, "codebook")
         if isinstance(book, list) and len(book) == 256 and book[0] is None:
             rest = SogMeta(json.dumps({key: {"codebook": book[1:]}}).encode(), self.source)
@@ -93,17 +93,17 @@ class SogMeta:
         return self.numbers(key, "codebook", count=256)
 
     def files(self, key: str, count: int) -> list[str]:
-        """``count`` file names."""
+        """Return ``count`` file names."""
         names = self.entry(key, "files")
         if not isinstance(names, list) or len(names) != count or not all(isinstance(name, str) for name in names):
             raise self._wrong(key, "files", expected=f"{count} file names")
         return names
 
     def integer(self, *keys: str) -> int:
-        """A count."""
+        """Return a count."""
         value = self.entry(*keys)
         if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-            raise self._wrong(*keys, expected="a whole number")
+            raise self._wrong(*keys, expected="an integer of at least 0")
         return value
 
     def _wrong(self, *keys: str, expected: str) -> UserError:
@@ -121,12 +121,12 @@ def decode_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
     check_count(count, sum(len(files.read(name)) for name in meta.files("means", 2)), files.source)
 
     def pixels(name: str) -> np.ndarray:
-        found = files.image(name, count)
-        if len(found) < count:
+        values = files.image(name, count)
+        if len(values) < count:
             raise UserError(
-                f"{files.source}: truncated: {count} Gaussians, but {name} has {len(found)} pixels; export it again"
+                f"{files.source}: truncated: {count} Gaussians, but {name} has {len(values)} pixels; export it again"
             )
-        return found[:count]
+        return values[:count]
 
     low, high = (pixels(name)[:, :3].astype(np.float64) for name in meta.files("means", 2))
     mins, maxs = meta.numbers("means", "mins", count=3), meta.numbers("means", "maxs", count=3)
@@ -169,15 +169,16 @@ def _decode_quaternions(pixels: np.ndarray) -> np.ndarray:
     tags = pixels[:, 3].astype(np.int64) - FIRST_TAG
     three = (pixels[:, :3] / 255.0 * 2.0 - 1.0) / np.sqrt(2.0)
     quaternions = largest_restored(three, np.maximum(tags, 0))
-    # Pixels that no Gaussian's rotation was written to.
+    # Pixels without a rotation.
     quaternions[tags < 0] = (1.0, 0.0, 0.0, 0.0)
     return quaternions
 
 
 def _decode_rest(meta: SogMeta, files: SogFiles, version: int, pixels: Callable[[str], np.ndarray]) -> np.ndarray:
-    """(n, K-1, 3): a palette of coefficient sets, 64 to a row of the image, and each Gaussian's place in it."""
+    """(n, K-1, 3) coefficients, by a palette of coefficient sets, 64 to a row of the image, and the index of each
+    Gaussian in it."""
     centroids_name, labels_name = meta.files("shN", 2)
-    centroids = files.image_rows(centroids_name, at_most=_MOST_LABELS * max(_SH_COUNTS))[:, :, :3]
+    centroids = files.image_rows(centroids_name, at_most=_MAX_LABELS * max(_SH_COUNTS))[:, :, :3]
     height, width = centroids.shape[:2]
     coefficients = width // LABELS_PER_ROW
     if version == 2:

@@ -1,4 +1,5 @@
-"""Writing SOG version 2 (``sog`` reads it): code books of 256 values and a palette of SH sets, found in the capture."""
+"""Writing of SOG version 2 (``sog`` reads it), with code books of 256 values and a palette of SH sets computed from the
+capture."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = Fals
 
     Lossy: positions to 1/65535 of the extent (finer near the origin), scales, colours and SH to one of 256 values each
     chosen for the capture, rotations and opacity to 1/255; above 65,536 Gaussians similar SH sets are merged. Gaussians
-    are sorted in space unless ``keep_order``. Raises ``UserError`` if the file cannot be written.
+    are sorted in space unless ``keep_order`` is set. Raises ``UserError`` if the file cannot be written.
     """
     means = cloud.means.numpy().astype(np.float64)
     order = np.arange(cloud.count) if keep_order else morton_order(means)
@@ -73,10 +74,11 @@ def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = Fals
 
 
 def _code_book(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(256,) increasing values that represent ``values`` with little squared error, and the index of each as uint8.
+    """Return (256,) increasing values that represent ``values`` with little squared error, and the index of each as
+    uint8.
 
-    Lloyd's algorithm on the line, from the quantiles and as many evenly spaced values: the latter keep outliers, such
-    as a few very large Gaussians, in place. Up to 256 different values are kept as they are.
+    Lloyd's algorithm in one dimension, starting from quantiles and the same number of evenly spaced values: the latter
+    preserve outliers, such as a few very large Gaussians. Up to 256 different values are represented exactly.
     """
     samples = np.sort(values.ravel()[:: -(-values.size // _BOOK_SAMPLES)].astype(np.float64))
     different = np.unique(values)
@@ -98,9 +100,9 @@ def _code_book(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _palette(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At most 65,536 vectors (p, m) that represent ``vectors`` (n, m), and the index of each.
+    """Return at most 65,536 vectors (p, m) that represent ``vectors`` (n, m), and the index of each.
 
-    Cells are halved at their mean, across the direction in which they vary most, until there are enough.
+    Cells are split at their mean, across the direction of largest variance, until there are enough.
     """
     count, width = vectors.shape
     if count <= 1 << _PALETTE_LEVELS:
@@ -124,7 +126,7 @@ def _palette(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _square(values: np.ndarray) -> np.ndarray:
-    """(side, side, 4) uint8 with ``values`` (n, 1 to 4) row by row; opaque where the values have no fourth column."""
+    """(side, side, 4) uint8 with ``values`` (n, 1 to 4) row by row; opaque if the values have no fourth column."""
     side = int(np.ceil(np.sqrt(len(values))))
     pixels = np.zeros((side * side, 4), np.uint8)
     pixels[:, 3] = 255
@@ -145,6 +147,6 @@ def _webp(pixels: np.ndarray) -> bytes:
     from PIL import Image
 
     data = io.BytesIO()
-    # Without exact the encoder drops the colours of pixels whose fourth channel is 0.
+    # Without exact, the encoder drops the colours of pixels whose fourth channel is 0.
     Image.fromarray(pixels).save(data, "WEBP", lossless=True, exact=True, quality=80, method=2)
     return data.getvalue()

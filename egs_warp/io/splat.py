@@ -1,4 +1,4 @@
-""".splat: 32 bytes a Gaussian and nothing else.
+""".splat: 32 bytes per Gaussian and no header.
 
 Public description: https://github.com/antimatter15/splat. Position and scale as three float32 each, colour and opacity
 as four uint8, rotation as four uint8 (w x y z, (b - 128) / 128). There is no magic number and no SH beyond band 0.
@@ -18,7 +18,7 @@ from egs_warp.io.raw import RawCapture, byte, bytes_from_logits, logits_from_byt
 _ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
 SPLAT_ROW = _ROW.itemsize
 """Bytes of one Gaussian."""
-_LEAST_SCALE = float(np.finfo(np.float32).tiny)
+_MIN_SCALE = float(np.finfo(np.float32).tiny)
 
 
 def decode_splat(data: bytes, source: Path) -> RawCapture:
@@ -37,17 +37,17 @@ def decode_splat(data: bytes, source: Path) -> RawCapture:
             f"{source}: scale of {len(negative)} Gaussians is negative (first: number {negative[0]}); "
             "if the file is a .splat, export it again"
         )
-    # float32 has no exp of less than -104: such Gaussians arrive with scale 0.
+    # In float32, exp of less than -104 is 0: such Gaussians arrive with scale 0.
     zero = int(np.count_nonzero((scales == 0).any(axis=1)))
     colour = rows["colour"]
     return RawCapture(
         format=".splat",
         means=np.ascontiguousarray(rows["position"]),
         rotations=(rows["rotation"].astype(np.float32) - np.float32(128.0)) / np.float32(128.0),
-        log_scales=np.log(np.where(scales == 0, np.float32(_LEAST_SCALE), scales)),
+        log_scales=np.log(np.where(scales == 0, np.float32(_MIN_SCALE), scales)),
         opacity_logits=logits_from_bytes(colour[:, 3]),
         sh=((colour[:, None, :3] / 255.0 - 0.5) / SH_BAND_0).astype(np.float32),
-        notes=(f"{zero} Gaussians with a scale of 0 read as {_LEAST_SCALE:.0e}",) if zero else (),
+        notes=(f"{zero} Gaussians with a scale of 0 read as {_MIN_SCALE:.0e}",) if zero else (),
     )
 
 

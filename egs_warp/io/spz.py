@@ -2,8 +2,8 @@
 
 Public description: README of https://github.com/nianticlabs/spz. Versions 1 (half-float positions), 2 (24-bit
 fixed-point positions), 3 (smallest-three rotations) and 4 (the blocks of 3, each a Zstandard stream: ``spz_streams``)
-are read; 2 to 4 are written. The format defines its axes as right, up, back: +y is up; version 4 may say otherwise.
-The axes are kept as they are in the file.
+are read; 2 to 4 are written. The format defines its axes as right, up, back: +y is up; version 4 may specify others.
+The axes stay those of the file.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ _HEADER = struct.Struct("<IIIBBBB")
 _COLOUR_SCALE = 0.15
 _FRACTIONAL_BITS = 12
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
-_LONGEST_EXTENSION = 1 << 20
-_MOST_FRACTIONAL_BITS = 24
+_MAX_EXTENSION_BYTES = 1 << 20
+_MAX_FRACTIONAL_BITS = 24
 _SH_COUNTS = (0, 3, 8, 15, 24)
-_KEPT_SH_COUNT = 15
-# Bits kept of each higher SH number, as the reference writer does: the rest would only cost gzip size.
+_MAX_SH_COUNT = 15
+# Precision of higher SH numbers, as in the reference writer: finer steps would only increase the gzip size.
 _BAND1_STEP, _REST_STEP = 8, 16
 
 
@@ -53,7 +53,7 @@ class _Layout:
 
     @property
     def widths(self) -> tuple[int, ...]:
-        """Bytes a Gaussian takes in each block: positions, alphas, colours, scales, rotations, SH."""
+        """Bytes of one Gaussian in each block: positions, alphas, colours, scales, rotations, SH."""
         return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version >= 3 else 3, 3 * self.sh_count
 
     @property
@@ -63,7 +63,7 @@ class _Layout:
 
 def decode_spz(data: bytes, source: Path) -> RawCapture:
     """Decode a .spz, gzipped or not. Raises ``UserError`` for a corrupt, truncated or too new one."""
-    # Only as much is inflated as the header asks for, so that a crafted file cannot fill the memory.
+    # Only the size that the header declares is inflated, so that a crafted file cannot fill the memory.
     inflate = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     gzipped = data[:2] == b"\x1f\x8b"
     header = _inflated(inflate, data, _HEADER.size, source) if gzipped else data[: _HEADER.size]
@@ -78,8 +78,8 @@ def decode_spz(data: bytes, source: Path) -> RawCapture:
     elif gzipped:
         check_count(layout.count, len(data), source)
         body = header + _inflated(inflate, inflate.unconsumed_tail, layout.size - len(header), source)
-        # zlib compares the checksum only where it comes to the end of the stream.
-        _inflated(inflate, inflate.unconsumed_tail, _LONGEST_EXTENSION, source)
+        # zlib verifies the checksum only at the end of the stream.
+        _inflated(inflate, inflate.unconsumed_tail, _MAX_EXTENSION_BYTES, source)
     else:
         body = data
     if len(body) < layout.size:
@@ -101,9 +101,9 @@ def _inflated(inflate: zlib._Decompress, data: bytes, size: int, source: Path) -
     return b"".join(parts)
 
 
-def _truncated(source: Path, layout: _Layout, found: str) -> UserError:
+def _truncated(source: Path, layout: _Layout, size: str) -> UserError:
     return UserError(
-        f"{source}: truncated: {layout.count} Gaussians need {layout.size} bytes, found {found}; copy it again"
+        f"{source}: truncated: {layout.count} Gaussians need {layout.size} bytes, found {size}; copy it again"
     )
 
 
@@ -119,7 +119,7 @@ def _layout(header: bytes, gzipped: bool, source: Path) -> _Layout:
         raise UserError(f"{source}: .spz version {version}, expected 1 to 4; export it as version 4 or as .ply")
     if degree >= len(_SH_COUNTS):
         raise UserError(f"{source}: .spz with SH degree {degree}, expected 0 to 4; export it again")
-    if version > 1 and fractional_bits > _MOST_FRACTIONAL_BITS:
+    if version > 1 and fractional_bits > _MAX_FRACTIONAL_BITS:
         raise UserError(
             f"{source}: .spz with {fractional_bits} fractional bits of the 24 of a position; export it again"
         )
@@ -140,11 +140,11 @@ def _decode(body: bytes, layout: _Layout, up: np.ndarray) -> RawCapture:
         # Shifting up and down again extends the sign bit.
         fixed = ((low << 8 | middle << 16 | high << 24) >> 8).astype(np.float64)
         means = np.ldexp(fixed, -layout.fractional_bits).astype(np.float32)
-    rest = (sh.reshape(layout.count, layout.sh_count, 3)[:, :_KEPT_SH_COUNT] - np.float32(128.0)) / np.float32(128.0)
+    rest = (sh.reshape(layout.count, layout.sh_count, 3)[:, :_MAX_SH_COUNT] - np.float32(128.0)) / np.float32(128.0)
     f_dc = ((colours / 255.0 - 0.5) / _COLOUR_SCALE).astype(np.float32)
     notes = []
-    if layout.sh_count > _KEPT_SH_COUNT:
-        notes.append("SH band 4 left out (degree 0 to 3 is drawn)")
+    if layout.sh_count > _MAX_SH_COUNT:
+        notes.append("SH band 4 left out (degrees 0 to 3 are rendered)")
     if layout.flags & _HAS_EXTENSIONS:
         notes.append("vendor extensions left out")
     return RawCapture(
@@ -173,11 +173,11 @@ def _quaternions(packed: np.ndarray, version: int) -> np.ndarray:
 
 
 def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> None:
-    """Write ``cloud`` as a .spz of version 2 to 4. Axes are written as they are: the format's viewers take +y as up.
+    """Write ``cloud`` as a .spz of version 2 to 4. Axes are written unchanged; the format's viewers take +y as up.
 
-    Versions 3 and 4 hold the same numbers; files of 4 are smaller, and fewer programs read them.
+    Versions 3 and 4 contain the same numbers; files of version 4 are smaller, and fewer programs read them.
 
-    Lossy: positions to 2^-13 (fewer bits where the capture is so large that they do not fit), log scales to 1/32 within
+    Lossy: positions to 2^-13 (fewer bits if the capture is so large that they do not fit), log scales to 1/32 within
     -10 ... 5.9, opacity and colour to 1/255. Raises ``UserError`` if the file cannot be written.
     """
     if version not in (2, 3, 4):
@@ -186,7 +186,10 @@ def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> No
     reach = float(np.abs(means).max())
     bits = int(np.clip(np.floor(np.log2((2**23 - 1) / reach)), 0, _FRACTIONAL_BITS)) if reach > 0 else _FRACTIONAL_BITS
     if reach * 2**bits > 2**23 - 1:
-        raise UserError(f"{path}: a mean lies {reach:g} units out, .spz holds {2**23 - 1}; scale the capture down")
+        raise UserError(
+            f"{path}: a mean lies {reach:g} units from the origin, the limit of .spz is {2**23 - 1}; scale the"
+            " capture down"
+        )
     fixed = np.rint(np.ldexp(means, bits)).astype(np.int32)
     sh = cloud.sh.numpy()
     header = _HEADER.pack(_MAGIC, version, cloud.count, cloud.sh_degree, bits, 0, 0)
@@ -215,7 +218,7 @@ def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> No
 
 
 def _deflated(blocks: tuple[bytes, ...]) -> Iterator[bytes]:
-    """``blocks`` in one gzip stream."""
+    """Compress ``blocks`` into one gzip stream."""
     deflate = zlib.compressobj(wbits=zlib.MAX_WBITS | 16)
     for block in blocks:
         yield deflate.compress(block)
@@ -223,6 +226,6 @@ def _deflated(blocks: tuple[bytes, ...]) -> Iterator[bytes]:
 
 
 def _packed_rest(rest: np.ndarray) -> np.ndarray:
-    """(n, K-1, 3) uint8, on a coarser grid than a byte allows."""
+    """(n, K-1, 3) uint8, quantised more coarsely than a byte."""
     step = np.where(np.arange(rest.shape[1]) < 3, _BAND1_STEP, _REST_STEP)[None, :, None]
     return byte(np.rint((rest * 128.0 + 128.0) / step) * step)

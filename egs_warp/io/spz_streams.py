@@ -1,9 +1,9 @@
-"""The container of .spz version 4: a plain header of 32 bytes, extensions, a table, one Zstandard stream a quantity.
+"""The container of .spz version 4: a plain header of 32 bytes, extensions, a table, one Zstandard stream per quantity.
 
-Public description: README of https://github.com/nianticlabs/spz. The header begins as that of versions 1 to 3; its
-byte 15 counts the streams, the next four say where their table lies, twelve are reserved. A row of the table is two
-uint64: bytes compressed and not. Streams follow it in turn. Between header and table lie extensions, each a uint32 of
-its kind, one of its length, and that many bytes.
+Public description: README of https://github.com/nianticlabs/spz. The header begins as that of versions 1 to 3; its byte
+15 is the number of streams, the next four the offset of their table, and twelve are reserved. A row of the table is two
+uint64: compressed and uncompressed bytes. The streams follow it in order. Between header and table are extensions, each
+a uint32 of its kind, one of its length, and that many bytes.
 """
 
 from __future__ import annotations
@@ -21,40 +21,40 @@ _HEADER = struct.Struct("<IIIBBBBI12x")
 _ROW = struct.Struct("<QQ")
 _RECORD = struct.Struct("<II")
 _COMMON = 15
-"""Bytes that the header shares with those of versions 1 to 3."""
+"""Number of bytes that the header shares with those of versions 1 to 3."""
 _LEVEL = 12
-"""Of Zstandard's 22; 19 takes eight times as long for files that are 4 to 6 % smaller."""
-_LARGEST_WINDOW = 1 << 27
-"""Bytes of memory that a stream may ask for beside its output: what the usual tools write by default."""
+"""Level out of Zstandard's 22; 19 takes eight times as long for files that are 4 to 6 % smaller."""
+_MAX_WINDOW = 1 << 27
+"""Maximum memory that a stream may need in addition to its output, bytes: the default of common tools."""
 _COORDINATES = 0xADBE0003
-"""Extension SPZ_ADOBE_coordinate_system: a uint32 that says which way each axis points."""
+"""Extension SPZ_ADOBE_coordinate_system: a uint32 for the directions of the axes."""
 _AXES = (
     *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
     *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
 )
-"""Where x, y and z point: left or right, up or down, forward or back."""
+"""Directions of x, y and z: left or right, up or down, forward or back."""
 
 
 def inflate_streams(data: bytes, sizes: Sequence[int], source: Path) -> bytes:
-    """The blocks of ``sizes`` bytes, one after another. Raises ``UserError`` where the file holds others.
+    """Decompress the blocks of ``sizes`` bytes, one after another. Raises ``UserError`` if the file has others.
 
-    Only as much is inflated as ``sizes`` says, so that a crafted file cannot fill the memory.
+    Only ``sizes`` bytes are inflated, so that a crafted file cannot fill the memory.
     """
     table, count = _table(data, source)
-    wanted = [size for size in sizes if size > 0]
-    if count != len(wanted):
-        raise UserError(f"{source}: .spz with {count} streams, expected {len(wanted)}; export it again")
+    nonempty = [size for size in sizes if size > 0]
+    if count != len(nonempty):
+        raise UserError(f"{source}: .spz with {count} streams, expected {len(nonempty)}; export it again")
     end = table + count * _ROW.size
     rows = [_ROW.unpack_from(data, table + k * _ROW.size) for k in range(count)]
     blocks = []
-    for (packed, unpacked), size in zip(rows, wanted, strict=True):
+    for (packed, unpacked), size in zip(rows, nonempty, strict=True):
         if unpacked != size or end + packed > len(data):
             raise UserError(
                 f"{source}: corrupt or truncated .spz: a stream of {packed} bytes for {unpacked}, of which {size} are"
-                f" needed and {len(data) - end} are there; copy or export it again"
+                f" needed and {len(data) - end} are present; copy or export it again"
             )
         try:
-            reader = zstandard.ZstdDecompressor(max_window_size=_LARGEST_WINDOW).stream_reader(data[end : end + packed])
+            reader = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data[end : end + packed])
             block = reader.read(size)
         except zstandard.ZstdError as error:
             raise UserError(f"{source}: corrupted .spz data ({error}); copy or export the file again") from error
@@ -66,21 +66,21 @@ def inflate_streams(data: bytes, sizes: Sequence[int], source: Path) -> bytes:
 
 
 def deflate_streams(header: bytes, blocks: Sequence[bytes]) -> list[bytes]:
-    """The parts of a file of ``blocks``, of which an empty one is left out, as the format has it.
+    """Return the parts of a file of ``blocks``; empty ones are left out, as the format requires.
 
-    ``header`` is that of version 3, with another version; what follows its flags is written anew.
+    ``header`` is that of version 3, with another version number; the part after its flags is replaced.
     """
-    kept = [block for block in blocks if block]
-    # The size of what is packed and a checksum go along: a damaged file is told.
-    streams = [zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True).compress(block) for block in kept]
-    table = b"".join(_ROW.pack(len(packed), len(block)) for packed, block in zip(streams, kept, strict=True))
-    return [header[:_COMMON] + struct.pack("<BI12x", len(kept), _HEADER.size), table, *streams]
+    nonempty = [block for block in blocks if block]
+    # The size of the content and a checksum are included, so that damage is detected.
+    streams = [zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True).compress(block) for block in nonempty]
+    table = b"".join(_ROW.pack(len(packed), len(block)) for packed, block in zip(streams, nonempty, strict=True))
+    return [header[:_COMMON] + struct.pack("<BI12x", len(nonempty), _HEADER.size), table, *streams]
 
 
 def stored_up_axis(data: bytes, source: Path) -> np.ndarray | None:
-    """(3,) up, where an extension says which way the axes point; None without one.
+    """(3,) up, if an extension specifies the directions of the axes; None without one.
 
-    Raises ``UserError`` for axes that are left-handed: the capture would be its mirror image.
+    Raises ``UserError`` for left-handed axes: the capture would be mirrored.
     """
     table, _ = _table(data, source)
     place = _HEADER.size
@@ -95,14 +95,14 @@ def stored_up_axis(data: bytes, source: Path) -> np.ndarray | None:
 
 
 def _table(data: bytes, source: Path) -> tuple[int, int]:
-    """Where the table begins, and how many streams it has."""
+    """Return the offset of the table and the number of streams."""
     if len(data) < _HEADER.size:
         raise UserError(
             f"{source}: truncated: .spz header of {len(data)} bytes, expected {_HEADER.size}; copy it again"
         )
     *_, count, table = _HEADER.unpack_from(data)
     if table < _HEADER.size or table + count * _ROW.size > len(data):
-        raise UserError(f"{source}: corrupt or truncated .spz: its table lies outside of the file; copy it again")
+        raise UserError(f"{source}: corrupt or truncated .spz: its table lies outside the file; copy it again")
     return table, count
 
 

@@ -1,7 +1,7 @@
-"""Streamed SOG: lod-meta.json, a tree whose leaves point into several SOGs, one or more for each level of detail.
+"""Streamed SOG: lod-meta.json, a tree whose leaves refer to several SOGs, one or more for each level of detail.
 
 Public description: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats (streamed SOG). Level 0 is
-the finest; each leaf is read at the finest level it has.
+the finest; each leaf is read at its finest level.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from egs_warp.io.sog import SogFiles, SogMeta, decode_sog
 
 
 def decode_streamed_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
-    """Join the leaves' finest Gaussians. Raises ``UserError`` for a malformed tree or an incomplete capture."""
+    """Concatenate the finest Gaussians of all leaves. Raises ``UserError`` for a malformed tree or an incomplete
+    capture."""
     meta = SogMeta(meta_json, files.source)
     names, tree = meta.entry("filenames"), meta.entry("tree")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not isinstance(tree, dict):
@@ -32,11 +33,11 @@ def decode_streamed_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
         ranges.setdefault(file, []).append((start, start + count))
     if not ranges:
         raise UserError(f"{files.source}: it has no Gaussians; export it again from the tool that made it")
-    return _joined([_part(files, names[file], ranges[file]) for file in sorted(ranges)])
+    return _concatenated([_part(files, names[file], ranges[file]) for file in sorted(ranges)])
 
 
 def _leaves(tree: dict, files: SogFiles) -> Iterator[tuple[int, int, int]]:
-    """(file, first Gaussian, count) of each leaf at its finest level, in the tree's order."""
+    """Yield (file, first Gaussian, count) of each leaf at its finest level, in the tree's order."""
     stack: list[object] = [tree]
     while stack:
         node = stack.pop()
@@ -62,7 +63,7 @@ def _part(files: SogFiles, name: str, ranges: list[tuple[int, int]]) -> RawCaptu
     part = decode_sog(files.read(name), SogFiles(files.source, lambda file: files.read(str(folder / file))))
     if max(end for _, end in ranges) > len(part.means):
         raise UserError(f"{files.source}: truncated: {name} has {len(part.means)} Gaussians; export the capture again")
-    # Before an index is made of each: leaves that overlap may be many.
+    # Before indices are allocated: overlapping leaves may be many.
     if sum(end - start for start, end in ranges) > len(part.means):
         raise UserError(f"{files.source}: leaves of {name} overlap in lod-meta.json; export the capture again")
     chosen = np.concatenate([np.arange(start, end) for start, end in ranges])
@@ -77,7 +78,7 @@ def _part(files: SogFiles, name: str, ranges: list[tuple[int, int]]) -> RawCaptu
     )
 
 
-def _joined(parts: list[RawCapture]) -> RawCapture:
+def _concatenated(parts: list[RawCapture]) -> RawCapture:
     coefficients = max(part.sh.shape[1] for part in parts)
     sh = [np.pad(part.sh, ((0, 0), (0, coefficients - part.sh.shape[1]), (0, 0))) for part in parts]
     return RawCapture(

@@ -1,4 +1,4 @@
-"""Pictures and videos on disk. A file appears whole or not at all: it is written beside its place and then renamed."""
+"""Pictures and videos on disk, written atomically: beside their place, then renamed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from egs_warp.io.atomic import atomic_write, system_error
 
 
 def write_png(path: Path | str, image: np.ndarray) -> None:
-    """Write (H, W, 3) uint8 RGB, (H, W, 4) RGBA or (H, W) grey. Raises ``UserError`` if the place cannot be written."""
+    """Write (H, W, 3) uint8 RGB, (H, W, 4) RGBA or (H, W) grey. Raises ``UserError`` if the file cannot be written."""
     import cv2
 
     swap = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
@@ -34,7 +34,7 @@ def write_png(path: Path | str, image: np.ndarray) -> None:
 def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[str]) -> np.ndarray:
     """(rows * H, columns * W, 3) uint8: the frames side by side, each with its label in its upper left corner.
 
-    Frames of other sizes than the largest height H and width W are laid in the middle of a white cell.
+    Frames smaller than the largest height H and width W are centred in a white cell.
     """
     import cv2
 
@@ -56,7 +56,7 @@ def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[s
             max(1, round(1.4 * size)),
             cv2.LINE_AA,
         )
-        # A light rim under dark letters reads on any background.
+        # Dark letters with a light rim are legible on any background.
         cell = _in_the_middle(frame, height, width)
         for colour, mask in ((255.0, cv2.dilate(letters, rim)), (20.0, letters)):
             cell = cell + mask[..., None] / 255.0 * (colour - cell)
@@ -74,7 +74,7 @@ def _in_the_middle(frame: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def ffmpeg_program() -> str:
-    """Path of the ffmpeg that draws videos. Raises ``UserError`` where none runs, before any long work."""
+    """Return the path of the ffmpeg program. Raises ``UserError``, before any long computation, if none runs."""
     import imageio_ffmpeg
 
     cure = "pip install imageio-ffmpeg, or set IMAGEIO_FFMPEG_EXE to an ffmpeg program"
@@ -88,25 +88,25 @@ def ffmpeg_program() -> str:
 
 
 class _AbandonedError(Exception):
-    """Ends the writing of a video that failed."""
+    """Marks the end of a video that failed."""
 
 
 _TOO_LARGE = getattr(signal, "SIGXFSZ", 0)
-"""The signal that ends a program whose file outgrows what its user may write; Windows has none."""
+"""Signal that ends a program whose file exceeds the user's limit; Windows has none."""
 _BT709 = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709")
 _CODECS = {
     ".mp4": ("mp4", "libx264", "yuv420p", ("-preset", "medium", "-movflags", "+faststart")),
     ".mov": ("mov", "prores_ks", "yuva444p10le", ("-profile:v", "4444", "-alpha_bits", "16", "-vendor", "apl0")),
     ".webm": ("webm", "libvpx-vp9", "yuva420p", ("-b:v", "0", "-auto-alt-ref", "0", "-cpu-used", "4", "-row-mt", "1")),
 }
-"""By the ending of a video: format, codec, pixels, and what else it is told."""
+"""Format, codec, pixel format and further options by the ending of a video."""
 
 
 class VideoWriter:
-    """Video through the ffmpeg program that imageio-ffmpeg brings: H.264 (.mp4), or with straight alpha ProRes 4444
+    """Video writer through the ffmpeg program of imageio-ffmpeg: H.264 (.mp4), or with straight alpha ProRes 4444
     (.mov) or VP9 (.webm).
 
-    Use as a context manager; leaving it without an exception puts the video at ``path``, otherwise nothing is left
+    Use it as a context manager; leaving it without an exception moves the video to ``path``, otherwise nothing is left
     behind.
     """
 
@@ -120,7 +120,8 @@ class VideoWriter:
         quality: int = 16,
         alpha: bool = False,
     ) -> None:
-        """``quality`` is the constant rate factor of H.264 and VP9: 0 lossless, 16 hardly visible loss, 51 worst.
+        """Prepare the command. ``quality`` is the constant rate factor of H.264 and VP9: 0 lossless, 16 hardly visible
+        loss, 51 worst.
 
         Raises ``UserError`` for another ending, and for ``alpha`` in an mp4.
         """
@@ -134,7 +135,7 @@ class VideoWriter:
         self._format, codec, pixels, more = _CODECS[ending]
         rate = () if codec == "prores_ks" else ("-crf", str(quality))
         self._command_tail = [
-            # Nothing but a pipe and a file: names may look like addresses or playlists.
+            # Only a pipe and a file are allowed, as names may look like addresses or playlists.
             *("-protocol_whitelist", "file,pipe", "-f", "rawvideo", "-pix_fmt", "rgba" if alpha else "rgb24"),
             *("-s", f"{width + width % 2}x{height + height % 2}"),
             *("-r", f"{frames_per_second:g}", "-i", "pipe:0", "-an"),
@@ -156,16 +157,15 @@ class VideoWriter:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=self._log,
-                # Ctrl-C reaches the writer, who ends it.
+                # Ctrl-C reaches the writer, which ends ffmpeg.
                 start_new_session=True,
             )
             self._files = files.pop_all()
         return self
 
     def write(self, frame: np.ndarray) -> None:
-        """Append one (H, W, 3) uint8 RGB frame, with alpha (H, W, 4). An odd side is padded by repeating its last line:
-        yuv420p needs even ones.
-        """
+        """Append one (H, W, 3) uint8 RGB frame, with alpha (H, W, 4). An odd side is padded by repeating its last line,
+        as yuv420p needs even sides."""
         if frame.shape != self._shape or frame.dtype != np.uint8:
             raise UserError(
                 f"{self._path}: a frame has shape {frame.shape} and type {frame.dtype},"
@@ -178,7 +178,7 @@ class VideoWriter:
         try:
             self._process.stdin.write(np.ascontiguousarray(frame).data)
         except BrokenPipeError as error:
-            raise self._failure() from (self._refusal() or error)
+            raise self._failure() from (self._system_error() or error)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -187,11 +187,11 @@ class VideoWriter:
         try:
             if kind is not None:
                 self._process.kill()
-            # A dead ffmpeg shows in its exit status below, with its own words.
+            # A failed ffmpeg is reported below, by its exit status and its message.
             with contextlib.suppress(BrokenPipeError):
                 self._process.stdin.close()
             if self._process.wait() != 0 and kind is None:
-                raise self._failure() from self._refusal()
+                raise self._failure() from self._system_error()
         except BaseException:
             self._abandon()
             raise
@@ -201,22 +201,22 @@ class VideoWriter:
             self._abandon()
 
     def _abandon(self) -> None:
-        """Leave what was at the path; what went wrong is not about the place, so it is not told of the error itself."""
+        """Leave the existing file at the path. The error does not concern the path, so it is not passed on."""
         self._files.__exit__(_AbandonedError, _AbandonedError(), None)
 
     def _failure(self) -> UserError:
-        lines = self._said().splitlines()
-        reason = self._refusal()
-        told = reason.strerror if reason is not None else lines[-1] if lines else "no message"
-        return UserError(f"{self._path}: ffmpeg could not write the video ({told})")
+        lines = self._log_text().splitlines()
+        reason = self._system_error()
+        message = reason.strerror if reason is not None else lines[-1] if lines else "no message"
+        return UserError(f"{self._path}: ffmpeg could not write the video ({message})")
 
-    def _refusal(self) -> OSError | None:
-        """Of the system: a full disk, say."""
+    def _system_error(self) -> OSError | None:
+        """Return the error of the operating system, such as a full disk."""
         if self._process.wait() == -_TOO_LARGE:
             return OSError(errno.EFBIG, os.strerror(errno.EFBIG))
-        return system_error(self._said())
+        return system_error(self._log_text())
 
-    def _said(self) -> str:
+    def _log_text(self) -> str:
         self._process.wait()
         self._log.seek(0)
         return self._log.read().decode(errors="replace").strip()

@@ -1,4 +1,4 @@
-"""Writing a capture of any format, told by the ending of its name."""
+"""Writing of captures in all formats, chosen by the ending of the name."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ WRITERS: dict[str, tuple[str, CaptureWriter]] = {
     "splat": (".splat", write_splat),
     "glb": (".glb", write_glb),
 }
-"""Ending and writer of each kind of splat file; an ending comes before those that it ends in. Of two kinds with one
-ending the first is what a name alone asks for."""
+"""Ending and writer of each kind of splat file. A longer ending comes before a shorter one that it ends in. Of two
+kinds with one ending, the first is the default."""
 
 
 def writer_of(path: Path, *, kind: str | None = None) -> CaptureWriter:
-    """What writes a capture to ``path``, as one ``kind`` of ``WRITERS`` or as its ending says.
+    """Return the writer for a capture at ``path``, by ``kind``, a key of ``WRITERS``, or by the ending.
 
-    Raises ``UserError`` for a folder, or a name without a known ending, or with that of another kind.
+    Raises ``UserError`` for a folder, for a name without a known ending, and for one with the ending of another kind.
     """
     endings = dict.fromkeys(ending for ending, _ in WRITERS.values())
     name = path.name.lower()
     ending = next((ending for ending in endings if name.endswith(ending) and name != ending), None)
-    wanted = list(endings) if kind is None else [WRITERS[kind][0]]
-    if ending not in wanted:
-        raise UserError(f"{path}: give a name that ends in {', '.join(wanted)}")
+    allowed = list(endings) if kind is None else [WRITERS[kind][0]]
+    if ending not in allowed:
+        raise UserError(f"{path}: give a name that ends in {', '.join(allowed)}")
     if path.is_dir():
         raise UserError(f"{path}: is a folder; give the name of a file")
     if kind is not None:

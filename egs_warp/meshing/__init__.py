@@ -1,4 +1,5 @@
-"""A cage of tetrahedra around a capture (section 3.2).
+"""Tetrahedral cages around a capture (section 3.2).
 
-In: a Gaussian cloud and the plane it stands on. Out: a ``TetMesh`` that encloses what of it is visible.
+Input: a Gaussian cloud and the plane it stands on. Output: a ``TetMesh`` that encloses its visible part. The kernels
+are in ``egs_warp/kernels/meshing``.
 """

@@ -1,4 +1,4 @@
-"""What the mechanics sees of a capture: its Gaussians in the body's own frame and in an order of their own."""
+"""Gaussians in the body's own frame and in a canonical order, as the mechanics uses them."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 
 _STEPS_PER_E = 64
-"""Sizes are rounded to this many steps a factor of e (1.6 %): a file's log scales lose bits when its unit changes."""
+"""Log scales are rounded to this many steps per factor of e (1.6 %), as a file's log scales lose bits when its unit
+changes."""
 
 
 def centred(cloud: GaussianCloud) -> tuple[GaussianCloud, np.ndarray]:
-    """The capture moved to an origin amid its Gaussians, and where that was (3,), capture's units.
+    """Move the capture to an origin amid its Gaussians. Returns it and the origin (3,), capture's units.
 
-    Each coordinate of the origin is one of the capture's own, so a move that single precision holds exactly leaves no
-    trace.
+    Each coordinate of the origin is one of the capture's own, so a translation that single precision represents exactly
+    does not change the result.
     """
     means = cloud.means.numpy().astype(np.float64)
     origin = np.sort(means, axis=0)[len(means) // 2]
@@ -30,9 +31,8 @@ def centred(cloud: GaussianCloud) -> tuple[GaussianCloud, np.ndarray]:
 
 
 def canonical_order(cloud: GaussianCloud) -> np.ndarray:
-    """(n,) indices that sort the Gaussians by what they are, first by their means, so that a file's order has no
-    say.
-    """
+    """(n,) indices that sort the Gaussians by their values, first by their means, so that the order in a file does not
+    matter."""
     return np.lexsort(
         np.concatenate(
             [
@@ -47,24 +47,25 @@ def canonical_order(cloud: GaussianCloud) -> np.ndarray:
 
 
 def find_body_frame(cloud: GaussianCloud, plane: Plane) -> BodyFrame:
-    """The frame of the body that ``cloud`` shows on ``plane`` (``upright_frame``), each Gaussian with its opacity."""
+    """Return the frame of the body in ``cloud`` on ``plane`` (``upright_frame``), each Gaussian weighted by its
+    opacity."""
     order = canonical_order(cloud)
     return upright_frame(cloud.means.numpy()[order].astype(np.float64), cloud.opacities()[order], plane)
 
 
 def body_gaussians(cloud: GaussianCloud, frame: BodyFrame) -> GaussianCloud:
-    """The capture in ``frame``, of its colours the even part, in an order that follows the body.
+    """Return the capture in ``frame``, with SH band 0 only, in canonical order.
 
-    The same bits for any order of the capture's Gaussians and, unless a size lies within single precision's rounding of
-    a step, for any unit that is a power of two.
+    The bits are the same for any order of the capture's Gaussians and, unless a size lies within single precision's
+    rounding of a step, for any unit that is a power of two.
     """
-    turn = Rotation.from_matrix(frame.axes)
+    rotation = Rotation.from_matrix(frame.axes)
     rotations = cloud.rotations.numpy().astype(np.float64)
-    turned = (turn * Rotation.from_quat(rotations[:, [1, 2, 3, 0]])).as_quat()[:, [3, 0, 1, 2]]
+    rotated = (rotation * Rotation.from_quat(rotations[:, [1, 2, 3, 0]])).as_quat()[:, [3, 0, 1, 2]]
     sizes = cloud.log_scales.numpy().astype(np.float64) + np.log(frame.scale)
     body = GaussianCloud.from_numpy(
         frame.points(cloud.means.numpy()),
-        turned,
+        rotated,
         np.rint(_STEPS_PER_E * sizes) / _STEPS_PER_E,
         cloud.opacity_logits.numpy(),
         cloud.sh.numpy()[:, :1],

@@ -23,56 +23,57 @@ from egs_warp.meshing.stuffing import isosurface_stuffing
 from egs_warp.meshing.tetwild import tetwild
 
 _MIN_DIHEDRAL_DEGREES = 8.0
-_ENCLOSED_AIM = 0.9993
-LEAST_NODES, MOST_NODES = 50, 20_000
+_MIN_ENCLOSED_FRACTION = 0.9993
+MIN_NODES, MAX_NODES = 50, 20_000
 _MAX_GROWTH_STEPS = 6
 _GROWTH_SAMPLE = 20000
-_FINER_PER_STEP = 0.15
+_REFINEMENT_PER_STEP = 0.15
 _THIN_RADIUS = 0.56
-"""In lattice cells: a rod of this radius cannot slip between the points of a body-centred cubic lattice, whose covering
-radius is sqrt(5)/4."""
+"""In lattice cells: a rod of this radius always contains points of a body-centred cubic lattice, whose covering radius
+is sqrt(5)/4."""
 
-_RUNGS = 16
-"""Sizes of a cell there are to a factor of 2, so that a few lattice points more or less leave the cell as it is."""
+_CELL_SIZES_PER_OCTAVE = 16
+"""Cell sizes per factor of 2. Cell sizes are rounded, so that the cell does not change if a few lattice points are
+added or removed."""
 
 
 class CageMethod(Enum):
-    """Which mesher makes the tetrahedra."""
+    """Mesher that makes the tetrahedra."""
 
     VOXEL = "voxel"
-    """Isosurface stuffing of the voxel solid: the same bits in every run; dihedral angles of 10 degrees and more, but
-    where the surface meets the floor (7.6 degrees at the least in 400 random solids)."""
+    """Isosurface stuffing of the voxel solid: the same bits in every run. Dihedral angles are at least 10 degrees,
+    except where the surface meets the floor (at least 7.6 degrees in 400 random solids)."""
     TETWILD = "tetwild"
-    """fTetWild, for thin parts with fewer nodes. It seeds its random numbers from the system, so two runs give two
-    meshes; where it fails or leaves a sliver, VOXEL takes its place."""
+    """fTetWild, which resolves thin parts with fewer nodes. It seeds its random numbers from the system, so two runs
+    give two meshes. VOXEL is used instead if it fails or leaves a sliver."""
 
 
 @dataclass(frozen=True)
 class Cage:
-    """A tetrahedral mesh around an object, and what it holds."""
+    """A tetrahedral mesh around an object, with measures of what it encloses."""
 
     mesh: TetMesh
-    """In the units and axes of the cloud that it was made for."""
+    """In the units and axes of the input cloud."""
     method: CageMethod
-    """The mesher that made it."""
+    """The mesher that was used."""
     min_dihedral_degrees: float
-    """Smallest dihedral angle of any tetrahedron."""
+    """Smallest dihedral angle of all tetrahedra."""
     enclosed_opacity_mass: float
-    """Share, by opacity, of the object's Gaussian means inside the mesh; floaters and means below the plane do not
+    """Fraction, by opacity, of the object's Gaussian means inside the mesh. Floaters and means below the plane do not
     count."""
     floater_opacity_mass: float
-    """Share, by opacity, of all Gaussians that hang in the air apart from the object."""
+    """Fraction, by opacity, of all Gaussians that are floaters: in the air, detached from the object."""
     below_plane_opacity_mass: float
-    """Share, by opacity, of all Gaussians whose mean lies below the plane."""
+    """Fraction, by opacity, of all Gaussians whose mean lies below the plane."""
     dilation: float
-    """How far the cage was grown around the occupied space, in the mesh's units."""
+    """Distance by which the cage was grown beyond the occupied space, in the mesh's units."""
 
     def height(self, plane: Plane) -> float:
-        """Body height H above ``plane``, in the mesh's units."""
+        """Return the body height H above ``plane``, in the mesh's units."""
         return float(plane.heights(self.mesh.nodes).max())
 
     def scaled(self, factor: float) -> Cage:
-        """The same cage after all lengths are multiplied by ``factor``."""
+        """Return the same cage with all lengths multiplied by ``factor``."""
         return replace(self, mesh=TetMesh(self.mesh.nodes * factor, self.mesh.tets), dilation=self.dilation * factor)
 
 
@@ -84,9 +85,9 @@ def build_cage(
     dilation: float = 0.005,
     method: CageMethod = CageMethod.VOXEL,
 ) -> Cage:
-    """Cage, in the capture's units and axes, of what ``cloud`` shows above ``plane``; see ``cage_of_body``.
+    """Build a cage, in the capture's units and axes, of the part of ``cloud`` above ``plane``; see ``cage_of_body``.
 
-    It is made in the body's own frame, so it goes along with any move, turn or unit of the capture.
+    It is built in the body's own frame, so it follows any translation, rotation or change of unit of the capture.
     """
     near, anchor = centred(cloud)
     frame = find_body_frame(near, plane.moved(-anchor))
@@ -100,9 +101,9 @@ def build_cage(
 
 
 def check_nodes(nodes: int) -> None:
-    """Raise ``ArgumentError`` for a number that no cage has: before any long work."""
-    if not LEAST_NODES <= nodes <= MOST_NODES:
-        raise ArgumentError("nodes", f"give a number from {LEAST_NODES} to {MOST_NODES}", value=nodes)
+    """Raise ``ArgumentError``, before any long computation, if no cage has this number of nodes."""
+    if not MIN_NODES <= nodes <= MAX_NODES:
+        raise ArgumentError("nodes", f"give a number from {MIN_NODES} to {MAX_NODES}", value=nodes)
 
 
 def cage_of_body(
@@ -113,39 +114,44 @@ def cage_of_body(
     method: CageMethod = CageMethod.VOXEL,
     solid: LatticeSolid | None = None,
 ) -> Cage:
-    """Cage of about ``target_nodes`` nodes around the opaque part of ``cloud`` above z = 0, which it never crosses.
+    """Build a cage around the opaque part of ``cloud`` above z = 0. The cage does not cross z = 0.
 
-    ``cloud`` is in its body's frame (``body_gaussians``), whose axes and origin are those of the lattice; ``solid`` is
-    what it shows (``solid_from_gaussians``), if that is known.
-    ``dilation`` is in units of the object's longest side; it is raised, and the mesh refined (up to 1.75 times the
-    nodes), until all but 0.07 % of the object's opacity mass is inside.
-    The same input gives the same bits (``CageMethod.VOXEL``). See docs/concepts/cage.md.
+    The dilation is increased, and the mesh refined (up to 1.75 times the nodes), until all but 0.07 % of the object's
+    opacity mass is inside. The same input gives the same bits (``CageMethod.VOXEL``). See docs/concepts/cage.md.
 
-    Raises ``UserError`` for an object without volume (flat, tiny, nothing opaque above the plane).
+    Args:
+        cloud: Gaussians in their body's frame (``body_gaussians``), whose axes and origin are those of the lattice.
+        target_nodes: approximate number of nodes.
+        dilation: initial growth, in units of the object's longest side.
+        method: the mesher.
+        solid: the solid that ``cloud`` shows, if known (``solid_from_gaussians``).
+
+    Raises:
+        UserError: the object has no volume (it is flat or tiny, or nothing opaque lies above the plane).
     """
-    if not LEAST_NODES <= target_nodes <= MOST_NODES:
-        raise UserError(f"cage: {target_nodes} nodes asked; give a number from {LEAST_NODES} to {MOST_NODES}")
+    if not MIN_NODES <= target_nodes <= MAX_NODES:
+        raise UserError(f"cage: {target_nodes} nodes; give a number from {MIN_NODES} to {MAX_NODES}")
     solid = solid or solid_from_gaussians(cloud)
-    _refuse_flat(solid)
+    _check_thickness(solid)
     weights = np.where(solid.belongs, cloud.opacities(), 0.0)
     distance = _Distance(solid)
-    # Two nodes a cell inside, about as many again on the surface.
-    cell = _rung((4.0 * np.count_nonzero(solid.inside) / target_nodes) ** (1.0 / 3.0))
-    # Large captures are judged by a regular sample while the cage grows, and by all in the end.
+    # Two nodes a cell inside, and about as many again on the surface.
+    cell = _rounded_cell((4.0 * np.count_nonzero(solid.inside) / target_nodes) ** (1.0 / 3.0))
+    # While the cage grows, large captures are evaluated by a regular sample; the final value uses all Gaussians.
     sample = np.arange(0, cloud.count, max(1, cloud.count // _GROWTH_SAMPLE))
     best: tuple[float, float, TetMesh, CageMethod] | None = None
     for growth in range(_MAX_GROWTH_STEPS):
         grown = dilation + 0.006 * growth
-        # Growth alone does not reach the tips of curled thin parts; a finer lattice does.
-        finer = round(target_nodes * (1.0 + _FINER_PER_STEP * growth))
+        # Growth alone does not enclose the tips of curled thin parts; a finer lattice does.
+        finer = round(target_nodes * (1.0 + _REFINEMENT_PER_STEP * growth))
         mesh, used, cell = _mesh(solid, distance, finer, grown, method, cell)
         enclosed = _enclosed_share(cloud, mesh, weights, sample)
         if best is None or enclosed > best[0]:
             best = (enclosed, grown, mesh, used)
-        if enclosed >= _ENCLOSED_AIM:
+        if enclosed >= _MIN_ENCLOSED_FRACTION:
             break
     if best is None:
-        raise UserError("cage: no mesh was made; choose another object")
+        raise UserError("cage: no mesh could be built; choose another object")
     _, grown, mesh, used = best
     return Cage(
         mesh=mesh,
@@ -163,8 +169,8 @@ def _share(cloud: GaussianCloud, chosen: np.ndarray) -> float:
     return float(np.sum(opacities[chosen]) / np.sum(opacities))
 
 
-def _refuse_flat(solid: LatticeSolid) -> None:
-    """A sheet is at most the lattice's own blur thick, wherever one looks."""
+def _check_thickness(solid: LatticeSolid) -> None:
+    """Raise ``UserError`` for a sheet: it is at most as thick as the blur of the lattice, in every direction."""
     thickest = float(_edt(np.pad(solid.inside, 1)[:, :, 1:]).max())
     size = np.ptp(np.argwhere(solid.inside), axis=0) + 1
     if thickest < 2.0 or size.min() < 4:
@@ -178,50 +184,52 @@ def _refuse_flat(solid: LatticeSolid) -> None:
 def _mesh(
     solid: LatticeSolid, distance: _Distance, target_nodes: int, dilation: float, method: CageMethod, cell: float
 ) -> tuple[TetMesh, CageMethod, float]:
-    """The mesh, who made it, and the lattice cell that gives the asked node count (``cell`` if no lattice was made)."""
+    """Return the mesh, its mesher, and the lattice cell for the requested number of nodes (``cell`` if no lattice was
+    made)."""
     if method is CageMethod.TETWILD:
         mesh = tetwild(_Field(distance, dilation, thin_radius=0.0), target_nodes)
         if mesh is not None and mesh.min_dihedral_degrees() >= _MIN_DIHEDRAL_DEGREES:
-            nodes, tets = _main_piece(mesh.nodes, mesh.tets)
+            nodes, tets = _largest_part(mesh.nodes, mesh.tets)
             return TetMesh.oriented(solid.points(nodes), tets), CageMethod.TETWILD, cell
-    nodes, tets, cell = _stuffed(distance, target_nodes, dilation, cell)
+    nodes, tets, cell = _lattice_mesh(distance, target_nodes, dilation, cell)
     return TetMesh.oriented(solid.points(nodes), tets), CageMethod.VOXEL, cell
 
 
-def _stuffed(
+def _lattice_mesh(
     distance: _Distance, target_nodes: int, dilation: float, cell: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Nodes (lattice spacings), tetrahedra and cell of the lattice mesh whose node count comes nearest to the target.
+    """Return nodes (lattice spacings), tetrahedra and cell of the lattice mesh with the number of nodes nearest to the
+    target.
 
-    Secant steps on the cell's size, from ``cell``, from rung to rung.
+    Secant steps on the cell size, starting from ``cell``, with rounded sizes.
     """
     best: tuple[float, np.ndarray, np.ndarray, float] | None = None
     for _ in range(6):
         field = _Field(distance, dilation, thin_radius=_THIN_RADIUS * cell)
         nodes, tets = isosurface_stuffing(field, *field.bounds(), cell)
         if len(tets) == 0:
-            cell = _rung(0.7 * cell)
+            cell = _rounded_cell(0.7 * cell)
             continue
-        nodes, tets = _main_piece(nodes, tets)
-        miss = abs(float(np.log(len(nodes) / target_nodes)))
-        if best is None or miss < best[0]:
-            best = (miss, nodes, tets, cell)
-        following = _rung(cell * (len(nodes) / target_nodes) ** 0.45)
-        if miss < 0.08 or following == cell:
+        nodes, tets = _largest_part(nodes, tets)
+        deviation = abs(float(np.log(len(nodes) / target_nodes)))
+        if best is None or deviation < best[0]:
+            best = (deviation, nodes, tets, cell)
+        next_cell = _rounded_cell(cell * (len(nodes) / target_nodes) ** 0.45)
+        if deviation < 0.08 or next_cell == cell:
             break
-        cell = following
+        cell = next_cell
     if best is None:
-        raise UserError("object: it is too thin to be given a volume; choose another object")
+        raise UserError("object: it is too thin to have a volume; choose another object")
     return best[1:]
 
 
-def _rung(cell: float) -> float:
-    """The nearest size of a cell that is used."""
-    return float(2.0 ** (np.rint(_RUNGS * np.log2(cell)) / _RUNGS))
+def _rounded_cell(cell: float) -> float:
+    """Round the size of a cell."""
+    return float(2.0 ** (np.rint(_CELL_SIZES_PER_OCTAVE * np.log2(cell)) / _CELL_SIZES_PER_OCTAVE))
 
 
 class _Distance:
-    """Distances of the solid and its mirror image below the plane, which no dilation changes."""
+    """Distances of the solid and its mirror image below the plane, which do not depend on the dilation."""
 
     def __init__(self, solid: LatticeSolid) -> None:
         self.pad = int(np.ceil(0.25 * solid.longest_side / solid.spacing))
@@ -230,20 +238,21 @@ class _Distance:
         self.sharp = sharp - 0.5 * np.sign(sharp)
         """Signed distance, in lattice spacings."""
         self.smooth = np.asarray(ndimage.gaussian_filter(self.sharp, 0.9))
-        """The same without the lattice's steps."""
+        """Smoothed signed distance, without the lattice's steps."""
         self.medial = (self.smooth < -0.2) & (self.smooth <= ndimage.minimum_filter(self.smooth, 3))
-        """Where it has a crest, as it has in the middle of a thin part (there is none at corners)."""
+        """Mask of its crests, as in the middle of a thin part (there is none at corners)."""
         self.longest_side = solid.longest_side / solid.spacing
         """In lattice spacings."""
         self.middle = -solid.corner[:2]
-        """(2,) lattice indices of the frame's origin, about which the cells are laid out."""
+        """(2,) lattice indices of the frame's origin, about which the cells are arranged."""
 
 
 class _Field:
-    """Smooth signed distance of the grown solid, in lattice spacings: negative inside."""
+    """Smooth signed distance of the dilated solid, in lattice spacings; negative inside."""
 
     def __init__(self, distance: _Distance, dilation: float, *, thin_radius: float) -> None:
-        """``dilation`` in longest sides; parts thinner than ``thin_radius`` (spacings) are thickened to it."""
+        """Compute the field. ``dilation`` is in longest sides; parts thinner than ``thin_radius`` (spacings) are
+        thickened to it."""
         smooth = distance.smooth
         value = np.minimum(smooth, distance.sharp + 0.3) - dilation * distance.longest_side
         if thin_radius > 0.0:
@@ -258,24 +267,25 @@ class _Field:
         return ndimage.map_coordinates(self._value, (points + self._offset).T, order=1, mode="nearest", prefilter=False)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Box (3,), (3,) that holds the solid, about the frame's origin, in lattice spacings."""
+        """Return the corners (3,), (3,) of a box about the frame's origin that contains the solid, in lattice
+        spacings."""
         where = np.argwhere(self._value < 0.0) - self._offset
         low, high = where.min(axis=0) - 1.0, where.max(axis=0) + 1.0
         half = np.maximum(self._middle - low[:2], high[:2] - self._middle)
         return np.append(self._middle - half, low[2]), np.append(self._middle + half, high[2])
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """The lattice of values from layer 0 up, and the position (3,) of its first point."""
+        """Return the lattice of values from layer 0 up, and the position (3,) of its first point."""
         return self._value[:, :, 1:], np.append(-self._offset[:2], 0.0)
 
 
 def _edt(mask: np.ndarray) -> np.ndarray:
-    """Distance of every True point to the nearest False one, in lattice spacings."""
+    """Distance of each True point to the nearest False one, in lattice spacings."""
     return np.asarray(ndimage.distance_transform_edt(mask))
 
 
-def _main_piece(nodes: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The largest part (by volume) that hangs together through faces; loose crumbs are dropped."""
+def _largest_part(nodes: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest part (by volume) connected through faces; smaller parts are dropped."""
     faces = np.sort(tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
     _, face = distinct_rows(faces)
     order = np.argsort(face, kind="stable")
@@ -291,7 +301,7 @@ def _main_piece(nodes: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _enclosed_share(cloud: GaussianCloud, mesh: TetMesh, weights: np.ndarray, sample: np.ndarray) -> float:
-    """Share of ``weights`` (n,) inside the mesh, of the means numbered ``sample`` (m,)."""
+    """Fraction of ``weights`` (n,) inside the mesh, over the means with indices ``sample`` (m,)."""
     centre = mesh.nodes.mean(axis=0)
     size = float(np.ptp(mesh.nodes, axis=0).max())
     surface = wp.Mesh(

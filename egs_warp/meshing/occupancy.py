@@ -1,4 +1,4 @@
-"""The solid a capture shows: a lattice of points over its plane, each inside or outside the object."""
+"""The solid that a capture shows: a lattice of points over its plane, each inside or outside the object."""
 
 from __future__ import annotations
 
@@ -13,68 +13,68 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.meshing.occupancy import OPACITY_UNIT, enclosed_kernel, splat_occupancy_kernel
 
 _OPACITY_THRESHOLD = 0.25
-"""Summed opacity from which a lattice point counts as occupied."""
+"""Summed opacity above which a lattice point counts as occupied."""
 _MIN_COMPONENT_TO_BRIDGE = 0.02
-"""A detached part with more than this share of the opacity mass belongs to the object: its gap is bridged."""
+"""A detached part with more than this fraction of the opacity mass belongs to the object, and its gap is bridged."""
 _MAX_BRIDGE = 4
-"""Widest gap bridged, in lattice spacings on either side."""
+"""Maximum width of a bridged gap, in lattice spacings on either side."""
 
 
 @dataclass(frozen=True)
 class LatticeSolid:
-    """The object as a set of lattice points in its body's frame; layer 0 of the last axis lies in the plane z = 0."""
+    """The object as a set of lattice points in its body's frame. Layer 0 of the last axis lies in the plane z = 0."""
 
     inside: np.ndarray
-    """(nx, ny, nz) bool, one connected piece."""
+    """(nx, ny, nz) bool, one connected part."""
     corner: np.ndarray
-    """(3,) int: lattice point (0, 0, 0) counted from the frame's origin, which is itself a lattice point."""
+    """(3,) int, position of lattice point (0, 0, 0) relative to the frame's origin, which is itself a lattice point."""
     spacing: float
-    """In the frame's lengths."""
+    """Distance between lattice points, in the frame's unit of length."""
     longest_side: float
-    """Of the object's Gaussians, in the frame's lengths."""
+    """Longest side of the object's Gaussians, in the frame's unit of length."""
     belongs: np.ndarray
-    """(n,) bool: Gaussians of the object; the others are floaters or lie below the plane."""
+    """(n,) bool, Gaussians of the object; the others are floaters or lie below the plane."""
     below_plane: np.ndarray
-    """(n,) bool: Gaussians whose mean is below the plane by more than the lattice's blur can tell from it."""
+    """(n,) bool, Gaussians whose mean is below the plane."""
     bridged: int
-    """Lattice spacings by which gaps were bridged on either side; 0 if the object is in one piece by itself."""
+    """Lattice spacings by which gaps were bridged on either side; 0 if the object is one part."""
 
     def points(self, lattice_points: np.ndarray) -> np.ndarray:
-        """Points (m, 3) of the body's frame, from lattice indices (m, 3)."""
+        """Return the points (m, 3) of the body's frame at lattice indices (m, 3)."""
         return self.spacing * (np.asarray(lattice_points, float) + self.corner)
 
     def scaled(self, factor: float) -> LatticeSolid:
-        """The same solid after all lengths are multiplied by ``factor``."""
+        """Return the same solid with all lengths multiplied by ``factor``."""
         return replace(self, spacing=self.spacing * factor, longest_side=self.longest_side * factor)
 
 
 def solid_from_gaussians(cloud: GaussianCloud, *, resolution: int = 64) -> LatticeSolid:
-    """Occupied and enclosed space above z = 0: the connected piece that holds most of the opacity mass.
+    """Return the occupied and enclosed space above z = 0: the connected part with most of the opacity mass.
 
-    ``cloud`` is in its body's frame. ``resolution`` lattice spacings span the object's longest side. Nothing but a
-    whole number hangs on which lattice points are the outermost, so that a body that has hardly changed keeps its
-    lattice. Raises ``UserError`` if nothing opaque stands on the plane.
+    ``cloud`` is in its body's frame. ``resolution`` lattice spacings span the object's longest side. The outermost
+    lattice points affect only an integer, so a body that has hardly changed keeps its lattice. Raises ``UserError`` if
+    nothing opaque stands on the plane.
     """
     means = cloud.means.numpy().astype(np.float64)
     opacities = cloud.opacities()
     low, high = _robust_bounds(means, opacities)
-    # A coarse look first: strays may have stretched the bounds.
-    coarse = _one_look(cloud, means, opacities, low, high, float(np.max(high - low)), min(resolution, 40))
+    # A coarse pass first, because outliers may have stretched the bounds.
+    coarse = _solid_within(cloud, means, opacities, low, high, float(np.max(high - low)), min(resolution, 40))
     indices = np.argwhere(coarse.inside)
     low, high = coarse.points(indices.min(axis=0)), coarse.points(indices.max(axis=0))
     longest = _longest_side(means[coarse.belongs], opacities[coarse.belongs])
-    return _one_look(cloud, means, opacities, low, high, longest or float(np.max(high - low)), resolution)
+    return _solid_within(cloud, means, opacities, low, high, longest or float(np.max(high - low)), resolution)
 
 
 def _robust_bounds(means: np.ndarray, opacities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Box (3,), (3,) around all but far strays: the central 98 % of the mass, grown by 60 % of its size."""
+    """Return a box (3,), (3,) without far outliers: the central 98 % of the mass, enlarged by 60 % of its size."""
     low, high = _mass_quantiles(means, opacities, 0.01, 0.99)
     grow = 0.6 * (high - low)
     return np.maximum(low - grow, means.min(axis=0)), np.minimum(high + grow, means.max(axis=0))
 
 
 def _longest_side(means: np.ndarray, opacities: np.ndarray) -> float:
-    """Longest side of the box from the plane up that holds all but the outermost thousandths of the mass."""
+    """Return the longest side of the box from the plane up, without the outermost thousandths of the mass."""
     if len(means) == 0:
         return 0.0
     low, high = _mass_quantiles(means, opacities, 0.001, 0.999)
@@ -82,16 +82,18 @@ def _longest_side(means: np.ndarray, opacities: np.ndarray) -> float:
 
 
 def _mass_quantiles(means: np.ndarray, opacities: np.ndarray, *shares: float) -> list[np.ndarray]:
-    """Points (3,) below which, along each axis, these shares of the mass lie."""
-    found = np.empty((len(shares), 3))
+    """Return the points (3,) below which, along each axis, these shares of the mass lie."""
+    quantiles = np.empty((len(shares), 3))
     for axis in range(3):
         order = np.argsort(means[:, axis], kind="stable")
         mass = np.cumsum(opacities[order])
-        found[:, axis] = means[order, axis][np.searchsorted(mass, np.array(shares) * mass[-1]).clip(0, len(order) - 1)]
-    return list(found)
+        quantiles[:, axis] = means[order, axis][
+            np.searchsorted(mass, np.array(shares) * mass[-1]).clip(0, len(order) - 1)
+        ]
+    return list(quantiles)
 
 
-def _one_look(
+def _solid_within(
     cloud: GaussianCloud,
     means: np.ndarray,
     opacities: np.ndarray,
@@ -161,7 +163,7 @@ def _bridge(occupied: np.ndarray, radius: int) -> np.ndarray:
 
 
 def _fill(piece: np.ndarray, device: wp.Device) -> np.ndarray:
-    """The piece with its enclosed space; twice, since what the first pass filled shields the rest."""
+    """Fill enclosed space. Two passes, because space filled in the first pass shields the rest."""
     solid = piece
     for _ in range(2):
         filled = wp.zeros(solid.shape, dtype=wp.uint8, device=device)

@@ -15,18 +15,26 @@ import numpy as np
 from egs_warp.geometry.unique_rows import distinct_rows
 
 Field = Callable[[np.ndarray], np.ndarray]
-"""Signed distance (m,) at points (m, 3): negative inside."""
+"""Signed distance (m,) at points (m, 3), negative inside."""
 
 _SNAP_LONG, _SNAP_SHORT = 0.25, 0.41
-"""Share of a long (cube side) or short (half body diagonal) edge within which a point is moved onto the surface. Away
-from the floor dihedral angles are at least 9.26 degrees (tests/meshing/test_stuffing.py)."""
+"""Fraction of a long (cube side) or short (half body diagonal) edge within which a point is moved onto the surface.
+Away from the floor, dihedral angles are at least 9.26 degrees (tests/meshing/test_stuffing.py)."""
 
 
 def isosurface_stuffing(field: Field, low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (N, 3) and tetrahedra (T, 4) of either winding that fill ``field`` < 0 above z = 0.
+    """Fill ``field`` < 0 above z = 0 with tetrahedra.
 
-    The box ``low`` (3,), ``high`` (3,) holds the solid; ``cell`` is the lattice's cube side, in the units of the
-    points. A solid thinner than about a cell falls between the lattice points. T is 0 if nothing is inside.
+    A solid thinner than about a cell may fall between the lattice points.
+
+    Args:
+        field: signed distance, negative inside.
+        low: (3,) lower corner of a box that contains the solid.
+        high: (3,) upper corner.
+        cell: side of the lattice's cubes, in the units of the points.
+
+    Returns:
+        Nodes (N, 3) and tetrahedra (T, 4) of either orientation. T is 0 if nothing is inside.
     """
     points, tets, long_edges, is_floor = _lattice(low, high, cell)
     value = field(points)
@@ -50,9 +58,8 @@ _CORNER_PAIRS = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 
 
 def _lattice(low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Points (P, 3), tetrahedra (T, 4), their two long edges (T, 2) as numbers of ``_CORNER_PAIRS``,
-    floor mask (P,).
-    """
+    """Return the points (P, 3), tetrahedra (T, 4), their two long edges (T, 2) as indices into ``_CORNER_PAIRS``, and
+    the floor mask (P,)."""
     centre = 0.5 * (low + high)[:2]
     half = np.ceil(0.5 * (high - low)[:2] / cell).astype(int) + 1
     nx, ny = 2 * half
@@ -74,7 +81,7 @@ def _lattice(low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray
     )
     pieces = []
     for axis in range(3):
-        # The square between two neighbouring cells, its corners in turn; the floor's squares have the floor point
+        # The square between two neighbouring cells, its corners in order. Squares of the floor have the floor point
         # below.
         other = [k for k in range(3) if k != axis]
         count = [nx, ny, nz]
@@ -100,13 +107,13 @@ def _lattice(low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray
 
 
 def _crossed_or_inside(value: np.ndarray, tets: np.ndarray, long_edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tetrahedra with a corner inside."""
+    """Return the tetrahedra with a corner inside, and their long edges."""
     keep = np.any(value[tets] < 0.0, axis=1)
     return tets[keep], long_edges[keep]
 
 
 def _unique_edges(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges (E, 2), lower point first, and for each tetrahedron the numbers (T, 6) of its edges."""
+    """Return the edges (E, 2), lower point first, and the edge indices (T, 6) of each tetrahedron."""
     ends = np.sort(tets[:, _CORNER_PAIRS].reshape(-1, 2), axis=1)
     edges, edge_of = distinct_rows(ends)
     return edges, edge_of.reshape(-1, 6)
@@ -120,30 +127,31 @@ def _snap(
     edge_is_long: np.ndarray,
     is_floor: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Move points near the surface onto their nearest cut. Points of the floor move along the floor or not at all."""
+    """Move points near the surface to their nearest intersection. Points of the floor move along the floor or not at
+    all."""
     cut = np.flatnonzero(value[edges[:, 0]] * value[edges[:, 1]] < 0.0)
     ends = edges[cut]
     at = _roots(field, points[ends[:, 0]], points[ends[:, 1]], np.where(value[ends[:, 0]] < 0.0, 1, -1))
     length = np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)
-    # From a floor point straight up it is half a long edge.
+    # From a floor point straight up, the edge is half a long edge.
     limit = np.where(edge_is_long[cut], _SNAP_LONG * length.max(initial=0.0), _SNAP_SHORT * length)
-    moved, on_surface = points.copy(), value.copy()
+    snapped, on_surface = points.copy(), value.copy()
     end = ends.T.ravel()
     target = np.concatenate([at, at])
     travel = np.linalg.norm(target - points[end], axis=1)
     close = travel < np.concatenate([limit, limit])
     end, target, travel = end[close], target[close], travel[close]
-    # Last write wins: farthest first, and cuts along the floor after all others for its points.
+    # The last write wins: farthest first, and for floor points the intersections along the floor last.
     in_floor = is_floor[end] & (target[:, 2] == 0.0)
     order = np.lexsort((-travel, in_floor))
     for k in order:
         on_surface[end[k]] = 0.0
-        moved[end[k]] = points[end[k]] if is_floor[end[k]] and not in_floor[k] else target[k]
-    return moved, on_surface
+        snapped[end[k]] = points[end[k]] if is_floor[end[k]] and not in_floor[k] else target[k]
+    return snapped, on_surface
 
 
 def _roots(field: Field, a: np.ndarray, b: np.ndarray, sign_a: np.ndarray) -> np.ndarray:
-    """Points (m, 3) where ``field`` vanishes between ``a`` and ``b``; ``sign_a`` is 1 where a is inside."""
+    """Return the points (m, 3) where ``field`` vanishes between ``a`` and ``b``; ``sign_a`` is 1 where a is inside."""
     low, high = np.zeros(len(a)), np.ones(len(a))
     for _ in range(12):
         t = 0.5 * (low + high)
@@ -160,7 +168,7 @@ def _fill_tets(
     edge_is_long: np.ndarray,
     node_of_edge: np.ndarray,
 ) -> np.ndarray:
-    """The inside part (T', 4) of every tetrahedron, by its pattern of signs."""
+    """Return the inside part (T', 4) of every tetrahedron, by its pattern of signs."""
     order = np.argsort(-sign[tets], axis=1, kind="stable")
     tets = np.take_along_axis(tets, order, axis=1)
     signs = sign[tets]
@@ -174,7 +182,8 @@ def _fill_tets(
         return node_of_edge[edge(a, b)]
 
     def first_owns(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-        """Whether the diagonal of the quad a, b, cut(b, c), cut(a, c) starts at a: a rule both neighbours share."""
+        """True where the diagonal of the quad a, b, cut(b, c), cut(a, c) starts at a. Both neighbours apply the same
+        rule."""
         a_long, b_long = edge_is_long[edge(a, c)], edge_is_long[edge(b, c)]
         return np.where(a_long != b_long, b_long, a < b)
 
@@ -198,7 +207,7 @@ def _fill_tets(
     shorter = np.linalg.norm(nodes[top[:, 1]] - nodes[bottom[:, 2]], axis=1) <= np.linalg.norm(
         nodes[top[:, 2]] - nodes[bottom[:, 1]], axis=1
     )
-    # The third quad lies on the surface, so it is free unless the other two leave one way without a cycle.
+    # The third quad lies on the surface, so its diagonal is free unless only one choice avoids a cycle.
     own12 = np.where(own01 == own02, shorter, ~own01)
     out += _prisms(top, bottom, own01, own02, own12)
     a, b, c, d = pick(3, 1)
@@ -210,8 +219,8 @@ def _fill_tets(
 def _prisms(
     top: np.ndarray, bottom: np.ndarray, own01: np.ndarray, own02: np.ndarray, own12: np.ndarray
 ) -> list[np.ndarray]:
-    """Three tetrahedra for each prism; the diagonal of quad ij runs from top i to bottom j where ``own_ij``, else from
-    top j to bottom i. The three choices never form a cycle."""
+    """Return three tetrahedra for each prism. The diagonal of quad ij runs from top i to bottom j where ``own_ij`` is
+    set, else from top j to bottom i. The three choices never form a cycle."""
     wins = np.stack([own01.astype(int) + own02, ~own01 + own12.astype(int), (~own02).astype(int) + ~own12], axis=1)
     rank = np.argsort(-wins, axis=1, kind="stable")
     p, q = np.take_along_axis(top, rank, axis=1).T, np.take_along_axis(bottom, rank, axis=1).T

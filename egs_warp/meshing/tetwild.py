@@ -1,4 +1,4 @@
-"""fTetWild behind one function."""
+"""Tetrahedral meshes by fTetWild."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from egs_warp.geometry.tetmesh import TetMesh
 
 
 class SampledField(Protocol):
-    """A signed distance known at lattice points."""
+    """A signed distance sampled at lattice points."""
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Values (nx, ny, nz), negative inside, layer 0 in the plane; position (3,) of the first point."""
+        """Return the values (nx, ny, nz), negative inside, with layer 0 in the plane, and the position (3,) of the
+        first point."""
         ...
 
 
 def flat_bottomed_surface(field: SampledField) -> tuple[np.ndarray, np.ndarray]:
-    """Marching-cubes vertices (v, 3) and outward faces (f, 3) of the field,
-    closed by an exactly flat bottom at z = 0.
-    """
+    """Return marching-cubes vertices (v, 3) and outward faces (f, 3) of the field, closed by an exactly flat bottom at
+    z = 0."""
     values, start = field.samples()
     closed = np.concatenate([np.full_like(values[:, :, :1], 2.0), values], axis=2)
     vertices, faces, _, _ = measure.marching_cubes(closed, 0.0)
@@ -37,12 +37,12 @@ def flat_bottomed_surface(field: SampledField) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
-    """A mesh of about ``target_nodes`` nodes by fTetWild, or None where it fails; not the same in two runs."""
+    """Build a mesh of about ``target_nodes`` nodes by fTetWild, or return None if it fails. Two runs differ."""
     vertices, faces = flat_bottomed_surface(field)
     tetrahedralize = _tetrahedralize()
     edge_length = 0.05 * (600.0 / target_nodes) ** 0.5
     try:
-        # It leaves a file in the folder where it runs, and takes no name for it.
+        # fTetWild writes a file into the working directory, and its name cannot be set.
         with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
             nodes, tets = tetrahedralize(
                 vertices,
@@ -54,7 +54,7 @@ def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
                 num_opt_iter=40,
                 num_threads=1,
             )
-        # The envelope lets the bottom wander; what it moved is put back into the plane.
+        # Within its tolerance, fTetWild moves nodes of the bottom; they are moved back into the plane.
         diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
         nodes[np.abs(nodes[:, 2]) < 6e-3 * diagonal, 2] = 0.0
         return TetMesh.oriented(nodes, tets)
@@ -63,8 +63,11 @@ def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
 
 
 def _tetrahedralize() -> Callable[..., Any]:
-    """pytetwild's function. Its 0.4.2 imports pyvista (and with it all of VTK) for an accessor that is not used here,
-    though its metadata call pyvista optional: an empty module takes its place while it is imported."""
+    """Return pytetwild's function.
+
+    pytetwild 0.4.2 imports pyvista (and with it all of VTK) for an accessor that is not used here, although its
+    metadata list pyvista as optional. An empty module replaces it during the import.
+    """
     try:
         import pyvista  # noqa: F401
     except ImportError:

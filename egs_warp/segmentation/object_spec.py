@@ -1,4 +1,4 @@
-"""Where the user says that the object is, and what was found there."""
+"""The user's description of the object, and the result of its segmentation."""
 
 from __future__ import annotations
 
@@ -17,35 +17,34 @@ class Box:
     """An axis-aligned box in the capture's frame."""
 
     low: np.ndarray
-    """(3,)"""
+    """(3,) lower corner."""
     high: np.ndarray
-    """(3,)"""
+    """(3,) upper corner."""
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """(n,) bool for points (n, 3)."""
+        """(n,) bool, True for points (n, 3) in the box."""
         return np.all((points >= self.low) & (points <= self.high), axis=1)
 
 
 @dataclass(frozen=True)
 class ObjectSpec:
-    """What the user says about where the object is: exactly one of masks, box and point; clicks add to it and take
-    from it.
-    """
+    """The user's description of the object: exactly one of masks, box and point; clicks add to it and remove from
+    it."""
 
     masks: tuple[MaskedView, ...] = ()
     box: Box | None = None
     point: np.ndarray | None = None
     """(3,) on or in the object, scene units."""
     clicks: tuple[Click, ...] = ()
-    """What each hits goes along, with what hangs together with it, or does not."""
+    """Each adds what it hits, with what is connected to it, or removes it."""
 
     @classmethod
     def of_clicks(cls, clicks: Sequence[Click]) -> ObjectSpec:
-        """The first of the ``clicks`` that are on the object says where it is. Raises ``UserError`` if none is."""
+        """Locate the object by the first of the ``clicks`` on it. Raises ``UserError`` if there is none."""
         for click in clicks:
             if click.inside:
                 return cls(point=click.point, clicks=tuple(clicks))
-        raise UserError("object: every click takes something away; click on the object itself as well")
+        raise UserError("object: every click removes something; click on the object itself as well")
 
 
 @dataclass(frozen=True)
@@ -53,15 +52,16 @@ class Segmentation:
     """The object among the Gaussians of a capture."""
 
     object_mask: np.ndarray
-    """(n,) bool: the object, means above the plane."""
+    """(n,) bool, the object; its means lie above the plane."""
     buried_mask: np.ndarray
-    """(n,) bool: of the object, but with means below the plane. Belongs to neither object nor background."""
+    """(n,) bool, hidden Gaussians of the object or under its foot, with means near or below the plane. They belong to
+    neither object nor background."""
     floater_mask: np.ndarray
-    """(n,) bool: looks like the object's, but hangs apart from it. Belongs to neither."""
+    """(n,) bool, similar to the object but detached from it. They belong to neither."""
     size: float
-    """Scene units: diagonal of the object's bounding box."""
+    """Diagonal of the object's bounding box, scene units."""
 
     @property
     def background_mask(self) -> np.ndarray:
-        """(n,) bool."""
+        """(n,) bool, all other Gaussians."""
         return ~(self.object_mask | self.buried_mask | self.floater_mask)

@@ -1,4 +1,4 @@
-"""The plane that rendered depth shows: from one view or several, in the presence of outliers (Eq. 18, 19)."""
+"""Robust fit of a plane to rendered depth, from one or several views (Eq. 18, 19)."""
 
 from __future__ import annotations
 
@@ -13,18 +13,17 @@ from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.plane import Plane
 
 _MAX_PIXELS = 20_000
-"""Of each view; more do not sharpen a fit of three numbers."""
+"""Maximum number of pixels of each view; more do not improve a fit of three numbers."""
 _MIN_PIXELS = 30
 _TRIALS = 300
 _TUKEY = 2.0
-"""Pixels further off than this many standard deviations count for nothing. 4.685 would be more efficient without
-outliers, but what stands on the plane is near it at its foot: with 3.0 some of 100 scenes tilt by a degree."""
-_LEAST_NOISE = 1e-3
-"""Of depth: what is nearer than this is on the plane. Where few wide splats make a floor, a plane through three of them
-leaves no error at all in half of the pixels, and the others would count for nothing.
-"""
+"""Pixels farther off than this many standard deviations have zero weight. 4.685 would be more efficient without
+outliers, but an object is close to the plane at its foot: with 3.0, some of 100 scenes tilt by a degree."""
+_MIN_NOISE = 1e-3
+"""Fraction of the depth. Points nearer than this are on the plane. If few wide splats form a floor, a plane through
+three of them has no error in half of the pixels, and the others would have zero weight."""
 _MIN_SINE = 0.02
-"""Of the angle between plane and line of sight: a camera this close to the plane does not see it."""
+"""Sine of the angle between plane and line of sight; a camera closer to the plane does not see it."""
 
 
 @dataclass(frozen=True)
@@ -33,23 +32,23 @@ class PlaneView:
 
     camera: Camera
     depth: np.ndarray
-    """(H, W) expected z-depth, scene units; 0 where nothing is."""
+    """(H, W) expected z-depth, scene units; 0 where it is empty."""
     mask: np.ndarray
-    """(H, W) bool, where the plane is to be seen."""
+    """(H, W) bool, where the plane is visible."""
 
 
 @dataclass(frozen=True)
 class PlaneFit:
-    """A fitted plane and how well it fits."""
+    """A fitted plane and the quality of the fit."""
 
     plane: Plane
     """Its normal points to the cameras' side."""
     noise: float
-    """Standard deviation of relative depth (robust), over the pixels on the plane."""
+    """Standard deviation (robust) of relative depth over the pixels on the plane."""
     inlier_share: float
-    """0 to 1: pixels of the masks that the plane explains."""
+    """Fraction of the masked pixels that the plane explains, 0 to 1."""
     pixel_count: int
-    """Pixels with depth inside the masks."""
+    """Number of pixels with depth inside the masks."""
 
 
 def plane_depth(plane: Plane, camera: Camera) -> np.ndarray:
@@ -61,13 +60,13 @@ def plane_depth(plane: Plane, camera: Camera) -> np.ndarray:
 
 
 def fit_plane(views: Sequence[PlaneView], *, start: Plane | None = None, seed: int = 0) -> PlaneFit:
-    """The plane whose depth agrees with the rendered depth inside the masks, over all views together, Eq. (19).
+    """Fit the plane whose depth agrees with the rendered depth inside the masks, over all views together, Eq. (19).
 
-    The residual of a pixel is its error in depth over its depth, D_g / D_p - 1: for one view it is linear in
-    m = -N / (N.o + d). Up to four tenths of the pixels may be wrong. The start is sampled, or found from ``start`` (for
-    the paper, the look direction with d = 0) by reweighted least squares on inverse depth.
+    The residual of a pixel is its relative error in depth, D_g / D_p - 1: for one view it is linear in m = -N / (N.o +
+    d). Up to four tenths of the pixels may be outliers. The start is sampled, or computed from ``start`` (for the
+    paper, the view direction with d = 0) by reweighted least squares on inverse depth.
 
-    Raises ``UserError`` for masks of the wrong size or without depth, and where no plane explains the pixels.
+    Raises ``UserError`` for masks of the wrong size or without depth, and if no plane explains the pixels.
     """
     pixels = _gather(views, np.random.default_rng(seed))
     guess = _sampled(pixels, np.random.default_rng(seed)) if start is None else _reweighted(pixels, start)
@@ -75,7 +74,7 @@ def fit_plane(views: Sequence[PlaneView], *, start: Plane | None = None, seed: i
     plane = _refined(pixels, plane, lambda scale: (_tukey, _TUKEY * scale), rounds=6)
     residual = np.abs(pixels.residuals(plane))
     scale = _scale(residual)
-    inside = residual < _TUKEY * max(scale, _LEAST_NOISE)
+    inside = residual < _TUKEY * max(scale, _MIN_NOISE)
     if scale > 0.1 or inside.mean() < 0.4:
         errors, share = (f"{100.0 * value:.0f} %" for value in (scale, inside.mean()))
         fault = f"leaves depth errors of {errors}" if scale > 0.1 else f"explains only {share} of what is"
@@ -92,15 +91,15 @@ class _Pixels:
     origins: np.ndarray
     """(p, 3) camera centre of each pixel."""
     rays: np.ndarray
-    """(p, 3) of z-depth 1."""
+    """(p, 3) rays of z-depth 1."""
     depth: np.ndarray
-    """(p,)"""
+    """(p,) rendered depth."""
     first_view: np.ndarray
-    """(p,) bool."""
+    """(p,) bool, pixels of the first view."""
 
     @property
     def points(self) -> np.ndarray:
-        """(p, 3) what was rendered, in the world."""
+        """(p, 3) rendered points, in the world."""
         return self.origins + self.depth[:, None] * self.rays
 
     def residuals(self, plane: Plane) -> np.ndarray:
@@ -123,8 +122,8 @@ def _gather(views: Sequence[PlaneView], random: np.random.Generator) -> _Pixels:
                     f"plane: {name} of view {number} is {np.shape(values)[::-1]}, its camera {shape[::-1]} pixels; "
                     "make it at the camera's size"
                 )
-        held = view.mask & (view.depth > 0.0) & np.isfinite(view.depth)
-        chosen = np.flatnonzero(held)
+        valid = view.mask & (view.depth > 0.0) & np.isfinite(view.depth)
+        chosen = np.flatnonzero(valid)
         if len(chosen) > _MAX_PIXELS:
             chosen = np.sort(random.choice(chosen, _MAX_PIXELS, replace=False))
         rays.append(camera_rays(view.camera).reshape(-1, 3)[chosen])
@@ -142,10 +141,10 @@ def _gather(views: Sequence[PlaneView], random: np.random.Generator) -> _Pixels:
 
 
 def _sampled(pixels: _Pixels, random: np.random.Generator) -> Plane:
-    """Of planes through three rendered points, the one of least median residual (Rousseeuw 1984)."""
+    """Return the plane of least median residual (Rousseeuw 1984) among planes through three rendered points."""
     points = pixels.points
     few = random.choice(len(points), min(2000, len(points)), replace=False)
-    judged = _Pixels(pixels.origins[few], pixels.rays[few], pixels.depth[few], pixels.first_view[few])
+    subset = _Pixels(pixels.origins[few], pixels.rays[few], pixels.depth[few], pixels.first_view[few])
     best, least = None, np.inf
     for _ in range(_TRIALS):
         a, b, c = points[random.choice(len(points), 3, replace=False)]
@@ -154,11 +153,11 @@ def _sampled(pixels: _Pixels, random: np.random.Generator) -> Plane:
         if length < 1e-12 * np.linalg.norm(b - a) * np.linalg.norm(c - a) or length == 0.0:
             continue
         plane = Plane(normal / length, float(-a @ normal / length))
-        sight = np.abs(judged.rays @ plane.normal) / np.linalg.norm(judged.rays, axis=1)
+        sight = np.abs(subset.rays @ plane.normal) / np.linalg.norm(subset.rays, axis=1)
         if np.median(sight) < _MIN_SINE:
             continue
-        # Slightly below the median, so that half of the pixels may be wrong.
-        cost = float(np.quantile(np.abs(judged.residuals(plane)), 0.45))
+        # Slightly below the median, so that half of the pixels may be outliers.
+        cost = float(np.quantile(np.abs(subset.residuals(plane)), 0.45))
         if cost < least:
             best, least = plane, cost
     if best is None:
@@ -169,12 +168,12 @@ def _sampled(pixels: _Pixels, random: np.random.Generator) -> Plane:
 
 
 def _reweighted(pixels: _Pixels, start: Plane) -> Plane:
-    """From ``start``, by least squares on inverse depth with weights 1 / |residual|, in the first view."""
+    """Improve ``start`` by least squares on inverse depth with weights 1 / |residual|, in the first view."""
     rays, depth = pixels.rays[pixels.first_view], pixels.depth[pixels.first_view]
     origin = pixels.origins[pixels.first_view][0]
     rows = depth[:, None] * rays
     height = float(start.heights(origin))
-    # The paper's start may pass through the camera, where inverse depth has no value.
+    # The paper's start may pass through the camera, where inverse depth is infinite.
     m = -start.normal / (height if abs(height) > 1e-9 else 1e-9)
     for _ in range(50):
         residual = rows @ m - 1.0
@@ -191,7 +190,7 @@ def _refined(pixels: _Pixels, start: Plane, loss: Callable[[float], tuple], *, r
     for _ in range(rounds):
         first, second = plane.tangents()
         base = plane
-        # Tilts act about the middle of the points, so that the three unknowns hardly depend on each other.
+        # Tilts are about the middle of the points, so that the three unknowns are nearly independent.
         middle = np.median(pixels.points, axis=0)
         reach = max(float(np.median(np.linalg.norm(pixels.points - middle, axis=1))), 1e-12)
 
@@ -207,7 +206,7 @@ def _refined(pixels: _Pixels, start: Plane, loss: Callable[[float], tuple], *, r
             normal = normal / np.linalg.norm(normal)
             return Plane(normal, float(-(middle @ normal) + base.heights(middle) + x[2] * reach))
 
-        name, scale = loss(max(_scale(np.abs(pixels.residuals(plane))), _LEAST_NOISE))
+        name, scale = loss(max(_scale(np.abs(pixels.residuals(plane))), _MIN_NOISE))
         found = least_squares(
             lambda x, of=of: pixels.residuals(of(x)), np.zeros(3), loss=name, f_scale=scale, x_scale=0.01
         )
@@ -216,10 +215,10 @@ def _refined(pixels: _Pixels, start: Plane, loss: Callable[[float], tuple], *, r
 
 
 def _scale(residual: np.ndarray) -> float:
-    """Standard deviation of the better part of absolute residuals; never 0.
+    """Standard deviation of the inliers among absolute residuals; never 0.
 
-    The median alone would be half too large where three tenths are outliers: it starts lower, and then is taken over
-    what lies within two deviations (whose median is 0.638 of one).
+    The median alone would be 50 % too large if three tenths are outliers: it starts from a lower quantile, and is then
+    taken over residuals within two deviations (whose median is 0.638 of one).
     """
     scale = max(float(np.quantile(residual, 0.3)) / 0.566, 1e-7)
     for _ in range(10):

@@ -1,4 +1,4 @@
-"""Planes of a capture that nobody has marked: what an object rests on, from a click or a box alone."""
+"""Search for the unmarked plane under an object, from a click or a box alone."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ _TRIALS = 1500
 _SAMPLE = 4000
 _MIN_OPACITY = 0.3
 _BAND = 0.03
-"""Of the radius looked at: what lies nearer to the plane is taken for part of it. With 0.06 the single views of a real
-table disagreed by 0.8 degree, with 0.03 by 0.3."""
+"""Fraction of the search radius. Points nearer to the plane belong to it. With 0.06, single views of a real table
+disagreed by 0.8 degree, with 0.03 by 0.3."""
 _VIEWS = 8
-"""Pictures that a plane is fitted to."""
+"""Maximum number of pictures to which a plane is fitted."""
 _MIN_SUPPORT = 0.005
-"""Of the visible surface that lies level: less is no plane but an accident."""
+"""Fraction of the visible level surface. A plane with less support is an accident."""
 _CELL = 0.1
-"""Of the object's size: cells of the grid on which a plane must be one patch."""
+"""Fraction of the object's size: side of the cells on which a plane must be one patch."""
 _COVERED = 0.3
-"""Of a cell, for it to be part of the patch."""
+"""Fraction of a cell that must be covered for it to belong to the patch."""
 
 
 @dataclass(frozen=True)
 class FoundPlane:
-    """A flat place, and how much of the surface lies in it."""
+    """A plane and the share of the surface that lies in it."""
 
     plane: Plane
     support: float
@@ -51,39 +51,47 @@ def find_planes(
     thickness: float | None = None,
     seed: int = 0,
 ) -> list[FoundPlane]:
-    """Up to ``count`` planes within ``tilt_degrees`` of level, widest first, by random sampling over opaque Gaussians.
+    """Find up to ``count`` planes within ``tilt_degrees`` of level by random sampling over opaque Gaussians, largest
+    support first.
 
-    A Gaussian counts with its opacity and the area of its broad side. ``thickness`` (scene units; default 1 % of the
-    extent) is how far from a plane its Gaussians may lie; each plane takes its Gaussians away before the next is
-    sought. The list is empty where nothing is flat.
+    A Gaussian is weighted by its opacity and the area of its broad side. The Gaussians of each plane are removed before
+    the next search. The list is empty if nothing is flat.
+
+    Args:
+        cloud: the capture.
+        up: (3,) up direction.
+        count: maximum number of planes.
+        tilt_degrees: maximum angle to level.
+        thickness: maximum distance of Gaussians from their plane, scene units; 1 % of the extent by default.
+        seed: seed of the random numbers.
     """
     random = np.random.default_rng(seed)
     means, opacity = cloud.means.numpy().astype(np.float64), cloud.opacities()
     scales = np.sort(np.exp(cloud.log_scales.numpy().astype(np.float64)), axis=1)
     area = opacity * scales[:, 1] * scales[:, 2]
-    # A few blurs behind everything would outweigh the rest.
+    # A few blurred Gaussians behind everything would outweigh the rest.
     area = np.minimum(area, np.quantile(area, 0.95))
-    left = np.flatnonzero((opacity >= _MIN_OPACITY) & (area > 0.0))
-    if len(left) < 10:
+    rest = np.flatnonzero((opacity >= _MIN_OPACITY) & (area > 0.0))
+    if len(rest) < 10:
         return []
-    low, high = np.quantile(means[left], [0.02, 0.98], axis=0)
+    low, high = np.quantile(means[rest], [0.02, 0.98], axis=0)
     band = thickness or 0.01 * float(np.linalg.norm(high - low))
     up = np.asarray(up, float) / np.linalg.norm(up)
-    total = float(area[left].sum())
+    total = float(area[rest].sum())
     found: list[FoundPlane] = []
     for _ in range(count):
-        if len(left) < 10:
+        if len(rest) < 10:
             break
-        few = random.choice(left, min(_SAMPLE, len(left)), replace=False, p=area[left] / area[left].sum())
+        few = random.choice(rest, min(_SAMPLE, len(rest)), replace=False, p=area[rest] / area[rest].sum())
         plane = _best_plane(means[few], up, np.cos(np.radians(tilt_degrees)), band, random)
         if plane is None:
             break
-        near = np.abs(plane.heights(means[left])) < band
-        plane = _levelled(means[left[near]], area[left[near]], up, plane)
-        near = np.abs(plane.heights(means[left])) < 2.0 * band
-        support = float(area[left[np.abs(plane.heights(means[left])) < band]].sum()) / total
+        near = np.abs(plane.heights(means[rest])) < band
+        plane = _levelled(means[rest[near]], area[rest[near]], up, plane)
+        near = np.abs(plane.heights(means[rest])) < 2.0 * band
+        support = float(area[rest[np.abs(plane.heights(means[rest])) < band]].sum()) / total
         found.append(FoundPlane(plane, support))
-        left = left[~near]
+        rest = rest[~near]
     return sorted(found, key=lambda one: -one.support)
 
 
@@ -101,7 +109,7 @@ def _best_plane(
         return None
     normals, through = normals[level], a[level]
     offsets = -np.einsum("ij,ij->i", normals, through)
-    # The share of points nearby, counted softly: a plane half inside the band is half as good.
+    # The number of points nearby, weighted smoothly: a plane half inside the band scores half.
     scores = np.array(
         [
             np.clip(1.0 - ((points @ normal + offset) / band) ** 2, 0.0, None).sum()
@@ -113,7 +121,7 @@ def _best_plane(
 
 
 def _levelled(points: np.ndarray, weights: np.ndarray, up: np.ndarray, start: Plane) -> Plane:
-    """Weighted least squares through ``points``."""
+    """Weighted least-squares plane through ``points``."""
     if len(points) < 3:
         return start
     centre = weights @ points / weights.sum()
@@ -127,17 +135,17 @@ def _levelled(points: np.ndarray, weights: np.ndarray, up: np.ndarray, start: Pl
 def plane_under(
     planes: Sequence[FoundPlane], lowest: np.ndarray, *, tolerance: float, least_share: float = 0.1
 ) -> Plane | None:
-    """The highest of ``planes`` that lies below the point ``lowest`` (3,), or no more than ``tolerance`` above it.
+    """Return the highest of ``planes`` that lies below the point ``lowest`` (3,), or at most ``tolerance`` above it.
 
-    Planes with less than ``least_share`` of the widest one's support do not count. None where there is no such plane.
+    Planes with less than ``least_share`` of the largest support are ignored. None if there is no such plane.
     """
     if not planes:
         return None
-    most = max(one.support for one in planes)
+    largest = max(one.support for one in planes)
     below = [
         (float(one.plane.heights(lowest)), one.plane)
         for one in planes
-        if one.support >= least_share * most and one.plane.heights(lowest) > -tolerance
+        if one.support >= least_share * largest and one.plane.heights(lowest) > -tolerance
     ]
     return min(below, key=lambda entry: entry[0])[1] if below else None
 
@@ -151,9 +159,9 @@ def refine_plane(
     radius: float,
     object_mask: np.ndarray | None = None,
 ) -> PlaneFit:
-    """``plane`` fitted anew to the depth of ``cloud`` rendered by ``cameras``, Eq. (18), (19).
+    """Refit ``plane`` to the depth of ``cloud`` rendered by ``cameras``, Eq. (18), (19).
 
-    The masks are those of ``plane_views``. Raises ``UserError`` where no camera sees the plane.
+    The masks are those of ``plane_views``. Raises ``UserError`` if no camera sees the plane.
     """
     surfaces = _surfaces(cloud, plane, cameras, radius, object_mask)
     views = _masked(surfaces, plane, centre, radius, _BAND * radius)
@@ -162,9 +170,9 @@ def refine_plane(
             "plane: none in sight: no camera sees it around the object; give other cameras, or leave them out"
         )
     fit = fit_plane(views)
-    # Heights over a plane that is hardly tilted any more.
-    again = _masked(surfaces, fit.plane, centre, radius, _BAND * radius)
-    return fit_plane(again) if again else fit
+    # Heights over a plane that is already nearly aligned.
+    realigned = _masked(surfaces, fit.plane, centre, radius, _BAND * radius)
+    return fit_plane(realigned) if realigned else fit
 
 
 def plane_views(
@@ -177,11 +185,11 @@ def plane_views(
     object_mask: np.ndarray | None = None,
     band: float | None = None,
 ) -> list[PlaneView]:
-    """Pictures of the surroundings of ``centre`` (3,) in which the plane is masked.
+    """Return pictures of the surroundings of ``centre`` (3,) in which the plane is masked.
 
     The masks are the pixels whose rendered point (``SeenSurface``) lies within ``band`` (default 3 % of ``radius``) of
-    the plane and within ``radius`` of ``centre`` along it, less those of ``object_mask`` (n,) bool Gaussians. Cameras
-    below the plane, and those that see nothing of it, do not count; of more than eight, some are picked evenly.
+    the plane and within ``radius`` of ``centre`` along it, without those of ``object_mask`` (n,) bool Gaussians.
+    Cameras below the plane, and those that see nothing of it, are ignored; of more than eight, some are picked evenly.
     """
     surfaces = _surfaces(cloud, plane, cameras, radius, object_mask)
     return _masked(surfaces, plane, centre, radius, band or _BAND * radius)
@@ -191,7 +199,12 @@ def _surfaces(
     cloud: GaussianCloud, plane: Plane, cameras: Sequence[Camera], radius: float, object_mask: np.ndarray | None
 ) -> list[SeenSurface]:
     above = [camera for camera in cameras if plane.heights(camera.centre) > 0.1 * radius]
-    # The object is left out of the picture only where it is known: its foot would bend the plane up.
+    # The object is removed from the picture only if it is known: its foot would bend the plane upwards.
+    if object_mask is not None and object_mask.all():
+        raise UserError(
+            f"segment: all {cloud.count} Gaussians of the capture are the object, so no plane is in sight; give the"
+            " plane, or mark less of the capture"
+        )
     bare = cloud if object_mask is None else cloud.subset(~object_mask)
     return [SeenSurface.of(bare, camera) for camera in above[:: max(1, -(-len(above) // _VIEWS))]]
 
@@ -212,12 +225,12 @@ def _masked(
 
 
 def near_plane(cloud: GaussianCloud, plane: Plane, thickness: float) -> np.ndarray:
-    """(n,) bool: Gaussians whose mean is within ``thickness`` (scene units) of the plane."""
+    """(n,) bool, Gaussians whose mean is within ``thickness`` (scene units) of the plane."""
     return np.abs(plane.heights(cloud.means.numpy())) < thickness
 
 
 def lies_along(cloud: GaussianCloud, plane: Plane | HeightField) -> np.ndarray:
-    """(n,) bool: flat Gaussians that lie along ``plane``, at whatever height, as a floor's do."""
+    """(n,) bool, flat Gaussians parallel to ``plane``, at any height, as a floor's are."""
     scales = cloud.log_scales.numpy()
     turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
     thin = np.take_along_axis(turns, scales.argmin(axis=1)[:, None, None], axis=2)[:, :, 0]
@@ -226,8 +239,8 @@ def lies_along(cloud: GaussianCloud, plane: Plane | HeightField) -> np.ndarray:
 
 
 def further_planes(cloud: GaussianCloud, plane: Plane, size: float, count: int) -> list[FoundPlane]:
-    """At most ``count`` other planes level with ``plane``, widest first."""
-    # Without this, slices of walls and of the object count, too.
+    """Return at most ``count`` other planes parallel to ``plane``, largest support first."""
+    # Otherwise slices of walls and of the object would count, too.
     lying = lies_along(cloud, plane)
     if not lying.any():
         return []
@@ -242,8 +255,11 @@ def further_planes(cloud: GaussianCloud, plane: Plane, size: float, count: int) 
 
 
 def _is_one_patch(level: GaussianCloud, plane: Plane, cell: float) -> bool:
-    """Whether one patch of well covered cells (scene units) holds most of what lies near ``plane``."""
-    near = level.subset(near_plane(level, plane, 0.5 * cell))
+    """True if one patch of well covered cells (scene units) contains most of the surface near ``plane``."""
+    chosen = near_plane(level, plane, 0.5 * cell)
+    if not chosen.any():
+        return False
+    near = level.subset(chosen)
     flat = near.means.numpy() @ np.stack(plane.tangents(), axis=1)
     area = near.opacities() * np.exp(np.sort(near.log_scales.numpy(), axis=1)[:, 1:].sum(axis=1))
     place = np.floor((flat - flat.min(axis=0)) / cell).astype(int)

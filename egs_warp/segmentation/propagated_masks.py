@@ -1,6 +1,5 @@
-"""Masks from clicks in many views: a network marks the object where it was clicked on, and what the marks so far mean
-is carried into the next view and marked there anew (as SA3D, Cen et al. 2023, does).
-"""
+"""Masks from clicks in many views: a network segments the object where it was clicked, and the selected Gaussians are
+rendered into the next view and segmented there again (as in SA3D, Cen et al. 2023)."""
 
 from __future__ import annotations
 
@@ -21,19 +20,19 @@ from egs_warp.segmentation.selection_masks import masks_from_selection
 from egs_warp.segmentation.votes import MaskedView, votes_of_masks
 
 _SIDE = 800
-"""Pixels of the pictures that are marked."""
-_LEAST = 0.002
-"""Of a picture: where less of the object shows, it is not marked."""
+"""Longer side of the segmented pictures, pixels."""
+_MIN_VISIBLE_FRACTION = 0.002
+"""Fraction of a picture. If less of the object is visible, the picture is not segmented."""
 _PROMPTS = 3
-"""Places of what is carried that the network is told."""
-_CARRIED, _LARGER = 0.5, 3.0
-"""A mask that holds less of what was carried, or would be so much larger than every mask before it at the object's
-distance, is of something else.
-"""
-_MOST, _ALIKE = 0.6, 0.5
-"""Of a picture: what stands out is less than this. And by how much of both a mask and what all mean overlap."""
+"""Number of points inside the propagated mask that prompt the network."""
+_MIN_COVERED_FRACTION, _MAX_AREA_RATIO = 0.5, 3.0
+"""Fractions: minimum share of the propagated mask that a new mask must contain, and maximum ratio of its area to that
+of every earlier mask at the object's distance. Otherwise it shows something else."""
+_MAX_SALIENT_FRACTION, _MIN_OVERLAP = 0.6, 0.5
+"""Fraction of a picture, the maximum of a salient region; and the minimum overlap (intersection over union) of a mask
+with the consensus of all."""
 _HIDDEN = 0.03
-"""Of the depth: a click that lies so far behind what a view shows is out of its sight."""
+"""Fraction of the depth. A click farther behind the surface that a view shows is not visible there."""
 
 
 def masks_of_clicks(
@@ -45,11 +44,20 @@ def masks_of_clicks(
     count: int = 8,
     progress: Callable[[int, int], object] = lambda done, of: None,
 ) -> list[MaskedView]:
-    """Masks in the views that were clicked in, then in others of ``cameras``, well apart, up to ``count`` in all; the
-    pictures are renders of ``cloud``. ``progress`` is told how many are looked at.
+    """Return masks in the clicked views, then in others of ``cameras``, well apart, up to ``count`` in all.
 
-    A view whose mask does not fit what the others mean is left out. Raises ``UserError`` where nothing on the object
-    was clicked on, and where the network marks nothing there.
+    The pictures are renders of ``cloud``. A view whose mask contradicts the others is left out.
+
+    Args:
+        cloud: the capture.
+        clicks: clicks on and beside the object.
+        cameras: further views.
+        model: the network.
+        count: maximum number of views.
+        progress: called with the number of processed views and of all views.
+
+    Raises:
+        UserError: no click is on the object, or the network finds nothing there.
     """
     seen: dict[int, tuple[Camera, list[Click]]] = {}
     for click in clicks:
@@ -57,7 +65,7 @@ def masks_of_clicks(
             seen.setdefault(id(click.camera), (click.camera, []))[1].append(click)
     first = [(camera, own) for camera, own in seen.values() if any(click.inside for click in own)]
     if not first:
-        raise UserError("object: no click on it for the network to go by; click on it in a photo")
+        raise UserError("object: the network needs a click on it; click on it in a photo")
     others = _well_apart([camera for camera, _ in first], cameras, max(0, count - len(first)))
     masks = []
     for number, (camera, own) in enumerate(first):
@@ -68,11 +76,13 @@ def masks_of_clicks(
         if mask.any():
             masks.append(MaskedView(small, mask, f"view {number}"))
     if not masks:
-        raise UserError("object: the network marks nothing where it was clicked on; click elsewhere, or leave it out")
-    beside = [click for click in clicks if not click.inside]
+        raise UserError(
+            "object: the network finds nothing where it was clicked; click elsewhere, or do without the network"
+        )
+    other_clicks = [click for click in clicks if not click.inside]
     for number, camera in enumerate(others, start=len(first)):
         progress(number, len(first) + len(others))
-        mask = _propagate_mask(cloud, masks, beside, camera, model)
+        mask = _propagate_mask(cloud, masks, other_clicks, camera, model)
         if mask is not None:
             masks.append(MaskedView(*mask, f"view {number}"))
     progress(len(first) + len(others), len(first) + len(others))
@@ -82,41 +92,44 @@ def masks_of_clicks(
 def salient_masks(
     cloud: GaussianCloud, cameras: Sequence[Camera], model: SalientModel, *, count: int = 12
 ) -> list[MaskedView]:
-    """What stands out of renders of ``cloud`` through ``count`` of ``cameras``, well apart; views in which that is
-    something else than in most are left out. Raises ``UserError`` where nothing stands out.
+    """Return salient regions in renders of ``cloud`` through ``count`` of ``cameras``, well apart.
+
+    Views that contradict most others are left out. Raises ``UserError`` if nothing is salient.
     """
     views = []
     for number, camera in enumerate([*cameras[:1], *_well_apart(cameras[:1], cameras, count - 1)]):
         picture, small = _picture(cloud, camera)
         views.append(MaskedView(small, model.mask(picture), f"view {number}"))
-    views = [view for view in views if _LEAST < view.mask.mean() < _MOST]
+    views = [view for view in views if _MIN_VISIBLE_FRACTION < view.mask.mean() < _MAX_SALIENT_FRACTION]
     if not views:
-        raise UserError("object: nothing stands out of the pictures; click on it")
-    wanted, _ = labels_of_votes(votes_of_masks(cloud, views))
-    shown = masks_from_selection(cloud, wanted, [view.camera for view in views])
-    alike = [
-        (own.mask & view.mask).sum() > _ALIKE * (own.mask | view.mask).sum()
-        for own, view in zip(shown, views, strict=True)
+        raise UserError("object: nothing is salient in the pictures; click on it")
+    selected, _ = labels_of_votes(votes_of_masks(cloud, views))
+    projected = masks_from_selection(cloud, selected, [view.camera for view in views])
+    agreeing = [
+        (own.mask & view.mask).sum() > _MIN_OVERLAP * (own.mask | view.mask).sum()
+        for own, view in zip(projected, views, strict=True)
     ]
-    return [view for view, fits in zip(views, alike, strict=True) if fits] or views
+    return [view for view, fits in zip(views, agreeing, strict=True) if fits] or views
 
 
 def _propagate_mask(
-    cloud: GaussianCloud, masks: Sequence[MaskedView], beside: Sequence[Click], camera: Camera, model: ClickModel
+    cloud: GaussianCloud, masks: Sequence[MaskedView], other_clicks: Sequence[Click], camera: Camera, model: ClickModel
 ) -> tuple[Camera, np.ndarray] | None:
-    """The mask of a further view, and its camera; None where it would be of something else."""
-    wanted, _ = labels_of_votes(votes_of_masks(cloud, masks))
+    """Return the mask of a further view, and its camera; None if it would show something else."""
+    selected, _ = labels_of_votes(votes_of_masks(cloud, masks))
     picture, small = _picture(cloud, camera)
-    shown = masks_from_selection(cloud, wanted, [small])[0].mask
-    if shown.mean() < _LEAST:
+    projected = masks_from_selection(cloud, selected, [small])[0].mask
+    if projected.mean() < _MIN_VISIBLE_FRACTION:
         return None
-    inside = _innermost(shown, _PROMPTS)
-    outside = _in_sight(cloud, [click.point for click in beside], small)
+    inside = _innermost(projected, _PROMPTS)
+    outside = _in_sight(cloud, [click.point for click in other_clicks], small)
     points = np.concatenate([inside, outside])
     mask = model.mask(picture, points, np.arange(len(points)) < len(inside))
-    middle = cloud.means.numpy()[wanted].mean(axis=0)
+    middle = cloud.means.numpy()[selected].mean(axis=0)
     before = max(_size(one.mask, one.camera, middle) for one in masks)
-    fits = (mask & shown).sum() > _CARRIED * shown.sum() and _size(mask, small, middle) < _LARGER * before
+    fits = (mask & projected).sum() > _MIN_COVERED_FRACTION * projected.sum() and _size(
+        mask, small, middle
+    ) < _MAX_AREA_RATIO * before
     return (small, mask) if fits else None
 
 
@@ -130,19 +143,18 @@ def _picture(cloud: GaussianCloud, camera: Camera) -> tuple[np.ndarray, Camera]:
     return np.clip(render_gaussians(cloud, small).colour.numpy(), 0.0, 1.0).astype(np.float32), small
 
 
-def _well_apart(taken: Sequence[Camera], cameras: Sequence[Camera], count: int) -> list[Camera]:
-    """``count`` of ``cameras``, each the furthest from all before, then in an order of small steps from what is
-    ``taken``, for what is carried changes little from one to the next.
-    """
-    left = [camera for camera in cameras if all(camera is not one for one in taken)]
-    places = [camera.centre for camera in taken]
+def _well_apart(chosen_before: Sequence[Camera], cameras: Sequence[Camera], count: int) -> list[Camera]:
+    """Return ``count`` of ``cameras``, each chosen farthest from all before, then ordered by small steps from
+    ``chosen_before``, because the mask changes little between neighbouring views."""
+    left = [camera for camera in cameras if all(camera is not one for one in chosen_before)]
+    places = [camera.centre for camera in chosen_before]
     chosen: list[Camera] = []
     for _ in range(min(count, len(left))):
         away = [min(float(np.linalg.norm(camera.centre - place)) for place in places) for camera in left]
         chosen.append(left.pop(int(np.argmax(away))))
         places.append(chosen[-1].centre)
     ordered: list[Camera] = []
-    near = [camera.centre for camera in taken]
+    near = [camera.centre for camera in chosen_before]
     while chosen:
         away = [min(float(np.linalg.norm(camera.centre - place)) for place in near) for camera in chosen]
         ordered.append(chosen.pop(int(np.argmin(away))))
@@ -151,7 +163,8 @@ def _well_apart(taken: Sequence[Camera], cameras: Sequence[Camera], count: int) 
 
 
 def _innermost(mask: np.ndarray, count: int) -> np.ndarray:
-    """(k, 2) pixels: the innermost place of ``mask`` (H, W), then that of what is further from it than its depth."""
+    """(k, 2) pixels: the innermost point of ``mask`` (H, W), then repeatedly the innermost of the rest, farther from it
+    than twice its depth."""
     places = []
     depth = depth_inside(np.pad(mask, 1))[1:-1, 1:-1]
     rows, columns = np.indices(mask.shape)
@@ -170,14 +183,14 @@ def _in_sight(cloud: GaussianCloud, points: Sequence[np.ndarray], camera: Camera
     if not points:
         return np.zeros((0, 2))
     depth = SeenSurface.of(cloud, camera).depth
-    found = []
+    pixels = []
     for point in points:
         x, y, z = camera.rotation @ point + camera.translation
         if z <= camera.near:
             continue
         u, v = camera.cx + camera.fx * x / z, camera.cy + camera.fy * y / z
         if 0.0 <= u < camera.width and 0.0 <= v < camera.height:
-            shown = depth[int(v), int(u)]
-            if shown == 0.0 or z < (1.0 + _HIDDEN) * shown:
-                found.append((u, v))
-    return np.array(found).reshape(-1, 2)
+            projected = depth[int(v), int(u)]
+            if projected == 0.0 or z < (1.0 + _HIDDEN) * projected:
+                pixels.append((u, v))
+    return np.array(pixels).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Pictures of where chosen Gaussians show, as masks."""
+"""Masks of selected Gaussians, by rendering."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from egs_warp.segmentation.votes import MaskedView
 
 
 def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: Sequence[Camera]) -> list[MaskedView]:
-    """Masks of where the Gaussians ``selection`` (n,) bool make up more than half of what shows,
-    through ``cameras``.
-    """
+    """Render masks where the Gaussians ``selection`` (n,) bool make up more than half of the picture, through
+    ``cameras``."""
     sh = np.zeros((cloud.count, 1, 3), np.float32)
     sh[:, 0, :] = np.where(selection, 0.5, -0.5)[:, None] / SH_BAND_0
     painted = GaussianCloud.from_numpy(

@@ -1,4 +1,5 @@
-"""What an object stands on in a room, where the widest plane is another: the level surface that goes on around it."""
+"""Search for the support of an object in a room whose widest plane is another one: the level surface that extends
+around it."""
 
 from __future__ import annotations
 
@@ -14,26 +15,26 @@ from egs_warp.segmentation.object_spec import Segmentation
 from egs_warp.segmentation.plane_search import find_planes, lies_along
 
 _LEVELS = 4
-"""Halvings of the capture's half diagonal: how far about a point planes are looked for."""
-_LEAST_SUPPORT = 0.1
-"""Of what lies level so near to a point: less is no table."""
+"""Number of halvings of the capture's half diagonal, the radius about a point in which planes are searched."""
+_MIN_SUPPORT = 0.1
+"""Minimum share of the level surface near a point; a plane with less is no table."""
 _THICKNESS = 0.02
-"""Of that distance."""
+"""Fraction of that radius."""
 _LEVEL_DEGREES = 5.0
 _CELL = 0.03
-"""Of the object's size."""
+"""Fraction of the object's size."""
 _APRON = 3
-"""Cells about the object's outline in which the surface must go on; the cell at the outline does not count."""
+"""Width in cells of the apron around the object's outline in which the surface must continue; the cell at the outline
+does not count."""
 _COVERED = 0.3
-"""Of a cell, for the surface to be there."""
+"""Fraction of a cell that must be covered by the surface."""
 _NEAR = 0.03
-"""Of the object's size: what is further from the plane is not of it."""
+"""Fraction of the object's size. Gaussians farther from the plane do not belong to it."""
 
 
 def planes_below(cloud: GaussianCloud, up: np.ndarray, point: np.ndarray) -> list[Plane]:
-    """Level planes below ``point`` (3,) among what lies within a half, a quarter, ... of the capture's size of it, the
-    highest first.
-    """
+    """Return level planes below ``point`` (3,), from the surroundings of half, a quarter, ... of the capture's size,
+    highest first."""
     means, opaque = cloud.means.numpy().astype(np.float64), cloud.opacities() > 0.3
     if not opaque.any():
         return []
@@ -52,24 +53,25 @@ def planes_below(cloud: GaussianCloud, up: np.ndarray, point: np.ndarray) -> lis
             cloud.subset(near), up, count=2, tilt_degrees=_LEVEL_DEGREES, thickness=_THICKNESS * reach
         ):
             height = float(one.plane.heights(point))
-            if height > 0.0 and one.support > _LEAST_SUPPORT:
+            if height > 0.0 and one.support > _MIN_SUPPORT:
                 found.append((height, one.plane))
     return [plane for _, plane in sorted(found, key=lambda entry: entry[0])]
 
 
-def surface_around(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> float:
-    """Share, 0 to 1, of the surroundings of the object's outline on ``plane`` in which a surface lies along it."""
-    cell, tangents = _CELL * found.size, np.stack(plane.tangents(), axis=1)
+def surface_around(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> float:
+    """Return the fraction, 0 to 1, of the surroundings of the object's outline on ``plane`` that a parallel surface
+    covers."""
+    cell, tangents = _CELL * segmentation.size, np.stack(plane.tangents(), axis=1)
     means = cloud.means.numpy().astype(np.float64)
     heights, flat = plane.heights(means), means @ tangents
-    low = found.object_mask & (heights < FOOTPRINT_HEIGHT * found.size)
+    low = segmentation.object_mask & (heights < FOOTPRINT_HEIGHT * segmentation.size)
     if not low.any():
         return 0.0
     corner = flat[low].min(axis=0) - 2.0 * _APRON * cell
     shape = np.ceil((flat[low].max(axis=0) + 2.0 * _APRON * cell - corner) / cell).astype(int) + 1
     middles = corner + cell * (np.indices(tuple(shape)).reshape(2, -1).T + 0.5)
     foot = enclosed(middles, flat[low], cell).reshape(shape)
-    surface = lies_along(cloud, plane) & (np.abs(heights) < _NEAR * found.size) & ~found.object_mask
+    surface = lies_along(cloud, plane) & (np.abs(heights) < _NEAR * segmentation.size) & ~segmentation.object_mask
     place = np.floor((flat - corner) / cell).astype(int)
     surface &= ((place >= 0) & (place < shape)).all(axis=1)
     area = 2.0 * np.pi * cloud.opacities() * np.exp(np.sort(cloud.log_scales.numpy(), axis=1)[:, 1:].sum(axis=1))

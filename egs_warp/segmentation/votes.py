@@ -1,4 +1,4 @@
-"""How much each Gaussian shows inside and outside a mask: its blending weight, summed over pixels.
+"""Votes of masks for each Gaussian: its blending weight inside and outside a mask, summed over pixels.
 
 See docs/concepts/segmentation.md.
 """
@@ -23,45 +23,45 @@ from egs_warp.render.rasteriser import background_of, translate_out_of_memory
 
 @dataclass(frozen=True)
 class MaskedView:
-    """One picture in which somebody, or a segmenter, has marked the object."""
+    """A picture in which a user or a network has marked the object."""
 
     camera: Camera
     mask: np.ndarray
     """(H, W) bool, True on the object."""
     name: str = "mask"
-    """For messages."""
+    """Name for messages."""
 
 
 @dataclass(frozen=True)
 class Votes:
-    """Sums over the pixels of all views, in pixels."""
+    """Blending weights summed over the pixels of all views, in pixels."""
 
     inside: np.ndarray
     """(n,) float64 blending weight inside the masks."""
     outside: np.ndarray
     """(n,) float64 blending weight outside the masks."""
     unhidden: np.ndarray
-    """(n,) float64 blending weight if nothing else stood in the way."""
+    """(n,) float64 blending weight without occlusion."""
 
     def share_inside(self) -> np.ndarray:
-        """(n,) 0 to 1; 0.5 for Gaussians that no view shows."""
+        """(n,) 0 to 1, share of the weight inside the masks; 0.5 for Gaussians that no view shows."""
         total = self.inside + self.outside
         return np.where(total > 0.0, self.inside / np.maximum(total, 1e-30), 0.5)
 
     def share_seen(self) -> np.ndarray:
-        """(n,) 0 to 1: how much of the Gaussian is not hidden."""
+        """(n,) 0 to 1, visible share of each Gaussian."""
         return np.minimum((self.inside + self.outside) / np.maximum(self.unhidden, 1e-30), 1.0)
 
 
 def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
-    """Blending weight of each Gaussian summed over the pixels inside and outside the masks.
+    """Sum the blending weight of each Gaussian over the pixels inside and outside the masks.
 
     A Gaussian's blending weight in a pixel is the derivative of the pixel's colour by the Gaussian's own. So the votes
-    are the colour gradient of a picture that counts masked pixels in red and the others in green, as the renderer's
-    backward kernels find it. Raises ``UserError`` for masks of another size than their cameras.
+    are the colour gradient of a picture that weights masked pixels in red and the others in green, computed by the
+    renderer's backward kernels. Raises ``UserError`` for masks of another size than their cameras.
     """
     sums = np.zeros((cloud.count, 3))
-    # One grey for all: colours are not clipped, and bands above 0 cost nothing.
+    # The same grey for all: colours are not clipped, and SH bands above 0 are not needed.
     grey = GaussianCloud(
         cloud.means,
         cloud.rotations,
@@ -76,9 +76,9 @@ def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
 
 
 def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
-    """Votes of the masks that mark anything: where the object is out of sight its mask is empty, and says nothing.
+    """Sum the votes of all masks that are not empty: a mask is empty where the object is out of sight, and is ignored.
 
-    Raises ``UserError`` for masks of another size than their cameras', where all are empty, and where their cameras see
+    Raises ``UserError`` for masks of another size than their cameras', if all are empty, and if their cameras see
     nothing.
     """
     for view in masks:
@@ -93,7 +93,7 @@ def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
 
 
 def check_size(view: MaskedView) -> None:
-    """Raises ``UserError`` for a mask of another size than its camera's picture."""
+    """Raise ``UserError`` for a mask of another size than its camera's picture."""
     height, width = view.camera.height, view.camera.width
     if view.mask.shape != (height, width):
         raise UserError(
@@ -110,9 +110,9 @@ def _votes_of_view(grey: GaussianCloud, masked: MaskedView) -> np.ndarray:
     with translate_out_of_memory(grey, masked.camera):
         projected = project(grey, view, antialiased=False, threads=threads)
         behind = background_of((0.0, 0.0, 0.0), masked.camera, grey.device)
-        begun = PendingImage(projected, view, background=behind, threads=threads).result()
+        rendered = PendingImage(projected, view, background=behind, threads=threads).result()
         gradients = backward(
-            *(grey, view, projected, begun.lists, begun.image),
+            *(grey, view, projected, rendered.lists, rendered.image),
             colour_gradient=wp.array(colour, dtype=wp.vec3, device=grey.device),
             alpha_gradient=None,
             depth_gradient=None,

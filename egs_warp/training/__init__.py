@@ -1,12 +1,12 @@
-"""Training through the renderer, with PyTorch: fine-tuning, photographs and what starts from them.
+"""Training through the renderer, with PyTorch: fine-tuning, and training from photographs.
 
-In: a cloud and views to match. Out: a cloud that matches them. The losses of L_seg (Eq. 21) and of the filled floor use
-it.
+Input: a cloud and views to match. Output: a cloud that matches them. Also used for L_seg (Eq. 21) and for the filled
+floor. The kernels are in ``egs_warp/kernels/training``.
 """
 
 from importlib.util import find_spec
 
 
 def has_torch() -> bool:
-    """Whether training is possible."""
+    """Return True if PyTorch is installed."""
     return find_spec("torch") is not None

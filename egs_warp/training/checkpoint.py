@@ -1,4 +1,4 @@
-"""Training that was cut off goes on: all that lasts from one step to the next, in one file, now and then.
+"""Checkpoints of a training run: its complete state in one file, written from time to time.
 
 The file is an ``.npz`` without pickled objects: arrays by name, all else as JSON under ``facts``. Python writes a float
 as the shortest text that reads back to the same bits.
@@ -23,34 +23,34 @@ from egs_warp.io.atomic import atomic_write
 from egs_warp.version import __version__
 
 SECONDS = 30.0
-"""Between two of them, at least."""
+"""Minimum time between two checkpoints, s."""
 _SHARE = 0.05
-"""Of the time that may go into writing them."""
+"""Maximum fraction of the time spent on writing checkpoints."""
 
 State = dict[str, Any]
-"""Arrays, and what JSON can tell."""
+"""Arrays, and values that JSON can represent."""
 
 
 class Checkpoint:
-    """The file of one training."""
+    """Checkpoint file of one training run."""
 
     def __init__(self, path: Path, *, resume: bool = False) -> None:
-        """With ``resume`` the training goes on from what ``path`` holds; else that is written over."""
+        """With ``resume`` the training continues from the checkpoint at ``path``; otherwise the file is overwritten."""
         self.path = path
         self._resume = resume
         self._digest = ""
         self._last, self._pause = time.monotonic(), SECONDS
 
     def begin(self, digest: str) -> State | None:
-        """What a training of this ``digest`` goes on from; None where it begins.
+        """Return the state from which the training with this ``digest`` continues; None for a new one.
 
-        Raises ``UserError`` where the file cannot be read, or is of a training of other input.
+        Raises ``UserError`` if the file cannot be read or belongs to a training with other input.
         """
         self._digest = digest
         if not self._resume:
             return None
         if not self.path.is_file():
-            raise UserError(f"{self.path}: no training was cut off here; begin it")
+            raise UserError(f"{self.path}: no checkpoint of an interrupted training here; start without resuming")
         try:
             state: State = dict(read_npz(self.path))
             facts = json.loads(str(state.pop("facts")))
@@ -58,31 +58,31 @@ class Checkpoint:
                 raise ValueError("other arrays than were written")
             state |= facts["state"]
         except (*READ_ERRORS, RecursionError) as error:
-            raise UserError(f"{self.path}: is damaged; begin the training again") from error
+            raise UserError(f"{self.path}: the checkpoint is damaged; start the training again") from error
         if facts.get("digest") != digest:
             raise UserError(
-                f"{self.path}: is of other photos, other flags or another version of egs-warp; begin the training again"
+                f"{self.path}: it is of other photos, flags or another version of egs-warp; start the training again"
             )
         return state
 
     def due(self) -> bool:
-        """Whether it is time to write it again."""
+        """Return True if the next checkpoint is due."""
         return time.monotonic() - self._last >= self._pause
 
     def write(self, state: State) -> None:
-        """Keep ``state`` in place of what the file held."""
-        began = time.monotonic()
+        """Replace the content of the file by ``state``."""
+        start = time.monotonic()
         arrays = {name: value for name, value in state.items() if isinstance(value, np.ndarray)}
         others = {name: value for name, value in state.items() if name not in arrays}
         facts = json.dumps({"digest": self._digest, "arrays": sorted(arrays), "state": others})
         with atomic_write(self.path) as temporary, open(temporary, "wb") as file:
             np.savez(file, facts=np.array(facts), **arrays)  # pyright: ignore[reportArgumentType]
         self._last = time.monotonic()
-        self._pause = max(SECONDS, (self._last - began) / _SHARE)
+        self._pause = max(SECONDS, (self._last - start) / _SHARE)
 
 
 def digest_of(arrays: Iterable[np.ndarray | None], cameras: Iterable[Camera], options: object) -> str:
-    """What tells a training from another: its pictures and first cloud, its ``cameras``, its ``options``."""
+    """Return a digest of a training's input: its pictures and first cloud, its ``cameras``, its ``options``."""
     content = hashlib.sha256(f"{__version__} {options!r}".encode())
     for camera in cameras:
         for one in fields(camera):

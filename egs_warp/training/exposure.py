@@ -1,4 +1,4 @@
-"""Exposure and white balance of each photo, found together with what the photos show."""
+"""Exposure and white balance of each photo, optimised together with the cloud."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import torch
 from egs_warp.training.checkpoint import State
 
 _RATE, _LAST_RATE = 1e-2, 1e-4
-"""Step of Adam at the start and at the end."""
-_PULL = 1e-2
-"""Weight of the squared distance from the mean tone: what all photos share belongs to the cloud."""
+"""Learning rate of Adam at the start and at the end."""
+_REGULARIZATION = 1e-2
+"""Weight of the squared distance from the mean colour map: what all photos share belongs to the cloud."""
 
 
 class ExposureModel:
-    """One affine map of colours (3, 4) for each view, their mean held at the identity.
+    """One affine colour map (3, 4) for each view; their mean is fixed at the identity.
 
-    Without that gauge a darker cloud under brighter tones would be as good. The views are stepped by Adam one by one:
-    one that is not seen does not drift.
+    Without that constraint, a darker cloud with brighter maps would fit equally well. Adam updates the views one by
+    one, so that a view that is not rendered does not drift.
     """
 
     def __init__(self, count: int, steps: int, device: str) -> None:
@@ -29,16 +29,17 @@ class ExposureModel:
         self._identity = torch.eye(3, 4, device=device)
 
     def tensor_for(self, number: int) -> torch.Tensor:
-        """(3, 4) the tone of view ``number``, a leaf whose gradient ``step`` takes."""
+        """(3, 4) colour map of view ``number``, a leaf tensor whose gradient ``step`` uses."""
         self._leaf = leaf = (self._identity + self._offsets[number]).requires_grad_()
         return leaf
 
     @torch.no_grad()
     def step(self, number: int, step: int) -> None:
-        """Move the tone of view ``number`` along its gradient, and all such that their mean stays."""
+        """Update the map of view ``number`` by its gradient, then shift all maps so that their mean stays the
+        identity."""
         gradient = self._leaf.grad
         assert gradient is not None
-        gradient = gradient + 2 * _PULL * self._offsets[number]
+        gradient = gradient + 2 * _REGULARIZATION * self._offsets[number]
         self._visits[number] += 1
         visits = self._visits[number]
         first = self._first[number].lerp_(gradient, 0.1)
@@ -49,16 +50,16 @@ class ExposureModel:
         self._offsets -= self._offsets.mean(dim=0)
 
     def state(self) -> State:
-        """All that lasts from step to step."""
+        """Return the state for a checkpoint."""
         arrays = {"offsets": self._offsets, "first": self._first, "second": self._second}
         return {name: tensor.cpu().numpy().copy() for name, tensor in arrays.items()} | {"visits": self._visits}
 
     def restore(self, state: State) -> None:
-        """Go on from ``state``."""
+        """Restore the ``state`` of a checkpoint."""
         for name, tensor in (("offsets", self._offsets), ("first", self._first), ("second", self._second)):
             tensor.copy_(torch.from_numpy(state[name]))
         self._visits = list(state["visits"])
 
     def matrices(self) -> np.ndarray:
-        """(views, 3, 4) float64."""
+        """(views, 3, 4) float64 colour maps."""
         return (self._identity + self._offsets).double().cpu().numpy()

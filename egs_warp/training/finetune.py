@@ -1,6 +1,6 @@
-"""The one training loop: Gaussians fitted to pictures (Kerbl et al. 2023; relocation after Kheradmand et al. 2024).
+"""The training loop: Gaussians fitted to pictures (Kerbl et al. 2023; relocation after Kheradmand et al. 2024).
 
-Imports torch, so import it only where something is trained.
+Imports torch, so import it only where a training runs.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from egs_warp.training.photo_loss import PhotoLoss, Target
 from egs_warp.training.relocation import Population
 
 MIN_LOG_SCALE = -10.0
-"""Scales are kept at e^-10 or above, as in the paper."""
+"""Minimum log scale: scales are at least e^-10, as in the paper."""
 _UNSEEN_STEPS = 20
-"""Steps on a GPU between two looks at the losses."""
+"""On a GPU, the losses are downloaded once in this number of steps."""
 
 
 class Densification(enum.Enum):
-    """How the number and places of Gaussians may change."""
+    """Changes to the number and positions of Gaussians."""
 
     NONE = "none"
-    """The same Gaussians throughout."""
+    """No changes."""
     RELOCATION = "relocation"
-    """Faint Gaussians move to where opaque ones are, the number grows to a cap, and means are jittered (MCMC)."""
+    """Faint Gaussians move to opaque ones, the number grows to a cap, and means are jittered (MCMC)."""
 
 
 @dataclass(frozen=True)
@@ -50,16 +50,17 @@ class TrainingView:
     image: np.ndarray
     """(H, W, 3) float32, 0 to 1, display-referred."""
     alpha: np.ndarray | None = None
-    """(H, W) float32; where given, ``image`` holds colours not yet laid over a background."""
+    """(H, W) float32; if given, ``image`` is not yet composited over a background."""
     weight: np.ndarray | None = None
-    """(H, W) float32 at least 0, how much each pixel counts in the L1 loss; without it all count alike."""
+    """(H, W) float32, nonnegative weight of each pixel in the L1 loss; None weights all alike."""
     name: str = ""
-    """Of the photo, for messages."""
+    """Name of the photo, for messages."""
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Step sizes of Adam by attribute; that of the means is times the scene's extent and decays to a hundredth."""
+    """Learning rates of Adam by attribute. That of the means is multiplied by the scene's extent and decays to a
+    hundredth."""
 
     means: float = 1.6e-4
     rotations: float = 1e-3
@@ -71,23 +72,23 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class FinetuneOptions:
-    """Everything that may be chosen about a training run."""
+    """Options of a training run."""
 
     iterations: int = 1000
     rates: LearningRates = field(default_factory=LearningRates)
     ssim_weight: float = 0.2
     """Loss = (1 - w) L1 + w (1 - SSIM)."""
     background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
-    """One colour; None draws a random one each step, which needs views with alpha to make sense."""
+    """Background colour. None draws a random one in each step, which requires views with alpha."""
     densification: Densification = Densification.NONE
     max_gaussians: int | None = 100_000
-    """The cap that relocation grows to; None grows while the pictures gain by it."""
+    """Number to which relocation grows the cloud. None grows it while the loss decreases by it."""
     sh_steps: int = 0
-    """Steps after which the next degree of SH begins; 0 trains all from the start."""
+    """Steps after which the next SH degree is trained; 0 trains all degrees from the start."""
     fit_exposure: bool = False
-    """Each view has an exposure and white balance of its own, found with the cloud."""
+    """Each view has its own exposure and white balance, optimised with the cloud."""
     exclude_outliers: bool = False
-    """Views that never fit the others are left out on the way."""
+    """Views that do not fit the others are excluded during the training."""
     antialiased: bool = False
     seed: int = 0
     threads: int | None = None
@@ -95,7 +96,7 @@ class FinetuneOptions:
 
 @dataclass(frozen=True)
 class GaussianTensors:
-    """The parameters under training, as leaf tensors in the terms of ``GaussianCloud``."""
+    """Parameters under training, as leaf tensors with the conventions of ``GaussianCloud``."""
 
     means: torch.Tensor
     """(n, 3)."""
@@ -113,15 +114,16 @@ class GaussianTensors:
 
 @dataclass(frozen=True)
 class FinetuneResult:
-    """What training gave."""
+    """Result of a training run."""
 
     cloud: GaussianCloud
     losses: np.ndarray
-    """(iterations,) float64."""
+    """(iterations,) float64, loss of each step."""
     tones: np.ndarray | None = None
-    """(views, 3, 4) float64: each view's colours are these times the cloud's and 1; None unless asked for."""
+    """(views, 3, 4) float64: the colours of each view are these times (the cloud's colours, 1). None without
+    ``fit_exposure``."""
     misfits: tuple[int, ...] = ()
-    """Numbers of the views that were left out."""
+    """Indices of the excluded views."""
 
 
 ExtraLoss = Callable[[GaussianTensors], torch.Tensor]
@@ -138,13 +140,23 @@ def finetune(
     resume: bool = False,
     progress: Callable[[int, float], None] | None = None,
 ) -> FinetuneResult:
-    """Fit ``cloud`` to ``views`` by Adam, one view a step in shuffled rounds; a new cloud on the same device.
+    """Fit ``cloud`` to ``views`` by Adam, one view a step in shuffled rounds.
 
-    ``extra_loss`` adds to the loss from the parameters themselves (``L_seg`` of Eq. 21, for one). ``trainable`` (n,)
-    bool picks the Gaussians that may change; it cannot be combined with relocation. ``checkpoint`` (.npz) is written
-    every half a minute, and gone on from with ``resume``, on a CPU to the bits of a run that was not cut off.
-    ``progress`` is called with the step's number and loss. Raises ``UserError`` for views that do not fit their
-    cameras, for a loss that is not finite and for a checkpoint of anything else.
+    Args:
+        cloud: start of the training; unchanged.
+        views: pictures with cameras.
+        options: see ``FinetuneOptions``.
+        extra_loss: additional loss of the parameters, for example ``L_seg`` of Eq. (21).
+        trainable: (n,) bool, Gaussians that may change; cannot be combined with relocation.
+        checkpoint: .npz file, written about every half minute.
+        resume: continue from ``checkpoint``; on a CPU, the result has the same bits as that of an uninterrupted run.
+        progress: called with the index and loss of each step.
+
+    Returns:
+        The new cloud, on the same device, and the losses.
+
+    Raises:
+        UserError: a view does not fit its camera, the loss is not finite, or the checkpoint is of another training.
     """
     options = options or FinetuneOptions()
     _check(cloud, views, options, trainable)
@@ -159,24 +171,26 @@ def finetune(
     targets = [_target(view, device) for view in views]
     tones = ExposureModel(len(views), options.iterations, device) if options.fit_exposure else None
     photo_loss = PhotoLoss(options.ssim_weight, device, options.threads)
-    misfits = OutlierViews(len(views))
+    outlier_views = OutlierViews(len(views))
     growth = Growth(len(views), options.max_gaussians, device)
     losses = np.zeros(options.iterations)
     pending: list[tuple[int, int, torch.Tensor]] = []
-    # Asking a GPU for a loss waits for it: the losses of many steps are fetched at once.
-    patience = 1 if device == "cpu" else _UNSEEN_STEPS
+    # Reading a loss synchronises with the GPU: the losses of many steps are downloaded at once.
+    losses_per_download = 1 if device == "cpu" else _UNSEEN_STEPS
     queue: list[int] = []
-    lasting = {"population": population, "misfits": misfits, "growth": growth} | ({"tones": tones} if tones else {})
-    kept = None if checkpoint is None else Checkpoint(Path(checkpoint), resume=resume)
-    saved = None if kept is None else kept.begin(_digest(cloud, views, options))
+    stateful = {"population": population, "misfits": outlier_views, "growth": growth} | (
+        {"tones": tones} if tones else {}
+    )
+    checkpoint_file = None if checkpoint is None else Checkpoint(Path(checkpoint), resume=resume)
+    saved = None if checkpoint_file is None else checkpoint_file.begin(_digest(cloud, views, options))
     if saved is not None:
         order.bit_generator.state, queue = saved["order"], list(saved["queue"])
         losses[: saved["step"]] = saved["losses"]
-        for name, part in lasting.items():
-            part.restore(_below(saved, name))
+        for name, part in stateful.items():
+            part.restore(_part_of(saved, name))
     for step in range(0 if saved is None else int(saved["step"]), options.iterations):
         if not queue:
-            fitting = [number for number in range(len(views)) if number not in misfits.found]
+            fitting = [number for number in range(len(views)) if number not in outlier_views.indices]
             queue = [fitting[i] for i in order.permutation(len(fitting))]
         number = queue.pop()
         target = targets[number]
@@ -214,8 +228,8 @@ def finetune(
             tones.step(number, step)
         with torch.no_grad():
             population.tensors["log_scales"].clamp_(min=MIN_LOG_SCALE)
-        if len(pending) >= patience or step + 1 == options.iterations:
-            for at, seen, value in zip(
+        if len(pending) >= losses_per_download or step + 1 == options.iterations:
+            for at, viewed, value in zip(
                 *([p[k] for p in pending] for k in (0, 1)), torch.stack([p[2] for p in pending]).tolist(), strict=True
             ):
                 losses[at] = value
@@ -223,34 +237,34 @@ def finetune(
                     raise UserError(
                         f"finetune: the loss is not finite at step {at}; lower the rates or check the views"
                     )
-                misfits.update(seen, value)
+                outlier_views.update(viewed, value)
                 growth.see(value, len(tensors.means))
                 if progress is not None:
                     progress(at, value)
             pending.clear()
             if options.exclude_outliers:
-                misfits.find(step / options.iterations)
+                outlier_views.find(step / options.iterations)
         if relocating:
             population.relocate(step, options.iterations, growth)
-        if kept is not None and not pending and kept.due():
+        if checkpoint_file is not None and not pending and checkpoint_file.due():
             state = {"step": step + 1, "losses": losses[: step + 1], "order": order.bit_generator.state, "queue": queue}
-            for name, part in lasting.items():
+            for name, part in stateful.items():
                 state |= {f"{name}/{key}": value for key, value in part.state().items()}
-            kept.write(state)
+            checkpoint_file.write(state)
     return FinetuneResult(
-        _cloud(population.tensors), losses, None if tones is None else tones.matrices(), tuple(misfits.found)
+        _cloud(population.tensors), losses, None if tones is None else tones.matrices(), tuple(outlier_views.indices)
     )
 
 
 def _digest(cloud: GaussianCloud, views: Sequence[TrainingView], options: FinetuneOptions) -> str:
-    """What tells this training from another."""
+    """Return the digest that identifies this training."""
     first = [getattr(cloud, one.name).numpy() for one in fields(cloud)]
     pictures = [array for view in views for array in (view.image, view.alpha, view.weight)]
     return digest_of([*first, *pictures], [view.camera for view in views], options)
 
 
-def _below(state: State, name: str) -> State:
-    """The part ``name`` of a whole ``state``."""
+def _part_of(state: State, name: str) -> State:
+    """Return the state of the part ``name`` in a whole ``state``."""
     return {key.removeprefix(f"{name}/"): value for key, value in state.items() if key.startswith(f"{name}/")}
 
 
@@ -261,7 +275,7 @@ def render_views(
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
     antialiased: bool = False,
 ) -> list[TrainingView]:
-    """Renders of the capture itself, to train against where the photos are not at hand."""
+    """Render the capture itself, as training views if there are no photos."""
     return [
         TrainingView(
             camera,
@@ -274,16 +288,16 @@ def render_views(
 
 
 def cameras_extent(cameras: Sequence[Camera]) -> float:
-    """1.1 times the radius in which nine cameras in ten lie: a few wrong poses far away do not blow it up."""
+    """Return 1.1 times the radius that contains nine cameras in ten, so that a few wrong poses far away do not enlarge
+    it."""
     centres = np.array([camera.centre for camera in cameras])
     radius = float(np.quantile(np.linalg.norm(centres - np.median(centres, axis=0), axis=1), 0.9))
     return 1.1 * radius if radius > 0 else 1.0
 
 
 def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
-    """Length that the step size of the means is measured by:
-    1.1 times the cameras' radius, or the cloud's if smaller.
-    """
+    """Return the length by which the learning rate of the means is scaled: 1.1 times the cameras' radius, or twice the
+    mean radius of the cloud if that is smaller."""
     centres = np.array([camera.centre for camera in cameras])
     of_cameras = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     means = cloud.means.numpy()
@@ -306,12 +320,12 @@ def _loss(target: Target, picture: torch.Tensor, background: Sequence[float], ss
     if target.alpha is not None:
         alpha = target.alpha[:, :, None]
         image = image * alpha + (1 - alpha) * torch.tensor(background, device=image.device)
-    off = (picture - image).abs()
+    difference = (picture - image).abs()
     if target.weight is not None:
-        off = off * target.weight[:, :, None]
-        # What does not count must not reach the windows of the similarity either.
+        difference = difference * target.weight[:, :, None]
+        # Pixels of weight 0 must not enter the windows of SSIM either.
         picture = torch.where(target.weight[:, :, None] > 0, picture, image)
-    loss = (1 - ssim_weight) * off.mean()
+    loss = (1 - ssim_weight) * difference.mean()
     if ssim_weight > 0:
         loss = loss + ssim_weight * (1 - ssim(picture, image))
     return loss
@@ -331,12 +345,12 @@ def _check(
         ):
             if values is not None and (values.shape != expected or not np.isfinite(values).all()):
                 raise UserError(
-                    f"finetune: {name} of view {number} has shape {values.shape}, expected {expected} and finite"
+                    f"finetune: {name} of view {number} has shape {values.shape}, expected {expected} and finite values"
                 )
     if trainable is not None and np.shape(trainable) != (cloud.count,):
         raise UserError(f"finetune: trainable has shape {np.shape(trainable)}, expected ({cloud.count},)")
     if trainable is not None and options.densification is not Densification.NONE:
-        raise UserError("finetune: relocation moves every Gaussian; leave trainable or the densification out")
+        raise UserError("finetune: relocation moves every Gaussian; give either trainable or a densification")
 
 
 def _tensors(cloud: GaussianCloud, device: str) -> dict[str, torch.Tensor]:

@@ -1,4 +1,4 @@
-"""How many Gaussians a scene gets: as many as asked, or as long as its pictures gain by more of them."""
+"""Number of Gaussians of a scene: a given cap, or growth as long as the loss decreases by it."""
 
 from __future__ import annotations
 
@@ -9,55 +9,56 @@ import torch
 
 from egs_warp.training.checkpoint import State
 
-_LEAST_STEPS = 300
-"""Steps whose losses are compared, in whole rounds of the views."""
-_LEAST_GAIN = 0.02
-"""Relative fall of the loss for each e-fold of Gaussians below which more are not worth their time."""
+_MIN_STEPS = 300
+"""Minimum number of steps whose losses are averaged, rounded up to whole rounds of the views."""
+_MIN_GAIN = 0.02
+"""Relative decrease of the loss for each e-fold of Gaussians; below it, more Gaussians are not worth their time."""
 _WINDOWS = 2
-"""Comparisons in a row that must say so."""
+"""Consecutive comparisons with too small a gain after which growth ends."""
 _BYTES_EACH = 4000
-"""Parameters, gradients, Adam's moments, and the renderer's arrays of one Gaussian in training."""
+"""Memory of one Gaussian in training: parameters, gradients, Adam's moments, and the renderer's arrays."""
 
 
 class Growth:
-    """The cap on the number of Gaussians, which falls to what is there once the pictures no longer gain."""
+    """Cap on the number of Gaussians. Without a given cap, it is set to the current number once growth no longer
+    decreases the loss."""
 
-    def __init__(self, views: int, asked: int | None, device: str) -> None:
-        self.asked = asked
-        self.cap = asked if asked is not None else _room(device)
+    def __init__(self, views: int, requested: int | None, device: str) -> None:
+        self.requested = requested
+        self.cap = requested if requested is not None else _memory_cap(device)
         self.history: list[tuple[float, int]] = []
-        self._window = views * -(-_LEAST_STEPS // views)
+        self._window = views * -(-_MIN_STEPS // views)
         self._losses: list[float] = []
         self._idle = 0
 
     def see(self, loss: float, count: int) -> None:
-        """The loss of one more step, made with ``count`` Gaussians."""
+        """Record the loss of one step, made with ``count`` Gaussians."""
         self._losses.append(loss)
         if len(self._losses) < self._window:
             return
         self.history.append((float(np.mean(self._losses)), count))
         self._losses.clear()
-        if self.asked is not None or len(self.history) < 2:
+        if self.requested is not None or len(self.history) < 2:
             return
         (before, few), (after, many) = self.history[-2:]
         if many > few:
             worth = (1 - after / before) / np.log(many / few)
-            self._idle = self._idle + 1 if worth < _LEAST_GAIN else 0
+            self._idle = self._idle + 1 if worth < _MIN_GAIN else 0
         if self._idle >= _WINDOWS:
             self.cap = min(self.cap, count)
 
     def state(self) -> State:
-        """All that lasts from step to step."""
+        """Return the state for a checkpoint."""
         return {"cap": self.cap, "history": self.history, "recent": self._losses, "idle": self._idle}
 
     def restore(self, state: State) -> None:
-        """Go on from ``state``."""
+        """Restore the ``state`` of a checkpoint."""
         self.cap, self._losses, self._idle = int(state["cap"]), list(state["recent"]), int(state["idle"])
         self.history = [(float(loss), int(count)) for loss, count in state["history"]]
 
 
-def _room(device: str) -> int:
-    """Gaussians for which half of the free memory is enough."""
+def _memory_cap(device: str) -> int:
+    """Return the number of Gaussians that fit into half of the free memory."""
     if device.startswith("cuda"):
         free = torch.cuda.mem_get_info(torch.device(device))[0]
     else:

@@ -1,6 +1,6 @@
-"""What training from photos begins with: Gaussians where the photos agree.
+"""Initial cloud of a training from photos: Gaussians where the photos agree.
 
-Imports torch through ``egs_warp.training.finetune``, so import it only where something is trained.
+Imports torch through ``egs_warp.training.finetune``, so import it only where a training runs.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from egs_warp.io.colmap import SparsePoints
 from egs_warp.training.finetune import TrainingView
 
 LEAST_POINTS = 500
-"""Fewer triangulated points are not a scene to begin with."""
+"""Minimum number of triangulated points from which a training starts."""
 _SIZE_OF_POINT, _OPACITY_OF_POINT = 1.0, 0.1
-"""Standard deviation over the spacing, and opacity, that a triangulated point begins with."""
+"""Initial standard deviation, in spacings, and initial opacity of a triangulated point."""
 
 
 def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
-    """(3,) the point nearest to all optical axes, in the least-squares sense."""
+    """(3,) point nearest to all optical axes, in the least-squares sense."""
     centres = np.array([camera.centre for camera in cameras])
     axes = np.array([camera.rotation[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -34,10 +34,11 @@ def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
 def initial_cloud(
     views: Sequence[TrainingView], *, count: int, sh_degree: int, seed: int = 0, device: str | None = None
 ) -> GaussianCloud:
-    """``count`` round Gaussians, spread evenly over the region that most cameras see, in the colours they see there.
+    """Create ``count`` round Gaussians, spread evenly over the region that most cameras see, in the colours they see
+    there.
 
-    Of many random points those are kept on whose colour the views agree best, and where all views have alpha only those
-    inside of all silhouettes: a rough visual and photometric hull.
+    Of many random points, those on whose colour the views agree best are chosen. If all views have alpha, only points
+    inside all silhouettes are used: a rough visual and photometric hull.
     """
     centres = np.array([view.camera.centre for view in views])
     focus = middle_of([view.camera for view in views])
@@ -46,25 +47,25 @@ def initial_cloud(
     random = np.random.default_rng(seed)
     low, high = focus - distance * min(float(reach), 1.0), focus + distance * min(float(reach), 1.0)
     points = random.uniform(low, high, (8 * count, 3))
-    sight = _Visibility.of(points, views)
-    if sight.solid.any():
-        # The object may fill little of what the cameras see: look again, around it alone.
+    visibility = _Visibility.of(points, views)
+    if visibility.solid.any():
+        # The object may fill little of the cameras' common view: sample again, around the object alone.
         margin = 0.05 * (high - low)
-        low, high = points[sight.solid].min(axis=0) - margin, points[sight.solid].max(axis=0) + margin
+        low, high = points[visibility.solid].min(axis=0) - margin, points[visibility.solid].max(axis=0) + margin
         points = random.uniform(low, high, (8 * count, 3))
-        sight = _Visibility.of(points, views)
-    kept = np.flatnonzero(sight.solid if sight.solid.any() else sight.often)
-    if len(kept) == 0:
-        raise UserError("train: the cameras do not look at a place in common; check the poses")
-    # Empty space before a plain backdrop agrees as well as a surface does; half of the points are kept at random.
-    best = kept[np.argsort(sight.spread[kept], kind="stable")][: count // 2]
-    rest = random.permutation(np.setdiff1d(kept, best))[: count - len(best)]
+        visibility = _Visibility.of(points, views)
+    candidates = np.flatnonzero(visibility.solid if visibility.solid.any() else visibility.often)
+    if len(candidates) == 0:
+        raise UserError("train: the cameras have no common view; check the poses")
+    # Empty space before a plain backdrop agrees as well as a surface does, so half of the points are chosen at random.
+    best = candidates[np.argsort(visibility.spread[candidates], kind="stable")][: count // 2]
+    rest = random.permutation(np.setdiff1d(candidates, best))[: count - len(best)]
     chosen = np.concatenate([best, rest])
     means = points[chosen]
-    volume = float(np.prod(high - low)) * len(kept) / len(points)
+    volume = float(np.prod(high - low)) * len(candidates) / len(points)
     spacing = 0.5 * (volume / len(means)) ** (1 / 3)
     sh = np.zeros((len(means), (sh_degree + 1) ** 2, 3))
-    sh[:, 0] = (sight.colour[chosen] - 0.5) / SH_BAND_0
+    sh[:, 0] = (visibility.colour[chosen] - 0.5) / SH_BAND_0
     return GaussianCloud.from_numpy(
         means,
         np.tile([1.0, 0, 0, 0], (len(means), 1)),
@@ -78,14 +79,15 @@ def initial_cloud(
 def cloud_from_points(
     points: SparsePoints, *, count: int | None, sh_degree: int, seed: int = 0, device: str | None = None
 ) -> GaussianCloud:
-    """Round Gaussians at ``points``, at most ``count`` of them, each as large as its three nearest are far."""
+    """Create round Gaussians at ``points``, at most ``count`` of them, each as large as the distance to its three
+    nearest neighbours."""
     positions, colours = points.positions, points.colours
     if count is not None and len(positions) > count:
         chosen = np.sort(np.random.default_rng(seed).permutation(len(positions))[:count])
         positions, colours = positions[chosen], colours[chosen]
     near = KDTree(positions).query(positions, k=4)[0][:, 1:]
     spacing = np.sqrt(np.mean(near**2, axis=1))
-    # Points on one spot have no room at all.
+    # Coincident points have no spacing.
     spacing = np.maximum(spacing, 1e-3 * np.median(spacing))
     sh = np.zeros((len(positions), (sh_degree + 1) ** 2, 3))
     sh[:, 0] = (colours - 0.5) / SH_BAND_0
@@ -101,16 +103,16 @@ def cloud_from_points(
 
 @dataclass(frozen=True)
 class _Visibility:
-    """How all views together see each of n points."""
+    """Colour and visibility of n points in all views together."""
 
     colour: np.ndarray
-    """(n, 3) mean over the views that see it."""
+    """(n, 3) mean over the views that see the point."""
     spread: np.ndarray
     """(n,) standard deviation of the colour."""
     often: np.ndarray
-    """(n,) bool: seen by at least half as many views as any other point."""
+    """(n,) bool, seen by at least half as many views as any other point."""
     solid: np.ndarray
-    """(n,) bool: seen often, and inside of the silhouettes; nowhere, unless all views have alpha."""
+    """(n,) bool, seen often, and inside the silhouettes; all False unless all views have alpha."""
 
     @classmethod
     def of(cls, points: np.ndarray, views: Sequence[TrainingView]) -> _Visibility:
@@ -137,6 +139,6 @@ class _Visibility:
             colour=mean,
             spread=np.sqrt(np.maximum(squares / known[:, None] - mean**2, 0).sum(axis=1)),
             often=often,
-            # One mask in ten may cut a little off.
+            # One mask in ten may miss a part.
             solid=often & (alpha > 0.9 * known),
         )

@@ -1,4 +1,4 @@
-"""How alike two pictures are."""
+"""Image metrics: SSIM, PSNR and colour matching."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import torch
 
 
 def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Mean structural similarity of two pictures (H, W, 3) in 0 to 1:
-    11 x 11 Gaussian window, sigma 1.5, zero padding.
-    """
+    """Mean structural similarity of two pictures (H, W, 3) in 0 to 1: 11 x 11 Gaussian window, sigma 1.5, zero
+    padding."""
     offsets = torch.arange(-5.0, 6.0, device=a.device)
     line = torch.exp(-(offsets**2) / (2 * 1.5**2))
     line = line / line.sum()
@@ -29,25 +28,27 @@ def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def ssim_of(a: np.ndarray, b: np.ndarray, known: np.ndarray | None = None) -> float:
-    """``ssim`` of two pictures (H, W, 3); where not ``known`` (H, W) they count as equal."""
+    """``ssim`` of two pictures (H, W, 3); pixels that are not ``known`` (H, W) count as equal."""
     if known is not None:
         a = np.where(known[:, :, None], a, b)
     return float(ssim(torch.as_tensor(a, dtype=torch.float32), torch.as_tensor(b, dtype=torch.float32)))
 
 
 def psnr(a: np.ndarray, b: np.ndarray, known: np.ndarray | None = None) -> float:
-    """Peak signal to noise ratio in dB of two pictures (H, W, 3) in 0 to 1 where ``known`` (H, W); at most 100."""
-    off = (a.astype(np.float64) - b) ** 2
-    return float(-10.0 * np.log10(max(float(np.mean(off if known is None else off[known])), 1e-10)))
+    """Peak signal-to-noise ratio in dB of two pictures (H, W, 3) in 0 to 1 over the ``known`` (H, W) pixels; at most
+    100."""
+    squared_error = (a.astype(np.float64) - b) ** 2
+    return float(-10.0 * np.log10(max(float(np.mean(squared_error if known is None else squared_error[known])), 1e-10)))
 
 
 def match_tone(photo: np.ndarray, picture: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
-    """(H, W, 3) ``picture`` under the affine map of colours that brings it nearest to ``photo`` where ``known`` (H, W).
+    """(H, W, 3) ``picture`` under the affine colour map that best fits it to ``photo`` over the ``known`` (H, W)
+    pixels.
 
-    Removes what exposure and white balance differ, as is usual before photos are judged that were not trained on:
-    twelve numbers fitted to the whole photo.
+    It removes differences of exposure and white balance, as is common when photos that were not trained on are
+    evaluated: twelve numbers fitted to the whole photo.
     """
-    wanted, seen = (of.reshape(-1, 3) if known is None else of[known] for of in (photo, picture))
+    target, seen = (of.reshape(-1, 3) if known is None else of[known] for of in (photo, picture))
     rows = np.column_stack([seen, np.ones(len(seen))]).astype(np.float64)
-    mixing = np.linalg.lstsq(rows.T @ rows, rows.T @ wanted.astype(np.float64), rcond=None)[0]
+    mixing = np.linalg.lstsq(rows.T @ rows, rows.T @ target.astype(np.float64), rcond=None)[0]
     return (picture @ mixing[:3] + mixing[3]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Photos that do not fit the others, by what is left of them when all others fit.
+"""Outlier photos: those whose loss stays high when all others fit.
 
 Their pose is wrong, or something moved.
 """
@@ -10,49 +10,52 @@ import numpy as np
 from egs_warp.training.checkpoint import State
 
 _JUDGED_AT = (0.3, 0.5, 0.7)
-"""Shares of the steps."""
+"""Fractions of the steps after which outliers are searched."""
 _LAST_VISITS = 3
 _TIMES_MEDIAN = 1.8
 _SPREADS = 3.0
-"""Robust standard deviations of the logarithm."""
-_MOST = 0.1
-"""Share of the photos that may be left out: where more do not fit, it is not they."""
+"""Robust standard deviations of the logarithm of the loss."""
+_MAX_EXCLUDED_FRACTION = 0.1
+"""Maximum fraction of the photos that may be excluded."""
 
 
 class OutlierViews:
-    """Watches the losses of all views; ``found`` are those to leave out."""
+    """Records the losses of all views; ``indices`` are those of the views to exclude."""
 
     def __init__(self, count: int) -> None:
-        self.found: list[int] = []
+        self.indices: list[int] = []
         self._losses: list[list[float]] = [[] for _ in range(count)]
         self._judged = 0
 
     def update(self, number: int, loss: float) -> None:
-        """The loss of view ``number`` at one more visit."""
+        """Record the loss of view ``number`` at one visit."""
         self._losses[number].append(loss)
 
     def find(self, done: float) -> None:
-        """At three times on the way (``done`` is the share of the steps) find the views that stay behind."""
+        """Search for views with high losses, at three times during the training; ``done`` is the fraction of the
+        steps."""
         if self._judged == len(_JUDGED_AT) or done < _JUDGED_AT[self._judged]:
             return
         self._judged += 1
-        numbers = [n for n, seen in enumerate(self._losses) if n not in self.found and len(seen) >= _LAST_VISITS]
+        numbers = [n for n, losses in enumerate(self._losses) if n not in self.indices and len(losses) >= _LAST_VISITS]
         values = np.array([np.mean(self._losses[n][-_LAST_VISITS:]) for n in numbers])
-        room = int(_MOST * len(self._losses)) - len(self.found)
+        remaining = int(_MAX_EXCLUDED_FRACTION * len(self._losses)) - len(self.indices)
         worst = np.array(numbers)[is_outlier(values)]
-        self.found += sorted(worst.tolist(), key=lambda n: -np.mean(self._losses[n][-_LAST_VISITS:]))[: max(room, 0)]
+        self.indices += sorted(worst.tolist(), key=lambda n: -np.mean(self._losses[n][-_LAST_VISITS:]))[
+            : max(remaining, 0)
+        ]
 
     def state(self) -> State:
-        """All that lasts from step to step."""
-        return {"found": self.found, "losses": self._losses, "judged": self._judged}
+        """Return the state for a checkpoint."""
+        return {"found": self.indices, "losses": self._losses, "judged": self._judged}
 
     def restore(self, state: State) -> None:
-        """Go on from ``state``."""
-        self.found, self._losses, self._judged = list(state["found"]), state["losses"], int(state["judged"])
+        """Restore the ``state`` of a checkpoint."""
+        self.indices, self._losses, self._judged = list(state["found"]), state["losses"], int(state["judged"])
 
 
 def is_outlier(losses: np.ndarray) -> np.ndarray:
-    """(n,) bool of the ``losses`` (n,) that lie far above the others; nowhere among fewer than eight."""
+    """(n,) bool, True for ``losses`` (n,) that are far above the others; all False for fewer than eight."""
     if len(losses) < 8:
         return np.zeros(len(losses), bool)
     logarithms = np.log(np.maximum(losses, 1e-12))

@@ -1,4 +1,4 @@
-"""Photographs in the colours of a capture."""
+"""Photographs converted to the colours of a capture."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ if TYPE_CHECKING:
     from egs_warp.training.finetune import TrainingView
 
 _PHOTO_SIDE = 320
-"""Pixels: enough for the few Gaussians at an object's foot."""
+"""Longer side in pixels: enough for the few Gaussians at an object's foot."""
 _OPAQUE = 0.98
-"""Where less of the capture covers a pixel, it does not tell the photo's colours."""
+"""Minimum opacity of the capture at pixels from which colours are matched."""
 _MATCHING_ROUNDS, _MATCHED_PIXELS = 20, 10_000
-"""Of choosing the pixels that agree, when a photo's colours are matched to the capture's, and out of how many."""
-_OPEN = 1e-5
-"""Pull of the mixing matrix towards that of the gains alone."""
+"""Rounds of choosing the pixels that agree, and the number of pixels used, when a photo's colours are matched to the
+capture's."""
+_REGULARIZATION = 1e-5
+"""Weight that pulls the mixing matrix towards the gains of the single channels."""
 
 
 def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage]) -> list[TrainingView]:
-    """The photos beside the cameras ``posed``, reduced to ``_PHOTO_SIDE`` pixels and in the colours of ``cloud``; none
+    """Read the photos of the cameras ``posed``, reduced to ``_PHOTO_SIDE`` pixels and in the colours of ``cloud``; none
     without PyTorch."""
     if not has_torch():
         return []
@@ -41,12 +42,12 @@ def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage])
         try:
             picture = read_photo(one)
         except UserError:
-            # Whoever wants to know why asks ``train``.
+            # ``train`` reports the reason.
             continue
         small = downscale(picture.camera, _PHOTO_SIDE)
         size = (small.width, small.height)
         whole = np.rint(picture.colour * 255.0).astype(np.uint8)
-        # Blocks of whole pixels, as the camera has them: stretched to all of the photo it would be off by a pixel.
+        # Blocks of whole pixels, as in the reduced camera: resizing the whole photo would be off by up to a pixel.
         block = picture.camera.width // small.width
         used = np.ix_(range(block * small.height), range(block * small.width))
         photo = cv2.resize(whole[used], size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
@@ -61,24 +62,25 @@ def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage])
 
 
 def in_colours_of(reference: np.ndarray, photo: np.ndarray, shared: np.ndarray) -> np.ndarray:
-    """(H, W, 3) float32: ``photo`` (H, W, 3) with the exposure and white balance of ``reference`` (H, W, 3), as the
-    pixels ``shared`` (H, W) bool tell them: what is trained against it must not change colour beside what is not.
+    """(H, W, 3) float32: ``photo`` (H, W, 3) with the exposure and white balance of ``reference`` (H, W, 3), fitted to
+    the pixels ``shared`` (H, W) bool.
 
-    The three channels are mixed linearly, by least squares over the three quarters that agree best; without 100 shared
-    pixels nothing changes.
+    Training against the photo must not change colours relative to Gaussians that are not trained. The three channels
+    are mixed linearly, by least squares over the three quarters of the pixels that agree best; with fewer than 100
+    shared pixels nothing changes.
     """
     if shared.sum() < 100:
         return photo
     few = slice(None, None, -(-int(shared.sum()) // _MATCHED_PIXELS))
-    seen, wanted = photo[shared][few], reference[shared][few]
-    rows = np.column_stack([seen, np.ones(len(seen))])
-    gain = np.median(wanted, axis=0) / np.maximum(np.median(seen, axis=0), 1e-3)
+    observed, target = photo[shared][few], reference[shared][few]
+    rows = np.column_stack([observed, np.ones(len(observed))])
+    gain = np.median(target, axis=0) / np.maximum(np.median(observed, axis=0), 1e-3)
     plain = np.concatenate([np.diag(gain), np.zeros((1, 3))])
     mixing = plain
     for _ in range(_MATCHING_ROUNDS):
-        off = np.linalg.norm(rows @ mixing - wanted, axis=1)
-        agreeing = off <= np.quantile(off, 0.75)
-        chosen, rest = rows[agreeing], wanted[agreeing] - rows[agreeing] @ plain
-        # What few colours leave open stays with the gain of each channel.
-        mixing = plain + np.linalg.solve(chosen.T @ chosen + _OPEN * len(chosen) * np.eye(4), chosen.T @ rest)
+        residual = np.linalg.norm(rows @ mixing - target, axis=1)
+        agreeing = residual <= np.quantile(residual, 0.75)
+        chosen, rest = rows[agreeing], target[agreeing] - rows[agreeing] @ plain
+        # Where few colours leave the fit undetermined, the gain of each channel remains.
+        mixing = plain + np.linalg.solve(chosen.T @ chosen + _REGULARIZATION * len(chosen) * np.eye(4), chosen.T @ rest)
     return np.clip(photo @ mixing[:3] + mixing[3], 0.0, 1.0).astype(np.float32)

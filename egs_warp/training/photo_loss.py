@@ -1,4 +1,7 @@
-"""The loss of a render against a photo, in the photo's exposure: L1 and SSIM with their derivative in five launches."""
+"""Loss of a render against a photo, in the photo's exposure: L1 and SSIM with their gradient in five kernel launches.
+
+The kernels are in ``egs_warp/kernels/training/photo_loss.py``.
+"""
 
 from __future__ import annotations
 
@@ -31,13 +34,13 @@ class Target:
     image: torch.Tensor
     """(H, W, 3) float32."""
     alpha: torch.Tensor | None
-    """(H, W) float32; where given, the photo is laid over the backdrop of the step."""
+    """(H, W) float32; if given, the photo is composited over the backdrop of the step."""
     weight: torch.Tensor | None
-    """(H, W) float32, how much each pixel counts in L1; one of 0 does not count in SSIM either."""
+    """(H, W) float32, weight of each pixel in L1; pixels of weight 0 do not count in SSIM either."""
 
 
 class PhotoLoss:
-    """(1 - w) L1 + w (1 - SSIM), its scratch memory kept from step to step."""
+    """The loss (1 - w) L1 + w (1 - SSIM). Its buffers are reused from step to step."""
 
     def __init__(self, ssim_weight: float, device: str, threads: int | None) -> None:
         wp.init()
@@ -56,14 +59,22 @@ class PhotoLoss:
         target: Target,
         backdrop: tuple[float, ...],
     ) -> torch.Tensor:
-        """Loss () of a render, ``colour`` (H, W, 3) over ``backdrop`` with ``alpha`` (H, W), in the ``tone`` (3, 4).
+        """Compute the loss () of a render.
 
-        Gradients flow to the first three. The backdrop keeps its colour where the photo has alpha.
+        Gradients flow to ``colour``, ``alpha`` and ``tone``. If the photo has alpha, the colour map does not apply to
+        the backdrop.
+
+        Args:
+            colour: (H, W, 3) render over ``backdrop``.
+            alpha: (H, W) of the render.
+            tone: (3, 4) colour map of the view.
+            target: the photo.
+            backdrop: colour behind the render.
         """
         return _Loss.apply(colour, alpha, tone, target, backdrop, self)  # type: ignore[return-value]
 
     def scratch(self, pixels: int) -> dict[str, torch.Tensor]:
-        """Memory for pictures of ``pixels``."""
+        """Return the buffers for pictures of ``pixels``."""
         if pixels not in self._scratch:
             device = self.window.device
             self._scratch[pixels] = {name: torch.empty((pixels, 3), device=device) for name in _PICTURES} | {
@@ -73,7 +84,7 @@ class PhotoLoss:
 
     @property
     def nothing(self) -> torch.Tensor:
-        """Stands for an array that is not there."""
+        """Placeholder for an array that is absent."""
         return self._none
 
 
@@ -92,18 +103,18 @@ class _Loss(torch.autograd.Function):
         pixels = height * width
         cut_out = int(target.alpha is not None)
         device = wp.device_from_torch(colour.device)
-        held = task.scratch(pixels)
+        buffers = task.scratch(pixels)
         tone = tone.detach().contiguous()
         by_colour = torch.empty((pixels, 3), device=colour.device)
         by_alpha = torch.empty(pixels if cut_out else 1, device=colour.device)
         behind = torch.tensor([backdrop], device=colour.device) if cut_out else task.nothing
 
-        def of(given: torch.Tensor | None, dtype: Any = wp.vec3) -> wp.array:
-            tensor = task.nothing if given is None else given
+        def of(value: torch.Tensor | None, dtype: Any = wp.vec3) -> wp.array:
+            tensor = task.nothing if value is None else value
             count = tensor.numel() // (3 if dtype is wp.vec3 else 1)
             return wp.array(ptr=tensor.data_ptr(), dtype=dtype, shape=(count,), device=device)
 
-        at = {name: of(tensor, wp.vec3 if tensor.ndim == 2 else wp.float32) for name, tensor in held.items()}
+        at = {name: of(tensor, wp.vec3 if tensor.ndim == 2 else wp.float32) for name, tensor in buffers.items()}
         window, tones, backdrops = of(task.window, wp.float32), of(tone, wp.float32), of(behind)
         weight = (
             of(target.weight, wp.float32)
@@ -111,7 +122,7 @@ class _Loss(torch.autograd.Function):
             else wp.array(ptr=task.nothing.data_ptr(), dtype=wp.float32, shape=(1,), device=device)
         )
         colour, alpha = colour.detach().contiguous(), alpha.detach().contiguous()
-        walk = {"device": device, "threads": task.threads}
+        options = {"device": device, "threads": task.threads}
         w = task.ssim_weight
         with torch_stream(colour.device):
             launch_rows(
@@ -122,14 +133,14 @@ class _Loss(torch.autograd.Function):
                     *(of(target.image), of(target.alpha, wp.float32), weight),
                 ],
                 outputs=[at["toned"], at["photo"], at["front"], at["off"]],
-                **walk,
+                **options,
             )
             launch_rows(
                 blur_products_kernel,
                 pixels,
                 inputs=[width, window, at["toned"], at["photo"]],
                 outputs=[at["mean_a"], at["mean_b"], at["aa"], at["bb"], at["ab"]],
-                **walk,
+                **options,
             )
             launch_rows(
                 likeness_kernel,
@@ -138,14 +149,14 @@ class _Loss(torch.autograd.Function):
                     *(width, height, w, window, at["mean_a"], at["mean_b"], at["aa"], at["bb"], at["ab"], at["off"])
                 ],
                 outputs=[at["loss"], at["by_mean"], at["by_square"], at["by_product"]],
-                **walk,
+                **options,
             )
             launch_rows(
                 blur_derivatives_kernel,
                 pixels,
                 inputs=[width, window, at["by_mean"], at["by_square"], at["by_product"]],
                 outputs=[at["by_mean_rows"], at["by_square_rows"], at["by_product_rows"]],
-                **walk,
+                **options,
             )
             launch_rows(
                 gradient_kernel,
@@ -155,18 +166,18 @@ class _Loss(torch.autograd.Function):
                     *(at["by_mean_rows"], at["by_square_rows"], at["by_product_rows"]),
                 ],
                 outputs=[at["by_toned"], of(by_colour), of(by_alpha, wp.float32)],
-                **walk,
+                **options,
             )
-        # Before the scratch is used again.
-        mixing = held["by_toned"].T @ held["front"]
-        shift = held["by_toned"].T @ (alpha.reshape(-1, 1) if cut_out else torch.ones_like(held["off"][:, None]))
+        # Copied out before the buffers are used again.
+        mixing = buffers["by_toned"].T @ buffers["front"]
+        shift = buffers["by_toned"].T @ (alpha.reshape(-1, 1) if cut_out else torch.ones_like(buffers["off"][:, None]))
         by_tone = torch.cat([mixing, shift], dim=1)
         ctx.gradients = (
             by_colour.reshape(height, width, 3),
             by_alpha.reshape(height, width) if cut_out else None,
             by_tone,
         )
-        return held["loss"].mean()
+        return buffers["loss"].mean()
 
     @staticmethod
     @torch.autograd.function.once_differentiable

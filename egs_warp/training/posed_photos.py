@@ -1,6 +1,6 @@
-"""Photos with poses, read as views to train on.
+"""Photos with poses, read as training views.
 
-Imports torch through ``egs_warp.training.finetune``, so import it only where something is trained.
+Imports torch through ``egs_warp.training.finetune``, so import it only where a training runs.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ class ExcludedPhoto:
 
     name: str
     reason: str
-    """For the user: what is wrong with it."""
+    """Reason, for the user."""
 
 
 @dataclass(frozen=True)
 class PosedPhotos:
-    """What lies beside the poses."""
+    """Photos that belong to a file of poses."""
 
     views: tuple[TrainingView, ...]
-    """Photos that can be used, straightened and upright."""
+    """Usable photos, undistorted and upright."""
     left_out: tuple[ExcludedPhoto, ...]
-    """Those that cannot."""
+    """Photos that cannot be used."""
 
 
 def read_views(posed: Path | str, *, max_side: int | None = None) -> PosedPhotos:
-    """Photos and cameras (``read_photo``); photos larger than ``max_side`` pixels are reduced.
+    """Read photos and cameras (``read_photo``); photos larger than ``max_side`` pixels are reduced.
 
-    Photos that are missing, unreadable or of another shape than their camera are left out. Raises ``UserError`` where
-    none can be used.
+    Photos that are missing, unreadable or of another shape than their camera are excluded. Raises ``UserError`` if none
+    can be used.
     """
     views, left_out = [], []
     for entry in read_cameras(posed):
@@ -57,7 +57,7 @@ def read_views(posed: Path | str, *, max_side: int | None = None) -> PosedPhotos
 
 
 def laid_over(view: TrainingView, background: tuple[float, float, float]) -> TrainingView:
-    """``view`` without alpha, its picture over one colour."""
+    """Composite the picture of ``view`` over one colour; the result has no alpha."""
     if view.alpha is None:
         return view
     alpha = view.alpha[:, :, None]
@@ -66,7 +66,7 @@ def laid_over(view: TrainingView, background: tuple[float, float, float]) -> Tra
 
 
 def backdrop_colour(views: Sequence[TrainingView]) -> tuple[float, float, float]:
-    """White for photos with alpha; else the mean colour along the borders of all photos."""
+    """Return white for photos with alpha, else the mean colour along the borders of all photos."""
     if any(view.alpha is not None for view in views):
         return (1.0, 1.0, 1.0)
     rims = []

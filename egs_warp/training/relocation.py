@@ -1,6 +1,7 @@
-"""Gaussians under training as a population: Adam's state follows them as they move and multiply.
+"""Gaussians under training as a population: Adam's state follows them when they move and multiply.
 
-The relocation is that of Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo".
+The relocation is that of Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". The kernels are
+in ``egs_warp/kernels/training/population.py``.
 """
 
 from __future__ import annotations
@@ -22,22 +23,23 @@ _FAINT = 0.005
 _MAX_COPIES = 50
 _EVERY = 100
 """Steps between relocations."""
-_GROWTH = 1.05
-"""Least factor by which the number of Gaussians grows at each."""
-_GROWN_AT_BEST, _GROWN_AT_LAST = 0.3, 0.5
-"""Shares of the steps at which a cap that was asked for is reached: early where that is gentle, by half time anyway."""
-_GENTLE = 1.1
-"""Factor above which copies outrun what the photos can tell them apart by."""
-_PULL = 0.01
+_MIN_GROWTH = 1.05
+"""Minimum factor by which the number of Gaussians grows at each relocation."""
+_GENTLE_GROWTH_END, _GROWTH_DEADLINE = 0.3, 0.5
+"""Fractions of the steps at which a given cap is reached: the first if growth stays gentle, the second in any case."""
+_MAX_GENTLE_GROWTH = 1.1
+"""Growth factor above which copies are made faster than the photos can separate them."""
+_REGULARIZATION = 0.01
 """Weight of the mean opacity and of the mean scale over the extent."""
 _JITTER = 5e5
-"""Noise over the rate of the means."""
-_SETTLING_FROM, _SETTLED = 0.5, 0.1
-"""Share of the steps from which the rates of all but the means fall, and to which part."""
+"""Noise relative to the learning rate of the means."""
+_SETTLING_FROM, _FINAL_RATE = 0.5, 0.1
+"""Fraction of the steps from which the learning rates of all but the means decrease, and the fraction of the rate at
+the end."""
 
 
 class Population:
-    """Parameter tensors with one Adam for all; ``evolve`` replaces tensors, so ask ``tensors`` anew each step."""
+    """Parameter tensors with one Adam for all. ``relocate`` replaces tensors, so read ``tensors`` in each step."""
 
     def __init__(
         self,
@@ -60,19 +62,19 @@ class Population:
         )
 
     def step(self, *, done: float, settling: bool = False) -> None:
-        """One step of Adam; the rate of the means falls to a hundredth as ``done`` goes from 0 to 1.
+        """Take one step of Adam. The learning rate of the means falls to a hundredth as ``done`` goes from 0 to 1.
 
         With ``settling`` the others fall to a tenth over the last part.
         """
         late = max(0.0, done - _SETTLING_FROM) / (1 - _SETTLING_FROM) if settling else 0.0
         for group in self._optimiser.param_groups:
-            group["lr"] = self._rates[group["name"]] * (0.01**done if group["name"] == "means" else _SETTLED**late)
+            group["lr"] = self._rates[group["name"]] * (0.01**done if group["name"] == "means" else _FINAL_RATE**late)
         self._optimiser.step()
         self._optimiser.zero_grad(set_to_none=True)
 
     @torch.no_grad()
     def add_regularization(self) -> None:
-        """Add to the gradients a pull on opacities and scales: useless Gaussians fade, and can then be moved."""
+        """Add the gradient of a penalty on opacities and scales: useless Gaussians fade, and can then be moved."""
         opacities, scales = self.tensors["opacity_logits"], self.tensors["log_scales"]
         assert opacities.grad is not None and scales.grad is not None
         count = len(opacities)
@@ -80,20 +82,25 @@ class Population:
             launch_rows(
                 pull_kernel,
                 count,
-                inputs=[_PULL / count, _PULL / (3 * count * self._extent), _array(opacities), _array(scales)],
+                inputs=[
+                    _REGULARIZATION / count,
+                    _REGULARIZATION / (3 * count * self._extent),
+                    _array(opacities),
+                    _array(scales),
+                ],
                 outputs=[_array(opacities.grad), _array(scales.grad)],
                 device=wp.device_from_torch(opacities.device),
             )
 
     @torch.no_grad()
     def relocate(self, step: int, steps: int, growth: Growth) -> None:
-        """Jitter the means; now and then move faint Gaussians onto opaque ones and grow.
+        """Jitter the means; at intervals, move faint Gaussians to opaque ones and add new ones.
 
-        A cap that was asked for is reached by half time or before; else the number grows at the least pace, while
-        ``growth`` lets it.
+        A given cap is reached by half time at the latest; otherwise the number grows by the minimum factor while
+        ``growth`` allows it.
         """
         self._jitter()
-        # The last fifth of the steps settles what is there.
+        # In the last fifth of the steps the population is fixed.
         if step % _EVERY != _EVERY - 1 or step > 0.8 * steps:
             return
         opacity = torch.sigmoid(self.tensors["opacity_logits"])
@@ -104,18 +111,18 @@ class Population:
             self._share(chosen)
             for tensor in self.tensors.values():
                 tensor[places] = tensor[chosen]
-            self._forget(torch.cat([places, chosen]))
+            self._reset_moments(torch.cat([places, chosen]))
         count = len(opacity)
-        pace = _GROWTH if growth.asked is None else _pace(growth.cap / count, step, steps)
+        pace = _MIN_GROWTH if growth.requested is None else _growth_factor(growth.cap / count, step, steps)
         more = min(growth.cap, int(pace * count) + 1) - count
         if more > 0:
             chosen = self._draw(torch.sigmoid(self.tensors["opacity_logits"]), more)
             self._share(chosen)
-            self._forget(chosen)
+            self._reset_moments(chosen)
             self._append(chosen)
 
     def state(self) -> State:
-        """All that lasts from step to step: parameters, Adam's moments, random numbers."""
+        """Return the state for a checkpoint: parameters, Adam's moments, random numbers."""
         state: State = {"random": self._generator.get_state().numpy()}
         for name, tensor in self.tensors.items():
             state[name] = tensor.detach().cpu().numpy().copy()
@@ -124,13 +131,13 @@ class Population:
         return state
 
     def restore(self, state: State) -> None:
-        """Go on from ``state``."""
+        """Restore the ``state`` of a checkpoint."""
         self._generator.set_state(torch.from_numpy(state["random"]))
         for group in self._optimiser.param_groups:
             old, name = group["params"][0], group["name"]
             new = torch.from_numpy(state[name]).to(old.device).requires_grad_()
             moments = [key for key in state if key.startswith(f"{name}.")]
-            # Adam counts its steps on the host, unless it is fused.
+            # Adam stores its step count on the host, unless it is fused.
             places = {key: old.device if group["fused"] or not key.endswith(".step") else "cpu" for key in moments}
             if moments:
                 self._optimiser.state[new] = {
@@ -140,13 +147,14 @@ class Population:
             self.tensors[name] = new
 
     def _draw(self, weights: torch.Tensor, count: int) -> torch.Tensor:
-        # Not torch.multinomial, which takes at most 2^24 weights.
+        # torch.multinomial takes at most 2^24 weights.
         total = torch.cumsum(weights.double(), 0)
         spots = torch.rand(count, generator=self._generator, device=weights.device, dtype=torch.float64) * total[-1]
         return torch.searchsorted(total, spots).clamp_max(len(weights) - 1)
 
     def _share(self, chosen: torch.Tensor) -> None:
-        """Opacity and scale of each chosen Gaussian such that it and its copies together look as it did alone."""
+        """Set opacity and scale of each chosen Gaussian so that it and its copies together render like the single
+        one."""
         opacity = torch.sigmoid(self.tensors["opacity_logits"])
         copies = torch.bincount(chosen, minlength=len(opacity))
         unique = torch.nonzero(copies)[:, 0]
@@ -163,11 +171,11 @@ class Population:
         self.tensors["opacity_logits"][unique] = torch.logit(new).float()
         self.tensors["log_scales"][unique] += torch.log(old / total).float()[:, None]
 
-    def _forget(self, which: torch.Tensor) -> None:
+    def _reset_moments(self, indices: torch.Tensor) -> None:
         for tensor in self.tensors.values():
             for value in self._optimiser.state.get(tensor, {}).values():
                 if torch.is_tensor(value) and value.shape == tensor.shape:
-                    value[which] = 0.0
+                    value[indices] = 0.0
 
     def _append(self, chosen: torch.Tensor) -> None:
         for group in self._optimiser.param_groups:
@@ -183,7 +191,8 @@ class Population:
             self.tensors[group["name"]] = new
 
     def _jitter(self) -> None:
-        """Noise of each Gaussian's own shape on the faint ones' means, as published for scenes of extent 1."""
+        """Add noise with each Gaussian's own shape to the means of faint ones, scaled as published for scenes of extent
+        1."""
         rate = next(group["lr"] for group in self._optimiser.param_groups if group["name"] == "means")
         means = self.tensors["means"]
         noise = torch.randn(means.shape, generator=self._generator, device=means.device)
@@ -198,16 +207,17 @@ class Population:
             )
 
 
-def _pace(ratio: float, step: int, steps: int) -> float:
-    """Factor of growth at ``step`` of ``steps``, where there are to be ``ratio`` times as many in the end."""
+def _growth_factor(ratio: float, step: int, steps: int) -> float:
+    """Return the growth factor at ``step`` of ``steps`` if the number is to grow by ``ratio`` in total."""
     best, last = (
-        ratio ** (1 / max(1, round((share * steps - step) / _EVERY))) for share in (_GROWN_AT_BEST, _GROWN_AT_LAST)
+        ratio ** (1 / max(1, round((share * steps - step) / _EVERY)))
+        for share in (_GENTLE_GROWTH_END, _GROWTH_DEADLINE)
     )
-    return max(_GROWTH, min(best, _GENTLE), last)
+    return max(_MIN_GROWTH, min(best, _MAX_GENTLE_GROWTH), last)
 
 
 def _array(tensor: torch.Tensor) -> wp.array:
-    """The contiguous ``tensor`` (n,), (n, 3) or (n, 4) as an array of n, without a copy."""
+    """View the contiguous ``tensor`` (n,), (n, 3) or (n, 4) as a Warp array of n, without a copy."""
     dtype = {1: wp.float32, 3: wp.vec3, 4: wp.vec4}[1 if tensor.ndim == 1 else tensor.shape[1]]
     device = wp.device_from_torch(tensor.device)
     return wp.array(ptr=tensor.data_ptr(), dtype=dtype, shape=(len(tensor),), device=device)

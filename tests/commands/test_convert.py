@@ -84,10 +84,10 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         (["a.ply", "out", "--to", "spz4"], "out: give a name that ends in .spz"),
         (["a.ply", "b.ply", "--to", "compressed-ply"], "b.ply: give a name that ends in .compressed.ply"),
         (["a.ply", "b.compressed.ply", "--to", "ply"], "b.compressed.ply: give a name that ends in .ply"),
-        (["no", "out", "--to", "ply"], "no: is no folder"),
+        (["no", "out", "--to", "ply"], "no: not a folder"),
         ([".", "out", "--to", "ply"], "it has no numbered captures such as frame0001.ply"),
         (["two", "out", "--to", "ply"], "it has two sequences (a0001.ply and b0001.ply)"),
-        (["same", "out", "--to", "ply"], "two of its captures have one number"),
+        (["same", "out", "--to", "ply"], "two of its captures have the same number"),
         (["two", "two", "--to", "ply"], "it has two sequences"),
     ):
         paths = [str(tmp_path / part) for part in flags[:2]]
@@ -100,4 +100,4 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_what_the_reader_left_out_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_spz(tmp_path / "a.spz", make_cloud(50))
     assert main(["convert", str(tmp_path / "a.spz"), str(tmp_path / "b.ply")]) == 0
-    assert re.search("which way is up is no longer said", capsys.readouterr().out)
+    assert re.search("the up direction is lost", capsys.readouterr().out)

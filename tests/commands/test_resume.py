@@ -190,18 +190,20 @@ def test_what_cannot_go_on_is_told(tmp_path: Path, capsys: pytest.CaptureFixture
         return capsys.readouterr().err
 
     out, manifest = tmp_path / "out", tmp_path / "out" / MANIFEST
-    assert told(out) == f"egs-warp: {out}: no run has begun to write here; begin it\n"
+    assert told(out) == f"egs-warp: {out}: no run has written here; start one without resuming\n"
     out.mkdir()
     content: dict = {"schema": 1, "version": "0.0.1", "finished": False, "files": {"run.yaml": None}}
     manifest.write_text(json.dumps(content))
-    assert told(out) == f"egs-warp: {out}: no run has begun to write here; begin it\n"
+    assert told(out) == f"egs-warp: {out}: no run has written here; start one without resuming\n"
     (out / "trajectory.parts").mkdir()
     content["files"] |= {"trajectory.parts": None}
     manifest.write_text(json.dumps(content))
-    assert "the run was begun by egs-warp 0.0.1, this is 0.1.0, whose steps are others; begin the run" in told(out)
+    assert "the run was started by egs-warp 0.0.1, this is 0.1.0, which may compute other steps; start the run" in told(
+        out
+    )
     for broken in ("[]", "{}", json.dumps({"files": {"../a": None}})):
         manifest.write_text(broken)
-        assert told(out) == f"egs-warp: {manifest}: is no manifest of a run; begin the run again\n"
+        assert told(out) == f"egs-warp: {manifest}: not a manifest of a run; start the run again\n"
     manifest.write_text(json.dumps(content | {"version": "0.1.0"}))
     assert "run.yaml: is missing; the run was interrupted before its first step; start it again" in told(out)
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=50, device="cpu").cloud)

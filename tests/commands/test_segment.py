@@ -89,7 +89,7 @@ def test_without_cameras_a_ring_is_used_and_written(
     assert main(again) == 2
     assert "plane: it has an earlier run, which would be mixed with this one" in capsys.readouterr().err
     assert main(["resume", str(out)]) == 2
-    assert f"{out}: egs-warp plane wrote here, which cannot go on; begin it again" in capsys.readouterr().err
+    assert f"{out}: egs-warp plane wrote here, which cannot be resumed; start it again" in capsys.readouterr().err
     assert main([*again, "--overwrite"]) == 0
     assert (out / "earlier-1" / "images" / "ring11.png").is_file() and len(list((out / "images").iterdir())) == 12
     # What was written can be clicked on.
@@ -114,7 +114,7 @@ def test_a_mask_of_the_plane_is_called_by_its_flag(
             "no.json: no such file or folder; make it with",
         ),
         (["--object", "0,0,0.5", "--plane", "0,0,1,-5"], "nothing of it lies above the plane"),
-        (["--object", "0,0,0.5", "--plane", "0,0,1,0.9"], "it touches no plane: its lowest part is"),
+        (["--object", "0,0,0.5", "--plane", "0,0,1,0.9"], "it does not touch the plane: its lowest part is"),
         (["--object", "0,0,0.5", "--cameras", "{folder}/away.json"], "no camera sees it around the object"),
         (["--object", "{folder}/photo1.png", "--cameras", "{folder}/away.json"], "the masks' cameras see nothing"),
         (

@@ -68,8 +68,7 @@ def test_an_earlier_training_is_kept(tmp_path: Path, capsys: pytest.CaptureFixtu
     (tmp_path / "a.sheet.png").write_bytes(b"sheet")
     assert main(line(posed, out)) == 2
     assert capsys.readouterr().err == (
-        f"egs-warp: --out {out}: a.sheet.png is there already; choose another name, or have it moved aside;"
-        " check --overwrite\n"
+        f"egs-warp: --out {out}: a.sheet.png exists already; choose another name, or move it aside; check --overwrite\n"
     )
     out.write_bytes(b"cloud")
     assert main([*line(posed, out), "--overwrite"]) == 0

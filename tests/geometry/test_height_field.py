@@ -1,4 +1,4 @@
-"""Ground that is not flat: its spline, its normals, and the frames in which it is told."""
+"""Uneven ground: its spline, its normals, and the frames of contact points on it."""
 
 from __future__ import annotations
 
@@ -124,5 +124,5 @@ def test_coarser_ground_keeps_what_is_wide() -> None:
     ],
 )
 def test_a_grid_that_is_no_ground_is_refused(broken: dict) -> None:
-    with pytest.raises(UserError, match="ground: it is damaged; make it again"):
+    with pytest.raises(UserError, match="ground: its height field is damaged; make it again with egs-warp segment"):
         check_grid(replace(wavy_ground(), **broken))

@@ -67,7 +67,7 @@ def test_a_lens_that_bends_nothing_is_none() -> None:
 
 
 def photographed(picture: np.ndarray, pinhole: Camera, taken: Camera, lens: Lens) -> np.ndarray:
-    """What ``taken`` sees through ``lens`` of the scene that ``picture`` shows to ``pinhole`` at the same place."""
+    """Photo by ``taken`` through ``lens`` of the scene that ``picture`` shows to ``pinhole`` at the same place."""
     columns, rows = np.meshgrid(np.arange(taken.width) + 0.5, np.arange(taken.height) + 0.5)
     wanted = np.stack([(columns - taken.cx) / taken.fx, (rows - taken.cy) / taken.fy], axis=-1)
     rays = wanted.copy()

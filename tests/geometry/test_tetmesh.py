@@ -1,4 +1,4 @@
-"""What a tetrahedral mesh knows of itself."""
+"""Measures of a tetrahedral mesh."""
 
 from __future__ import annotations
 

@@ -15,6 +15,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.laplace_fill import laplace_fill
+from egs_warp.inpainting import inpaint as inpaint_module
 from egs_warp.inpainting.holes import Hole, disc, footprint, unseen
 from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
 from egs_warp.inpainting.inpainters import OpenCvInpainter
@@ -246,13 +247,24 @@ def test_holes_that_cannot_be_filled(place: tuple[float, float], radius: float, 
         inpaint(floor(spacing=0.05), disc(PLANE, on_plane(*place), radius), options=InpaintOptions(steps=0))
 
 
+def test_a_hole_narrower_than_the_new_gaussians_names_the_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inpaint_module, "flat_gaussians", lambda *_, **__: None)
+    with pytest.raises(UserError, match=r"^inpaint: the hole is too narrow: none of its \d+ texels lie in a block of"):
+        inpaint(
+            floor(spacing=0.05),
+            disc(PLANE, on_plane(0.0, 0.0), 0.3),
+            inpainter=OpenCvInpainter(),
+            options=InpaintOptions(steps=0),
+        )
+
+
 def test_bad_options_and_objects() -> None:
     with pytest.raises(UserError, match=r"steps -1: give a whole number of at least 0"):
         InpaintOptions(steps=-1)
     with pytest.raises(UserError, match=r"margin 2: give a number from 0 to 1"):
         InpaintOptions(margin=2)
     window = disc(PLANE, on_plane(0, 0), 0.1).window
-    with pytest.raises(UserError, match="the hole is empty; give the object, a mask, or a place on the plane"):
+    with pytest.raises(UserError, match="the hole is empty; give the object, a mask, or a point on the plane"):
         Hole(window, np.zeros((256, 256), bool))
     pawn = scene("pawn")
     high = replace(pawn.plane, offset=pawn.plane.offset - 5.0)
@@ -276,7 +288,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (tmp_path / "filled.png").stat().st_size > 10_000
     before = (tmp_path / "filled.ply").read_bytes()
     assert main(["inpaint", *files, str(tmp_path / "filled.ply"), *where, "--steps", "0"]) == 2
-    assert f"--out {tmp_path / 'filled.ply'}: it is there already; choose another name" in capsys.readouterr().err
+    assert f"--out {tmp_path / 'filled.ply'}: it exists already; choose another name" in capsys.readouterr().err
     quick = [*files, str(tmp_path / "other.ply"), *where, "--steps", "0", "--inpainter", "telea", "--picture"]
     for flags, message in (
         ([*quick, str(tmp_path / "gone" / "a.png")], "a.png: its folder does not exist; create"),

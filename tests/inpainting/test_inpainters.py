@@ -18,7 +18,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 
 class MeanOfTheKnown(torch.nn.Module):
-    """Paints the hole in the mean colour of the rest: what LaMa's interface asks for, in two lines."""
+    """Paints the hole in the mean colour of the rest: the interface of LaMa in two lines."""
 
     def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         mean = (image * (1 - mask)).sum(dim=(2, 3), keepdim=True) / (1 - mask).sum(dim=(2, 3), keepdim=True)
@@ -146,7 +146,7 @@ def test_bad_onnx_files(tmp_path: Path) -> None:
         (b"", "not an ONNX file of a network with inputs"),
         (onnx.model([], [], [onnx.value("image", [1, 3, 8, 8])], []), r"takes 1 inputs \(image\)"),
         (grey_paint()[:-40], "not an ONNX file"),
-        (grey_paint().replace(b"Sub", b"Sob"), "OpenCV does not know this network"),
+        (grey_paint().replace(b"Sub", b"Sob"), "OpenCV cannot read this network"),
     ):
         (tmp_path / "bad.onnx").write_bytes(data)
         with pytest.raises(UserError, match=rf"bad\.onnx: .*{said}") as caught:

@@ -27,7 +27,7 @@ def round_hole(size: int, middle: tuple[int, int], radius: float) -> np.ndarray:
 
 
 def test_cut_is_the_optimum() -> None:
-    """Of all labellings of random small problems none is cheaper."""
+    """No labelling of random small problems is cheaper."""
     random = np.random.default_rng(3)
     for _ in range(30):
         unary = random.integers(-9, 10, 7)

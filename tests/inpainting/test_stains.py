@@ -1,4 +1,4 @@
-"""What an object's shadow and foot leave on the floor."""
+"""Stains that an object's shadow and foot leave on the floor."""
 
 from __future__ import annotations
 

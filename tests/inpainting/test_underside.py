@@ -9,6 +9,10 @@ import pytest
 import warp as wp
 
 from egs_warp.geometry.gaussians import SH_BAND_0
+from egs_warp.geometry.plane import Plane
+from egs_warp.inpainting import underside
+from egs_warp.inpainting.new_floor import flat_gaussians
+from egs_warp.inpainting.rectified import PlaneWindow
 from egs_warp.inpainting.underside import with_underside
 from tests.support.grounds import RADIUS, ball
 from tests.support.waves import wavy_ground
@@ -37,6 +41,23 @@ def test_a_ball_sunk_into_folds_is_closed(degree: int) -> None:
     assert nearest.max() < 0.03
     colour = closed.sh.numpy()[thing.count :, 0] * SH_BAND_0 + 0.5
     assert np.abs(colour - [0.8, 0.3, 0.2]).max() < 0.02
+
+
+@pytest.mark.parametrize("sides", [(), (4,), (1, 1, 1)])
+def test_an_underside_too_small_for_a_gaussian_stays_open(
+    sides: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No unseen texel at all, and no whole block of unseen texels: there is nothing to add, and no error."""
+    hole, known = np.zeros((2, 16, 16), bool)
+    known[:] = True
+    for number, side in enumerate(sides):
+        hole[4 * number + 1 : 4 * number + 1 + side, 3] = True
+    known &= ~hole
+    window = PlaneWindow(Plane(np.array([0.0, 0.0, 1.0]), 0.0), np.zeros(3), 0.1, 16, 16)
+    assert flat_gaussians(window, hole, known, np.zeros((16, 16, 3)), np.zeros((16, 16)), spacing=2) is None
+    ground, object_cloud = wavy_ground(0.03, spacing=0.04), ball(-0.2 * RADIUS)
+    monkeypatch.setattr(underside, "flat_gaussians", lambda *_, **__: None)
+    assert with_underside(object_cloud, ground, SIZE) == (object_cloud, 0)
 
 
 def test_what_is_closed_already_stays_as_it_is() -> None:

@@ -109,7 +109,7 @@ def test_what_a_killed_process_leaves_is_swept(tmp_path: Path) -> None:
 
 
 def test_a_temporary_file_is_opened_exclusively(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A link that somebody has put under the very name is not followed."""
+    """A link that another process has created under the temporary name is not followed."""
     (tmp_path / "victim").write_text("precious")
     (tmp_path / ".egs-guessed.json").symlink_to(tmp_path / "victim")
     monkeypatch.setattr("egs_warp.io.atomic._temporary_name", lambda folder, suffix: folder / f".egs-guessed{suffix}")

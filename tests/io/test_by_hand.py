@@ -96,7 +96,7 @@ def test_damaged_spz_of_streams_is_one_line(tmp_path: Path) -> None:
     bomb = zstandard.ZstdCompressor().compress(bytes(1 << 26))
     for data, said in {
         good[:20]: "truncated: .spz header of 20 bytes, expected 32",
-        good[:50]: "its table lies outside of the file",
+        good[:50]: "its table lies outside the file",
         good[:-3]: "corrupt or truncated .spz: a stream",
         good[:15] + b"\4" + good[16:]: ".spz with 4 streams, expected 5",
         good[:112] + b"\0" * (len(good) - 112): "corrupted .spz data",

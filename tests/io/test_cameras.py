@@ -30,7 +30,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def inside(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Whether each pixel coordinate falls on a set pixel; centres lie at +0.5."""
+    """Return True if each pixel coordinate falls on a set pixel; centres lie at +0.5."""
     columns, rows = np.floor(pixels).astype(int).T
     height, width = mask.shape
     valid = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
@@ -284,7 +284,7 @@ def test_bad_inria(change: dict, expected: str, tmp_path: Path) -> None:
         ({"k1": "much"}, ": frame 0: k1 is not a finite number; export the poses again"),
         (
             {"camera_model": "EQUIRECTANGULAR"},
-            ": frame 0 has the lens model 'EQUIRECTANGULAR', which is not known; give one of SIMPLE_PINHOLE, PINHOLE,"
+            ": frame 0 has the unknown lens model 'EQUIRECTANGULAR'; give one of SIMPLE_PINHOLE, PINHOLE,"
             " SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, OPENCV_FISHEYE, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE",
         ),
         ({"w": None}, ": frame 0: w is not a finite number; export the poses again"),
@@ -302,9 +302,9 @@ def test_transforms_without_a_size(tmp_path: Path) -> None:
     frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist()}
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps({"camera_angle_x": 0.7, "frames": [frame]}))
-    assert message(path) == ": it has no w and h, and none of its photos can be read; add either"
+    assert message(path) == ": it has no w and h, and none of its photos can be read; add w and h, or the photos"
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n no")
-    assert message(path) == ": it has no w and h, and none of its photos can be read; add either"
+    assert message(path) == ": it has no w and h, and none of its photos can be read; add w and h, or the photos"
     # The first that can be read tells for all.
     path.write_text(json.dumps({"camera_angle_x": 0.7, "frames": [frame, frame | {"file_path": "b"}]}))
     Image.new("RGB", (12, 8)).save(tmp_path / "b.png")
@@ -314,12 +314,15 @@ def test_transforms_without_a_size(tmp_path: Path) -> None:
 def test_bad_colmap(tmp_path: Path) -> None:
     colmap_text(tmp_path, camera="3 EUCM 640 480 500 500 320 240 0.01 0.02")
     assert message(tmp_path).startswith(
-        "cameras.txt: camera 3 of model EUCM with 6 parameters is not known; give one of SIMPLE_PINHOLE, PINHOLE, "
+        "cameras.txt: camera 3 of model EUCM with 6 parameters is unknown; give one of SIMPLE_PINHOLE, PINHOLE, "
     )
     colmap_text(tmp_path, camera="4 PINHOLE 640 480 500 510 320 240")
-    assert message(tmp_path) == "images.txt: image sub/with space.jpg has camera 3, missing in cameras.txt"
+    assert (
+        message(tmp_path)
+        == "images.txt: image sub/with space.jpg has camera 3, which is missing in cameras.txt; export the model again"
+    )
     colmap_text(tmp_path, camera="3 PINHOLE 640 480 500 510 320")
-    assert message(tmp_path).startswith("cameras.txt: camera 3 of model PINHOLE with 3 parameters is not known")
+    assert message(tmp_path).startswith("cameras.txt: camera 3 of model PINHOLE with 3 parameters is unknown")
     colmap_text(tmp_path, camera="3 PINHOLE wide")
     assert message(tmp_path) == "cameras.txt: malformed camera line '3 PINHOLE wide'; export the model again"
     (tmp_path / "cameras.txt").unlink()

@@ -172,7 +172,7 @@ def test_bad_spz(tmp_path: Path) -> None:
     # Four thousand million Gaussians in 300 bytes: refused before any memory is taken.
     many = gzip.compress(body[:8] + b"\xff\xff\xff\xff" + body[12:])
     assert message(written(path, many)) == (
-        f"it says that it has 4294967295 Gaussians, in {len(many)} bytes; copy or export it again"
+        f"it declares 4294967295 Gaussians in {len(many)} bytes; copy or export it again"
     )
     flipped = bytearray(good_bytes("a.spz"))
     flipped[-6] ^= 255
@@ -181,7 +181,9 @@ def test_bad_spz(tmp_path: Path) -> None:
 
 def test_spz_cannot_hold_what_is_too_far_out(tmp_path: Path) -> None:
     far = small_cloud().scaled(1e8)
-    with pytest.raises(UserError, match=r"a mean lies .* units out, \.spz holds 8388607; scale the capture down"):
+    with pytest.raises(
+        UserError, match=r"a mean lies .* units from the origin, the limit of \.spz is 8388607; scale the capture down"
+    ):
         write_spz(tmp_path / "a.spz", far)
     with pytest.raises(UserError, match=r"\.spz version 5 cannot be written; choose 2, 3 or 4"):
         write_spz(tmp_path / "a.spz", far, version=5)

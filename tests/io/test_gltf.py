@@ -59,7 +59,7 @@ def test_a_gltf_with_its_buffer_inside_or_beside(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read.means.numpy(), cloud.means.numpy())
     tree["buffers"][0]["uri"] = "../the buffer.bin"
     (tmp_path / "a.gltf").write_text(json.dumps(tree))
-    with pytest.raises(UserError, match="which lies outside of its folder"):
+    with pytest.raises(UserError, match="which lies outside its folder"):
         read_capture(tmp_path / "a.gltf")
 
 
@@ -93,7 +93,7 @@ def test_a_turned_node_says_where_up_is(tmp_path: Path) -> None:
     capture = read_capture(tmp_path / "b.glb", device="cpu")
     assert capture.up is not None
     np.testing.assert_allclose(capture.up, [0.0, 0.0, 1.0], atol=1e-12)
-    assert capture.notes == ("the transform of glTF's nodes was left out: the capture lies as its mesh does",)
+    assert capture.notes == ("the transforms of glTF's nodes were ignored: the capture is in the axes of its mesh",)
 
 
 def _changed(tree: dict[str, Any], case: str) -> None:
@@ -122,8 +122,8 @@ def _changed(tree: dict[str, Any], case: str) -> None:
         ("a mesh", "glTF without splats (KHR_gaussian_splatting)"),
         ("packed", "packed by KHR_gaussian_splatting_compression_spz_2 are not read"),
         ("linear", "the colour space 'lin_rec709_display'"),
-        ("long", "accessor 0 ends behind its buffer"),
-        ("negative", "accessor 0 ends behind its buffer"),
+        ("long", "accessor 0 extends beyond its buffer"),
+        ("negative", "accessor 0 extends beyond its buffer"),
         ("no scales", "no glTF with splats (KeyError"),
         ("flat", "a transform of its nodes is flat"),
         ("nonsense", "no glTF with splats (TypeError"),

@@ -1,4 +1,4 @@
-"""Small files that ask for much: refused before the memory is taken."""
+"""Small files that declare large contents: rejected before memory is allocated."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import PosedImage
-from egs_warp.io.limits import LARGEST_TEXT, read_bytes
+from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.photos import read_photo
 from egs_warp.io.planes import read_planes
 from egs_warp.io.writing import WRITERS, writer_of
@@ -71,7 +71,7 @@ def test_more_gaussians_than_the_pictures_can_hold(tmp_path: Path) -> None:
     files["meta.json"] = json.dumps(meta).encode()
     size = len(files["means_l.webp"]) + len(files["means_u.webp"])
     assert message(written(tmp_path / "a.sog", zipped(files))) == (
-        f"it says that it has 33554432 Gaussians, in {size} bytes; copy or export it again"
+        f"it declares 33554432 Gaussians in {size} bytes; copy or export it again"
     )
 
 
@@ -83,7 +83,7 @@ def test_what_a_zip_does_not_name_is_not_inflated(tmp_path: Path) -> None:
     path = written(tmp_path / "b.sog", zipped(named))
     assert "means_l.webp inflates from" in message(path)
     assert megabytes_of(read_on_cpu, path) < 16
-    path = written(tmp_path / "c.sog", zipped(members() | {"meta.json": bytes(LARGEST_TEXT + 1)}))
+    path = written(tmp_path / "c.sog", zipped(members() | {"meta.json": bytes(MAX_TEXT_BYTES + 1)}))
     assert "meta.json inflates from" in message(path)
 
 
@@ -91,7 +91,7 @@ def test_a_small_spz_of_many_gaussians(tmp_path: Path) -> None:
     count = 50_000_000
     header = struct.pack("<IIIBBBB", 0x5053474E, 2, count, 0, 12, 0, 0)
     path = written(tmp_path / "a.spz", gzip.compress(header + bytes(20 << 20)))
-    assert message(path).startswith(f"it says that it has {count} Gaussians, in ")
+    assert message(path).startswith(f"it declares {count} Gaussians in ")
     assert megabytes_of(read_on_cpu, path) < 16
 
 
@@ -161,7 +161,7 @@ def test_cameras_of_no_photo(tmp_path: Path) -> None:
         ({"width": 32_768, "height": 32_768}, "at most 32768 a side and 178956970 in all are read"),
         ({"fx": 1e-300}, "fit no photo of 640 x 480 pixels"),
         ({"fy": 1e9}, "fit no photo of 640 x 480 pixels"),
-        ({"position": [1e30, 0.0, 0.0]}, "it lies further than 1e\\+12 units out"),
+        ({"position": [1e30, 0.0, 0.0]}, "it lies more than 1e\\+12 units from the origin"),
         ({"width": int("9" * 400)}, "width is not a finite number"),
     ):
         (tmp_path / "cameras.json").write_text(json.dumps([entry | change]))
@@ -171,7 +171,7 @@ def test_cameras_of_no_photo(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["../secret.png", "/secret.png", "a/../../secret.png"])
 def test_photos_outside_of_the_folder_are_not_looked_for(name: str, tmp_path: Path) -> None:
-    """Whether such a file is there makes no difference."""
+    """The result does not depend on the existence of such a file."""
     folder = tmp_path / "poses"
     folder.mkdir()
     Image.new("RGB", (4, 4)).save(tmp_path / "secret.png")
@@ -194,10 +194,10 @@ def test_a_pipe_does_not_wait(tmp_path: Path) -> None:
 def test_texts_have_a_largest_size(tmp_path: Path) -> None:
     path = tmp_path / "cameras.json"
     with open(path, "wb") as file:
-        file.truncate(LARGEST_TEXT + 1)
-    with pytest.raises(UserError, match=r"33554433 bytes, of which at most 33554432 are read; give a smaller one"):
+        file.truncate(MAX_TEXT_BYTES + 1)
+    with pytest.raises(UserError, match=r"the file has 33554433 bytes, the limit is 33554432; give a smaller one"):
         read_cameras(path)
-    assert len(read_bytes(path)) == LARGEST_TEXT + 1
+    assert len(read_bytes(path)) == MAX_TEXT_BYTES + 1
 
 
 HOLE = {"centre": [0, 0, 0], "texel": 0.1, "texels": [20, 20], "outlines": [[[1, 1], [5, 1], [5, 5]]]}
@@ -262,5 +262,5 @@ def test_a_valid_capture_takes_four_times_its_file_and_six_times_what_it_becomes
 def test_two_elements_of_one_name(tmp_path: Path) -> None:
     data = good_bytes("a.ply").replace(b"element vertex 7\n", b"element vertex 1\nproperty float x\nelement vertex 7\n")
     assert message(written(tmp_path / "a.ply", data)) == (
-        "malformed .ply header, an element is there twice; export the file again"
+        "malformed .ply header, an element occurs twice; export the file again"
     )

@@ -23,7 +23,7 @@ def test_what_is_there_is_refused_or_kept_aside(tmp_path: Path) -> None:
     first, second = tmp_path / "made" / "a.ply", tmp_path / "made" / "a.png"
     write(first, second, text="1")
     first.unlink()
-    with pytest.raises(UserError, match=r"out .*a\.ply: a\.png is there already; .*; check overwrite"):
+    with pytest.raises(UserError, match=r"out .*a\.ply: a\.png exists already; .*; check overwrite"):
         write(first, second, text="2")
     write(first, second, text="2", overwrite=True)
     write(first, second, text="3", overwrite=True)

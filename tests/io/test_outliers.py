@@ -38,16 +38,16 @@ def unchecked(arrays: dict[str, np.ndarray]) -> GaussianCloud:
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ({"means": 1e19}, "lie further than 10000 sizes of the capture out"),
-        ({"means": 3e38}, "lie further than 10000 sizes of the capture out"),
-        ({"means": 1e6}, "lie further than 10000 sizes of the capture out"),
+        ({"means": 1e19}, "lie more than 10000 sizes of the capture away"),
+        ({"means": 3e38}, "lie more than 10000 sizes of the capture away"),
+        ({"means": 1e6}, "lie more than 10000 sizes of the capture away"),
         ({"log_scales": 60.0}, "are larger than 100 sizes of the capture"),
         ({"log_scales": 8.0}, "are larger than 100 sizes of the capture"),
         ({"log_scales": 3e38}, "are larger than 100 sizes of the capture"),
         ({"sh": 1e6}, "have a colour beyond 1000"),
         (
             {"means": 1e19, "log_scales": 60.0},
-            "lie further than 10000 sizes of the capture out or are larger than 100 sizes of the capture",
+            "lie more than 10000 sizes of the capture away or are larger than 100 sizes of the capture",
         ),
     ],
 )
@@ -65,9 +65,9 @@ def test_a_capture_of_outliers_is_refused(tmp_path: Path) -> None:
     path = spoiled(tmp_path / "a.ply", slice(0, 30), sh=1e6)
     assert message(path) == "30 of 50 Gaussians have a colour beyond 1000; export it again"
     path = spoiled(tmp_path / "a.ply", slice(0, 50), means=3e38)
-    assert message(path) == "it reaches 3e+38 units out, at most 1e+12 are read; export it again"
+    assert message(path) == "it extends 3e+38 units from the origin, the limit is 1e+12; export it again"
     path = spoiled(tmp_path / "a.ply", slice(0, 50), log_scales=200.0)
-    assert message(path).startswith("it reaches 7.23e+86 units out")
+    assert message(path).startswith("it extends 7.23e+86 units from the origin")
 
 
 def test_values_that_single_precision_cannot_use_are_told(tmp_path: Path) -> None:

@@ -47,9 +47,9 @@ def test_what_is_found_anew_takes_the_place_of_what_was_known() -> None:
             {"ground": {"axes": [[0] * 3] * 3, "origin": [0] * 3, "spacing": 1, "coefficients": [[0] * 4] * 4}},
             "its ground is damaged; make it again with egs-warp segment",
         ),
-        ({"noise": "low"}, "the facts of plane 0 are damaged; make it again"),
+        ({"noise": "low"}, "the properties of plane 0 are damaged; make it again"),
         ({"offset": 1e300}, "plane 0 lies 1e+300 units from the origin; make it again"),
-        ({"centre": [1.0]}, "the facts of plane 0 are damaged; make it again"),
+        ({"centre": [1.0]}, "the properties of plane 0 are damaged; make it again"),
     ],
 )
 def test_damage_is_named(tmp_path: Path, facts: dict[str, object], message: str) -> None:

@@ -146,7 +146,7 @@ def test_places_are_checked_before_the_work_and_not_made(tmp_path: Path) -> None
 
 
 def test_what_a_killed_run_left_is_gone_when_the_next_has_finished(tmp_path: Path) -> None:
-    """However young: an ffmpeg that has outlived the run that started it writes its last after the next has begun."""
+    """At any age: an ffmpeg that has outlived its run may write its last bytes after the next run has started."""
     left = tmp_path / f".egs-{'0' * 16}.mp4"
     with run_folder(tmp_path) as run:
         run.file("a.txt").write_text("one")
@@ -162,7 +162,10 @@ def test_a_run_that_was_killed_before_its_first_file_is_none(tmp_path: Path) -> 
     with run_folder(tmp_path) as run:
         run.file("a.txt")
     assert manifest(tmp_path)["files"] == {"a.txt": None}
-    with pytest.raises(UserError, match="no run has begun to write here; begin it"), run_folder(tmp_path, resume=True):
+    with (
+        pytest.raises(UserError, match="no run has written here; start one without resuming"),
+        run_folder(tmp_path, resume=True),
+    ):
         raise AssertionError("must not come here")
     check_run_folder(tmp_path)
     with run_folder(tmp_path) as run:
@@ -189,7 +192,7 @@ def test_what_a_run_left_that_was_killed_as_it_ended(tmp_path: Path) -> None:
 
 def test_a_run_that_goes_on(tmp_path: Path) -> None:
     """Its files are its own, what it began with is not written again, and folders are gone when it has finished."""
-    with pytest.raises(UserError, match="no run has begun to write here"), run_folder(tmp_path, resume=True):
+    with pytest.raises(UserError, match="no run has written here"), run_folder(tmp_path, resume=True):
         raise AssertionError("must not come here")
     with run_folder(tmp_path) as run:
         run.file("a.txt").write_text("one")

@@ -130,7 +130,7 @@ def test_bad_zip(tmp_path: Path) -> None:
     [
         (("version",), 3, "SOG version 3, expected 1 or 2; export it as version 2 or as .ply"),
         (("count",), 10, "truncated: 10 Gaussians, but means_l.webp has 9 pixels; export it again"),
-        (("count",), -1, "count in meta.json is not a whole number; export the capture again"),
+        (("count",), -1, "count in meta.json is not an integer of at least 0; export the capture again"),
         (("means", "mins"), [0, 1], "means.mins in meta.json is not 3 finite numbers; export the capture again"),
         (("means", "maxs"), [0, 1, float("nan")], "means.maxs in meta.json is not 3 finite numbers"),
         (("means", "files"), ["../../x", "y"], "meta.json names '../../x', which lies outside the capture"),

@@ -67,7 +67,8 @@ def test_an_ffmpeg_that_does_not_start_leaves_nothing(tmp_path: Path, monkeypatc
 
 
 def test_what_ffmpeg_says_of_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As the reason, with the error behind it that decides the exit status; other words of its are told as they are."""
+    """They are the reason in the message, and the error behind it decides the exit status; other messages of ffmpeg are
+    quoted unchanged."""
     for said, number in (("[out#0] Error: No space left on device", errno.ENOSPC), ("Unknown encoder", None)):
         program = tmp_path / "ffmpeg"
         program.write_text(f"#!/bin/sh\ncat > /dev/null\necho '{said}' >&2\nexit 1\n")

@@ -73,7 +73,7 @@ def test_same_bits_however_the_file_lies(thing: Lying, its_cage: Cage, other: Ca
     ids=["both", "x0.37", "turned"],
 )
 def test_same_cage_in_any_unit_and_turned(thing: Lying, its_cage: Cage, other: Callable[[Lying], Lying]) -> None:
-    """What rounding leaves: the same tetrahedra, nodes within 1e-5 of the height; before, 3e-2."""
+    """The same tetrahedra, and nodes within 1e-5 of the height, the effect of rounding; before, 3e-2."""
     _, cage = body_cage(other(thing))
     assert np.array_equal(cage.mesh.tets, its_cage.mesh.tets)
     assert np.abs(cage.mesh.nodes - its_cage.mesh.nodes).max() < 1e-5 * its_cage.height(GROUND)
@@ -105,7 +105,7 @@ def test_base_plane_goes_along(thing: Lying) -> None:
     st.lists(st.floats(-100.0, 100.0), min_size=3, max_size=3),
 )
 def test_frame_turns_moves_and_grows_with_the_body(seed: int, scale: float, angle: float, shift: list[float]) -> None:
-    """Of random points: what is seen from the frame does not change."""
+    """Random points: their coordinates in the frame do not change."""
     random = np.random.default_rng(seed)
     points = random.normal(size=(200, 3)) * random.uniform(0.3, 1.0, 3)
     weights = random.uniform(0.1, 1.0, 200)
@@ -148,7 +148,7 @@ def test_a_star_is_faced_through_a_tip(sides: int, turned: float) -> None:
 
 
 def test_corners_do_not_outweigh_a_long_side() -> None:
-    """Of a rectangle's four corners most is at its diagonals, in the fourth moment."""
+    """The largest moment of a rectangle's four corners is the fourth, at its diagonals."""
     corners = np.array([[x, y, 0.3] for x in (-0.5, 0.5) for y in (-0.6, 0.6)])
     frame = upright_frame(corners, np.ones(4), GROUND)
     assert np.abs(frame.axes[0]) == pytest.approx(np.array([0.0, 1.0, 0.0]), abs=1e-9)
@@ -165,7 +165,7 @@ def test_a_long_body_is_faced_along_its_length_the_way_its_tail_points(way: floa
 
 
 def test_the_origin_is_under_the_middle_and_the_unit_the_median_distance() -> None:
-    """Of points all over a sphere, whose plane lies under it and is not level."""
+    """Points all over a sphere, above a plane that is not level."""
     random = np.random.default_rng(0)
     half = random.normal(size=(500, 3))
     points = 2.0 * np.concatenate([half, -half]) / np.linalg.norm(np.concatenate([half, half]), axis=1)[:, None]

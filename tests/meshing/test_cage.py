@@ -54,7 +54,7 @@ def _box_surface(low: tuple[float, ...], high: tuple[float, ...], count: int, se
 
 
 def _check(cage: Cage, plane: Plane, *, flat: float = 1e-9) -> None:
-    """What every cage holds."""
+    """Check the properties of all cages."""
     height = cage.height(plane)
     above = plane.heights(cage.mesh.nodes)
     assert above.min() >= -flat * height
@@ -198,7 +198,7 @@ def test_target_nodes() -> None:
     thing, _ = _pawn_cage(6000)
     cage = build_cage(thing.cloud, thing.plane, target_nodes=1200)
     assert len(cage.mesh.nodes) == pytest.approx(1200, rel=0.15)
-    with pytest.raises(UserError, match="cage: 3 nodes asked; give a number from 50 to 20000"):
+    with pytest.raises(UserError, match="cage: 3 nodes; give a number from 50 to 20000"):
         build_cage(thing.cloud, thing.plane, target_nodes=3)
 
 

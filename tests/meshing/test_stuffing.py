@@ -11,7 +11,8 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.meshing import stuffing
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, -0.5, 0.5], [0.5, 0.5, 0.5]])
-"""Of a lattice tetrahedron in units of the cube side: two points of a long edge, then two of the opposite one."""
+"""Corners of a lattice tetrahedron in units of the cube side: two points of a long edge, then two of the opposite
+one."""
 STEPS = np.array([*(np.array(d) - 0.5 for d in product((0, 1), repeat=3)), *np.eye(3), *-np.eye(3)])
 """From a lattice point to its 14 neighbours: 8 short edges, 6 long ones."""
 INSIDE, OUTSIDE = -2, -1
@@ -21,8 +22,8 @@ IS_LONG = np.isin(np.arange(6), [0, 5])
 
 
 def is_possible(states: tuple[int, ...]) -> bool:
-    """Whether some signs of the lattice points lead to these states: the ends of an edge along which a point was moved
-    have opposite signs, and no edge has two cuts."""
+    """Return True if some signs of the lattice points lead to these states: the ends of an edge along which a point was
+    moved have opposite signs, and no edge has two cuts."""
 
     def point(x: np.ndarray) -> tuple[int, ...]:
         return tuple((2.0 * x).round().astype(int))

@@ -117,7 +117,7 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
     ("text", "message"),
     [
         ("[", "not JSON at line 1"),
-        ("[" * 100_000, "lists in lists in lists, too deep to read"),
+        ("[" * 100_000, "its lists are nested too deeply; write fewer levels"),
         ("{}", 'give a list of motions, as [{"motion": "jump"}]'),
         ("[3]", f', motion 1: give an object with a "motion", one of {KNOWN}'),
         ('[{"motion": "jump", "repeat": 1.5}]', ', motion 1: "repeat" is 1.5; give a whole number'),

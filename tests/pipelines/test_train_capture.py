@@ -226,7 +226,7 @@ def test_cameras_that_see_nothing_in_common_are_refused() -> None:
     camera = ring(1)[0]
     away = replace(camera, rotation=camera.rotation, near=1e9)
     view = TrainingView(away, np.zeros((camera.height, camera.width, 3), np.float32))
-    with pytest.raises(UserError, match="train: the cameras do not look at a place in common; check the poses"):
+    with pytest.raises(UserError, match="train: the cameras have no common view; check the poses"):
         initial_cloud([view], count=100, sh_degree=0, device="cpu")
 
 

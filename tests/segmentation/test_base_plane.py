@@ -109,7 +109,7 @@ def test_up_of_the_format_wins() -> None:
 
 
 def test_no_height() -> None:
-    """A sheet square to up has no base plane."""
+    """A sheet orthogonal to up has no base plane."""
     cloud = pawn(gaussian_count=500).cloud
     flat = GaussianCloud.from_numpy(
         cloud.means.numpy() * [1, 1, 0],
@@ -123,7 +123,7 @@ def test_no_height() -> None:
 
 
 def test_a_bevel_above_the_sole_is_not_the_support() -> None:
-    """Of two levels of the underside the lower one is, though more columns end at the other."""
+    """The lower of two levels of the underside is found, though more columns end at the other."""
     random = np.random.default_rng(0)
     bottoms = np.concatenate([random.normal(0.0, 0.001, 60), random.normal(0.08, 0.001, 100)])
     heights = np.concatenate([bottoms, random.uniform(0.1, 1.0, 2000)])
@@ -237,7 +237,7 @@ def test_up_of_a_huge_capture_is_told_by_few_of_its_gaussians(monkeypatch: pytes
     foot = random.uniform([-0.6, -0.6, 0.0], [0.6, 0.6, 0.02], (3000, 3))
     table = opaque(np.concatenate([top, leg, foot])[:, [2, 0, 1]])
     whole = guess_up(table)[0]
-    monkeypatch.setattr("egs_warp.segmentation.base_plane._ENOUGH", 4000)
+    monkeypatch.setattr("egs_warp.segmentation.base_plane._MAX_GAUSSIANS", 4000)
     up, reason = guess_up(table)
     np.testing.assert_array_equal(up, whole)
     assert reason == guess_up(table.subset(random.permutation(table.count)))[1]

@@ -1,4 +1,4 @@
-"""What reaches across the plane: its measure, the half above, and the loss that pushes it off (Eq. 20, 21)."""
+"""Gaussians that straddle the plane: their extent, the half above, and the loss that clears the plane (Eq. 20, 21)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
+from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
@@ -172,7 +174,7 @@ def test_cameras_about_the_foot_look_at_it_from_low_down() -> None:
 
 @pytest.mark.parametrize("above", [True, False])
 def test_a_camera_under_the_plane_says_nothing_of_what_it_sees_through_it(above: bool) -> None:
-    """Of a ball over the floor pixels count from above; from below those alone that show nothing."""
+    """From above, all pixels of a ball over the floor count; from below, only those that show nothing."""
     pytest.importorskip("torch")
     ball = round_ones(shell() + [0.0, 0.0, 0.2], 0.04)
     eye = np.array([2.0, 0.0, 2.0 if above else -2.0])
@@ -203,6 +205,23 @@ def test_removing_leaves_nothing_across_the_plane() -> None:
     heights, reach = plane_extents(clear_plane(cloud, PLANE, StraddlingPolicy.REMOVE), PLANE)
     assert (np.abs(heights) >= reach).all()
     assert clear_plane(cloud, PLANE, StraddlingPolicy.NONE) is cloud
+
+
+def test_an_object_that_clearing_leaves_empty_is_an_error_of_that_stage() -> None:
+    cloud = cloud_near(PLANE, "cpu")
+    heights, reach = plane_extents(cloud, PLANE)
+    straddling = cloud.subset(np.abs(heights) < reach)
+    message = rf"^clear: none of the object's {straddling.count} Gaussians is left: all of them straddle the plane and"
+    with pytest.raises(UserError, match=message):
+        clear_plane(straddling, PLANE, StraddlingPolicy.REMOVE)
+    below = cloud_near(PLANE.moved(-2.0 * PLANE.normal), "cpu")
+    with pytest.raises(UserError, match=r"^clear: none .* after splitting all of their means lie below the plane"):
+        _subdivided(
+            replace(below, log_scales=wp.zeros(below.count, dtype=wp.vec3, device="cpu")),
+            PLANE,
+            ExtentMeasure.ELLIPSOID,
+            0.0,
+        )
 
 
 def test_loss_is_the_sum_over_straddling_gaussians() -> None:

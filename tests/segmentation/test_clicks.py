@@ -37,7 +37,7 @@ def test_a_click_hits_the_surface_and_not_what_shines_through() -> None:
 
 
 def test_haze_before_what_is_clicked_on_is_not_hit() -> None:
-    """Of a fiftieth of its opacity, just above its surface; as opaque as that it is."""
+    """A Gaussian just above the surface with a fiftieth of its opacity is not hit; one of the same opacity is."""
     skin = round_ones(shell(400), 0.04)
     for opacity, hit in ((-4.0, False), (3.0, True)):
         logits = np.append(skin.opacity_logits.numpy(), np.float32(opacity))
@@ -64,9 +64,8 @@ def test_a_click_is_a_disc_about_its_pixel(axis: int, sign: float) -> None:
 
 
 def test_a_click_hits_what_lies_a_little_before_and_behind() -> None:
-    """Of five discs in a row along its ray the one that most of its light comes from, and those within 3 % of the
-    distance on both sides of it.
-    """
+    """Among five discs in a row along the ray, the hits are the one that gives most of the light, and those within 3 %
+    of the distance on both sides of it."""
     camera = front()
     steps, opacities = np.array([4.5, 4.9, 5.0, 5.1, 5.6]), np.array([0.12, 0.12, 0.6, 0.6, 0.9])
     means = camera.centre + steps[:, None] * camera.rotation[2]
@@ -107,14 +106,14 @@ def test_veils_between_camera_and_object_are_looked_through(opacity: float, thro
 
 @pytest.mark.parametrize("tones", [(-1.0, 1.0), (0.0, 0.0)])
 def test_a_click_beside_cuts_off_what_touches(tones: tuple[float, float]) -> None:
-    """Of two balls that touch one click takes both; a second takes the other away, whatever the colours."""
+    """One click takes both of two touching balls; a second one removes the other, for all colours."""
     cloud = balls(tones)
     mine = click(cloud, (-0.5, -0.5, 0.5))
     both = segment(cloud, FLOOR, ObjectSpec.of_clicks([mine]))
     clear = cloud.means.numpy()[:3000, 2] > 0.06
     assert both.object_mask[:3000][clear].all()
     other = click(cloud, (0.5, -0.5, 0.5), inside=False)
-    # Where they touch, a twentieth wide, nobody can tell two of one colour apart.
+    # Where they touch, within a twentieth, two balls of one colour cannot be separated.
     clear &= np.abs(cloud.means.numpy()[:3000, 0]) > 0.05
     for clicks in ([mine, other], [other, mine]):
         found = segment(cloud, FLOOR, ObjectSpec.of_clicks(clicks))
@@ -222,10 +221,10 @@ def test_clicks_as_the_user_writes_them(tmp_path: Path) -> None:
     with_box = read_object(["-1,-1,0,1,1,2", "-32,60@b"], cloud, posed)
     assert with_box.box is not None and with_box.point is None and len(with_box.clicks) == 1
     for texts, message in (
-        (["-32,60@b"], "every click takes something away; click on the object itself"),
+        (["-32,60@b"], "every click removes something; click on the object itself"),
         (["+32,32@c"], r"--object \+32,32@c: no such camera; the 2 cameras are"),
         (["+1,1@b"], r"--object \+1,1@b: no Gaussian is visible at this pixel"),
-        (["+64,1@b"], "outside of the 64 x 64 pixels of the view"),
+        (["+64,1@b"], "outside of the view's 64 x 64 pixels"),
         (["+1.2.3,1@b"], r"1\.2\.3,1 is not a pixel"),
         (["0,0,1", "0,0,2"], "--object: 2 objects, 0,0,1 and others; give one, and clicks"),
     ):

@@ -1,4 +1,4 @@
-"""Which Gaussians hang together, and what a shell of them encloses."""
+"""Connected parts of Gaussians, and the space that a shell of them encloses."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from egs_warp.segmentation.graph_cut import SplatGraph
 
 
 def cost(graph: SplatGraph, inside: np.ndarray, leaning: np.ndarray, smoothness: float) -> float:
-    """What is to be least, term by term."""
+    """Sum the terms of the cost."""
     unlike = inside[graph.first] != inside[graph.second]
     own = np.where(inside, np.maximum(-leaning, 0.0), np.maximum(leaning, 0.0)).sum()
     return float(own + smoothness * graph.strength[unlike].sum())
@@ -49,7 +49,7 @@ def test_a_chain_is_cut_at_its_widest_gap_and_at_its_change_of_colour() -> None:
 
 
 def test_ways_go_along_the_links() -> None:
-    """Round three sides of a square, not across; nowhere from one square to another far away."""
+    """The path follows three sides of a square, not the gap; there is none between two distant squares."""
     side = np.linspace(0.0, 1.0, 41)
     legs = [
         np.column_stack([side * 0, side]),

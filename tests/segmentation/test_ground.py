@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.height_field import HeightField
@@ -19,6 +20,7 @@ from egs_warp.segmentation import ground as module
 from egs_warp.segmentation.ground import MeasuredGround, measure_ground
 from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import ObjectSpec
+from egs_warp.segmentation.plane_search import plane_views
 from tests.support.grounds import RADIUS, ball, level, on_folds, sheet
 from tests.support.waves import wave
 
@@ -184,7 +186,7 @@ def test_specks_of_ground_are_left_out() -> None:
 
 @pytest.mark.parametrize("count", [5, 12])
 def test_medians_of_what_is_nearest_to_each_node(count: int) -> None:
-    """Of odd and even numbers of points; none of those off the grid, nor any where there are none."""
+    """For odd and even numbers of points; points off the grid are ignored, and empty nodes are NaN."""
     random = np.random.default_rng(0)
     spacing, origin = 0.25, np.array([0.3, -0.2, 0.1])
     axes = np.linalg.qr(random.standard_normal((3, 3)))[0]
@@ -199,3 +201,13 @@ def test_medians_of_what_is_nearest_to_each_node(count: int) -> None:
             expected = np.median(heights) if len(heights) else np.nan
             np.testing.assert_allclose(medians[row, column], expected, atol=1e-12)
     assert sizes == {0, 1}
+
+
+def test_a_capture_that_is_all_object_has_no_ground() -> None:
+    cloud = ball()
+    everything = np.ones(cloud.count, bool)
+    message = rf"^segment: all {cloud.count} Gaussians of the capture are the object, so "
+    with pytest.raises(UserError, match=message + "there is no ground to measure"):
+        measure_ground(cloud, everything, LEVEL, centre=np.zeros(3), size=1.0)
+    with pytest.raises(UserError, match=message + "no plane is in sight"):
+        plane_views(cloud, LEVEL, [], centre=np.zeros(3), radius=1.0, object_mask=everything)

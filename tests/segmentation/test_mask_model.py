@@ -19,7 +19,7 @@ NAMES = ("batched_images", "batched_point_coords", "batched_point_labels")
 
 @pytest.fixture(params=["OpenCV", "onnxruntime"])
 def program(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """What computes networks; the second where it is installed."""
+    """Program that evaluates networks; the second one if it is installed."""
     if request.param == "onnxruntime":
         pytest.importorskip("onnxruntime")
     else:
@@ -104,7 +104,7 @@ def test_files_that_are_no_such_network(program: str, tmp_path: Path) -> None:
         OnnxClickModel.read(written(tmp_path / "two.onnx", two))
     unknown = alike().replace(b"MatMul", b"MatMuX")
     with pytest.raises(
-        UserError, match=rf"unknown\.onnx: ({program} does not know this network|the network failed on)"
+        UserError, match=rf"unknown\.onnx: ({program} cannot read this network|the network failed on)"
     ):
         OnnxClickModel.read(written(tmp_path / "unknown.onnx", unknown)).mask(
             halves(), np.array([[9.0, 6.0]]), np.array([True])
@@ -147,7 +147,7 @@ def test_what_stands_out_is_stretched_to_all_of_its_range() -> None:
 def test_where_nothing_that_proposes_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(
-        UserError, match=r"nothing is installed that proposes one; install egs-warp\[salient\], or click"
+        UserError, match=r"no network for proposing an object is installed; install egs-warp\[salient\], or click"
     ):
         SalientModel.installed()
 

@@ -31,7 +31,7 @@ def check(cloud: GaussianCloud, truth: np.ndarray, spec: ObjectSpec) -> None:
     found = segment(cloud, FLOOR, spec)
     heights = FLOOR.heights(cloud.means.numpy())
     clear = heights > 0.05
-    # A few of the floor's at the very point of contact, which nobody can tell apart.
+    # A few of the floor's Gaussians at the point of contact cannot be separated.
     assert (found.object_mask & ~truth & (np.abs(heights) > 0.01)).sum() == 0
     assert (found.object_mask & ~truth).sum() <= 4
     assert (truth & clear & ~found.object_mask).sum() == 0
@@ -61,6 +61,26 @@ def test_shreds_of_the_floor_do_not_go_along() -> None:
     assert found.floater_mask[cloud.count :].tolist() == [True] * 5 + [False]
     assert found.object_mask[-1]
     assert (truth & (cloud.means.numpy()[:, 2] > 0.05) & ~found.object_mask[: cloud.count]).sum() == 0
+
+
+def test_an_object_that_segmentation_leaves_empty_is_an_error_of_that_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whichever step removes the last Gaussian: floor remnants, haze or clicks."""
+    cloud, _ = ball_on_floor()
+    spec = ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "floor_remnants", lambda scene, chosen, size: np.ones(len(chosen), bool))
+        with pytest.raises(UserError, match=r"^segment: none of the object's \d+ Gaussians is left: all of it has the"):
+            segment(cloud, FLOOR, spec)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_haze_indices", lambda scene, object_cloud, size: object_cloud)
+        with pytest.raises(
+            UserError, match=r"^segment: none of the object's \d+ Gaussians is left: haze and the clicks"
+        ):
+            segment(cloud, FLOOR, spec)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "removed_by_clicks", lambda cloud, nodes, *_: np.ones(len(nodes), bool))
+        with pytest.raises(UserError, match=r"^segment: none of the object's \d+ Gaussians is left: the clicks beside"):
+            segment(cloud, FLOOR, spec)
 
 
 def test_fine_specks_in_the_floor_s_colour_are_no_shreds_of_it() -> None:
@@ -118,12 +138,12 @@ def test_what_no_mask_can_mean_is_said() -> None:
     with pytest.raises(UserError, match="nothing of it lies above the plane"):
         segment(cloud, FLOOR, ObjectSpec(box=Box(np.array([5.0, 5.0, 0.0]), np.array([6.0, 6.0, 1.0]))))
     hovering, _ = ball_on_floor(lift=0.6)
-    with pytest.raises(UserError, match=r"it touches no plane: its lowest part is 0\.\d+ of its size above"):
+    with pytest.raises(UserError, match=r"it does not touch the plane: its lowest part is 0\.\d+ of its size above"):
         segment(hovering, FLOOR, ObjectSpec(point=np.array([0.0, -0.5, 1.1])))
 
 
 def test_plane_and_object_from_a_click_alone() -> None:
-    """Nobody says where the plane is, nor which way is up."""
+    """Neither the plane nor the up direction is given."""
     cloud, _ = ball_on_floor()
     located = locate_plane(cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
     assert located.plane.normal[2] > np.cos(np.radians(0.3))
@@ -185,7 +205,8 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     "name", ["pawn", *(pytest.param(name, marks=pytest.mark.slow) for name in ("stool", "figurine"))]
 )
 def test_built_in_scenes_come_apart(name: str) -> None:
-    """Against the known object: all of it above the foot, and none of the room but what nobody can see."""
+    """Compared with the known object: all of it above the foot is found, and nothing of the room except unseen
+    Gaussians."""
     made = scene(name)
     cloud, truth = made.whole()
     camera = made.camera(width=200, height=200)
@@ -245,9 +266,8 @@ def test_a_click_finds_what_is_flat_in_a_room() -> None:
 
 
 def test_the_unit_of_length_changes_nothing() -> None:
-    """A ball on its floor, wide shreds of the floor at its foot, and what is buried under it: in metres as in
-    millimetres.
-    """
+    """A ball on its floor, wide floor remnants at its foot, and buried Gaussians under it, in metres and in
+    millimetres."""
     cloud, truth = ball_on_floor()
     angles = np.arange(6)
     shreds = np.column_stack([0.3 * np.cos(angles), 0.3 * np.sin(angles), np.full(6, 0.09)])
@@ -349,5 +369,5 @@ def test_what_hovers_over_the_only_floor_is_taken_and_said() -> None:
     assert located.segmentation.object_mask[truth].mean() > 0.99
     assert any("its lowest part hangs 0.2" in note for note in located.notes)
     higher, _ = ball_on_floor(lift=0.7)
-    with pytest.raises(UserError, match=r"it touches no plane: its lowest part is 0\.4"):
+    with pytest.raises(UserError, match=r"it does not touch the plane: its lowest part is 0\.4"):
         locate_plane(higher, ObjectSpec(point=np.array([0.0, -0.5, 1.2])), up=FLOOR.normal)

@@ -1,4 +1,4 @@
-"""Planes that nobody has marked: the widest first, of what lies along them, in one patch, where they can be seen."""
+"""Search for unmarked planes: widest first, from Gaussians parallel to them, in one patch, where they are visible."""
 
 from __future__ import annotations
 
@@ -75,11 +75,12 @@ def test_a_plane_is_one_patch_or_none() -> None:
     above = level((-1.0, -1.0), (7.0, 1.0), 0.4, 0.03)
     assert _is_one_patch(lying(one), FLOOR, 0.1)
     assert not _is_one_patch(lying(np.concatenate([apart, above])), FLOOR, 0.1)
+    assert not _is_one_patch(lying(one), Plane(FLOOR.normal, FLOOR.offset - 1.0), 0.1)
 
 
 @pytest.mark.parametrize("scale", [1.0, 10.0])
 def test_further_planes_are_level_in_one_patch_and_elsewhere(scale: float) -> None:
-    """Of a table, a floor below and shelves apart at one level, the floor, in whatever unit of length."""
+    """With a table, a floor below and separate shelves at one level, the floor is found, in any unit of length."""
     table, floor = level((-0.6, -0.6), (0.6, 0.6), 0.0, 0.03), level((-2.0, -2.0), (2.0, 2.0), -0.8, 0.03)
     shelves = [level((x, y), (x + 0.7, y + 0.7), 0.7, 0.03) for x in (-2.0, 1.3) for y in (-2.0, 1.3)]
     room = lying(np.concatenate([table, floor, *shelves])).scaled(scale)

@@ -34,7 +34,7 @@ TONES = (-1.0, 1.2)
 
 
 class ByTone:
-    """Marks what is as dark as the first point, and notes what it is asked."""
+    """Marks pixels as dark as the first point, and records its inputs."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[np.ndarray, np.ndarray]] = []
@@ -57,7 +57,7 @@ def pixel_of(camera: Camera, point: tuple[float, float, float]) -> tuple[float, 
 
 @pytest.mark.slow
 def test_one_click_is_marked_in_every_view_and_cuts_what_touches(cameras: list[Camera]) -> None:
-    """Of two balls that touch the one that is clicked on is found, whole; by that click without a network, both."""
+    """Among two touching balls, the clicked one is found completely; without a network, the click finds both."""
     cloud = balls(TONES)
     camera = next(one for one in cameras if one.centre[1] < -1.0 and abs(one.centre[0]) < 1.5)
     click = click_at(cloud, camera, *pixel_of(camera, (-0.5, -0.45, 0.6)))
@@ -89,7 +89,7 @@ def test_a_view_that_marks_something_else_is_left_out(cameras: list[Camera]) -> 
 
 @pytest.mark.parametrize(("times", "fits"), [(2.9, True), (3.1, False)])
 def test_a_mask_thrice_as_large_is_of_something_else(cameras: list[Camera], times: float, fits: bool) -> None:
-    """What the network marks from where the first mask was drawn, about its middle, larger by so many times."""
+    """The network marks the region of the first mask about its middle, enlarged by this factor."""
     cloud = balls(TONES)
     (first,) = masks_from_selection(cloud, np.arange(cloud.count) < 1500, cameras[:1])
     places = np.indices(first.mask.shape).transpose(1, 2, 0)
@@ -122,14 +122,14 @@ def test_what_nothing_can_be_made_of_is_told(cameras: list[Camera]) -> None:
     beside = click_at(cloud, cameras[0], *pixel_of(cameras[0], (0.5, 0.0, 0.9)), inside=False)
     on = click_at(cloud, cameras[0], *pixel_of(cameras[0], (-0.5, 0.0, 0.9)))
     assert beside is not None and on is not None
-    with pytest.raises(UserError, match="no click on it for the network to go by"):
+    with pytest.raises(UserError, match="the network needs a click on it"):
         masks_of_clicks(cloud, [beside], cameras, ByTone())
 
     class Blind(ByTone):
         def mask(self, picture: np.ndarray, points: np.ndarray, inside: np.ndarray) -> np.ndarray:
             return np.zeros(picture.shape[:2], bool)
 
-    with pytest.raises(UserError, match="the network marks nothing where it was clicked on"):
+    with pytest.raises(UserError, match="the network finds nothing where it was clicked"):
         masks_of_clicks(cloud, [on], cameras, Blind())
 
 
@@ -173,7 +173,7 @@ def test_what_stands_out_of_most_views_is_taken(cameras: list[Camera]) -> None:
         def mask(self, picture: np.ndarray) -> np.ndarray:
             return np.ones(picture.shape[:2], bool)
 
-    with pytest.raises(UserError, match="nothing stands out of the pictures; click on it"):
+    with pytest.raises(UserError, match="nothing is salient in the pictures; click on it"):
         salient_masks(cloud, cameras, Nothing.__new__(Nothing))
 
 

@@ -69,7 +69,7 @@ def test_a_box_rests_on_its_underside(off: float) -> None:
 
 @pytest.mark.parametrize("off", [-9.0, -5.0, 5.0])
 def test_the_direction_is_found_more_finely_than_by_the_first_search(off: float) -> None:
-    """Which tries directions 1.4 degrees apart."""
+    """The search tries directions 1.4 degrees apart."""
     cloud = round_ones(skin_of_box(), 0.008)
     found = resting_plane(cloud, np.ones(cloud.count, bool), FLOOR, leaning(off), degrees=10.0, size=1.3)
     assert degrees_between(found.normal, UP) < 0.15
@@ -167,7 +167,7 @@ def test_haze_within_an_object_is_dropped_with_it() -> None:
 
 
 def test_haze_at_an_object_in_its_colour_is_dropped_with_it() -> None:
-    """What has another colour, or is further away, is of the room."""
+    """Haze of another colour, or farther away, belongs to the room."""
     cloud, _ = ball_on_floor()
     where = np.array([[0.55, 0.0, 0.5], [0.0, 0.55, 0.5], [0.75, 0.0, 0.5]])
     haze = round_ones(where, 0.2)

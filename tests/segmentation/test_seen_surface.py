@@ -1,4 +1,4 @@
-"""Where a picture shows a surface: by heights a floor is where it is, by depths it seems higher."""
+"""Visible surfaces of a picture: from heights, a floor is at its place; from depths, it seems higher."""
 
 from __future__ import annotations
 

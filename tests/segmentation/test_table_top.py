@@ -82,7 +82,7 @@ def test_candidates_do_not_hang_on_the_unit_of_length(room: GaussianCloud, candi
 
 
 def test_dust_far_away_changes_no_candidate(room: GaussianCloud, candidates: list[Plane]) -> None:
-    """What is too faint to be seen does not say how large the capture is."""
+    """Gaussians too faint to be visible do not affect the size of the capture."""
     dust = GaussianCloud.from_numpy(
         np.random.default_rng(0).uniform(-60.0, 60.0, (4000, 3)),
         np.tile([1.0, 0.0, 0.0, 0.0], (4000, 1)),

@@ -32,7 +32,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import PosedImage, read_points
 from egs_warp.io.glb import write_glb
-from egs_warp.io.limits import FURTHEST, LONGEST_SIDE
+from egs_warp.io.limits import FURTHEST, MAX_SIDE
 from egs_warp.io.onnx import read_onnx
 from egs_warp.io.photos import read_photo
 from egs_warp.io.planes import read_planes
@@ -158,7 +158,7 @@ def _capture(path: Path) -> None:
 def _cameras(path: Path) -> None:
     for one in read_cameras(path):
         camera = one.camera
-        assert 1 <= camera.width <= LONGEST_SIDE and 1 <= camera.height <= LONGEST_SIDE
+        assert 1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE
         numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.translation, *camera.rotation.ravel()]
         assert np.isfinite(numbers).all() and min(camera.fx, camera.fy) > 0
 

@@ -100,10 +100,10 @@ def test_what_cannot_go_on_is_told(views: list[TrainingView], tmp_path: Path) ->
             finetune(start(), views, options=OPTIONS, checkpoint=path, resume=True)
         return str(error.value)
 
-    assert told(views) == f"{path}: no training was cut off here; begin it"
+    assert told(views) == f"{path}: no checkpoint of an interrupted training here; start without resuming"
     cut_off(views, path, 3, resume=False)
     assert told(views[:9]) == (
-        f"{path}: is of other photos, other flags or another version of egs-warp; begin the training again"
+        f"{path}: it is of other photos, flags or another version of egs-warp; start the training again"
     )
     path.write_bytes(path.read_bytes()[:300])
-    assert told(views) == f"{path}: is damaged; begin the training again"
+    assert told(views) == f"{path}: the checkpoint is damaged; start the training again"

@@ -15,7 +15,7 @@ from egs_warp.training.finetune import FinetuneOptions, finetune, render_views  
 from egs_warp.training.growth import Growth  # noqa: E402
 from egs_warp.training.metrics import match_tone  # noqa: E402
 from egs_warp.training.outlier_views import is_outlier  # noqa: E402
-from egs_warp.training.relocation import Population, _pace  # noqa: E402
+from egs_warp.training.relocation import Population, _growth_factor  # noqa: E402
 
 
 @pytest.mark.slow
@@ -120,7 +120,7 @@ def test_the_number_grows_gently_where_there_is_time() -> None:
         """Step at which the cap is reached, and the largest factor."""
         largest = 1.0
         for step in range(99, steps, 100):
-            pace = _pace(cap / count, step, steps)
+            pace = _growth_factor(cap / count, step, steps)
             largest = max(largest, pace)
             count = min(cap, int(pace * count) + 1)
             if count == cap:

@@ -177,7 +177,7 @@ def test_bad_views_are_named() -> None:
         finetune(cloud, [TrainingView(camera, image), TrainingView(camera, image[:8, :8])])
     with pytest.raises(UserError, match=r"trainable has shape \(3,\), expected \(10,\)"):
         finetune(cloud, [TrainingView(camera, image)], trainable=np.ones(3, bool))
-    with pytest.raises(UserError, match="leave trainable or the densification out"):
+    with pytest.raises(UserError, match="give either trainable or a densification"):
         finetune(
             cloud,
             [TrainingView(camera, image)],

@@ -65,7 +65,7 @@ def test_photographs_beside_the_cameras_clear_the_plane(tmp_path: Path) -> None:
 def test_a_photo_is_reduced_in_blocks_of_whole_pixels_as_its_camera_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of 97 pixels at a third 32 are left, of the first 96; stretched to all of them it would be off at its edge."""
+    """A third of 97 pixels is 32, of the first 96; an image resized from all 97 would be shifted at its edge."""
     pytest.importorskip("torch")
     from egs_warp.io import read_cameras
     from egs_warp.training import photo_colours

@@ -91,14 +91,14 @@ SEGMENTATION = [
     ),
     Survivor(
         "segmentation/plane_search.py",
-        "if len(left) < 10:",
-        "if len(left) < 9:",
+        "if len(rest) < 10:",
+        "if len(rest) < 9:",
         "nine Gaussians that are left over make no plane that counts beside the widest",
     ),
     Survivor(
         "segmentation/plane_search.py",
-        "near = np.abs(plane.heights(means[left])) < 2.0 * band",
-        "near = np.abs(plane.heights(means[left])) <= 2.0 * band",
+        "near = np.abs(plane.heights(means[rest])) < 2.0 * band",
+        "near = np.abs(plane.heights(means[rest])) <= 2.0 * band",
         "a height that is the very bound",
     ),
     Survivor(
@@ -121,8 +121,8 @@ SEGMENTATION = [
     ),
     Survivor(
         "segmentation/plane_search.py",
-        "few = random.choice(left, min(_SAMPLE, len(left)), replace=False, p=area[left] / area[left].sum())",
-        "few = random.choice(left, min(_SAMPLE, len(left)), replace=True, p=area[left] / area[left].sum())",
+        "few = random.choice(rest, min(_SAMPLE, len(rest)), replace=False, p=area[rest] / area[rest].sum())",
+        "few = random.choice(rest, min(_SAMPLE, len(rest)), replace=True, p=area[rest] / area[rest].sum())",
         "another sample, as good: some of its Gaussians come twice",
     ),
     Survivor(
