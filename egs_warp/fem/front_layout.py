@@ -68,7 +68,7 @@ class FrontLayout:
             "factor_offsets": _offsets(heights * widths),
             "inverse_offsets": _offsets(inverses),
             "update_offsets": update_offsets,
-            "place": blocks.permutation,
+            "permutation": blocks.permutation,
         }.items():
             setattr(fronts, name, as_index_array(values))
         return cls(

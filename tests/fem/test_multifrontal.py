@@ -156,7 +156,7 @@ def test_a_pivot_next_to_nothing_has_no_factors() -> None:
     whole = upper_of(sparse.csc_matrix(matrix))
     factors = MultifrontalLdl(whole)
     # The matrix whose Schur complement at the last of k rows, in the order of elimination, is so much of the diagonal.
-    place = np.argsort(factors.place)
+    place = np.argsort(factors.permutation)
     for k in (1, 17, 50):
         inside, last = place[: k - 1], place[k - 1]
         schur = matrix[last, inside] @ np.linalg.solve(matrix[np.ix_(inside, inside)], matrix[inside, last])
