@@ -260,7 +260,7 @@ class _InverseFactor:
     def factor(self) -> torch.Tensor:
         """Compute R of ``matrix``; return a () bool tensor, True if the matrix is definite."""
         if self._tiled is not None:
-            return self._tiled.make()
+            return self._tiled.factor()
         definite = self._whole.factor(self.matrix)
         self._set_inverse(self._whole.inverse)
         return definite
