@@ -16,11 +16,11 @@ from egs_warp.worker_threads import Task, WorkerThreads, worker_threads
 
 BUSY = """
 import sys, time
-from egs_warp.worker_threads import helpers
+from egs_warp.worker_threads import worker_threads
 began = time.monotonic()
 print("ready", flush=True)
 while time.monotonic() < began + 60.0:
-    helpers().begin(lambda: sum(range(300))).result()
+    worker_threads().begin(lambda: sum(range(300))).result()
 """
 
 
