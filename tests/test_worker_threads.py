@@ -1,4 +1,4 @@
-"""Threads that help: each work is done once, by whoever is free, and Ctrl-C at any moment ends the process."""
+"""Worker threads execute each task once, and Ctrl-C at any moment ends the process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ while time.monotonic() < began + 60.0:
 
 
 def test_each_work_is_done_once() -> None:
-    """By a helper or by who wants it, more of them than there are threads; no more threads than may be."""
+    """By a worker or by the caller, with more tasks than threads; the number of threads stays within its limit."""
     many, done = WorkerThreads(2), []
     before = threading.active_count()
     tasks = [many.begin(lambda number=number: done.append(number) or number) for number in range(300)]
@@ -76,8 +76,8 @@ def test_what_was_settled_never_begins() -> None:
     assert task.result() is None and done == []
 
 
-def test_an_error_is_told_to_who_wants_the_result() -> None:
-    """And to nobody else: the thread goes on."""
+def test_an_error_is_raised_by_result() -> None:
+    """Only the caller of ``result`` gets the error; the worker thread continues."""
     one = WorkerThreads(1)
     for _ in range(3):
         begun = threading.Event()
