@@ -1,6 +1,6 @@
-"""egs_warp: still objects in 3D Gaussian Splatting captures come to life (EnliveningGS, CVPR 2025) in Warp kernels.
+"""egs_warp animates still objects in 3D Gaussian Splatting captures (EnliveningGS, CVPR 2025) with Warp kernels.
 
-``import egs_warp as egs`` gives all of the names below, each imported when it is first used.
+``import egs_warp as egs`` provides all names below; each is imported at its first use.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     ),
     "training.metrics": ("psnr",),
 }
-"""Where each public name lives; the imports above say the same to type checkers."""
+"""Module of each public name; the imports above declare the same for type checkers."""
 _MODULE_OF = {name: f"egs_warp.{module}" for module, names in _MODULES.items() for name in names}
 
 __all__ = [
@@ -198,7 +198,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """The public ``name``, imported now (PEP 562)."""
+    """Import and return the public ``name`` (PEP 562)."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'egs_warp' has no attribute {name!r}")
     value = getattr(import_module(_MODULE_OF[name]), name)

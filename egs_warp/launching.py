@@ -1,7 +1,7 @@
-"""New arrays, and launches of a kernel over many independent rows: at once on a GPU, with every core on a CPU.
+"""Device setup, kernel launches and array allocation.
 
-On a CPU, Warp runs one launch on one thread but releases the interpreter lock while it runs, so launches over disjoint
-rows from several threads run side by side.
+On a CPU, Warp runs a launch on one thread but releases the interpreter lock, so launches over disjoint rows from
+several threads run in parallel.
 """
 
 from __future__ import annotations
@@ -33,44 +33,49 @@ Device: TypeAlias = wp.Device | str | None
 """A device or its name; None is Warp's current one."""
 
 THREADS = "EGS_WARP_THREADS"
-"""In the environment: how many cores the package may use at most, where that is less than there are."""
+"""Environment variable with the maximum number of cores that the package uses."""
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 _MIN_ROWS_PER_CHUNK = 2048
-"""Below this many light rows a launch's own cost (about 20 us) is no longer small against its work."""
+"""Minimum number of light rows per chunk; below it the cost of a launch (about 20 us) is not negligible."""
 
 _ALIGNMENT = 256
-"""Bytes: what the widest loads of a GPU ask for."""
+"""Alignment of pooled arrays, bytes: that of the widest loads of a GPU."""
 
 _LAST_CHUNKS_PER_THREAD = 24
-"""The smallest chunk is this part of a thread's share: what one thread may wait for the other at the end."""
+"""The smallest chunk is this part of a thread's share; it bounds the idle time of a thread at the end."""
 
 
 def available_threads() -> int:
-    """Number of processor cores that this process may use."""
+    """Return the number of processor cores that this process may use."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-    most = os.environ.get(THREADS, "")
-    return max(1, min(cores, int(most)) if most.isdecimal() else cores - _left)
+    limit = os.environ.get(THREADS, "")
+    return max(1, min(cores, int(limit)) if limit.isdecimal() else cores - _reserved)
 
 
-_left = 0
-"""Cores that are left to others."""
+_reserved = 0
+"""Number of cores reserved for other processes."""
 
 
 @contextmanager
 def reserve_core() -> Iterator[None]:
-    """While it lasts, all threads of this process leave a core to whoever else computes here, where there is more than
-    one and the environment does not say how many to use."""
-    global _left
-    _left += 1
+    """Reserve a core for other processes within the context.
+
+    It has no effect on a machine with one core or if the environment variable ``THREADS`` is set.
+    """
+    global _reserved
+    _reserved += 1
     try:
         yield
     finally:
-        _left -= 1
+        _reserved -= 1
 
 
 def use_device(device: str) -> None:
-    """Called first by programs: raises ``UserError`` where Warp sees no such device or has no place for its kernels,
-    and leaves Warp only its warnings."""
+    """Initialize Warp for ``device`` and limit its output to warnings. Programs call this first.
+
+    Raises:
+        UserError: Warp has no such device, or cannot create its kernel cache.
+    """
     wp.config.log_level = wp.LOG_WARNING
     try:
         with _without_driver_warning() if device == "cpu" else nullcontext():
@@ -78,8 +83,7 @@ def use_device(device: str) -> None:
     except OSError as error:
         place = error.filename or wp.config.kernel_cache_dir
         raise UserError(
-            f"kernel cache {place}: cannot be made ({error.strerror}); set WARP_CACHE_PATH to a folder that can be"
-            " written"
+            f"kernel cache {place}: cannot be created ({error.strerror}); set WARP_CACHE_PATH to a writable folder"
         ) from error
     if device not in (devices := [str(known) for known in wp.get_devices()]):
         raise ArgumentError("device", f"this machine has {', '.join(devices)}", value=device)
@@ -87,28 +91,28 @@ def use_device(device: str) -> None:
 
 @contextmanager
 def _without_driver_warning() -> Iterator[None]:
-    """Warp's native code warns those, too, who ask for no GPU that there is no driver, past Python's own streams."""
+    """Suppress the warning about a missing GPU driver, which Warp's native code writes to stderr even for a CPU."""
     with ExitStack() as files:
         try:
-            said = files.enter_context(tempfile.TemporaryFile())
-            kept = os.dup(2)
+            captured = files.enter_context(tempfile.TemporaryFile())
+            stderr = os.dup(2)
         except OSError:
             yield
             return
-        files.callback(os.close, kept)
-        os.dup2(said.fileno(), 2)
+        files.callback(os.close, stderr)
+        os.dup2(captured.fileno(), 2)
         try:
             yield
         finally:
-            os.dup2(kept, 2)
-            said.seek(0)
-            # A stream that is full or closed is not about the device.
+            os.dup2(stderr, 2)
+            captured.seek(0)
+            # A full or closed stream is no error of the device.
             with suppress(OSError):
-                os.write(2, b"".join(line for line in said if _NO_DRIVER not in line))
+                os.write(2, b"".join(line for line in captured if _NO_DRIVER not in line))
 
 
 def kernels_are_compiled() -> bool:
-    """Whether some of this package's kernels lie in Warp's cache; call ``use_device`` before."""
+    """Return True if kernels of this package are in Warp's cache. Requires ``use_device``."""
     return any(Path(wp.config.kernel_cache_dir or ".").glob("wp_egs_warp.*"))
 
 
@@ -122,12 +126,19 @@ def launch_rows(
     threads: int | None = None,
     work: np.ndarray | None = None,
 ) -> None:
-    """Run ``kernel`` over rows 0 .. ``row_count`` - 1.
+    """Run ``kernel`` over rows 0 .. ``row_count`` - 1, on a CPU with several threads.
 
-    The kernel's first parameter must be ``first_row: wp.int32`` and its row ``first_row + wp.tid()``; each row may
-    write only what belongs to it, so that the result does not depend on how rows are shared out. ``inputs`` and
-    ``outputs`` are the remaining parameters. ``threads`` (a CPU only) defaults to the available cores. ``work``
-    (row_count,) is the expected effort of heavy rows, any unit; without it rows are light and alike.
+    The kernel's first parameter must be ``first_row: wp.int32`` and its row ``first_row + wp.tid()``. Each row may
+    write only its own outputs, so that the result does not depend on the distribution of rows.
+
+    Args:
+        kernel: the Warp kernel.
+        row_count: number of rows.
+        inputs: inputs after ``first_row``.
+        outputs: outputs.
+        device: device of the launch.
+        threads: number of threads on a CPU; default: the available cores.
+        work: (row_count,) expected effort of heavy rows in any unit; without it rows count as light and equal.
     """
     if not device.is_cpu:
         launch_cached(kernel, row_count, inputs=[0, *inputs], outputs=outputs, device=device)
@@ -137,13 +148,13 @@ def launch_rows(
     if threads == 1 or len(edges) < 3:
         wp.launch(kernel, dim=row_count, inputs=[0, *inputs], outputs=list(outputs), device=device)
         return
-    # Compiling is not safe from several threads at once.
+    # Compilation is not safe from several threads at once.
     kernel.module.load(device, block_dim=1)
     chunks = iter(list(pairwise(edges)))
 
     def launch_chunks() -> None:
         launch: Any = None
-        # Whoever is free takes the next chunk, and packs the arguments only once.
+        # Each thread takes the next chunk when it is idle, and packs the arguments only once.
         for first, last in chunks:
             if launch is None:
                 arguments = {"inputs": [first, *inputs], "outputs": list(outputs), "device": device}
@@ -157,227 +168,233 @@ def launch_rows(
     try:
         launch_chunks()
     finally:
-        # Who has not begun would find nothing left to do.
+        # Tasks that have not started have no chunks left; waiting cancels them.
         for task in tasks:
             task.wait()
     for task in tasks:
         task.result()
 
 
-class _Recorded(threading.local):
-    """Launches that this thread has made, for it to change and make again."""
+class _LaunchCache(threading.local):
+    """Recorded launches of this thread, which are updated and repeated."""
 
     def __init__(self) -> None:
         self.launches: dict[tuple[Any, str], tuple[Any, int | tuple[int, int], list[Any]]] = {}
 
 
-_recorded = _Recorded()
+_launch_cache = _LaunchCache()
 
 
 def launch_cached(
     kernel: Any, dim: int | tuple[int, int], *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device
 ) -> None:
-    """``wp.launch`` at a third of its cost, for kernels that run many times a second.
+    """Launch a kernel at a third of the cost of ``wp.launch``, for kernels that run many times a second.
 
-    The first launch of a thread is kept; the next ones only put in those arguments that are others than last time,
-    whose types are not checked again. A struct or vector that is the same object as last time may have other contents.
+    Each thread records its first launch; later launches replace only the arguments that have changed, without a check
+    of their types. A struct or vector that is the same object as before may have new contents.
     """
-    launches = _recorded.launches
-    kept, kept_dim, held = launches.get((kernel, device.alias), (None, -1, []))
-    if kept is None:
-        kept = wp.launch(kernel, dim, inputs=list(inputs), outputs=list(outputs), device=device, record_cmd=True)
-        # None where there is nothing to do.
-        if kept is None:
+    launches = _launch_cache.launches
+    command, command_dim, arguments = launches.get((kernel, device.alias), (None, -1, []))
+    if command is None:
+        command = wp.launch(kernel, dim, inputs=list(inputs), outputs=list(outputs), device=device, record_cmd=True)
+        # Warp returns None for an empty launch.
+        if command is None:
             return
-        # What the launch keeps alive besides its packed arguments.
-        kept.fwd_args = None  # pyright: ignore[reportAttributeAccessIssue]  # guessed from a list
-        held = [_UNKNOWN] * (len(inputs) + len(outputs))
-        launches[kernel, device.alias] = kept, dim, held
+        # Release the arguments that the recorded launch holds besides the packed ones.
+        command.fwd_args = None  # pyright: ignore[reportAttributeAccessIssue]  # guessed from a list
+        arguments = [_UNKNOWN] * (len(inputs) + len(outputs))
+        launches[kernel, device.alias] = command, dim, arguments
     else:
-        if dim != kept_dim:
-            kept.set_dim(dim)
-            launches[kernel, device.alias] = kept, dim, held
+        if dim != command_dim:
+            command.set_dim(dim)
+            launches[kernel, device.alias] = command, dim, arguments
         for i, value in enumerate((*inputs, *outputs)):
-            last = held[i]
+            last = arguments[i]
             if isinstance(value, wp.array):
-                # Held weakly: the array itself would keep its memory.
+                # A weak reference, so that the cache does not hold the memory of the array.
                 if type(last) is not weakref.ref or last() is not value:
-                    kept.set_param_at_index_from_ctype(i, value.__ctype__())
-                    held[i] = weakref.ref(value)
+                    command.set_param_at_index_from_ctype(i, value.__ctype__())
+                    arguments[i] = weakref.ref(value)
             elif isinstance(value, int | float):
                 if type(last) is not type(value) or last != value:
-                    kept.set_param_at_index_from_ctype(i, value)
-                    held[i] = value
+                    command.set_param_at_index_from_ctype(i, value)
+                    arguments[i] = value
             elif last is not value:
-                kept.set_param_at_index(i, value)
-                held[i] = value
-    if kept.bounds.size > 0:
-        kept.launch()
+                command.set_param_at_index(i, value)
+                arguments[i] = value
+    if command.bounds.size > 0:
+        command.launch()
 
 
 def lanes_on(device: wp.Device) -> int:
-    """Threads that work out a row together: those of a GPU's warp, one on a CPU."""
+    """Return the number of threads that compute a row together: those of a warp on a GPU, one on a CPU."""
     return 1 if device.is_cpu else 32
 
 
 _UNKNOWN = object()
-"""Stands for an argument that was never put in."""
+"""Marks an argument that has not been set."""
 
 
 def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[int]:
-    """Where chunks begin and end, whose effort shrinks towards the last:
-    all threads then finish at about the same time.
-    """
-    least = 0.0 if work is not None else _MIN_ROWS_PER_CHUNK / max(row_count, 1)
-    least = max(least, 1.0 / (_LAST_CHUNKS_PER_THREAD * threads))
-    shares, taken = [], 0.0
-    while threads > 1 and taken + least < 1.0:
-        taken += max((1.0 - taken) / (2 * threads), least)
-        shares.append(taken)
+    """Return the boundaries of the chunks; their effort shrinks towards the end, so that threads finish together."""
+    min_share = 0.0 if work is not None else _MIN_ROWS_PER_CHUNK / max(row_count, 1)
+    min_share = max(min_share, 1.0 / (_LAST_CHUNKS_PER_THREAD * threads))
+    shares, total = [], 0.0
+    while threads > 1 and total + min_share < 1.0:
+        total += max((1.0 - total) / (2 * threads), min_share)
+        shares.append(total)
     if work is None:
         inner = np.array(shares) * row_count
     else:
-        done = np.concatenate([[0.0], np.cumsum(np.asarray(work, dtype=np.float64) + 1e-3)])
-        inner = np.searchsorted(done, np.array(shares) * done[-1])
+        cumulative = np.concatenate([[0.0], np.cumsum(np.asarray(work, dtype=np.float64) + 1e-3)])
+        inner = np.searchsorted(cumulative, np.array(shares) * cumulative[-1])
     return np.unique(np.concatenate([[0], inner, [row_count]]).astype(int)).tolist()
 
 
-def thread_local_cache(most: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """A decorator: what was made for the last ``most`` different arguments is kept, by each thread for itself, as
-    memory must be that is written to."""
+def thread_local_cache(max_entries: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
+    """Return a decorator that caches a function's results in a per-thread LRU cache of ``max_entries``.
 
-    def decorated(make: Callable[..., T]) -> Callable[..., T]:
-        own = threading.local()
+    Per thread, because the cached objects are writable buffers.
+    """
 
-        def kept(*arguments: Any) -> T:
-            if not hasattr(own, "made"):
-                own.made = lru_cache(maxsize=most)(make)
-            return own.made(*arguments)
+    def decorate(make: Callable[..., T]) -> Callable[..., T]:
+        local = threading.local()
 
-        return kept
+        def cached(*arguments: Any) -> T:
+            if not hasattr(local, "make"):
+                local.make = lru_cache(maxsize=max_entries)(make)
+            return local.make(*arguments)
 
-    return decorated
+        return cached
+
+    return decorate
 
 
 def run_concurrently(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
-    """Both results; ``second`` runs in another thread where one is free."""
+    """Run both functions, ``second`` in a worker thread if one is idle, and return their results."""
     if available_threads() == 1:
         return first(), second()
     task = worker_threads().begin(second)
     try:
         return first(), task.result()
     except BaseException:
-        # What it works with may be used again at once.
+        # The caller may reuse the memory of ``second`` at once.
         task.wait()
         raise
 
 
 @cache
 def warp_stream(stream: Any) -> wp.Stream:
-    """Warp's name of a ``stream`` of torch, which has few and keeps them, kept, too: with a name goes what Warp holds
-    for that stream, whoever else has a name of it."""
+    """Return Warp's wrapper of a PyTorch ``stream``, cached forever.
+
+    PyTorch has few streams and never frees them. When a wrapper is freed, Warp frees what it holds for the stream, even
+    if another wrapper of it exists.
+    """
     return wp.stream_from_torch(stream)
 
 
 def device_of(array: wp.array) -> wp.Device:
-    """Where ``array`` is. Warp's own type leaves room for none, which only annotations have."""
+    """Return the device of ``array``. Warp's type also admits None, which only annotations have."""
     device: Any = array.device
     return device
 
 
 def empty(shape: Shape, dtype: Any, device: Device, *, pinned: bool = False) -> wp.array:
-    """Array of undefined contents; ``pinned`` is page-locked, on a CPU. Warp's own stub admits only Python's ``float``
-    as a type.
+    """Return an uninitialized array; ``pinned`` makes host memory page-locked.
+
+    Warp's own stub admits only Python's ``float`` as a type.
     """
     return wp.empty(shape, dtype=dtype, device=device, pinned=pinned)
 
 
-def empty_pooled(device: Device, *wanted: tuple[Shape, Any]) -> list[wp.array]:
-    """Arrays of undefined contents in one piece of memory, each given by its shape and type.
+def empty_pooled(device: Device, *specs: tuple[Shape, Any]) -> list[wp.array]:
+    """Return uninitialized arrays that share one allocation, each specified by its shape and type.
 
-    An allocation on a GPU costs several times a look into it, and small pictures wait for both: arrays that nobody
-    holds any more are given again, as they are, to the next who wants the same on the same stream. Put together what
-    lives equally long: the memory goes when the last of the arrays does.
+    An allocation on a GPU is expensive compared to rendering a small image. Arrays without remaining references are
+    therefore reused by the next call with the same ``specs`` on the same stream. Allocate arrays of equal lifetime
+    together: the memory is freed with the last of them.
     """
     device = wp.get_device(device)
-    kept = _spare.kept
-    key = (device.alias, device.stream.cuda_stream if device.is_cuda else None, wanted)
-    made = kept.get(key, [])
-    for pieces in made:
-        if _holders(pieces) == _NO_HOLDER:
-            kept.move_to_end(key)
-            return list(pieces)
+    cache = _free_list.entries
+    key = (device.alias, device.stream.cuda_stream if device.is_cuda else None, specs)
+    groups = cache.get(key, [])
+    for arrays in groups:
+        if _max_references(arrays) == _UNREFERENCED:
+            cache.move_to_end(key)
+            return list(arrays)
     starts, total = [], 0
-    for shape, dtype in wanted:
+    for shape, dtype in specs:
         starts.append(total)
         count = shape if isinstance(shape, int) else math.prod(shape)
         total += -(-count * wp.types.type_size_in_bytes(dtype) // _ALIGNMENT) * _ALIGNMENT
     if device.is_cuda:
-        _keep_memory(device.alias)
-    # In rows, for no side of an array may have 2^31 entries.
+        _raise_release_threshold(device.alias)
+    # Two-dimensional, since no dimension of an array may have 2^31 entries.
     memory = empty((max(total // _ALIGNMENT, 1), _ALIGNMENT), wp.uint8, device)
-    pieces = []
-    for (shape, dtype), start in zip(wanted, starts, strict=True):
+    arrays = []
+    for (shape, dtype), start in zip(specs, starts, strict=True):
         assert memory.ptr is not None
-        piece = wp.array(ptr=memory.ptr + start, dtype=dtype, shape=shape, device=memory.device)
-        piece._ref = memory
-        pieces.append(piece)
-    if 0 < total <= _POOLED_BYTES:
-        kept[key] = [*made[1 - _POOLED_ALIKE :], pieces]
-        kept.move_to_end(key)
-        while len(kept) > _POOLED_KINDS:
-            kept.popitem(last=False)
-    return list(pieces)
+        array = wp.array(ptr=memory.ptr + start, dtype=dtype, shape=shape, device=memory.device)
+        array._ref = memory
+        arrays.append(array)
+    if 0 < total <= _MAX_POOLED_BYTES:
+        cache[key] = [*groups[1 - _MAX_POOLED_GROUPS :], arrays]
+        cache.move_to_end(key)
+        while len(cache) > _MAX_POOLED_KEYS:
+            cache.popitem(last=False)
+    return list(arrays)
 
 
 @cache
-def _keep_memory(alias: str) -> None:
-    """Let Warp keep some of the memory that is free: by CUDA's default a GPU gives all of it back whenever anyone waits
-    for it, and to have it mapped again takes as long as a picture of a small scene."""
+def _raise_release_threshold(alias: str) -> None:
+    """Let Warp's memory pool retain some free memory.
+
+    By default CUDA releases all of it at every synchronization, and mapping it again takes as long as rendering a small
+    scene.
+    """
     device = wp.get_device(alias)
-    share = device.total_memory // _KEPT_SHARE
-    if device.is_mempool_enabled and wp.get_mempool_release_threshold(device) < share:
-        wp.set_mempool_release_threshold(device, share)
+    threshold = device.total_memory // _RETAINED_MEMORY_DIVISOR
+    if device.is_mempool_enabled and wp.get_mempool_release_threshold(device) < threshold:
+        wp.set_mempool_release_threshold(device, threshold)
 
 
-_KEPT_SHARE = 32
-"""The part of a GPU's memory that is kept is one in so many."""
+_RETAINED_MEMORY_DIVISOR = 32
+"""The pool retains the total memory of the GPU divided by this number."""
 
 
-def _holders(pieces: list[wp.array]) -> int:
-    return max(map(sys.getrefcount, pieces))
+def _max_references(arrays: list[wp.array]) -> int:
+    return max(map(sys.getrefcount, arrays))
 
 
-_NO_HOLDER = max(map(sys.getrefcount, [object()]))
-"""References to what only one list holds, counted as ``_holders`` does."""
-_POOLED_BYTES, _POOLED_KINDS, _POOLED_ALIKE = 2**25, 16, 4
-"""Largest piece that is kept for the next who wants it, and how many of different kinds and of one kind are."""
+_UNREFERENCED = max(map(sys.getrefcount, [object()]))
+"""Result of ``_max_references`` for objects that only one list refers to."""
+_MAX_POOLED_BYTES, _MAX_POOLED_KEYS, _MAX_POOLED_GROUPS = 2**25, 16, 4
+"""Maximum size of a reusable allocation, number of different specifications, and allocations per specification."""
 
 
 class _FreeList(threading.local):
-    """What this thread made by ``empty_together``, oldest first."""
+    """Reusable allocations of this thread from ``empty_pooled``, least recently used first."""
 
     def __init__(self) -> None:
-        self.kept: OrderedDict[Any, list[list[wp.array]]] = OrderedDict()
+        self.entries: OrderedDict[Any, list[list[wp.array]]] = OrderedDict()
 
 
-_spare = _FreeList()
+_free_list = _FreeList()
 
 
 def round_up(count: int, step: int) -> int:
-    """The least multiple of ``step`` that is at least ``count``, and 1."""
+    """Return the smallest positive multiple of ``step`` that is at least ``count``."""
     return -(-max(count, 1) // step) * step
 
 
 def grow_capacity(count: int) -> int:
-    """At least ``count``, at most a quarter more: counts that differ a little then ask for arrays of one size."""
+    """Round ``count`` up by at most a quarter, so that similar counts use arrays of one size."""
     step = 1 << max(count.bit_length() - 3, 0)
     return -(-max(count, 1) // step) * step
 
 
 def copy_into(target: wp.array, values: np.ndarray) -> None:
-    """Copy ``values`` of the same shape and kind into ``target``; on a CPU without Warp's own way, which takes longer
-    than a small copy."""
+    """Copy ``values`` of the same shape and type into ``target``; on a CPU by NumPy, as that is faster."""
     if device_of(target).is_cpu:
         np.copyto(target.numpy(), values)
     else:
@@ -385,43 +402,45 @@ def copy_into(target: wp.array, values: np.ndarray) -> None:
 
 
 class PinnedMirror:
-    """Numbers of an ``array`` on the host, which come and go many times a second: by memory that a GPU reads and writes
-    itself, in a fraction of the time that Warp's own ways take; on a CPU the array has no other."""
+    """Page-locked host copy of an ``array`` for frequent transfers, faster than ``array.numpy`` and ``array.assign``.
+
+    On a CPU it is the array itself.
+    """
 
     def __init__(self, array: wp.array) -> None:
-        self._array, self._device, self._here = array, device_of(array), array
+        self._array, self._device, self._host = array, device_of(array), array
         if not self._device.is_cpu:
-            self._here = wp.zeros(array.shape, array.dtype, "cpu", pinned=True)
-        self._values = self._here.numpy()
+            self._host = wp.zeros(array.shape, array.dtype, "cpu", pinned=True)
+        self._values = self._host.numpy()
         self._sent: wp.Event | None = None
 
     def put(self, values: np.ndarray) -> None:
-        """Into the array, of the same shape, which nobody else writes to."""
+        """Upload ``values`` of the same shape. Nothing else may write to the array."""
         if self._sent is not None:
             if np.array_equal(values, self._values):
                 return
-            # What was told before may still be on its way.
+            # The previous upload may still be in flight.
             wp.synchronize_event(self._sent)
         np.copyto(self._values, values)
         if not self._device.is_cpu:
-            wp.copy(self._array, self._here)
+            wp.copy(self._array, self._host)
             self._sent = wp.get_stream(self._device).record_event(self._sent)
 
     def get(self) -> np.ndarray:
-        """From the array, a copy."""
+        """Download the array and return a copy."""
         return self.get_all(self)[0]
 
     @staticmethod
     def get_all(*mirrors: PinnedMirror) -> list[np.ndarray]:
-        """From the arrays of ``mirrors`` on one device, copies."""
+        """Download the arrays of ``mirrors`` on one device with one synchronization and return copies."""
         device = mirrors[0]._device
         if not device.is_cpu:
             for mirror in mirrors:
-                wp.copy(mirror._here, mirror._array)
+                wp.copy(mirror._host, mirror._array)
             wp.synchronize_stream(device)
         return [mirror._values.copy() for mirror in mirrors]
 
 
 def zeros(shape: Shape, dtype: Any, device: Device) -> wp.array:
-    """Array of zeros."""
+    """Return an array of zeros."""
     return wp.zeros(shape, dtype=dtype, device=device)

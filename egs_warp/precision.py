@@ -1,4 +1,4 @@
-"""Number types: Gaussian work is float32 (Warp's ``vec3``, ``mat33``), mechanics is float64 (the names below)."""
+"""Number types in kernels: Gaussians use float32 (Warp's ``vec3``, ``mat33``), mechanics the float64 types here."""
 
 import warp as wp
 

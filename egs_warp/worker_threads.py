@@ -1,4 +1,7 @@
-"""Threads that help: small work, many times a second, that nobody is stuck with who is interrupted."""
+"""Worker threads for short, frequent tasks.
+
+An interrupt of the caller never leaves a lock held that a worker needs next.
+"""
 
 from __future__ import annotations
 
@@ -13,43 +16,46 @@ from queue import SimpleQueue
 from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
-_PATIENCE = 10.0
-"""Seconds that the end of the process waits for what a helper is at."""
+_MAX_EXIT_TIME = 10.0
+"""Maximum time that the exit of the process waits for running tasks, s."""
 
 
 class Task(Generic[T]):
-    """Work for whoever comes first: a helper that is free, or who wants its result."""
+    """Task that is executed once: by an idle worker or, if none has started it, by the caller of ``result``."""
 
     def __init__(self, work: Callable[[], T]) -> None:
         self._work = work
-        # Plain locks: Ctrl-C, which may come between any two lines of Python, can leave one of this task taken, for
-        # which nobody waits any more, but none that a helper needs for the next.
-        self._claim, self._over = threading.Lock(), threading.Lock()
-        self._over.acquire()
+        # Plain locks: a KeyboardInterrupt between any two lines can leave a lock of this task held, on which no thread
+        # blocks any more, but no lock that a worker needs for the next task.
+        self._started, self._done = threading.Lock(), threading.Lock()
+        self._done.acquire()
         self._result: Any = None
         self._error: BaseException | None = None
 
     def run_once(self) -> None:
-        """The work, unless somebody is or was at it."""
-        if not self._claim.acquire(blocking=False):
+        """Execute the work, unless another thread has started it."""
+        if not self._started.acquire(blocking=False):
             return
         try:
             self._result = self._work()
         except BaseException as error:
             self._error = error
         finally:
-            self._over.release()
+            self._done.release()
 
     def wait(self) -> None:
-        """Nobody is at the work when this returns, nor will be."""
-        if self._claim.acquire(blocking=False):
-            self._over.release()
+        """Block until the work is done; work that has not started is cancelled."""
+        if self._started.acquire(blocking=False):
+            self._done.release()
         else:
-            with self._over:
+            with self._done:
                 pass
 
     def result(self) -> T:
-        """Of the work, done here if no helper has begun it; raises what it raised; None if it was settled before."""
+        """Return the result of the work, executed in this thread if no worker has started it.
+
+        Returns None if ``wait`` has cancelled the work. Raises the exception of the work.
+        """
         self.run_once()
         self.wait()
         if self._error is not None:
@@ -58,24 +64,24 @@ class Task(Generic[T]):
 
 
 class WorkerThreads:
-    """At most ``most`` threads, one more begun with each of the first tasks.
+    """Pool of at most ``max_threads`` threads, which start one by one with the first tasks.
 
-    Not ``ThreadPoolExecutor``: a KeyboardInterrupt within its ``submit`` can leave a lock taken for which its threads
-    wait, and the end of the process for them.
+    ``ThreadPoolExecutor`` is not used: a KeyboardInterrupt within its ``submit`` can leave a lock held on which its
+    threads block, and with them the exit of the process.
     """
 
-    def __init__(self, most: int) -> None:
-        self._most = most
-        # Made of no Python that could be interrupted half-way.
+    def __init__(self, max_threads: int) -> None:
+        self._max_threads = max_threads
+        # Implemented in C, so that an interrupt cannot leave it in an inconsistent state.
         self._tasks: SimpleQueue[Task[Any] | None] = SimpleQueue()
         self._threads: list[threading.Thread] = []
 
     def begin(self, work: Callable[[], T]) -> Task[T]:
-        """``work`` for a helper to do."""
+        """Queue ``work`` and return its task."""
         task = Task(work)
-        if len(self._threads) < self._most:
-            thread = threading.Thread(target=self._help, name="helper", daemon=True)
-            # Where there can be no more of them, who wants the result does the work.
+        if len(self._threads) < self._max_threads:
+            thread = threading.Thread(target=self._run, name="helper", daemon=True)
+            # If no thread can be started, the caller of ``result`` executes the work.
             with suppress(RuntimeError):
                 thread.start()
                 self._threads.append(thread)
@@ -83,29 +89,29 @@ class WorkerThreads:
         return task
 
     def end(self) -> None:
-        """Helpers stop after what they are at."""
+        """Stop the workers after their current tasks, and wait for them."""
         for _ in self._threads:
             self._tasks.put(None)
-        latest = time.monotonic() + _PATIENCE
+        deadline = time.monotonic() + _MAX_EXIT_TIME
         for thread in self._threads:
-            thread.join(max(latest - time.monotonic(), 0.0))
+            thread.join(max(deadline - time.monotonic(), 0.0))
 
-    def _help(self) -> None:
+    def _run(self) -> None:
         while task := self._tasks.get():
             task.run_once()
-            # Held while it waits for the next, the memory of the last would be.
+            # Release the memory of the last task before blocking on the next.
             del task
 
 
 @cache
 def worker_threads() -> WorkerThreads:
-    """Of this process: one for each core but one, and one at least."""
-    made = WorkerThreads(max(1, (os.cpu_count() or 1) - 1))
-    # Compiled code must not be taken away from under a helper.
-    atexit.register(made.end)
-    return made
+    """Return the worker threads of this process: one per core except one, but at least one."""
+    workers = WorkerThreads(max(1, (os.cpu_count() or 1) - 1))
+    # Compiled code must not be unloaded while a worker runs it.
+    atexit.register(workers.end)
+    return workers
 
 
 if hasattr(os, "register_at_fork"):
-    # Threads are not forked.
+    # A forked process has none of its parent's threads.
     os.register_at_fork(after_in_child=worker_threads.cache_clear)

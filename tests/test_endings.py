@@ -187,7 +187,7 @@ def test_an_unwritable_kernel_cache_is_one_line(tmp_path: Path) -> None:
     environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "file" / "cache")}
     done = subprocess.run(run, capture_output=True, text=True, env=environment)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
-    assert "cache: cannot be made (Not a directory); set WARP_CACHE_PATH to a folder that can be written" in done.stderr
+    assert "cache: cannot be created (Not a directory); set WARP_CACHE_PATH to a writable folder" in done.stderr
 
 
 def test_a_machine_without_a_gpu_is_not_warned() -> None:

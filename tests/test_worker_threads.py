@@ -1,4 +1,4 @@
-"""Worker threads: each task is executed once, by any idle thread, and Ctrl-C at any time ends the process."""
+"""Worker threads execute each task once, and Ctrl-C at any moment ends the process."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from egs_warp.worker_threads import Task, WorkerThreads, worker_threads
 
 BUSY = """
 import sys, time
-from egs_warp.worker_threads import helpers
+from egs_warp.worker_threads import worker_threads
 began = time.monotonic()
 print("ready", flush=True)
 while time.monotonic() < began + 60.0:
-    helpers().begin(lambda: sum(range(300))).result()
+    worker_threads().begin(lambda: sum(range(300))).result()
 """
 
 
 def test_each_work_is_done_once() -> None:
-    """More tasks than threads: a worker or the caller executes each, and the number of threads stays limited."""
+    """By a worker or by the caller, with more tasks than threads; the number of threads stays within its limit."""
     many, done = WorkerThreads(2), []
     before = threading.active_count()
     tasks = [many.begin(lambda number=number: done.append(number) or number) for number in range(300)]
@@ -76,8 +76,8 @@ def test_what_was_settled_never_begins() -> None:
     assert task.result() is None and done == []
 
 
-def test_an_error_is_told_to_who_wants_the_result() -> None:
-    """Only the caller receives the error; the thread continues."""
+def test_an_error_is_raised_by_result() -> None:
+    """Only the caller of ``result`` gets the error; the worker thread continues."""
     one = WorkerThreads(1)
     for _ in range(3):
         begun = threading.Event()

@@ -1,4 +1,5 @@
 """The soft body: elements, sparse factors and the equation of one implicit step (section 3.2, Eq. 4 to 6).
 
-In: a cage, its material, what pulls and pushes. Out: positions and velocities a step later.
+Input: a cage, its material and the forces on it. Output: nodal positions and velocities one step later. The
+kernels are in ``egs_warp.kernels.fem``.
 """

@@ -1,4 +1,4 @@
-"""What elasticity is told of a body: its material, its mesh as the kernels read it, and the start of a step."""
+"""Inputs of the elasticity kernels: material, mesh topology for assembly, and reference state of the damping."""
 
 from __future__ import annotations
 
@@ -16,66 +16,68 @@ class Material:
     """Isotropic Neo-Hookean material with stiffness-proportional damping."""
 
     young_modulus: float
-    """E, pascals."""
+    """Young's modulus E, Pa."""
     poisson_ratio: float
+    """nu, dimensionless."""
     density: float
-    """kg/m^3."""
+    """Mass density at rest, kg/m^3."""
     damping_time: float
-    """beta of Rayleigh damping C = beta K at rest, seconds."""
+    """Coefficient beta of the Rayleigh damping C = beta K at rest, s."""
 
     @property
     def mu(self) -> float:
-        """First Lame parameter of Eq. (5) (shear modulus), pascals."""
+        """First Lame parameter of Eq. (5) (shear modulus), Pa."""
         return self.young_modulus / (2.0 * (1.0 + self.poisson_ratio))
 
     @property
     def lam(self) -> float:
-        """Second Lame parameter of Eq. (5), pascals."""
+        """Second Lame parameter of Eq. (5), Pa."""
         nu = self.poisson_ratio
         return self.young_modulus * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
 
 
 @dataclass(frozen=True)
 class Damping:
-    """What the damping of one step resists: the change of strain since the step's start (docs: body).
+    """Reference state of the damping of one step, which resists the change of strain since the step's start.
 
-    It is blind to rotations however large, so a spin is not damped.
+    The strain is invariant under rotations of any size, so the damping does not slow a rigid rotation
+    (docs/concepts/body.md).
     """
 
     dt: float
-    """Seconds of the step."""
+    """Step size, s."""
     start: wp.array
-    """Of its elements at its start, as the assembly's kernels want it."""
+    """Deformation of each element at the start of the step, in the layout of the assembly (``elements.start``)."""
 
 
 @dataclass(frozen=True)
 class AssemblyTopology:
-    """One mesh as the kernels of elasticity read it."""
+    """Mesh topology of one body and the maps that gather element terms into nodes and matrix entries."""
 
     tets: np.ndarray
-    """(T, 4) int32."""
+    """(T, 4) int32, nodes of each tetrahedron."""
     rest_inverses: np.ndarray
-    """(T, 3, 3) 1/m, inverse edges at rest."""
+    """(T, 3, 3) 1/m, inverses of the matrices whose columns are the edges at rest."""
     volumes: np.ndarray
-    """(T,) m^3."""
+    """(T,) m^3, volumes at rest."""
     corner_offsets: np.ndarray
-    """(N + 1,) where the slots of a node's corners begin."""
+    """(N + 1,) int32, offset of each node's corners in ``corner_from_slot``."""
     corner_from_slot: np.ndarray
-    """(4 T,)."""
+    """(4 T,) int32, element corners (4 times the element, plus its corner), grouped by node."""
     block_keys: np.ndarray
-    """(blocks,) N times the row of a 3x3 block in the upper triangle, and its column."""
+    """(blocks,) N times the block row plus the block column of each 3x3 block of the upper triangle, ascending."""
     contribution_offsets: np.ndarray
-    """(blocks + 1,) where the slots of a block of the matrix begin."""
+    """(blocks + 1,) int32, offset of each block's terms in ``block_from_contribution``."""
     block_from_contribution: np.ndarray
-    """(slots,) 16 times the element, and which of its blocks."""
+    """(slots,) int32, element blocks (16 times the element, plus 4 times the row corner, plus the column corner)."""
     entry_from_block: np.ndarray
-    """(blocks, 9) of the upper triangle, -1 for those below it."""
+    """(blocks, 9) int32, matrix entry of each element of a block; -1 below the diagonal."""
     upper_pattern: sparse.csc_matrix
-    """(3N, 3N), all entries there."""
+    """(3N, 3N) upper triangle with sorted indices and the diagonal; its values carry no meaning."""
 
     @classmethod
     def of(cls, mesh: TetMesh) -> AssemblyTopology:
-        """Of ``mesh``."""
+        """Build the topology of ``mesh``."""
         corners = mesh.nodes[mesh.tets]
         edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
         tets, count = mesh.tets.astype(np.int64), len(mesh.nodes)
@@ -92,16 +94,16 @@ class AssemblyTopology:
         i, k = np.divmod(np.arange(9), 3)
         entry_rows = 3 * block_rows[:, None] + i
         entry_columns = 3 * block_columns[:, None] + k
-        kept = entry_rows <= entry_columns
+        in_upper = entry_rows <= entry_columns
         pattern = sparse.coo_matrix(
-            (np.arange(1, kept.sum() + 1, dtype=np.float64), (entry_rows[kept], entry_columns[kept])),
+            (np.arange(1, in_upper.sum() + 1, dtype=np.float64), (entry_rows[in_upper], entry_columns[in_upper])),
             shape=(3 * count, 3 * count),
         ).tocsc()
         pattern.sort_indices()
         entry_from_sequence = np.empty(pattern.nnz, dtype=np.int32)
         entry_from_sequence[pattern.data.astype(np.int64) - 1] = np.arange(pattern.nnz)
-        entry_from_block = np.full(kept.shape, -1, dtype=np.int32)
-        entry_from_block[kept] = entry_from_sequence
+        entry_from_block = np.full(in_upper.shape, -1, dtype=np.int32)
+        entry_from_block[in_upper] = entry_from_sequence
         return cls(
             mesh.tets.astype(np.int32),
             np.linalg.inv(edges),

@@ -1,4 +1,7 @@
-"""Elasticity, damping and muscles of many bodies with one mesh: the kernels of one body over copies of it."""
+"""Elasticity, damping and muscles of many worlds with the same body.
+
+Launches the kernels of ``egs_warp.kernels.fem.elasticity`` over index maps that repeat the mesh once per world.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +20,25 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import LENGTH_FULL_FORCE, LENGTH_ZERO_FORCE
 from egs_warp.precision import Mat33, Vec3, real
 
-_NEGLIGIBLE = 1e-300
-"""Metres: no segment is shorter, so that one whose ends meet has a direction of 0."""
+_MIN_LENGTH = 1e-300
+"""Lower bound of segment lengths, m; it gives a segment whose ends coincide the direction 0."""
 
 
 class BatchElasticity:
-    """Index maps of ``count`` copies of a body's mesh and muscles, which lie one behind the other. Tensors of c bodies
-    go in and out, c at most ``count``: they use the first c copies."""
+    """Index maps for ``count`` consecutive copies of a body's mesh and muscles.
+
+    Methods take and return tensors of c worlds, c <= ``count``, and use the first c copies.
+    """
 
     def __init__(self, assembly: ElasticAssembly, muscles: MuscleSet, count: int, *, matrices: int) -> None:
-        """``matrices``: bodies whose matrices are asked for at a time."""
+        """Build the maps.
+
+        Args:
+            assembly: assembly of the single body.
+            muscles: muscles of the body.
+            count: maximum number of worlds.
+            matrices: maximum number of worlds whose matrices are computed in one call.
+        """
         self.device, self._lanes = torch.device(str(assembly.device)), lanes_on(assembly.device)
         self.node_count, self.tet_count = len(assembly.mesh.nodes), len(assembly.mesh.tets)
         self._material, maps = assembly.material, assembly.maps
@@ -38,7 +50,7 @@ class BatchElasticity:
             as_warp(repeat_offsets(maps.corner_from_slot, count, 4 * self.tet_count, self.device), wp.int32),
         ]
         self._block_count, self._entry_count = len(maps.entry_from_block), assembly.upper_pattern.nnz
-        self._gathering = [
+        self._gather_maps = [
             as_warp(repeat_bounds(maps.contribution_offsets, matrices, self.device), wp.int32),
             as_warp(repeat_offsets(maps.block_from_contribution, matrices, 16 * self.tet_count, self.device), wp.int32),
             as_warp(repeat_offsets(maps.entry_from_block, matrices, self._entry_count, self.device), wp.int32),
@@ -51,7 +63,7 @@ class BatchElasticity:
         self.segment_count = muscles.segment_count
         self._rows = self._tensor(rows.toarray())
         self._rest_lengths = self._tensor(muscles.rest_lengths)
-        self._lines = [
+        self._segments = [
             *self._copies(rows, count, self.node_count),
             as_warp(self._rest_lengths.repeat(count), real),
         ]
@@ -61,7 +73,7 @@ class BatchElasticity:
         self._no_gradients = as_warp(self._empty(0, 3, 3), Mat33)
 
     def _copies(self, rows: sparse.csr_matrix, count: int, column_count: int) -> list[wp.array]:
-        """``rows`` over so many columns, ``count`` times: where each begins, its columns, its entries."""
+        """Return ``count`` copies of CSR ``rows``: offsets, columns shifted by ``column_count`` each, and values."""
         return [
             as_warp(repeat_bounds(rows.indptr, count, self.device), wp.int32),
             as_warp(repeat_offsets(rows.indices, count, column_count, self.device), wp.int32),
@@ -79,7 +91,7 @@ class BatchElasticity:
         return torch.empty(shape, dtype=torch.float64, device=self.device)
 
     def deformation_gradients(self, positions: torch.Tensor) -> torch.Tensor:
-        """(c, T, 3, 3) F at ``positions`` (c, N, 3)."""
+        """Return the deformation gradients F (c, T, 3, 3) at ``positions`` (c, N, 3)."""
         gradients = self._empty(len(positions), self.tet_count, 3, 3)
         launch_on(
             self.device,
@@ -91,7 +103,7 @@ class BatchElasticity:
         return gradients
 
     def is_inversion_free(self, positions: torch.Tensor) -> torch.Tensor:
-        """(c,) bool: whether no element is inverted at ``positions`` (c, N, 3)."""
+        """Return, for each world, True if no element is inverted at ``positions`` (c, N, 3): (c,) bool."""
         energies, determinants = self._empty(2, len(positions), self.tet_count)
         flat = positions.reshape(-1, 3)
         launch_on(
@@ -106,20 +118,28 @@ class BatchElasticity:
     def gradient(
         self, positions: torch.Tensor, start_gradients: torch.Tensor, dt: float, tensions: torch.Tensor | None
     ) -> torch.Tensor:
-        """(c, N, 3) newtons, minus the forces of elasticity, of damping over a step of ``dt`` seconds from
-        ``start_gradients`` (c, T, 3, 3), and of muscles with ``tensions`` (c, M) newtons, at ``positions`` (c, N, 3).
+        """Return minus the internal forces of elasticity, damping and muscles.
+
+        Args:
+            positions: (c, N, 3) m.
+            start_gradients: (c, T, 3, 3) deformation gradients at the start of the step.
+            dt: step size, s.
+            tensions: (c, M) N, muscle tensions, or None for no muscles.
+
+        Returns:
+            (c, N, 3) N.
         """
         count, flat = len(positions), (positions.reshape(-1, 3), Vec3)
         corners, nodes = self._empty(count * self.tet_count, 4, 3), self._empty(count, self.node_count, 3)
-        ends, pulls = self._no_ends, self._empty(0, 3)
+        ends, segment_forces = self._no_ends, self._empty(0, 3)
         if tensions is not None:
-            ends, pulls = self._ends, self._empty(count * self.segment_count, 3)
+            ends, segment_forces = self._ends, self._empty(count * self.segment_count, 3)
             launch_on(
                 self.device,
                 kernels.segment_forces_kernel,
-                (len(pulls), self._lanes),
-                inputs=[*self._lines, LENGTH_ZERO_FORCE, LENGTH_FULL_FORCE, (tensions.reshape(-1), real), flat],
-                outputs=[(pulls, Vec3)],
+                (len(segment_forces), self._lanes),
+                inputs=[*self._segments, LENGTH_ZERO_FORCE, LENGTH_FULL_FORCE, (tensions.reshape(-1), real), flat],
+                outputs=[(segment_forces, Vec3)],
             )
         launch_on(
             self.device,
@@ -132,7 +152,7 @@ class BatchElasticity:
             self.device,
             kernels.gather_forces_kernel,
             (count * self.node_count, self._lanes),
-            inputs=[*self._corners, *ends, (corners, Vec3), (pulls, Vec3)],
+            inputs=[*self._corners, *ends, (corners, Vec3), (segment_forces, Vec3)],
             outputs=[(nodes.view(-1, 3), Vec3)],
         )
         return nodes
@@ -146,8 +166,18 @@ class BatchElasticity:
         *,
         projected: bool,
     ) -> torch.Tensor:
-        """(c, 3N, 3N) kg, lower triangles of ``diagonal`` (3N,) plus dt^2 times the second derivative of elasticity and
-        damping; ``projected``: each element's part is made positive semi-definite."""
+        """Return the lower triangles of the step matrices without muscles.
+
+        Args:
+            positions: (c, N, 3) m.
+            start_gradients: (c, T, 3, 3) deformation gradients at the start of the step.
+            dt: step size, s; elasticity and damping enter with the factor dt^2.
+            diagonal: (3N,) kg, added to the diagonal of every matrix.
+            projected: project the Hessian of each element to a positive semi-definite one.
+
+        Returns:
+            (c, 3N, 3N) kg.
+        """
         count, size = len(positions), 3 * self.node_count
         blocks, entries = self._empty(count * self.tet_count, 16, 3, 3), self._empty(count, self._entry_count)
         launch_on(
@@ -164,29 +194,43 @@ class BatchElasticity:
             self.device,
             kernels.gather_matrix_kernel,
             count * self._block_count,
-            inputs=[*self._gathering, (blocks, Mat33), dt**2],
+            inputs=[*self._gather_maps, (blocks, Mat33), dt**2],
             outputs=[(entries.view(-1), real)],
         )
         entries[:, self._diagonal] += diagonal
-        made = torch.zeros((count, size * size), dtype=torch.float64, device=self.device)
-        made.index_copy_(1, self._lower, entries)
-        return made.view(count, size, size)
+        out = torch.zeros((count, size * size), dtype=torch.float64, device=self.device)
+        out.index_copy_(1, self._lower, entries)
+        return out.view(count, size, size)
 
     def add_stiffness(
-        self, matrices: torch.Tensor, positions: torch.Tensor, tensions: torch.Tensor, factor: float, *, least: float
+        self,
+        matrices: torch.Tensor,
+        positions: torch.Tensor,
+        tensions: torch.Tensor,
+        factor: float,
+        *,
+        min_relative: float,
     ) -> None:
-        """Add ``factor`` times the second derivative of the energy of muscles with ``tensions`` (c, M) newtons to the
-        ``matrices`` (c, 3N, 3N); rates below ``least`` of a body's largest do not count (``TensionHessian``)."""
-        lines = self._rows @ positions
-        lengths = lines.norm(dim=2).clamp(min=_NEGLIGIBLE)
-        directions = lines / lengths[:, :, None]
+        """Add ``factor`` times the Hessian of the muscle energy to the lower triangles of ``matrices``.
+
+        Args:
+            matrices: (c, 3N, 3N) kg, modified in place.
+            positions: (c, N, 3) m.
+            tensions: (c, M) N, muscle tensions.
+            factor: s^2, multiplies the Hessian.
+            min_relative: stiffnesses below this fraction of the largest of the same world are dropped, as in
+                ``TensionHessian.rank_one_terms``.
+        """
+        vectors = self._rows @ positions
+        lengths = vectors.norm(dim=2).clamp(min=_MIN_LENGTH)
+        directions = vectors / lengths[:, :, None]
         along = ((lengths / self._rest_lengths - LENGTH_ZERO_FORCE) / (LENGTH_FULL_FORCE - LENGTH_ZERO_FORCE)).clamp(
             0.0, 1.0
         )
         across = tensions * along**2 * (3.0 - 2.0 * along) / lengths
         stretch = tensions * 6.0 * along * (1.0 - along) / (LENGTH_FULL_FORCE - LENGTH_ZERO_FORCE) / self._rest_lengths
-        largest = torch.maximum(across.abs(), stretch.abs()).amax(dim=1, keepdim=True).clamp(min=_NEGLIGIBLE)
-        across, stretch = (torch.where(rate.abs() > least * largest, rate, 0.0) for rate in (across, stretch))
+        largest = torch.maximum(across.abs(), stretch.abs()).amax(dim=1, keepdim=True).clamp(min=_MIN_LENGTH)
+        across, stretch = (torch.where(rate.abs() > min_relative * largest, rate, 0.0) for rate in (across, stretch))
         blocks = matrices.view(len(matrices), self.node_count, 3, self.node_count, 3)
         for i in range(3):
             for k in range(i + 1):

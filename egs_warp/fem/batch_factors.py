@@ -1,4 +1,4 @@
-"""Cholesky factors of many dense symmetric matrices of one size, by panels, in torch."""
+"""Batched Cholesky factorization of dense symmetric matrices of one size, panel by panel, in PyTorch."""
 
 from __future__ import annotations
 
@@ -7,36 +7,52 @@ from collections.abc import Iterator
 import torch
 
 PANEL = 96
-"""Columns that are factored at a time."""
+"""Columns that are factored at once."""
 CHUNK_BYTES = 2**31
-"""Of the matrices that are worked on at a time: what is needed beside the factors stays a few times as large."""
+"""Total size of the matrices that are processed at once, bytes; temporary memory is a small multiple of it."""
 
 
 class BatchCholesky:
-    """A factor L of S = L L^T for each of B worlds, in slots.
+    """Cholesky factors L of S = L L^T for several worlds, each stored in a slot.
 
-    A left-looking factorisation by panels: a product with all columns before, the panel's own small factor, and a
-    product with its inverse, which is kept: so solving takes nothing but products either. CUDA's own batched
-    factorisation is made for small matrices. ``slots`` in what follows are ascending.
+    Uses a left-looking factorization by panels: each panel is updated with all columns before it, its diagonal block is
+    factored, and the rows below are multiplied by the inverse of that factor. The inverses are stored, so that a solve
+    consists of matrix products only. CUDA's own batched factorization is designed for small matrices. Arguments named
+    ``slots`` must be ascending.
     """
 
     def __init__(
         self, slots: int, size: int, device: torch.device, *, panel: int = PANEL, chunk_bytes: int = CHUNK_BYTES
     ) -> None:
-        """For ``slots`` worlds with matrices (size, size): 8 ``slots size``^2 bytes."""
+        """Allocate factors for ``slots`` worlds with (``size``, ``size``) matrices, 8 slots size^2 bytes.
+
+        Args:
+            slots: number of worlds.
+            size: rows of each matrix.
+            device: device of the factors.
+            panel: columns factored at once.
+            chunk_bytes: total size of the matrices processed at once.
+        """
         self.size, self.panel = size, panel
         self.chunk = max(1, chunk_bytes // (8 * size * size))
-        """Worlds whose matrices are worked on at a time."""
+        """Worlds whose matrices are processed at once."""
         self._starts = range(0, size, panel)
         kind = {"dtype": torch.float64, "device": device}
         self._factors = torch.zeros((slots, size, size), **kind)
         self._inverses = torch.zeros((slots, len(self._starts), panel, panel), **kind)
 
     def factor(self, slots: torch.Tensor, matrices: torch.Tensor) -> torch.Tensor:
-        """Factor ``matrices`` (k, n, n), lower triangles, which are used up, into ``slots`` (k,); (k,) bool says which
-        are positive definite, the others' slots must not be solved with."""
+        """Factor ``matrices`` into ``slots``.
+
+        Args:
+            slots: (k,) slots to write.
+            matrices: (k, n, n), lower triangles; overwritten.
+
+        Returns:
+            (k,) bool, True where the matrix is positive definite. Other slots must not be used for a solve.
+        """
         count = len(slots)
-        fine = torch.ones(count, dtype=torch.bool, device=matrices.device)
+        is_definite = torch.ones(count, dtype=torch.bool, device=matrices.device)
         inverses = self._inverses.new_zeros((count, *self._inverses.shape[1:]))
         for number, start in enumerate(self._starts):
             stop = min(start + self.panel, self.size)
@@ -44,7 +60,7 @@ class BatchCholesky:
             if start > 0:
                 columns.baddbmm_(before, before[:, : stop - start].mT, alpha=-1.0)
             own, wrong = torch.linalg.cholesky_ex(columns[:, : stop - start])
-            fine &= (wrong == 0) & own.diagonal(dim1=1, dim2=2).isfinite().all(dim=1)
+            is_definite &= (wrong == 0) & own.diagonal(dim1=1, dim2=2).isfinite().all(dim=1)
             identity = torch.eye(stop - start, dtype=own.dtype, device=own.device).expand_as(own)
             inverse = torch.linalg.solve_triangular(own, identity, upper=False)
             inverses[:, number, : stop - start, : stop - start] = inverse
@@ -52,30 +68,32 @@ class BatchCholesky:
             if stop < self.size:
                 columns[:, stop - start :] = columns[:, stop - start :] @ inverse.mT
         self._factors[slots], self._inverses[slots] = matrices, inverses
-        return fine
+        return is_definite
 
     def solve(self, slots: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-        """(k, n, m) S^-1 times ``right`` of that shape, with the factors in ``slots`` (k,)."""
-        whole = len(slots) == len(self._factors)
-        # Where all are asked for, they need not be copied.
-        parts = [self._solved(part if whole else slots[part], right[part]) for part in self.chunks(len(slots))]
+        """Return S^-1 ``right`` (k, n, m) with the factors in ``slots`` (k,); ``right`` has the same shape."""
+        is_complete = len(slots) == len(self._factors)
+        # A slice of all slots avoids a copy of the factors.
+        parts = [
+            self._solve_chunk(part if is_complete else slots[part], right[part]) for part in self.chunks(len(slots))
+        ]
         return parts[0] if len(parts) == 1 else torch.cat(parts)
 
     def chunks(self, count: int) -> Iterator[slice]:
-        """Of ``count`` worlds those that are worked on at a time; one empty chunk of none."""
+        """Return slices of ``count`` worlds to be processed at once; a single empty slice if there are none."""
         return (slice(start, min(start + self.chunk, count)) for start in range(0, max(count, 1), self.chunk))
 
-    def _solved(self, slots: torch.Tensor | slice, right: torch.Tensor) -> torch.Tensor:
-        factors, inverses, answer = self._factors[slots], self._inverses[slots], right.clone()
+    def _solve_chunk(self, slots: torch.Tensor | slice, right: torch.Tensor) -> torch.Tensor:
+        factors, inverses, solution = self._factors[slots], self._inverses[slots], right.clone()
         bounds = [(start, min(start + self.panel, self.size)) for start in self._starts]
         for number, (start, stop) in enumerate(bounds):
-            rows = answer[:, start:stop]
+            rows = solution[:, start:stop]
             if start > 0:
-                rows = torch.baddbmm(rows, factors[:, start:stop, :start], answer[:, :start], alpha=-1.0)
-            answer[:, start:stop] = inverses[:, number, : stop - start, : stop - start] @ rows
+                rows = torch.baddbmm(rows, factors[:, start:stop, :start], solution[:, :start], alpha=-1.0)
+            solution[:, start:stop] = inverses[:, number, : stop - start, : stop - start] @ rows
         for number, (start, stop) in reversed(list(enumerate(bounds))):
-            rows = answer[:, start:stop]
+            rows = solution[:, start:stop]
             if stop < self.size:
-                rows = torch.baddbmm(rows, factors[:, stop:, start:stop].mT, answer[:, stop:], alpha=-1.0)
-            answer[:, start:stop] = inverses[:, number, : stop - start, : stop - start].mT @ rows
-        return answer
+                rows = torch.baddbmm(rows, factors[:, stop:, start:stop].mT, solution[:, stop:], alpha=-1.0)
+            solution[:, start:stop] = inverses[:, number, : stop - start, : stop - start].mT @ rows
+        return solution

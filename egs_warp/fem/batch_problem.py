@@ -1,4 +1,4 @@
-"""``StepProblem`` and its ``Tangent`` for many worlds side by side, on the device (Eq. 4, 6)."""
+"""Batched version of ``StepProblem`` and its ``Tangent``: many worlds in one set of device tensors (Eq. 4, 6)."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from egs_warp.muscles.muscle_set import MuscleSet
 
 
 class BatchBody:
-    """What the worlds of one body have in common: its mass, gravity, elasticity, muscles, and room for the factors of
-    ``count`` worlds."""
+    """Data shared by all worlds of one body: mass, gravity, elasticity, muscles and storage for the factors."""
 
     def __init__(
         self,
@@ -28,7 +27,15 @@ class BatchBody:
         panel: int = PANEL,
         chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
-        """``panel``, ``chunk_bytes``: see ``BatchFactors``."""
+        """Build the shared data.
+
+        Args:
+            body: the body, on the device of the batch.
+            muscles: its muscles.
+            count: maximum number of worlds.
+            panel: as in ``BatchCholesky``.
+            chunk_bytes: as in ``BatchCholesky``.
+        """
         self.body = body
         self.device = torch.device(str(body.assembly.device))
         size = 3 * len(body.mesh.nodes)
@@ -38,31 +45,32 @@ class BatchBody:
         self.gravity = torch.as_tensor(np.asarray(body.gravity, dtype=np.float64), device=self.device)
 
     def centre(self, values: torch.Tensor) -> torch.Tensor:
-        """(c, 1, 3) mean by mass of ``values`` (c, N, 3)."""
+        """Return the mass-weighted mean (c, 1, 3) of nodal ``values`` (c, N, 3)."""
         return (self.mass[:, None] * values).sum(dim=1, keepdim=True) / self.body.mass
 
 
 @dataclass(frozen=True)
 class BatchProblem(BatchedRecord):
-    """A step of ``dt`` s of c worlds; see ``StepProblem``, whose names these are."""
+    """The implicit step of c worlds; members have the names and meanings of those of ``StepProblem``."""
 
     body: BatchBody
     dt: float
+    """Step size, s."""
     drag: float
-    """1/s."""
+    """alpha of the Rayleigh damping, 1/s."""
     slots: torch.Tensor
-    """(c,) where each world's factors lie."""
+    """(c,) slot of each world's factors, ascending."""
     positions: torch.Tensor
-    """(c, N, 3) metres, at the start."""
+    """(c, N, 3) m, nodal positions at the start of the step."""
     velocities: torch.Tensor
-    """(c, N, 3) m/s."""
+    """(c, N, 3) m/s, nodal velocities at the start of the step."""
     start_gradients: torch.Tensor
-    """(c, T, 3, 3)."""
+    """(c, T, 3, 3) deformation gradients at the start of the step."""
     rotation_modes: torch.Tensor
-    """(c, 3N, 3)."""
+    """(c, 3N, 3) m, nodal velocities e_k x r of unit rotations about the centre of mass."""
     inverse_inertia: torch.Tensor
-    """(c, 3, 3) 1/(kg m^2), the inverse of the inertia; no numbers where there is none, in place of an error for all
-    worlds."""
+    """(c, 3, 3) 1/(kg m^2), inverse inertia; not finite for a world whose inertia is singular, where an error would
+    stop all worlds."""
 
     @classmethod
     def at(
@@ -75,125 +83,153 @@ class BatchProblem(BatchedRecord):
         dt: float,
         drag: float = 0.0,
     ) -> BatchProblem:
-        """From ``positions`` (c, N, 3) and ``velocities`` (c, N, 3) on."""
+        """Build the step that starts at the given state.
+
+        Args:
+            common: shared data of the body.
+            slots: (c,) slots for the factors, ascending.
+            positions: (c, N, 3) m.
+            velocities: (c, N, 3) m/s.
+            dt: step size, s.
+            drag: alpha of the Rayleigh damping, 1/s.
+        """
         arms = positions - common.centre(positions)
-        turns = arms.new_zeros((*arms.shape, 3))
+        modes = arms.new_zeros((*arms.shape, 3))
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3
-            turns[:, :, i, k], turns[:, :, j, k] = -arms[:, :, j], arms[:, :, i]
-        turns = turns.flatten(1, 2)
-        inertia = (turns * common.mass.repeat_interleave(3)[:, None]).mT @ turns
+            modes[:, :, i, k], modes[:, :, j, k] = -arms[:, :, j], arms[:, :, i]
+        modes = modes.flatten(1, 2)
+        inertia = (modes * common.mass.repeat_interleave(3)[:, None]).mT @ modes
         gradients = common.elasticity.deformation_gradients(positions)
-        rates = torch.linalg.inv_ex(inertia).inverse
-        return cls(common, dt, drag, slots, positions, velocities, gradients, turns, rates)
+        inverse = torch.linalg.inv_ex(inertia).inverse
+        return cls(common, dt, drag, slots, positions, velocities, gradients, modes, inverse)
 
     @property
     def momenta(self) -> torch.Tensor:
-        """(c, 3, 3N)."""
+        """Return the angular momenta (c, 3, 3N) of unit nodal velocities about the centre of mass."""
         return (self.rotation_modes * self.body.mass.repeat_interleave(3)[:, None]).mT
 
     @property
     def residual_scale(self) -> float:
-        """N s."""
+        """dt times the weight, N s, the unit of residual norms."""
         return self.dt * self.body.body.weight
 
     @property
     def inertia_ratio(self) -> float:
-        """1 + dt alpha."""
+        """Factor 1 + dt alpha of the mass in the step's equation."""
         return 1.0 + self.dt * self.drag
 
     def end_positions(self, velocities: torch.Tensor) -> torch.Tensor:
-        """(c, N, 3)."""
+        """Return x + dt v (c, N, 3), m."""
         return self.positions + self.dt * velocities
 
     def is_inversion_free(self, velocities: torch.Tensor) -> torch.Tensor:
-        """(c,) bool: whether no element is inverted at the end of ``velocities`` (c, N, 3)."""
+        """Return, for each world, True if no element is inverted at the end positions of ``velocities``: (c,) bool."""
         return self.body.elasticity.is_inversion_free(self.end_positions(velocities))
 
     def rigid_guess(self) -> torch.Tensor:
-        """(c, N, 3) m/s to solve the step from: the body goes on rigidly."""
+        """Return the rigid motion (c, N, 3) m/s that continues both momenta, the initial guess of the solver."""
         arms = self.positions - self.body.centre(self.positions)
         spin = (self.inverse_inertia @ (self.momenta @ self.velocities.flatten(1)[:, :, None]))[:, :, 0]
-        turned = _turned(self.dt * spin, arms)
-        return self.body.centre(self.velocities) + (turned - arms) / self.dt
+        rotated = _rotate(self.dt * spin, arms)
+        return self.body.centre(self.velocities) + (rotated - arms) / self.dt
 
     def internal_gradient(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
-        """(c, N, 3) newtons; ``tensions`` (c, M) newtons of the muscles."""
+        """Return minus the internal forces (c, N, 3) N at the end of the step, with muscle ``tensions`` (c, M) N."""
         end = self.end_positions(velocities)
         return self.body.elasticity.gradient(end, self.start_gradients, self.dt, tensions)
 
     def momentum_correction(self, internal_gradient: torch.Tensor) -> torch.Tensor:
-        """(c, 3) rad/s that the step gives back."""
+        """Return the angular velocity (c, 3) rad/s that the projection P^T restores (``StepProblem``)."""
         torque = self.rotation_modes.mT @ internal_gradient.flatten(1)[:, :, None]
         return self.dt * (self.inverse_inertia @ torque)[:, :, 0]
 
     def residual(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
-        """(c, N, 3) N s."""
+        """Return the residual (c, N, 3) N s of the step's equation without contact forces."""
         internal = self.internal_gradient(velocities, tensions)
-        turned = (self.rotation_modes @ self.momentum_correction(internal)[:, :, None]).view_as(velocities)
-        change = self.inertia_ratio * velocities - self.velocities - self.dt * self.body.gravity - turned
+        correction = (self.rotation_modes @ self.momentum_correction(internal)[:, :, None]).view_as(velocities)
+        change = self.inertia_ratio * velocities - self.velocities - self.dt * self.body.gravity - correction
         return self.body.mass[:, None] * change + self.dt * internal
 
     def factor(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
-        """Factor the derivative of the residual at ``velocities`` (c, N, 3), or a definite one near it, into the
-        worlds' slots; (c,) bool, whether there is one. In the order of ``StepProblem.tangent``."""
-        fine = [
+        """Factor the derivative of the residual, or a positive definite approximation of it, into the worlds' slots.
+
+        Tries the same matrices in the same order as ``StepProblem.tangent``.
+
+        Args:
+            velocities: (c, N, 3) m/s, linearization point.
+            tensions: (c, M) N, muscle tensions, or None.
+
+        Returns:
+            (c,) bool, True where a factor exists.
+        """
+        factored = [
             self._factor(slice(part.start, part.stop), velocities, tensions)
             for part in self.body.factors.chunks(len(velocities))
         ]
-        return torch.cat(fine)
+        return torch.cat(factored)
 
     def _factor(self, part: slice, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
         end = self.end_positions(velocities)[part]
         gradients, slots = self.start_gradients[part], self.slots[part]
-        pulls = None if tensions is None else tensions[part]
-        fine = torch.zeros(len(end), dtype=torch.bool, device=end.device)
-        left = torch.arange(len(end), device=end.device)
+        part_tensions = None if tensions is None else tensions[part]
+        factored = torch.zeros(len(end), dtype=torch.bool, device=end.device)
+        remaining = torch.arange(len(end), device=end.device)
         diagonal = self.inertia_ratio * self.body.mass.repeat_interleave(3)
-        # With the muscles' stiffness, without it, and with the elements' alone that is surely definite.
+        # First with the muscles' stiffness, then without it, then with the projected Hessian, which is definite.
         for muscles, projected in ((True, False), (False, False), (False, True)):
-            if (muscles and pulls is None) or len(left) == 0:
+            if (muscles and part_tensions is None) or len(remaining) == 0:
                 continue
-            matrices = self.body.elasticity.matrices(end[left], gradients[left], self.dt, diagonal, projected=projected)
-            if muscles and pulls is not None:
+            matrices = self.body.elasticity.matrices(
+                end[remaining], gradients[remaining], self.dt, diagonal, projected=projected
+            )
+            if muscles and part_tensions is not None:
                 self.body.elasticity.add_stiffness(
-                    matrices, end[left], pulls[left], self.dt**2, least=MIN_RELATIVE_STIFFNESS
+                    matrices, end[remaining], part_tensions[remaining], self.dt**2, min_relative=MIN_RELATIVE_STIFFNESS
                 )
-            fine[left] = self.body.factors.factor(slots[left], matrices)
-            left = nonzero(~fine)
-        return fine
+            factored[remaining] = self.body.factors.factor(slots[remaining], matrices)
+            remaining = nonzero(~factored)
+        return factored
 
 
 @dataclass(frozen=True)
 class BatchMomentumProjection(BatchedRecord):
-    """What makes the inverse of the elements' matrix keep angular momentum, see ``Tangent``."""
+    """Rank-3 correction with which the solutions conserve angular momentum (``Tangent``)."""
 
-    turned: torch.Tensor
-    """(c, 3N, 3)."""
+    rotation_response: torch.Tensor
+    """(c, 3N, 3) solutions U for the right-hand sides M T."""
     inverse: torch.Tensor
-    """(c, 3, 3)."""
+    """(c, 3, 3) inverse of (1 + dt alpha) (M T)^T U."""
 
 
 def apply_inverse(
     problem: BatchProblem, impulses: torch.Tensor, turning: BatchMomentumProjection | None = None
 ) -> tuple[torch.Tensor, BatchMomentumProjection]:
-    """(c, 3N, m) m/s that ``impulses`` of that shape, N s, bring about by the factors in the worlds' slots, and the
-    ``turning`` of these, if it is not known."""
+    """Return the velocity changes J^-1 ``impulses`` and the momentum projection that was used.
+
+    Args:
+        problem: the step, whose slots hold factors.
+        impulses: (c, 3N, m) N s.
+        turning: momentum projection of these factors; computed if None.
+
+    Returns:
+        (c, 3N, m) m/s, and the momentum projection.
+    """
     factors, momenta = problem.body.factors, problem.momenta
     if turning is None:
         both = factors.solve(problem.slots, torch.cat([momenta.mT, impulses], dim=2))
-        turned, plain = both[:, :, :3].contiguous(), both[:, :, 3:]
+        response, plain = both[:, :, :3].contiguous(), both[:, :, 3:]
         turning = BatchMomentumProjection(
-            turned, torch.linalg.inv_ex(problem.inertia_ratio * (momenta @ turned)).inverse
+            response, torch.linalg.inv_ex(problem.inertia_ratio * (momenta @ response)).inverse
         )
     else:
         plain = factors.solve(problem.slots, impulses)
     missing = problem.rotation_modes.mT @ impulses - problem.inertia_ratio * (momenta @ plain)
-    return plain + turning.turned @ (turning.inverse @ missing), turning
+    return plain + turning.rotation_response @ (turning.inverse @ missing), turning
 
 
-def _turned(vectors: torch.Tensor, arms: torch.Tensor) -> torch.Tensor:
-    """(c, n, 3) ``arms`` turned by the rotation vectors ``vectors`` (c, 3)."""
+def _rotate(vectors: torch.Tensor, arms: torch.Tensor) -> torch.Tensor:
+    """Rotate ``arms`` (c, n, 3) by the rotation vectors ``vectors`` (c, 3) rad."""
     half = 0.5 * vectors.norm(dim=1, keepdim=True)
     axis = (0.5 * torch.sinc(half / torch.pi) * vectors)[:, None].expand_as(arms)
     once = torch.linalg.cross(axis, arms)

@@ -1,4 +1,4 @@
-"""Many worlds side by side: records whose tensors have one row for each, and Warp's kernels over those tensors."""
+"""Batches of worlds: records whose tensors have a leading world axis, and kernel launches over such tensors."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ import warp as wp
 
 @dataclass(frozen=True)
 class BatchedRecord:
-    """A record of c worlds: each tensor in it, and in records of this kind within it, has a row for each world."""
+    """Record of c worlds: each of its tensors, also in nested records, has one row per world."""
 
     def gather(self, worlds: torch.Tensor) -> Self:
-        """Of those ``worlds`` (k,) alone, rows of this record, in their order."""
+        """Return a record of the given ``worlds`` (k,), in their order."""
         return replace(self, **{name: _rows(value, worlds) for name, value in self.batched_fields()})
 
     def subset(self, worlds: torch.Tensor) -> Self:
-        """``of`` for ascending ``worlds``; where these are all, this very record, not a copy."""
+        """Return ``gather`` of ascending ``worlds``, or this record itself, without a copy, if these are all worlds."""
         _, first = next(iter(self.batched_fields()))
         return self if len(worlds) == _count(first) else self.gather(worlds)
 
-    def scatter(self, worlds: torch.Tensor, given: Self) -> None:
-        """Write what is ``given`` of the ``worlds`` (k,) into this record's own tensors."""
+    def scatter(self, worlds: torch.Tensor, values: Self) -> None:
+        """Write the rows of ``values`` to the ``worlds`` (k,) of this record, in place."""
         for name, value in self.batched_fields():
             if isinstance(value, BatchedRecord):
-                value.scatter(worlds, getattr(given, name))
+                value.scatter(worlds, getattr(values, name))
             else:
-                value[worlds] = getattr(given, name)
+                value[worlds] = getattr(values, name)
 
     def batched_fields(self) -> list[tuple[str, Any]]:
-        """What has a row for each world, by name."""
+        """Return names and values of the fields that have a world axis."""
         values = [(field.name, getattr(self, field.name)) for field in fields(self)]
         return [(name, value) for name, value in values if isinstance(value, torch.Tensor | BatchedRecord)]
 
@@ -46,21 +46,22 @@ def _count(value: Any) -> int:
 
 
 def nonzero(mask: torch.Tensor) -> torch.Tensor:
-    """(k,) int64, where ``mask`` (c,) is true. Waits for the device."""
+    """Return the indices (k,) int64 at which ``mask`` (c,) is true; synchronizes with the device."""
     return mask.nonzero().squeeze(1)
 
 
 def repeat_offsets(offsets: np.ndarray, count: int, step: int, device: torch.device) -> torch.Tensor:
-    """``count`` copies of index map ``offsets`` (m, ...), int32, each ``step`` higher than the one before; negative
-    entries, which stand for none, stay."""
+    """Repeat the index map ``offsets`` (m, ...) ``count`` times, adding ``step`` per copy: (count m, ...) int32.
+
+    Negative entries, which mean "none", are unchanged.
+    """
     first = torch.as_tensor(np.asarray(offsets, dtype=np.int32), device=device)
     shifts = step * torch.arange(count, dtype=torch.int32, device=device).reshape(-1, *[1] * first.ndim)
     return torch.where(first < 0, first, first + shifts).flatten(0, 1)
 
 
 def repeat_bounds(bounds: np.ndarray, count: int, device: torch.device) -> torch.Tensor:
-    """(count m + 1,) int32: where the slots of ``count`` copies of rows begin and end, ``bounds`` (m + 1,) those of
-    one."""
+    """Repeat the row offsets ``bounds`` (m + 1,) of a CSR-like map ``count`` times: (count m + 1,) int32."""
     last = torch.full((1,), count * int(bounds[-1]), dtype=torch.int32, device=device)
     return torch.cat([repeat_offsets(bounds[:-1], count, int(bounds[-1]), device), last])
 
@@ -74,15 +75,23 @@ def launch_on(
     outputs: list[Any],
     block_dim: int = 256,
 ) -> None:
-    """``kernel`` over tensors on ``device``: each is a pair of a contiguous tensor and the type of the kernel's array,
-    or an array of Warp's, or a number."""
+    """Launch ``kernel`` on ``device``.
+
+    Args:
+        device: device of all tensors.
+        kernel: the Warp kernel.
+        dim: launch dimensions.
+        inputs: arguments; a tensor is passed as a pair of the contiguous tensor and the element type of the array.
+        outputs: output arguments, likewise.
+        block_dim: threads per block.
+    """
     target = wp.device_from_torch(device)
-    given, made = ([_array(value) for value in values] for values in (inputs, outputs))
-    wp.launch(kernel, dim, inputs=given, outputs=made, device=target, block_dim=block_dim)
+    input_arrays, output_arrays = ([_array(value) for value in values] for values in (inputs, outputs))
+    wp.launch(kernel, dim, inputs=input_arrays, outputs=output_arrays, device=target, block_dim=block_dim)
 
 
 def as_warp(tensor: torch.Tensor, dtype: Any) -> wp.array:
-    """A ``tensor`` as an array of Warp's, where it lies."""
+    """Return a Warp array that shares the memory of ``tensor``."""
     return wp.from_torch(tensor, dtype=dtype)
 
 

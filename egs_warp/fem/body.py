@@ -1,4 +1,4 @@
-"""The soft body: what never changes (``SoftBody``) and what a step changes (``BodyState``)."""
+"""The soft body: its constant data (``SoftBody``) and the state that a step advances (``BodyState``)."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 
 GRAVITY = 9.81
-"""m/s^2."""
+"""Gravitational acceleration, m/s^2."""
 DEFAULT_SAG = 0.05
-"""rho g H / E of a column."""
-SMALLEST_HEIGHT, LARGEST_HEIGHT = 0.001, 1000.0
-"""Metres; smaller and larger bodies are refused as a slip of the pen."""
+"""Default ratio rho g H / E of a column of height H; the column shortens by half of it."""
+MIN_HEIGHT, MAX_HEIGHT = 0.001, 1000.0
+"""Heights of a body, m; others are rejected as a probable mistake in the units."""
 MAX_SAG = 0.02
-"""Body heights by which the centre of mass may sink from the unloaded to the standing body."""
+"""Maximum displacement of the centre of mass from the unloaded to the standing body, in body heights."""
 
-_HINGED = 1e4
-"""Body heights by which, linearly, only what swings on hinges sinks."""
+_MAX_LINEAR_SAG = 1e4
+"""Linear sag, in body heights, that only a body with a mechanism (a part on a hinge) exceeds."""
 
 
 @dataclass(frozen=True)
@@ -35,78 +35,80 @@ class SoftBody:
     """A tetrahedral body under gravity."""
 
     mesh: TetMesh
+    """Rest shape, m."""
     assembly: ElasticAssembly
+    """Elasticity of the mesh."""
     node_mass: np.ndarray
-    """(N,) float64, kg."""
+    """(N,) float64, kg, lumped masses."""
     gravity: np.ndarray
     """(3,) float64, m/s^2."""
     height: float
-    """H, metres: extent along the plane's normal."""
+    """H, m, extent along the plane's normal."""
 
     @cached_property
     def mass(self) -> float:
-        """Kilograms."""
+        """Total mass, kg."""
         return float(self.node_mass.sum())
 
     @property
     def young_modulus(self) -> float:
-        """Pascals."""
+        """Young's modulus E, Pa."""
         return self.assembly.material.young_modulus
 
     @property
     def stiffening(self) -> float:
-        """E over that of a column of the same height with the default sag."""
+        """Ratio of E to that of a column of the same height with the default sag."""
         return self.young_modulus * DEFAULT_SAG / (self.assembly.material.density * GRAVITY * self.height)
 
     @cached_property
     def weight(self) -> float:
-        """Newtons."""
+        """Weight, N."""
         return self.mass * float(np.linalg.norm(self.gravity))
 
     @cached_property
     def time_unit(self) -> float:
-        """sqrt(H / g), seconds."""
+        """Time scale sqrt(H / g), s."""
         return float(np.sqrt(self.height / np.linalg.norm(self.gravity)))
 
     @cached_property
     def speed_unit(self) -> float:
-        """sqrt(g H), m/s."""
+        """Speed scale sqrt(g H), m/s."""
         return float(np.sqrt(np.linalg.norm(self.gravity) * self.height))
 
     @cached_property
     def mean_rows(self) -> np.ndarray:
-        """(3, 3N) whose product with velocities is that of the centre of mass."""
+        """(3, 3N) matrix that maps nodal velocities to the velocity of the centre of mass."""
         return np.kron(self.node_mass / self.mass, np.eye(3))
 
     @cached_property
     def mass_roots(self) -> np.ndarray:
-        """(3N,) of the square root of each node's share of the mass, for each of its axes."""
+        """(3N,) square root of each node's fraction of the mass, repeated for its three axes."""
         return np.sqrt(np.repeat(self.node_mass / self.mass, 3))
 
     def centre_of_mass(self, positions: np.ndarray) -> np.ndarray:
-        """(3,) mean of ``positions`` (N, 3) weighted by mass; of velocities, the velocity of the centre of mass."""
+        """Return the mass-weighted mean (3,) of ``positions`` (N, 3), or of velocities (N, 3)."""
         return self.node_mass @ positions / self.mass
 
     def angular_momentum(self, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
-        """(3,) kg m^2/s about the centre of mass."""
+        """Return the angular momentum (3,) kg m^2/s about the centre of mass."""
         arms = positions - self.centre_of_mass(positions)
         moment = arms.T @ (self.node_mass[:, None] * velocities)
         return (moment - moment.T)[[1, 2, 0], [2, 0, 1]]
 
     def inertia(self, positions: np.ndarray) -> np.ndarray:
-        """(3, 3) kg m^2 about the centre of mass."""
+        """Return the inertia tensor (3, 3) kg m^2 about the centre of mass."""
         arms = positions - self.centre_of_mass(positions)
         second = np.einsum("n,ni,nj->ij", self.node_mass, arms, arms)
         return np.trace(second) * np.eye(3) - second
 
     def best_fit_rotation(self, positions: np.ndarray) -> np.ndarray:
-        """(3, 3) rotation that best carries the rest shape to ``positions`` (Kabsch, mass-weighted)."""
+        """Return the mass-weighted best-fit rotation (3, 3) from the rest shape to ``positions`` (N, 3) (Kabsch)."""
         rest = self.mesh.nodes - self.centre_of_mass(self.mesh.nodes)
         arms = positions - self.centre_of_mass(positions)
         return kabsch_rotation(self.node_mass, rest, arms)
 
     def mechanical_energy(self, positions: np.ndarray, velocities: np.ndarray) -> float:
-        """Kinetic + elastic + gravitational energy, joules."""
+        """Return the sum of kinetic, elastic and gravitational energy, J."""
         kinetic = 0.5 * float(self.node_mass @ (velocities**2).sum(axis=1))
         elastic = self.assembly.energy(positions)
         return kinetic + elastic - self.mass * float(self.gravity @ self.centre_of_mass(positions))
@@ -114,20 +116,20 @@ class SoftBody:
 
 @dataclass(frozen=True)
 class BodyState:
-    """Positions and velocities of the nodes at one time."""
+    """Positions and velocities of the nodes at one point in time."""
 
     positions: np.ndarray
-    """(N, 3) float64, metres."""
+    """(N, 3) float64, m."""
     velocities: np.ndarray
     """(N, 3) float64, m/s."""
     time: float = 0.0
-    """Seconds."""
+    """Time since the start of the simulation, s."""
 
     def with_velocity_kick(self, kick: np.ndarray | None) -> BodyState:
-        """With nodes that are faster by ``kick`` (N, 3) m/s, if something gives them that.
+        """Return the state with ``kick`` (N, 3) m/s added to the nodal velocities, or this state if it is None.
 
-        An implicit step from there is, to the letter, the step from here with the impulses beside its forces,
-        M (v - v0) = dt f + M kick: both momenta get them, and contact answers to them in the same step.
+        An implicit step from the new state is exactly the step from this one with additional impulses,
+        M (v - v0) = dt f + M kick. Both momenta include them, and contact forces respond to them in the same step.
         """
         return self if kick is None else replace(self, velocities=self.velocities + kick)
 
@@ -143,35 +145,41 @@ def make_body(
     damping_ratio: float = 0.05,
     device: str | None = None,
 ) -> SoftBody:
-    """A body whose elasticity follows from its own height H: E = density g H / sag, that of a column.
+    """Make a body whose stiffness follows from its height H: E = density g H / sag, as for a column.
 
-    See docs/concepts/cage.md.
+    A body on thin legs would sag more than a column. Its E is increased until its centre of mass sinks by at most
+    ``MAX_SAG`` H under its weight (docs/concepts/cage.md).
 
-    A body on thin legs would sink further into them than a column does; it is stiffened until its centre of mass sinks
-    by no more than ``LARGEST_SINK`` H under its weight.
+    Args:
+        mesh: cage at rest, m.
+        plane: the ground; heights are measured along its normal.
+        up: (3,) unit vector opposite to gravity, for sloped ground; default: the plane's normal.
+        sag: ratio rho g H / E.
+        poisson_ratio: Poisson's ratio nu.
+        density: kg/m^3.
+        damping_ratio: damping ratio of the first mode of the body clamped at its base (nodes within 5 % of H above the
+            lowest); it sets the Rayleigh coefficient beta.
+        device: Warp device of the assembly; default: Warp's current device.
 
-    ``up`` (3,) is against gravity where the ground is a slope. Raises ``UserError`` for a height that no body has.
-
-    ``damping_ratio`` is that of the first mode of the body held at its base (nodes within 5 % of H above the plane); it
-    sets the Rayleigh coefficient beta.
+    Raises:
+        UserError: the height is outside ``MIN_HEIGHT`` to ``MAX_HEIGHT``, or the cage has a hinged part.
     """
     heights = plane.heights(mesh.nodes)
     height = float(heights.max() - heights.min())
-    if not SMALLEST_HEIGHT <= height <= LARGEST_HEIGHT:
+    if not MIN_HEIGHT <= height <= MAX_HEIGHT:
         raise ArgumentError(
             "metres_per_unit",
-            f"the body is {height:.3g} m high; choose it so that this is from {SMALLEST_HEIGHT:g} to"
-            f" {LARGEST_HEIGHT:g} m",
+            f"the body is {height:.3g} m high; choose it so that this is from {MIN_HEIGHT:g} to {MAX_HEIGHT:g} m",
         )
     young = density * GRAVITY * height / sag
     node_mass = mesh.lumped_masses(density)
     free = heights > heights.min() + 0.05 * height
     column = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)
-    sink = _sink(column, node_mass, free, -GRAVITY * plane.normal)
-    # It is no number, or below zero, where the stiffness is singular.
-    if not 0.0 <= sink < _HINGED * height:
-        raise ArgumentError("nodes", "the cage has parts that hang on a corner or an edge alone; give it more")
-    young *= max(1.0, sink / (MAX_SAG * height))
+    displacement = _linear_sag(column, node_mass, free, -GRAVITY * plane.normal)
+    # NaN or negative if the stiffness is singular.
+    if not 0.0 <= displacement < _MAX_LINEAR_SAG * height:
+        raise ArgumentError("nodes", "parts of the cage are connected by a single corner or edge; give it more nodes")
+    young *= max(1.0, displacement / (MAX_SAG * height))
     undamped = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)
     frequency = _first_frequency(undamped, node_mass, free)
     damped = Material(young, poisson_ratio, density, 2.0 * damping_ratio / frequency)
@@ -179,29 +187,29 @@ def make_body(
     return SoftBody(mesh, assembly, node_mass, -GRAVITY * (plane.normal if up is None else up), height)
 
 
-def _held_stiffness(assembly: ElasticAssembly, free: np.ndarray) -> tuple[sparse.csc_matrix, np.ndarray]:
-    """Stiffness at rest of the ``free`` (N,) nodes, and the indices of their coordinates."""
+def _clamped_stiffness(assembly: ElasticAssembly, free: np.ndarray) -> tuple[sparse.csc_matrix, np.ndarray]:
+    """Return the stiffness at rest of the ``free`` (N,) nodes, and the indices of their coordinates."""
     upper = assembly.matrix(assembly.hessian_entries(assembly.mesh.nodes))
-    kept = np.flatnonzero(np.repeat(free, 3))
-    return (upper + sparse.triu(upper, 1).T).tocsc()[kept][:, kept], kept
+    free_coordinates = np.flatnonzero(np.repeat(free, 3))
+    return (upper + sparse.triu(upper, 1).T).tocsc()[free_coordinates][:, free_coordinates], free_coordinates
 
 
-def _sink(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.ndarray, gravity: np.ndarray) -> float:
-    """Metres by which the centre of mass moves along ``gravity`` (3,) under the weight, linearly."""
-    stiffness, kept = _held_stiffness(assembly, free)
+def _linear_sag(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.ndarray, gravity: np.ndarray) -> float:
+    """Return the linear displacement of the centre of mass along ``gravity`` (3,) under the weight, m."""
+    stiffness, free_coordinates = _clamped_stiffness(assembly, free)
     force = (node_mass[:, None] * gravity).ravel()
     moved = np.zeros_like(force)
     with warnings.catch_warnings():
-        # What is singular sinks by no number.
+        # A singular stiffness gives NaN, which the caller rejects.
         warnings.simplefilter("ignore", sparse_linalg.MatrixRankWarning)
-        moved[kept] = sparse_linalg.spsolve(stiffness, force[kept])
+        moved[free_coordinates] = sparse_linalg.spsolve(stiffness, force[free_coordinates])
     return float(node_mass @ moved.reshape(-1, 3) @ gravity / (node_mass.sum() * np.linalg.norm(gravity)))
 
 
 def _first_frequency(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.ndarray) -> float:
-    """Smallest angular frequency, rad/s, with the nodes that are not ``free`` (N,) held."""
-    stiffness, kept = _held_stiffness(assembly, free)
-    mass = sparse.diags(np.repeat(node_mass, 3)[kept]).tocsc()
-    start = np.ones(len(kept))
+    """Return the smallest angular frequency, rad/s, with the nodes that are not ``free`` (N,) clamped."""
+    stiffness, free_coordinates = _clamped_stiffness(assembly, free)
+    mass = sparse.diags(np.repeat(node_mass, 3)[free_coordinates]).tocsc()
+    start = np.ones(len(free_coordinates))
     value = sparse_linalg.eigsh(stiffness, k=1, M=mass, sigma=0.0, v0=start, return_eigenvectors=False)[0]
     return float(np.sqrt(value))

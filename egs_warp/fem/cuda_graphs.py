@@ -1,4 +1,4 @@
-"""Work of torch and Warp that is done again and again on the same memory: on a GPU one graph, launched at once."""
+"""CUDA graphs of PyTorch and Warp operations that repeat on the same memory; on a CPU they run directly."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ import warp as wp
 
 from egs_warp.launching import warp_stream
 
-_MOST = 64
-"""Works of one kind that are kept: steps of other lengths and other numbers of contacts are others."""
+_MAX_GRAPHS = 64
+"""Capacity of a ``GraphCache``; steps with other sizes or numbers of contacts need graphs of their own."""
 
 
 class _Entered(threading.local):
-    """Streams that this thread has entered, the last one last: which, and what is left with it."""
+    """Stack of the streams that this thread has entered: CUDA stream and context to exit."""
 
     def __init__(self) -> None:
         self.contexts: list[tuple[int | None, ExitStack]] = []
@@ -31,7 +31,7 @@ _entered = _Entered()
 
 
 class GraphStream:
-    """Where torch and Warp both work: on a GPU on Warp's stream, so that neither has to wait for the other."""
+    """Stream shared by PyTorch and Warp: on a GPU Warp's stream, so that no synchronization between them is needed."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -45,10 +45,10 @@ class GraphStream:
         self._first: Any = None
 
     def __enter__(self) -> None:
-        """From now on torch works there, and keeps no track of gradients."""
+        """Make this PyTorch's current stream and disable gradients."""
         key, entered = None if self._stream is None else self._stream.cuda_stream, _entered.contexts
         context = ExitStack()
-        # Torch takes longer to turn to a stream than to begin some work there.
+        # Switching PyTorch's stream costs more than a small operation, so nested entries do nothing.
         if not entered or entered[-1][0] != key:
             context.enter_context(torch.no_grad())
             if self._stream is not None:
@@ -59,19 +59,19 @@ class GraphStream:
         _entered.contexts.pop()[1].__exit__(*raised)
 
     def current(self) -> wp.Stream | None:
-        """Warp's name of the stream on which torch works: this one, or one of those that are ``at_once``."""
+        """Return Warp's object for PyTorch's current stream: this one, or a branch of ``fork_join``; None on a CPU."""
         if self._stream is None:
             return None
         stream = torch.cuda.current_stream(self.device)
         return self._of_warp if stream.cuda_stream == self._stream.cuda_stream else warp_stream(stream)
 
     def wait(self) -> None:
-        """Until all is done that was begun."""
+        """Block until all queued work is done."""
         if self._stream is not None:
             self._stream.synchronize()
 
     def record_event(self, event: Any) -> Any:
-        """An event after all that was begun, for which somebody may wait: ``event``, or a new one."""
+        """Record ``event``, or a new event, after all work queued so far and return it; None on a CPU."""
         if self._stream is None:
             return None
         event = event or torch.cuda.Event()
@@ -79,42 +79,53 @@ class GraphStream:
         return event
 
     def fork_join(self, works: Sequence[Callable[[], None]]) -> None:
-        """``works`` of torch, each of which leaves alone what the others touch; what is asked for next comes after all
-        of them."""
+        """Run PyTorch operations concurrently, each in a stream of its own; work queued later follows all of them.
+
+        The ``works`` must not access each other's memory.
+        """
         if self._stream is None:
             for work in works:
                 work()
             return
         while len(self._others) < len(works) - 1:
             self._others.append(torch.cuda.Stream(self.device))
-        begun, *ended = (torch.cuda.Event() for _ in works)
-        begun.record(self._stream)
-        for work, other, end in zip(works[1:], self._others, ended, strict=False):
-            other.wait_event(begun)
+        fork, *joins = (torch.cuda.Event() for _ in works)
+        fork.record(self._stream)
+        for work, other, end in zip(works[1:], self._others, joins, strict=False):
+            other.wait_event(fork)
             with torch.cuda.stream(other):
                 work()
             end.record(other)
         works[0]()
-        for end in ended:
+        for end in joins:
             self._stream.wait_event(end)
 
     def run_captured(self, work: Callable[[], None]) -> Callable[[], None]:
-        """``work``, which is run as it is the first time: nothing may be compiled or made while it is recorded, the
-        second time. It must not wait for the device."""
+        """Return a function that runs ``work``, on a GPU by a CUDA graph.
+
+        The first call runs ``work`` directly, so that compilation and setup precede the capture by the second
+        call. ``work`` must not synchronize with the device.
+        """
         return work if self._stream is None else _Graph(work, self)
 
     def run_while(self, work: Callable[[], None], going: torch.Tensor) -> Callable[[], None]:
-        """``work`` again and again while ``going`` (1,) int32 is not 0, as it says itself: on a GPU a loop within a
-        graph, for which nobody waits, once ``work`` has run as it is."""
+        """Return a function that repeats ``work`` while ``going`` (1,) int32, which ``work`` updates, is not 0.
+
+        On a GPU, once ``work`` has run directly, this is a loop within a CUDA graph, launched asynchronously.
+        """
         return _WhileGraph(work, self, going)
 
     def record(self, work: Callable[[], None], *, keep: bool = False) -> torch.cuda.CUDAGraph:
-        """What ``work`` asks of the device, none of which is done; a graph to ``keep`` can be part of another.
+        """Capture the device operations of ``work`` in a graph without executing them.
 
-        What graphs make on their way lies in the same memory: they run one after the other, and leave nothing there.
-        The first is kept, since with the last of them that memory would go. No other thread may work on the device
-        meanwhile: what it begins would be recorded, too. Nor may Python look for garbage: what it found of the device's
-        memory it would give back, which waits for all that goes on there.
+        All graphs share one memory pool for temporary memory: they run one after the other and leave no results there.
+        The first graph is retained, since the pool is released with its last graph. No other thread may use the device
+        during a capture, as its operations would be captured too. Python's garbage collection is disabled meanwhile:
+        freeing device memory would synchronize with the device.
+
+        Args:
+            work: operations to capture.
+            keep: retain the raw graph, so that it can become part of another graph.
         """
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()
@@ -130,13 +141,16 @@ class GraphStream:
         return graph
 
     def while_graph(self, graph: torch.cuda.CUDAGraph, going: torch.Tensor) -> Callable[[], None]:
-        """What was recorded to be kept, while ``going`` (1,) int32 is not 0: in a graph, if the driver knows loops."""
+        """Return a function that replays a graph recorded with ``keep`` while ``going`` (1,) int32 is not 0.
+
+        Uses a conditional graph node if the driver supports it, else a loop on the host.
+        """
         if not wp.is_conditional_graph_supported():
 
-            def replayed() -> None:
+            def replay() -> None:
                 _repeat(graph.replay, going)
 
-            return replayed
+            return replay
         stream = self._of_warp
         assert stream is not None
         within, condition = wp.Graph(stream.device), wp.from_torch(going)
@@ -145,86 +159,92 @@ class GraphStream:
             wp.capture_begin(stream=stream)
             wp.capture_while(condition, within, stream=stream)
             loop = wp.capture_end(stream=stream)
-        # Torch's, who gives it back.
+        # PyTorch owns the raw graph and destroys it.
         within.graph = None
         return lambda: wp.capture_launch(loop, stream=stream)
 
     def pinned(self, count: int) -> torch.Tensor:
-        """(count,) of zeros on the host, which a GPU reads and writes by itself. Warp's: torch would note, when its own
-        go, where Warp's stream is then, which ends the program if that went before, as it may at the end."""
+        """Return page-locked host memory (count,) of float64 zeros that a GPU can access directly.
+
+        Warp allocates it. PyTorch, when it frees page-locked memory, records an event on the stream that used it, which
+        aborts the program at exit if Warp's stream has been destroyed before.
+        """
         return wp.to_torch(wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._stream is not None))
 
 
 class PinnedUpload:
-    """Numbers that go to the device in one piece."""
+    """Float64 values that are uploaded together: page-locked host buffer ``host`` and device tensor ``device``."""
 
     def __init__(self, stream: GraphStream, count: int) -> None:
         self.host, self._stream = stream.pinned(count), stream
-        self._sent: Any = None
+        self._copied: Any = None
         self.device = torch.zeros(count, dtype=torch.float64, device=stream.device)
 
     def set(self, *parts: np.ndarray) -> None:
-        """``parts`` one behind the other, zeros behind the last."""
+        """Upload the concatenated ``parts``, padded with zeros, asynchronously."""
         self.write(*parts)
         self.send()
         self.start_copy()
 
     def write(self, *parts: np.ndarray) -> None:
-        """The same, for a graph to ``send``; what it has sent before must have gone, or be known to be ``sent``."""
-        here, at = self.host.numpy(), 0
+        """Write the concatenated ``parts``, padded with zeros, to the host buffer, for a graph that calls ``send``.
+
+        Blocks until the previous copy, marked by ``start_copy``, has finished.
+        """
+        host, at = self.host.numpy(), 0
         self.wait()
         for part in parts:
-            here[at : at + part.size] = part.ravel()
+            host[at : at + part.size] = part.ravel()
             at += part.size
-        here[at:] = 0.0
+        host[at:] = 0.0
 
     def start_copy(self) -> None:
-        """It is on its way."""
-        self._sent = self._stream.record_event(self._sent)
+        """Mark a copy as queued: ``write`` and ``wait`` block until it has finished."""
+        self._copied = self._stream.record_event(self._copied)
 
     def wait(self) -> None:
-        """Until what is on its way has gone."""
-        if self._sent is not None:
-            self._sent.synchronize()
+        """Block until the last marked copy has finished."""
+        if self._copied is not None:
+            self._copied.synchronize()
 
     def send(self) -> None:
-        """What lies ``here`` now."""
+        """Queue the copy of the host buffer to the device."""
         self.device.copy_(self.host, non_blocking=True)
 
 
 class GraphCache:
-    """Works by their keys, of which the last are kept."""
+    """Cache of captured operations by key; evicts the least recently used."""
 
     def __init__(self, stream: GraphStream) -> None:
         self._stream = stream
-        self._kept: OrderedDict[Hashable, Callable[[], None]] = OrderedDict()
+        self._graphs: OrderedDict[Hashable, Callable[[], None]] = OrderedDict()
 
     def run(self, key: Hashable, work: Callable[[], None]) -> None:
-        """``work``, or what was recorded of that with the same ``key``."""
-        if key not in self._kept:
+        """Run ``work``, or the graph that was captured under the same ``key``."""
+        if key not in self._graphs:
             self._keep(key, self._stream.run_captured(work))
-        self._kept.move_to_end(key)
-        self._kept[key]()
+        self._graphs.move_to_end(key)
+        self._graphs[key]()
 
     def repeat(self, key: Hashable, work: Callable[[], None], going: torch.Tensor) -> None:
-        """The same again and again while ``going`` (1,) int32 is not 0."""
-        if key not in self._kept:
+        """Repeat ``work``, or the graph captured under ``key``, while ``going`` (1,) int32 is not 0 (``run_while``)."""
+        if key not in self._graphs:
             self._keep(key, self._stream.run_while(work, going))
-        self._kept.move_to_end(key)
-        self._kept[key]()
+        self._graphs.move_to_end(key)
+        self._graphs[key]()
 
     def _keep(self, key: Hashable, work: Callable[[], None]) -> None:
-        self._kept[key] = work
-        while len(self._kept) > _MOST:
-            self._kept.popitem(last=False)
+        self._graphs[key] = work
+        while len(self._graphs) > _MAX_GRAPHS:
+            self._graphs.popitem(last=False)
 
     def forget(self) -> None:
-        """All of them."""
-        self._kept.clear()
+        """Remove all entries."""
+        self._graphs.clear()
 
 
 class _Graph:
-    """Work, and its graph once there is one."""
+    """Operations that run directly at the first call and from a graph afterwards."""
 
     def __init__(self, work: Callable[[], None], stream: GraphStream) -> None:
         self._work, self._stream, self._warm = work, stream, False
@@ -241,26 +261,26 @@ class _Graph:
 
 
 class _WhileGraph:
-    """Work that is repeated, and the loop of its graph once there is one."""
+    """Operations that repeat while a flag is set: directly at first, then as a loop within a graph."""
 
     def __init__(self, work: Callable[[], None], stream: GraphStream, going: torch.Tensor) -> None:
         self._work, self._stream, self._going = work, stream, going
         self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._looped: Callable[[], None] | None = None
+        self._loop: Callable[[], None] | None = None
 
     def __call__(self) -> None:
-        if self._looped is None and (self._going.device.type == "cpu" or not self._warm):
+        if self._loop is None and (self._going.device.type == "cpu" or not self._warm):
             self._warm = _repeat(self._work, self._going) > 0
             return
-        if self._looped is None:
+        if self._loop is None:
             self._graph = self._stream.record(self._work, keep=True)
-            self._looped = self._stream.while_graph(self._graph, self._going)
-        self._looped()
+            self._loop = self._stream.while_graph(self._graph, self._going)
+        self._loop()
 
 
 def _repeat(work: Callable[[], None], going: torch.Tensor) -> int:
-    """How often ``work`` was done while ``going`` was not 0, at which the host looks each time."""
+    """Run ``work`` while ``going`` is not 0, with a synchronization each time, and return the number of runs."""
     count = 0
     while int(going) != 0:
         work()
@@ -270,11 +290,11 @@ def _repeat(work: Callable[[], None], going: torch.Tensor) -> int:
 
 @contextmanager
 def _no_garbage() -> Iterator[None]:
-    """Python looks for none meanwhile."""
-    looks = gc.isenabled()
+    """Disable Python's garbage collection within the context."""
+    enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        if looks:
+        if enabled:
             gc.enable()

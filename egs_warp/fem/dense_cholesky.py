@@ -1,4 +1,7 @@
-"""Factors of a step's matrix as a dense one, by torch: for a GPU, where that takes less time than any sparse way."""
+"""Dense Cholesky factors of a step's matrix, in PyTorch; on a GPU they are faster than sparse factors.
+
+The kernel that inverts triangular blocks is in ``egs_warp.kernels.fem.triangles``.
+"""
 
 from __future__ import annotations
 
@@ -20,16 +23,21 @@ from egs_warp.precision import real
 
 
 class DenseCholesky:
-    """Cholesky factors L of symmetric matrices of one pattern; see ``Factors``.
+    """Dense Cholesky solver for symmetric matrices of one pattern; implements ``LinearSolver``.
 
-    L^-1 is made once a matrix: a triangular solve takes as long for one right-hand side as for a thousand, a product
-    with L^-1 a fiftieth of that.
+    The inverse factor L^-1 is computed once per matrix. A triangular solve takes the same time for one right-hand side
+    as for a thousand, and a product with L^-1 takes a fiftieth of it.
     """
 
     is_host = False
 
     def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array, *, device: str) -> None:
-        """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``."""
+        """Allocate the solver.
+
+        Args:
+            upper_pattern: (n, n) upper triangle with the diagonal, entries in the order of ``update``.
+            device: PyTorch device.
+        """
         count = len(upper_pattern.indptr) - 1
         rows = np.asarray(upper_pattern.indices, dtype=np.int64)
         columns = np.repeat(np.arange(count), np.diff(upper_pattern.indptr))
@@ -38,96 +46,108 @@ class DenseCholesky:
         self._upper = torch.from_numpy(rows * count + columns).to(self.device)
         self._lower = torch.from_numpy(columns * count + rows).to(self.device)
         self._root = _InverseFactor(Dissection.of(upper_pattern), self.stream)
-        self.places = self._root.places_of(rows, columns)
-        """Of the entries in the matrix that is factored."""
-        self._other = torch.zeros((count, count), dtype=torch.float64, device=self.device)
-        self._entries, self._diagonal = self._other.new_zeros(len(rows)), self._other.new_zeros(count)
-        self._diagonal_here = np.zeros(count)
-        self._told, self.verdict = self.stream.pinned(2), self._other.new_zeros(2)
-        """Whether the entries were finite, and the matrix definite."""
+        self.places = self._root.entry_slots(rows, columns)
+        """(nnz,) positions of the entries in the flat matrix that is factored."""
+        self._energy_hessian = torch.zeros((count, count), dtype=torch.float64, device=self.device)
+        self._entries, self._diagonal = self._energy_hessian.new_zeros(len(rows)), self._energy_hessian.new_zeros(count)
+        self._uploaded_diagonal = np.zeros(count)
+        self._verdict_readback, self.verdict = self.stream.pinned(2), self._energy_hessian.new_zeros(2)
+        """(2,) on the host and on the device: nonzero if the entries are finite, and if the matrix is definite."""
         self._factored = self.stream.run_captured(self._factor)
-        self._strain_told, self._strain_entries = PinnedUpload(self.stream, 3 * count), torch.zeros_like(self._entries)
-        self._strain_here, self._strains = self.stream.pinned(0), GraphCache(self.stream)
-        self._finite = self._ready = self._begun = False
+        self._effort_upload, self._effort_entries = (
+            PinnedUpload(self.stream, 3 * count),
+            torch.zeros_like(self._entries),
+        )
+        self._effort_readback, self._effort_graphs = self.stream.pinned(0), GraphCache(self.stream)
+        self._finite = self._ready = self._pending = False
 
     def update(self, entries: np.ndarray | torch.Tensor, diagonal: np.ndarray | None = None) -> bool:
-        """See ``Factors``; what is not positive definite has no factors."""
+        """Factor S; see ``LinearSolver.update``. A matrix that is not positive definite has no factors."""
         self.start_update(entries, diagonal)
         return self.is_ready
 
     def start_update(self, entries: np.ndarray | torch.Tensor, diagonal: np.ndarray | None = None) -> None:
-        """See ``Factors``."""
+        """Factor S asynchronously; see ``LinearSolver.start_update``."""
         with self.stream:
-            self._entries.copy_(self._take(entries))
+            self._entries.copy_(self._to_device(entries))
             self.upload_diagonal(np.zeros(len(self._diagonal)) if diagonal is None else diagonal)
             self._factored()
-        self._begun = True
+        self._pending = True
 
     def upload_diagonal(self, diagonal: np.ndarray) -> None:
-        """The ``diagonal`` (n,) that is added to the entries."""
-        # From step to step it is the same.
-        if not np.array_equal(diagonal, self._diagonal_here):
-            self._diagonal_here = diagonal.copy()
-            self._diagonal.copy_(self._take(diagonal))
+        """Set the ``diagonal`` (n,) that is added to the entries."""
+        # It is usually the same in every step.
+        if not np.array_equal(diagonal, self._uploaded_diagonal):
+            self._uploaded_diagonal = diagonal.copy()
+            self._diagonal.copy_(self._to_device(diagonal))
 
     def enqueue(self, entries: torch.Tensor) -> None:
-        """``begin`` with the diagonal that was told, as part of a graph; who launches that says so by ``begun``."""
+        """Queue ``start_update`` with the uploaded diagonal, as part of a graph.
+
+        The caller of the graph reports its launch by ``mark_started``.
+        """
         self._entries.copy_(entries)
         self._factor()
 
     def enqueue_low_rank(self, directions: torch.Tensor, sign: float) -> None:
-        """From now on solve with S + ``sign`` U^T U, ``directions`` U (k, n), where that is definite; ``verdict`` and
-        ``ready`` say so. S must be, and a sign of less than 0 comes last."""
-        self.verdict[1].mul_(self._root.add(directions, sign))
-        self._told.copy_(self.verdict, non_blocking=True)
+        """Queue the update of the factors from S to S + ``sign`` U^T U; ``verdict`` and ``is_ready`` report the result.
+
+        S must be positive definite. Updates with a negative sign must come last, since their sum may be indefinite.
+
+        Args:
+            directions: (k, n) U.
+            sign: 1 or -1.
+        """
+        self.verdict[1].mul_(self._root.add_low_rank(directions, sign))
+        self._verdict_readback.copy_(self.verdict, non_blocking=True)
 
     def mark_started(self) -> None:
-        """Factors are on their way."""
-        self._begun = True
+        """Report that factors are queued; ``is_ready`` then waits for them."""
+        self._pending = True
 
     def _factor(self) -> None:
-        """Of what lies in the entries and the diagonal, and whether these are finite and make it definite."""
+        """Queue the factorization of the current entries and diagonal, and of its verdict."""
         self._root.matrix.view(-1)[self.places] = self._entries
         self._root.matrix.diagonal().add_(self._diagonal[self._root.order])
-        definite = self._root.make()
+        definite = self._root.factor()
         self.verdict.copy_(torch.stack([self._entries.isfinite().all(), definite]))
-        self._told.copy_(self.verdict, non_blocking=True)
+        self._verdict_readback.copy_(self.verdict, non_blocking=True)
 
     def add_low_rank(self, across: np.ndarray, rates: np.ndarray) -> bool:
-        """See ``Factors``; S keeps its own factor where the sum has none."""
-        self._settle()
+        """Add a low-rank term; see ``LinearSolver.add_low_rank``. If the sum is not definite, S keeps its factors."""
+        self._finish()
         if not self._finite or not (np.isfinite(across).all() and np.isfinite(rates).all()):
             return False
         with self.stream:
-            if not self._root.make_with(self._take(across), self._take(rates)):
+            if not self._root.factor_with(self._to_device(across), self._to_device(rates)):
                 return False
         self._ready = True
         return True
 
     @property
     def is_ready(self) -> bool:
-        """See ``Factors``."""
-        self._settle()
+        """True if factors exist; blocks until queued ones are computed."""
+        self._finish()
         return self._ready
 
-    def _settle(self) -> None:
-        """Wait for what is begun, and see what it has come to."""
-        if self._begun:
+    def _finish(self) -> None:
+        """Wait for queued factors and read their verdict."""
+        if self._pending:
             self.stream.wait()
-            self._begun = False
-            finite, definite = self._told.tolist()
+            self._pending = False
+            finite, definite = self._verdict_readback.tolist()
             self._finite, self._ready = finite > 0.0, finite > 0.0 and definite > 0.0
 
-    def solve(self, right: np.ndarray, kept: MomentumProjection | None = None) -> np.ndarray:
-        """See ``Factors``."""
+    def solve(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
+        """Solve for ``right``; see ``LinearSolver.solve``."""
         assert self.is_ready, "update() comes first"
         with self.stream:
-            plain = self._give(self._solve(self._take(right)))
-        return plain if kept is None else kept.corrected(right, plain)
+            plain = self._to_host(self._solve(self._to_device(right)))
+        return plain if projection is None else projection.corrected(right, plain)
 
     @property
     def inverse(self) -> torch.Tensor:
-        """(n, n) R of S^-1 = R^T R, L^-1 in another order of unknowns, on the device, always in the same place."""
+        """(n, n) R with S^-1 = R^T R on the device: L^-1 with permuted unknowns. Its address never changes."""
         return self._root.inverse
 
     def _solve(self, right: torch.Tensor) -> torch.Tensor:
@@ -144,110 +164,119 @@ class DenseCholesky:
         dt_ahead: float,
         reference: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """See ``Factors``."""
+        """Compute the quadratic model of the elastic energy; see ``LinearSolver.effort_quadratic``."""
         count = vectors.shape[1]
         with self.stream:
-            self._strain_told.set(gradient, weights, reference)
-            self._strain_entries.copy_(self._take(entries))
-            given = self._take(vectors)
-            if self._strain_here.numel() < count * count + count:
-                self._strain_here = self.stream.pinned(count * count + count)
-                self._strains.forget()
+            self._effort_upload.set(gradient, weights, reference)
+            self._effort_entries.copy_(self._to_device(entries))
+            columns = self._to_device(vectors)
+            if self._effort_readback.numel() < count * count + count:
+                self._effort_readback = self.stream.pinned(count * count + count)
+                self._effort_graphs.forget()
 
             def work() -> None:
-                found = self._strain(given, dt_now, dt_ahead)
-                self._strain_here[: len(found)].copy_(found, non_blocking=True)
+                result = self._effort(columns, dt_now, dt_ahead)
+                self._effort_readback[: len(result)].copy_(result, non_blocking=True)
 
             if isinstance(vectors, torch.Tensor):
-                self._strains.run((given.data_ptr(), count, dt_now, dt_ahead), work)
+                self._effort_graphs.run((columns.data_ptr(), count, dt_now, dt_ahead), work)
             else:
-                # What comes from the host lies elsewhere the next time.
+                # Vectors of the host are uploaded to a different address each time, so no graph is captured.
                 work()
             self.stream.wait()
-        form, along = np.split(self._strain_here.numpy()[: count * count + count], [count * count])
-        return form.reshape(count, count).copy(), along.copy()
+        quadratic, linear = np.split(self._effort_readback.numpy()[: count * count + count], [count * count])
+        return quadratic.reshape(count, count).copy(), linear.copy()
 
-    def _strain(self, given: torch.Tensor, near: float, far: float) -> torch.Tensor:
-        """Form and slope, one behind the other, with what was told; no numbers where there are no factors."""
-        slope, weights, away = self._strain_told.device.split([len(given)] * 3)
-        form, along = self.enqueue_effort_quadratic(self._strain_entries, slope, weights, given, near, far, away)
-        return torch.cat([form.flatten(), along])
+    def _effort(self, vectors: torch.Tensor, dt_now: float, dt_ahead: float) -> torch.Tensor:
+        """Return the flat quadratic and linear terms for the uploaded input; not finite if there are no factors."""
+        gradient, weights, reference = self._effort_upload.device.split([len(vectors)] * 3)
+        quadratic, linear = self.enqueue_effort_quadratic(
+            self._effort_entries, gradient, weights, vectors, dt_now, dt_ahead, reference
+        )
+        return torch.cat([quadratic.flatten(), linear])
 
     def enqueue_effort_quadratic(
         self,
         entries: torch.Tensor,
-        slope: torch.Tensor,
+        gradient: torch.Tensor,
         weights: torch.Tensor,
         vectors: torch.Tensor,
-        near: float,
-        far: float,
-        away: torch.Tensor,
+        dt_now: float,
+        dt_ahead: float,
+        reference: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """``strain_ahead`` of what lies on the device, with nothing that waits."""
-        moves = near * vectors + far * self._solve(weights[:, None] * vectors)
-        moves[:, -1] -= away
-        flat = self._other.view(-1)
+        """Queue ``effort_quadratic`` of device tensors, without synchronization."""
+        moves = dt_now * vectors + dt_ahead * self._solve(weights[:, None] * vectors)
+        moves[:, -1] -= reference
+        flat = self._energy_hessian.view(-1)
         flat[self._upper] = entries
         flat[self._lower] = entries
-        return moves.T @ (self._other @ moves), slope @ moves
+        return moves.T @ (self._energy_hessian @ moves), gradient @ moves
 
-    def _take(self, values: np.ndarray | torch.Tensor) -> torch.Tensor:
+    def _to_device(self, values: np.ndarray | torch.Tensor) -> torch.Tensor:
         if isinstance(values, torch.Tensor):
             return values
         return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
 
     @staticmethod
-    def _give(values: torch.Tensor) -> np.ndarray:
+    def _to_host(values: torch.Tensor) -> np.ndarray:
         return values.cpu().numpy()
 
 
 class _InverseFactor:
-    """R of S^-1 = R^T R for symmetric matrices S (n, n) of one pattern: L^-1 of S in the order of its slabs, columns in
-    that of S.
+    """R with S^-1 = R^T R for symmetric matrices S (n, n) of one pattern.
 
-    On a GPU slabs are eliminated at once, by tiles; on a CPU the whole goes by torch.
+    R is L^-1 of S permuted to the order of the dissection, with columns in the order of S. On a GPU the slabs are
+    eliminated in parallel, tile by tile; on a CPU PyTorch factors the whole matrix.
     """
 
-    def __init__(self, slabs: Dissection, stream: GraphStream) -> None:
-        order, device = slabs.order, stream.device
+    def __init__(self, dissection: Dissection, stream: GraphStream) -> None:
+        order, device = dissection.order, stream.device
         count = len(order)
-        place = np.empty(count, dtype=np.int64)
-        place[order] = np.arange(count)
-        self._place_here, self._stream = place, stream
-        self._place, self.order = (torch.from_numpy(each).to(device) for each in (place, order.astype(np.int64)))
+        permutation = np.empty(count, dtype=np.int64)
+        permutation[order] = np.arange(count)
+        self._host_permutation, self._stream = permutation, stream
+        self._permutation, self.order = (
+            torch.from_numpy(each).to(device) for each in (permutation, order.astype(np.int64))
+        )
         self.matrix, self.inverse = torch.zeros((2, count, count), dtype=torch.float64, device=device)
-        """Of these the lower triangle of S in the order of the slabs, and R."""
-        # Of each number of directions that were added at once.
-        self._small: dict[int, tuple[_Triangle, _Triangle]] = {}
-        self._tiled = TiledInverseFactor(slabs, self.matrix, self.inverse, stream) if device.type == "cuda" else None
+        """(n, n) each: S in the order of the dissection, of which the lower triangle is read, and R."""
+        # By the number of directions that are added at once.
+        self._small: dict[int, tuple[_TriangularInverse, _TriangularInverse]] = {}
+        self._tiled = (
+            TiledInverseFactor(dissection, self.matrix, self.inverse, stream) if device.type == "cuda" else None
+        )
 
     @cached_property
-    def _whole(self) -> _Triangle:
-        return _Triangle(len(self.order), self._stream)
+    def _whole(self) -> _TriangularInverse:
+        return _TriangularInverse(len(self.order), self._stream)
 
-    def places_of(self, rows: np.ndarray, columns: np.ndarray) -> torch.Tensor:
-        """Where the entries at ``rows`` and ``columns`` of one triangle lie in the flat ``matrix``."""
-        one, other = self._place_here[rows], self._place_here[columns]
-        places = np.maximum(one, other) * len(self.order) + np.minimum(one, other)
-        return torch.from_numpy(places).to(self._stream.device)
+    def entry_slots(self, rows: np.ndarray, columns: np.ndarray) -> torch.Tensor:
+        """Return the positions of the entries at ``rows`` and ``columns`` of one triangle in the flat ``matrix``."""
+        one, other = self._host_permutation[rows], self._host_permutation[columns]
+        slots = np.maximum(one, other) * len(self.order) + np.minimum(one, other)
+        return torch.from_numpy(slots).to(self._stream.device)
 
-    def make(self) -> torch.Tensor:
-        """R of what lies in the ``matrix``; () bool, whether that is definite."""
+    def factor(self) -> torch.Tensor:
+        """Compute R of ``matrix``; return a () bool tensor, True if the matrix is definite."""
         if self._tiled is not None:
-            return self._tiled.make()
+            return self._tiled.factor()
         definite = self._whole.factor(self.matrix)
-        self._give(self._whole.inverse)
+        self._set_inverse(self._whole.inverse)
         return definite
 
-    def add(self, directions: torch.Tensor, sign: float) -> torch.Tensor:
-        """R of S + ``sign`` U^T U, ``directions`` U (k, n); () bool, whether that is definite.
+    def add_low_rank(self, directions: torch.Tensor, sign: float) -> torch.Tensor:
+        """Update R from S to S + ``sign`` U^T U, ``directions`` U (k, n).
 
-        With W = R U^T and K K^T = 1 + sign W^T W that is (1 - sign W K^-T (K + 1)^-1 W^T)^T R: the square root of a
-        sum by the one of a matrix (Andrews, AIAA Journal 6(6), 1968), so that n is not factored anew.
+        With W = R U^T and K K^T = 1 + sign W^T W, the new factor is (1 - sign W K^-T (K + 1)^-1 W^T)^T R (Andrews, AIAA
+        Journal 6(6), 1968). Only k x k matrices are factored.
+
+        Returns:
+            () bool tensor, True if the sum is definite.
         """
         count = len(directions)
         if count not in self._small:
-            self._small[count] = _Triangle(count, self._stream), _Triangle(count, self._stream)
+            self._small[count] = _TriangularInverse(count, self._stream), _TriangularInverse(count, self._stream)
         plain, raised = self._small[count]
         through = torch.mm(self.inverse, directions.T)
         one = torch.eye(count, dtype=torch.float64, device=through.device)
@@ -258,61 +287,72 @@ class _InverseFactor:
         self.inverse.addmm_(through, gain @ (through.T @ self.inverse), alpha=-sign)
         return info == 0
 
-    def make_with(self, across: torch.Tensor, rates: torch.Tensor) -> bool:
-        """R of the ``matrix`` and ``across`` (n, m) diag(``rates``) across^T, if that is definite; else it stays."""
+    def factor_with(self, across: torch.Tensor, rates: torch.Tensor) -> bool:
+        """Compute R of ``matrix`` + U diag(r) U^T, ``across`` U (n, m), ``rates`` r (m,).
+
+        Returns:
+            True if the sum is definite; else R is unchanged.
+        """
         directions = across[self.order]
         if not bool(self._whole.factor(torch.addmm(self.matrix, directions * rates, directions.T))):
             return False
-        self._give(self._whole.inverse)
+        self._set_inverse(self._whole.inverse)
         return True
 
-    def _give(self, made: torch.Tensor) -> None:
-        torch.index_select(made, 1, self._place, out=self.inverse)
+    def _set_inverse(self, inverse: torch.Tensor) -> None:
+        torch.index_select(inverse, 1, self._permutation, out=self.inverse)
 
 
-class _Triangle:
-    """Inverses of Cholesky factors of one size: of small blocks on the diagonal at once, then of pairs of them."""
+class _TriangularInverse:
+    """Inverse of a lower triangular matrix: small diagonal blocks in parallel, then pairs of blocks recursively."""
 
     def __init__(self, count: int, stream: GraphStream) -> None:
-        pairs = max(0, math.ceil(math.log2(count / kernels.LARGEST)))
-        # Even, for what loads two numbers at once.
+        pairs = max(0, math.ceil(math.log2(count / kernels.MAX_ROWS)))
+        # Even, as kernels load two numbers at once.
         side = 2 * math.ceil(count / 2 ** (pairs + 1))
         size = side * 2**pairs
         self._count, self._side, self._size, self._stream = count, side, size, stream
-        self._given = torch.eye(size, dtype=torch.float64, device=stream.device)
-        self._made = torch.zeros_like(self._given)
-        self.inverse = self._made[:count, :count]
+        self._lower = torch.eye(size, dtype=torch.float64, device=stream.device)
+        self._out = torch.zeros_like(self._lower)
+        self.inverse = self._out[:count, :count]
 
     def factor(self, matrix: torch.Tensor) -> torch.Tensor:
-        """``inverse`` of the factor of the lower triangle of a ``matrix`` (n, n); () bool, whether it has one."""
+        """Set ``inverse`` to that of the Cholesky factor of ``matrix`` (n, n); return () bool, True if definite."""
         factor, info = torch.linalg.cholesky_ex(matrix)
         self.invert(factor)
         return info == 0
 
     def invert(self, lower: torch.Tensor) -> None:
-        """``inverse`` of a ``lower`` triangle (n, n)."""
-        self._given[: self._count, : self._count] = lower
+        """Set ``inverse`` to that of a ``lower`` triangular matrix (n, n)."""
+        self._lower[: self._count, : self._count] = lower
         side = self._side
-        # Torch would take one block after the other.
+        # PyTorch would invert the blocks one after the other.
         lanes = kernels.BLOCK if lower.is_cuda else 1
         wp.launch(
             kernels.invert_triangles_kernel,
             (self._size // side, lanes),
-            inputs=[as_warp(self._given, real), side],
-            outputs=[as_warp(self._made, real)],
+            inputs=[as_warp(self._lower, real), side],
+            outputs=[as_warp(self._out, real)],
             device=wp.device_from_torch(lower.device),
             stream=self._stream.current(),
             block_dim=lanes,
         )
         while side < self._size:
-            first, second = (_blocks(self._made, side, 2 * side, place) for place in (0, side * (self._size + 1)))
+            first, second = (_blocks(self._out, side, 2 * side, place) for place in (0, side * (self._size + 1)))
             below = side * self._size
-            between = torch.bmm(_blocks(self._given, side, 2 * side, below), first)
-            _blocks(self._made, side, 2 * side, below).copy_(torch.bmm(second, between).neg_())
+            between = torch.bmm(_blocks(self._lower, side, 2 * side, below), first)
+            _blocks(self._out, side, 2 * side, below).copy_(torch.bmm(second, between).neg_())
             side *= 2
 
 
 def _blocks(matrix: torch.Tensor, side: int, apart: int, first: int) -> torch.Tensor:
-    """(b, side, side) blocks of a square ``matrix``, each so far ``apart`` along the diagonal, from entry ``first``."""
+    """Return a view (b, side, side) of blocks of a square ``matrix``.
+
+    Args:
+        matrix: contiguous square matrix.
+        side: rows of a block.
+        apart: rows between the first rows of two blocks, along the diagonal.
+        first: flat index of the first block's first entry.
+    """
     size = len(matrix)
     return matrix.as_strided((size // apart, side, side), (apart * (size + 1), size, 1), first)

@@ -1,4 +1,4 @@
-"""A body cut into slabs that do not meet, so that their factors can be made at once."""
+"""One-level nested dissection of a matrix into slabs without common entries, which are factored in parallel."""
 
 from __future__ import annotations
 
@@ -9,45 +9,48 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import shortest_path
 
-_MOST_CUTS = 3
-_WORTH = 0.8
-"""Of all unknowns: what cuts leave to be eliminated one after the other, if they are worth their launches."""
+_MAX_CUTS = 3
+_MAX_SEQUENTIAL_FRACTION = 0.8
+"""Fraction of the unknowns eliminated in sequence above which a dissection does not pay for its launches."""
 
 
 @dataclass(frozen=True)
 class Dissection:
-    """Unknowns of a symmetric matrix (n, n): no entry of it joins two ``parts``.
+    """Partition of the unknowns of a symmetric matrix (n, n) such that no entry couples two ``parts``.
 
-    One part is eliminated beside the other, then what lies ``between`` them: nested dissection (George, 1973), by one
-    level, since on a GPU what is eliminated at once takes no longer than its largest part.
+    The parts are eliminated in parallel, then the ``separator``: one level of nested dissection (George, 1973). On a
+    GPU the parts together take as long as the largest of them.
     """
 
     parts: list[np.ndarray]
-    """Of each its unknowns."""
+    """Unknowns of each part, ascending."""
     separator: np.ndarray
-    """The others."""
+    """All other unknowns, ascending."""
 
     @property
     def order(self) -> np.ndarray:
-        """(n,) the unknowns, part by part, then those between."""
+        """(n,) order of elimination: the unknowns of each part, then the separator."""
         return np.concatenate([*self.parts, self.separator])
 
     @classmethod
     def of(cls, upper: sparse.csc_matrix | sparse.csc_array) -> Dissection:
-        """Of a matrix with a pattern whose upper triangle is ``upper``: levels of the graph from one of its ends on,
-        some of which are cuts, so that the largest part and all cuts have the fewest unknowns together."""
+        """Dissect a matrix whose pattern has the upper triangle ``upper``.
+
+        The candidates for cuts are the levels of a breadth-first search from one end of the graph. The choice minimizes
+        the unknowns of the largest part plus those of all cuts.
+        """
         count = len(upper.indptr) - 1
         whole = cls([np.arange(count)], np.zeros(0, int))
         level = _levels(sparse.csr_matrix(abs(upper) + abs(upper).T))
         widths = np.bincount(level)
         ends = np.concatenate([[0], np.cumsum(widths)])
-        best, cuts = _WORTH * count, ()
-        for number in range(1, _MOST_CUTS + 1):
+        best, cuts = _MAX_SEQUENTIAL_FRACTION * count, ()
+        for number in range(1, _MAX_CUTS + 1):
             for chosen in combinations(range(1, len(widths) - 1), number):
                 sizes = [ends[last] - ends[first + 1] for first, last in pairwise((-1, *chosen, len(widths)))]
-                left = max(sizes) + widths[list(chosen)].sum()
-                if min(sizes) > 0 and left < best:
-                    best, cuts = left, chosen
+                sequential = max(sizes) + widths[list(chosen)].sum()
+                if min(sizes) > 0 and sequential < best:
+                    best, cuts = sequential, chosen
         if not cuts:
             return whole
         parts = [np.flatnonzero((level > a) & (level < b)) for a, b in pairwise((-1, *cuts, len(widths)))]
@@ -55,10 +58,12 @@ class Dissection:
 
 
 def _levels(graph: sparse.csr_matrix) -> np.ndarray:
-    """(n,) how many edges each vertex is from one of the ends of the ``graph``; what is not joined to that is one level
-    further than all others."""
+    """Return the distance (n,), in edges, of each vertex from one end of the ``graph``.
+
+    Vertices that are not connected to that end form one further level.
+    """
     level = np.zeros(len(graph.indptr) - 1)
     for _ in range(2):
         level = shortest_path(graph, unweighted=True, indices=int(np.argmax(np.where(np.isfinite(level), level, -1.0))))
-    joined = np.isfinite(level)
-    return np.where(joined, level, level[joined].max() + 1.0).astype(int)
+    connected = np.isfinite(level)
+    return np.where(connected, level, level[connected].max() + 1.0).astype(int)

@@ -1,4 +1,7 @@
-"""Elastic energy of a tetrahedral body (Eq. 5) and its derivatives, assembled in a fixed order by Warp kernels."""
+"""Elastic energy of a tetrahedral body (Eq. 5) and its derivatives, assembled in a fixed order by Warp kernels.
+
+The kernels are in ``egs_warp.kernels.fem.elasticity`` (GPU) and ``elasticity_cpu`` (CPU).
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from egs_warp.muscles.tension import MuscleEnergy
 
 
 class ElasticAssembly:
-    """Kernels, index maps and scratch memory for one mesh. Node arrays go in and out as (N, 3) float64 on the host."""
+    """Elasticity of one mesh: index maps, scratch memory and launches. Node arrays are (N, 3) float64 on the host."""
 
     def __init__(self, mesh: TetMesh, material: Material, *, device: str | None = None) -> None:
         self.mesh, self.material, self.device = mesh, material, wp.get_device(device)
@@ -30,26 +33,26 @@ class ElasticAssembly:
         self.elements = on_device(self.maps, material, self.device)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """It is made anew wherever a copy of it is read: its arrays lie on a device."""
+        """Pickle the mesh and the material only; the copy rebuilds the arrays on its device."""
         return partial(ElasticAssembly, device=str(self.device)), (self.mesh, self.material)
 
     @cached_property
     def analysis(self) -> SymbolicFactorization:
-        """Of ``upper_pattern``."""
+        """Symbolic factorization of ``upper_pattern``."""
         return SymbolicFactorization.of(self.upper_pattern)
 
     def damping(self, positions: np.ndarray, dt: float) -> Damping:
-        """Of a step of ``dt`` seconds that starts at ``positions`` (N, 3)."""
+        """Return the damping of a step of ``dt`` seconds that starts at ``positions`` (N, 3) m."""
         return Damping(dt, self.elements.start(positions))
 
     def determinants(self, positions: np.ndarray) -> np.ndarray:
-        """(T,) J = det F; not positive where an element is inverted."""
+        """Return J = det F (T,) at ``positions`` (N, 3); not positive where an element is inverted."""
         return self.elements.energy(positions, None)[1]
 
     def energy(self, positions: np.ndarray, damping: Damping | None = None) -> float:
-        """Psi(positions), joules; infinite if an element is inverted.
+        """Return the elastic energy Psi(positions), J; infinite if an element is inverted.
 
-        With ``damping``, plus dt beta/2 sum V E':C:E', where E' = (F^T F - F0^T F0) / (2 dt) is the mean strain rate of
+        With ``damping``, add dt beta/2 sum V E':C:E', where E' = (F^T F - F0^T F0) / (2 dt) is the mean strain rate of
         the step.
         """
         return self.elements.energy(positions, damping)[0]
@@ -57,20 +60,26 @@ class ElasticAssembly:
     def gradient(
         self, positions: np.ndarray, damping: Damping | None = None, tension: MuscleEnergy | None = None
     ) -> np.ndarray:
-        """(N, 3) newtons: the derivative of ``energy`` by the positions, minus the internal force; with that of
-        ``tension``."""
+        """Return the derivative of ``energy`` with respect to the positions, minus the internal force: (N, 3) N.
+
+        With ``tension``, add the gradient of the muscle energy.
+        """
         return self.elements.gradient(positions, damping, tension)
 
     def energy_and_gradient(self, positions: np.ndarray, damping: Damping | None = None) -> tuple[float, np.ndarray]:
-        """Both of them."""
+        """Return ``energy`` and ``gradient`` without muscles."""
         return self.elements.energy_and_gradient(positions, damping)
 
     def hessian_entries(
         self, positions: np.ndarray, damping: Damping | None = None, *, factor: float = 1.0, projected: bool = False
     ) -> np.ndarray:
-        """Entries of ``factor`` times the second derivative of ``energy`` in the order of ``upper_pattern``.
+        """Return the entries (nnz,), ordered as in ``upper_pattern``, of ``factor`` times the Hessian of ``energy``.
 
-        ``projected``: each element's part is made positive semi-definite.
+        Args:
+            positions: (N, 3) m.
+            damping: damping of the step, or None.
+            factor: multiplies all entries.
+            projected: project the Hessian of each element to a positive semi-definite one.
         """
         return self.elements.hessian_entries(positions, damping, factor=factor, projected=projected)
 
@@ -83,14 +92,14 @@ class ElasticAssembly:
         factor: float = 1.0,
         projected: bool = False,
     ) -> Any:
-        """``hessian_entries`` where ``factors`` want them: a tensor of torch, or an array of the host."""
+        """Return ``hessian_entries`` where ``factors`` read them: a NumPy array, or a PyTorch tensor on the device."""
         if factors.is_host:
             return self.hessian_entries(positions, damping, factor=factor, projected=projected)
         assert isinstance(self.elements, WarpElasticity)
         return self.elements.entries_on_device(positions, damping, factor=factor, projected=projected)
 
     def matrix(self, entries: np.ndarray) -> sparse.csc_matrix:
-        """Upper triangle (3N, 3N) with the given entries."""
+        """Return the upper triangle (3N, 3N) with the given ``entries`` (nnz,)."""
         return sparse.csc_matrix(
             (entries, self.upper_pattern.indices, self.upper_pattern.indptr), shape=self.upper_pattern.shape
         )

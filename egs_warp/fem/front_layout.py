@@ -1,4 +1,4 @@
-"""Where the numbers of a factorisation by fronts lie in memory."""
+"""Memory layout of the multifrontal factorization."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from egs_warp.kernels.vectors import BLOCK
 
 @dataclass(frozen=True)
 class FrontLayout:
-    """Places, and how many numbers there are of each kind."""
+    """Index maps of the fronts, and the sizes of the arrays in float64 numbers."""
 
     fronts: Any
-    """The kernels' ``Fronts``."""
+    """``kernels.fem.supernodal.Fronts``, the index maps as the kernels read them."""
     front: int
-    """Of the largest front, by rows whose lengths are multiples of 8."""
+    """Size of the largest front, stored row by row with row lengths padded to multiples of 8."""
     scratch: int
-    """Behind it."""
+    """Size of the scratch memory behind the front."""
     stack: int
-    """Of what fronts leave for their parents, while it waits."""
+    """Size of the stack of update matrices that are not yet added to their parents."""
     factor: int
-    """Of L, each block by rows."""
+    """Size of L, each block stored row by row."""
     inverses: int
-    """Of its diagonal blocks' inverses."""
+    """Size of the inverses of the diagonal blocks of L."""
 
     @classmethod
     def of(cls, blocks: Supernodes, upper: sparse.csc_matrix) -> FrontLayout:
-        """Of ``blocks``, into which the entries of ``upper`` (n, n) go in the order of its columns."""
+        """Lay out the fronts of ``blocks``; matrix entries are numbered as in ``upper`` (n, n), column by column."""
         widths, heights, parents = (part.astype(np.int64) for part in (blocks.widths, blocks.heights, blocks.parents))
         strides, inverses = -(-heights // 8) * 8, -(-widths // BLOCK) * BLOCK**2
-        place_in = _places_in_fronts(blocks)
-        # An entry lies in the columns of the block that is eliminated first.
+        row_in_front = _front_row_lookup(blocks)
+        # An entry belongs to the block of the column that is eliminated first.
         ends = (
             blocks.permutation[upper.indices],
             blocks.permutation[np.repeat(np.arange(len(upper.indptr) - 1), np.diff(upper.indptr))],
@@ -46,13 +46,13 @@ class FrontLayout:
         column, row = np.minimum(*ends), np.maximum(*ends)
         block = np.repeat(np.arange(blocks.count), widths)[column]
         entries = np.argsort(block, kind="stable")
-        entry_places = place_in(block, row) * strides[block] + column - blocks.first[block]
-        # What a front leaves goes to its parent.
-        left = np.concatenate([np.arange(height) >= width for height, width in zip(heights, widths, strict=True)])
+        entry_places = row_in_front(block, row) * strides[block] + column - blocks.first[block]
+        # The update matrix of a front is added to its parent.
+        is_update = np.concatenate([np.arange(height) >= width for height, width in zip(heights, widths, strict=True)])
         in_parent = np.zeros(len(blocks.rows), dtype=np.int64)
-        in_parent[left] = place_in(np.repeat(parents, heights)[left], blocks.rows[left])
+        in_parent[is_update] = row_in_front(np.repeat(parents, heights)[is_update], blocks.rows[is_update])
         children = np.argsort(parents, kind="stable")[np.count_nonzero(parents < 0) :]
-        updates, stack = _stacked(heights - widths, parents)
+        update_offsets, stack = _stack_offsets(heights - widths, parents)
         fronts = kernels.Fronts()
         for name, values in {
             "first": blocks.first,
@@ -67,8 +67,8 @@ class FrontLayout:
             "entry_places": entry_places[entries],
             "factor_offsets": _offsets(heights * widths),
             "inverse_offsets": _offsets(inverses),
-            "update_offsets": updates,
-            "place": blocks.permutation,
+            "update_offsets": update_offsets,
+            "permutation": blocks.permutation,
         }.items():
             setattr(fronts, name, as_index_array(values))
         return cls(
@@ -82,7 +82,7 @@ class FrontLayout:
 
 
 def as_index_array(values: np.ndarray) -> wp.array:
-    """As the kernels take them."""
+    """Return ``values`` as an int32 Warp array on the host."""
     return wp.array(np.asarray(values, dtype=np.int32), dtype=int, device="cpu")
 
 
@@ -90,26 +90,29 @@ def _offsets(counts: np.ndarray) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(counts)])
 
 
-def _places_in_fronts(blocks: Supernodes) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Where permuted rows lie in the fronts of given blocks."""
+def _front_row_lookup(blocks: Supernodes) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Return a function that maps blocks and permuted rows to the position of each row in the block's front."""
     keys = np.repeat(np.arange(blocks.count), blocks.heights) * len(blocks.permutation) + blocks.rows
 
-    def found(block: np.ndarray, row: np.ndarray) -> np.ndarray:
+    def lookup(block: np.ndarray, row: np.ndarray) -> np.ndarray:
         return np.searchsorted(keys, block * len(blocks.permutation) + row) - blocks.row_offsets[block]
 
-    return found
+    return lookup
 
 
-def _stacked(left: np.ndarray, parents: np.ndarray) -> tuple[np.ndarray, int]:
-    """(S,) where on a stack each front leaves its ``left`` (S,) rows and columns, and how much room all need: a front
-    takes its children's off before it leaves its own."""
-    waiting: list[int] = []
-    where, top, most = np.zeros(len(left), dtype=np.int64), 0, 0
-    for block, size in enumerate(left):
-        while waiting and parents[waiting[-1]] == block:
-            top -= int(left[waiting.pop()]) ** 2
-        where[block] = top
+def _stack_offsets(sizes: np.ndarray, parents: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the offset (S,) of each front's update matrix on a stack, and the capacity that the stack needs.
+
+    A front pops the update matrices of its children before it pushes its own, which has ``sizes`` (S,) rows and
+    columns.
+    """
+    stack: list[int] = []
+    offsets, top, capacity = np.zeros(len(sizes), dtype=np.int64), 0, 0
+    for block, size in enumerate(sizes):
+        while stack and parents[stack[-1]] == block:
+            top -= int(sizes[stack.pop()]) ** 2
+        offsets[block] = top
         top += int(size) ** 2
-        most = max(most, top)
-        waiting.append(block)
-    return where, most
+        capacity = max(capacity, top)
+        stack.append(block)
+    return offsets, capacity

@@ -1,4 +1,4 @@
-"""Factors of a step's matrix, wherever they are made: sparse on the host, dense on a GPU."""
+"""Protocol of the linear solvers for a step's matrix: sparse factors on the host, dense factors on a GPU."""
 
 from __future__ import annotations
 
@@ -14,37 +14,51 @@ from egs_warp.fem.multifrontal import MultifrontalLdl
 
 
 class LinearSolver(Protocol):
-    """Of symmetric matrices S of one pattern, and of sums with them."""
+    """Direct solver for symmetric matrices S of one sparsity pattern, plus an optional low-rank term."""
 
     is_host: bool
-    """Where they work: entries come from the host's arrays, or as tensors of the device."""
+    """True if entries are NumPy arrays; False if they are PyTorch tensors on the device."""
 
     @property
     def stream(self) -> AbstractContextManager[None]:
-        """Within it what they do there takes least time."""
+        """Context within which calls need no stream switches."""
         ...
 
     def update(self, entries: Any, diagonal: np.ndarray | None = None) -> bool:
-        """Factor S with these upper ``entries`` (nnz,), and ``diagonal`` (n,) added; False if it is not positive
-        definite."""
+        """Factor S.
+
+        Args:
+            entries: (nnz,) upper entries in the order of the pattern.
+            diagonal: (n,) added to the diagonal, or None.
+
+        Returns:
+            True if S is positive definite.
+        """
         ...
 
     def start_update(self, entries: Any, diagonal: np.ndarray | None = None) -> None:
-        """``update``, for which nobody waits: ``ready`` does. A GPU goes on with it meanwhile."""
+        """Start ``update`` asynchronously where the solver supports it; ``is_ready`` waits for the result."""
         ...
 
     def add_low_rank(self, across: np.ndarray, rates: np.ndarray) -> bool:
-        """From now on solve with S + U diag(r) U^T, ``across`` U (n, k) and ``rates`` r (k,); False, and nothing is
-        added, if that is not positive definite. Once after ``update`` with success."""
+        """Replace S by S + U diag(r) U^T in the following solves. Succeeds at most once per ``update``.
+
+        Args:
+            across: (n, k) U.
+            rates: (k,) r.
+
+        Returns:
+            True if the sum is positive definite; else nothing is added.
+        """
         ...
 
     @property
     def is_ready(self) -> bool:
-        """Whether there is something to solve with. Of factors that are begun, once they are there."""
+        """True if factors exist; blocks until queued ones are computed."""
         ...
 
-    def solve(self, right: np.ndarray, kept: MomentumProjection | None = None) -> np.ndarray:
-        """(n,) or each column of (n, m); with what is ``kept``."""
+    def solve(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
+        """Solve for ``right`` (n,) or for each column of (n, m); apply ``projection`` if given."""
         ...
 
     def effort_quadratic(
@@ -58,16 +72,30 @@ class LinearSolver(Protocol):
         dt_ahead: float,
         reference: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(m, m) X^T H X and (m,) X^T g of the moves X = ``near`` V + ``far`` S^-1 diag(w) V of ``vectors`` V (n, m),
-        ``weights`` w (n,), from the last of which ``away`` (n,) is taken; H has upper ``entries``, g (n,) is the
-        ``slope``. Of an S without a sum."""
+        """Return the quadratic model of the elastic energy in a subspace.
+
+        Displacements are X = dt_now V + dt_ahead S^-1 diag(w) V, with ``reference`` subtracted from the last column.
+        Requires that no low-rank term has been added to S.
+
+        Args:
+            entries: (nnz,) upper entries of H, in the order of the pattern.
+            gradient: (n,) g.
+            weights: (n,) w.
+            vectors: (n, m) V.
+            dt_now: factor of V.
+            dt_ahead: factor of the solution.
+            reference: (n,) subtracted from the last column of X.
+
+        Returns:
+            X^T H X (m, m) and X^T g (m,).
+        """
         ...
 
 
 def linear_solver_on(device: wp.Device, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> LinearSolver:
-    """Dense ones on a GPU, where torch sees it too; else sparse ones.
+    """Return a dense solver on a GPU that PyTorch can use, else a sparse solver on the host.
 
-    The inverse of a dense factor takes 0.15 ms for 568 nodes on an H100, and 0.44 for 1,064.
+    On an H100 the inverse of a dense factor takes 0.15 ms for 568 nodes and 0.44 ms for 1,064.
     """
     if device.is_cuda:
         try:

@@ -1,4 +1,4 @@
-"""Angular momentum that the solutions of a step's matrix keep (Eq. 4)."""
+"""Rank-3 correction with which the solutions of a step's matrix conserve angular momentum (Eq. 4)."""
 
 from __future__ import annotations
 
@@ -9,20 +9,25 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class MomentumProjection:
-    """Angular momentum that solutions keep: so much of a turn is added to each that it has that of what is given."""
+    """Correction by rigid rotations that gives solutions the angular momenta of their right-hand sides."""
 
     rotation_modes: np.ndarray
-    """(n, 3) rigid turns T."""
+    """(n, 3) rigid rotations T, as nodal velocities."""
     mode_momenta: np.ndarray
-    """(n, 3) M T: angular momenta of velocities."""
+    """(n, 3) M T; (M T)^T v is the angular momentum of velocities v."""
     inertia_ratio: float
-    """By which those of a solution count."""
+    """Factor of the angular momentum of a solution, 1 + dt alpha."""
     rotation_response: np.ndarray
-    """(n, 3) solutions U of the ``momenta``."""
+    """(n, 3) U, solutions for the right-hand sides M T."""
     inverse: np.ndarray
-    """(3, 3) of ratio (M T)^T U."""
+    """(3, 3) inverse of inertia_ratio (M T)^T U."""
 
     def corrected(self, right: np.ndarray, plain: np.ndarray) -> np.ndarray:
-        """Of ``right`` (n,) or (n, m) the solution ``plain``, and the turn that it lacks."""
+        """Return the corrected solution.
+
+        Args:
+            right: (n,) or (n, m) right-hand sides.
+            plain: solutions for them, of the same shape.
+        """
         missing = self.rotation_modes.T @ right - self.inertia_ratio * (self.mode_momenta.T @ plain)
         return plain + self.rotation_response @ (self.inverse @ missing)

@@ -1,4 +1,7 @@
-"""Factors of a step's sparse matrix, many right-hand sides at once."""
+"""Multifrontal L D L^T factorization of a step's sparse matrix, with solves for many right-hand sides.
+
+The kernels are in ``egs_warp.kernels.fem.supernodal`` and ``products``.
+"""
 
 from __future__ import annotations
 
@@ -19,29 +22,30 @@ from egs_warp.kernels.fem.products import Rows
 from egs_warp.launching import launch_cached, run_concurrently, zeros
 from egs_warp.precision import real
 
-_SINGULAR = 1e-14
-"""Of the largest diagonal entry: pivots that are as small have no reciprocal worth the name."""
+_MIN_RELATIVE_PIVOT = 1e-14
+"""Fraction of the largest diagonal entry at or below which a pivot counts as zero and the matrix as singular."""
 
 
 @dataclass(frozen=True)
 class SymbolicFactorization:
-    """Of the pattern of symmetric matrices: what their factors have in common."""
+    """Symbolic factorization of a sparsity pattern, shared by all matrices with that pattern."""
 
     full_from_upper: np.ndarray
-    """Where each entry of both triangles is, in the order of the columns, in the upper one."""
+    """Index into the upper entries of each entry of the full symmetric matrix, in column order."""
     offsets: wp.array
-    """(n + 1,) of the columns of both triangles."""
+    """(n + 1,) column offsets of the full matrix."""
     indices: wp.array
-    """The rows in them."""
+    """Row indices of the full matrix."""
     first_of_equal_rows: wp.array
-    """(n,) see ``first_of_alike``."""
+    """(n,) result of ``supernodes.first_of_equal_rows``."""
     permutation: np.ndarray
-    """(n,) of each row in the order of elimination."""
+    """(n,) position of each row in the order of elimination."""
     layout: FrontLayout
+    """Memory layout of the fronts."""
 
     @classmethod
     def of(cls, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> SymbolicFactorization:
-        """Of an upper triangle with the diagonal."""
+        """Analyse the pattern of an upper triangle that includes the diagonal."""
         upper = sparse.csc_matrix(
             (np.arange(1.0, upper_pattern.nnz + 1.0), upper_pattern.indices, upper_pattern.indptr), upper_pattern.shape
         )
@@ -59,11 +63,12 @@ class SymbolicFactorization:
 
 
 class MultifrontalLdl:
-    """L D L^T of symmetric matrices of one pattern by a multifrontal method; see ``Factors``. The symbolic analysis is
-    done once. The same bits on any number of cores.
+    """Multifrontal L D L^T solver for symmetric matrices of one pattern; implements ``LinearSolver``.
 
-    Pivots are taken as they come: a definite matrix asks for no others, of one that is not only the inertia and a sum
-    with muscles are wanted, and one that is next to singular has no factors.
+    The symbolic analysis is done once. Results are bitwise equal on any number of cores.
+
+    There is no pivoting: definite matrices need none; of an indefinite matrix only the inertia and a sum with the
+    muscles' stiffness are used; a nearly singular matrix is reported as having no factors.
     """
 
     is_host = True
@@ -72,25 +77,29 @@ class MultifrontalLdl:
     def __init__(
         self, upper_pattern: sparse.csc_matrix | sparse.csc_array, analysis: SymbolicFactorization | None = None
     ) -> None:
-        """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``; ``analysis``: of it,
-        where it is known."""
+        """Allocate the solver.
+
+        Args:
+            upper_pattern: (n, n) upper triangle with the diagonal, entries in the order of ``update``.
+            analysis: symbolic factorization of the pattern; computed if None.
+        """
         self._device = wp.get_device("cpu")
-        # Two threads at once cannot load them.
+        # Loading a module from two threads at once is not safe.
         kernels.solve_kernel.module.load(self._device, block_dim=1)
-        known = analysis or SymbolicFactorization.of(upper_pattern)
-        self._full_from_upper = known.full_from_upper
+        symbolic = analysis or SymbolicFactorization.of(upper_pattern)
+        self._full_from_upper = symbolic.full_from_upper
         self._full = Rows()
-        self._full_values, self._full.values = _shared_zeros(len(known.full_from_upper))
-        self._full.offsets, self._full.indices, self._full.heads = (
-            known.offsets,
-            known.indices,
-            known.first_of_equal_rows,
+        self._full_values, self._full.values = _shared_zeros(len(symbolic.full_from_upper))
+        self._full.offsets, self._full.indices, self._full.first_of_equal_rows = (
+            symbolic.offsets,
+            symbolic.indices,
+            symbolic.first_of_equal_rows,
         )
         self._diagonal = upper_pattern.indptr[1:] - 1
         self._unknowns = len(upper_pattern.indptr) - 1
-        self.place = known.permutation
-        """(n,) of each row in the order of elimination."""
-        self._layout = layout = known.layout
+        self.permutation = symbolic.permutation
+        """(n,) position of each row in the order of elimination."""
+        self._layout = layout = symbolic.layout
         self._entries, self._matrix = _shared_zeros(upper_pattern.nnz)
         sizes = layout.front + layout.scratch, layout.stack, layout.factor, layout.inverses, self._unknowns
         self._front, self._stack, self._factor, self._inverses, self._reciprocals = (
@@ -98,21 +107,22 @@ class MultifrontalLdl:
         )
         self._negative = np.zeros(1, np.int32)
         self._negative_array = wp.array(self._negative, dtype=int, device="cpu", copy=False)
-        self._room = _shared_zeros(0)[1]
+        self._workspace = _shared_zeros(0)[1]
         self._counters = np.zeros(3, np.int32)
         self._counters_array = wp.array(self._counters, dtype=int, device="cpu", copy=False)
-        self._nothing, self._keeping = _Keeping(0).struct, _Keeping(self._unknowns)
-        self._keeping.struct.enabled = 1
-        self._moves: _Moves | None = None
+        self._no_projection, self._projection = _ProjectionArrays(0).struct, _ProjectionArrays(self._unknowns)
+        self._projection.struct.enabled = 1
+        self._effort: _EffortWorkspace | None = None
         self._ready = False
         self._added: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-        """U, S^-1 U and the inverse of the capacitance matrix."""
+        """U (n, k), S^-1 U (n, k) and the inverse (k, k) of the capacitance matrix diag(1/r) + U^T S^-1 U."""
         self.negative_pivots = 0
-        """Negative eigenvalues of the last matrix."""
+        """Number of negative eigenvalues of the last matrix; -1 if it was singular."""
 
     def update(self, entries: np.ndarray, diagonal: np.ndarray | None = None) -> bool:
-        """See ``Factors``. The factors of an indefinite matrix can be solved with all the same; without any, ``solve``
-        must not be called.
+        """Factor S; see ``LinearSolver.update``.
+
+        The factors of an indefinite matrix can be used for solves, too. ``solve`` requires ``is_ready``.
         """
         self._ready, self._added = False, None
         if not np.isfinite(entries).all():
@@ -127,7 +137,7 @@ class MultifrontalLdl:
                 self._layout.fronts,
                 len(self._layout.fronts.first),
                 self._matrix,
-                _SINGULAR * float(np.abs(self._entries[self._diagonal]).max()),
+                _MIN_RELATIVE_PIVOT * float(np.abs(self._entries[self._diagonal]).max()),
                 self._front,
                 self._layout.front,
                 self._stack,
@@ -142,11 +152,11 @@ class MultifrontalLdl:
         return self.negative_pivots == 0
 
     def start_update(self, entries: np.ndarray, diagonal: np.ndarray | None = None) -> None:
-        """See ``Factors``."""
+        """Call ``update``, synchronously."""
         self.update(entries, diagonal)
 
     def add_low_rank(self, across: np.ndarray, rates: np.ndarray) -> bool:
-        """See ``Factors``: by Woodbury's formula, also where S alone is not definite."""
+        """Add a low-rank term by the Woodbury formula, also to an indefinite S; see ``LinearSolver.add_low_rank``."""
         if not self.is_ready:
             return False
         if len(rates) == 0:
@@ -155,8 +165,8 @@ class MultifrontalLdl:
         through = self.solve(across)
         small = across.T @ through
         small[np.diag_indices_from(small)] += 1.0 / rates
-        # Haynsworth: negative eigenvalues of the sum = those of S + positive ones of the small matrix - pulling
-        # directions.
+        # Haynsworth's inertia additivity: the number of negative eigenvalues of the sum is that of S, plus that of
+        # positive ones of the small matrix, minus that of positive rates.
         positive, inverse = inverse_and_positives(small)
         if self.negative_pivots + positive != int((rates > 0.0).sum()):
             return False
@@ -165,17 +175,17 @@ class MultifrontalLdl:
 
     @property
     def is_ready(self) -> bool:
-        """See ``Factors``."""
+        """True if factors exist."""
         return self._ready
 
-    def solve(self, right: np.ndarray, kept: MomentumProjection | None = None) -> np.ndarray:
-        """See ``Factors``."""
+    def solve(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
+        """Solve for ``right``; see ``LinearSolver.solve``."""
         if self._added is None:
-            return self._solve_unprojected(right, kept)
+            return self._solve_unprojected(right, projection)
         plain = self._solve_unprojected(right)
         across, through, small = self._added
         plain -= through @ (small @ (across.T @ plain))
-        return plain if kept is None else kept.corrected(right, plain)
+        return plain if projection is None else projection.corrected(right, plain)
 
     def effort_quadratic(
         self,
@@ -188,37 +198,50 @@ class MultifrontalLdl:
         dt_ahead: float,
         reference: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """See ``Factors``: two threads share the panels."""
+        """Compute the quadratic model of the elastic energy with two threads; see ``LinearSolver.effort_quadratic``."""
         assert self._ready and self._added is None, "update() comes first"
         count = vectors.shape[1]
         panels = -(-count // kernels.PANEL)
-        if self._moves is None or len(self._moves.along) != panels:
-            self._moves = _Moves(panels, self._unknowns)
-        room, vectors = self._moves, np.asarray(vectors, dtype=np.float64)
+        if self._effort is None or len(self._effort.linear) != panels:
+            self._effort = _EffortWorkspace(panels, self._unknowns)
+        workspace, vectors = self._effort, np.asarray(vectors, dtype=np.float64)
         weights = np.ascontiguousarray(weights, dtype=np.float64)
         self._full_values[:] = entries[self._full_from_upper]
-        room.away[:], room.slope[:] = reference, gradient
+        workspace.reference[:], workspace.gradient[:] = reference, gradient
         self._launch_two_threads(
             kernels.effort_panel_kernel,
             panels,
-            [*self._solving, *self._place_of(vectors), weights.ctypes.data, dt_now, dt_ahead, room.away_array]
-            + [room.slope_array, self._full, self._room_for(panels)],
-            [room.moves, room.products, room.along_array, room.form_array],
+            [
+                *self._factor_arguments,
+                *self._address_of(vectors),
+                weights.ctypes.data,
+                dt_now,
+                dt_ahead,
+                workspace.reference_array,
+            ]
+            + [workspace.gradient_array, self._full, self._workspace_for(panels)],
+            [workspace.moves, workspace.products, workspace.linear_array, workspace.quadratic_array],
         )
-        return room.form[:count, :count].copy(), room.along.ravel()[:count].copy()
+        return workspace.quadratic[:count, :count].copy(), workspace.linear.ravel()[:count].copy()
 
-    def _solve_unprojected(self, right: np.ndarray, kept: MomentumProjection | None = None) -> np.ndarray:
+    def _solve_unprojected(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
         assert self._ready, "update() comes first"
         right = np.asarray(right, dtype=np.float64)
         solution = np.empty(right.shape)
         panels = -(-(1 if right.ndim == 1 else right.shape[1]) // kernels.PANEL)
-        keeping = self._nothing if kept is None else self._keeping.of(kept)
-        inputs = [*self._solving, *self._place_of(right), keeping, self._room_for(panels), solution.ctypes.data]
+        struct = self._no_projection if projection is None else self._projection.load(projection)
+        inputs = [
+            *self._factor_arguments,
+            *self._address_of(right),
+            struct,
+            self._workspace_for(panels),
+            solution.ctypes.data,
+        ]
         self._launch_two_threads(kernels.solve_kernel, panels, inputs, [])
         return solution
 
     def _launch_two_threads(self, kernel: Any, panels: int, inputs: list[Any], outputs: list[Any]) -> None:
-        """``kernel``, of which two threads share what there is to do if there are several ``panels``."""
+        """Launch ``kernel``, on two threads that share the work if there are several ``panels``."""
         self._counters[:] = 0
 
         def launch() -> None:
@@ -229,36 +252,43 @@ class MultifrontalLdl:
         else:
             launch()
 
-    def solving_one(self, kept: MomentumProjection) -> tuple[list[Any], list[int], wp.array]:
-        """What ``kernels.fem.supernodal.solved_one`` is told of the factors and of what is ``kept``; of what is added
-        the directions, their number first, with addresses of what ``add`` has made of them; memory to work in."""
+    def solving_one(self, projection: MomentumProjection) -> tuple[list[Any], list[int], wp.array]:
+        """Return kernel arguments for ``kernels.fem.supernodal.solve_vector_native``.
+
+        Args:
+            projection: momentum projection of the solutions.
+
+        Returns:
+            The arguments for the factors and the projection; the number k of added directions and the addresses of U,
+            S^-1 U and the inverse of the capacitance matrix, zeros if none are added; and the workspace.
+        """
         assert self._ready, "update() comes first"
         added = [0, 0, 0, 0]
         if self._added is not None:
             across, through, small = self._added
             added = [across.shape[1], across.ctypes.data, through.ctypes.data, small.ctypes.data]
-        return [*self._solving, self._keeping.of(kept)], added, self._room_for(1)
+        return [*self._factor_arguments, self._projection.load(projection)], added, self._workspace_for(1)
 
     @property
-    def _solving(self) -> list[Any]:
+    def _factor_arguments(self) -> list[Any]:
         fronts = self._layout.fronts
         return [fronts, len(fronts.first), self._unknowns, self._factor, self._inverses, self._reciprocals]
 
     @staticmethod
-    def _place_of(right: np.ndarray) -> list[int]:
-        """Address, strides by rows and columns, and how many columns there are."""
+    def _address_of(right: np.ndarray) -> list[int]:
+        """Return the address, the row and column strides in numbers, and the number of columns."""
         strides = [stride // 8 for stride in right.strides]
         return [right.ctypes.data, *(strides if right.ndim > 1 else [*strides, 0]), right[0].size]
 
-    def _room_for(self, panels: int) -> wp.array:
+    def _workspace_for(self, panels: int) -> wp.array:
         size = panels * (self._unknowns + 4) * kernels.PANEL
-        if self._room.size < size:
-            self._room = _shared_zeros(size)[1]
-        return self._room
+        if self._workspace.size < size:
+            self._workspace = _shared_zeros(size)[1]
+        return self._workspace
 
 
-class _Keeping:
-    """Memory for what is kept."""
+class _ProjectionArrays:
+    """Arrays of a momentum projection as the kernels read them."""
 
     def __init__(self, unknowns: int) -> None:
         self.struct = kernels.MomentumProjection()
@@ -272,26 +302,26 @@ class _Keeping:
             self._arrays[name], array = _shared_zeros(size)
             setattr(self.struct, name, array)
         self._ratio, self.struct.inertia_ratio = _shared_zeros(1)
-        self._now: MomentumProjection | None = None
+        self._loaded: MomentumProjection | None = None
 
-    def of(self, kept: MomentumProjection) -> Any:
-        """As the kernels read it."""
-        if self._now is not kept:
-            self._now, self._ratio[0] = kept, kept.inertia_ratio
+    def load(self, projection: MomentumProjection) -> Any:
+        """Copy ``projection`` to the arrays, unless it was the last one, and return the kernels' struct."""
+        if self._loaded is not projection:
+            self._loaded, self._ratio[0] = projection, projection.inertia_ratio
             for name, array in self._arrays.items():
-                array[:] = getattr(kept, name).ravel()
+                array[:] = getattr(projection, name).ravel()
         return self.struct
 
 
-class _Moves:
-    """Memory for so many panels of moves."""
+class _EffortWorkspace:
+    """Workspace of ``effort_quadratic`` for a number of panels."""
 
     def __init__(self, panels: int, unknowns: int) -> None:
         self.moves, self.products = (zeros((panels, unknowns, kernels.PANEL), real, "cpu") for _ in range(2))
-        self.away, self.away_array = _shared_zeros(unknowns)
-        self.slope, self.slope_array = _shared_zeros(unknowns)
-        self.along, self.along_array = _shared_zeros((panels, kernels.PANEL))
-        self.form, self.form_array = _shared_zeros((panels * kernels.PANEL, panels * kernels.PANEL))
+        self.reference, self.reference_array = _shared_zeros(unknowns)
+        self.gradient, self.gradient_array = _shared_zeros(unknowns)
+        self.linear, self.linear_array = _shared_zeros((panels, kernels.PANEL))
+        self.quadratic, self.quadratic_array = _shared_zeros((panels * kernels.PANEL, panels * kernels.PANEL))
 
 
 def _shared_zeros(size: int | tuple[int, ...]) -> tuple[np.ndarray, wp.array]:
@@ -300,14 +330,16 @@ def _shared_zeros(size: int | tuple[int, ...]) -> tuple[np.ndarray, wp.array]:
 
 
 def inverse_and_positives(symmetric: np.ndarray) -> tuple[int, np.ndarray]:
-    """How many eigenvalues of the lower triangle's matrix (n, n) are positive, and its inverse, from one
-    Bunch-Kaufman factorisation; not finite where the matrix is singular.
+    """Return the number of positive eigenvalues and the inverse of a symmetric matrix.
+
+    Both come from one Bunch-Kaufman factorization. Of ``symmetric`` (n, n) only the lower triangle is read. For a
+    singular matrix the number is -1 and the inverse is not finite.
     """
     factor, invert = dense.get_lapack_funcs(("sytrf", "sytri"), (symmetric,))
     factors, pivots, info = factor(symmetric, lower=1)
     if info > 0:
         return -1, np.full_like(symmetric, np.nan)
-    # A block of two, marked by negative pivots, has an eigenvalue of each sign.
+    # A 2 x 2 block, marked by negative pivots, has one eigenvalue of each sign.
     positive = int((factors.diagonal()[pivots > 0] > 0.0).sum()) + int((pivots < 0).sum()) // 2
     inverse, _ = invert(factors, pivots, lower=1)
     lower = np.tril(inverse, -1)

@@ -1,4 +1,4 @@
-"""One implicit Euler step as an equation for the end velocity that keeps linear and angular momentum (Eq. 4, 6)."""
+"""One implicit Euler step as an equation for the end velocities that conserves both momenta (Eq. 4, 6)."""
 
 from __future__ import annotations
 
@@ -18,123 +18,145 @@ from egs_warp.muscles.tension import MuscleEnergy
 
 UNSOLVABLE = "the tangent is singular or not finite"
 MIN_RELATIVE_STIFFNESS = 1e-3
-"""Of the largest T / L of the muscles: those below it do not count in a tangent."""
+"""Fraction of the largest T / L of the muscles below which a stiffness is left out of the tangent."""
 
 
 class UnsolvableStepError(ArithmeticError):
-    """A step's equations cannot be solved."""
+    """The equations of a step cannot be solved."""
 
 
 @dataclass(frozen=True)
 class StepProblem:
     """M (v - v0) + dt alpha M v = dt (P^T f(x + dt v) + M g + f_contact), f of elasticity, damping and muscles.
 
-    Implicit Euler alone eats spin: with x+ = x + dt v the momentum changes by dt sum r x f with the arms r of the
-    step's *start*, about which the forces at its end are not free of torque. P^T takes that torque off as the inertia
-    of a rigid turn, M (w x r): P is v less the rigid turn with v's angular momentum. So L+ = L + dt sum r x (f_contact
-    - alpha M v) holds to rounding, contact velocities are those that are solved for, and ``spin`` is the size of what
-    was taken off.
+    Implicit Euler alone loses angular momentum: with x+ = x + dt v the momentum changes by dt sum r x f, with the lever
+    arms r at the *start* of the step, about which the internal forces at its end have a torque. P^T removes that torque
+    as the inertial force of a rigid rotation, M (w x r): P v is v minus the rigid rotation with v's angular momentum.
+    So L+ = L + dt sum r x (f_contact - alpha M v) holds to rounding, contact velocities are those that are solved for,
+    and ``momentum_correction`` is the angular velocity w of the removed rotation.
     """
 
     body: SoftBody
+    """The body."""
     state: BodyState
+    """State at the start of the step."""
     dt: float
-    """Seconds."""
+    """Step size, s."""
     drag: float = 0.0
-    """alpha of Rayleigh damping (drag against the air), 1/s."""
+    """alpha of the Rayleigh damping (air drag), 1/s."""
 
     def starts_from(self, state: BodyState, dt: float) -> bool:
-        """Whether it is the step of ``dt`` seconds from that very ``state``."""
+        """Return True if this is the step of ``dt`` seconds from the same ``state`` object."""
         return self.state is state and self.dt == dt
 
     @cached_property
     def damping(self) -> Damping:
-        """What the body's damping resists."""
+        """Damping of the step."""
         return self.body.assembly.damping(self.state.positions, self.dt)
 
     @cached_property
     def mass(self) -> np.ndarray:
-        """(N, 1) kg."""
+        """(N, 1) kg, lumped masses."""
         return self.body.node_mass[:, None]
 
     @cached_property
     def rotation_modes(self) -> np.ndarray:
-        """(3N, 3) nodal velocities e_k x r of the rigid turns about the centre of mass, ``arms`` r."""
+        """(3N, 3) m, nodal velocities e_k x r of unit rotations about the centre of mass, with lever arms r."""
         return cross_matrices(self.lever_arms).reshape(-1, 3)
 
     @cached_property
     def lever_arms(self) -> np.ndarray:
-        """(N, 3) metres from the centre of mass at the start of the step."""
+        """(N, 3) m, positions relative to the centre of mass at the start of the step."""
         return self.state.positions - self.body.centre_of_mass(self.state.positions)
 
     @cached_property
     def momenta(self) -> np.ndarray:
-        """(3, 3N) angular momentum of nodal velocities about the centre of mass, arms at the start of the step."""
+        """(3, 3N) kg m, maps nodal velocities to the angular momentum about the centre of mass, lever arms r."""
         return (self.rotation_modes * np.repeat(self.body.node_mass, 3)[:, None]).T
 
     @cached_property
     def inertia(self) -> np.ndarray:
-        """(3, 3) kg m^2 at the start of the step."""
+        """(3, 3) kg m^2, inertia at the start of the step."""
         return self.momenta @ self.rotation_modes
 
     @cached_property
     def inverse_inertia(self) -> np.ndarray:
-        """(3, 3) 1/(kg m^2), the inverse of the inertia."""
+        """(3, 3) 1/(kg m^2), inverse of ``inertia``."""
         return np.linalg.inv(self.inertia)
 
     @cached_property
     def angular_momentum(self) -> np.ndarray:
-        """(3,) kg m^2/s about the centre of mass at the start of the step."""
+        """(3,) kg m^2/s, angular momentum about the centre of mass at the start of the step."""
         return self.body.angular_momentum(self.state.positions, self.state.velocities)
 
     @property
     def residual_scale(self) -> float:
-        """dt times the weight, N s: what residuals are told in."""
+        """dt times the weight, N s, the unit of residual norms."""
         return self.dt * self.body.weight
 
     def end_positions(self, velocities: np.ndarray) -> np.ndarray:
-        """(N, 3) x + dt v."""
+        """Return x + dt v (N, 3), m."""
         return self.state.positions + self.dt * velocities
 
     def is_inversion_free(self, velocities: np.ndarray) -> bool:
-        """Whether no element is inverted at the end of ``velocities`` (N, 3)."""
+        """Return True if no element is inverted at the end positions of ``velocities`` (N, 3)."""
         return bool(self.body.assembly.determinants(self.end_positions(velocities)).min() > 0.0)
 
     @cached_property
     def rigid_guess(self) -> np.ndarray:
-        """(N, 3) m/s to solve the step from: the body goes on rigidly with its momenta, so no element is inverted, and
-        what is stiff, whose speed at the start says nothing about the end, is at rest."""
+        """(N, 3) m/s, initial guess of the solver: the rigid motion with the momenta of the state.
+
+        It inverts no element, and it contains no velocities of stiff modes, which change completely within a step.
+        """
         positions, mass = self.state.positions, self.body.node_mass
         centre = self.body.centre_of_mass(positions)
         spin = self.inverse_inertia @ self.angular_momentum
-        turned = Rotation.from_rotvec(self.dt * spin).apply(positions - centre)
-        return mass @ self.state.velocities / mass.sum() + (turned - (positions - centre)) / self.dt
+        rotated = Rotation.from_rotvec(self.dt * spin).apply(positions - centre)
+        return mass @ self.state.velocities / mass.sum() + (rotated - (positions - centre)) / self.dt
 
     def internal_gradient(self, velocities: np.ndarray, tension: MuscleEnergy | None) -> np.ndarray:
-        """(N, 3) newtons, minus the forces of elasticity, damping and muscles at the end of ``velocities`` (N, 3)."""
+        """Return minus the forces of elasticity, damping and muscles at the end of the step: (N, 3) N."""
         end = self.end_positions(velocities)
         return self.body.assembly.gradient(end, self.damping, tension)
 
     def momentum_correction(self, internal_gradient: np.ndarray) -> np.ndarray:
-        """(3,) rad/s that the step gives back: the rigid turn whose momentum implicit Euler would have eaten."""
+        """Return the angular velocity (3,) rad/s of the rotation whose momentum implicit Euler alone would lose."""
         return self.momentum_correction_from_torque(self.rotation_modes.T @ internal_gradient.ravel())
 
     def momentum_correction_from_torque(self, torque: np.ndarray) -> np.ndarray:
-        """``spin`` of an internal gradient with this ``torque`` (3,) N m about the centre of mass."""
+        """Return ``momentum_correction`` of an internal gradient with ``torque`` (3,) N m about the centre of mass."""
         return self.dt * (self.inverse_inertia @ torque)
 
     def residual(self, velocities: np.ndarray, tension: MuscleEnergy | None) -> np.ndarray:
-        """(N, 3) N s, left side less right side of the equation without contact forces; not finite where an element is
-        inverted.
+        """Return the left side minus the right side of the equation, without contact forces.
+
+        Args:
+            velocities: (N, 3) m/s, at the end of the step.
+            tension: muscle energy, or None.
+
+        Returns:
+            (N, 3) N s; not finite where an element is inverted.
         """
         internal = self.internal_gradient(velocities, tension)
-        turned = (self.rotation_modes @ self.momentum_correction(internal)).reshape(velocities.shape)
-        change = (1.0 + self.dt * self.drag) * velocities - self.state.velocities - self.dt * self.body.gravity - turned
+        correction = (self.rotation_modes @ self.momentum_correction(internal)).reshape(velocities.shape)
+        change = (
+            (1.0 + self.dt * self.drag) * velocities - self.state.velocities - self.dt * self.body.gravity - correction
+        )
         return self.mass * change + self.dt * internal
 
     def tangent(self, factors: LinearSolver, velocities: np.ndarray, tension: MuscleEnergy | None) -> Tangent:
-        """The derivative of the residual at ``velocities`` (N, 3), or a definite one near it, factored by
-        ``factors``. Raises ``UnsolvableStepError`` where it has no factors, or, of what is only begun, ``settle`` does.
+        """Factor the derivative of the residual, or a positive definite approximation of it.
+
+        Args:
+            factors: solver that holds the factors.
+            velocities: (N, 3) m/s, linearization point.
+            tension: muscle energy, or None.
+
+        Returns:
+            The tangent. On a GPU without muscles its factors are only queued; ``Tangent.wait`` completes them.
+
+        Raises:
+            UnsolvableStepError: there are no factors.
         """
         if tension is None and not factors.is_host:
             factors.start_update(*self._matrix(factors, velocities, projected=False))
@@ -149,17 +171,21 @@ class StepProblem:
         return Tangent(self, factors)
 
     def factor_near(self, factors: LinearSolver, velocities: np.ndarray) -> None:
-        """A definite matrix near S. Raises ``UnsolvableStepError`` where that has no factors."""
+        """Factor a positive definite approximation of S.
+
+        Raises:
+            UnsolvableStepError: there are no factors.
+        """
         self._factor(factors, velocities, projected=True)
         if not factors.is_ready:
             raise UnsolvableStepError(UNSOLVABLE)
 
     def _factor(self, factors: LinearSolver, velocities: np.ndarray, *, projected: bool) -> bool:
-        """S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``; whether it is definite."""
+        """Factor S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``; return True if it is definite."""
         return factors.update(*self._matrix(factors, velocities, projected=projected))
 
     def _matrix(self, factors: LinearSolver, velocities: np.ndarray, *, projected: bool) -> tuple[Any, np.ndarray]:
-        """Entries and diagonal of S for ``factors``."""
+        """Return the entries and the added diagonal of S for ``factors``."""
         end = self.end_positions(velocities)
         entries = self.body.assembly.entries_for(factors, end, self.damping, factor=self.dt**2, projected=projected)
         return entries, (1.0 + self.dt * self.drag) * np.repeat(self.body.node_mass, 3)
@@ -167,21 +193,29 @@ class StepProblem:
 
 @dataclass(frozen=True)
 class Tangent:
-    """Inverse J^-1 of the derivative of a step's residual: S of the elements, the muscles' stiffness, the momentum
-    kept.
+    """Inverse J^-1 of the derivative of a step's residual.
 
-    J = S + dt^2 (K_a - M turns I^-1 turns^T (K + K_a)). Its inverse is that of S + dt^2 K_a with so much of a turn
-    added that each column of the result has the angular momentum of the impulse.
+    J = S + dt^2 (K_a - M T I^-1 T^T (K + K_a)) with the elements' matrix S, the muscles' stiffness K_a and the rotation
+    modes T. Its inverse is that of S + dt^2 K_a plus rigid rotations that give each column of the result the angular
+    momentum of its impulse.
     """
 
     problem: StepProblem
+    """The step."""
     factors: LinearSolver
+    """Factors of S + dt^2 K_a."""
     pending_velocities: np.ndarray | None = None
-    """(N, 3) m/s at which the matrix is whose factors are only begun; None if they are there."""
+    """(N, 3) m/s, linearization point of factors that are only queued; None if they exist."""
 
     def wait(self) -> bool:
-        """Wait for factors that are begun; whether they are there. If not, those of a definite matrix near by are
-        then. Raises ``UnsolvableStepError`` if that has none."""
+        """Wait for queued factors. If there are none, factor a positive definite approximation instead.
+
+        Returns:
+            False if the approximation was needed.
+
+        Raises:
+            UnsolvableStepError: the approximation has no factors.
+        """
         if self.pending_velocities is None or self.factors.is_ready:
             return True
         self.problem.factor_near(self.factors, self.pending_velocities)
@@ -189,15 +223,15 @@ class Tangent:
 
     @cached_property
     def momentum_projection(self) -> MomentumProjection:
-        """Of the rigid turns of the step."""
+        """Momentum projection for the rotation modes of the step."""
         problem = self.problem
         ratio, momenta = 1.0 + problem.dt * problem.drag, np.ascontiguousarray(problem.momenta.T)
-        turned = self.factors.solve(momenta)
+        response = self.factors.solve(momenta)
         return MomentumProjection(
-            problem.rotation_modes, momenta, ratio, turned, np.linalg.inv(ratio * momenta.T @ turned)
+            problem.rotation_modes, momenta, ratio, response, np.linalg.inv(ratio * momenta.T @ response)
         )
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:
-        """(3N,) or (3N, m) m/s that ``impulses`` of that shape, N s, bring about."""
+        """Return J^-1 ``impulses``, m/s, for impulses (3N,) or (3N, m), N s."""
         self.wait()
         return self.factors.solve(impulses, self.momentum_projection)

@@ -1,7 +1,7 @@
-"""Which columns of a sparse factor are alike, and what each group of them adds to which others: the symbolic analysis.
+"""Symbolic analysis of a sparse symmetric matrix: fill-reducing order, supernodes and their elimination tree.
 
-The multifrontal method of Duff and Reid (1983) with supernodes: columns of the factor that follow one another and reach
-the same rows are kept as one dense block.
+Multifrontal method of Duff and Reid (1983) with supernodes: consecutive columns of the factor with the same rows below
+them are stored as one dense block.
 """
 
 from __future__ import annotations
@@ -13,46 +13,46 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
-_NARROW, _THIN = 16, 6
-"""Columns up to which two blocks together, or the first alone, join if that ..."""
-_FILL = 0.3
-"""... makes at most this share of both zeros; others if it is a third of it."""
+_MAX_MERGED_WIDTH, _MAX_CHILD_WIDTH = 16, 6
+"""Maximum columns of two blocks together, or of the child alone, for the larger fill tolerance."""
+_FILL_FRACTION = 0.3
+"""Maximum fraction of zeros in a merged block of these widths; for others a third of it."""
 
 
 @dataclass(frozen=True)
 class Supernodes:
-    """Blocks of L, P A P^T = L D L^T, in the order in which they are eliminated; children come before their parent.
+    """Blocks of L, P A P^T = L D L^T, in the order of elimination; children come before their parent.
 
-    Block s has the columns ``first[s]`` on, ``widths[s]`` of them, and of the permuted rows first those and then
-    ``rows[row_offsets[s] + widths[s] : row_offsets[s + 1]]`` below them: its front.
+    Block s has ``widths[s]`` columns from ``first[s]`` on. The rows of its front are these columns, followed by
+    ``rows[row_offsets[s] + widths[s] : row_offsets[s + 1]]`` below them, all permuted.
     """
 
     permutation: np.ndarray
-    """(n,) the permuted place of each row of A."""
+    """(n,) position of each row of A in the order of elimination."""
     first: np.ndarray
-    """(S,)."""
+    """(S,) first column."""
     widths: np.ndarray
-    """(S,)."""
+    """(S,) number of columns."""
     row_offsets: np.ndarray
-    """(S + 1,)."""
+    """(S + 1,) offset of each front in ``rows``."""
     rows: np.ndarray
-    """Of all fronts, ascending in each."""
+    """Rows of all fronts, ascending in each."""
     parents: np.ndarray
-    """(S,) -1 for roots."""
+    """(S,) parent block, -1 for roots."""
 
     @property
     def count(self) -> int:
-        """S."""
+        """Number of blocks S."""
         return len(self.first)
 
     @property
     def heights(self) -> np.ndarray:
-        """(S,) rows of each front."""
+        """(S,) number of rows of each front."""
         return np.diff(self.row_offsets)
 
     @classmethod
     def of(cls, upper: sparse.csc_matrix) -> Supernodes:
-        """Of a symmetric matrix with a pattern whose upper triangle is ``upper``, its diagonal included."""
+        """Analyse a symmetric matrix whose pattern has the upper triangle ``upper``, including the diagonal."""
         full = (upper + upper.T).tocsc()
         full.sort_indices()
         groups = np.cumsum(first_of_equal_rows(full)) - 1
@@ -60,13 +60,13 @@ class Supernodes:
         thin = _between_groups(upper, groups, len(sizes))
         order = _ordered(thin)
         blocks = _merged(*_fundamental(_structures(thin, order)[0]), sizes[order])
-        # From groups to rows.
+        # Expand groups to rows.
         starts = np.concatenate([[0], np.cumsum(sizes[order])])
-        where = np.empty(len(sizes), dtype=np.int64)
-        where[order] = np.arange(len(sizes))
-        within = np.argsort(where[groups], kind="stable")
-        place = np.empty(len(groups), dtype=np.int32)
-        place[within] = np.arange(len(groups))
+        position = np.empty(len(sizes), dtype=np.int64)
+        position[order] = np.arange(len(sizes))
+        within = np.argsort(position[groups], kind="stable")
+        permutation = np.empty(len(groups), dtype=np.int32)
+        permutation[within] = np.arange(len(groups))
         fronts = [
             np.concatenate([np.arange(starts[c], starts[c + 1]) for c in (*own, *below)]) for own, below in blocks
         ]
@@ -78,7 +78,7 @@ class Supernodes:
         ]
         offsets = np.concatenate([[0], np.cumsum([len(front) for front in fronts])])
         return cls(
-            place,
+            permutation,
             first,
             widths,
             offsets.astype(np.int32),
@@ -88,14 +88,16 @@ class Supernodes:
 
 
 def first_of_equal_rows(full: sparse.csc_matrix) -> np.ndarray:
-    """(n,) whether a row of a symmetric pattern, both triangles of it, sorted, reaches others than the row before; the
-    three of a node reach the same."""
+    """Return (n,) bool: False for each row whose pattern equals that of the row before, as for the rows of a node.
+
+    ``full`` is a symmetric matrix with both triangles and sorted indices.
+    """
     keys = [full.indices[a:b].tobytes() for a, b in pairwise(full.indptr)]
     return np.array([True, *(key != last for last, key in pairwise(keys))])
 
 
 def _between_groups(upper: sparse.csc_matrix, groups: np.ndarray, count: int) -> sparse.csc_matrix:
-    """(G, G) the pattern of both triangles, diagonally dominant."""
+    """Return the pattern (G, G) of both triangles between groups of rows, with diagonally dominant values."""
     entries = upper.tocoo()
     rows, columns = groups[entries.row], groups[entries.col]
     both = np.concatenate([rows, columns]), np.concatenate([columns, rows])
@@ -107,24 +109,26 @@ def _between_groups(upper: sparse.csc_matrix, groups: np.ndarray, count: int) ->
 
 
 def _ordered(thin: sparse.csc_matrix) -> np.ndarray:
-    """(G,) the groups in an order of small fill: by minimum degree, along the elimination tree."""
-    found = splu(thin, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    order = np.argsort(found.perm_c)
+    """Return the groups (G,) in a fill-reducing order: minimum degree, postordered along the elimination tree."""
+    factors = splu(thin, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    order = np.argsort(factors.perm_c)
     _, parents = _structures(thin, order)
     return order[_postorder(parents)]
 
 
 def _structures(thin: sparse.csc_matrix, order: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
-    """Of each column of the factor of ``thin`` in ``order`` the rows below its diagonal, ascending, and its parent in
-    the elimination tree or -1."""
+    """Return the structure of the factor of ``thin`` in ``order``: rows below the diagonal of each column, and parents.
+
+    Rows are ascending. Parents are those of the elimination tree, -1 for roots.
+    """
     count = len(order)
-    where = np.empty(count, dtype=np.int64)
-    where[order] = np.arange(count)
+    position = np.empty(count, dtype=np.int64)
+    position[order] = np.arange(count)
     below: list[np.ndarray] = []
     children: list[list[int]] = [[] for _ in range(count)]
     parents = np.full(count, -1)
     for j, group in enumerate(order):
-        near = where[thin.indices[thin.indptr[group] : thin.indptr[group + 1]]]
+        near = position[thin.indices[thin.indptr[group] : thin.indptr[group + 1]]]
         parts = [near[near > j], *(below[child][1:] for child in children[j])]
         below.append(np.unique(np.concatenate(parts)))
         if len(below[j]) > 0:
@@ -134,7 +138,7 @@ def _structures(thin: sparse.csc_matrix, order: np.ndarray) -> tuple[list[np.nda
 
 
 def _postorder(parents: np.ndarray) -> np.ndarray:
-    """(n,) the nodes of a forest, each after all that are below it."""
+    """Return the nodes (n,) of a forest in an order in which each follows all of its descendants."""
     children: list[list[int]] = [[] for _ in parents]
     for node, parent in enumerate(parents):
         if parent >= 0:
@@ -148,7 +152,7 @@ def _postorder(parents: np.ndarray) -> np.ndarray:
 
 
 def _fundamental(columns: list[np.ndarray]) -> tuple[list[tuple[int, int]], list[np.ndarray]]:
-    """Runs of columns that reach the same rows, (first, last + 1), and the rows below each."""
+    """Return runs of columns with the same rows below them, as (first, last + 1), and the rows below each run."""
     runs: list[tuple[int, int]] = []
     start = 0
     for j in range(1, len(columns) + 1):
@@ -159,7 +163,7 @@ def _fundamental(columns: list[np.ndarray]) -> tuple[list[tuple[int, int]], list
 
 
 def _merged(runs: list[tuple[int, int]], below: list[np.ndarray], sizes: np.ndarray) -> list[tuple[range, np.ndarray]]:
-    """Columns and rows below of blocks: a run joins the one after it, whose child it is, where that adds few zeros."""
+    """Merge each run into the next one, its parent, if that adds few zeros; return columns and rows of the blocks."""
     starts = np.concatenate([[0], np.cumsum(sizes)])
 
     def area(first: int, last: int, rows: np.ndarray) -> float:
@@ -167,15 +171,17 @@ def _merged(runs: list[tuple[int, int]], below: list[np.ndarray], sizes: np.ndar
         return width * (0.5 * width + float(sizes[rows].sum()))
 
     blocks: list[tuple[int, int, np.ndarray, float]] = []
-    """First, last + 1, rows below, and the area that is not zero."""
+    """First, last + 1, rows below, and the number of entries that are not padding."""
     for (first, last), rows in zip(runs, below, strict=True):
         own = area(first, last, rows)
-        # Those before it that are its children, the last of them first.
+        # Preceding blocks that are its children, the last first.
         while blocks and len(blocks[-1][2]) > 0 and blocks[-1][2][0] < last and blocks[-1][2][0] >= first:
             before, _, _, needed = blocks[-1]
-            joined = area(before, last, rows)
-            narrow = starts[last] - starts[before] <= _NARROW or starts[first] - starts[before] <= _THIN
-            if joined - own - needed > (_FILL if narrow else _FILL / 3.0) * joined:
+            merged = area(before, last, rows)
+            narrow = (
+                starts[last] - starts[before] <= _MAX_MERGED_WIDTH or starts[first] - starts[before] <= _MAX_CHILD_WIDTH
+            )
+            if merged - own - needed > (_FILL_FRACTION if narrow else _FILL_FRACTION / 3.0) * merged:
                 break
             blocks.pop()
             first, own = before, own + needed

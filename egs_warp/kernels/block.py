@@ -1,6 +1,6 @@
-"""What threads of a block on a GPU do together; on a CPU a block is one thread, which has nobody to wait for.
+"""Barriers and reductions over the threads of a block on a GPU; on a CPU a block is one thread.
 
-Blocks have whole warps, and all of their threads call.
+Blocks must consist of whole warps, and all threads of a block must call.
 """
 
 import warp as wp
@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 #endif
 """)
 def sync_block():
-    """Until all threads of the block are here, and see what the others have written."""
+    """Synchronize the threads of the block; writes before the barrier are visible after it."""
     ...
 
 
@@ -34,7 +34,7 @@ def sync_block():
     return value;
 """)
 def block_max(value: real) -> real:
-    """Of the threads' values; they have waited for each other."""
+    """Return the maximum of ``value`` over the block; synchronizes the block."""
     ...
 
 
@@ -52,7 +52,7 @@ def block_max(value: real) -> real:
     return value;
 """)
 def sum_of_block(value: real) -> real:
-    """Of the threads' values; they have waited for each other."""
+    """Return the sum of ``value`` over the block; synchronizes the block."""
     ...
 
 
@@ -64,7 +64,7 @@ def sum_of_block(value: real) -> real:
 #endif
 """)
 def warp_size() -> int:
-    """Threads of a warp, see ``launching.lanes_on``."""
+    """Return the number of threads of a warp: 32 on a GPU, 1 on a CPU (``launching.lanes_on``)."""
     ...
 
 
@@ -76,5 +76,5 @@ def warp_size() -> int:
     return value;
 """)
 def warp_sum(value: real) -> real:
-    """Of the values of a warp's threads, all of which call."""
+    """Return the sum of ``value`` over a warp; all of its threads must call."""
     ...

@@ -1,10 +1,11 @@
-"""C++ of dense algebra on a CPU, for native functions: four rows by eight columns are what the registers hold.
+"""C++ source of dense linear algebra on a CPU, for native functions.
 
-Clang maps vectors and contracted products to what the processor has.
+The inner kernel updates four rows by eight columns, which fit the vector registers. Clang maps the vector types and
+fused multiply-adds to the instructions of the processor.
 """
 
 BLOCK = 16
-"""Columns that are eliminated at once; an inverse is kept of each such diagonal block of a symmetric matrix."""
+"""Columns eliminated at once; the factorization stores the inverse of each diagonal block of this size."""
 
 _PRODUCTS = """
     #pragma clang fp contract(fast)
@@ -23,7 +24,7 @@ _PRODUCTS = """
         *(v4*)y0 = a0; *(v4*)(y0 + 4) = a1; *(v4*)y1 = b0; *(v4*)(y1 + 4) = b1;
         *(v4*)y2 = c0; *(v4*)(y2 + 4) = c1; *(v4*)y3 = d0; *(v4*)(y3 + 4) = d1;
     };
-    // The same of one row.
+    // The same for one row.
     auto take_off_one = [](double* y, const double* l, const double* x, int stride, int k) {
         #pragma clang fp contract(fast)
         v4 a0 = *(v4*)y, a1 = *(v4*)(y + 4);
@@ -50,15 +51,16 @@ _SIZES = f"""
     constexpr int BLOCK = {BLOCK};
 """
 ROW_ELIMINATION = """
-    // Rows of unknowns columns with right sides behind, a multiple of four columns in all, made triangular with rows
-    // exchanged: how many have a pivot, and in which column. One below a share of the largest so far is none.
+    // Gaussian elimination with row exchanges of a matrix of `unknowns` rows and columns, followed by right-hand sides,
+    // in all a multiple of four columns. Returns the rank, and the column of each pivot in `pivots`. A candidate of at
+    // most `singular` times the largest pivot so far is no pivot.
     auto eliminate_rows = [&](double* M, int stride, int unknowns, int columns, double singular, int* pivots) {
         #pragma clang fp contract(fast)
         int rank = 0, chosen[BLOCK];
         double largest = 0.0, shares[4 * BLOCK];
         for (int begin = 0; begin < unknowns; begin += BLOCK) {
             const int end = unknowns - begin < BLOCK ? unknowns : begin + BLOCK, next = (end + 3) & ~3, first = rank;
-            int found = 0;
+            int block_rank = 0;
             for (int j = begin; j < end; ++j) {
                 int pivot = rank;
                 double size = 0.0;
@@ -70,9 +72,9 @@ ROW_ELIMINATION = """
                 largest = size > largest ? size : largest;
                 double *const top = M + rank * stride, *const other = M + pivot * stride;
                 for (int c = begin; pivot != rank && c < columns; ++c) {
-                    const double kept = top[c];
+                    const double swapped = top[c];
                     top[c] = other[c];
-                    other[c] = kept;
+                    other[c] = swapped;
                 }
                 for (int a = rank + 1; a < unknowns; ++a) {
                     double* const row = M + a * stride;
@@ -81,9 +83,9 @@ ROW_ELIMINATION = """
                     for (int c = j + 1; c < next; ++c) row[c] -= factor * top[c];
                 }
                 pivots[rank++] = j;
-                chosen[found++] = j;
+                chosen[block_rank++] = j;
             }
-            for (int t = 1; t < found; ++t)
+            for (int t = 1; t < block_rank; ++t)
                 for (int s = 0; s < t; ++s) {
                     double *const row = M + (first + t) * stride, *const by = M + (first + s) * stride;
                     const double share = row[chosen[s]];
@@ -92,18 +94,18 @@ ROW_ELIMINATION = """
             for (int a = rank; a < unknowns; a += 4) {
                 const int rows = unknowns - a < 4 ? unknowns - a : 4;
                 for (int q = 0; q < rows; ++q)
-                    for (int s = 0; s < found; ++s) shares[q * BLOCK + s] = M[(a + q) * stride + chosen[s]];
+                    for (int s = 0; s < block_rank; ++s) shares[q * BLOCK + s] = M[(a + q) * stride + chosen[s]];
                 double* const row = M + a * stride;
                 const double* const by = M + first * stride;
                 int c = next;
                 if (rows == 4)
                     for (; c + 8 <= columns; c += 8)
                         take_off(row + c, row + stride + c, row + 2 * stride + c, row + 3 * stride + c, shares,
-                                 shares + BLOCK, shares + 2 * BLOCK, shares + 3 * BLOCK, by + c, stride, found);
+                                 shares + BLOCK, shares + 2 * BLOCK, shares + 3 * BLOCK, by + c, stride, block_rank);
                 for (int q = 0; q < rows; ++q)
                     for (int d = c; d < columns; d += 4) {
                         v4 left = *(v4*)(row + q * stride + d);
-                        for (int s = 0; s < found; ++s)
+                        for (int s = 0; s < block_rank; ++s)
                             left -= shares[q * BLOCK + s] * *(const v4*)(by + s * stride + d);
                         *(v4*)(row + q * stride + d) = left;
                     }
@@ -114,10 +116,11 @@ ROW_ELIMINATION = """
 """
 
 FRONT_ELIMINATION = """
-    // The first w of the f columns of a symmetric front F, of which the lower triangle counts: unit columns of L with
-    // the pivots on the diagonal, what is left behind them, the inverses of diagonal blocks of L and the pivots'
-    // reciprocals. T is room for BLOCK rows. How many pivots are negative, -1 where one is as small as least.
-    auto eliminate_front = [&](double* F, int f, int w, int ld, double* T, double least, double* inverse,
+    // Eliminates the first w of the f columns of a symmetric front F, of which only the lower triangle is read. F then
+    // holds unit columns of L with the pivots on the diagonal, and behind them the Schur complement. Also writes the
+    // inverses of the diagonal blocks of L and the reciprocals of the pivots. T is scratch memory for BLOCK rows.
+    // Returns the number of negative pivots, or -1 if the size of one is at most min_pivot.
+    auto eliminate_front = [&](double* F, int f, int w, int ld, double* T, double min_pivot, double* inverse,
                                double* reciprocals) {
         #pragma clang fp contract(fast)
         double u[BLOCK], reciprocal[BLOCK], X[BLOCK * BLOCK], P[4 * BLOCK];
@@ -127,7 +130,7 @@ FRONT_ELIMINATION = """
             for (int j = 0; j < nb; ++j) {
                 double* const pivot_row = F + (b + j) * ld + b;
                 const double d = pivot_row[j];
-                if (!(d > least || d < -least)) return -1;
+                if (!(d > min_pivot || d < -min_pivot)) return -1;
                 negative += d < 0.0;
                 reciprocal[j] = 1.0 / d;
                 reciprocals[b + j] = reciprocal[j];
@@ -148,7 +151,7 @@ FRONT_ELIMINATION = """
                 row[i] = 1.0;
                 for (int k = 0; k <= i; ++k) X[k * BLOCK + i] = -row[k];
             }
-            // The rows below times the inverse are L D: by rows divided by D, by columns as they are.
+            // The rows below times the inverse are L D: stored by rows divided by D, and by columns in T unchanged.
             const int aligned = next & ~7;
             for (int c = 0; c < nb; ++c) {
                 for (int i = aligned; i < next; ++i) T[c * ld + i] = 0.0;
@@ -192,6 +195,10 @@ FRONT_ELIMINATION = """
 
 
 def on_cpu(body: str, *, elsewhere: str = "") -> str:
-    """``body``, which may use ``BLOCK``, ``v4`` and what takes products off, on a CPU; on a GPU, which never comes
-    there, ``elsewhere``."""
+    """Return source for a native function that runs on a CPU only.
+
+    Args:
+        body: the CPU source; it may use ``BLOCK``, ``v4`` and the ``take_off`` functions.
+        elsewhere: source for the GPU compilation, which is never executed.
+    """
     return f"#if !defined(__CUDA_ARCH__)\n{_PRODUCTS}{_SIZES}{body}\n#else\n{elsewhere}\n#endif\n"

@@ -1,4 +1,5 @@
-"""Fibres that pull inside a cage (section 3.2, Eq. 7).
+"""Muscle fibres inside a cage (section 3.2, Eq. 7).
 
-In: a cage and its up, or a user's file. Out: muscles: where they are attached, how strong they are, and what they pull.
+Input: a cage and its up direction, or a user's file. Output: muscles with their attachments, strengths and forces. The
+kernel is in ``egs_warp.kernels.muscles``.
 """

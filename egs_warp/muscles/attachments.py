@@ -1,4 +1,4 @@
-"""Where a muscle's end point is attached: non-negative weights over the nodes around it."""
+"""Attachment of a muscle's end points: non-negative weights over the nodes around them."""
 
 from __future__ import annotations
 
@@ -9,19 +9,27 @@ from scipy.sparse.csgraph import dijkstra
 from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 
 MIN_ATTACHMENT_NODES = 8
-"""Fewer nodes than this would concentrate the force on one or two elements, which then crumple."""
+"""Minimum number of nodes of an attachment; fewer concentrate the force on one or two elements, which collapse."""
 
 _NEWTON_ITERATIONS = 30
 _MULTIPLIER_PENALTY = 0.05
 
 
 def attachment_rows(mesh: TetMesh, points: np.ndarray, *, radius: float | None = None) -> sp.csr_matrix:
-    """Attach each of ``points`` (P, 3) to the nodes within about ``radius`` metres (default: the mean edge length).
+    """Attach points to the nodes around them.
 
-    Returns rows B (P, N) with B >= 0 and row sums 1. Weights are a Gaussian of width ``radius`` times each node's share
-    of the volume (so that the force density, not the force, is smooth), tilted exponentially so that the weighted
-    centroid B p lies at the point wherever the nodes around it allow (local maximum-entropy weights, Arroyo and Ortiz
-    2006). Nodes are reached along the mesh's edges, never across the gap between two limbs.
+    The weights are a Gaussian of width ``radius`` times each node's part of the volume (so that the force density, not
+    the force, is smooth), tilted exponentially so that the weighted centroid B p lies at the point wherever the nodes
+    around it allow it (local maximum-entropy weights, Arroyo and Ortiz 2006). Distances along the mesh's edges exclude
+    nodes across the gap between two limbs.
+
+    Args:
+        mesh: cage at rest.
+        points: (P, 3) m.
+        radius: distance of the attached nodes, m; default: the mean edge length.
+
+    Returns:
+        Rows B (P, N) with B >= 0 and row sums 1.
     """
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     graph = edge_graph(mesh)
@@ -48,7 +56,7 @@ def attachment_rows(mesh: TetMesh, points: np.ndarray, *, radius: float | None =
 
 
 def _maximum_entropy_weights(offsets: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Weights (n,) >= 0, sum 1, closest in entropy to shares exp(-|offset|^2), with mean offset near zero.
+    """Return weights (n,) >= 0 with sum 1, closest in entropy to shares exp(-|offset|^2), with mean offset near zero.
 
     Newton's method on the smooth, strictly convex dual log sum(prior exp(offset.t)) + penalty |t|^2 / 2; the penalty
     keeps t finite where the origin lies outside the nodes' convex hull.

@@ -1,4 +1,4 @@
-"""One branch of a skeleton as a bent cylinder, and the fibres in it."""
+"""Model of a skeleton's branch as a bent cylinder, and the fibres in it."""
 
 from __future__ import annotations
 
@@ -11,38 +11,42 @@ from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.skeleton import Branch
 
 _RADIUS_FRACTION = 0.7
-"""Fibres run at this part of the way from the branch's axis to the surface:
-near enough to bend, inside enough to hold.
+"""Distance of fibres from the branch's axis, as a fraction of the distance to the surface.
+
+Fibres near the surface bend the branch well; fibres further inside are attached well.
 """
 _MAX_FLARE = 1.6
-"""No fibre is further from the axis than this many section radii,
-lest those of a leg spread over the seat it carries.
+"""Maximum distance from the axis to the assumed surface, in section radii.
+
+It keeps the fibres of a leg from spreading over the seat above it.
 """
 
 
 @dataclass(frozen=True)
 class FibreDensity:
-    """How many fibres a branch gets."""
+    """Number of fibres of each kind in a branch."""
 
     azimuths: int
-    """Longitudinal fibres, evenly around the axis: a multiple of 4, so that they mirror in both horizontal axes."""
+    """Longitudinal fibres, evenly around the axis; a multiple of 4 for mirror symmetry in both horizontal axes."""
     intervals: int
     """Segments of each longitudinal or oblique fibre."""
     radial_levels: int
+    """Levels of radial fibres along the branch."""
     diameters: int
     """Radial fibres on each level."""
     hoops: int
+    """Circular fibres."""
     helices: int
     """Oblique fibres of each hand."""
 
     def segment_count(self) -> int:
-        """Of the whole branch."""
+        """Return the number of segments of the whole branch."""
         along = (self.azimuths + 2 * self.helices) * self.intervals
         return along + self.radial_levels * self.diameters + self.hoops * self.azimuths
 
 
 class Surface:
-    """Rays from inside the body to its surface."""
+    """Boundary of the body, for rays that start inside."""
 
     def __init__(self, mesh: TetMesh) -> None:
         corners = mesh.nodes[mesh.boundary_faces()]
@@ -51,7 +55,7 @@ class Surface:
         self.normal = np.cross(*self.sides)
 
     def exit_distance(self, start: np.ndarray, direction: np.ndarray, *, limit: float) -> float:
-        """Metres from ``start`` along unit ``direction`` to where the ray first leaves the body; at most ``limit``."""
+        """Return the distance from ``start`` along unit ``direction`` to the first exit, at most ``limit``, m."""
         facing = self.normal @ direction
         leaving = facing > 1e-12 * np.linalg.norm(self.normal, axis=1)
         to_start = start - self.origin
@@ -66,7 +70,7 @@ class Surface:
 
 
 class BranchCylinder:
-    """A branch seen as a bent cylinder: stations along its axis, and around each the distance to the surface."""
+    """Model of a branch as a bent cylinder: stations along its axis, and the distance to the surface around each."""
 
     def __init__(
         self, branch: Branch, up: np.ndarray, forward: np.ndarray, surface: Surface, edge: float, detail: FibreDensity
@@ -75,21 +79,21 @@ class BranchCylinder:
         steps = np.linalg.norm(np.diff(branch.points, axis=0), axis=1)
         self.arc = np.concatenate([[0.0], np.cumsum(steps)])
         self.window = max(edge, float(np.median(branch.radii)))
-        # A junction's section is as wide as the whole body there; the limb that ends in it is not.
+        # The section of a junction is as wide as the body, wider than the limb that ends in it.
         self.radii = np.minimum(branch.radii, 1.5 * np.median(branch.radii))
         self.stations = self._place_stations(edge)
         self.up = up
         tangents = np.array([self.tangent(station) for station in self.stations])
         helpers = np.stack([forward, np.cross(up, forward), up])
-        # The helper least along the branch gives the most stable frame; the margin keeps upright branches on `forward`.
+        # The helper most orthogonal to the branch gives the most stable frame; the margin prefers `forward`.
         worst = np.abs(tangents @ helpers.T).max(axis=0) + np.array([0.0, 0.1, 0.1])
         self.helper = helpers[int(np.argmin(worst))]
 
     def _place_stations(self, edge: float) -> np.ndarray:
-        """Arc lengths of the fibres' vertices: inside a free or ground end, and a little way into a junction.
+        """Return the arc lengths of the fibres' vertices: inside a free or ground end, and slightly into a junction.
 
-        A limb's fibres hold on to the body that carries it but do not cross it, and have a vertex where they enter it,
-        lest they leave the body on the inside of the bend.
+        A limb's fibres are anchored in the adjoining body but do not cross it. They have a vertex where they enter it,
+        so that they do not leave the body on the inside of the bend.
         """
         slim = np.flatnonzero(self.branch.own & (self.branch.radii <= 1.25 * np.median(self.branch.radii)))
         enters = float(self.arc[slim[0]]) if len(slim) else 0.0
@@ -112,15 +116,15 @@ class BranchCylinder:
         return stations
 
     def centre(self, arc: float) -> np.ndarray:
-        """(3,) of the axis at this arc length, metres."""
+        """Return the point (3,) of the axis at arc length ``arc``, m."""
         return np.array([np.interp(arc, self.arc, self.branch.points[:, axis]) for axis in range(3)])
 
     def radius(self, arc: float) -> float:
-        """Of the section at this arc length, metres."""
+        """Return the radius of the section at arc length ``arc``, m."""
         return float(np.interp(arc, self.arc, self.radii))
 
     def tangent(self, arc: float) -> np.ndarray:
-        """Unit direction of the axis; on the ground it is the ground's normal, so that the first section lies flat."""
+        """Return the unit direction of the axis; at the ground it is the normal, so that the first section is flat."""
         ahead, behind = min(arc + self.window, self.arc[-1]), max(arc - self.window, 0.0)
         direction = self.centre(ahead) - self.centre(behind)
         direction = direction / np.linalg.norm(direction)
@@ -130,7 +134,7 @@ class BranchCylinder:
         return direction / np.linalg.norm(direction)
 
     def point(self, arc: float, azimuth: float) -> np.ndarray:
-        """The fibres' place at this arc length and azimuth index (turning right-handed about the axis)."""
+        """Return the point (3,) of a fibre at an arc length and azimuth index (right-handed about the axis), m."""
         tangent = self.tangent(arc)
         side = self.helper - (self.helper @ tangent) * tangent
         side /= np.linalg.norm(side)
@@ -141,7 +145,7 @@ class BranchCylinder:
         return centre + _RADIUS_FRACTION * reach * outwards
 
     def fibres(self, name: str) -> list[Fibre]:
-        """All fibres of the branch; ``max_force`` here is each one's share of the section's area, square metres."""
+        """Return all fibres of the branch; their ``max_force`` is each one's part of the section's area, m^2."""
         count = self.detail.azimuths
         middles = 0.5 * (self.stations[1:] + self.stations[:-1])
         shares = np.array([np.pi * self.radius(middle) ** 2 for middle in middles]) / count
@@ -172,18 +176,18 @@ class BranchCylinder:
                 azimuth = azimuth if hand > 0 else count - 1 - azimuth
                 points = [grid[0][azimuth]]
                 for row, before, after in zip(grid[1:], self.stations[:-1], self.stations[1:], strict=True):
-                    azimuth = (azimuth + hand * self._turn(before, after)) % count
+                    azimuth = (azimuth + hand * self._azimuth_steps(before, after)) % count
                     points.append(row[azimuth])
                 fibres.append(Fibre(f"{name} {kind.value} {helix}", kind, np.array(points), shares))
         return fibres
 
     def _spread(self, count: int) -> np.ndarray:
-        """Arc lengths of ``count`` levels evenly inside the stations."""
+        """Return the arc lengths of ``count`` evenly spaced levels within the stations."""
         first, last = self.stations[0], self.stations[-1]
         return first + (last - first) * (np.arange(count) + 0.5) / max(count, 1)
 
-    def _turn(self, before: float, after: float) -> int:
-        """Azimuth steps between two stations that bring a helix nearest to 45 degrees; at most a quarter turn."""
+    def _azimuth_steps(self, before: float, after: float) -> int:
+        """Return the azimuth steps between two stations for a helix of about 45 degrees; at most a quarter turn."""
         radius = _RADIUS_FRACTION * self.radius(0.5 * (before + after))
         steps = round((after - before) / radius * self.detail.azimuths / (2.0 * np.pi))
         return int(np.clip(steps, 1, self.detail.azimuths // 4))

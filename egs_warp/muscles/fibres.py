@@ -1,4 +1,4 @@
-"""Muscle fibres as geometry: named polylines in the rest body, before they are attached to nodes."""
+"""Geometry of muscle fibres: named polylines in the rest body, before attachment to nodes."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import numpy as np
 
 
 class FibreKind(Enum):
-    """How a fibre runs about its branch of the body, and so what it does."""
+    """Kind of a fibre: its course in a branch of the body, which determines its effect."""
 
     LONGITUDINAL = "longitudinal"
-    """Along the branch: shortens it; on one side alone, bends it."""
+    """Along the branch; shortens it, or bends it if only one side contracts."""
     RADIAL = "radial"
-    """Across the branch: thins it and so lengthens it."""
+    """Across the branch; thins and so lengthens it."""
     CIRCULAR = "circular"
-    """A hoop around the branch: squeezes it; makes no axial torque."""
+    """Closed hoop around the branch; constricts it without an axial torque."""
     OBLIQUE_LEFT = "oblique_left"
-    """A left-handed helix around the branch: twists it one way."""
+    """Left-handed helix around the branch; twists it."""
     OBLIQUE_RIGHT = "oblique_right"
-    """A right-handed helix: twists it the other way."""
+    """Right-handed helix; twists the branch in the opposite direction."""
     USER = "user"
-    """A free polyline of the user's."""
+    """Polyline from the user's file."""
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,14 @@ class Fibre:
     """One polyline of muscle segments in the rest body."""
 
     name: str
+    """Unique name."""
     kind: FibreKind
+    """Kind of the fibre."""
     points: np.ndarray
-    """(K, 3) float64, metres, K >= 2; a closed hoop repeats its first point at its end."""
+    """(K, 3) float64, m, K >= 2; a closed hoop repeats its first point at its end."""
     max_force: float | np.ndarray
-    """Strength F_max of its segments, newtons: one number, or (K-1,)."""
+    """Strength F_max of its segments, N: one number, or (K-1,)."""
     group: int = 0
-    """Fibres of one group belong together (one branch, or the user's choice)."""
+    """Group of the fibre: a branch, or the user's choice."""
     partner: str | None = None
-    """Name of the mirror-image fibre, if the body has one."""
+    """Name of the mirror-image fibre, or None."""

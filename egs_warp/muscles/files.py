@@ -1,4 +1,4 @@
-"""Muscles that a user writes down as JSON.
+"""Muscles from a user's JSON file.
 
 A file is an object with ``fibres``, a list of entries. Lengths are in units of the capture. Every entry has ``name``
 and ``kind`` and, by kind,
@@ -32,22 +32,29 @@ from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres
 
 MAX_SEGMENTS = 400
-"""The quadratic program of a step has one unknown for each segment: more would take seconds a frame."""
+"""Maximum number of segments; the quadratic program has one unknown per segment, and more take seconds a frame."""
 
 _SAME_FRAME = BodyFrame(np.eye(3), np.zeros(3), 1.0)
 _COMMON_KEYS = {"name", "kind", "strength", "stiffness", "group", "mirror"}
 _FILE_KEYS = {"fibres", "max_strain", "mirror_plane"}
 _DEFAULT_STRENGTH = 2.0
-_LARGEST = {"strength": 1e3, "stiffness": 1e9}
-"""Body weights and N/m: what is far stiffer than steel cables leaves the solver no digits."""
+_MAX_VALUES = {"strength": 1e3, "stiffness": 1e9}
+"""Maximum values, in body weights and N/m; muscles far stiffer than steel cables leave the solver no precision."""
 _MAX_OUTSIDE_EDGES = 1.5
+"""Maximum distance of a point from the nearest node, in mean edge lengths."""
 
 
 def read_muscles(path: Path | str, mesh: TetMesh, *, body_weight: float, frame: BodyFrame = _SAME_FRAME) -> MuscleSet:
-    """Muscles of the JSON file ``path`` (module docstring), attached to ``mesh`` (metres).
+    """Read muscles from a JSON file (module docstring) and attach them to ``mesh``.
 
-    ``body_weight`` in newtons; ``frame`` is that of the mesh in the file's. Raises ``UserError`` with the
-    file, the entry, what is wrong with it and what to do.
+    Args:
+        path: JSON file.
+        mesh: cage at rest, m.
+        body_weight: N.
+        frame: frame of the mesh in the coordinates of the file.
+
+    Raises:
+        UserError: the file is invalid; the message names the file, the entry, what is wrong and what to do.
     """
     path = Path(path)
     content = _load(path)
@@ -63,19 +70,19 @@ def read_muscles(path: Path | str, mesh: TetMesh, *, body_weight: float, frame: 
     stiffness: list[float] = []
     groups: dict[str, int] = {}
     for index, entry in enumerate(entries):
-        made, its_stiffness = _fibres(path, index, entry, mirror, groups, frame, body_weight)
-        fibres += made
-        stiffness += [its_stiffness] * len(made)
+        entry_fibres, entry_stiffness = _fibres(path, index, entry, mirror, groups, frame, body_weight)
+        fibres += entry_fibres
+        stiffness += [entry_stiffness] * len(entry_fibres)
     _check(path, fibres, mesh, frame)
     muscles = attach_fibres(mesh, fibres, max_strain=max_strain)
-    asked = np.array(stiffness)[muscles.fibre_from_segment]
-    return replace(muscles, stiffness=np.where(np.isnan(asked), muscles.stiffness, asked))
+    requested = np.array(stiffness)[muscles.fibre_from_segment]
+    return replace(muscles, stiffness=np.where(np.isnan(requested), muscles.stiffness, requested))
 
 
 def _load(path: Path) -> dict[str, Any]:
     content = parse_json(read_text(path), path)
     if not isinstance(content, dict):
-        raise UserError(f'{path}: the file holds no object; write {{"fibres": [...]}}')
+        raise UserError(f'{path}: the file contains no object; write {{"fibres": [...]}}')
     return content
 
 
@@ -88,7 +95,7 @@ def _fibres(
     frame: BodyFrame,
     body_weight: float,
 ) -> tuple[list[Fibre], float]:
-    """The fibres of one entry with their mirror images, and their stiffness in N/m, NaN if none was asked."""
+    """Return the fibres of one entry with their mirror images, and their stiffness in N/m, NaN if it gives none."""
     where = f"{path}: fibre {index + 1}"
     if not isinstance(entry, dict):
         raise UserError(f"{where} is no object; write {{...}} with a name and a kind")
@@ -112,25 +119,23 @@ def _fibres(
     if not isinstance(mirrored, bool):
         raise UserError(f'{where}: "mirror" is {json.dumps(mirrored)}; give true or false')
     if mirrored and mirror is None:
-        raise UserError(
-            f'{where} is to be mirrored but the file has no plane; give "mirror_plane" with point and normal'
-        )
+        raise UserError(f'{where} is mirrored but the file has no plane; give "mirror_plane" with point and normal')
     group_index = groups.setdefault(group, len(groups))
     polylines = shape(where, entry)
-    made = []
+    fibres = []
     for number, points in enumerate(polylines):
         own = name if len(polylines) == 1 else f"{name} {number + 1}"
         image = f"{own} mirrored" if mirrored else None
-        made.append(Fibre(own, fibre_kind, frame.points(points), force, group_index, image))
+        fibres.append(Fibre(own, fibre_kind, frame.points(points), force, group_index, image))
         if mirrored and mirror is not None:
             image_points = frame.points(mirror(points))
-            made.append(Fibre(f"{own} mirrored", fibre_kind, image_points, force, group_index, own))
-    return made, stiffness
+            fibres.append(Fibre(f"{own} mirrored", fibre_kind, image_points, force, group_index, own))
+    return fibres, stiffness
 
 
 def _longitudinal(where: str, entry: dict[str, Any]) -> list[np.ndarray]:
     start, end = _point(where, entry, "from"), _point(where, entry, "to")
-    along = np.linspace(0.0, 1.0, _count(where, entry, "segments", 4, least=1) + 1)[:, None]
+    along = np.linspace(0.0, 1.0, _count(where, entry, "segments", 4, minimum_value=1) + 1)[:, None]
     return [(1.0 - along) * start + along * end]
 
 
@@ -142,13 +147,13 @@ def _polyline(where: str, entry: dict[str, Any]) -> list[np.ndarray]:
 
 
 def _circular(where: str, entry: dict[str, Any]) -> list[np.ndarray]:
-    count = _count(where, entry, "segments", 8, least=3)
+    count = _count(where, entry, "segments", 8, minimum_value=3)
     ring = _around(where, entry, 2.0 * np.pi * np.arange(count) / count)
     return [np.concatenate([ring, ring[:1]])]
 
 
 def _radial(where: str, entry: dict[str, Any]) -> list[np.ndarray]:
-    count = _count(where, entry, "count", 2, least=1)
+    count = _count(where, entry, "count", 2, minimum_value=1)
     ring = _around(where, entry, np.pi * np.arange(2 * count) / count)
     return [ring[[diameter, diameter + count]] for diameter in range(count)]
 
@@ -162,7 +167,7 @@ _SHAPES: dict[str, tuple[Callable[[str, dict[str, Any]], list[np.ndarray]], set[
 
 
 def _around(where: str, entry: dict[str, Any], angles: np.ndarray) -> np.ndarray:
-    """Points at ``angles`` on the entry's circle."""
+    """Return the points at ``angles`` on the entry's circle."""
     first, second = orthonormal_basis(_direction(where, entry, "axis"))
     spokes = -np.cos(angles)[:, None] * first - np.sin(angles)[:, None] * second
     return _point(where, entry, "centre") + _positive(where, entry, "radius", None) * spokes
@@ -186,7 +191,7 @@ def _check(path: Path, fibres: list[Fibre], mesh: TetMesh, frame: BodyFrame) -> 
     for fibre in fibres:
         where = f'{path}: fibre "{fibre.name}"'
         if fibre.name in names:
-            raise UserError(f"{where} is there twice; give each fibre its own name")
+            raise UserError(f"{where} occurs twice; give each fibre its own name")
         names.add(fibre.name)
         distances = np.linalg.norm(fibre.points[:, None] - mesh.nodes[None], axis=2).min(axis=1)
         worst = int(np.argmax(distances))
@@ -226,22 +231,24 @@ def _direction(where: str, entry: dict[str, Any], key: str) -> np.ndarray:
     largest = np.abs(value).max()
     if largest == 0.0:
         raise UserError(f'{where}: "{key}" is zero; give a direction [x, y, z]')
-    # The square of a large number has no double.
+    # The square of a large number overflows.
     value = value / largest
     return value / np.linalg.norm(value)
 
 
 def _positive(where: str, entry: dict[str, Any], key: str, default: float | None) -> float:
     value = entry.get(key, default)
-    most = _LARGEST.get(key, np.inf)
-    if not _is_number(value) or not 0 < value <= most:
-        upto = "" if most == np.inf else f", at most {most:g}"
+    maximum_value = _MAX_VALUES.get(key, np.inf)
+    if not _is_number(value) or not 0 < value <= maximum_value:
+        upto = "" if maximum_value == np.inf else f", at most {maximum_value:g}"
         raise UserError(f'{where}: "{key}" is {json.dumps(value)}; give a number above 0{upto}')
     return float(value)
 
 
-def _count(where: str, entry: dict[str, Any], key: str, default: int, *, least: int) -> int:
+def _count(where: str, entry: dict[str, Any], key: str, default: int, *, minimum_value: int) -> int:
     value = entry.get(key, default)
-    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= MAX_SEGMENTS:
-        raise UserError(f'{where}: "{key}" is {json.dumps(value)}; give a whole number from {least} to {MAX_SEGMENTS}')
+    if not isinstance(value, int) or isinstance(value, bool) or not minimum_value <= value <= MAX_SEGMENTS:
+        raise UserError(
+            f'{where}: "{key}" is {json.dumps(value)}; give a whole number from {minimum_value} to {MAX_SEGMENTS}'
+        )
     return value

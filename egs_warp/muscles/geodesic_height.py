@@ -1,8 +1,8 @@
-"""A height-like function that grows along every limb of a body away from the ground.
+"""Height-like function that grows along every limb of a body away from the ground.
 
-First a drainage field u (the body is heated evenly and cooled only at its base, so that heat flows down every limb to
-the ground: -lap u = 1, u = 0 at the base; u has no minimum but the base and no maximum but the tips), then the ascent,
-with the direction of u's gradient and unit slope, as in the heat method of Crane, Weischedel and Wardetzky (2013).
+First the drainage field u solves -lap u = 1 with u = 0 at the base (a body heated evenly and cooled at its base). Its
+only minimum is the base and its maxima are the tips. The ascent then has the direction of u's gradient and unit slope,
+as in the heat method of Crane, Weischedel and Wardetzky (2013).
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from scipy.sparse.linalg import splu
 from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 
 _BASE_FRACTION = 0.02
-"""Nodes lower than this part of the body's height above its lowest point are its base (or half an edge, if more)."""
+"""Base: nodes lower than this fraction of the body's height above its lowest point (or 0.4 edges, if more)."""
 
 
 def base_nodes(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
-    """Indices of the nodes on which the body stands."""
+    """Return the indices of the nodes on which the body stands."""
     heights = mesh.nodes @ up
     edge = edge_graph(mesh).data.mean()
     return np.flatnonzero(heights <= heights.min() + max(_BASE_FRACTION * np.ptp(heights), 0.4 * edge))
 
 
 def geodesic_height(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
-    """(N,) metres: zero at the base, growing with about unit slope along every limb away from it (module docstring)."""
+    """Return the geodesic height (N,) m: zero at the base, of about unit slope along every limb (module docstring)."""
     volumes = mesh.volumes()
     corners = mesh.nodes[mesh.tets]
     inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])

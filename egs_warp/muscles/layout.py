@@ -1,4 +1,4 @@
-"""Automatic fibres along the branches of a body's curve skeleton."""
+"""Automatic layout of fibres along the branches of a body's curve skeleton."""
 
 from __future__ import annotations
 
@@ -20,27 +20,35 @@ _DETAILS = (
     FibreDensity(4, 2, 1, 2, 1, 1),
     FibreDensity(4, 1, 1, 2, 1, 1),
 )
-"""From the richest to the poorest."""
+"""Fibre densities, from the most to the least segments."""
 _LEG_DETAILS = (FibreDensity(4, 4, 1, 2, 1, 1), FibreDensity(4, 3, 1, 1, 1, 1), *_DETAILS[-2:])
-"""The same of each leg of a body on ``_LEGS`` or more. A foot is carried ahead and set down flat by a leg that bends
-one way above and the other way below, which takes three segments on each side of it."""
-_LEGS = 3
-_SEGMENTS, _LEGGED_SEGMENTS = 112, 120
+"""Densities for each leg of a body with ``_MIN_LEGS`` or more.
+
+To move a foot forward and set it down flat, a leg bends in opposite directions above and below, which needs three
+segments on each of its sides.
+"""
+_MIN_LEGS = 3
+_MAX_SEGMENTS, _MAX_LEGGED_SEGMENTS = 112, 120
 
 
 def is_legged(skeleton: Skeleton) -> bool:
-    """Whether the body stands on three legs or more."""
-    return sum(branch.starts_on_ground for branch in skeleton.branches) >= _LEGS
+    """Return True if the body stands on three legs or more."""
+    return sum(branch.starts_on_ground for branch in skeleton.branches) >= _MIN_LEGS
 
 
 def lay_fibres(
     mesh: TetMesh, skeleton: Skeleton, *, max_force: float, max_stress: float, max_segments: int | None = None
 ) -> list[Fibre]:
-    """Longitudinal, radial, circular and oblique fibres on every branch, at most ``max_segments`` segments in all (112;
-    for a body on three legs or more 120).
+    """Lay longitudinal, radial, circular and oblique fibres on every branch.
 
-    ``max_force`` in newtons bounds each segment; ``max_stress`` in pascals bounds all longitudinal fibres of one
-    section together. Branches too many for the budget go without, the least voluminous first.
+    If there are too many branches for the segment budget, those with the least volume get none.
+
+    Args:
+        mesh: cage at rest, m.
+        skeleton: its curve skeleton.
+        max_force: maximum force of a segment, N.
+        max_stress: bounds the stress of all longitudinal fibres of a section together, Pa.
+        max_segments: maximum number of segments; default: 112, or 120 for a body on three legs or more.
     """
     edge = mean_edge_length(mesh)
     surface = Surface(mesh)
@@ -57,9 +65,9 @@ def lay_fibres(
 
 
 def _share_segments(skeleton: Skeleton, edge: float, budget: int | None) -> list[tuple[Branch, FibreDensity]]:
-    """The detail of each branch; like branches (the four legs of a stool) get the same."""
+    """Return the fibre density of each branch; similar branches (the four legs of a stool) get the same."""
     legged = is_legged(skeleton)
-    budget = budget or (_LEGGED_SEGMENTS if legged else _SEGMENTS)
+    budget = budget or (_MAX_LEGGED_SEGMENTS if legged else _MAX_SEGMENTS)
     families: list[list[Branch]] = []
     for branch in skeleton.branches:
         like = families[-1][0] if families else None
@@ -80,16 +88,18 @@ def _share_segments(skeleton: Skeleton, edge: float, budget: int | None) -> list
     def count(family: int) -> int:
         return len(families[family]) * detail(family).segment_count()
 
-    def greed(family: int) -> tuple[bool, float]:
-        """Segments against the volume they move; legs count double, since they alone push the ground, and those of a
-        body on many legs come last."""
+    def reduction_priority(family: int) -> tuple[bool, float]:
+        """Return the sort key for reductions: segments relative to the square root of the volume.
+
+        Legs count double, since only they act on the ground; the legs of a body on many legs are reduced last.
+        """
         volume = sum(branch.volume * (2.0 if branch.starts_on_ground else 1.0) for branch in families[family])
         return ladders[family] is _DETAILS, count(family) / volume**0.5
 
     while sum(count(family) for family in range(len(families))) > budget:
         reducible = [family for family in range(len(families)) if levels[family] < len(ladders[family]) - 1]
         if reducible:
-            levels[max(reducible, key=greed)] += 1
+            levels[max(reducible, key=reduction_priority)] += 1
         elif len(families) > 1:
             families.pop()
             levels.pop()
@@ -103,9 +113,9 @@ def _centre(mesh: TetMesh) -> np.ndarray:
 
 
 def _principal_horizontal(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
-    """Unit horizontal vector (3,) along which the body is widest; a round body gets a fixed one.
+    """Return the unit horizontal direction (3,) in which the body is widest, or a fixed one for a round body.
 
-    Its sign is fixed too: rounding must not choose between a direction and its opposite.
+    The sign is fixed, too, so that it does not depend on rounding.
     """
     plane = np.stack(orthonormal_basis(up))
     flat = (mesh.nodes - _centre(mesh)) @ plane.T
@@ -123,10 +133,10 @@ _MIRRORED = {FibreKind.OBLIQUE_LEFT: FibreKind.OBLIQUE_RIGHT, FibreKind.OBLIQUE_
 def _with_partners(
     fibres: list[Fibre], centre: np.ndarray, up: np.ndarray, forward: np.ndarray, *, tolerance: float
 ) -> list[Fibre]:
-    """Fibres with their mirror images named, in whichever of the two upright principal planes mirrors more of them."""
+    """Return the fibres with mirror images as partners, in the vertical principal plane that mirrors more of them."""
     best: dict[str, str] = {}
     for normal in (forward, np.cross(up, forward)):
-        found: dict[str, str] = {}
+        images: dict[str, str] = {}
         for fibre in fibres:
             image = fibre.points - 2.0 * ((fibre.points - centre) @ normal)[:, None] * normal
             candidates = [
@@ -136,15 +146,15 @@ def _with_partners(
                 and (distance := _polyline_distance(image, other.points)) < tolerance
             ]
             if candidates:
-                found[fibre.name] = min(candidates)[1]
-        mutual = {name: other for name, other in found.items() if found.get(other) == name}
+                images[fibre.name] = min(candidates)[1]
+        mutual = {name: other for name, other in images.items() if images.get(other) == name}
         if len(mutual) > len(best):
             best = mutual
     return [replace(fibre, partner=best.get(fibre.name)) for fibre in fibres]
 
 
 def _polyline_distance(first: np.ndarray, second: np.ndarray) -> float:
-    """Largest distance from a vertex of one polyline to the nearest of the other, both ways."""
+    """Return the symmetric Hausdorff distance of the vertices of two polylines; infinite if their counts differ."""
     if len(first) != len(second):
         return float("inf")
     apart = np.linalg.norm(first[:, None] - second[None], axis=2)

@@ -1,4 +1,4 @@
-"""Tetrahedra cut at the whole numbers of a field: what touches what between two neighbouring cuts."""
+"""Tetrahedra cut at the integer level sets of a field, and the adjacency of the resulting cells."""
 
 from __future__ import annotations
 
@@ -9,26 +9,29 @@ import numpy as np
 
 @dataclass(frozen=True)
 class LevelSetCells:
-    """The pieces into which slabs of equal ascent cut the tetrahedra; each tetrahedron holds a run of levels."""
+    """Cells into which the level sets of a field cut the tetrahedra; each tetrahedron has consecutive levels."""
 
     tet_from_cell: np.ndarray
+    """(C,) tetrahedron of each cell."""
     level_from_cell: np.ndarray
+    """(C,) level of each cell."""
     touching: np.ndarray
-    """(., 2) cells of one level that share part of a face."""
+    """(., 2) pairs of cells of one level that share part of a face."""
     stacked: np.ndarray
-    """(., 2) cells of one tetrahedron on consecutive levels."""
+    """(., 2) pairs of cells of one tetrahedron on consecutive levels."""
     first_cell: np.ndarray
-    """(T,) the cell of each tetrahedron's lowest level."""
+    """(T,) cell of each tetrahedron's lowest level."""
     first_level: np.ndarray
-    """(T,)."""
+    """(T,) lowest level of each tetrahedron."""
 
     @property
     def count(self) -> int:
+        """Number of cells C."""
         return len(self.tet_from_cell)
 
     @classmethod
     def cut(cls, tets: np.ndarray, level_field: np.ndarray, *, level_count: int) -> LevelSetCells:
-        """Cut where ``level_field`` (N,), given at the nodes and linear inside each tetrahedron, is a whole number."""
+        """Cut where ``level_field`` (N,), defined at the nodes and linear in each tetrahedron, is an integer."""
         first, last = _level_range(level_field[tets], level_count)
         tet_from_cell, level_from_cell = _runs(first, last)
         first_cell = np.concatenate([[0], np.cumsum(last - first + 1)[:-1]])
@@ -40,27 +43,27 @@ class LevelSetCells:
         return cls(tet_from_cell, level_from_cell, touching, np.stack([below, below + 1], axis=1), first_cell, first)
 
     def holding(self, tets: np.ndarray, level_field: np.ndarray) -> np.ndarray:
-        """The cell of tetrahedron ``tets`` (S,) that holds the point where the field is ``level_field`` (S,)."""
+        """Return the cell (S,) in each of ``tets`` (S,) that contains the point of field value ``level_field``."""
         last_level = np.append(self.first_cell[1:], self.count) - self.first_cell + self.first_level - 1
         level = np.clip(np.floor(level_field).astype(int), self.first_level[tets], last_level[tets])
         return self.first_cell[tets] + level - self.first_level[tets]
 
 
 def _level_range(values: np.ndarray, level_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """First and last level (rows,) that each row of corner values (rows, corners) passes through."""
+    """Return the first and last level (rows,) that each row of corner values (rows, corners) covers."""
     first = np.clip(np.floor(values.min(axis=1)).astype(int), 0, level_count - 1)
     return first, np.clip(np.ceil(values.max(axis=1)).astype(int) - 1, first, level_count - 1)
 
 
 def _runs(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Row number and level of every level first .. last of each row."""
+    """Return the row number and the level of each of the levels first .. last of every row."""
     counts = last - first + 1
     row = np.repeat(np.arange(len(first)), counts)
     return row, np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts) + first[row]
 
 
 def _inner_faces(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The two tetrahedra (I, 2) on either side of every inner face, and its three nodes (I, 3)."""
+    """Return the two tetrahedra (I, 2) at every inner face, and its three nodes (I, 3)."""
     faces = np.sort(tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
     order = np.lexsort(faces.T)
     same = np.flatnonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))

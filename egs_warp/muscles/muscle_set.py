@@ -1,4 +1,4 @@
-"""Muscles (Eq. 7): fibres of segments whose end points are embedded in the body; each segment is one actuator."""
+"""Muscles (Eq. 7): fibres made of segments whose end points are embedded in the body; each segment is an actuator."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from egs_warp.muscles.layout import is_legged, lay_fibres
 from egs_warp.muscles.skeleton import skeleton
 
 _MIN_AUTOMATIC_EDGES = 0.25
-"""An automatic fibre with a segment shorter than this many mean edges is left out: its ends share their nodes."""
+"""Minimum segment length of an automatic fibre, in mean edges; ends of shorter segments share their nodes."""
 
 
 @dataclass(frozen=True)
@@ -30,70 +30,76 @@ class MuscleSet:
     segments: np.ndarray
     """(M, 2) int32, end points (i, k) of each segment."""
     rest_lengths: np.ndarray
-    """(M,) float64, metres, between the weighted centroids at rest."""
+    """(M,) float64, m, distances between the end points at rest."""
     stiffness: np.ndarray
     """(M,) float64, N/m, k_j = F_max / (s_max L_j)."""
     bounds: np.ndarray
-    """(M,) float64, metres: |a_j| <= s_max L_j."""
+    """(M,) float64, m, bounds of the activations, |a_j| <= s_max L_j."""
     fibre_from_segment: np.ndarray
-    """(M,) int32."""
+    """(M,) int32, fibre of each segment."""
     fibre_kinds: tuple[FibreKind, ...]
-    """(F,)."""
+    """(F,) kind of each fibre."""
     fibre_names: tuple[str, ...]
-    """(F,) unique."""
+    """(F,) unique name of each fibre."""
     fibre_groups: np.ndarray
-    """(F,) int32, fibres of one group belong together (one branch of the body)."""
+    """(F,) int32, group of each fibre (a branch of the body)."""
     fibre_partners: np.ndarray
-    """(F,) int32, the mirror-image fibre, -1 for none."""
+    """(F,) int32, mirror-image fibre, -1 for none."""
 
     @property
     def segment_count(self) -> int:
-        """M."""
+        """Number of segments M."""
         return len(self.segments)
 
     @property
     def node_count(self) -> int:
-        """N."""
+        """Number of nodes N."""
         return self.end_rows.shape[1]  # pyright: ignore[reportOptionalSubscript]
 
     @property
     def fibre_count(self) -> int:
-        """F."""
+        """Number of fibres F."""
         return len(self.fibre_names)
 
     @property
     def max_forces(self) -> np.ndarray:
-        """(M,) float64, newtons: the force of each segment at its bound."""
+        """(M,) float64, N, force of each segment at its bound."""
         return self.stiffness * self.bounds
 
     @cached_property
     def difference_rows(self) -> sp.csr_matrix:
-        """(M, N) float64, B_k - B_i of each segment: its extent is (B_k - B_i) p."""
+        """(M, N) float64, B_k - B_i of each segment, whose vector is (B_k - B_i) p."""
         rows = (self.end_rows[self.segments[:, 1]] - self.end_rows[self.segments[:, 0]]).tocsr()
         rows.sort_indices()
         return rows
 
     def segments_of_kind(self, *kinds: FibreKind) -> np.ndarray:
-        """Indices (int64) of the segments of fibres of the given kinds."""
+        """Return the indices (int64) of the segments of fibres of the given kinds."""
         chosen = np.array([kind in kinds for kind in self.fibre_kinds], dtype=bool)
         return np.flatnonzero(chosen[self.fibre_from_segment])
 
     def end_points(self, positions: np.ndarray) -> np.ndarray:
-        """(P, 3) metres, B p for node positions (N, 3)."""
+        """Return the end points B p (P, 3) m for node positions p (N, 3)."""
         return self.end_rows @ positions
 
     def lengths(self, positions: np.ndarray) -> np.ndarray:
-        """(M,) metres, current length of each segment for node positions (N, 3)."""
+        """Return the length (M,) m of each segment for node positions (N, 3)."""
         return np.linalg.norm(self.difference_rows @ positions, axis=1)
 
 
 def attach_fibres(
     mesh: TetMesh, fibres: Sequence[Fibre], *, max_strain: float = 0.3, radius: float | None = None
 ) -> MuscleSet:
-    """Attach fibres to the nodes of ``mesh``: every polyline edge becomes one segment.
+    """Attach fibres to the nodes of ``mesh``; every edge of a polyline becomes a segment.
 
-    ``max_strain`` is s_max; ``radius`` is the reach of each attachment in metres (default: the mean edge length).
-    Raises ``UserError`` if there is no fibre, or a segment's two ends attach to the same place.
+    Args:
+        mesh: cage at rest, m.
+        fibres: at least one, with unique names.
+        max_strain: s_max.
+        radius: distance of the attached nodes, m; default: the mean edge length.
+
+    Raises:
+        UserError: there is no fibre, a name occurs twice, or the attached ends of a segment coincide.
     """
     if not fibres:
         raise UserError("muscles: the body has no fibre; give at least one")
@@ -148,12 +154,20 @@ def automatic_muscles(
     young_modulus: float | None = None,
     max_segments: int | None = None,
 ) -> MuscleSet:
-    """Muscles for any body: fibres of every kind along each branch of its curve skeleton (docs/concepts/muscles.md).
+    """Make muscles for any body: fibres of every kind along each branch of its skeleton (docs/concepts/muscles.md).
 
-    ``plane_normal`` (3,) points away from the ground; ``body_weight`` in newtons; ``height`` in metres along the
-    normal; ``strength`` is F_max of a segment in body weights. It is lowered where the body is thin: all longitudinal
-    fibres of a section together pull no harder than twice its area times E (``young_modulus``, pascals; default that of
-    sag 0.05, body_weight height / (0.05 volume)); of a body on three legs or more, whose legs would crumple, 0.4 times.
+    The strength is reduced where the body is thin: the total force of all longitudinal fibres of a section is at most
+    twice its area times E, or 0.4 times for a body on three legs or more, whose legs would collapse.
+
+    Args:
+        mesh: cage at rest, m.
+        plane_normal: (3,) away from the ground.
+        body_weight: N.
+        height: extent along the normal, m.
+        strength: F_max of a segment, in body weights.
+        max_strain: s_max.
+        young_modulus: E, Pa; default: that of sag 0.05, body_weight height / (0.05 volume).
+        max_segments: maximum number of segments; default as in ``lay_fibres``.
     """
     volume = float(mesh.volumes().sum())
     young = young_modulus or body_weight * height / (volume * 0.05)
@@ -169,7 +183,7 @@ def automatic_muscles(
 
 
 def _long_enough(mesh: TetMesh, fibres: Sequence[Fibre]) -> list[Fibre]:
-    """The fibres whose segments keep their length when their points are spread over nodes."""
+    """Return the fibres whose segments keep a minimum length after the attachment of their ends to nodes."""
     attached = attachment_rows(mesh, np.concatenate([fibre.points for fibre in fibres])) @ mesh.nodes
     polylines = np.split(attached, np.cumsum([len(fibre.points) for fibre in fibres])[:-1])
     shortest = _MIN_AUTOMATIC_EDGES * mean_edge_length(mesh)

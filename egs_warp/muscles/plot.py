@@ -1,4 +1,4 @@
-"""A picture of a body and its muscles, from three sides."""
+"""Image of a body and its muscles from three directions."""
 
 from __future__ import annotations
 
@@ -22,26 +22,37 @@ _BGR = {
     FibreKind.OBLIQUE_RIGHT: (30, 150, 240),
     FibreKind.USER: (90, 90, 90),
 }
-_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+_EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 _PANEL = 640
 _MARGIN = 40
-_SHARPNESS = 2
-"""Drawn this much larger, then averaged down."""
+_SUPERSAMPLING = 2
+"""Factor by which the image is drawn larger before it is averaged down."""
 _SUBPIXEL_BITS = 4
 
 
 def check_picture_name(path: Path) -> None:
-    """Raises ``UserError`` where the ending is not that of a picture, or its folder is missing."""
-    if path.suffix.lower() not in _ENDINGS:
-        raise UserError(f"{path}: not the name of a picture; let it end in one of {', '.join(_ENDINGS)}")
+    """Check the name of an image file.
+
+    Raises:
+        UserError: the extension is not that of an image format, or the folder does not exist.
+    """
+    if path.suffix.lower() not in _EXTENSIONS:
+        raise UserError(f"{path}: not the name of a picture; let it end in one of {', '.join(_EXTENSIONS)}")
     if not path.parent.is_dir():
         raise UserError(f"{path}: its folder does not exist; create {path.parent} first")
 
 
 def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarray) -> None:
-    """Write a picture with the body from the front, from the side and from above, its fibres coloured by kind.
+    """Write an image of the body from the front, the side and above, with fibres coloured by kind.
 
-    ``up`` (3,) points up in the first two views. Raises ``UserError`` if ``path`` cannot be written.
+    Args:
+        mesh: cage at rest.
+        muscles: its muscles.
+        path: image file.
+        up: (3,) up direction of the first two views.
+
+    Raises:
+        UserError: ``path`` cannot be written.
     """
     check_picture_name(path)
     up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
@@ -58,10 +69,10 @@ def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarra
 
 
 def _panel(title: str, axes: np.ndarray, mesh: TetMesh, muscles: MuscleSet) -> np.ndarray:
-    size = _PANEL * _SHARPNESS
+    size = _PANEL * _SUPERSAMPLING
     image = np.full((size, size, 3), 255, np.uint8)
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-    scale = (_PANEL - 2 * _MARGIN) * _SHARPNESS / float((high - low).max())
+    scale = (_PANEL - 2 * _MARGIN) * _SUPERSAMPLING / float((high - low).max())
     middle = 0.5 * (low + high)
 
     def pixels(points: np.ndarray) -> np.ndarray:
@@ -74,22 +85,22 @@ def _panel(title: str, axes: np.ndarray, mesh: TetMesh, muscles: MuscleSet) -> n
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     depth = corners.mean(axis=1) @ axes[2]
     brightness = 225 - 40 * np.clip(normals @ axes[2] + 1.0, 0.0, 1.0)
-    drawn = pixels(corners)
+    outlines = pixels(corners)
     for face in np.argsort(-depth, kind="stable"):
         if normals[face] @ axes[2] < 0:
             shade = (int(brightness[face]),) * 3
-            cv2.fillConvexPoly(image, drawn[face], shade, cv2.LINE_AA, _SUBPIXEL_BITS)
-            cv2.polylines(image, [drawn[face]], True, (200, 200, 200), 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+            cv2.fillConvexPoly(image, outlines[face], shade, cv2.LINE_AA, _SUBPIXEL_BITS)
+            cv2.polylines(image, [outlines[face]], True, (200, 200, 200), 1, cv2.LINE_AA, _SUBPIXEL_BITS)
     ends = muscles.end_points(mesh.nodes)
-    drawn_ends = pixels(ends)
+    end_pixels = pixels(ends)
     middles = ends[muscles.segments].mean(axis=1) @ axes[2]
     for segment in np.argsort(-middles, kind="stable"):
         i, k = muscles.segments[segment]
         colour = _BGR[muscles.fibre_kinds[muscles.fibre_from_segment[segment]]]
-        first, last = (drawn_ends[i].tolist(), drawn_ends[k].tolist())
-        cv2.line(image, first, last, colour, 2 * _SHARPNESS, cv2.LINE_AA, _SUBPIXEL_BITS)
+        first, last = (end_pixels[i].tolist(), end_pixels[k].tolist())
+        cv2.line(image, first, last, colour, 2 * _SUPERSAMPLING, cv2.LINE_AA, _SUBPIXEL_BITS)
         for end in (first, last):
-            cv2.circle(image, end, 3 * _SHARPNESS * 2**_SUBPIXEL_BITS, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
+            cv2.circle(image, end, 3 * _SUPERSAMPLING * 2**_SUBPIXEL_BITS, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
     image = cv2.resize(image, (_PANEL, _PANEL), interpolation=cv2.INTER_AREA)
     cv2.putText(image, title, (12, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (0, 0, 0), 1, cv2.LINE_AA)
     return image

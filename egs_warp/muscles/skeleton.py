@@ -1,8 +1,9 @@
 """Curve skeleton of a body: branches (legs, trunk, arms) from the ground up, each a polyline with sections.
 
-Connected slabs of a height-like function (``egs_warp.muscles.geodesic_height``) are the body's sections; how they
-join is its Reeb graph, whose short and thin chains are merged into their neighbours. Slabs cut through tetrahedra (the
-function is linear inside each), so that a coarse mesh has as fine a skeleton as a dense one.
+The body's sections are the connected components between level sets of a height-like function
+(``egs_warp.muscles.geodesic_height``). Their adjacency is the Reeb graph, whose short and thin chains are merged into
+their neighbours. Level sets cut through tetrahedra, so that the skeleton of a coarse mesh is as fine as that of a dense
+one.
 """
 
 from __future__ import annotations
@@ -24,48 +25,50 @@ _SAMPLES_PER_EDGE = 4
 """A tetrahedron is sampled at the points of a lattice with this many along its edge (20 points in all)."""
 _SMOOTHING_PASSES = 3
 _CAP_SECTIONS = 3
+"""Sections that are merged at a free end of a long branch."""
 _MIN_BRANCH_VOLUME = 0.01
-"""A branch holds at least this part of the body's volume."""
+"""Minimum volume of a branch, as a fraction of the body's volume."""
 _MIN_BRANCH_SLENDERNESS = 1.5
-"""A branch that ends freely is at least this many of its own radii long; shorter ones are bumps."""
+"""Minimum length of a branch with a free end, in its own radii; shorter ones are bumps."""
 
 
 @dataclass(frozen=True)
 class Branch:
-    """One limb or the trunk: a polyline through the middles of its sections, running away from the ground. K points."""
+    """A limb or the trunk: polyline of K points through the centres of its sections, directed away from the ground."""
 
     points: np.ndarray
-    """(K, 3) float64, metres, K >= 2."""
+    """(K, 3) float64, m, K >= 2."""
     radii: np.ndarray
-    """(K,) float64, metres: radius of the disc with the section's area."""
+    """(K,) float64, m, radius of the disc with the section's area."""
     own: np.ndarray
-    """(K,) bool: the section belongs to this branch alone; elsewhere the branch runs inside a junction."""
+    """(K,) bool, True where the section belongs to this branch only, False inside a junction."""
     starts_on_ground: bool
-    """Its first point lies on the body's base."""
+    """True if its first point lies on the body's base."""
     ends_freely: bool
-    """Its last point is a tip of the body."""
+    """True if its last point is a tip of the body."""
     volume: float
-    """Cubic metres of the body that its own sections hold."""
+    """Volume of its own sections, m^3."""
 
     @property
     def length(self) -> float:
-        """Metres along the polyline."""
+        """Length of the polyline, m."""
         return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """All branches of a body, the most voluminous first."""
+    """Curve skeleton of a body."""
 
     branches: tuple[Branch, ...]
+    """Sorted by descending volume."""
     up: np.ndarray
     """(3,) unit vector away from the ground."""
 
 
 def skeleton(mesh: TetMesh, up: np.ndarray) -> Skeleton:
-    """Curve skeleton of ``mesh`` that stands with its lowest nodes on the ground; ``up`` (3,) points away from it.
+    """Compute the curve skeleton of ``mesh``, whose lowest nodes are on the ground; ``up`` (3,) points away from it.
 
-    The same mesh gives the same bits every time.
+    The result is deterministic to the bit.
     """
     up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     graph = _SectionGraph(mesh, geodesic_height(mesh, up), up)
@@ -76,7 +79,7 @@ def skeleton(mesh: TetMesh, up: np.ndarray) -> Skeleton:
 
 
 class _SectionGraph:
-    """Sections (connected slabs of equal ascent) and which of them touch; merging changes it in place."""
+    """Graph of sections (connected components of a level) and their adjacency; merges modify it in place."""
 
     def __init__(self, mesh: TetMesh, ascent: np.ndarray, up: np.ndarray) -> None:
         self.thickness = float(ascent.max()) / _SECTION_COUNT
@@ -109,10 +112,11 @@ class _SectionGraph:
             self.neighbours[int(b)].add(int(a))
 
     def volume(self, sections: Iterable[int]) -> float:
+        """Return the total volume of ``sections``, m^3."""
         return sum(float(self.sample_volumes[self.members[section]].sum()) for section in sections)
 
     def merge_insignificant_chains(self) -> None:
-        """Merge the least chain that is no limb, until every chain is one."""
+        """Merge the smallest insignificant chain into its neighbours until every chain is a limb."""
         while True:
             chains = [chain for chain in self.chains() if self._is_insignificant(chain)]
             if not chains:
@@ -120,26 +124,26 @@ class _SectionGraph:
             self._merge(min(chains, key=lambda chain: (self.volume(self._own(chain)), chain)))
 
     def chains(self) -> list[list[int]]:
-        """Paths between branching or end sections, including these, each once, running upwards."""
+        """Return the paths between junctions or ends, including both, each once and directed upwards."""
         special = [
             section for section, others in self.neighbours.items() if len(others) != 2 or self._is_extreme(section)
         ]
-        found = []
+        chains = []
         for start in special:
             for following in sorted(self.neighbours[start]):
                 chain = [start, following]
                 while chain[-1] not in special:
-                    (onward,) = self.neighbours[chain[-1]] - {chain[-2]}
-                    chain.append(onward)
+                    (successor,) = self.neighbours[chain[-1]] - {chain[-2]}
+                    chain.append(successor)
                 if (self.level[chain[0]], chain[0], chain[1]) <= (self.level[chain[-1]], chain[-1], chain[-2]):
-                    found.append(chain)
-        return found
+                    chains.append(chain)
+        return chains
 
     def joined_chains(self) -> list[list[int]]:
-        """Chains, with the one that alone carries a junction continued by the most voluminous one that leaves it.
+        """Return the chains, where a chain that dominates the junction at its end continues with the largest one above.
 
-        One of several carries it alone if it has twice the volume of the next: a trunk beside a hand that rests on the
-        hip, but no leg of a stool.
+        A chain dominates if it is the only one below the junction or has twice the volume of the next: a trunk beside a
+        hand that rests on the hip, but no leg of a stool.
         """
         chains = self.chains() or [[section, section] for section in self.neighbours]
         for junction in sorted(self.neighbours, key=lambda section: (self.level[section], section)):
@@ -148,32 +152,32 @@ class _SectionGraph:
                 key=lambda chain: (-self._own_volume(chain), chain),
             )
             above = [chain for chain in chains if chain[0] == junction]
-            alone = len(below) == 1 or (
+            dominates = len(below) == 1 or (
                 len(below) > 1 and self._own_volume(below[0]) > 2.0 * self._own_volume(below[1])
             )
-            if alone and above:
-                onward = max(above, key=lambda chain: (self._own_volume(chain), chain))
-                chains = [chain for chain in chains if chain is not below[0] and chain is not onward]
-                chains.append(below[0] + onward[1:])
+            if dominates and above:
+                continuation = max(above, key=lambda chain: (self._own_volume(chain), chain))
+                chains = [chain for chain in chains if chain is not below[0] and chain is not continuation]
+                chains.append(below[0] + continuation[1:])
         return chains
 
     def branch(self, chain: list[int]) -> Branch:
-        """The polyline of a chain of sections; a free end is carried on to its tip, a ground end to the base."""
-        kept = [section for section in chain if len(self.members[section])] or chain
-        grounded, ends_freely = self.grounded[kept[0]], len(self.neighbours[kept[-1]]) <= 1
-        # The last slabs of a blunt end are cut by the mesh's rounding: only together do they have a middle to trust.
-        cap = _CAP_SECTIONS if len(kept) >= 3 * _CAP_SECTIONS else 1
-        groups = [[section] for section in kept]
-        if not grounded and self._is_free(kept[0]):
-            groups[:cap] = [kept[:cap]]
+        """Return the branch of a chain of sections; its polyline extends to the tip of a free end, or to the base."""
+        sections = [section for section in chain if len(self.members[section])] or chain
+        grounded, ends_freely = self.grounded[sections[0]], len(self.neighbours[sections[-1]]) <= 1
+        # The last sections of a blunt end depend on the mesh, so their common centroid is used.
+        cap = _CAP_SECTIONS if len(sections) >= 3 * _CAP_SECTIONS else 1
+        groups = [[section] for section in sections]
+        if not grounded and self._is_free(sections[0]):
+            groups[:cap] = [sections[:cap]]
         if ends_freely:
-            groups[-cap:] = [kept[-cap:]]
+            groups[-cap:] = [sections[-cap:]]
         members = [np.concatenate([self.members[section] for section in group]) for group in groups]
         points = [self._middle(samples) for samples in members]
         radii = [float(np.mean([self._radius(section) for section in group])) for group in groups]
         own = [not any(self._is_junction(section) for section in group) for group in groups]
-        if grounded or self._is_free(kept[0]):
-            points.insert(0, self._ground_point(kept[0]) if grounded else self._tip(members[0], points[1::-1]))
+        if grounded or self._is_free(sections[0]):
+            points.insert(0, self._ground_point(sections[0]) if grounded else self._tip(members[0], points[1::-1]))
             radii.insert(0, radii[0])
             own.insert(0, own[0])
         if ends_freely:
@@ -189,17 +193,15 @@ class _SectionGraph:
         return np.average(self.samples[members], axis=0, weights=self.sample_volumes[members])
 
     def _tip(self, members: np.ndarray, last_points: list[np.ndarray]) -> np.ndarray:
-        """Where a free end of the body is: as far on from the last point as its samples reach
-        in the axis' direction.
-        """
+        """Return the tip of a free end: the last point, moved along the axis to the extent of the samples."""
         middle = last_points[-1]
-        onwards = middle - last_points[0]
-        length = float(np.linalg.norm(onwards))
-        onwards = onwards / length if length > 0.0 else self.up
-        return middle + float(((self.samples[members] - middle) @ onwards).max()) * onwards
+        axis = middle - last_points[0]
+        length = float(np.linalg.norm(axis))
+        axis = axis / length if length > 0.0 else self.up
+        return middle + float(((self.samples[members] - middle) @ axis).max()) * axis
 
     def _ground_point(self, section: int) -> np.ndarray:
-        """The middle of the section's lowest layer, on the ground."""
+        """Return the centre of the section's lowest layer, projected to the ground."""
         members = self.members[section]
         heights = self.samples[members] @ self.up
         base = self._middle(members[heights <= heights.min() + 0.5 * self.thickness])
@@ -216,7 +218,7 @@ class _SectionGraph:
         return len(self.neighbours[section]) == 1
 
     def _own(self, chain: list[int]) -> list[int]:
-        """The sections of a chain that are not shared with another chain."""
+        """Return the sections of a chain that it does not share with another chain."""
         return [section for section in chain if not self._is_junction(section)]
 
     def _own_volume(self, chain: list[int]) -> float:
@@ -234,42 +236,43 @@ class _SectionGraph:
         if self._is_free(chain[0]) or self._is_free(chain[-1]):
             too_small = self.volume(own) < _MIN_BRANCH_VOLUME * self.total_volume
             return too_small or len(own) < 2 or length < _MIN_BRANCH_SLENDERNESS * mean_radius
-        # Between two junctions: a short link only separates limbs that leave the body at about the same place.
+        # Between two junctions, a short link only separates limbs that leave the body at about the same position.
         return len(own) < 2 or length < mean_radius
 
     def _merge(self, chain: list[int]) -> None:
-        """Unite a free chain level by level with the body beside it; a link between junctions, with both of these."""
+        """Merge a free chain level by level into the adjacent body, or a link between junctions into both of them."""
         if self._is_free(chain[0]) or self._is_free(chain[-1]):
             junction, own = (chain[-1], chain[-2::-1]) if self._is_free(chain[0]) else (chain[0], chain[1:])
             upwards = self.level[own[0]] > self.level[junction]
-            beside, avoid = junction, set(own)
+            neighbour, avoid = junction, set(own)
             for section in own:
-                onward = [
+                candidates = [
                     other
-                    for other in self.neighbours[beside]
-                    if other not in avoid and (self.level[other] > self.level[beside]) == upwards
+                    for other in self.neighbours[neighbour]
+                    if other not in avoid and (self.level[other] > self.level[neighbour]) == upwards
                 ]
-                if onward and (self.level[section] > self.level[beside]) == upwards:
-                    beside = max(onward, key=lambda other: (self.volume([other]), other))
-                self._unite(beside, section)
+                if candidates and (self.level[section] > self.level[neighbour]) == upwards:
+                    neighbour = max(candidates, key=lambda other: (self.volume([other]), other))
+                self._unite(neighbour, section)
         else:
             for section in chain[1:]:
                 if section != chain[0]:
                     self._unite(chain[0], section)
 
-    def _unite(self, kept: int, gone: int) -> None:
-        self.members[kept] = np.sort(np.concatenate([self.members[kept], self.members.pop(gone)]))
-        self.grounded[kept] |= self.grounded.pop(gone)
-        for other in self.neighbours.pop(gone):
-            self.neighbours[other].discard(gone)
-            if other != kept:
-                self.neighbours[other].add(kept)
-                self.neighbours[kept].add(other)
-        del self.level[gone]
+    def _unite(self, target: int, merged: int) -> None:
+        """Merge section ``merged`` into ``target``."""
+        self.members[target] = np.sort(np.concatenate([self.members[target], self.members.pop(merged)]))
+        self.grounded[target] |= self.grounded.pop(merged)
+        for other in self.neighbours.pop(merged):
+            self.neighbours[other].discard(merged)
+            if other != target:
+                self.neighbours[other].add(target)
+                self.neighbours[target].add(other)
+        del self.level[merged]
 
 
 def _tetrahedron_lattice(per_edge: int) -> np.ndarray:
-    """(S, 4) barycentric coordinates of a lattice of inner points."""
+    """Return the barycentric coordinates (S, 4) of a lattice of inner points."""
     indices = [
         (a, b, c, per_edge - 1 - a - b - c)
         for a in range(per_edge)

@@ -1,4 +1,7 @@
-"""From an activation to the force on each node (Eq. 7): an energy while the body moves, columns for the program."""
+"""Nodal forces of muscle activations (Eq. 7): an energy for the step's equation, columns for the quadratic program.
+
+The kernel is in ``egs_warp.kernels.muscles.impulses``.
+"""
 
 from __future__ import annotations
 
@@ -15,29 +18,35 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.precision import Vec3, real
 
 LENGTH_FULL_FORCE, LENGTH_ZERO_FORCE = 0.7, 0.3
-"""Of its rest length: a segment that is at least so long pulls with all its tension, one at most so long not at all."""
+"""Relative lengths at and above which a segment exerts its full tension, and at and below which it exerts none."""
 
 
 def segment_vectors(rows: sparse.csr_matrix, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(M, 3) vectors in metres between the ends of segments with difference ``rows`` (M, N) at node ``positions``
-    (N, 3), and their lengths (M,); a segment whose ends coincide has length 1e-300, and a direction of 0.
+    """Return the vectors and lengths of segments.
+
+    Args:
+        rows: (M, N) difference rows.
+        positions: (N, 3) m, node positions.
+
+    Returns:
+        Vectors (M, 3) m and lengths (M,) m, at least 1e-300, so that a segment whose ends coincide has the direction 0.
     """
     vectors = rows @ positions
     return vectors, np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)
 
 
 def shortening(muscles: MuscleSet, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """(M,) metres by which segments are shorter at node positions ``end`` (N, 3) than at ``start`` (N, 3)."""
+    """Return by how much segments are shorter at positions ``end`` (N, 3) than at ``start`` (N, 3): (M,) m."""
     rows = muscles.difference_rows
     return segment_vectors(rows, start)[1] - segment_vectors(rows, end)[1]
 
 
 def force_length_factor(shortened: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """phi, its integral from 0 and its derivative, each (M,), at lengths over rest lengths ``shortened`` (M,).
+    """Return phi, its integral from 0 and its derivative, each (M,), at relative lengths ``shortened`` (M,).
 
-    A muscle that has shortened far pulls less: the ascending limb of the force-length relation (Gordon, Huxley and
-    Julian 1966), here a smooth step from SLACK to FULL. With a tension that no length changes, two ends that are drawn
-    together meet in a point where the force has no direction, and no step has an end there.
+    A strongly shortened muscle exerts less force: the ascending limb of the force-length relation (Gordon, Huxley and
+    Julian 1966), here a smooth step from ``LENGTH_ZERO_FORCE`` to ``LENGTH_FULL_FORCE``. With a constant tension, two
+    ends could be pulled into one point, where the force has no direction and the step has no solution.
     """
     width = LENGTH_FULL_FORCE - LENGTH_ZERO_FORCE
     along = np.clip((shortened - LENGTH_ZERO_FORCE) / width, 0.0, 1.0)
@@ -46,7 +55,7 @@ def force_length_factor(shortened: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def activation_jacobian(muscles: MuscleSet, positions: np.ndarray) -> sparse.csc_matrix:
-    """A(p) of Eq. (7), (3N, M): newtons on each node's axes for each metre of activation, at node ``positions`` (N, 3).
+    """Return A(p) of Eq. (7), (3N, M) N/m: nodal forces per metre of activation, at node ``positions`` (N, 3).
 
     Column j is k_j phi (B_i^T u - B_k^T u), u the unit vector from end i to end k: a_j > 0 contracts.
     """
@@ -55,7 +64,7 @@ def activation_jacobian(muscles: MuscleSet, positions: np.ndarray) -> sparse.csc
     share, _, _ = force_length_factor(lengths / muscles.rest_lengths)
     pulls = -(muscles.stiffness * share)[:, None] * (vectors / lengths[:, None])
     entries = rows.data[:, None] * np.repeat(pulls, np.diff(rows.indptr), axis=0)
-    # One entry of a segment's row is three of its column: x, y and z of the node.
+    # One entry of a segment's row gives three of its column: x, y and z of the node.
     nodes = (3 * rows.indices[:, None] + np.arange(3)).ravel()
     return sparse.csc_matrix(
         (entries.ravel(), nodes, 3 * rows.indptr), shape=(3 * muscles.node_count, len(rows.indptr) - 1)
@@ -63,10 +72,10 @@ def activation_jacobian(muscles: MuscleSet, positions: np.ndarray) -> sparse.csc
 
 
 class SynergyColumns:
-    """Columns of groups of segments that act together, over a step: kernel, index maps and memory, on the host."""
+    """Impulse columns of groups of segments that share an activation: index maps and memory, on the host."""
 
     def __init__(self, muscles: MuscleSet, group_from_muscle: np.ndarray) -> None:
-        """``group_from_muscle`` (M,) from 0 to m - 1."""
+        """Build the maps; ``group_from_muscle`` (M,) has values from 0 to m - 1."""
         rows, self._count = muscles.difference_rows, int(group_from_muscle.max(initial=-1)) + 1
         order = np.argsort(group_from_muscle, kind="stable")
         offsets = np.searchsorted(group_from_muscle[order], np.arange(self._count + 1))
@@ -84,8 +93,16 @@ class SynergyColumns:
         self._rows = wp.array(self._impulses.reshape(len(self._impulses), -1, 3), dtype=Vec3, device="cpu", copy=False)
 
     def with_base(self, other: np.ndarray, positions: np.ndarray, dt: float) -> np.ndarray:
-        """(3N, m + 1) N s over ``dt`` seconds at node ``positions`` (N, 3), of each group at its bounds, and last
-        ``other`` (3N,); overwritten the next time."""
+        """Return the impulses of each group at its bound, and ``other`` as the last column.
+
+        Args:
+            other: (3N,) N s.
+            positions: (N, 3) m, node positions.
+            dt: step size, s.
+
+        Returns:
+            (3N, m + 1) N s; the next call overwrites it.
+        """
         copy_into(self._positions, positions)
         launch_cached(
             impulses_kernel,
@@ -100,25 +117,27 @@ class SynergyColumns:
 
 @dataclass(frozen=True)
 class MuscleEnergy:
-    """Segments that pull with constant tensions T over a step: V(p) = sum_j T_j L_j Phi(|D_j p| / L_j), D_j p the
-    vector between the ends, L_j its length at rest, Phi the integral of phi (``shares_of_tension``): where no segment
-    is shorter than FULL of that, sum_j T_j |D_j p| and a constant.
+    """Energy of muscle segments with constant tensions T over a step.
 
-    Its force is that of Eq. (7) at ``p``, so it turns with the body. Forces that keep the direction of the step's start
-    instead are dead loads: they press on the elements without the tension's own stiffness T / L across the line, and
-    slender parts buckle under muscles that in truth hold them straight.
+    V(p) = sum_j T_j L_j Phi(|D_j p| / L_j), with the segment vectors D_j p, rest lengths L_j and the integral Phi of
+    phi (``force_length_factor``). If all relative lengths are at least ``LENGTH_FULL_FORCE``, V is sum_j T_j |D_j p|
+    plus a constant.
+
+    The force is that of Eq. (7) at ``p``, so it rotates with the body. Forces with the directions of the step's start
+    would be dead loads: they lack the transverse stiffness T / L of the tension, and slender parts would buckle under
+    muscles that in reality keep them straight.
     """
 
     rows: sparse.csr_matrix
-    """(M, N) D."""
+    """(M, N) difference rows D."""
     tensions: np.ndarray
-    """(M,) newtons, positive where the segment contracts."""
+    """(M,) N, positive where the segment contracts."""
     rest_lengths: np.ndarray
-    """(M,) metres."""
+    """(M,) m."""
 
     @classmethod
     def of(cls, muscles: MuscleSet, activations: np.ndarray) -> MuscleEnergy:
-        """Of all segments at ``activations`` (M,) metres."""
+        """Build the energy of all segments at ``activations`` (M,) m."""
         return cls(muscles.difference_rows, muscles.stiffness * activations, muscles.rest_lengths)
 
     @cached_property
@@ -126,18 +145,18 @@ class MuscleEnergy:
         return self.rows.T.tocsr()
 
     def energy(self, positions: np.ndarray) -> float:
-        """Joules, V at node ``positions`` (N, 3)."""
+        """Return V at node ``positions`` (N, 3), J."""
         _, lengths = segment_vectors(self.rows, positions)
         return float((self.tensions * self.rest_lengths) @ force_length_factor(lengths / self.rest_lengths)[1])
 
     def gradient(self, positions: np.ndarray) -> np.ndarray:
-        """(N, 3) newtons: the derivative of V by the positions, minus the force of the muscles."""
+        """Return the derivative of V with respect to the positions (N, 3) N, minus the force of the muscles."""
         vectors, lengths = segment_vectors(self.rows, positions)
         share, _, _ = force_length_factor(lengths / self.rest_lengths)
         return self._ends @ ((self.tensions * share / lengths)[:, None] * vectors)
 
     def hessian(self, positions: np.ndarray) -> TensionHessian:
-        """The second derivative of V at ``positions``."""
+        """Return the Hessian of V at node ``positions`` (N, 3)."""
         vectors, lengths = segment_vectors(self.rows, positions)
         share, _, slope = force_length_factor(lengths / self.rest_lengths)
         return TensionHessian(
@@ -148,28 +167,34 @@ class MuscleEnergy:
 
 @dataclass(frozen=True)
 class TensionHessian:
-    """K = sum_j D_j^T (r_j (I - u_j u_j^T) + s_j u_j u_j^T) D_j, never formed: the ends are spread over dozens of
-    nodes.
+    """Hessian K = sum_j D_j^T (r_j (I - u_j u_j^T) + s_j u_j u_j^T) D_j, in factored form.
+
+    K is never assembled, since the ends of a segment are spread over dozens of nodes.
     """
 
     rows: sparse.csr_matrix
-    """(M, N)."""
+    """(M, N) difference rows D."""
     directions: np.ndarray
-    """(M, 3) u."""
+    """(M, 3) u, unit vectors of the segments."""
     transverse_stiffness: np.ndarray
-    """(M,) r, tension over length, N/m."""
+    """(M,) N/m, r, tension divided by length."""
     axial_stiffness: np.ndarray
-    """(M,) s, how much more tension a metre of length gives, N/m; 0 where none is so short that it loses any."""
+    """(M,) N/m, s, derivative of the tension with respect to the length; 0 at full force."""
 
     def factors(self, *, least: float) -> tuple[np.ndarray, np.ndarray]:
-        """U (3N, n) and rates (n,) with K = U diag(rates) U^T, of the ``ways``."""
-        segments, ways, rates = self.rank_one_terms(least=least)
+        """Return U (3N, n) and rates (n,) N/m with K = U diag(rates) U^T, for the terms of ``rank_one_terms``."""
+        segments, directions, rates = self.rank_one_terms(least=least)
         rows = self.rows[segments].toarray()
-        return np.einsum("mn,mi->nim", rows, ways).reshape(3 * rows.shape[1], len(segments)), rates
+        return np.einsum("mn,mi->nim", rows, directions).reshape(3 * rows.shape[1], len(segments)), rates
 
     def rank_one_terms(self, *, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Segments (n,), unit vectors (n, 3) and rates (n,) of which K is the sum: of each segment two directions
-        across it and the one along it, where its rate is above ``least`` of the largest.
+        """Return the rank-1 terms of which K is the sum: two transverse directions and the axis of each segment.
+
+        Args:
+            least: terms whose rate is at most this fraction of the largest are dropped.
+
+        Returns:
+            Segments (n,), unit vectors (n, 3) and rates (n,) N/m.
         """
         axis = np.eye(3)[np.argmin(np.abs(self.directions), axis=1)]
         first = np.cross(self.directions, axis)

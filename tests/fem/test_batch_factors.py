@@ -13,7 +13,7 @@ COUNT, SIZE = 5, 53
 
 @pytest.fixture
 def matrices() -> np.ndarray:
-    """(5, 53, 53), the third not definite, the fourth no number."""
+    """(5, 53, 53), the third indefinite, the fourth with a NaN."""
     half = np.random.default_rng(0).normal(size=(COUNT, SIZE, SIZE))
     made = half @ np.swapaxes(half, 1, 2) + SIZE * np.eye(SIZE)
     made[2] -= 1.01 * np.linalg.eigvalsh(made[2])[0] * np.eye(SIZE)
@@ -24,7 +24,7 @@ def matrices() -> np.ndarray:
 @pytest.mark.parametrize("panel", [8, 53, 96])
 @pytest.mark.parametrize("chunk_bytes", [1, 2**31])
 def test_solutions_are_those_of_numpy(matrices: np.ndarray, panel: int, chunk_bytes: int) -> None:
-    """In all slots, in some of them, and after some were written anew."""
+    """In all slots, in some of them, and after some were overwritten."""
     right = np.random.default_rng(1).normal(size=(COUNT, SIZE, 3))
     factors = BatchCholesky(COUNT, SIZE, torch.device("cpu"), panel=panel, chunk_bytes=chunk_bytes)
     every = torch.arange(COUNT)

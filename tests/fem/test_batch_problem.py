@@ -1,4 +1,4 @@
-"""The equations of many worlds side by side are those of each alone."""
+"""The batched equations agree with those of each world alone."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def muscles(body: SoftBody) -> MuscleSet:
 
 @pytest.fixture(scope="module")
 def activations(muscles: MuscleSet) -> np.ndarray:
-    """(3, M) metres: pulls and a few pushes, some of them too weak to count."""
+    """(3, M) m, contractions and a few extensions, some of them negligible."""
     share = np.random.default_rng(5).uniform(-0.05, 0.3, (3, muscles.segment_count))
     share[:, ::7] *= 1e-5
     return share * muscles.bounds
@@ -96,7 +96,7 @@ def test_residuals(
     alone: list[StepProblem],
     pulling: bool,
 ) -> None:
-    """Forces, what the step gives back of a spin, and the whole equation, with muscles and without."""
+    """Forces, momentum corrections and residuals, with muscles and without."""
     given = tried(states)
     velocities, tensions = torch.from_numpy(given), torch.from_numpy(muscles.stiffness * activations)
     pulls = [MuscleEnergy.of(muscles, one) if pulling else None for one in activations]
@@ -140,7 +140,7 @@ def test_tangents(
     pulling: bool,
     chunk_bytes: int,
 ) -> None:
-    """What impulses bring about, with and without the stiffness of muscles; a turning that is known is used."""
+    """Velocity changes by impulses, with and without the stiffness of muscles; a given momentum projection is used."""
     beside = problem_of(BatchBody(body, muscles, 4, panel=32, chunk_bytes=chunk_bytes), states)
     given, impulses = tried(states), np.random.default_rng(3).standard_normal((3, given_size(body), 4))
     pulls = [MuscleEnergy.of(muscles, one) for one in activations] if pulling else [None] * 3
@@ -157,8 +157,8 @@ def test_tangents(
 def test_tangents_of_muscles_that_are_half_slack(
     body: SoftBody, muscles: MuscleSet, activations: np.ndarray, states: list[BodyState], alone: list[StepProblem]
 ) -> None:
-    """Muscles of 0.35 to 0.65 of their length, where the share of the tension that is left falls with it: what impulses
-    bring about is as alone, and not as without muscles."""
+    """At relative lengths from 0.35 to 0.65 the tension depends on the length: results are those of single worlds, and
+    differ from those without muscles."""
     half = replace(muscles, rest_lengths=muscles.rest_lengths / np.linspace(0.35, 0.65, muscles.segment_count))
     beside, given, pulls = problem_of(BatchBody(body, half, 4), states), tried(states), np.abs(activations)
     assert beside.factor(torch.from_numpy(given), torch.from_numpy(half.stiffness * pulls)).all()
@@ -178,7 +178,7 @@ def given_size(body: SoftBody) -> int:
 def test_an_indefinite_world_is_projected_and_one_without_numbers_has_no_factors(
     body: SoftBody, muscles: MuscleSet
 ) -> None:
-    """Squashed to 40 % in a long step; the third is as at rest."""
+    """Squashed to 40 % in a long step; the second has NaN velocities, the third is at rest."""
     rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
     squashed = BodyState(body.mesh.nodes * [1.1, 1.1, 0.4], rest.velocities)
     states = [squashed, rest, rest]
@@ -195,7 +195,7 @@ def test_an_indefinite_world_is_projected_and_one_without_numbers_has_no_factors
 
 
 def test_muscles_that_would_make_a_world_indefinite_are_left_out(body: SoftBody, muscles: MuscleSet) -> None:
-    """Pushes a thousand times what muscles have: its tangent is that of the elements alone."""
+    """With negative tensions a thousand times the maximum, the tangent is that of the elements alone."""
     rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
     beside = problem_of(BatchBody(body, muscles, 4), [rest, rest], drag=0.0)
     pushes = torch.from_numpy(np.stack([-1e3 * muscles.stiffness * muscles.bounds, 0.0 * muscles.bounds]))

@@ -1,4 +1,4 @@
-"""Records of many worlds: some of them, and what is written back of some."""
+"""Batched records: gather and scatter of some worlds."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def made(count: int = 4) -> Outer:
 
 
 def test_some_worlds_of_a_record() -> None:
-    """In their order, records within it too; what has no rows stays."""
+    """In the given order, also in nested records; fields without a world axis are unchanged."""
     record = made()
     some = record.gather(torch.tensor([3, 1]))
     assert some.inner.size.tolist() == [3, 1] and some.name == "all"
@@ -46,7 +46,7 @@ def test_worlds_are_written_back_in_place() -> None:
 
 
 def test_copies_of_a_map_lie_one_behind_the_other() -> None:
-    """What stands for none stays none."""
+    """Negative entries are unchanged."""
     assert repeat_offsets(np.array([[0, 2], [-1, 1]]), 3, 5, CPU).tolist() == [
         [0, 2],
         [-1, 1],

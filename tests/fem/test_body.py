@@ -11,7 +11,7 @@ import scipy.sparse as sparse
 from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
-from egs_warp.fem.body import GRAVITY, LARGEST_HEIGHT, MAX_SAG, SMALLEST_HEIGHT, SoftBody, make_body
+from egs_warp.fem.body import GRAVITY, MAX_HEIGHT, MAX_SAG, MIN_HEIGHT, SoftBody, make_body
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from tests.support.meshes import block_mesh, box_mesh, coarse_stool
@@ -25,7 +25,7 @@ def body() -> SoftBody:
 
 
 def test_material_follows_from_height() -> None:
-    """docs/concepts/cage.md: E = rho g H / sag, for any size and any up."""
+    """E = rho g H / sag, for any size and any up direction (docs/concepts/cage.md)."""
     for size, normal in ((0.3, [0.0, 0.0, 1.0]), (2.0, [0.0, 1.0, 0.0])):
         mesh = block_mesh(size=(0.4 * size, 0.4 * size, size))
         made = make_body(mesh, Plane(np.array(normal), 0.1), sag=0.03, density=800.0, device="cpu")
@@ -68,7 +68,7 @@ def test_momenta_of_a_rigid_motion(body: SoftBody) -> None:
 
 
 def test_best_fit_rotation_recovers_a_turn(body: SoftBody) -> None:
-    """Exact for a turned stretch along the body's own axis; proper even for a mirrored body."""
+    """Exact for a rotated stretch along the principal axes; a proper rotation even for a mirrored body."""
     turn = Rotation.from_rotvec([0.4, -1.9, 0.8]).as_matrix()
     centred = body.mesh.nodes - body.centre_of_mass(body.mesh.nodes)
     assert np.allclose(body.best_fit_rotation(centred @ turn.T + [1.0, 2.0, 3.0]), turn, atol=1e-12)
@@ -90,26 +90,28 @@ def test_a_height_that_no_body_has_is_refused(scale: float) -> None:
 
 
 def test_the_smallest_and_the_largest_body_are_bodies() -> None:
-    for height in (SMALLEST_HEIGHT, LARGEST_HEIGHT):
+    for height in (MIN_HEIGHT, MAX_HEIGHT):
         mesh = box_mesh((2, 2, 2), (0.4 * height, 0.4 * height, height))
         assert make_body(mesh, FLOOR, device="cpu").height == height
 
 
 def test_a_body_that_hangs_on_an_edge_is_refused() -> None:
-    """Two boxes that share an edge are hinged: the upper one swings free, which no damping of a first mode can hold."""
+    """Two boxes that share only an edge form a hinge: the upper one rotates freely, so there is no first mode."""
     box = box_mesh((1, 1, 1), (1.0, 1.0, 1.0))
     low = box.nodes.min(axis=0)
     both = np.concatenate([box.nodes - low, box.nodes - low + [1.0, 0.0, 1.0]])
     nodes, merged = np.unique(both.round(9), axis=0, return_inverse=True)
     assert len(nodes) == 2 * len(box.nodes) - 2
     tets = merged.ravel()[np.concatenate([box.tets, box.tets + len(box.nodes)])].astype(np.int32)
-    with pytest.raises(UserError, match="nodes: the cage has parts that hang on a corner or an edge alone; give it"):
+    with pytest.raises(
+        UserError, match="nodes: parts of the cage are connected by a single corner or edge; give it more"
+    ):
         make_body(TetMesh(nodes, tets), FLOOR, device="cpu")
 
 
 def test_a_body_on_thin_legs_is_stiffened_until_it_sinks_by_two_percent() -> None:
-    """docs/concepts/cage.md: its centre of mass, linearly and by a dense solve, with the nodes of its base held; a
-    column, which sinks less, stays as soft as it is.
+    """The centre of mass sinks by ``MAX_SAG`` H, by a linear dense solve with a clamped base; a column, which sags
+    less, is not stiffened (docs/concepts/cage.md).
     """
     for mesh, stiffened in ((coarse_stool(), True), (box_mesh((2, 2, 4), (0.8, 0.8, 2.0)), False)):
         made = make_body(mesh, FLOOR, sag=0.05, device="cpu")

@@ -1,4 +1,4 @@
-"""What is recorded does again what it did, with what lies in its memory then."""
+"""A captured graph repeats its operations with the current contents of its memory."""
 
 from __future__ import annotations
 
@@ -20,94 +20,94 @@ from egs_warp.fem import cuda_graphs
 from egs_warp.fem.cuda_graphs import GraphCache, GraphStream, PinnedUpload
 
 
-def test_recorded_work_reads_what_is_told_each_time(device: str) -> None:
+def test_captured_work_reads_the_current_input(device: str) -> None:
     stream = GraphStream(torch.device(device))
-    told, here = PinnedUpload(stream, 4), stream.pinned(4)
+    upload, readback = PinnedUpload(stream, 4), stream.pinned(4)
     runs = []
 
     def work() -> None:
         runs.append(len(runs))
-        here.copy_((told.device @ told.device) * told.device, non_blocking=True)
+        readback.copy_((upload.device @ upload.device) * upload.device, non_blocking=True)
 
     again = stream.run_captured(work)
     for number in range(5):
         with stream:
-            told.set(np.array([1.0, number]), np.array([2.0]))
+            upload.set(np.array([1.0, number]), np.array([2.0]))
             again()
             stream.wait()
         expected = np.array([1.0, number, 2.0, 0.0]) * (5.0 + number**2)
-        np.testing.assert_array_equal(here.numpy(), expected)
-    # A GPU has it run once, and once to record it.
+        np.testing.assert_array_equal(readback.numpy(), expected)
+    # On a GPU it runs once directly and once for the capture.
     assert len(runs) == (5 if device == "cpu" else 2)
 
 
 @pytest.mark.parametrize("loops", [True, False])
-def test_repeated_work_goes_on_while_it_says_so(device: str, monkeypatch: pytest.MonkeyPatch, loops: bool) -> None:
-    """From what is told each time, not at all where it says so before; with a driver that knows loops, and with one
-    that does not."""
+def test_repeated_work_runs_while_its_flag_is_set(device: str, monkeypatch: pytest.MonkeyPatch, loops: bool) -> None:
+    """With new input each time, and zero repetitions if the flag is 0 at the start; with and without support for
+    conditional graphs."""
     if not loops:
         monkeypatch.setattr(wp, "is_conditional_graph_supported", lambda: False)
     stream = GraphStream(torch.device(device))
-    told, here = PinnedUpload(stream, 2), stream.pinned(2)
+    upload, readback = PinnedUpload(stream, 2), stream.pinned(2)
     going, sums = torch.zeros(1, dtype=torch.int32, device=device), torch.zeros(2, dtype=torch.float64, device=device)
     works, runs = GraphCache(stream), []
 
     def work() -> None:
         runs.append(len(runs))
-        # With what is made on the way.
-        sums.add_(torch.stack([torch.ones_like(told.device[0]), told.device[0]]))
-        going.copy_(sums[:1] < told.device[1])
+        # With temporary memory.
+        sums.add_(torch.stack([torch.ones_like(upload.device[0]), upload.device[0]]))
+        going.copy_(sums[:1] < upload.device[1])
 
     for number, steps in enumerate([0, 3, 1, 5, 0, 2]):
         with stream:
-            told.set(np.array([number + 0.5, steps]))
+            upload.set(np.array([number + 0.5, steps]))
             sums.zero_()
             going.fill_(steps > 0)
             works.repeat("steps", work, going)
-            here.copy_(sums, non_blocking=True)
+            readback.copy_(sums, non_blocking=True)
             stream.wait()
-        np.testing.assert_array_equal(here.numpy(), [steps, steps * (number + 0.5)])
-    # A GPU has it run three times the first time that there is anything to do, and once to record it.
+        np.testing.assert_array_equal(readback.numpy(), [steps, steps * (number + 0.5)])
+    # On a GPU it runs directly three times, in the first loop with work, and once for the capture.
     assert len(runs) == (11 if device == "cpu" else 4)
 
 
-def test_the_last_works_are_kept_by_their_keys(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """More of them than are kept, again and again; what is forgotten is run anew, with what it is then."""
-    monkeypatch.setattr(cuda_graphs, "_MOST", 3)
+def test_the_cache_keeps_the_most_recent_graphs(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More keys than the capacity, repeatedly; evicted operations run directly again, with the current arguments."""
+    monkeypatch.setattr(cuda_graphs, "_MAX_GRAPHS", 3)
     stream = GraphStream(torch.device(device))
-    told, here = PinnedUpload(stream, 1), stream.pinned(1)
+    upload, readback = PinnedUpload(stream, 1), stream.pinned(1)
     works = GraphCache(stream)
 
     def run(factor: float, value: float) -> float:
         def work() -> None:
-            here.copy_(factor * told.device, non_blocking=True)
+            readback.copy_(factor * upload.device, non_blocking=True)
 
         with stream:
-            told.set(np.array([value]))
+            upload.set(np.array([value]))
             works.run(factor, work)
             stream.wait()
-        return float(here[0])
+        return float(readback[0])
 
     for turn in range(4):
         for factor in (1.0, 2.0, 3.0, 4.0, 4.0, 4.0):
             assert run(factor, turn + 0.5) == factor * (turn + 0.5)
-    assert list(works._kept) == [2.0, 3.0, 4.0]
+    assert list(works._graphs) == [2.0, 3.0, 4.0]
     works.forget()
-    assert run(2.0, 1.0) == 2.0 and len(works._kept) == 1
+    assert run(2.0, 1.0) == 2.0 and len(works._graphs) == 1
 
 
-def test_nobody_looks_for_garbage_while_work_is_recorded(device: str) -> None:
-    """What is found would be given back to the device, which waits for what goes on there."""
-    stream, looks = GraphStream(torch.device(device)), []
-    again = stream.run_captured(lambda: looks.append(gc.isenabled()))
+def test_garbage_collection_is_disabled_during_a_capture(device: str) -> None:
+    """Freed device memory would synchronize with the device."""
+    stream, enabled = GraphStream(torch.device(device)), []
+    again = stream.run_captured(lambda: enabled.append(gc.isenabled()))
     for _ in range(3):
         with stream:
             again()
-    assert gc.isenabled() and looks == ([True] * 3 if device == "cpu" else [True, False])
+    assert gc.isenabled() and enabled == ([True] * 3 if device == "cpu" else [True, False])
 
 
-def test_a_stream_that_is_entered_again_is_left_with_the_first(device: str) -> None:
-    """By another who works there too, and in a thread of its own; gradients are kept track of before and after."""
+def test_nested_entries_of_a_stream_end_with_the_first(device: str) -> None:
+    """Also with another object for the same stream, and per thread; gradients are enabled before and after."""
     one, other = GraphStream(torch.device(device)), GraphStream(torch.device(device))
     outside = torch.cuda.current_stream() if device != "cpu" else None
     with one:
@@ -123,28 +123,28 @@ def test_a_stream_that_is_entered_again_is_left_with_the_first(device: str) -> N
     assert device == "cpu" or torch.cuda.current_stream() == outside
 
 
-def test_works_at_once_are_over_before_what_comes_next(device: str) -> None:
-    """And begin after what came before, run as they are and recorded: sums of long rows that the one before has
+def test_later_work_follows_all_branches_of_a_fork(device: str) -> None:
+    """Branches also start after the work before them, run directly and captured: sums of long rows that were just
     filled."""
     stream, count = GraphStream(torch.device(device)), 1 << 20
-    told, rows = PinnedUpload(stream, 1), torch.zeros((4, count), dtype=torch.float64, device=device)
-    sums, here = torch.zeros(4, dtype=torch.float64, device=device), stream.pinned(1)
+    upload, rows = PinnedUpload(stream, 1), torch.zeros((4, count), dtype=torch.float64, device=device)
+    sums, readback = torch.zeros(4, dtype=torch.float64, device=device), stream.pinned(1)
 
     def add_up(place: int) -> None:
         sums[place] = (place + 1) * rows[place].sum()
 
     def work() -> None:
-        rows.copy_(told.device.expand_as(rows))
+        rows.copy_(upload.device.expand_as(rows))
         stream.fork_join([partial(add_up, place) for place in range(4)])
-        here.copy_(sums.sum()[None], non_blocking=True)
+        readback.copy_(sums.sum()[None], non_blocking=True)
 
     again = stream.run_captured(work)
     for value in range(1, 6):
         with stream:
-            told.set(np.array([float(value)]))
+            upload.set(np.array([float(value)]))
             again()
             stream.wait()
-        assert float(here[0]) == 10.0 * count * value
+        assert float(readback[0]) == 10.0 * count * value
 
 
 _ENDS = """
@@ -152,20 +152,20 @@ import numpy as np, torch
 from egs_warp.fem.cuda_graphs import GraphStream, PinnedUpload
 
 stream = GraphStream(torch.device("{device}"))
-told = PinnedUpload(stream, 8)
+upload = PinnedUpload(stream, 8)
 with stream:
-    told.take(np.arange(8.0))
-    again = stream.recorded(told.send)
+    upload.set(np.arange(8.0))
+    again = stream.run_captured(upload.send)
     for _ in range(3):
         again()
     stream.wait()
-kept = told.here.numpy()
-assert float(told.there.sum()) == 28.0
-del told, stream, again
+values = upload.host.numpy()
+assert float(upload.device.sum()) == 28.0
+del upload, stream, again
 """
 
 
-def test_a_program_ends_with_what_it_still_holds(device: str) -> None:
-    """A view of page-locked memory that goes when Warp and torch do."""
+def test_a_program_exits_while_it_holds_pinned_memory(device: str) -> None:
+    """A view of page-locked memory outlives the objects of Warp and PyTorch until the exit."""
     done = subprocess.run([sys.executable, "-c", _ENDS.format(device=device)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""Dense factors solve as sparse ones do, and tell definiteness alike."""
+"""Dense and sparse factors give the same solutions and the same verdicts on definiteness."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def pattern(count: int) -> sparse.csc_matrix:
 
 
 def band(count: int) -> sparse.csc_matrix:
-    """Upper triangle of a long body: all that is at most four places away."""
+    """Upper triangle of a band matrix with bandwidth four."""
     return sparse.csc_matrix(np.triu(np.tri(count, k=4).T.astype(float)) * (np.tri(count, k=4) > 0))
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [1, 7, 64, 65, 130, 259])
 def test_matrices_of_every_size_are_inverted_by_halves(count: int, device: str) -> None:
-    """With what is added to their diagonals, by dense factors as by sparse ones; no number is no matrix."""
+    """With an added diagonal, by dense and sparse factors; a NaN is rejected."""
     upper = pattern(count)
     dense, thin = DenseCholesky(upper, device=device), MultifrontalLdl(upper)
     random = np.random.default_rng(count)
@@ -61,8 +61,8 @@ def test_matrices_of_every_size_are_inverted_by_halves(count: int, device: str) 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_slabs_of_a_long_body_are_factored_at_once(device: str) -> None:
-    """As recorded work, too, and with a sum between two matrices; what is indefinite in a slab, or between them alone,
-    has no factors."""
+    """Also from a captured graph, and with a low-rank term between two matrices; a matrix that is indefinite only in a
+    slab or only in the separator has no factors."""
     count = 150
     upper = band(count)
     slabs = Dissection.of(upper)
@@ -91,8 +91,8 @@ def test_slabs_of_a_long_body_are_factored_at_once(device: str) -> None:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("diagonal", [30.0, 1.0])
 def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
-    """Solutions and strains of moves to rounding, with a sum and without; an indefinite matrix has no dense factors,
-    but a sum with it may have.
+    """Solutions and quadratic models agree to rounding, with and without a low-rank term; an indefinite matrix has no
+    dense factors, but its sum with a term may have.
     """
     upper = pattern(60)
     dense, thin = DenseCholesky(upper, device=device), MultifrontalLdl(upper)
@@ -140,7 +140,7 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [1, 70])
 def test_directions_are_added_without_another_factor(count: int, device: str) -> None:
-    """What pulls, then what pushes; where they take too much away the sum is not definite, until the next matrix."""
+    """Positive, then negative terms; if the sum is indefinite, there are no factors until the next matrix."""
     upper, random = pattern(60), np.random.default_rng(5)
     factors, right = DenseCholesky(upper, device=device), random.normal(size=(60, 4))
     directions = np.vstack([random.normal(size=(count, 60)), np.zeros((3, 60))])
@@ -184,7 +184,7 @@ def test_a_cpu_gets_sparse_factors() -> None:
 
 @pytest.mark.cuda
 def test_factors_leave_what_warp_holds_for_its_stream() -> None:
-    """Memory for sorts, which would go while a graph is recorded."""
+    """Temporary memory of sorts, which would be freed during a capture."""
     upper = band(150)
     factors, count = DenseCholesky(upper, device="cuda:0"), 1000
     for seed in range(3):

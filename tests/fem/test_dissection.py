@@ -1,4 +1,4 @@
-"""Slabs of a body: what lies between them holds all that joins them."""
+"""Dissection into slabs: all couplings between parts go through the separator."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def upper_of(joined: np.ndarray) -> sparse.csc_matrix:
 
 
 def band(count: int, reach: int, seed: int) -> np.ndarray:
-    """(n, n) of a long body: each of ``count`` is joined to those up to ``reach`` from it, in a random order."""
+    """Return the pattern (n, n) of a band matrix of bandwidth ``reach`` in a random order."""
     places = np.random.default_rng(seed).permutation(count)
     return abs(places[:, None] - places) <= reach
 
@@ -43,7 +43,7 @@ def test_what_no_cut_divides_is_whole() -> None:
 
 
 def test_bodies_that_do_not_meet_have_slabs_too() -> None:
-    """All of those that the first one does not reach are one level of it."""
+    """All vertices that are not connected to the first one form one level."""
     joined = sparse.block_diag([band(60, 2, 0), band(20, 2, 1)]).toarray().astype(bool)
     slabs = Dissection.of(upper_of(joined))
     assert np.array_equal(np.sort(slabs.order), np.arange(80)) and len(slabs.parts) > 1

@@ -58,9 +58,7 @@ def test_gradient_is_derivative_of_energy(bent: Bent, damped: bool) -> None:
 
 @pytest.mark.parametrize("damped", [False, True])
 def test_hessian_is_derivative_of_gradient(bent: Bent, damped: bool) -> None:
-    """Eq. (5), Eq. (6): central differences of the gradient; the projected matrix lies above the true one where damping
-    turns it.
-    """
+    """Eq. (5), Eq. (6): central differences of the gradient; the projected matrix is positive semi-definite."""
     assembly, x, damping = bent
     damping = damping if damped else None
     matrix = full(assembly, assembly.hessian_entries(x, damping))

@@ -1,4 +1,4 @@
-"""Sparse factors solve as dense algebra does, and tell definiteness by inertia."""
+"""Sparse factors agree with dense algebra and report definiteness by the inertia."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def test_what_cannot_be_factored_is_told() -> None:
 
 @pytest.mark.parametrize("name", PATTERNS)
 def test_every_pattern_and_number_of_right_sides(name: str) -> None:
-    """To rounding, whatever their order in memory; the bits of each do not hang on how many there are with it, but for
-    one alone."""
+    """To rounding, for any memory order; the bits of a solution do not depend on the number of right-hand sides, except
+    for a single one."""
     matrix = PATTERNS[name]
     factors, count = MultifrontalLdl(upper_of(matrix)), len(matrix.indptr) - 1
     assert factors.update(upper_of(matrix).data) and factors.negative_pivots == 0
@@ -69,7 +69,7 @@ def test_every_pattern_and_number_of_right_sides(name: str) -> None:
 
 
 def strained(factors: LinearSolver, upper: sparse.csc_matrix, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """By the matrix itself, numbers drawn."""
+    """Return the quadratic model of random input with the factored matrix's pattern."""
     random = np.random.default_rng(6)
     slope, weights, away = random.standard_normal((3, len(vectors)))
     return factors.effort_quadratic(upper.data, slope, weights, vectors, dt_now=0.3, dt_ahead=-0.7, reference=away)
@@ -77,7 +77,7 @@ def strained(factors: LinearSolver, upper: sparse.csc_matrix, vectors: np.ndarra
 
 @pytest.mark.parametrize("name", PATTERNS)
 def test_the_strain_of_many_moves(name: str) -> None:
-    """X^T H X and X^T g of X = 0.3 V - 0.7 S^-1 diag(w) V less what is taken away from its last column, H another
+    """X^T H X and X^T g of X = 0.3 V - 0.7 S^-1 diag(w) V minus the reference in its last column, H another
     matrix of the same pattern."""
     matrix = PATTERNS[name]
     factors = MultifrontalLdl(upper_of(matrix))
@@ -97,7 +97,7 @@ def test_the_strain_of_many_moves(name: str) -> None:
 
 @pytest.mark.parametrize("added", [False, True])
 def test_what_solutions_keep(added: bool) -> None:
-    """M T of a solution, by its ratio, is T of what is given: of many as of one, of a sum with muscles, too."""
+    """The scaled angular momentum of a solution equals that of its right-hand side, also with a low-rank term."""
     matrix = PATTERNS["grid of nodes"]
     count, random = len(matrix.indptr) - 1, np.random.default_rng(8)
     factors = MultifrontalLdl(upper_of(matrix))
@@ -116,7 +116,7 @@ def test_what_solutions_keep(added: bool) -> None:
 
 
 def test_where_nothing_is_given_nothing_comes_of_it() -> None:
-    """Columns with a few numbers each, by which some blocks are passed over."""
+    """Columns with few nonzero entries, for which some blocks are skipped."""
     matrix = PATTERNS["grid of nodes"]
     count = len(matrix.indptr) - 1
     factors = MultifrontalLdl(upper_of(matrix))
@@ -138,7 +138,7 @@ def test_the_same_bits_on_any_number_of_cores(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_factors_that_share_an_analysis_keep_to_their_own_matrices() -> None:
-    """Two at once, to the bits of those that have found it for themselves."""
+    """Two solvers with one analysis give the bits of solvers with their own."""
     upper = upper_of(random_matrix(60, 12.0))
     analysis, right = SymbolicFactorization.of(upper), np.random.default_rng(5).standard_normal((60, 3))
     shared = [MultifrontalLdl(upper, analysis) for _ in range(2)]
@@ -151,12 +151,13 @@ def test_factors_that_share_an_analysis_keep_to_their_own_matrices() -> None:
 
 
 def test_a_pivot_next_to_nothing_has_no_factors() -> None:
-    """In the middle of a block as at its start; what is only indefinite has."""
+    """In the middle of a block and at its start; an indefinite matrix has factors."""
     matrix = PATTERNS["full, of fifty"].toarray()
     whole = upper_of(sparse.csc_matrix(matrix))
     factors = MultifrontalLdl(whole)
-    # The matrix whose Schur complement at the last of k rows, in the order of elimination, is so much of the diagonal.
-    place = np.argsort(factors.place)
+    # The matrix whose Schur complement at the last of k rows, in the order of elimination, is `share` times the
+    # diagonal entry.
+    place = np.argsort(factors.permutation)
     for k in (1, 17, 50):
         inside, last = place[: k - 1], place[k - 1]
         schur = matrix[last, inside] @ np.linalg.solve(matrix[np.ix_(inside, inside)], matrix[inside, last])
@@ -175,7 +176,7 @@ def test_a_pivot_next_to_nothing_has_no_factors() -> None:
 
 @pytest.mark.parametrize("size", [2, 7, 60])
 def test_an_inverse_comes_with_the_count_of_positive_eigenvalues(size: int) -> None:
-    """Of any symmetric matrix, a diagonal of zeros and blocks of two among them; the upper triangle is not read."""
+    """For any symmetric matrix, also with a zero diagonal and 2 x 2 pivots; the upper triangle is not read."""
     random = np.random.default_rng(size)
     for diagonal in (0.0, 1.0, 10.0, -10.0):
         lower = np.tril(random.normal(size=(size, size)), -1)

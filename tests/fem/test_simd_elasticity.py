@@ -1,4 +1,4 @@
-"""Eq. (5), elements by fours against one at a time: the same numbers, whatever way they are added up."""
+"""Eq. (5): elements in groups of four agree with elements one at a time, up to the order of summation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def both(mesh: TetMesh) -> Pair:
 
 
 def part(count: int) -> TetMesh:
-    """The first tetrahedra of a block, whose nodes are put in another order: of a group of four some are missing."""
+    """Return the first tetrahedra of a block with permuted nodes; the last group of four is incomplete."""
     mesh = block_mesh()
     used, corners = np.unique(mesh.tets[:count], return_inverse=True)
     order = np.random.default_rng(count).permutation(len(used))
@@ -34,7 +34,7 @@ def part(count: int) -> TetMesh:
 
 
 def strings(mesh: TetMesh) -> MuscleEnergy:
-    """Three segments between a few nodes each; one is slack, one shorter than what pulls fully."""
+    """Three segments between a few nodes each; one is slack, one is below the full-force length."""
     rng = np.random.default_rng(2)
     rows = sparse.csr_matrix(rng.standard_normal((3, len(mesh.nodes))) * (rng.random((3, len(mesh.nodes))) < 0.6))
     lengths = np.linalg.norm(rows @ mesh.nodes, axis=1)
@@ -72,7 +72,7 @@ def test_they_are_those_of_one_at_a_time(count: int | None, dt: float | None) ->
 
 
 def test_shapes_whose_axes_are_not_told_apart() -> None:
-    """At rest, stretched along one axis, and pulled alike everywhere: rotations that have nothing to turn."""
+    """At rest, stretched along one axis, and scaled uniformly: equal principal stretches, with no rotation to find."""
     mesh = block_mesh()
     one, four = both(mesh)
     for shape in (np.ones(3), np.array([1.0, 1.0, 1.3]), 0.8 * np.ones(3)):
@@ -84,7 +84,7 @@ def test_shapes_whose_axes_are_not_told_apart() -> None:
 
 
 def test_an_inverted_element_among_four() -> None:
-    """The energy is infinite, the gradient no number, as for one at a time; those of others stay what they are."""
+    """The energy is infinite and the gradient not finite, as for single elements; later calls are not affected."""
     mesh = block_mesh()
     one, four = both(mesh)
     turned = mesh.nodes.copy()

@@ -1,5 +1,5 @@
 """The step's equation (Eq. 4, 6): it is the derivative of an energy, its tangent is its derivative, both momenta are
-kept; free fall, spin, drag, and a column that sags.
+conserved; free fall, spin, drag, and a column that sags.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def tension(body: SoftBody) -> MuscleEnergy:
 
 @pytest.mark.parametrize("muscles", [False, True])
 def test_the_residual_is_the_derivative_of_an_energy_but_for_a_turn(device: str, muscles: bool) -> None:
-    """Eq. (4), Eq. (6): central differences of Phi(v), with drag and Rayleigh damping; what differs is M times the
-    rigid turn that is given back, to rounding.
+    """Eq. (4), Eq. (6): central differences of Phi(v), with drag and Rayleigh damping; the difference is M times
+    the rigid rotation of the momentum correction, to rounding.
     """
     body = make_body(block_mesh(), FLOOR, device=device)
     problem = StepProblem(body, bent_state(body), DT, drag=0.7)
@@ -71,7 +71,7 @@ def test_the_residual_is_the_derivative_of_an_energy_but_for_a_turn(device: str,
 @pytest.mark.parametrize("drag", [0.0, 0.7])
 @pytest.mark.parametrize("muscles", [False, True])
 def test_the_tangent_inverts_the_derivative(body: SoftBody, tension: MuscleEnergy, drag: float, muscles: bool) -> None:
-    """Central differences of the residual along J^-1 b give b, with muscles and the kept angular momentum."""
+    """Central differences of the residual along J^-1 b give b, with muscles and the momentum projection."""
     problem, pull = StepProblem(body, spinning_state(body), DT, drag), tension if muscles else None
     v = problem.state.velocities + DT * body.gravity
     tangent = problem.tangent(MultifrontalLdl(body.assembly.upper_pattern), v, pull)
@@ -98,8 +98,8 @@ def test_every_column_has_the_momenta_of_its_impulse(body: SoftBody, tension: Mu
 def test_an_indefinite_stiffness_is_projected_and_keeps_the_momenta(
     body: SoftBody, tension: MuscleEnergy, muscles: bool
 ) -> None:
-    """Squashed to 40 % in a long step the true S has negative pivots, which muscles do not mend; a definite one near it
-    has the momenta, too."""
+    """Squashed to 40 % in a long step the true S has negative pivots, also with muscles; its definite approximation
+    conserves the momenta, too."""
     squashed = BodyState(body.mesh.nodes * [1.1, 1.1, 0.4], np.zeros_like(body.mesh.nodes))
     problem, factors = StepProblem(body, squashed, 1.0), MultifrontalLdl(body.assembly.upper_pattern)
     entries = body.assembly.hessian_entries(squashed.positions, problem.damping, factor=1.0)
@@ -135,7 +135,7 @@ def test_a_step_says_when_it_does_not_converge(body: SoftBody) -> None:
 def fall(
     body: SoftBody, start: BodyState, dt: float, steps: int, tension: MuscleEnergy | None = None, *, drag: float = 0.0
 ) -> tuple[list[BodyState], float]:
-    """States of a free flight, and the spin given back, rad/s summed over the steps."""
+    """Return the states of a free flight and the sum of the momentum corrections, rad/s."""
     flying, states, given = passive_body(body, state=start), [start], 0.0
     for _ in range(steps):
         problem, result = flying.advance(dt, tension, drag=drag)
@@ -182,10 +182,10 @@ def test_free_fall_converges_at_rate_one(body: SoftBody) -> None:
 @pytest.mark.parametrize("damping_ratio", [0.0, 0.05])
 def test_spin_survives_a_free_half_turn(damping_ratio: float) -> None:
     """A free half turn in 24 steps keeps L to rounding and turns by 180 degrees within 3; 10 % of the spin is what
-    implicit Euler alone would have eaten.
+    implicit Euler alone would lose.
 
-    Damped or not, for the damping of Eq. (6) does not see rotations. The body is stiff, for a soft one grows under the
-    spin and so turns slower.
+    With and without damping, as Eq. (6) does not damp rotations. The body is stiff, since a soft one expands under the
+    spin and so rotates more slowly.
     """
     body = make_body(block_mesh(), FLOOR, sag=1e-3, damping_ratio=damping_ratio, device="cpu")
     steps = 24

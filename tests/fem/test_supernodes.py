@@ -1,4 +1,4 @@
-"""The symbolic analysis: blocks hold all that a factor has, in an order in which they can be eliminated."""
+"""Symbolic analysis: the blocks contain all entries of the factor, in a valid order of elimination."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.support.sparse_patterns import PATTERNS, upper_of
 
 @pytest.mark.parametrize("name", PATTERNS)
 def test_blocks_hold_the_factor(name: str) -> None:
-    """Of a matrix with that pattern, every entry of L that is not zero lies in a block; blocks tile the columns."""
+    """Every nonzero entry of L lies in a block, and the blocks partition the columns."""
     matrix = PATTERNS[name]
     blocks, count = Supernodes.of(upper_of(matrix)), len(matrix.indptr) - 1
     assert np.array_equal(np.sort(blocks.permutation), np.arange(count))
@@ -25,7 +25,7 @@ def test_blocks_hold_the_factor(name: str) -> None:
         own = np.arange(blocks.first[s], blocks.first[s] + blocks.widths[s])
         assert np.array_equal(front[: len(own)], own) and (np.diff(front) > 0).all()
         held[np.ix_(front, own)] = True
-        # What is below is taken in by the parent, which comes later.
+        # The rows below are in the parent, which comes later.
         below, parent = front[len(own) :], blocks.parents[s]
         assert (parent < 0) == (len(below) == 0)
         if parent >= 0:
@@ -35,7 +35,7 @@ def test_blocks_hold_the_factor(name: str) -> None:
 
 
 def test_blocks_of_a_mesh_are_wide_and_nearly_full() -> None:
-    """The three rows of a node are one; of what the blocks of a grid of nodes hold, most is not zero."""
+    """The three rows of a node form one group; most entries of the blocks of a grid are nonzero."""
     matrix = PATTERNS["grid of nodes"]
     full = sparse.csc_matrix(matrix)
     full.sort_indices()
@@ -46,5 +46,5 @@ def test_blocks_of_a_mesh_are_wide_and_nearly_full() -> None:
     factor = np.linalg.cholesky(matrix.toarray()[np.ix_(order, order)])
     held = (blocks.widths * (blocks.heights - 0.5 * (blocks.widths - 1.0))).sum()
     assert held < 1.35 * np.count_nonzero(np.abs(factor) > 1e-14)
-    # An order as it comes would hold half as much again.
+    # The given order would have 1.5 times as many entries.
     assert held < np.count_nonzero(np.abs(np.linalg.cholesky(matrix.toarray())) > 1e-14) / 1.5

@@ -1,4 +1,4 @@
-"""Tasks make the inverse of a factor, one after the other."""
+"""The tasks, executed in sequence, compute the inverse of a factor."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SIZES = [([1], 0), ([64], 0), ([200], 0), ([1, 1], 1), ([65, 3, 130], 70), ([64,
 
 
 def padded(entries: np.ndarray, *, unit: bool) -> np.ndarray:
-    """(SIDE, SIDE), beyond the ``entries`` the unit matrix or zeros."""
+    """Pad ``entries`` to (``TILE_SIDE``, ``TILE_SIDE``) with the identity or zeros."""
     tile = np.eye(TILE_SIDE) if unit else np.zeros((TILE_SIDE, TILE_SIDE))
     tile[: len(entries)] = tile[:, : entries.shape[1]] = 0.0
     tile[: len(entries), : entries.shape[1]] = entries
@@ -22,7 +22,7 @@ def padded(entries: np.ndarray, *, unit: bool) -> np.ndarray:
 
 
 def work(plan: TileTaskGraph, matrix: np.ndarray) -> np.ndarray:
-    """What the tasks make of a ``matrix``, nothing of it known before it is made."""
+    """Execute the tasks for ``matrix``; a tile that is read before it is written raises ``KeyError``."""
     tiles: dict[int, np.ndarray] = {}
     inverses: dict[int, np.ndarray] = {}
     root = np.full_like(matrix, np.nan)
@@ -32,36 +32,36 @@ def work(plan: TileTaskGraph, matrix: np.ndarray) -> np.ndarray:
         tiles[number] = tile
 
     for task in plan.tasks.tolist():
-        kind, row, rows, column, width, by, first, last, made, diagonal, turned, begun, square = task[:13]
-        own, there = slice(row, row + rows), slice(column, column + width)
+        kind, row, rows, column, width, by, first, last, out, diagonal, transposed, initial, diagonal_sum = task[:13]
+        own, target = slice(row, row + rows), slice(column, column + width)
         if kind == Kind.ZEROS:
             root[own, :column] = root[own, width:] = 0.0
             continue
-        if begun >= 0:
-            tile = tiles[begun].copy()
+        if initial >= 0:
+            tile = tiles[initial].copy()
         elif kind == Kind.UNIT:
             tile = np.zeros((TILE_SIDE, TILE_SIDE))
         else:
-            tile = padded(matrix[own, there], unit=row == column)
-        beside = tiles[square].copy() if square >= 0 else padded(matrix[own, own], unit=True)
+            tile = padded(matrix[own, target], unit=row == column)
+        beside = tiles[diagonal_sum].copy() if diagonal_sum >= 0 else padded(matrix[own, own], unit=True)
         for one, other in plan.pairs[first:last].tolist():
             tile -= tiles[one] @ tiles[other].T
             beside -= tiles[one] @ tiles[one].T
         if kind == Kind.SUM:
-            keep(made, tile)
+            keep(out, tile)
             continue
         if kind == Kind.FIRST:
             beside = tile
         else:
             tile = tile @ inverses[by].T
-            keep(made, tile)
+            keep(out, tile)
             beside -= tile @ tile.T
         if kind == Kind.UNIT:
-            root[there, own] = tile[:rows, :width].T
+            root[target, own] = tile[:rows, :width].T
         if kind in (Kind.FIRST, Kind.CHAINED):
             assert diagonal not in inverses
             inverses[diagonal] = inv(cholesky(beside))
-            keep(turned, inverses[diagonal].T)
+            keep(transposed, inverses[diagonal].T)
             root[own, own] = inverses[diagonal][:rows, :rows]
     assert len(tiles) == plan.tiles and len(inverses) == plan.columns
     return root

@@ -1,4 +1,4 @@
-"""Inverses of factors by tiles on a GPU are those of a CPU."""
+"""Tiled inverse factors on a GPU agree with NumPy."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ SIZES = [
 @pytest.mark.cuda
 @pytest.mark.parametrize(("parts", "between"), SIZES)
 def test_tiles_make_the_inverse_of_a_factor(parts: list[int], between: int) -> None:
-    """Where something else was before, too; always with the same bits, also after a matrix that has no factor, and by
-    however many blocks."""
+    """Previous contents of the output do not matter; results are bitwise equal, also after an indefinite matrix and for
+    any number of blocks."""
     count = sum(parts) + between
     random = np.random.default_rng(count)
     order = random.permutation(count)
@@ -46,7 +46,7 @@ def test_tiles_make_the_inverse_of_a_factor(parts: list[int], between: int) -> N
     def make(entries: np.ndarray) -> bool:
         inverse.fill_(3.0)
         matrix.copy_(torch.from_numpy(np.tril(entries)))
-        return bool(tiled.make())
+        return bool(tiled.factor())
 
     assert make(given)
     root = inverse.cpu().numpy()

@@ -49,7 +49,7 @@ def test_every_kind_is_made_as_written(tmp_path: Path) -> None:
 
 
 def test_stiffness_strain_units_groups_and_partners(tmp_path: Path) -> None:
-    """Lengths are in capture units; a stiffness is kept as asked; mirrored fibres are each other's partners."""
+    """Lengths are in capture units; a given stiffness is used unchanged; mirrored fibres are partners."""
     doubled = {**FREE, "points": (2.0 * np.array(FREE["points"])).tolist(), "mirror": True, "group": "sides"}
     content = {
         "max_strain": 0.2,
@@ -72,7 +72,7 @@ def test_stiffness_strain_units_groups_and_partners(tmp_path: Path) -> None:
     ("content", "message"),
     [
         ("{", "not JSON at line 1"),
-        ([], "the file holds no object"),
+        ([], "the file contains no object"),
         ({}, 'no fibres; give a list "fibres"'),
         ({"fibres": []}, 'no fibres; give a list "fibres"'),
         ({"fibres": [STRAIGHT], "fibers": []}, '"fibers" is not known here; use fibres, max_strain, mirror_plane'),
@@ -97,8 +97,8 @@ def test_stiffness_strain_units_groups_and_partners(tmp_path: Path) -> None:
         ({"fibres": [{**STRAIGHT, "strength": 1, "stiffness": 1}]}, 'both "strength" and "stiffness"'),
         ({"fibres": [{**STRAIGHT, "group": 7}]}, '"group" is 7; give a name in quotes'),
         ({"fibres": [{**STRAIGHT, "mirror": "x"}]}, '"mirror" is "x"; give true or false'),
-        ({"fibres": [{**STRAIGHT, "mirror": True}]}, "is to be mirrored but the file has no plane"),
-        ({"fibres": [STRAIGHT, STRAIGHT]}, 'fibre "back" is there twice'),
+        ({"fibres": [{**STRAIGHT, "mirror": True}]}, "is mirrored but the file has no plane"),
+        ({"fibres": [STRAIGHT, STRAIGHT]}, 'fibre "back" occurs twice'),
         ({"fibres": [{**STRAIGHT, "to": [0, 0, 9]}]}, "the point [0, 0, 9] is 8 units away from the body"),
         ({"fibres": [{**STRAIGHT, "to": STRAIGHT["from"]}]}, "has two equal points in a row"),
         ({"fibres": [{**STRAIGHT, "segments": 400}, {**STRAIGHT, "name": "b"}]}, "404 segments in all"),

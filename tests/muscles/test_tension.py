@@ -36,7 +36,7 @@ def tendon(count: int) -> MuscleSet:
 
 
 def scattered(rng: np.random.Generator) -> MuscleEnergy:
-    """Segments across the rod, some that pull and some that push."""
+    """Segments across the rod, with positive and negative tensions."""
     points = rng.uniform([-0.03, -0.03, 0.1], [0.03, 0.03, 0.9], (6, 4, 3))
     muscles = attach_fibres(ROD, [Fibre(f"f{i}", FibreKind.USER, p, 5.0 + i) for i, p in enumerate(points)])
     return MuscleEnergy.of(muscles, rng.uniform(-1.0, 1.0, muscles.segment_count) * muscles.bounds)
@@ -49,7 +49,7 @@ def dense(tension: MuscleEnergy, x: np.ndarray) -> np.ndarray:
 
 
 def test_segments_of_a_rod_that_is_pressed_are_shorter() -> None:
-    """By a tenth of their rest length each, at whatever place and turn it ends."""
+    """By a tenth of their rest lengths, after any translation and rotation."""
     muscles, turned = tendon(3), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     pressed = (ROD.nodes * [1.0, 1.0, 0.9]) @ turned.T + [1.0, 2.0, 3.0]
     np.testing.assert_allclose(shortening(muscles, ROD.nodes, pressed), 0.1 * muscles.rest_lengths, rtol=1e-9)
@@ -239,7 +239,7 @@ def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
     right = np.random.default_rng(3).standard_normal((whole.shape[0], 4))
     tangent = problem.tangent(MultifrontalLdl(rod.assembly.upper_pattern), still, tension)
     found = tangent.solve(right)
-    # But for so much of a turn as keeps the angular momentum.
+    # Except for the rigid rotation that conserves the angular momentum.
     turned = problem.momenta.T
     missing = right - whole @ found
     missing = missing - turned @ np.linalg.lstsq(turned, missing, rcond=None)[0]
@@ -248,8 +248,8 @@ def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
 
 
 def test_impulses_of_groups_are_the_columns_of_their_muscles() -> None:
-    """Eq. (7), each at its bound, over the time, of a body that is bent so far that some pull less; one muscle a group,
-    and several."""
+    """Eq. (7) at the bounds, times the step size, for a body so bent that some segments lose force; with one muscle per
+    group, and with several."""
     creature = coarse_pawn()
     muscles, rest = creature.muscles, creature.body.mesh.nodes
     bent = rest * [1.0, 1.0, 0.6] + 0.01 * np.random.default_rng(0).standard_normal(rest.shape)

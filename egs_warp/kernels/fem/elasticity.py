@@ -7,22 +7,23 @@ from egs_warp.precision import Mat33, Vec3, real
 
 wp.set_module_options({"enable_backward": False})
 
-OFF, SWEEPS = 1e-31, 12
-_OFF = wp.constant(real(OFF))
-"""Of the squared trace: what is left beside the diagonal, squared, of a matrix in its principal axes."""
-_SWEEPS = wp.constant(SWEEPS)
-"""In which Jacobi's rotations, whose error squares in each, are long done."""
+DIAGONAL_TOLERANCE, MAX_SWEEPS = 1e-31, 12
+_DIAGONAL_TOLERANCE = wp.constant(real(DIAGONAL_TOLERANCE))
+"""Jacobi's iteration stops when the sum of squared off-diagonal entries is below this fraction of the squared trace."""
+_MAX_SWEEPS = wp.constant(MAX_SWEEPS)
+"""Maximum number of Jacobi sweeps; the iteration converges quadratically, so fewer suffice."""
 
 
 @wp.func
 def deformation_gradient(x: wp.array[Vec3], tet: wp.vec4i, rest_inverse: Mat33) -> Mat33:
+    """Return the deformation gradient F of a tetrahedron with nodes ``tet`` at positions ``x``."""
     edges = wp.matrix_from_cols(x[tet[1]] - x[tet[0]], x[tet[2]] - x[tet[0]], x[tet[3]] - x[tet[0]])
     return edges * rest_inverse
 
 
 @wp.func
 def shape_gradient(rest_inverse: Mat33, corner: int) -> Vec3:
-    """Gradient of a corner's hat function in the rest shape, so that F = sum_a x_a outer shape_gradient(a)."""
+    """Return the rest-space gradient g_a of a corner's shape function; F = sum_a x_a outer g_a."""
     if corner == 0:
         return -(rest_inverse[0] + rest_inverse[1] + rest_inverse[2])
     return rest_inverse[corner - 1]
@@ -30,12 +31,12 @@ def shape_gradient(rest_inverse: Mat33, corner: int) -> Vec3:
 
 @wp.func
 def principal_axes(symmetric: Mat33):
-    """The eigenvectors of a matrix, columns of a rotation, and its eigenvalues, by Jacobi's rotations."""
+    """Return the eigenvectors (columns of a rotation) and eigenvalues of a symmetric matrix, by Jacobi rotations."""
     m = real(1.0) * symmetric
     axes = wp.identity(n=3, dtype=wp.float64)
-    least = _OFF * wp.trace(m) * wp.trace(m)
+    tolerance = _DIAGONAL_TOLERANCE * wp.trace(m) * wp.trace(m)
     sweep = int(0)
-    while sweep < _SWEEPS and m[0, 1] * m[0, 1] + m[0, 2] * m[0, 2] + m[1, 2] * m[1, 2] > least:
+    while sweep < _MAX_SWEEPS and m[0, 1] * m[0, 1] + m[0, 2] * m[0, 2] + m[1, 2] * m[1, 2] > tolerance:
         sweep += 1
         for r in range(3):
             p = (r + 1) % 3
@@ -68,24 +69,37 @@ def principal_axes(symmetric: Mat33):
 
 @wp.func
 def damping_stress(start_gradient: Mat33, gradient: Mat33, dt: real, mu: real, lam: real) -> Mat33:
-    """Second Piola stress 2 mu E' + lambda tr(E') I of E' = (F^T F - F0^T F0) / (2 dt), F0 at the start of the step."""
+    """Return the second Piola stress 2 mu E' + lambda tr(E') I, E' = (F^T F - F0^T F0) / (2 dt), F0 at the start."""
     strain_rate = (wp.transpose(gradient) * gradient - wp.transpose(start_gradient) * start_gradient) / (real(2.0) * dt)
     return real(2.0) * mu * strain_rate + lam * wp.trace(strain_rate) * wp.identity(n=3, dtype=wp.float64)
 
 
 @wp.func
-def damping_block(stretch: Mat33, f_a: Vec3, f_b: Vec3, along: real, turning: real, dt: real, mu: real, lam: real):
-    """Block (a, b) of the derivative of F S by the corners: ``turning`` g_a.S g_b I from that of F, the rest from S
-    itself; ``stretch`` F F^T, ``f_a`` F g_a, ``along`` g_a.g_b.
+def damping_block(
+    stretch: Mat33, f_a: Vec3, f_b: Vec3, along: real, rotation_term: real, dt: real, mu: real, lam: real
+):
+    """Return block (a, b) of the derivative of F S with respect to the corners.
+
+    Args:
+        stretch: F F^T.
+        f_a: F g_a.
+        f_b: F g_b.
+        along: g_a.g_b.
+        rotation_term: g_a.S g_b, the factor of I from the derivative of F; the other terms come from that of S.
+        dt: step size, s.
+        mu: first Lame parameter.
+        lam: second Lame parameter.
     """
     material = mu * (along * stretch + wp.outer(f_b, f_a)) + lam * wp.outer(f_a, f_b)
-    return material / dt + turning * wp.identity(n=3, dtype=wp.float64)
+    return material / dt + rotation_term * wp.identity(n=3, dtype=wp.float64)
 
 
 @wp.func
 def write_first_corner(e: int, blocks: wp.array2d[Mat33]):
-    """The blocks of element ``e`` that its first corner has part in, and those below the diagonal, from the others: the
-    matrix is symmetric, and a body that goes elsewhere as a whole is not strained."""
+    """Complete the blocks of element ``e``: those below the diagonal by symmetry, those of corner 0 from the others.
+
+    By translation invariance the blocks of a row sum to zero.
+    """
     last = Mat33()
     for a in range(1, 4):
         row = Mat33()
@@ -109,6 +123,7 @@ def deformation_gradients_kernel(
     # Out:
     gradients_out: wp.array[Mat33],
 ):
+    """Compute F of each element; one thread per element."""
     e = wp.tid()
     gradients_out[e] = deformation_gradient(positions, tets[e], rest_inverses[e])
 
@@ -130,7 +145,10 @@ def element_energies_kernel(
     energies_out: wp.array[real],
     determinants_out: wp.array[real],
 ):
-    """Eq. (5) plus dt times half the dissipated power (none if dt is 0); infinite where an element is inverted."""
+    """Compute Eq. (5) plus dt times half the dissipated power (none if dt is 0) and det F of each element.
+
+    The energy of an inverted element is infinite.
+    """
     e = wp.tid()
     f = deformation_gradient(positions, tets[e], rest_inverses[e])
     j = wp.determinant(f)
@@ -164,7 +182,7 @@ def element_gradients_kernel(
     # Out:
     corner_gradients_out: wp.array2d[Vec3],
 ):
-    """Minus the elastic and damping force on each corner."""
+    """Compute minus the elastic and damping force on each corner of each element (no damping if dt is 0)."""
     e = wp.tid()
     f = deformation_gradient(positions, tets[e], rest_inverses[e])
     inverse_transpose = wp.transpose(wp.inverse(f))
@@ -178,7 +196,7 @@ def element_gradients_kernel(
 
 @wp.func
 def sum_lanes(part: Vec3) -> Vec3:
-    """Sum of the lanes' parts."""
+    """Return the sum of ``part`` over the threads of a warp."""
     return Vec3(warp_sum(part[0]), warp_sum(part[1]), warp_sum(part[2]))
 
 
@@ -187,27 +205,34 @@ def segment_forces_kernel(
     # Model:
     offsets: wp.array[int],
     nodes: wp.array[int],
-    shares: wp.array[real],
+    weights: wp.array[real],
     rest_lengths: wp.array[real],
-    slack: real,
-    full: real,
+    length_zero_force: real,
+    length_full_force: real,
     # In:
     tensions: wp.array[real],
     positions: wp.array[Vec3],
     # Out:
-    pulls_out: wp.array[Vec3],
+    forces_out: wp.array[Vec3],
 ):
-    """T phi u of each segment (Eq. 7), with the shares of tension of ``muscles.tension``."""
+    """T phi u of each segment (Eq. 7), phi as in ``muscles.tension.force_length_factor``.
+
+    One warp per segment (on a CPU one thread).
+    """
     segment, lane = wp.tid()
-    line = Vec3(real(0.0))
+    vector = Vec3(real(0.0))
     for slot in range(offsets[segment] + lane, offsets[segment + 1], warp_size()):
-        line += shares[slot] * positions[nodes[slot]]
-    line = sum_lanes(line)
-    length = wp.max(wp.length(line), real(1e-300))
-    along = wp.clamp((length / rest_lengths[segment] - slack) / (full - slack), real(0.0), real(1.0))
-    share = along * along * (real(3.0) - real(2.0) * along)
+        vector += weights[slot] * positions[nodes[slot]]
+    vector = sum_lanes(vector)
+    length = wp.max(wp.length(vector), real(1e-300))
+    along = wp.clamp(
+        (length / rest_lengths[segment] - length_zero_force) / (length_full_force - length_zero_force),
+        real(0.0),
+        real(1.0),
+    )
+    length_factor = along * along * (real(3.0) - real(2.0) * along)
     if lane == 0:
-        pulls_out[segment] = (tensions[segment] * share / length) * line
+        forces_out[segment] = (tensions[segment] * length_factor / length) * vector
 
 
 @wp.kernel
@@ -217,14 +242,14 @@ def gather_forces_kernel(
     corner_from_slot: wp.array[int],
     end_offsets: wp.array[int],
     segment_from_end: wp.array[int],
-    end_shares: wp.array[real],
+    end_weights: wp.array[real],
     # In:
     corner_values: wp.array2d[Vec3],
-    pulls: wp.array[Vec3],
+    forces: wp.array[Vec3],
     # Out:
     node_values_out: wp.array[Vec3],
 ):
-    """Of each node's corners and, where there are ends of muscles, of those."""
+    """Sum the values of each node's corners and, if there are muscles, of its segment ends; one warp per node."""
     node, lane = wp.tid()
     total = Vec3(real(0.0))
     for slot in range(corner_offsets[node] + lane, corner_offsets[node + 1], warp_size()):
@@ -232,7 +257,7 @@ def gather_forces_kernel(
         total += corner_values[corner // 4, corner % 4]
     if end_offsets.shape[0] > 0:
         for slot in range(end_offsets[node] + lane, end_offsets[node + 1], warp_size()):
-            total += end_shares[slot] * pulls[segment_from_end[slot]]
+            total += end_weights[slot] * forces[segment_from_end[slot]]
     total = sum_lanes(total)
     if lane == 0:
         node_values_out[node] = total
@@ -254,10 +279,10 @@ def element_hessians_kernel(
     # Out:
     blocks_out: wp.array2d[Mat33],
 ):
-    """True Hessian of Eq. (5): block (a, b) = V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T],
-    h = F^-T g.
+    """Compute the Hessian of Eq. (5) for each element.
 
-    Plus that of the damping (Eq. 6) over a step of dt, if dt is not 0.
+    Block (a, b) = V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T], h = F^-T g. Adds that of the
+    damping (Eq. 6) over a step of dt, if dt is not 0.
     """
     e = wp.tid()
     rest_inverse = rest_inverses[e]
@@ -282,8 +307,8 @@ def element_hessians_kernel(
                 + lam * wp.outer(h_a, h_b)
             )
             if dt > real(0.0):
-                turning = wp.dot(g_a, stress * g_b)
-                block += damping_time * damping_block(stretch, f_a, f * g_b, along, turning, dt, mu, lam)
+                rotation_term = wp.dot(g_a, stress * g_b)
+                block += damping_time * damping_block(stretch, f_a, f * g_b, along, rotation_term, dt, mu, lam)
             blocks_out[e, 4 * a + b] = volumes[e] * block
     write_first_corner(e, blocks_out)
 
@@ -304,12 +329,12 @@ def element_projected_hessians_kernel(
     # Out:
     blocks_out: wp.array2d[Mat33],
 ):
-    """The Hessian with the negative eigenvalues of each element set to zero, by the eigensystem of an isotropic energy.
+    """Compute element Hessians with negative eigenvalues set to zero, by the eigensystem of an isotropic energy.
 
     In the frames of F = U diag(s) V^T the Hessian splits into the 3x3 block d2Psi/ds_i ds_j and, for each pair i < k, a
     twist eigenvalue (Psi_i + Psi_k)/(s_i + s_k) and a flip eigenvalue (Psi_i - Psi_k)/(s_i - s_k) (Smith, de Goes, Kim
-    2019). For Eq. (5) these are mu + (lambda ln J - mu)/(s_i s_k) and mu - (lambda ln J - mu)/(s_i s_k). Of the damping
-    the semi-definite part is added: without the turning of F.
+    2019). For Eq. (5) these are mu + (lambda ln J - mu)/(s_i s_k) and mu - (lambda ln J - mu)/(s_i s_k). Only
+    the semi-definite part of the damping is added, without the term from the derivative of F.
     """
     e = wp.tid()
     rest_inverse = rest_inverses[e]
@@ -367,7 +392,7 @@ def gather_matrix_kernel(
     # Out:
     entries_out: wp.array[real],
 ):
-    """Upper-triangular matrix entries of ``factor`` times the sum of the elements' blocks, one thread a 3x3 block."""
+    """Compute the upper entries of ``factor`` times the sum of the elements' blocks; one thread per 3x3 block."""
     block_index = wp.tid()
     total = Mat33()
     for slot in range(contribution_offsets[block_index], contribution_offsets[block_index + 1]):

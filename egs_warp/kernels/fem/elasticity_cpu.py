@@ -1,4 +1,7 @@
-"""``kernels.fem.elasticity`` on a CPU: four tetrahedra at a time in vectors, added up in their order by one thread."""
+"""``kernels.fem.elasticity`` on a CPU: vectors of four tetrahedra, summed in a fixed order by one thread.
+
+Host code: ``egs_warp.fem.simd_elasticity``.
+"""
 
 import warp as wp
 
@@ -8,9 +11,9 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 LANES = 4
-"""Tetrahedra that are taken at once; behind the last come some without volume."""
+"""Tetrahedra of a group; the last group is filled with tetrahedra of zero volume."""
 PAIRS = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
-"""Corners of the blocks that an element has in the upper triangle, in their order in ``Elements.entries``."""
+"""Corner pairs of the blocks of an element in the upper triangle, in the order of ``Elements.entries``."""
 
 _ELEMENTS = """
     constexpr int LANES = 4;
@@ -18,7 +21,7 @@ _ELEMENTS = """
     auto root = [](v4 x) { return __builtin_elementwise_sqrt(x); };
     auto log_of = [](v4 x) { return v4{wp::log(x[0]), wp::log(x[1]), wp::log(x[2]), wp::log(x[3])}; };
     const int groups = elements.volumes.shape[0] / LANES;
-    // Deformation gradient and shape gradients of the corners but the first of a group.
+    // Deformation gradients F of a group, and shape gradients R of all corners but the first.
     auto load = [&](const double* x, int group, M& F, M& R) {
         #pragma clang fp contract(fast)
         const double* const rest = elements.rests.data + group * 9 * LANES;
@@ -37,7 +40,7 @@ _ELEMENTS = """
             for (int j = 0; j < 3; ++j)
                 F.at[i][j] = E.at[i][0] * R.at[0][j] + E.at[i][1] * R.at[1][j] + E.at[i][2] * R.at[2][j];
     };
-    // Cofactors, and the determinant.
+    // Cofactors C; returns the determinant.
     auto cofactors = [](const M& F, M& C) {
         #pragma clang fp contract(fast)
         for (int i = 0; i < 3; ++i)
@@ -47,57 +50,66 @@ _ELEMENTS = """
             }
         return F.at[0][0] * C.at[0][0] + F.at[0][1] * C.at[0][1] + F.at[0][2] * C.at[0][2];
     };
-    // F^T F, by the six of its upper triangle.
+    // F^T F: the six entries of its upper triangle.
     auto stretch_of = [](const M& F, v4* six) {
         #pragma clang fp contract(fast)
         for (int i = 0, k = 0; i < 3; ++i)
             for (int j = i; j < 3; ++j, ++k)
                 six[k] = F.at[0][i] * F.at[0][j] + F.at[1][i] * F.at[1][j] + F.at[2][i] * F.at[2][j];
     };
-    // Stress of damping, as long as ``dt`` is not 0.
+    // Damping stress; dt must not be 0.
     auto damping_stress = [&](const M& F, int group, double dt, M& S) {
         #pragma clang fp contract(fast)
         const double *const start = starts.data + group * 6 * LANES, half = 0.5 / dt;
         v4 rate[6];
         stretch_of(F, rate);
         for (int k = 0; k < 6; ++k) rate[k] = (rate[k] - *(const v4*)(start + k * LANES)) * half;
-        const v4 all = elements.lam * (rate[0] + rate[3] + rate[5]);
+        const v4 trace_term = elements.lam * (rate[0] + rate[3] + rate[5]);
         for (int i = 0, k = 0; i < 3; ++i)
             for (int j = i; j < 3; ++j, ++k)
-                S.at[i][j] = S.at[j][i] = 2.0 * elements.mu * rate[k] + (i == j ? all : v4(0.0));
+                S.at[i][j] = S.at[j][i] = 2.0 * elements.mu * rate[k] + (i == j ? trace_term : v4(0.0));
     };
 """
 
 
 @wp.struct
 class Elements:
-    """Of a mesh, by groups of ``LANES`` tetrahedra."""
+    """Mesh in groups of ``LANES`` tetrahedra; T is padded to a multiple of ``LANES``."""
 
     corners: wp.array[wp.int32]
-    """(T, 4) nodes."""
+    """(T, 4) nodes, flat."""
     rests: wp.array[real]
-    """(T / 4, 9, 4) inverse edges at rest, row by row."""
+    """(T / 4, 9, 4) 1/m, inverse edge matrices at rest, row by row, flat."""
     volumes: wp.array[real]
-    """(T,)."""
+    """(T,) m^3; 0 for padding."""
     entries: wp.array[wp.int32]
-    """(T, 78) where the numbers of each of ``PAIRS`` go in the matrix, row by row, of those of a corner with itself
-    the upper triangle."""
+    """(T, 78) matrix entry of each number of the blocks ``PAIRS``, row by row; upper triangles of blocks (a, a)."""
     mu: real
+    """First Lame parameter, Pa."""
     lam: real
+    """Second Lame parameter, Pa."""
     damping_time: real
+    """beta, s."""
 
 
 @wp.struct
 class MuscleSegments:
-    """Muscles' segments, see ``segment_pulls_kernel``; there may be none."""
+    """Muscle segments (``elasticity.segment_forces_kernel``), possibly none."""
 
     offsets: wp.array[wp.int32]
+    """(M + 1,) offset of each segment in ``nodes`` and ``weights``."""
     nodes: wp.array[wp.int32]
+    """Nodes of each segment."""
     weights: wp.array[real]
+    """Weights of these nodes; the segment vector is the weighted sum of their positions."""
     rest_lengths: wp.array[real]
+    """(M,) m."""
     tensions: wp.array[real]
+    """(M,) N."""
     length_zero_force: real
+    """Relative length at and below which a segment exerts no force."""
     length_full_force: real
+    """Relative length at and above which a segment exerts its full tension."""
 
 
 @wp.func_native(
@@ -115,7 +127,7 @@ class MuscleSegments:
     )
 )
 def starts_native(elements: Elements, positions: wp.array2d[real], starts: wp.array[real]):
-    """See ``starts_kernel``."""
+    """Write F^T F of all elements to ``starts``; see ``starts_kernel``."""
     ...
 
 
@@ -153,7 +165,7 @@ def starts_native(elements: Elements, positions: wp.array2d[real], starts: wp.ar
 def energy_of(
     elements: Elements, positions: wp.array2d[real], starts: wp.array[real], dt: real, determinants: wp.array[real]
 ) -> real:
-    """See ``energy_kernel``."""
+    """Return the energy and write det F; see ``energy_kernel``."""
     ...
 
 
@@ -214,21 +226,21 @@ def gradient_native(
     dt: real,
     gradient: wp.array2d[real],
 ):
-    """See ``gradient_kernel``."""
+    """Write the gradient of elasticity, damping and muscles; see ``gradient_kernel``."""
     ...
 
 
 _HESSIANS = """
-    // Blocks of a group among corners but the first, a <= b: six of nine.
+    // Index of block (a, b), 1 <= a <= b, among the six stored blocks of a group.
     auto at_of = [](int a, int b) { return a == 1 ? b - 1 : a + b - 1; };
-    // What damping adds to a block, of F F^T and F g_a; ``turning`` only in the true derivative.
-    auto add_damping = [&](v4* block, const M& FF, const v4* fa, const v4* fb, v4 along, v4 turning, double dt) {
+    // Damping term of a block, from F F^T and F g_a; rotation_term is nonzero only in the true derivative.
+    auto add_damping = [&](v4* block, const M& FF, const v4* fa, const v4* fb, v4 along, v4 rotation_term, double dt) {
         #pragma clang fp contract(fast)
         const double beta = elements.damping_time, by = beta / dt;
         for (int i = 0; i < 3; ++i)
             for (int k = 0; k < 3; ++k)
                 block[3 * i + k] += by * elements.mu * (along * FF.at[i][k] + fb[i] * fa[k])
-                    + by * elements.lam * fa[i] * fb[k] + (i == k ? beta * turning : v4(0.0));
+                    + by * elements.lam * fa[i] * fb[k] + (i == k ? beta * rotation_term : v4(0.0));
     };
     auto scatter = [&](int group, const v4 (*block)[9]) {
         v4 all[78];
@@ -312,7 +324,7 @@ def hessian_native(
     factor: real,
     entries: wp.array[real],
 ):
-    """See ``hessian_kernel``."""
+    """Write the upper entries of the Hessian; see ``hessian_kernel``."""
     ...
 
 
@@ -323,15 +335,15 @@ def hessian_native(
         + """
     const double mu = elements.mu, lam = elements.lam;
     auto larger = [](v4 x) { return x > 0.0 ? x : v4(0.0); };
-    // Eigenvectors, columns of a rotation, of a symmetric matrix, which ends diagonal: Jacobi's rotations, in as many
-    // sweeps as the slowest of a group needs.
+    // Eigenvectors (columns of a rotation) of symmetric matrices by Jacobi rotations, which make m diagonal, in as many
+    // sweeps as the slowest matrix of the group needs.
     auto principal_axes = [&](M& m, M& axes) {
         #pragma clang fp contract(fast)
         for (int k = 0; k < 9; ++k) axes.at[k / 3][k % 3] = k % 4 == 0 ? 1.0 : 0.0;
-        const v4 trace = m.at[0][0] + m.at[1][1] + m.at[2][2], least = off * trace * trace;
-        for (int sweep = 0; sweep < sweeps; ++sweep) {
-            const v4 beside = m.at[0][1] * m.at[0][1] + m.at[0][2] * m.at[0][2] + m.at[1][2] * m.at[1][2];
-            const auto more = beside > least;
+        const v4 trace = m.at[0][0] + m.at[1][1] + m.at[2][2], limit = tolerance * trace * trace;
+        for (int sweep = 0; sweep < max_sweeps; ++sweep) {
+            const v4 off_diagonal = m.at[0][1] * m.at[0][1] + m.at[0][2] * m.at[0][2] + m.at[1][2] * m.at[1][2];
+            const auto more = off_diagonal > limit;
             if (!(more[0] | more[1] | more[2] | more[3])) break;
             for (int r = 0; r < 3; ++r) {
                 const int p = (r + 1) % 3, q = (r + 2) % 3;
@@ -422,17 +434,17 @@ def projected_hessian_native(
     starts: wp.array[real],
     dt: real,
     factor: real,
-    off: real,
-    sweeps: wp.int32,
+    tolerance: real,
+    max_sweeps: wp.int32,
     entries: wp.array[real],
 ):
-    """See ``hessian_kernel``."""
+    """Write the upper entries of the Hessian; see ``hessian_kernel``."""
     ...
 
 
 @wp.kernel
 def starts_kernel(elements: Elements, positions: wp.array2d[real], starts_out: wp.array[real]) -> None:
-    """(T / 4, 6, 4) F^T F at ``positions`` (N, 3), which damping needs of a step's start: its upper triangle."""
+    """Write the upper triangles (T / 4, 6, 4) of F^T F at ``positions`` (N, 3), the reference of the damping."""
     starts_native(elements, positions, starts_out)
 
 
@@ -448,7 +460,7 @@ def energy_kernel(
     energy_out: wp.array[real],
     determinants_out: wp.array[real],
 ) -> None:
-    """The sum over ``element_energies_kernel``, and det F (T,); no damping, and no ``starts``, where ``dt`` is 0."""
+    """Compute the sum of the energies of ``element_energies_kernel`` and det F (T,); no damping if ``dt`` is 0."""
     energy_out[0] = energy_of(elements, positions, starts, dt, determinants_out)
 
 
@@ -464,7 +476,7 @@ def gradient_kernel(
     # Out:
     gradient_out: wp.array2d[real],
 ) -> None:
-    """(N, 3) sums over ``element_gradients_kernel`` and ``segment_pulls_kernel``."""
+    """Compute the nodal sums (N, 3) of ``element_gradients_kernel`` and ``segment_forces_kernel``."""
     gradient_native(elements, lines, positions, starts, dt, gradient_out)
 
 
@@ -478,14 +490,17 @@ def hessian_kernel(
     dt: real,
     factor: real,
     projected: wp.int32,
-    off: real,
-    sweeps: wp.int32,
+    tolerance: real,
+    max_sweeps: wp.int32,
     # Out:
     entries_out: wp.array[real],
 ) -> None:
-    """``factor`` times the upper entries of the sum over ``element_hessians_kernel``, or, ``projected``, over
-    ``element_projected_hessians_kernel``, of whose rotations ``off`` and ``sweeps`` are."""
+    """Compute ``factor`` times the upper entries of the assembled element Hessians.
+
+    If ``projected`` is nonzero, those of ``element_projected_hessians_kernel``, whose Jacobi iteration uses
+    ``tolerance`` and ``max_sweeps``; else those of ``element_hessians_kernel``.
+    """
     if projected != 0:
-        projected_hessian_native(elements, positions, starts, dt, factor, off, sweeps, entries_out)
+        projected_hessian_native(elements, positions, starts, dt, factor, tolerance, max_sweeps, entries_out)
     else:
         hessian_native(elements, positions, starts, dt, factor, entries_out)

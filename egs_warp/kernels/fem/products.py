@@ -1,6 +1,7 @@
 """Products of a sparse symmetric matrix with panels of vectors, and of panels with each other, on a CPU.
 
-Threads share panels as they come to them, so that one that is late or slow does less.
+Threads take panels from a shared counter, so that a slow or late thread processes fewer. Host code:
+``egs_warp.fem.multifrontal``.
 """
 
 import warp as wp
@@ -11,35 +12,38 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 PANEL, STRIP = 16, 8
-"""Vectors that lie together, in a row of memory for each unknown, and of them those that are taken at a time."""
+"""Vectors of a panel, which is stored row by row per unknown, and vectors that one pass over the matrix processes."""
 
 
 @wp.struct
 class Rows:
-    """A matrix row by row."""
+    """Sparse matrix in CSR format."""
 
     offsets: wp.array[wp.int32]
+    """(n + 1,) row offsets."""
     indices: wp.array[wp.int32]
-    heads: wp.array[wp.int32]
-    """Zero for rows with the same columns as the row before."""
+    """(nnz,) columns."""
+    first_of_equal_rows: wp.array[wp.int32]
+    """(n,) 0 for rows with the same columns as the row before, else 1."""
     values: wp.array[real]
+    """(nnz,)."""
 
 
 @wp.func_native("return __atomic_fetch_add(&counters.data[which], 1, __ATOMIC_ACQ_REL);")
-def claimed(counters: wp.array[wp.int32], which: wp.int32) -> wp.int32:
-    """The next number of a counter that threads share: each number goes to one of them."""
+def claim_next(counters: wp.array[wp.int32], which: wp.int32) -> wp.int32:
+    """Increment the shared counter ``which`` atomically and return its previous value."""
     ...
 
 
-@wp.func_native("while (__atomic_load_n(&counters.data[which], __ATOMIC_ACQUIRE) < least) {}")
-def wait_for(counters: wp.array[wp.int32], which: wp.int32, least: wp.int32) -> None:
-    """Until a counter is as large: what was written before it was counted can be read."""
+@wp.func_native("while (__atomic_load_n(&counters.data[which], __ATOMIC_ACQUIRE) < count) {}")
+def wait_for(counters: wp.array[wp.int32], which: wp.int32, count: wp.int32) -> None:
+    """Spin until counter ``which`` is at least ``count``; writes that precede the increments are then visible."""
     ...
 
 
 @wp.func_native("return (wp::uint64)values.data;")
 def address_of(values: wp.array2d[real]) -> wp.uint64:
-    """Of its first number."""
+    """Return the address of the first element."""
     ...
 
 
@@ -50,12 +54,12 @@ def address_of(values: wp.array2d[real]) -> wp.uint64:
     const int from = strip * 8;
     for (int i = 0; i < rows; ) {
         const int begin = offsets.data[i], count = offsets.data[i + 1] - begin;
-        // The rows of a node have the same columns.
-        int alike = 1;
-        while (alike < 3 && i + alike < rows && heads.data[i + alike] == 0) ++alike;
+        // The three rows of a node have the same columns.
+        int equal = 1;
+        while (equal < 3 && i + equal < rows && first_of_equal_rows.data[i + equal] == 0) ++equal;
         const int* const to = indices.data + begin;
         const double* const l0 = values.data + begin;
-        const double *const l1 = alike > 1 ? l0 + count : l0, *const l2 = alike > 2 ? l1 + count : l0;
+        const double *const l1 = equal > 1 ? l0 + count : l0, *const l2 = equal > 2 ? l1 + count : l0;
         double sums[24];
         {
             v4 a0 = 0.0, a1 = 0.0, b0 = 0.0, b1 = 0.0, c0 = 0.0, c1 = 0.0;
@@ -68,24 +72,36 @@ def address_of(values: wp.array2d[real]) -> wp.uint64:
             *(v4*)sums = a0; *(v4*)(sums + 4) = a1; *(v4*)(sums + 8) = b0; *(v4*)(sums + 12) = b1;
             *(v4*)(sums + 16) = c0; *(v4*)(sums + 20) = c1;
         }
-        for (int t = 0; t < alike; ++t)
+        for (int t = 0; t < equal; ++t)
             for (int q = 0; q < 8; ++q) y[(long long)(i + t) * columns + from + q] = sums[8 * t + q];
-        i += alike;
+        i += equal;
     }
 """)
 )
-def strip_of_products(
+def multiply_strip(
     rows: wp.int32,
     offsets: wp.array[wp.int32],
     indices: wp.array[wp.int32],
-    heads: wp.array[wp.int32],
+    first_of_equal_rows: wp.array[wp.int32],
     values: wp.array[real],
     vectors: wp.uint64,
     columns: wp.int32,
     strip: wp.int32,
     products: wp.uint64,
 ) -> None:
-    """``STRIP`` of the ``columns`` of a product, row by row at addresses as the vectors are."""
+    """Compute ``STRIP`` columns of the product of a symmetric CSR matrix with ``vectors``.
+
+    Args:
+        rows: number of rows n.
+        offsets: (n + 1,) row offsets.
+        indices: (nnz,) columns.
+        first_of_equal_rows: (n,) 0 for rows with the same columns as the row before.
+        values: (nnz,) entries.
+        vectors: address of (n, columns) float64.
+        columns: row length of the vectors and the products.
+        strip: which strip.
+        products: address of (n, columns) float64.
+    """
     ...
 
 
@@ -93,30 +109,41 @@ def strip_of_products(
     on_cpu("""
     const int n = moves.shape[0], width = moves.shape[1];
     double* const X = (double*)moves.data;
-    for (int q = 0; q < width; ++q) along.data[q] = 0.0;
+    for (int q = 0; q < width; ++q) linear.data[q] = 0.0;
     for (int i = 0; i < n; ++i) {
         double* const row = X + i * width;
-        if (columns <= width) row[columns - 1] -= away.data[i];
+        if (columns <= width) row[columns - 1] -= reference.data[i];
         for (int q = columns; q < width; ++q) row[q] = 0.0;
-        for (int q = 0; q < width; ++q) along.data[q] += slope.data[i] * row[q];
+        for (int q = 0; q < width; ++q) linear.data[q] += gradient.data[i] * row[q];
     }
 """)
 )
 def finish_moves(
     columns: wp.int32,
-    away: wp.array[real],
-    slope: wp.array[real],
+    reference: wp.array[real],
+    gradient: wp.array[real],
     moves: wp.array2d[real],
-    along: wp.array[real],
+    linear: wp.array[real],
 ) -> None:
-    """Of a panel of ``moves`` from which on there are so many ``columns``: see ``moves_kernel``."""
+    """Finish a panel of displacements and compute its linear terms.
+
+    Subtracts ``reference`` from the last column of all panels if it is in this one, clears the columns behind it, and
+    writes X^T g.
+
+    Args:
+        columns: number of columns in this and the following panels.
+        reference: (n,) subtracted from the last column.
+        gradient: (n,) g.
+        moves: (n, ``PANEL``) X, modified in place.
+        linear: (``PANEL``,) X^T g.
+    """
     ...
 
 
 @wp.func_native(
     on_cpu("""
     constexpr int PANEL = 16, CHUNK = 128;
-    const int n = moves.shape[0], stride = form.strides[0] / 8;
+    const int n = moves.shape[0], stride = quadratic.strides[0] / 8;
     double sums[PANEL][PANEL] = {{0.0}};
     for (int begin = 0; begin < n; begin += CHUNK) {
         const int rows = n - begin < CHUNK ? n - begin : CHUNK;
@@ -130,11 +157,11 @@ def finish_moves(
                     a0 += x[0] * y0; a1 += x[0] * y1; b0 += x[1] * y0; b1 += x[1] * y1;
                     c0 += x[2] * y0; c1 += x[2] * y1; d0 += x[3] * y0; d1 += x[3] * y1;
                 }
-                const v4 found[8] = {a0, a1, b0, b1, c0, c1, d0, d1};
-                for (int q = 0; q < 8; ++q) *(v4*)(sums[i + q / 2] + c + 4 * (q % 2)) += found[q];
+                const v4 parts[8] = {a0, a1, b0, b1, c0, c1, d0, d1};
+                for (int q = 0; q < 8; ++q) *(v4*)(sums[i + q / 2] + c + 4 * (q % 2)) += parts[q];
             }
     }
-    double* const to = (double*)form.data;
+    double* const to = (double*)quadratic.data;
     for (int i = 0; i < PANEL; ++i)
         for (int c = 0; c < PANEL; ++c) {
             to[(first * PANEL + i) * stride + second * PANEL + c] = sums[i][c];
@@ -142,12 +169,12 @@ def finish_moves(
         }
 """)
 )
-def write_form(
+def write_quadratic(
     first: wp.int32,
     second: wp.int32,
     moves: wp.array2d[real],
     products: wp.array2d[real],
-    form: wp.array2d[real],
+    quadratic: wp.array2d[real],
 ) -> None:
-    """Of X^T Y of panels X of moves and Y of products, which is symmetric, the blocks of two."""
+    """Write block (first, second) of X^T Y, and its transpose; X are the displacements, Y = H X, X^T Y is symmetric."""
     ...

@@ -1,6 +1,6 @@
-"""Factors L D L^T of a sparse matrix by fronts, and solutions with them: dense arithmetic in vectors of four, on a CPU.
+"""Multifrontal L D L^T factorization of a sparse matrix and solves with it, in vectors of four numbers, on a CPU.
 
-See ``egs_warp/fem/multifrontal.py``.
+Host code: ``egs_warp.fem.multifrontal``.
 """
 
 import warp as wp
@@ -10,11 +10,11 @@ from egs_warp.kernels.fem.products import (
     STRIP,
     Rows,
     address_of,
-    claimed,
+    claim_next,
     finish_moves,
-    strip_of_products,
+    multiply_strip,
     wait_for,
-    write_form,
+    write_quadratic,
 )
 from egs_warp.kernels.vectors import FRONT_ELIMINATION, on_cpu
 from egs_warp.precision import real
@@ -22,7 +22,7 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 PADDING = 16
-"""Numbers behind an array that may be read, not used."""
+"""Numbers behind the end of an array that vector loads may read; their values do not matter."""
 
 _SIZES = f"""
     constexpr int PANEL = {PANEL};
@@ -31,42 +31,54 @@ _SIZES = f"""
 
 @wp.struct
 class Fronts:
-    """What ``Supernodes`` says, and where the numbers of each block lie."""
+    """Supernodes (``egs_warp.fem.supernodes.Supernodes``) and the memory layout of their blocks."""
 
     first: wp.array[wp.int32]
+    """(S,) first column of each block."""
     widths: wp.array[wp.int32]
+    """(S,) columns of each block."""
     row_offsets: wp.array[wp.int32]
+    """(S + 1,) offset of each front in ``rows``."""
     rows: wp.array[wp.int32]
+    """Permuted rows of all fronts, ascending in each."""
     in_parent: wp.array[wp.int32]
-    """Along ``rows``: the place of each row below in the parent's front."""
+    """For each of ``rows`` below its block: position in the parent's front."""
     child_offsets: wp.array[wp.int32]
+    """(S + 1,) offset of each block's children in ``children``."""
     children: wp.array[wp.int32]
+    """Child blocks."""
     entry_offsets: wp.array[wp.int32]
+    """(S + 1,) offset of each block's matrix entries in ``entries``."""
     entries: wp.array[wp.int32]
-    """Of each block those of the matrix in its columns, ..."""
+    """(nnz,) matrix entries, grouped by block."""
     entry_places: wp.array[wp.int32]
-    """... and their places in its front."""
+    """(nnz,) position of each of ``entries`` in its front."""
     factor_offsets: wp.array[wp.int32]
+    """(S + 1,) offset of each block of L."""
     inverse_offsets: wp.array[wp.int32]
+    """(S + 1,) offset of the inverses of each block's diagonal blocks."""
     update_offsets: wp.array[wp.int32]
-    """On the stack of what is still to be added to a parent."""
-    place: wp.array[wp.int32]
-    """The permuted place of each row."""
+    """(S,) offset of each front's update matrix on the stack."""
+    permutation: wp.array[wp.int32]
+    """(n,) position of each row in the order of elimination."""
 
 
 @wp.struct
 class MomentumProjection:
-    """Angular momentum that a solution keeps, see ``fem.linear_solver.Kept``; nothing where it is not ``there``."""
+    """Momentum projection of solutions (``egs_warp.fem.momentum_projection``)."""
 
     enabled: wp.int32
+    """0: no projection."""
     inertia_ratio: wp.array[real]
-    """(1,)."""
+    """(1,) 1 + dt alpha."""
     rotation_modes: wp.array[real]
+    """(3 n,) T, three numbers per unknown."""
     mode_momenta: wp.array[real]
+    """(3 n,) M T."""
     rotation_response: wp.array[real]
-    """(3n,), three numbers for each unknown."""
+    """(3 n,) solutions U for the right-hand sides M T."""
     inverse: wp.array[real]
-    """(9,)."""
+    """(9,) inverse of inertia_ratio (M T)^T U, row by row."""
 
 
 @wp.func_native(
@@ -92,7 +104,7 @@ class MomentumProjection:
                 for (int b = 0; b <= a; ++b) row[to[b]] += U[b];
             }
         }
-        const int pivots = eliminate_front(F, f, w, ld, T, least, inverses.data + fronts.inverse_offsets.data[s],
+        const int pivots = eliminate_front(F, f, w, ld, T, min_pivot, inverses.data + fronts.inverse_offsets.data[s],
                                            reciprocals.data + column);
         if (pivots < 0) return -1;
         negative += pivots;
@@ -112,7 +124,7 @@ def factor_native(
     fronts: Fronts,
     count: wp.int32,
     matrix: wp.array[real],
-    least: real,
+    min_pivot: real,
     front: wp.array[real],
     front_size: wp.int32,
     stack: wp.array[real],
@@ -120,7 +132,23 @@ def factor_native(
     inverses: wp.array[real],
     reciprocals: wp.array[real],
 ) -> wp.int32:
-    """How many pivots are negative, or -1 where one is as small as ``least``."""
+    """Factor the matrix.
+
+    Args:
+        fronts: the supernodes.
+        count: number of supernodes S.
+        matrix: (nnz,) upper entries.
+        min_pivot: a pivot of this size or smaller stops the factorization.
+        front: workspace for the largest front and, behind it, scratch memory.
+        front_size: size of the largest front.
+        stack: workspace for update matrices.
+        factor: output, blocks of L.
+        inverses: output, inverses of the diagonal blocks of L.
+        reciprocals: (n,) output, reciprocals of the pivots.
+
+    Returns:
+        The number of negative pivots, or -1 if a pivot is too small.
+    """
     ...
 
 
@@ -128,14 +156,14 @@ def factor_native(
     on_cpu(
         _SIZES
         + """
-    const double* const given = (const double*)right;
-    double* const found = (double*)solution;
-    double* const x = room.data + (long long)panel * (unknowns + 4) * PANEL;
+    const double* const rhs = (const double*)right;
+    double* const out = (double*)solution;
+    double* const x = workspace.data + (long long)panel * (unknowns + 4) * PANEL;
     const int from = panel * PANEL, columns = count - from < PANEL ? count - from : PANEL;
     const int width = columns <= 8 ? 8 : 16;
     for (int i = 0; i < unknowns; ++i) {
-        double* const row = x + fronts.place.data[i] * PANEL;
-        const double* g = given + i * row_stride + from * column_stride;
+        double* const row = x + fronts.permutation.data[i] * PANEL;
+        const double* g = rhs + i * row_stride + from * column_stride;
         const double by = weights ? ((const double*)weights)[i] : 1.0;
         for (int q = 0; q < columns; ++q) row[q] = by * g[q * column_stride];
         for (int q = columns; q < width; ++q) row[q] = 0.0;
@@ -153,7 +181,7 @@ def factor_native(
                 bool any = false;
                 for (int q = 0; q < nb && !any; ++q)
                     for (int c = 0; c < 8; ++c) any |= own[q * PANEL + c] != 0.0;
-                // Where nothing is given, nothing comes of it.
+                // A block of zeros contributes nothing.
                 if (!any) continue;
                 for (int g = (nb - 1) & ~3; g >= 0; g -= 4) {
                     double sums[32] = {0.0};
@@ -221,28 +249,28 @@ def factor_native(
         }
     }
     double missing[3][PANEL] = {{0.0}}, by[3][PANEL] = {{0.0}};
-    if (kept.enabled) {
+    if (projection.enabled) {
         for (int i = 0; i < unknowns; ++i) {
-            const double* const row = x + fronts.place.data[i] * PANEL;
-            const double* const g = given + i * row_stride + from * column_stride;
+            const double* const row = x + fronts.permutation.data[i] * PANEL;
+            const double* const g = rhs + i * row_stride + from * column_stride;
             for (int t = 0; t < 3; ++t) {
-                const double turn = kept.rotation_modes.data[3 * i + t];
-                const double momentum = kept.inertia_ratio.data[0] * kept.mode_momenta.data[3 * i + t];
+                const double turn = projection.rotation_modes.data[3 * i + t];
+                const double momentum = projection.inertia_ratio.data[0] * projection.mode_momenta.data[3 * i + t];
                 for (int q = 0; q < columns; ++q) missing[t][q] += turn * g[q * column_stride] - momentum * row[q];
             }
         }
         for (int t = 0; t < 3; ++t)
             for (int s = 0; s < 3; ++s)
-                for (int q = 0; q < columns; ++q) by[t][q] += kept.inverse.data[3 * t + s] * missing[s][q];
+                for (int q = 0; q < columns; ++q) by[t][q] += projection.inverse.data[3 * t + s] * missing[s][q];
     }
     for (int i = 0; i < unknowns; ++i) {
-        const double* row = x + fronts.place.data[i] * PANEL;
-        double* const to = found + (long long)i * solution_stride;
-        const double* g = given + i * row_stride + from * column_stride;
+        const double* row = x + fronts.permutation.data[i] * PANEL;
+        double* const to = out + (long long)i * solution_stride;
+        const double* g = rhs + i * row_stride + from * column_stride;
         if (weights) {
-            for (int q = 0; q < columns; ++q) to[q] = near_share * g[q * column_stride] + far_share * row[q];
-        } else if (kept.enabled) {
-            const double* const turned = kept.rotation_response.data + 3 * i;
+            for (int q = 0; q < columns; ++q) to[q] = dt_now * g[q * column_stride] + dt_ahead * row[q];
+        } else if (projection.enabled) {
+            const double* const turned = projection.rotation_response.data + 3 * i;
             for (int q = 0; q < columns; ++q)
                 to[q] = row[q] + (turned[0] * by[0][q] + turned[1] * by[1][q] + turned[2] * by[2][q]);
         } else {
@@ -264,18 +292,39 @@ def solve_panel_native(
     column_stride: wp.int32,
     count: wp.int32,
     weights: wp.uint64,
-    near_share: real,
-    far_share: real,
-    kept: MomentumProjection,
+    dt_now: real,
+    dt_ahead: real,
+    projection: MomentumProjection,
     panel: wp.int32,
-    room: wp.array[real],
+    workspace: wp.array[real],
     solution: wp.uint64,
     solution_stride: wp.int32,
 ) -> None:
-    """A panel of ``count`` right-hand sides; ``right`` and ``solution``, which is the panel's own, are addresses of
-    numbers, the first with its strides in them, the second row by row. With ``weights`` of rows, another address or 0,
-    ``near_share`` of what is given and ``far_share`` of the solution with what is given by weight; else what is
-    ``kept``."""
+    """Solve for one panel of right-hand sides B (n, count).
+
+    Without weights, writes S^-1 B, with the momentum projection if it is enabled. With weights w, writes
+    dt_now B + dt_ahead S^-1 diag(w) B.
+
+    Args:
+        fronts: the supernodes.
+        blocks: number of supernodes.
+        unknowns: n.
+        factor: blocks of L.
+        inverses: inverses of the diagonal blocks of L.
+        reciprocals: (n,) reciprocals of the pivots.
+        right: address of B, float64.
+        row_stride: row stride of B, in numbers.
+        column_stride: column stride of B, in numbers.
+        count: columns of B.
+        weights: address of w (n,), or 0.
+        dt_now: factor of B.
+        dt_ahead: factor of the solution.
+        projection: momentum projection.
+        panel: index of the panel.
+        workspace: (panels, n + 4, ``PANEL``).
+        solution: address of the panel's first column of the output.
+        solution_stride: row stride of the output, in numbers.
+    """
     ...
 
 
@@ -283,11 +332,11 @@ def solve_panel_native(
     on_cpu(
         _SIZES
         + """
-    const double* const given = (const double*)right;
-    double* const found = (double*)solution;
-    double* const x = room.data;
+    const double* const rhs = (const double*)right;
+    double* const out = (double*)solution;
+    double* const x = workspace.data;
     auto sum_of = [](v4 v) { return (v[0] + v[1]) + (v[2] + v[3]); };
-    for (int i = 0; i < unknowns; ++i) x[fronts.place.data[i]] = given[i * row_stride];
+    for (int i = 0; i < unknowns; ++i) x[fronts.permutation.data[i]] = rhs[i * row_stride];
     for (int s = 0; s < blocks; ++s) {
         const int begin = fronts.row_offsets.data[s], f = fronts.row_offsets.data[s + 1] - begin;
         const int w = fronts.widths.data[s], column = fronts.first.data[s];
@@ -297,19 +346,19 @@ def solve_panel_native(
         for (int b = 0; b < w; b += BLOCK, inverse += BLOCK * BLOCK) {
             const int nb = w - b < BLOCK ? w - b : BLOCK, fours = (nb + 3) >> 2;
             double* const own = x + column + b;
-            double kept[BLOCK] = {0.0};
-            for (int j = 0; j < nb; ++j) kept[j] = own[j];
+            double copy[BLOCK] = {0.0};
+            for (int j = 0; j < nb; ++j) copy[j] = own[j];
             for (int i = 0; i < nb; ++i) {
                 v4 a = 0.0;
-                for (int k = 0; k < fours; ++k) a += *(const v4*)(inverse + i * BLOCK + 4 * k) * *(v4*)(kept + 4 * k);
+                for (int k = 0; k < fours; ++k) a += *(const v4*)(inverse + i * BLOCK + 4 * k) * *(v4*)(copy + 4 * k);
                 own[i] = sum_of(a);
             }
-            for (int j = 0; j < nb; ++j) kept[j] = own[j];
-            // What is behind a row's end is multiplied by zero.
+            for (int j = 0; j < nb; ++j) copy[j] = own[j];
+            // Numbers behind the end of a row are multiplied by zero.
             const double* l = L + (b + nb) * w + b;
             for (int i = b + nb; i < f; ++i, l += w) {
-                v4 a = *(const v4*)l * *(v4*)kept;
-                for (int k = 1; k < fours; ++k) a += *(const v4*)(l + 4 * k) * *(v4*)(kept + 4 * k);
+                v4 a = *(const v4*)l * *(v4*)copy;
+                for (int k = 1; k < fours; ++k) a += *(const v4*)(l + 4 * k) * *(v4*)(copy + 4 * k);
                 x[rows[i]] -= sum_of(a);
             }
         }
@@ -339,14 +388,14 @@ def solve_panel_native(
     }
     double missing[3] = {0.0, 0.0, 0.0}, by[3] = {0.0, 0.0, 0.0};
     for (int i = 0; i < unknowns; ++i) {
-        found[i] = x[fronts.place.data[i]];
-        for (int t = 0; t < 3 && kept.enabled; ++t)
-            missing[t] += kept.rotation_modes.data[3 * i + t] * given[i * row_stride]
-                - kept.inertia_ratio.data[0] * kept.mode_momenta.data[3 * i + t] * found[i];
+        out[i] = x[fronts.permutation.data[i]];
+        for (int t = 0; t < 3 && projection.enabled; ++t)
+            missing[t] += projection.rotation_modes.data[3 * i + t] * rhs[i * row_stride]
+                - projection.inertia_ratio.data[0] * projection.mode_momenta.data[3 * i + t] * out[i];
     }
-    for (int t = 0; t < 9 && kept.enabled; ++t) by[t / 3] += kept.inverse.data[t] * missing[t % 3];
-    for (int i = 0; i < unknowns && kept.enabled; ++i)
-        for (int t = 0; t < 3; ++t) found[i] += kept.rotation_response.data[3 * i + t] * by[t];
+    for (int t = 0; t < 9 && projection.enabled; ++t) by[t / 3] += projection.inverse.data[t] * missing[t % 3];
+    for (int i = 0; i < unknowns && projection.enabled; ++i)
+        for (int t = 0; t < 3; ++t) out[i] += projection.rotation_response.data[3 * i + t] * by[t];
 """
     )
 )
@@ -359,11 +408,11 @@ def solve_vector_native(
     reciprocals: wp.array[real],
     right: wp.uint64,
     row_stride: wp.int32,
-    kept: MomentumProjection,
-    room: wp.array[real],
+    projection: MomentumProjection,
+    workspace: wp.array[real],
     solution: wp.uint64,
 ) -> None:
-    """The same of one right-hand side alone."""
+    """Solve for a single right-hand side (n,); arguments as for ``solve_panel_native``, ``solution`` is contiguous."""
     ...
 
 
@@ -372,7 +421,7 @@ def factor_kernel(
     fronts: Fronts,
     count: wp.int32,
     matrix: wp.array[real],
-    least: real,
+    min_pivot: real,
     front: wp.array[real],
     front_size: wp.int32,
     stack: wp.array[real],
@@ -381,8 +430,10 @@ def factor_kernel(
     reciprocals: wp.array[real],
     negative: wp.array[wp.int32],
 ) -> None:
-    """See ``factored``."""
-    negative[0] = factor_native(fronts, count, matrix, least, front, front_size, stack, factor, inverses, reciprocals)
+    """Call ``factor_native`` and store its result in ``negative`` (1,)."""
+    negative[0] = factor_native(
+        fronts, count, matrix, min_pivot, front, front_size, stack, factor, inverses, reciprocals
+    )
 
 
 @wp.kernel
@@ -398,23 +449,27 @@ def solve_kernel(
     row_stride: wp.int32,
     column_stride: wp.int32,
     count: wp.int32,
-    kept: MomentumProjection,
-    room: wp.array[real],
+    projection: MomentumProjection,
+    workspace: wp.array[real],
     solution: wp.uint64,
 ) -> None:
-    """Panel after panel as ``counters`` (1,) give them out, see ``solved_panel``."""
+    """Solve for all right-hand sides: take panels from counter 0 and call ``solve_panel_native`` for each.
+
+    Several launches may share the counters.
+    """
     if count == 1:
         solve_vector_native(
-            fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, kept, room, solution
+            fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, projection, workspace, solution
         )
         return
-    panel = claimed(counters, 0)
+    panel = claim_next(counters, 0)
     while PANEL * panel < count:
         solve_panel_native(
             fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count,
-            wp.uint64(0), real(0.0), real(1.0), kept, panel, room, solution + wp.uint64(8 * PANEL * panel), count,
+            wp.uint64(0), real(0.0), real(1.0), projection, panel, workspace,
+            solution + wp.uint64(8 * PANEL * panel), count,
         )  # fmt: skip
-        panel = claimed(counters, 0)
+        panel = claim_next(counters, 0)
 
 
 @wp.kernel
@@ -431,43 +486,46 @@ def effort_panel_kernel(
     column_stride: wp.int32,
     count: wp.int32,
     weights: wp.uint64,
-    near_share: real,
-    far_share: real,
-    away: wp.array[real],
-    slope: wp.array[real],
+    dt_now: real,
+    dt_ahead: real,
+    reference: wp.array[real],
+    gradient: wp.array[real],
     matrix: Rows,
-    room: wp.array[real],
+    workspace: wp.array[real],
     # Out:
     moves: wp.array3d[real],
     products: wp.array3d[real],
-    along: wp.array2d[real],
-    form: wp.array2d[real],
+    linear: wp.array2d[real],
+    quadratic: wp.array2d[real],
 ) -> None:
-    """The ``moves`` (panels, n, ``PANEL``) of each panel, see ``solved_panel``, from the last of which ``away`` is
-    taken; their ``products`` with a ``matrix``, what they are ``along`` the ``slope`` (panels, ``PANEL``), and when all
-    panels are there their ``form`` X^T Y. ``counters`` (3,): panels and pairs of them that are given out, and panels
-    that are done."""
+    """Compute the quadratic model of the elastic energy (``LinearSolver.effort_quadratic``).
+
+    For each panel, computes the displacements X (``moves``), their ``products`` H X and the terms ``linear`` X^T g.
+    After all panels, computes the blocks of ``quadratic`` X^T H X. Several launches may share the work by ``counters``
+    (3,): next panel, next pair of panels, and number of finished panels.
+    """
     panels = moves.shape[0]
-    panel = claimed(counters, 0)
+    panel = claim_next(counters, 0)
     while panel < panels:
-        mine = address_of(moves[panel])
+        panel_address = address_of(moves[panel])
         solve_panel_native(
             fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count, weights,
-            near_share, far_share, MomentumProjection(), panel, room, mine, PANEL,
+            dt_now, dt_ahead, MomentumProjection(), panel, workspace, panel_address, PANEL,
         )  # fmt: skip
-        finish_moves(count - PANEL * panel, away, slope, moves[panel], along[panel])
+        finish_moves(count - PANEL * panel, reference, gradient, moves[panel], linear[panel])
         for strip in range(PANEL // STRIP):
-            strip_of_products(
-                unknowns, matrix.offsets, matrix.indices, matrix.heads, matrix.values, mine, PANEL, strip,
+            multiply_strip(
+                unknowns, matrix.offsets, matrix.indices, matrix.first_of_equal_rows, matrix.values, panel_address,
+                PANEL, strip,
                 address_of(products[panel]),
             )  # fmt: skip
-        claimed(counters, 2)
-        panel = claimed(counters, 0)
+        claim_next(counters, 2)
+        panel = claim_next(counters, 0)
     wait_for(counters, 2, panels)
-    pair = claimed(counters, 1)
+    pair = claim_next(counters, 1)
     while pair < panels * panels:
         first = pair / panels
         second = pair % panels
         if first <= second:
-            write_form(first, second, moves[first], products[second], form)
-        pair = claimed(counters, 1)
+            write_quadratic(first, second, moves[first], products[second], quadratic)
+        pair = claim_next(counters, 1)

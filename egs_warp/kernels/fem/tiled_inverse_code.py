@@ -1,10 +1,10 @@
-"""Tiles of 64 rows and columns by a block of threads on a GPU, see ``inverse_root``.
+"""CUDA source of ``tiled_inverse``: operations of a thread block on tiles of 64 rows and columns.
 
-A tile lies in memory as eight times eight tiles of eight rows and columns, these column by column, each row by row: two
-numbers of each of a warp's threads, as tensor cores have them.
+A tile is stored as 8 x 8 subtiles of eight rows and columns, subtiles in column-major order, each row by row: two
+numbers per thread of a warp, the layout of the tensor cores.
 """
 
-TOOLS = """
+TOOLS_CODE = """
     auto product = [](double (&to)[2], const double2& one, const double2& other) {
 #if __CUDA_ARCH__ >= 800
         asm("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 {%0,%1},{%2},{%3},{%0,%1};"
@@ -23,7 +23,7 @@ TOOLS = """
         }
 #endif
     };
-    // The inverse of the factor of eight rows and columns, by each thread of a warp, one column of it by each of eight.
+    // Inverse of the Cholesky factor of an 8 x 8 matrix. All threads of a warp factor; eight compute a column each.
     auto invert = [](const double* from, double* to) {
         const int c = threadIdx.x & 7;
         double a[8][8], y[8], roots[8];
@@ -46,7 +46,7 @@ TOOLS = """
             asm("rcp.approx.ftz.f64 %0, %1;" : "=d"(about) : "d"(pivot));
             const double off = fma(-pivot, about, 1.0), more = fma(off, off, off), over = fma(about, more, about);
             if (k < 7) {
-                // All wait for the next pivot: that comes from what is known of the reciprocal first.
+                // The next pivot is on the critical path: compute it first, from the approximate reciprocal.
                 const double some = a[k + 1][k] * a[k + 1][k] * about;
                 a[k + 1][k + 1] = fma(-some, more, a[k + 1][k + 1] - some);
             }
@@ -69,7 +69,7 @@ TOOLS = """
         }
         return sound;
     };
-    // Sixteen rows and eight columns, and the products of rows and other rows over eight columns.
+    // Add the product of sixteen rows and the transpose of eight other rows, over eight columns.
     auto add = [&](double (&to)[4], const double2& upper, const double2& lower, const double2& by) {
 #if __CUDA_ARCH__ >= 900
         asm("mma.sync.aligned.m16n8k8.row.col.f64.f64.f64.f64 {%0,%1,%2,%3},{%4,%5,%6,%7},{%8,%9},{%0,%1,%2,%3};"
@@ -85,7 +85,7 @@ TOOLS = """
     auto load = [&](const double* from) { return *(const double2*)(from + 2 * own); };
     auto store = [&](double* to, double one, double two) { *(double2*)(to + 2 * own) = make_double2(one, two); };
     auto less = [](const double2& x) { return make_double2(-x.x, -x.y); };
-    // Eight columns of a tile, past the first cache: that may have kept what was there before.
+    // Copy eight columns of a tile, bypassing the L1 cache, which may hold old values.
     auto fetch = [&](double* to, const double* from) {
 #if __CUDA_ARCH__ >= 800
         const unsigned at = static_cast<unsigned>(__cvta_generic_to_shared(to + 2 * lane));
@@ -100,28 +100,28 @@ TOOLS = """
 #endif
     };
     auto flag_of = [](const int* flag) { return *(volatile const int*)flag; };
-    // All that this block has written is there for who sees the flag.
-    auto publish = [&](int* flag, int who) {
+    // Everything that this block has written is visible to a thread that reads the flag.
+    auto publish = [&](int* flag, int writer) {
         __syncthreads();
-        if (lane == who) {
+        if (lane == writer) {
             __threadfence();
-            *(volatile int*)flag = turn;
+            *(volatile int*)flag = launch;
         }
     };
     auto await = [&](const int* flag) {
-        while (!__syncthreads_and(lane != 0 || flag_of(flag) == turn)) {
+        while (!__syncthreads_and(lane != 0 || flag_of(flag) == launch)) {
         }
     };
-    // What a sum begins with: another, or entries of the matrix, beyond which it goes on as the unit matrix.
-    auto begin = [&](double (&to)[4][4], int begun, int row, int rows, int column, int width) {
-        if (begun >= 0) {
-            await(there + begun);
-            const double* const from = tiles.data + (size_t)begun * TILE + 2 * own;
+    // Initial value of a sum: a partial sum, or entries of the matrix, padded with the identity.
+    auto begin = [&](double (&to)[4][4], int initial, int row, int rows, int column, int width) {
+        if (initial >= 0) {
+            await(tile_flags + initial);
+            const double* const from = tiles.data + (size_t)initial * TILE + 2 * own;
             #pragma unroll
             for (int s = 0; s < 4; ++s)
                 #pragma unroll
                 for (int k = 0; k < 2; ++k) {
-                    const double2 x = __ldcg((const double2*)(from + (8 * piece(s) + 2 * band + k) * 64));
+                    const double2 x = __ldcg((const double2*)(from + (8 * column_block(s) + 2 * band + k) * 64));
                     to[s][2 * k] = x.x, to[s][2 * k + 1] = x.y;
                 }
             return;
@@ -130,7 +130,7 @@ TOOLS = """
         for (int s = 0; s < 4; ++s)
             #pragma unroll
             for (int k = 0; k < 4; ++k) {
-                const int i = 16 * band + r + 8 * (k / 2), j = 8 * piece(s) + 2 * q + k % 2;
+                const int i = 16 * band + r + 8 * (k / 2), j = 8 * column_block(s) + 2 * q + k % 2;
                 const double none = row == column && i == j ? 1.0 : 0.0;
                 to[s][k] = i < rows && j < width ? S[(size_t)(row + i) * stride + column + j] : none;
             }
@@ -138,31 +138,31 @@ TOOLS = """
     auto put = [&](double* to, const double (&from)[4][4]) {
         #pragma unroll
         for (int s = 0; s < 4; ++s) {
-            store(to + (8 * piece(s) + 2 * band) * 64, from[s][0], from[s][1]);
-            store(to + (8 * piece(s) + 2 * band + 1) * 64, from[s][2], from[s][3]);
+            store(to + (8 * column_block(s) + 2 * band) * 64, from[s][0], from[s][1]);
+            store(to + (8 * column_block(s) + 2 * band + 1) * 64, from[s][2], from[s][3]);
         }
     };
 
 """
 
-FACTOR = """
+FACTOR_CODE = """
         if (kind == FIRST || chained) {
             if (!chained) __syncthreads();
             #pragma unroll
             for (int s = 0; s < 4; ++s)
                 #pragma unroll
                 for (int k = 0; k < 2; ++k) {
-                    const int i = 2 * band + k, n = piece(s);
+                    const int i = 2 * band + k, n = column_block(s);
                     const double one = chained ? square[s][2 * k] : sum[s][2 * k];
                     const double two = chained ? square[s][2 * k + 1] : sum[s][2 * k + 1];
-                    store(room + (8 * i + n) * 64, n <= i ? one : 0.0, n <= i ? two : 0.0);
+                    store(scratch + (8 * i + n) * 64, n <= i ? one : 0.0, n <= i ? two : 0.0);
                 }
-            // Eight columns at a time: below the diagonal what is left of the matrix, above it what there is of the
-            // factor's inverse, turned. One warp goes ahead along the diagonal, each other has one of the other rows.
-            double *const line = room + TILE, *const roots = line + 512, *const corner = roots + 128;
+            // Eight columns at a time: below the diagonal is the remaining matrix, above it the computed part of the
+            // factor's inverse, transposed. One warp runs ahead along the diagonal, each other one has one of the rows.
+            double *const line = scratch + TILE, *const roots = line + 512, *const corner = roots + 128;
             __syncthreads();
             bool sound = true;
-            if (warp == 0) sound = invert(room, roots);
+            if (warp == 0) sound = invert(scratch, roots);
             #pragma unroll 1
             for (int j = 0; j < 8; ++j) {
                 const double* const root = roots + (j & 1) * 64;
@@ -172,14 +172,14 @@ FACTOR = """
                 if (i == j)
                     v[0] = root[16 * q + r], v[1] = root[16 * q + 8 + r];
                 else
-                    product(v, load(room + (8 * i + j) * 64), load(root));
+                    product(v, load(scratch + (8 * i + j) * 64), load(root));
                 const double2 w = make_double2(v[0], v[1]), minus = less(w);
                 store(line + i * 64, v[0], v[1]);
-                if (i <= j) store(room + (8 * i + j) * 64, v[0], v[1]);
+                if (i <= j) store(scratch + (8 * i + j) * 64, v[0], v[1]);
                 if (j == 7) break;
                 if (warp == 0) {
                     asm volatile("bar.arrive 1, 256;" ::: "memory");
-                    const double2 d = load(room + (8 * i + i) * 64);
+                    const double2 d = load(scratch + (8 * i + i) * 64);
                     double left[2] = {d.x, d.y};
                     product(left, minus, w);
                     store(corner, left[0], left[1]);
@@ -191,7 +191,7 @@ FACTOR = """
                     #pragma unroll
                     for (int s = 1; s < 8; ++s) {
                         const int c = min(j + s, end);
-                        double* const at = room + (8 * i + c) * 64;
+                        double* const at = scratch + (8 * i + c) * 64;
                         const double2 x = load(at);
                         double to[2] = {x.x, x.y};
                         product(to, minus, load(line + c * 64));
@@ -203,21 +203,21 @@ FACTOR = """
             __syncthreads();
             for (int s = warp; s < 64; s += LANES / 32) {
                 const int k = s / 8, n = s % 8;
-                const double* const from = room + s * 64 + 16 * q + r;
-                if (k <= n) store(triangles.data + (size_t)mine * TILE + s * 64, from[0], from[8]);
+                const double* const from = scratch + s * 64 + 16 * q + r;
+                if (k <= n) store(triangles.data + (size_t)diagonal * TILE + s * 64, from[0], from[8]);
             }
-            publish(flags.data + mine, 0);
+            publish(flags.data + diagonal, 0);
             for (int s = warp; s < 64; s += LANES / 32) {
                 const int i = s % 8, n = s / 8;
-                const double2 x = load(room + (8 * i + n) * 64);
-                if (i <= n) store(tiles.data + (size_t)turned * TILE + s * 64, x.x, x.y);
+                const double2 x = load(scratch + (8 * i + n) * 64);
+                if (i <= n) store(tiles.data + (size_t)transposed * TILE + s * 64, x.x, x.y);
             }
-            publish(there + turned, 0);
+            publish(tile_flags + transposed, 0);
             for (int s = lane; s < TILE; s += LANES) {
                 const int i = s / 64, j = s % 64, n = i / 8, k = j / 8;
                 if (i < rows && j < rows)
-                    R[(size_t)(row + i) * apart + order.data[row + j]] =
-                        k <= n ? room[(8 * k + n) * 64 + j % 8 * 8 + i % 8] : 0.0;
+                    R[(size_t)(row + i) * out_stride + order.data[row + j]] =
+                        k <= n ? scratch[(8 * k + n) * 64 + j % 8 * 8 + i % 8] : 0.0;
             }
         }
     }

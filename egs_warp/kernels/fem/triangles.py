@@ -1,4 +1,4 @@
-"""Inverses of small triangles by a block of threads each, on a GPU."""
+"""Inverses of small lower triangular matrices: on a GPU one thread block each, on a CPU one thread."""
 
 import warp as wp
 
@@ -6,34 +6,35 @@ from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
 
-LARGEST = 64
-"""Rows of a triangle at most."""
-SHARE = 4
-"""Threads for each of its columns on a GPU."""
-BLOCK = LARGEST * SHARE
+MAX_ROWS = 64
+"""Maximum number of rows of a triangular matrix."""
+COLUMN_THREADS = 4
+"""Threads per column on a GPU."""
+BLOCK = MAX_ROWS * COLUMN_THREADS
+"""Threads of a block on a GPU."""
 
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    constexpr int WIDE = {LARGEST + 1}, SHARE = {SHARE};
-    __shared__ double both[{LARGEST} * WIDE], over[{LARGEST}];
-    const int lane = threadIdx.x, stride = given.strides[0] / 8, apart = made.strides[0] / 8;
-    const double* const from = given.data + (size_t)block * side * (stride + 1);
-    double* const to = made.data + (size_t)block * side * (apart + 1);
-    for (int k = lane; k < side * {LARGEST}; k += blockDim.x) {{
-        const int i = k / {LARGEST}, c = k % {LARGEST};
-        if (c < i) both[i * WIDE + c] = from[(size_t)i * stride + c];
-        if (c == i) over[i] = 1.0 / from[(size_t)i * stride + i];
+    constexpr int WIDE = {MAX_ROWS + 1}, SHARE = {COLUMN_THREADS};
+    __shared__ double tile[{MAX_ROWS} * WIDE], reciprocals[{MAX_ROWS}];
+    const int lane = threadIdx.x, stride = lower.strides[0] / 8, out_stride = inverse.strides[0] / 8;
+    const double* const from = lower.data + (size_t)block * side * (stride + 1);
+    double* const to = inverse.data + (size_t)block * side * (out_stride + 1);
+    for (int k = lane; k < side * {MAX_ROWS}; k += blockDim.x) {{
+        const int i = k / {MAX_ROWS}, c = k % {MAX_ROWS};
+        if (c < i) tile[i * WIDE + c] = from[(size_t)i * stride + c];
+        if (c == i) reciprocals[i] = 1.0 / from[(size_t)i * stride + i];
     }}
     __syncthreads();
-    // A column of the inverse is for some threads, who take turns in its sums: above the diagonal, turned, lies what
-    // they have found. All threads of a warp go through all rows.
+    // SHARE threads compute a column of the inverse and split its sums. The results are stored transposed above the
+    // diagonal. All threads of a warp loop over all rows.
     const int column = lane / SHARE, part = lane % SHARE;
-    double* const own = both + column * WIDE;
-    const double first = column < side ? over[column] : 0.0;
-    if (part == 0 && column < side) to[(size_t)column * apart + column] = first;
+    double* const own = tile + column * WIDE;
+    const double first = column < side ? reciprocals[column] : 0.0;
+    if (part == 0 && column < side) to[(size_t)column * out_stride + column] = first;
     for (int i = 1; i < side; ++i) {{
-        const double* const row = both + i * WIDE;
+        const double* const row = tile + i * WIDE;
         const bool below = i > column;
         double sum = part == 0 && below ? row[column] * first : 0.0, other = 0.0;
         int k = column + 1 + part;
@@ -46,37 +47,39 @@ BLOCK = LARGEST * SHARE
         #pragma unroll
         for (int away = SHARE / 2; away > 0; away >>= 1) sum += __shfl_xor_sync(0xffffffffu, sum, away);
         if (part == 0 && below) {{
-            own[i] = -sum * over[i];
-            to[(size_t)i * apart + column] = -sum * over[i];
+            own[i] = -sum * reciprocals[i];
+            to[(size_t)i * out_stride + column] = -sum * reciprocals[i];
         }}
         __syncwarp();
     }}
 #else
-    const int stride = given.strides[0] / 8, apart = made.strides[0] / 8;
-    const double* const from = given.data + (size_t)block * side * (stride + 1);
-    double* const to = made.data + (size_t)block * side * (apart + 1);
+    const int stride = lower.strides[0] / 8, out_stride = inverse.strides[0] / 8;
+    const double* const from = lower.data + (size_t)block * side * (stride + 1);
+    double* const to = inverse.data + (size_t)block * side * (out_stride + 1);
     for (int column = 0; column < side; ++column)
         for (int i = column; i < side; ++i) {{
             double sum = i == column ? 1.0 : 0.0;
-            for (int k = column; k < i; ++k) sum -= from[(size_t)i * stride + k] * to[(size_t)k * apart + column];
-            to[(size_t)i * apart + column] = sum / from[(size_t)i * stride + i];
+            for (int k = column; k < i; ++k) sum -= from[(size_t)i * stride + k] * to[(size_t)k * out_stride + column];
+            to[(size_t)i * out_stride + column] = sum / from[(size_t)i * stride + i];
         }}
 #endif
 """)
-def invert_triangle(given: wp.array2d[real], side: int, block: int, made: wp.array2d[real]) -> None:
-    """See ``invert_triangles_kernel``."""
+def invert_triangle(lower: wp.array2d[real], side: int, block: int, inverse: wp.array2d[real]) -> None:
+    """Invert diagonal block number ``block`` of ``lower``; see ``invert_triangles_kernel``."""
     ...
 
 
 @wp.kernel
 def invert_triangles_kernel(
     # In:
-    given: wp.array2d[real],
+    lower: wp.array2d[real],
     side: int,
     # Out:
-    made_out: wp.array2d[real],
+    inverse_out: wp.array2d[real],
 ):
-    """Into ``made_out`` the inverses of the lower triangles of ``side`` rows, at most ``LARGEST``, along the diagonal
-    of what is ``given``; what is above them stays."""
+    """Write the inverses of the diagonal blocks of ``lower``, of ``side`` <= ``MAX_ROWS`` rows, to ``inverse_out``.
+
+    Entries above the diagonal of ``inverse_out`` are unchanged. One thread block (on a CPU one thread) per block.
+    """
     block, _lane = wp.tid()
-    invert_triangle(given, side, block, made_out)
+    invert_triangle(lower, side, block, inverse_out)

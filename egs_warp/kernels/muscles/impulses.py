@@ -1,4 +1,4 @@
-"""What activations of groups of segments push nodes with over a step (Eq. 7), a row for each."""
+"""Nodal impulses of groups of muscle segments over a step (Eq. 7); host code: ``egs_warp.muscles.tension``."""
 
 import warp as wp
 
@@ -14,32 +14,49 @@ def impulses_kernel(
     members: wp.array[int],
     node_offsets: wp.array[int],
     nodes: wp.array[int],
-    shares: wp.array[real],
-    strengths: wp.array[real],
+    weights: wp.array[real],
+    max_forces: wp.array[real],
     rest_lengths: wp.array[real],
-    slack: real,
-    full: real,
+    length_zero_force: real,
+    length_full_force: real,
     # In:
     positions: wp.array[Vec3],
     dt: real,
     # Out:
     impulses_out: wp.array2d[Vec3],
 ):
-    """N s on each node for an activation of a group at its bound, over ``dt`` seconds: of its ``members``, which pull
-    with ``strengths`` newtons at their bounds where they are not ``slack``, with the shares of tension of
-    ``muscles.tension``. One thread a group."""
+    """Compute the nodal impulses, N s, of each group at its activation bound over ``dt`` seconds; one thread per group.
+
+    Args:
+        member_offsets: (groups + 1,) offset of each group in ``members``.
+        members: segments of each group.
+        node_offsets: (M + 1,) offset of each segment in ``nodes`` and ``weights``.
+        nodes: nodes of each segment.
+        weights: weights of these nodes; the segment vector is the weighted sum of their positions.
+        max_forces: (M,) N, forces of segments at their bounds.
+        rest_lengths: (M,) m.
+        length_zero_force: relative length at and below which a segment exerts no force.
+        length_full_force: relative length at and above which a segment exerts its full force.
+        positions: (N,) m.
+        dt: step size, s.
+        impulses_out: (groups, N) N s.
+    """
     group = wp.tid()
     for node in range(positions.shape[0]):
         impulses_out[group, node] = Vec3(real(0.0))
-    for place in range(member_offsets[group], member_offsets[group + 1]):
-        segment = members[place]
-        line = Vec3(real(0.0))
+    for member in range(member_offsets[group], member_offsets[group + 1]):
+        segment = members[member]
+        vector = Vec3(real(0.0))
         for slot in range(node_offsets[segment], node_offsets[segment + 1]):
-            line += shares[slot] * positions[nodes[slot]]
-        length = wp.max(wp.length(line), real(1e-300))
-        along = wp.clamp((length / rest_lengths[segment] - slack) / (full - slack), real(0.0), real(1.0))
-        share = along * along * (real(3.0) - real(2.0) * along)
-        pull = (-dt * strengths[segment] * share / length) * line
+            vector += weights[slot] * positions[nodes[slot]]
+        length = wp.max(wp.length(vector), real(1e-300))
+        along = wp.clamp(
+            (length / rest_lengths[segment] - length_zero_force) / (length_full_force - length_zero_force),
+            real(0.0),
+            real(1.0),
+        )
+        length_factor = along * along * (real(3.0) - real(2.0) * along)
+        pull = (-dt * max_forces[segment] * length_factor / length) * vector
         for slot in range(node_offsets[segment], node_offsets[segment + 1]):
             node = nodes[slot]
-            impulses_out[group, node] = impulses_out[group, node] + shares[slot] * pull
+            impulses_out[group, node] = impulses_out[group, node] + weights[slot] * pull

@@ -7,8 +7,8 @@ from tests.support.surviving_mutants.survivor import Survivor
 FEM = [
     Survivor(
         "fem/warp_elasticity.py",
-        "self._no_gradients, self._no_pulls = empty(0, Mat33, device), empty(0, Vec3, device)",
-        "self._no_gradients, self._no_pulls = empty( 1, Mat33, device), empty(0, Vec3, device)",
+        "self._no_gradients, self._no_forces = empty(0, Mat33, device), empty(0, Vec3, device)",
+        "self._no_gradients, self._no_forces = empty( 1, Mat33, device), empty(0, Vec3, device)",
         "it stands in for an array that no kernel reads without damping",
     ),
     Survivor(
@@ -31,9 +31,9 @@ FEM = [
     ),
     Survivor(
         "kernels/fem/elasticity.py",
-        "along = wp.clamp((length / rest_lengths[segment] - slack) / (full - slack), real(0.0), real(1.0))",
-        "along = wp.clamp((length / rest_lengths[segment] - slack) / (full % slack), real(0.0), real(1.0))",
-        "tests/muscles/test_tension.py notices, which the room does not run",
+        "(length / rest_lengths[segment] - length_zero_force) / (length_full_force - length_zero_force),",
+        "(length / rest_lengths[segment] - length_zero_force) / (length_full_force % length_zero_force),",
+        "tests/muscles/test_tension.py kills it, which is not among the tests of this package",
     ),
     Survivor(
         "kernels/fem/elasticity.py",
@@ -49,8 +49,8 @@ FEM = [
     ),
     Survivor(
         "kernels/fem/elasticity.py",
-        "OFF, SWEEPS = 1e-31, 12",
-        "OFF, SWEEPS = 1e-31,  13",
+        "DIAGONAL_TOLERANCE, MAX_SWEEPS = 1e-31, 12",
+        "DIAGONAL_TOLERANCE, MAX_SWEEPS = 1e-31,  13",
         "sweeps after which a matrix of three has long been diagonal: one more",
     ),
     Survivor(
@@ -61,9 +61,9 @@ FEM = [
     ),
     Survivor(
         "kernels/fem/elasticity.py",
-        "share = along * along * (real(3.0) - real(2.0) * along)",
-        "share = along * along // (real(3.0) - real(2.0) * along)",
-        "tests/muscles/test_tension.py, another room's, kills it",
+        "length_factor = along * along * (real(3.0) - real(2.0) * along)",
+        "length_factor = along * along // (real(3.0) - real(2.0) * along)",
+        "tests/muscles/test_tension.py, of another package, kills it",
     ),
     Survivor(
         "fem/multifrontal.py",
@@ -79,8 +79,8 @@ FEM = [
     ),
     Survivor(
         "kernels/fem/elasticity.py",
-        "while sweep < _SWEEPS and m[0, 1] * m[0, 1] + m[0, 2] * m[0, 2] + m[1, 2] * m[1, 2] > least:",
-        "while sweep < _SWEEPS and m[0, 1] * m[0, 1] + m[0, 2] * m[0, 2] + m[1, 2] * m[1, 2] >= least:",
+        "while sweep < _MAX_SWEEPS and m[0, 1] * m[0, 1] + m[0, 2] * m[0, 2] + m[1, 2] * m[1, 2] > tolerance:",
+        "while sweep < _MAX_SWEEPS and m[0, 1] * m[0, 1] + m[0, 2] * m[0, 2] + m[1, 2] * m[1, 2] >= tolerance:",
         "no sum of squares is the bound to the bit",
     ),
     Survivor(
