@@ -161,13 +161,13 @@ class TensionHessian:
     axial_stiffness: np.ndarray
     """(M,) s, how much more tension a metre of length gives, N/m; 0 where none is so short that it loses any."""
 
-    def factors(self, *, least: float) -> tuple[np.ndarray, np.ndarray]:
+    def factors(self, *, min_relative_stiffness: float) -> tuple[np.ndarray, np.ndarray]:
         """U (3N, n) and rates (n,) with K = U diag(rates) U^T, of the ``ways``."""
-        segments, ways, rates = self.rank_one_terms(least=least)
+        segments, ways, rates = self.rank_one_terms(min_relative_stiffness=min_relative_stiffness)
         rows = self.rows[segments].toarray()
         return np.einsum("mn,mi->nim", rows, ways).reshape(3 * rows.shape[1], len(segments)), rates
 
-    def rank_one_terms(self, *, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def rank_one_terms(self, *, min_relative_stiffness: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Segments (n,), unit vectors (n, 3) and rates (n,) of which K is the sum: of each segment two directions
         across it and the one along it, where its rate is above ``least`` of the largest.
         """
@@ -176,5 +176,5 @@ class TensionHessian:
         first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
         frames = np.stack([first, np.cross(self.directions, first), self.directions], axis=1)
         rates = np.stack([self.transverse_stiffness, self.transverse_stiffness, self.axial_stiffness], axis=1)
-        segments, which = np.nonzero(np.abs(rates) > least * np.abs(rates).max(initial=1e-300))
+        segments, which = np.nonzero(np.abs(rates) > min_relative_stiffness * np.abs(rates).max(initial=1e-300))
         return segments, frames[segments, which], rates[segments, which]
