@@ -47,7 +47,9 @@ class Studio:
         eye, middle = height * np.array([1.6, -2.4, 1.1]), height * np.array([0.0, 0.0, 0.45])
         self.camera = Camera.look_at(eye, middle, np.eye(3)[2], width=size[0], height=size[1])
         where = {"centre": np.zeros(3), "reach": 3.5 * height, "device": creature.cloud.device}
-        ground = ContactShadow(self.camera, GROUND, grain=shadow_blur_radius(creature.cloud), height=height, **where)
+        ground = ContactShadow(
+            self.camera, GROUND, blur_radius=shadow_blur_radius(creature.cloud), height=height, **where
+        )
         self.behind = grid_floor(ground, cell=0.25 * height)
 
     def carried(self, nodes: np.ndarray) -> GaussianCloud:

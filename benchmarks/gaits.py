@@ -123,7 +123,7 @@ def _run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> 
         "work": work,
         "cost_of_transport": work / way if cell in ("walk", "walk to") and way > NEAR else None,
         "fallen": performance.fallen,
-        "got_up": [entry.fell for entry in performance.sequence.done if entry.got_up],
+        "got_up": [entry.fall_note for entry in performance.sequence.done if entry.got_up],
     }
 
 
@@ -165,7 +165,7 @@ def _missed(asked: dict[str, float], moved: np.ndarray, reached: dict[str, Any],
 def _lies(performance: SimulatedRun, reached: dict[str, Any]) -> str | None:
     if reached["tilt_degrees"] >= GET_UP:
         return f"leans: tilt {reached['tilt_degrees']:.0f} degrees"
-    rose = all(entry.got_up for entry in performance.sequence.done if entry.fell is not None)
+    rose = all(entry.got_up for entry in performance.sequence.done if entry.fall_note is not None)
     return None if rose and performance.sequence.is_finished else "it has not got up within its time"
 
 

@@ -70,7 +70,7 @@ def _run(name: str, degrees: float, side: str, nodes: int) -> Row:
     trajectory = simulation.trajectory
     books = energy_balance(trajectory)
     checked = asdict(audit(trajectory, newton_unconverged=sum(not r.converged for r in simulation.reports)))
-    up = motion.up and motion.resting
+    up = motion.is_up and motion.resting
     return {
         "up": up,
         "tries": motion.tries,

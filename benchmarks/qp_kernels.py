@@ -97,7 +97,7 @@ def recording(name: str, most: int) -> Iterator[list[Recorded]]:
                 raise _EnoughError
             kept = None if start is None else start.copy()
             made.append(Recorded(name, self._program, lower.copy(), upper.copy(), kept, beside))
-            return self._solver.solve(lower, upper, start, beside=beside)
+            return self._solver.solve(lower, upper, start, skip_splitting=beside)
 
     with patch.object(contact_modes, "quadratic_program", Recorder), suppress(_EnoughError):
         yield made
@@ -197,14 +197,14 @@ def full(programs: Sequence[Recorded], device: str) -> list[Row]:
     """A row for each motion and one for all: how often both end alike, and how far their solutions are apart."""
     times, asked, made = compared(programs, device, accuracy=FULL, most=MOST)
     differences = [
-        missed(one, b.x, a.x) if a.ending is b.ending is AdmmStatus.SOLVED else None
+        missed(one, b.x, a.x) if a.status is b.status is AdmmStatus.SOLVED else None
         for one, a, b in zip(programs, asked, made, strict=True)
     ]
     rows = []
     for name in ["all", *dict.fromkeys(one.motion for one in programs)]:
         of = [i for i, one in enumerate(programs) if name in ("all", one.motion)]
         apart = [value for i in of if (value := differences[i]) is not None]
-        unlike = [f"{i}: {asked[i].ending.name} {made[i].ending.name}" for i in of if asked[i].ending != made[i].ending]
+        unlike = [f"{i}: {asked[i].status.name} {made[i].status.name}" for i in of if asked[i].status != made[i].status]
         rows.append(
             {
                 **{"kind": "full", "motion": name, "programs": len(of), "solved": len(apart)},
@@ -223,10 +223,10 @@ def few(programs: Sequence[Recorded], device: str) -> Row:
     ends = list(enumerate(zip(asked, made, strict=True)))
     # What a certificate has ended is no point.
     points = (AdmmStatus.SOLVED, AdmmStatus.INEXACT, AdmmStatus.LIMIT)
-    apart = [_apart(b.x, a.x) for _, (a, b) in ends if a.ending in points and b.ending in points]
+    apart = [_apart(b.x, a.x) for _, (a, b) in ends if a.status in points and b.status in points]
     return {
         **{"kind": "few", "motion": "all", "programs": len(first)},
-        "unlike": [f"{i}: {a.ending.name} {b.ending.name}" for i, (a, b) in ends if a.ending is not b.ending],
+        "unlike": [f"{i}: {a.status.name} {b.status.name}" for i, (a, b) in ends if a.status is not b.status],
         **{"worst": max(apart), "median": float(np.median(apart)), **times},
     }
 
@@ -242,7 +242,7 @@ def whole(programs: Sequence[Recorded], device: str) -> Row:
                 made: QuadraticProgram = quadratic_program(
                     one.program.P, one.program.q, one.program.A, solver=solver, device=device
                 )
-                return made.solve(one.lower, one.upper, one.start, beside=one.beside)
+                return made.solve(one.lower, one.upper, one.start, skip_splitting=one.beside)
 
             end, milliseconds = timed(solve)
             ends.append(end)

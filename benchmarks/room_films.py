@@ -124,7 +124,7 @@ def film(
             gaussians=GaussianCounts.of(creature, made.splats.count),
             drawing=made.milliseconds,
             source=name,
-            notes=(*scene.notes, *performance.cut_short(), *left),
+            notes=(*scene.notes, *performance.unfinished_note(), *left),
             seed=0,
             asked={},
             ending=performance.ending,

@@ -119,15 +119,17 @@ def parse_direction(flag: str, text: str) -> np.ndarray:
 def parse_plane(text: str) -> Plane:
     """Return the plane n.x + d = 0 of ``nx,ny,nz,d``. Raises ``UserError`` for other texts."""
     from egs_warp.geometry.plane import Plane
-    from egs_warp.io.limits import FURTHEST
+    from egs_warp.io.limits import MAX_COORDINATE
 
     try:
         nx, ny, nz, d = (float(part) for part in text.split(","))
     except ValueError as error:
         raise UserError(f"--plane {text}: give four numbers nx,ny,nz,d") from error
     plane = Plane.from_coefficients(nx, ny, nz, d)
-    if abs(plane.offset) > FURTHEST:
-        raise UserError(f"--plane {text}: lies {abs(plane.offset):g} units from the origin; give at most {FURTHEST:g}")
+    if abs(plane.offset) > MAX_COORDINATE:
+        raise UserError(
+            f"--plane {text}: lies {abs(plane.offset):g} units from the origin; give at most {MAX_COORDINATE:g}"
+        )
     return plane
 
 

@@ -102,7 +102,7 @@ def _session(args: argparse.Namespace) -> Session:
     from egs_warp.meshing.cage import check_nodes
     from egs_warp.pipelines.creature import CreatureOptions, make_creature
     from egs_warp.pipelines.progress import preparation_bar
-    from egs_warp.web.feed import drawn_creature
+    from egs_warp.web.feed import live_render_data
     from egs_warp.web.presplit import presplit_gaussians
     from egs_warp.web.session import Session, SessionOptions
 
@@ -134,8 +134,8 @@ def _session(args: argparse.Namespace) -> Session:
             progress=begins,
         )
         begins("split")
-        drawn_as = drawn_creature(creature, presplit_gaussians(creature))
+        drawn_as = live_render_data(creature, presplit_gaussians(creature))
     if front is None:
-        print_note(creature.front.told(creature.frame))
+        print_note(creature.front.description(creature.frame))
     session_options = SessionOptions(source=Path(args.capture).name, takes=args.out, muscles_file=args.muscles)
     return Session(creature, drawn_as, session_options)

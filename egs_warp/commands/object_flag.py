@@ -14,7 +14,7 @@ from egs_warp.geometry.camera import downscale
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.lens import Undistortion
 from egs_warp.io.cameras import PosedImage
-from egs_warp.io.limits import FURTHEST, check_pixels, picture_size, read_bytes
+from egs_warp.io.limits import MAX_COORDINATE, check_pixels, picture_size, read_bytes
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.mask_model import OnnxClickModel, SalientModel
 from egs_warp.segmentation.object_spec import Box, ObjectSpec
@@ -116,8 +116,8 @@ def _parse_location(text: str, posed: Sequence[PosedImage] | None, view: str | N
         raise UserError(f"{flag} {text}: no such file, and not numbers; {_HELP}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
         raise UserError(f"{flag} {text}: {len(numbers)} numbers; {_HELP}")
-    if np.abs(numbers).max() > FURTHEST:
-        raise UserError(f"{flag} {text}: further than {FURTHEST:g} units from the origin; {_HELP}")
+    if np.abs(numbers).max() > MAX_COORDINATE:
+        raise UserError(f"{flag} {text}: further than {MAX_COORDINATE:g} units from the origin; {_HELP}")
     if len(numbers) == 3:
         return ObjectSpec(point=numbers)
     low, high = np.minimum(numbers[:3], numbers[3:]), np.maximum(numbers[:3], numbers[3:])

@@ -35,7 +35,7 @@ class CoulombWorkspace:
             np.zeros(0),
             count,
         )
-        self.friction, self.shifts = self._parameters.device.split([1, capacity])
+        self.friction, self.normal_bias = self._parameters.device.split([1, capacity])
         self.counts = torch.zeros(1, dtype=torch.int32, device=device)
         """(1,) int32, contacts of the operator. ``friction`` is (1,), ``shifts`` (K,) m/s."""
         self._regular = torch.zeros((width, width), dtype=torch.float64, device=device)
@@ -76,7 +76,7 @@ class CoulombWorkspace:
             (1, lanes),
             inputs=[
                 (self.counts, wp.int32),
-                *((each, real) for each in (self._regular[None], speeds[None], self.shifts[None], self.friction)),
+                *((each, real) for each in (self._regular[None], speeds[None], self.normal_bias[None], self.friction)),
                 *(TOLERANCE, MAX_ITERATIONS, (forces[None], real), (self._vectors, real)),
                 *((self._indices, wp.int32), (self._matrices, Vec4)),
             ],

@@ -106,9 +106,14 @@ class NewtonWorkspace:
         """
         parts = [1, width, size, 1, width, 5, convergence_kernels.HEADER_SIZE + MAX_NEWTON_STEPS, width, size, width]
         self._packed_readback, self._host_readback = owner.zeros(sum(parts)), owner.stream.pinned(sum(parts))
-        self.size, self.speeds_after, self.velocities, self.coulomb_violation, self._solved_forces, *others = (
-            self._packed_readback.split(parts)
-        )
+        (
+            self.residual_norm,
+            self.free_contact_velocities,
+            self.velocities,
+            self.coulomb_violation,
+            self._solved_forces,
+            *others,
+        ) = self._packed_readback.split(parts)
         penetration, self._convergence_state, self._previous_contact_velocities, *self._previous_iterate = others
         self._penetrating_count, self._min_gap, self._internal_torque = penetration.split([1, 1, 3])
         self.readback = TrialReadback(*np.split(self._host_readback.numpy(), np.cumsum(parts)[:-1]))
@@ -126,7 +131,7 @@ class NewtonWorkspace:
         """
         self._tensions = as_warp(self.tensions, real)
         self._base, self._trial = owner.zeros(3 * size + width), owner.zeros(3 * size + width)
-        self.ends, self._gradient, self._residual, self._solved, self._force_velocities, self._half_solved = (
+        self.end_positions, self._gradient, self._residual, self._solved, self._force_velocities, self._half_solved = (
             owner.zeros(6, size)
         )
         self._torque, self._rotation = owner.zeros(2, 3)
@@ -299,7 +304,7 @@ class NewtonWorkspace:
         *,
         base: float,
         residual_norm: float | None = None,
-        usual: torch.Tensor | None = None,
+        enabled: torch.Tensor | None = None,
     ) -> None:
         """Start the Newton loop on the device, asynchronously; ``wait_newton`` blocks for its result.
 
@@ -319,8 +324,8 @@ class NewtonWorkspace:
         with self.owner.stream:
             self.coulomb.upload(normal_bias, friction)
             self._convergence_upload.set(convergence.pack(problem.residual_scale, residual_norm))
-            work = partial(self._enqueue_convergence, base, self._always_enabled if usual is None else usual)
-            self._graphs.run(("convergence", base, usual is None), work)
+            work = partial(self._enqueue_convergence, base, self._always_enabled if enabled is None else enabled)
+            self._graphs.run(("convergence", base, enabled is None), work)
             self._graphs.repeat((dt, ratio), lambda: self._enqueue_next_step(dt, ratio), self._loop_condition)
             self._run(self._enqueue_end, dt)
             self._newton_event = self.owner.stream.record_event(self._newton_event)
@@ -338,7 +343,7 @@ class NewtonWorkspace:
         self._launch(
             convergence_kernels.init_convergence_kernel,
             1,
-            [as_warp(usual, wp.int32), as_warp(self.size, real)],
+            [as_warp(usual, wp.int32), as_warp(self.residual_norm, real)],
             [as_warp(self._convergence_state, real), as_warp(self._loop_condition, wp.int32)],
         )
         self.trial_input.copy_(self._full_step)
@@ -346,13 +351,13 @@ class NewtonWorkspace:
     def _enqueue_next_step(self, dt: float, ratio: float) -> None:
         """Take a Newton step from the last trial and update the loop condition."""
         self.target_forces.copy_(self.trial_parts()[3])
-        self._previous_contact_velocities.copy_(self.speeds_after)
+        self._previous_contact_velocities.copy_(self.free_contact_velocities)
         self.enqueue_newton(dt, ratio)
         self._enqueue_penetration()
         self._launch(
             convergence_kernels.check_convergence_kernel,
             1,
-            [as_warp(each, real) for each in (self.size, self.coulomb_violation, self._penetrating_count)],
+            [as_warp(each, real) for each in (self.residual_norm, self.coulomb_violation, self._penetrating_count)],
             [as_warp(self._convergence_state, real), as_warp(self._loop_condition, wp.int32)],
         )
 
@@ -364,13 +369,13 @@ class NewtonWorkspace:
         for target, value in zip(self._previous_iterate, (velocities, forces), strict=True):
             target.copy_(value)
         self._download_rest()
-        self.owner.enqueue_prefetch(self.ends, self.velocities, dt, self._points)
+        self.owner.enqueue_prefetch(self.end_positions, self.velocities, dt, self._points)
         self._start_download()
 
     def _enqueue_penetration(self) -> None:
         """Count the points that penetrate too far at the end of the last trial."""
         self.owner.selector.enqueue_penetration(
-            vectors(self.ends), self._points, self.coulomb.counts, self._penetrating_count
+            vectors(self.end_positions), self._points, self.coulomb.counts, self._penetrating_count
         )
 
     def _download_rest(self) -> None:
@@ -382,7 +387,7 @@ class NewtonWorkspace:
         """Solve Coulomb's law, starting from ``target_forces``, and run the trial in ``trial_input`` with the
         solution.
         """
-        self.coulomb.enqueue_forces(self.speeds_after, self.target_forces, self.coulomb_violation)
+        self.coulomb.enqueue_forces(self.free_contact_velocities, self.target_forces, self.coulomb_violation)
         self._solved_forces.copy_(self.target_forces)
         self.enqueue_trial(dt, ratio)
 
@@ -430,8 +435,8 @@ class NewtonWorkspace:
         owner = self.owner
         self._trial_upload.send()
         self._enqueue_base()
-        torch.add(owner.positions, self.parts(self._base)[0], alpha=dt, out=self.ends)
-        owner.enqueue_factors(vectors(self.ends), dt)
+        torch.add(owner.positions, self.parts(self._base)[0], alpha=dt, out=self.end_positions)
+        owner.enqueue_factors(vectors(self.end_positions), dt)
 
     def _enqueue_refactor(self, dt: float, ratio: float) -> None:
         self.enqueue_linearization(dt, ratio)
@@ -468,7 +473,7 @@ class NewtonWorkspace:
         """
         velocities, free_velocities, residual, _ = self.parts(state)
         self._enqueue_free_velocities(velocities, residual, free_velocities)
-        self._enqueue_contact_velocities(free_velocities[:, None], self.speeds_after[:, None])
+        self._enqueue_contact_velocities(free_velocities[:, None], self.free_contact_velocities[:, None])
 
     def _enqueue_free_velocities(self, velocities: torch.Tensor, residual: torch.Tensor, end: torch.Tensor) -> None:
         """Compute the velocities after a Newton step.
@@ -509,9 +514,9 @@ class NewtonWorkspace:
         self.enqueue_residual(dt, ratio)
         velocities, free_velocities, _, _ = self.trial_parts()
         self._enqueue_free_velocities(velocities, self._residual, free_velocities)
-        torch.add(owner.positions, free_velocities, alpha=dt, out=self.ends)
-        owner.enqueue_gradient(vectors(self.ends), dt, self._tensions, vectors(self._gradient))
-        torch.linalg.vector_norm(self._gradient, out=self.size[0])
+        torch.add(owner.positions, free_velocities, alpha=dt, out=self.end_positions)
+        owner.enqueue_gradient(vectors(self.end_positions), dt, self._tensions, vectors(self._gradient))
+        torch.linalg.vector_norm(self._gradient, out=self.residual_norm[0])
         self.velocities.copy_(free_velocities)
 
     def _enqueue_trial(self, dt: float, ratio: float) -> None:
@@ -526,7 +531,7 @@ class NewtonWorkspace:
         there.
         """
         self.enqueue_residual(dt, ratio)
-        torch.linalg.vector_norm(self._residual, out=self.size[0])
+        torch.linalg.vector_norm(self._residual, out=self.residual_norm[0])
         self.velocities.copy_(self.trial_parts()[0])
         self._enqueue_newton(self._trial)
 
@@ -550,7 +555,7 @@ class NewtonWorkspace:
                 vectors(old_free_velocities),
                 vectors(self._force_velocities),
             ],
-            [vectors(velocities), vectors(self.ends)],
+            [vectors(velocities), vectors(self.end_positions)],
         )
         self._launch(
             kernels.trial_forces_kernel,
@@ -558,7 +563,7 @@ class NewtonWorkspace:
             [lengths, vectors(old_forces), vectors(target_forces)],
             [vectors(forces)],
         )
-        owner.enqueue_gradient(vectors(self.ends), dt, self._tensions, vectors(self._gradient))
+        owner.enqueue_gradient(vectors(self.end_positions), dt, self._tensions, vectors(self._gradient))
         torch.mv(owner.rotation_modes.T, self._gradient, out=self._torque)
         gravity = Vec3(*(float(each) for each in owner.body.gravity))
         self._launch(

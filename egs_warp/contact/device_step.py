@@ -82,9 +82,9 @@ class StepWorkspace:
         self._graphs = GraphCache(self.stream)
         self.no_tensions = wp.zeros(0, dtype=real, device=body.assembly.device)
         self.gradients = wp.zeros(len(body.mesh.tets), dtype=Mat33, device=body.assembly.device)
-        self.lines = elements.muscle_segments(MuscleEnergy.of(muscles, np.zeros(muscles.segment_count)))
+        self.muscle_segments = elements.muscle_segments(MuscleEnergy.of(muscles, np.zeros(muscles.segment_count)))
         self.segment_count = muscles.segment_count
-        self._rows = self.tensor(self.lines.rows.toarray())
+        self._rows = self.tensor(self.muscle_segments.rows.toarray())
         self._directions_upload = PinnedUpload(self.stream, 4 * (3 * self.segment_count + 2 * _CAPACITY_STEP))
         self._loaded_step: tuple[BodyState, float] | None = None
         """State and step size in seconds of the loaded step."""
@@ -198,7 +198,7 @@ class StepWorkspace:
         matrix.
         """
         segments, directions, rates = tension.hessian(problem.end_positions(velocities)).rank_one_terms(
-            least=MIN_RELATIVE_STIFFNESS
+            min_relative_stiffness=MIN_RELATIVE_STIFFNESS
         )
         # Terms with positive stiffness are added, negative ones subtracted. Zero rows of padding change nothing.
         terms_by_sign = {sign: np.flatnonzero(sign * rates > 0.0) for sign in _SIGNS}
@@ -223,7 +223,7 @@ class StepWorkspace:
 
     def enqueue_gradient(self, ends: wp.array, dt: float, tensions: wp.array, gradient: wp.array) -> None:
         """Compute the internal ``gradient`` in newtons at the positions ``ends``, under the muscles' ``tensions``."""
-        self.elements.enqueue_gradient(ends, self.gradients, dt, self.lines, tensions, gradient)
+        self.elements.enqueue_gradient(ends, self.gradients, dt, self.muscle_segments, tensions, gradient)
 
 
 def vectors(flat: torch.Tensor) -> wp.array:

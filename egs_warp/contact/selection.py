@@ -32,7 +32,7 @@ class ContactSelector:
     load oscillate.
     """
 
-    def __init__(self, geometry: ContactGeometry, *, near: float, lower: float) -> None:
+    def __init__(self, geometry: ContactGeometry, *, activation_distance: float, hysteresis: float) -> None:
         """Divide the surface into cells.
 
         Args:
@@ -43,16 +43,16 @@ class ContactSelector:
         """
         self.geometry, self.activation_distance, self.hysteresis, self.gap_tolerance = (
             geometry,
-            near,
-            lower,
-            GAP_TOLERANCE_FRACTION * near,
+            activation_distance,
+            hysteresis,
+            GAP_TOLERANCE_FRACTION * activation_distance,
         )
         corners = geometry.mesh.tets[geometry.tet_from_point]
         positions = np.einsum("pw,pwi->pi", geometry.weights, geometry.mesh.nodes[corners])
         # Rounding makes points equally far from two centres go to the same cell on every machine.
         positions = self.gap_tolerance * np.rint(positions / self.gap_tolerance)
         heights = geometry.ground_heights(positions)
-        sole = np.flatnonzero(heights < heights.min() + 2.0 * near)
+        sole = np.flatnonzero(heights < heights.min() + 2.0 * activation_distance)
         spacing = _MIN_SPACING * mean_edge_length(geometry.mesh)
         self.cell_from_point, away = _few_cells(positions, heights, sole, spacing, MAX_CELLS_AT_REST)
         self.order = np.lexsort((np.rint(away / self.gap_tolerance), self.cell_from_point))

@@ -163,7 +163,9 @@ class StepProblem:
             return Tangent(self, factors, velocities)
         definite = self._factor(factors, velocities, projected=False)
         if tension is not None:
-            across, rates = tension.hessian(self.end_positions(velocities)).factors(least=MIN_RELATIVE_STIFFNESS)
+            across, rates = tension.hessian(self.end_positions(velocities)).factors(
+                min_relative_stiffness=MIN_RELATIVE_STIFFNESS
+            )
             if factors.add_low_rank(across, self.dt**2 * rates):
                 return Tangent(self, factors)
         if not definite:

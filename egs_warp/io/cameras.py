@@ -16,7 +16,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.colmap import SparsePoints, read_colmap_model, read_colmap_points
-from egs_warp.io.limits import FURTHEST, MAX_TEXT_BYTES, check_pixels, picture_size, read_bytes
+from egs_warp.io.limits import MAX_COORDINATE, MAX_TEXT_BYTES, check_pixels, picture_size, read_bytes
 from egs_warp.io.ply import read_point_ply
 from egs_warp.io.text import whole_number
 
@@ -114,8 +114,8 @@ def _checked(camera: Camera, what: str) -> Camera:
             f"{what}: focal lengths {camera.fx:g}, {camera.fy:g} and middle {camera.cx:g}, {camera.cy:g} fit no photo"
             f" of {camera.width} x {camera.height} pixels; export the poses again"
         )
-    if not (abs(camera.translation) < FURTHEST).all():
-        raise UserError(f"{what}: it lies more than {FURTHEST:g} units from the origin; export the poses again")
+    if not (abs(camera.translation) < MAX_COORDINATE).all():
+        raise UserError(f"{what}: it lies more than {MAX_COORDINATE:g} units from the origin; export the poses again")
     return camera
 
 

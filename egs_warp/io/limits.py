@@ -22,7 +22,7 @@ MAX_SIDE = 1 << 15
 """Maximum side of a picture or camera, pixels."""
 
 
-FURTHEST = 1e12
+MAX_COORDINATE = 1e12
 """Maximum coordinate, scene units."""
 FREE_GAUSSIANS = 1 << 16
 """Number of Gaussians that a packed capture of any size may declare."""

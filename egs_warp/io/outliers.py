@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.io.limits import FURTHEST
+from egs_warp.io.limits import MAX_COORDINATE
 from egs_warp.io.raw import RawCapture
 
 MAX_DISTANCE_RATIO = 1e4
@@ -44,9 +44,9 @@ def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
     distance = np.sqrt(np.einsum("ni,ni->n", means - middle, means - middle))
     size = max(float(np.median(distance)), float(np.median(scales)))
     reach = max(size, float(np.abs(middle).max()))
-    if reach > FURTHEST:
+    if reach > MAX_COORDINATE:
         raise UserError(
-            f"{source}: it extends {reach:.3g} units from the origin, the limit is {FURTHEST:g}; export it again"
+            f"{source}: it extends {reach:.3g} units from the origin, the limit is {MAX_COORDINATE:g}; export it again"
         )
     far, large = distance > MAX_DISTANCE_RATIO * size, scales > MAX_SCALE_RATIO * size
     bright = np.asarray((np.abs(raw.sh) > MAX_SH).any(axis=(1, 2)))

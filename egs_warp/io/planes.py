@@ -14,7 +14,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.height_field import HeightField, check_grid
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
-from egs_warp.io.limits import FURTHEST, MAX_TEXT_BYTES, read_bytes
+from egs_warp.io.limits import MAX_COORDINATE, MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.text import whole_number
 
 _MAX_TEXELS = 1 << 13
@@ -110,7 +110,7 @@ class PlaneRecord:
             raise UserError(f"{path}: plane {number} needs normal [x, y, z] and offset; make it again") from error
         nx, ny, nz = normal.tolist()
         plane = Plane.from_coefficients(nx, ny, nz, offset)
-        if abs(plane.offset) > FURTHEST:
+        if abs(plane.offset) > MAX_COORDINATE:
             raise UserError(f"{path}: plane {number} lies {abs(plane.offset):g} units from the origin; make it again")
         try:
             centre = np.array(entry["centre"], dtype=float).reshape(3) if "centre" in entry else None

@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from egs_warp.kernels.locomotion import active_set as kernels
-from egs_warp.kernels.locomotion.whitened_constraints import STEP, WhitenedConstraints, reduce_kernel, room_of
+from egs_warp.kernels.locomotion.whitened_constraints import STEP, WhitenedConstraints, reduce_kernel, scratch_size
 from egs_warp.launching import thread_local_cache
 from egs_warp.precision import Vec4, real
 
@@ -102,7 +102,7 @@ class _Workspace:
         self._transpose, self._roots = np.zeros((unknowns, padded_unknowns)), np.zeros(unknowns)
         constraints.lower, constraints.columns = _zeros((unknowns, padded_unknowns)), _zeros((unknowns, rows))
         constraints.upper, constraints.roots = _shared(self._transpose), _shared(self._roots)
-        constraints.scratch = _zeros((room_of(unknowns, padded_unknowns),))
+        constraints.scratch = _zeros((scratch_size(unknowns, padded_unknowns),))
         constraints.minimum, constraints.free, constraints.lengths = map(
             _shared, (self._minimum, self._values_at_minimum, self._row_norms)
         )

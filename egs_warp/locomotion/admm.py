@@ -34,7 +34,7 @@ class AdmmStatus(Enum):
     """At the iteration limit, residuals are larger."""
     INFEASIBLE = kernels.INFEASIBLE
     """There is a certificate that no point satisfies the bounds."""
-    DOUBTFUL = kernels.DOUBTFUL
+    INFEASIBLE_INEXACT = kernels.INFEASIBLE_INEXACT
     """At the iteration limit, there is such a certificate to ten times its tolerance."""
     FAILED = -1
     """The iterates are not finite, or the solver failed."""
@@ -56,7 +56,7 @@ class DenseQp:
 class AdmmResult:
     """Result of the iterations on one QP."""
 
-    ending: AdmmStatus
+    status: AdmmStatus
     x: np.ndarray
     """(n,)."""
     multipliers: np.ndarray
@@ -136,7 +136,7 @@ class AdmmPrograms:
             ending, x, y = AdmmStatus(int(status[i])), self._x[i, :columns].copy(), self._y[i, :rows].copy()
             if not np.isfinite(x).all() or not np.isfinite(y).all():
                 ending = AdmmStatus.FAILED
-            if ending in (AdmmStatus.INFEASIBLE, AdmmStatus.DOUBTFUL, AdmmStatus.FAILED):
+            if ending in (AdmmStatus.INFEASIBLE, AdmmStatus.INFEASIBLE_INEXACT, AdmmStatus.FAILED):
                 # Iterates that diverged are no warm start.
                 self._x[i], self._y[i], self._rho[i] = 0.0, 0.0, self._first
             results.append(AdmmResult(ending, x, y, int(count[i])))

@@ -164,7 +164,7 @@ class BatchStepper:
         count = len(frictions)
         self.body, self.muscles = body, muscles
         near = self.settings.activation_distance * body.height
-        points = ContactSelector(geometry, near=near, lower=0.1 * near)
+        points = ContactSelector(geometry, activation_distance=near, hysteresis=0.1 * near)
         self.common = BatchBody(body, muscles, count, panel=panel, chunk_bytes=chunk_bytes)
         self.detector = BatchDetector(geometry, points, count, device=self.device)
         self.solver = BatchSolver(

@@ -160,7 +160,9 @@ def search_modes(
                 break
             modes = best.next_modes_single
             continue
-        is_small_gain = best is not None and best.objective - solution.objective < kernels.GAIN * abs(best.objective)
+        is_small_gain = best is not None and best.objective - solution.objective < kernels.MIN_GAIN_FRACTION * abs(
+            best.objective
+        )
         best, start = solution, solution.x
         if solution.next_modes is None or is_small_gain:
             break
@@ -305,12 +307,15 @@ def solve_mode_region(
     if region is None:
         return None
     b = region.rows_offset[m:]
-    lower = np.minimum(-b, np.maximum(region.rows[m:] @ start[:m], -b - kernels.BROKEN)) - kernels.ROUNDING
+    lower = (
+        np.minimum(-b, np.maximum(region.rows[m:] @ start[:m], -b - kernels.MAX_START_VIOLATION))
+        - kernels.START_ROUNDING
+    )
     optimum = quadratic_program(region.P, region.q, region.rows, solver=solver, device=device).solve(
         np.concatenate([program.lower, lower]),
         np.concatenate([program.upper, np.full(len(lower), np.inf)]),
         start[:m],
-        beside=warm_start,
+        skip_splitting=warm_start,
     )
     if not optimum.usable:
         return None
@@ -318,7 +323,7 @@ def solve_mode_region(
     x = np.concatenate([a, region.force_offset + region.force_slope @ a])
     objective = program.objective(x)
     multipliers = -optimum.multipliers[m:]
-    active = np.flatnonzero(multipliers > kernels.ACTIVE * max(abs(objective), 1e-9))
+    active = np.flatnonzero(multipliers > kernels.MIN_MULTIPLIER * max(abs(objective), 1e-9))
     next_all = next_single = None
     if len(active):
         contact, transitions, multipliers = region.contact[active], region.transitions[active], multipliers[active]

@@ -190,7 +190,11 @@ class DeviceLinearSteps:
     def segment_forces(self, newton: NewtonWorkspace) -> torch.Tensor:
         """Return (M, 3) N, by which the segments pull their ends together at their bounds, where the last trial of
         ``newton`` ends."""
-        return wp.to_torch(self.owner.lines.enqueue_segment_forces(as_warp(self._tensions, real), vectors(newton.ends)))
+        return wp.to_torch(
+            self.owner.muscle_segments.enqueue_segment_forces(
+                as_warp(self._tensions, real), vectors(newton.end_positions)
+            )
+        )
 
     def write(self, newton: NewtonWorkspace, segment_forces: torch.Tensor, dt: float, velocities: torch.Tensor) -> None:
         """Write ``LinearStep.velocities`` about the last trial of ``newton``, which must be one without muscles

@@ -25,7 +25,7 @@ from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
 from egs_warp.fem.dense_cholesky import DenseCholesky
 from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.kernels.locomotion import step_program as kernels
-from egs_warp.kernels.locomotion.active_set import FOUND
+from egs_warp.kernels.locomotion.active_set import OPTIMUM_FOUND
 from egs_warp.kernels.locomotion.mode_search import HEADER_SIZE
 from egs_warp.kernels.locomotion.relaxed_contact import pack_search_kernel
 from egs_warp.locomotion.contact_modes import ModeSearchResult, search_modes, solve_relaxed
@@ -134,7 +134,7 @@ class PlanWorkspace:
     def __init__(self, owner: DevicePlanner, newton: NewtonWorkspace) -> None:
         body, zeros = owner.owner, owner.owner.zeros
         self.owner, self.body, self.newton = owner, body, newton
-        self.m, size, capacity = owner.planner.synergies.count, len(newton.ends), newton.capacity
+        self.m, size, capacity = owner.planner.synergies.count, len(newton.end_positions), newton.capacity
         m, width = self.m, 3 * capacity
         parts = [3 * m, m, m, 1, width, body.segment_count]
         self._input = PinnedUpload(body.stream, sum(parts))
@@ -267,10 +267,10 @@ class PlanWorkspace:
             return None
         contacts = start.contacts.count
         self._objective = float(objective)
-        if status != FOUND or has_point != 1.0 or needs_restart(objective, contacts):
+        if status != OPTIMUM_FOUND or has_point != 1.0 or needs_restart(objective, contacts):
             x = search_result[HEADER_SIZE : HEADER_SIZE + self.m + 3 * contacts].copy() if has_point == 1.0 else None
             first = ModeSearchResult(x, objective, int(count), int(infeasible))
-            if status != FOUND:
+            if status != OPTIMUM_FOUND:
                 first = self._search_on_host(self._search)
             final = self._search_with_restart(first, contacts)
             if final.x is None:
@@ -369,7 +369,7 @@ class PlanWorkspace:
             self._plan_event = self.body.stream.record_event(self._plan_event)
         convergence = self.owner.convergence_state(start.problem)
         self.newton.start_newton(
-            start.problem, start.normal_bias, start.friction, convergence, base=FROM_TRIAL, usual=enabled
+            start.problem, start.normal_bias, start.friction, convergence, base=FROM_TRIAL, enabled=enabled
         )
         if self._plan_event is not None:
             self._plan_event.synchronize()
@@ -407,24 +407,24 @@ class PlanWorkspace:
             each.copy_(self._known)
         newton.tensions.copy_(self._tensions)
         newton.trial_input.copy_(self._evaluate_input[FROM_START])
-        torch.add(body.positions, body.rigid_guess, alpha=dt, out=newton.ends)
+        torch.add(body.positions, body.rigid_guess, alpha=dt, out=newton.end_positions)
         self._enqueue_factors(dt, 0)
         newton.enqueue_prediction(dt, ratio)
-        self._residual_norms[0].copy_(newton.size[0])
+        self._residual_norms[0].copy_(newton.residual_norm[0])
         self._enqueue_factors(dt, 1)
         newton.enqueue_linearization(dt, ratio)
         velocities.copy_(newton.velocities)
         newton.enqueue_trial(dt, ratio)
-        self._residual_norms[1].copy_(newton.size[0])
+        self._residual_norms[1].copy_(newton.residual_norm[0])
         for iteration in range(PREDICTION_ITERATIONS):
             newton.trial_input.copy_(self._newton_input)
             newton.enqueue_newton(dt, ratio)
-            self._residual_norms[2 + iteration].copy_(newton.size[0])
+            self._residual_norms[2 + iteration].copy_(newton.residual_norm[0])
             self._coulomb_violations[iteration].copy_(newton.coulomb_violation[0])
 
     def _enqueue_factors(self, dt: float, which: int) -> None:
         """Queue the factorisation of the step's matrix at the end of the last trial."""
-        self.body.enqueue_factors(vectors(self.newton.ends), dt)
+        self.body.enqueue_factors(vectors(self.newton.end_positions), dt)
         self._verdicts[which].copy_(self.body.factors.verdict)
 
     def _enqueue_linear(self, dt: float, ratio: float, time: float, base: float) -> None:
@@ -434,7 +434,7 @@ class PlanWorkspace:
         newton.tensions.zero_()
         newton.trial_input.copy_(self._evaluate_input[base])
         newton.enqueue_residual(dt, ratio)
-        segment_forces, ends = owner.linear.segment_forces(newton), vectors(newton.ends)
+        segment_forces, ends = owner.linear.segment_forces(newton), vectors(newton.end_positions)
         torch.sum(wp.to_torch(body.elements.enqueue_energies(ends, body.gradients, time)), dim=0, out=self._energy[0])
         body.elements.enqueue_gradient(ends, body.gradients, time, None, body.no_tensions, vectors(self._gradient))
         entries = body.elements.enqueue_entries(ends, body.gradients, time, factor=1.0, projected=True)
@@ -480,7 +480,11 @@ class PlanWorkspace:
             inputs=[
                 *(planner.settings.qp_limit, body.body.speed_unit, body.body.weight),
                 *(as_warp(coulomb.counts, wp.int32), as_warp(coulomb.friction, real), as_warp(self._form, real)),
-                *(as_warp(self._contact_velocities, real), as_warp(coulomb.shifts, real), as_warp(self._bounds, real)),
+                *(
+                    as_warp(self._contact_velocities, real),
+                    as_warp(coulomb.normal_bias, real),
+                    as_warp(self._bounds, real),
+                ),
                 vectors(newton.target_forces),
             ],
             outputs=[self._search.packed_qp],
@@ -521,8 +525,8 @@ class PlanWorkspace:
         torch.mul(activations[owner.group_from_muscle] * bounds, stiffness, out=newton.tensions)
         newton.trial_input.copy_(self._evaluate_input[FROM_START])
         newton.enqueue_trial(dt, ratio)
-        self._plan_check[1].copy_(newton.size[0])
-        self._end_contact_velocities.copy_(newton.speeds_after)
+        self._plan_check[1].copy_(newton.residual_norm[0])
+        self._end_contact_velocities.copy_(newton.free_contact_velocities)
         self._end_velocities.copy_(newton.velocities)
         self._host_readback.copy_(self._readback, non_blocking=True)
 
@@ -538,7 +542,7 @@ class PlanWorkspace:
         form.add_(quadratic, alpha=unit)
         form[:, -1].add_(linear_terms, alpha=unit)
         form[-1, -1].add_(unit * (linear_terms[-1] + 2.0 * self._energy[0]) + self._constant[0])
-        shortenings = owner.linear.lengths(body.positions) - owner.linear.lengths(newton.ends)
+        shortenings = owner.linear.lengths(body.positions) - owner.linear.lengths(newton.end_positions)
         squared_work = owner.members.T @ (owner.work_factors * shortenings).square()
         form.diagonal()[: self.m].add_(self._diagonal + (2.0 * WORK_WEIGHT) * squared_work)
         form[: self.m, -1].add_(self._linear_terms)

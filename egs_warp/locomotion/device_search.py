@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from egs_warp.kernels.locomotion import mode_search as kernels
-from egs_warp.kernels.locomotion.active_set import FOUND, NUMERICAL_FAILURE
+from egs_warp.kernels.locomotion.active_set import NUMERICAL_FAILURE, OPTIMUM_FOUND
 from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints
 from egs_warp.kernels.locomotion.block_splitting import Splitting
 from egs_warp.kernels.locomotion.mode_region import CONE_FACES
@@ -85,7 +85,7 @@ class ModeSearchWorkspace:
             "cost_products": (size, m + 1),
             **dict.fromkeys(("cost", "root"), (m, m)),
             **dict.fromkeys(("slope", "minimum", "optimum", "start"), m),
-            **dict.fromkeys(("at_minimum", "at_start", "at_found"), base_count),
+            **dict.fromkeys(("at_minimum", "at_start", "at_optimum"), base_count),
             **{
                 "lengths": row_capacity,
                 "bounds": (2, row_capacity),
@@ -172,7 +172,7 @@ class RelaxationWorkspace:
         relaxed = Relaxed()
         for name, shape in {
             **{"cost": (size, size), "root": (size, size), "leaving": (n, size), "speeds": n},
-            **dict.fromkeys(("minimum", "found", "slope", "values"), size),
+            **dict.fromkeys(("minimum", "optimum", "slope", "values"), size),
             **{"lengths": row_capacity, "bounds": (2, row_capacity)},
         }.items():
             setattr(relaxed, name, wp.zeros(shape, dtype=real, device=device))
@@ -194,7 +194,11 @@ class RelaxationWorkspace:
         failure, or if the search was accepted first."""
         packed_result = self._host_result.get()
         # Large enough forces always prevent penetration, so the relaxed QP is feasible: other statuses are failures.
-        return (packed_result[kernels.HEADER_SIZE :], float(packed_result[1])) if packed_result[0] == FOUND else None
+        return (
+            (packed_result[kernels.HEADER_SIZE :], float(packed_result[1]))
+            if packed_result[0] == OPTIMUM_FOUND
+            else None
+        )
 
 
 def _active_set(rows: int, base_rows: int, unknowns: int, cancelled: wp.array) -> tuple[Any, Any, Any]:

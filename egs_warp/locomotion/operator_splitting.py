@@ -131,7 +131,7 @@ def _convert_result(result: Any) -> AdmmResult:
         _CODES.OSQP_SOLVED_INACCURATE: AdmmStatus.INEXACT,
         _CODES.OSQP_MAX_ITER_REACHED: AdmmStatus.LIMIT,
         _CODES.OSQP_PRIMAL_INFEASIBLE: AdmmStatus.INFEASIBLE,
-        _CODES.OSQP_PRIMAL_INFEASIBLE_INACCURATE: AdmmStatus.DOUBTFUL,
+        _CODES.OSQP_PRIMAL_INFEASIBLE_INACCURATE: AdmmStatus.INFEASIBLE_INEXACT,
     }.get(result.info.status_val, AdmmStatus.FAILED)
     return AdmmResult(status, result.x, result.y, result.info.iter)
 

@@ -18,7 +18,7 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import FIRST_PART, Trajectory, part_name, write_arrays
 from egs_warp.muscles.muscle_set import MuscleSet
 
-_STEPS_A_PART = 10
+_MIN_STEPS_PER_PART = 10
 """Minimum number of steps in a part."""
 REPORTED = ("qp_count", "qp_infeasible", "newton_iterations", "converged", "added_spin")
 """Fields of ``StepReport`` that are arrays of a part, one row a step."""
@@ -74,7 +74,7 @@ class Recorder:
         self._reports += reports
         self._requests += [(self._requested_steps, request_digest)] * len(reports)
         self._requested_steps += 1
-        if len(self._reports) >= _STEPS_A_PART:
+        if len(self._reports) >= _MIN_STEPS_PER_PART:
             self._parts.append(self._part())
         self._write()
 

@@ -41,7 +41,7 @@ _STATUS = {
     AdmmStatus.INEXACT: QpStatus.INEXACT,
     AdmmStatus.LIMIT: QpStatus.ITERATION_LIMIT,
     AdmmStatus.INFEASIBLE: QpStatus.INFEASIBLE,
-    AdmmStatus.DOUBTFUL: QpStatus.INFEASIBLE,
+    AdmmStatus.INFEASIBLE_INEXACT: QpStatus.INFEASIBLE,
     AdmmStatus.FAILED: QpStatus.FAILED,
 }
 """QP status for each status of operator splitting."""
@@ -83,7 +83,7 @@ class QuadraticProgram(Protocol):
     """The QP min 1/2 x^T P x + q^T x subject to lower <= A x <= upper, set up once; a solve changes only the bounds."""
 
     def solve(
-        self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, beside: bool = False
+        self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, skip_splitting: bool = False
     ) -> QpSolution:
         """Solve with these bounds.
 
@@ -171,7 +171,7 @@ class SplittingProgram:
         z = None if start is None else rows.whiten(start)
         result = self._splitting.warm_start(rows.unit_rows[index], below[index], above[index], z)
         if (
-            result.ending not in (AdmmStatus.SOLVED, AdmmStatus.INEXACT, AdmmStatus.LIMIT)
+            result.status not in (AdmmStatus.SOLVED, AdmmStatus.INEXACT, AdmmStatus.LIMIT)
             or not np.isfinite(result.x).all()
         ):
             # The active-set method decides whether the QP is feasible: OSQP returns x = 2e9 where it is uncertain.
@@ -211,7 +211,7 @@ class SplittingProgram:
         if self._full_run is None:
             self._full_run = self._splitting.full_run(self._A, _MAX_ITERATIONS)
         result = self._full_run.run(lower, upper, start)
-        status = _STATUS[result.ending]
+        status = _STATUS[result.status]
         if status is QpStatus.ITERATION_LIMIT:
             rows = self._A @ result.x
             violation = max(float((lower - rows).max()), float((rows - upper).max()))

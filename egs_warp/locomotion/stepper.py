@@ -118,14 +118,14 @@ class LocomotionStepper:
         self.body, self.muscles, self.geometry = body, muscles, geometry
         self.settings = settings or LocomotionSettings()
         self.detector = ContactDetector(geometry, device=device)
-        self.points = ContactSelector(
+        self.selector = ContactSelector(
             geometry,
-            near=self.settings.activation_distance * body.height,
-            lower=0.1 * self.settings.activation_distance * body.height,
+            activation_distance=self.settings.activation_distance * body.height,
+            hysteresis=0.1 * self.settings.activation_distance * body.height,
         )
         self.solver = CoupledSolver(
             self.detector,
-            self.points,
+            self.selector,
             push_out_cap=self.settings.push_out_cap * body.speed_unit,
             penetration_tolerance=self.settings.penetration_tolerance * body.height,
         )
@@ -180,7 +180,7 @@ class LocomotionStepper:
         problem = StepProblem(self.body, state, dt)
         contacts = self._detect(problem, memory)
         response = self.linearizer(problem.tangent(self.factors, problem.rigid_guess, None), contacts)
-        forces = self.points.transfer_forces(contacts.points, memory.points, memory.forces)
+        forces = self.selector.transfer_forces(contacts.points, memory.points, memory.forces)
         return self.solver.solve(response, None, velocities=problem.rigid_guess, forces=forces)
 
     def advance(
@@ -265,7 +265,7 @@ class LocomotionStepper:
         problem = StepProblem(self.body, state, dt, self.settings.drag)
         start = self.step_inputs(problem, self._detect(problem, memory), memory)
         predicted = self.predict(replace(start, activations=activations))
-        clock.lap("foresee")
+        clock.lap("predict")
         plan = Plan(activations, predicted.velocities, predicted.forces)
         result = self._solve(predicted.linearization, plan)
         clock.lap("solve")
@@ -316,7 +316,7 @@ class LocomotionStepper:
             start = self._start(end, after, dt)
             self._device_planner.start(start)
             self._prefetched = after, start
-            clock.lap("begin")
+            clock.lap("prefetch")
         return end, after, report
 
     def _start(self, state: BodyState, memory: WarmStart, dt: float) -> StepInputs:
@@ -335,7 +335,7 @@ class LocomotionStepper:
     def step_inputs(self, problem: StepProblem, contacts: ContactSet, memory: WarmStart) -> StepInputs:
         """Collect the inputs of a step with these ``contacts``: velocity bias, and the previous activations and contact
         forces of ``memory``."""
-        previous_forces = self.points.transfer_forces(contacts.points, memory.points, memory.forces)
+        previous_forces = self.selector.transfer_forces(contacts.points, memory.points, memory.forces)
         bias = self.solver.normal_bias(contacts, problem.dt)
         return StepInputs(problem, contacts, bias, self.geometry.friction, memory.activations, previous_forces)
 
@@ -354,7 +354,7 @@ class LocomotionStepper:
             if planned is not None:
                 return planned
         predicted = self.predict(start)
-        clock.lap("foresee")
+        clock.lap("predict")
         return predicted.linearization, self.planner.plan(predicted, start.activations, objectives, clock)
 
     def _replan(
@@ -381,7 +381,7 @@ class LocomotionStepper:
         if other is None:
             other = self.planner.plan(predicted, memory.activations, objectives, clock)
         end = self._solve(response, other)
-        clock.lap("again")
+        clock.lap("replan")
         costs = [self._objective_value(problem, objectives, one.contacts, one) for one in (result, end)]
         if end.converged and costs[1] < costs[0]:
             return other.counting(plan, other), end
@@ -411,7 +411,7 @@ class LocomotionStepper:
             return contacts
         ballistic = problem.state.velocities + problem.dt * self.body.gravity
         gaps, _ = self.detector.gaps(problem.end_positions(ballistic))
-        return self.detector.contact_set(self.points.select(memory.points, loaded, gaps), problem.state.positions)
+        return self.detector.contact_set(self.selector.select(memory.points, loaded, gaps), problem.state.positions)
 
     def predict(self, start: StepInputs) -> PredictedStep:
         """Predict the end of the step under the activations of ``start``, those of the previous step (Eq. 12).

@@ -55,7 +55,7 @@ RESTART_BUDGET = 3
 class Strategy(Enum):
     """Search for the contact modes or states of a step."""
 
-    MODES = "pieces"
+    MODES = "modes"
     """Search over contact modes (``contact_modes``) from the predicted modes. The only strategy with the exact friction
     cone, and with no unknowns but the activations."""
     PAPER = "paper"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.io.limits import FURTHEST
+from egs_warp.io.limits import MAX_COORDINATE
 from egs_warp.locomotion.trajectory import Trajectory
 
 MAX_DURATION = 86_400.0
@@ -72,7 +72,7 @@ def check_trajectory(t: Trajectory) -> None:
         values = np.asarray(getattr(t, name))
         if values.dtype.kind not in "iuf":
             raise ValueError(f"{name} is not numeric")
-        if name not in _MAY_BE_NAN and not (np.abs(values) <= FURTHEST).all():
+        if name not in _MAY_BE_NAN and not (np.abs(values) <= MAX_COORDINATE).all():
             raise ValueError(f"{name} has values that are not finite or too large")
         if name in _POSITIVE and not (values > 0.0).all():
             raise ValueError(f"{name} is not positive")

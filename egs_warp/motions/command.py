@@ -9,7 +9,7 @@ from pathlib import Path
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import read_text
 
-FASTEST = 2.0
+MAX_SPEED = 2.0
 """Largest command, in sqrt(g H) or in radians per sqrt(H / g); larger values are rejected as typing errors."""
 MAX_TIME = 60.0
 """Largest time in a file, s."""
@@ -32,8 +32,8 @@ class Drive:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not (math.isfinite(value) and abs(value) <= FASTEST):
-                raise ArgumentError(name, f"give a speed from -{FASTEST:g} to {FASTEST:g}", value=value)
+            if not (math.isfinite(value) and abs(value) <= MAX_SPEED):
+                raise ArgumentError(name, f"give a speed from -{MAX_SPEED:g} to {MAX_SPEED:g}", value=value)
 
     @property
     def is_zero(self) -> bool:

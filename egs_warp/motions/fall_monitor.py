@@ -52,7 +52,7 @@ class FallMonitor:
         self._fallen_time = FALLEN_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
         self._last_time = self._lying_time = 0.0
         self._gets_up, self._recoveries = gets_up, 0
-        self.spent = 0.0
+        self.get_up_time = 0.0
         """Time spent on getting up, s."""
         self.time = 0.0
         """Time of the last state, s."""
@@ -95,14 +95,14 @@ class FallMonitor:
 
     def _check_recovery(self, getting_up: GetUp, elapsed: float) -> None:
         """Check whether getting up has succeeded or failed."""
-        self.spent += elapsed
+        self.get_up_time += elapsed
         if not getting_up.is_at_rest:
             return
         before = self.sequence.done[-2] if len(self.sequence.done) > 1 else None
-        if getting_up.up and before is not None and before.fell is not None:
+        if getting_up.is_up and before is not None and before.fall_note is not None:
             before.got_up = True
-        elif not getting_up.up:
-            description = before.fell if before is not None else None
+        elif not getting_up.is_up:
+            description = before.fall_note if before is not None else None
             self.fallen = description or f"the body does not get up, at {self._last_time:.2f} s"
 
     def _lying_note(self, state: BodyState, report: StepReport) -> str | None:

@@ -161,7 +161,7 @@ class GetUp:
         return self.phase is GetUpPhase.GIVEN_UP
 
     @property
-    def up(self) -> bool:
+    def is_up(self) -> bool:
         """True if the body stands on its feet."""
         return self.phase is GetUpPhase.STAND
 

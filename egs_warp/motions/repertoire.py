@@ -19,7 +19,7 @@ from egs_warp.motions.hop import HopTargets
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.keyframes import Key, read_keyframes
-from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN, MotionRequest
+from egs_warp.motions.request import MAX_TARGET, MAX_TURN, MotionRequest
 from egs_warp.motions.route import Route, path_route, read_path, straight_route
 from egs_warp.motions.sequence import BodyMotion, MotionTask, Stance
 from egs_warp.motions.stand import StandFor
@@ -124,7 +124,7 @@ def _get_up_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
 
 
 def _run_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
-    route, length = straight_route(request.asked["distance"] * height), LARGEST_TARGET * height
+    route, length = straight_route(request.asked["distance"] * height), MAX_TARGET * height
     return _repeat_task(request, request.asked, lambda stance: move_along(stance, route, length, speed=_SPEED.maximum))
 
 
@@ -183,7 +183,7 @@ def _keys(request: MotionRequest) -> tuple[Key, ...]:
 
 
 _SPEED = Value("speed", 1.0, 0.3, 1.6, "times the usual")
-_STEP_LENGTH = Value("step_length", _STEP, 0.0, LARGEST_TARGET, "body heights", is_exclusive=True)
+_STEP_LENGTH = Value("step_length", _STEP, 0.0, MAX_TARGET, "body heights", is_exclusive=True)
 _TURN_PATH = 2.5
 """Path length in body heights that takes as long as a full turn on the spot."""
 _FULL_TURN_PATH = 10.0
@@ -194,7 +194,7 @@ _MIN_STEP = 0.02
 
 
 def _length(name: str, default: float, *, is_exclusive: bool = False) -> Value:
-    return Value(name, default, 0.0, LARGEST_TARGET, "body heights", is_exclusive=is_exclusive)
+    return Value(name, default, 0.0, MAX_TARGET, "body heights", is_exclusive=is_exclusive)
 
 
 MOTIONS: Mapping[str, MotionKind] = {
@@ -212,7 +212,7 @@ MOTIONS: Mapping[str, MotionKind] = {
     ),
     "twist": MotionKind(
         (
-            Value("heading_degrees", 180.0, -LARGEST_TURN, LARGEST_TURN, "degrees"),
+            Value("heading_degrees", 180.0, -MAX_TURN, MAX_TURN, "degrees"),
             _length("distance", 0.0),
             _length("height", 0.2, is_exclusive=True),
         ),
@@ -222,7 +222,7 @@ MOTIONS: Mapping[str, MotionKind] = {
     ),
     "walk": MotionKind(
         (
-            Value("distance", 0.4, -LARGEST_TARGET, LARGEST_TARGET, "body heights"),
+            Value("distance", 0.4, -MAX_TARGET, MAX_TARGET, "body heights"),
             _STEP_LENGTH,
             _SPEED,
         ),
@@ -231,8 +231,8 @@ MOTIONS: Mapping[str, MotionKind] = {
     ),
     "walk to": MotionKind(
         (
-            Value("ahead", 0.4, -LARGEST_TARGET, LARGEST_TARGET, "body heights"),
-            Value("left", 0.0, -LARGEST_TARGET, LARGEST_TARGET, "body heights"),
+            Value("ahead", 0.4, -MAX_TARGET, MAX_TARGET, "body heights"),
+            Value("left", 0.0, -MAX_TARGET, MAX_TARGET, "body heights"),
             _STEP_LENGTH,
             _SPEED,
         ),
@@ -248,12 +248,12 @@ MOTIONS: Mapping[str, MotionKind] = {
         file="a file of points, as walk along way.csv",
     ),
     "run": MotionKind(
-        (Value("distance", 1.0, -LARGEST_TARGET, LARGEST_TARGET, "body heights"),),
+        (Value("distance", 1.0, -MAX_TARGET, MAX_TARGET, "body heights"),),
         _run_tasks,
         lambda request: 170 + int(np.ceil(36 * abs(request.asked["distance"]) / _MIN_STEP)),
     ),
     "turn": MotionKind(
-        (Value("heading_degrees", 90.0, -LARGEST_TURN, LARGEST_TURN, "degrees"), _SPEED),
+        (Value("heading_degrees", 90.0, -MAX_TURN, MAX_TURN, "degrees"), _SPEED),
         _turn_tasks,
         lambda request: _frames_of_walk(_FULL_TURN_PATH * abs(request.asked["heading_degrees"]) / 360.0, request),
     ),
@@ -289,7 +289,7 @@ MOTIONS: Mapping[str, MotionKind] = {
 }
 
 
-def parts_of(request: MotionRequest, height: float) -> list[MotionTask]:
+def tasks_of_request(request: MotionRequest, height: float) -> list[MotionTask]:
     """Return the tasks of ``request``, with all repeats, for a body of ``height`` metres, in the style of the request
     if it has one."""
     parts, style = MOTIONS[request.name].build_tasks(request, height), request.style

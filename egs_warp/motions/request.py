@@ -9,9 +9,9 @@ from pathlib import Path
 from egs_warp.motions.command import DrivePlan
 from egs_warp.motions.style import Style
 
-LARGEST_TARGET = 10.0
+MAX_TARGET = 10.0
 """Largest target, in body heights; larger values are rejected as typing errors."""
-LARGEST_TURN = 720.0
+MAX_TURN = 720.0
 """Largest turn, in degrees."""
 
 

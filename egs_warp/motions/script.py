@@ -18,12 +18,12 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import parse_json, read_text, whole_number
 from egs_warp.motions.beats import parse_beats
 from egs_warp.motions.command import Drive, DrivePlan
-from egs_warp.motions.repertoire import MOTIONS, MotionKind, parts_of
+from egs_warp.motions.repertoire import MOTIONS, MotionKind, tasks_of_request
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.sequence import MotionTask, Stance
 from egs_warp.motions.style import Style, read_style
 
-MOST_MOTIONS = 100
+MAX_MOTIONS = 100
 _NAMES = ", ".join(MOTIONS)
 _BEATS_FILE = "file of beats"
 """Key of the file of beats among the default values of a script."""
@@ -65,7 +65,7 @@ class Script:
 
     def parts(self, height: float) -> list[MotionTask]:
         """Return the tasks of all motions in order, for a body of ``height`` metres."""
-        return [part for request in self.requests for part in parts_of(request, height)]
+        return [part for request in self.requests for part in tasks_of_request(request, height)]
 
     def check(self, stance: Stance) -> list[float]:
         """Return the expected duration in seconds of each motion, for a body that stands at ``stance``.
@@ -101,8 +101,8 @@ def motion(text: str, *, beats: str | None = None, **values: float | None) -> Sc
         pieces = [piece.strip() for piece in re.split(r",(?!\s*[-+.]?\d)", text)]
         requests = [_from_words(piece, defaults, f"motion {number}") for number, piece in enumerate(pieces, start=1)]
     count = sum(request.repeat for request in requests)
-    if count > MOST_MOTIONS:
-        raise ArgumentError("motion", f"{count} motions are given; at most {MOST_MOTIONS} are allowed")
+    if count > MAX_MOTIONS:
+        raise ArgumentError("motion", f"{count} motions are given; at most {MAX_MOTIONS} are allowed")
     if beats is not None and not any(MOTIONS[request.name].beats for request in requests):
         raise ArgumentError("beats", f"no motion of {text.strip()!r} takes beats; add a dance")
     for name in values.keys() & defaults.keys():
@@ -212,8 +212,8 @@ def _request(
     for key in values:
         if key not in known:
             raise UserError(f"{where}: {key!r} is unknown; {kind.usage(name)}")
-    if not 1 <= repeat <= MOST_MOTIONS:
-        raise UserError(f"{where}: repeat {repeat}; give a whole number from 1 to {MOST_MOTIONS}")
+    if not 1 <= repeat <= MAX_MOTIONS:
+        raise UserError(f"{where}: repeat {repeat}; give a whole number from 1 to {MAX_MOTIONS}")
     if file is None and kind.file is not None:
         raise UserError(f"{where}: {name} needs {kind.file}")
     if file is not None and kind.file is None and not kind.beats:

@@ -171,7 +171,7 @@ class MotionRecord:
     asked: Mapping[str, float]
     motion: BodyMotion
     start_time: float
-    fell: str | None = None
+    fall_note: str | None = None
     """Description of the fall that ended the motion, or None."""
     got_up: bool = False
     """True if the body has got up after that fall."""
@@ -209,7 +209,7 @@ class MotionSequence:
     def start_get_up(self, get_up: MotionTask, why: str) -> None:
         """End the current motion because the body has fallen, as ``why`` describes; ``get_up`` runs before the sequence
         continues."""
-        self.done[-1].fell = why
+        self.done[-1].fall_note = why
         self._parts.insert(0, get_up)
         self._is_dropped = self._gets_up_next = True
 

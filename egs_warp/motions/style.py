@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from egs_warp.errors import ArgumentError
 from egs_warp.motions.values import Value
 
-LEAST, MOST = 0.5, 2.0
+MIN_FACTOR, MAX_FACTOR = 0.5, 2.0
 """Smallest and largest factor; beyond, no body could make the stroke of the jump."""
 
 
@@ -25,8 +25,8 @@ class Style:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not LEAST <= value <= MOST:
-                raise ArgumentError(name, f"give a number from {LEAST:g} to {MOST:g}", value=value)
+            if not MIN_FACTOR <= value <= MAX_FACTOR:
+                raise ArgumentError(name, f"give a number from {MIN_FACTOR:g} to {MAX_FACTOR:g}", value=value)
 
     def __str__(self) -> str:
         """Return the text that ``read_style`` reads: a preset's name, or all numbers."""
@@ -58,7 +58,7 @@ def read_style(text: str) -> Style:
         if not equals and number == 0 and name in PRESETS:
             values |= PRESETS[name]
         elif equals and name in _NAMES:
-            values[name] = Value(name, 1.0, LEAST, MOST, "times the usual").parse(value, "style")
+            values[name] = Value(name, 1.0, MIN_FACTOR, MAX_FACTOR, "times the usual").parse(value, "style")
         else:
             raise ArgumentError("style", f"unknown word {word!r}; give {_usage()}")
     return Style(**values)

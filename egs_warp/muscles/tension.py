@@ -181,17 +181,17 @@ class TensionHessian:
     axial_stiffness: np.ndarray
     """(M,) N/m, s, derivative of the tension with respect to the length; 0 at full force."""
 
-    def factors(self, *, least: float) -> tuple[np.ndarray, np.ndarray]:
+    def factors(self, *, min_relative_stiffness: float) -> tuple[np.ndarray, np.ndarray]:
         """Return U (3N, n) and rates (n,) N/m with K = U diag(rates) U^T, for the terms of ``rank_one_terms``."""
-        segments, directions, rates = self.rank_one_terms(least=least)
+        segments, directions, rates = self.rank_one_terms(min_relative_stiffness=min_relative_stiffness)
         rows = self.rows[segments].toarray()
         return np.einsum("mn,mi->nim", rows, directions).reshape(3 * rows.shape[1], len(segments)), rates
 
-    def rank_one_terms(self, *, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def rank_one_terms(self, *, min_relative_stiffness: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the rank-1 terms of which K is the sum: two transverse directions and the axis of each segment.
 
         Args:
-            least: terms whose rate is at most this fraction of the largest are dropped.
+            min_relative_stiffness: terms whose rate is at most this fraction of the largest are dropped.
 
         Returns:
             Segments (n,), unit vectors (n, 3) and rates (n,) N/m.
@@ -201,5 +201,5 @@ class TensionHessian:
         first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
         frames = np.stack([first, np.cross(self.directions, first), self.directions], axis=1)
         rates = np.stack([self.transverse_stiffness, self.transverse_stiffness, self.axial_stiffness], axis=1)
-        segments, which = np.nonzero(np.abs(rates) > least * np.abs(rates).max(initial=1e-300))
+        segments, which = np.nonzero(np.abs(rates) > min_relative_stiffness * np.abs(rates).max(initial=1e-300))
         return segments, frames[segments, which], rates[segments, which]

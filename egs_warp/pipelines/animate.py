@@ -16,7 +16,7 @@ from egs_warp.io.video import ffmpeg_program
 from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.motions.push import read_pushes
-from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN
+from egs_warp.motions.request import MAX_TARGET, MAX_TURN
 from egs_warp.motions.script import motion as script
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.capture_warnings import capture_warnings
@@ -74,13 +74,13 @@ class AnimateOptions:
 
     def __post_init__(self) -> None:
         for name, value in (("distance", self.distance), ("height", self.height)):
-            if value is not None and not (0.0 <= value <= LARGEST_TARGET):
-                raise ArgumentError(name, f"give a number of body heights from 0 to {LARGEST_TARGET:g}", value=value)
+            if value is not None and not (0.0 <= value <= MAX_TARGET):
+                raise ArgumentError(name, f"give a number of body heights from 0 to {MAX_TARGET:g}", value=value)
         if self.height == 0.0:
             raise ArgumentError("height", "a jump needs a height above 0 body heights", value=0)
         turn = self.heading_degrees
-        if turn is not None and not abs(turn) <= LARGEST_TURN:
-            span = f"from -{LARGEST_TURN:g} to {LARGEST_TURN:g}"
+        if turn is not None and not abs(turn) <= MAX_TURN:
+            span = f"from -{MAX_TURN:g} to {MAX_TURN:g}"
             raise ArgumentError("heading_degrees", f"give a number of degrees {span}", value=turn)
         check_frames(self.frames)
         if not MIN_SIDE <= self.size <= MAX_SIDE:
@@ -167,7 +167,7 @@ def animate(
             creature = make_creature(cloud, up=up, plane=plane, options=options.creature, progress=begin_stage)
         notes = options.notes
         if options.creature.front is None:
-            notes = (*notes, creature.front.told(creature.frame))
+            notes = (*notes, creature.front.description(creature.frame))
         notes = (*notes, *capture_warnings(creature.cloud, creature.cage.mesh, creature.body.height))
         with simulation_bar(quiet=quiet) as show_progress:
             performance = simulate(
@@ -205,7 +205,7 @@ def animate(
         coverage_warning = ground_coverage_warning(
             simulation.trajectory.positions[-1], placed_background, creature.solids[0], creature.body.height
         )
-        notes = (*notes, *performance.cut_short(), *coverage_warning)
+        notes = (*notes, *performance.unfinished_note(), *coverage_warning)
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
             *(performance.sequence.done, energy),

@@ -55,9 +55,9 @@ class EndCause:
         """
         if last and self.stopped:
             return State.STOPPED, ["stopped: the next step could not be solved, however short; the run ends before it"]
-        if entry.fell is not None:
+        if entry.fall_note is not None:
             state, outcome = (State.GOT_UP, "got up again") if entry.got_up else (State.FALLEN, "did not get up")
-            return state, [f"fallen: {entry.fell}; it {outcome}"]
+            return state, [f"fallen: {entry.fall_note}; it {outcome}"]
         if last and self.fallen is not None:
             return State.FALLEN, [f"fallen: {self.fallen}"]
         if not entry.motion.is_at_rest:

@@ -58,7 +58,7 @@ class Front:
     reason: str | None
     """Explanation of an estimate; None if the direction was given."""
 
-    def told(self, frame: BodyFrame) -> str:
+    def description(self, frame: BodyFrame) -> str:
         """Return one line for the user; ``frame`` is that of the body in the capture."""
         direction = ",".join(f"{x:.2f}" for x in frame.axes.T @ self.direction)
         return (

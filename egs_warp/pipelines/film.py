@@ -220,9 +220,9 @@ def _backdrop_of(
     is_plain = shot.transparent or shot.colour is not None
     if scene is not None and not is_plain:
         return captured_scene(
-            scene, camera, GROUND, centre=centre, reach=reach, grain=grain, height=height, shadow=shadow
+            scene, camera, GROUND, centre=centre, reach=reach, blur_radius=grain, height=height, shadow=shadow
         )
-    ground = ContactShadow(camera, GROUND, centre=centre, reach=reach, device=device, grain=grain, height=height)
+    ground = ContactShadow(camera, GROUND, centre=centre, reach=reach, device=device, blur_radius=grain, height=height)
     if is_plain:
         return plain_colour(ground, shot.colour or (0.0, 0.0, 0.0), shadow=shadow)
     return grid_floor(ground, cell=0.25 * height, shadow=shadow)

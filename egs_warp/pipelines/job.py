@@ -69,7 +69,7 @@ class Job:
             gaussians=GaussianCounts.of(creature),
             drawing={},
             source="",
-            notes=performance.cut_short(),
+            notes=performance.unfinished_note(),
             seed=0,
             asked=self._requested_options(),
             ending=performance.ending,

@@ -15,7 +15,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.arrays import READ_ERRORS, read_npz
 from egs_warp.io.atomic import atomic_write
-from egs_warp.io.limits import FURTHEST, check_pixels
+from egs_warp.io.limits import MAX_COORDINATE, check_pixels
 from egs_warp.motions.feet import Foot
 from egs_warp.muscles.muscle_set import MuscleSet
 
@@ -120,10 +120,12 @@ class RenderData:
         ends.check_format()
         check_pixels(camera.width, camera.height, "its camera")
         numbers = np.concatenate([camera.rotation.ravel(), camera.translation, [camera.cx, camera.cy, camera.far]])
-        if (camera.rotation.shape, camera.translation.shape) != ((3, 3), (3,)) or not (abs(numbers) <= FURTHEST).all():
+        if (camera.rotation.shape, camera.translation.shape) != ((3, 3), (3,)) or not (
+            abs(numbers) <= MAX_COORDINATE
+        ).all():
             raise ValueError("its camera stands nowhere")
         lengths = np.array([camera.fx, camera.fy, camera.near, camera.far - camera.near])
-        if not (lengths > 0.0).all() or lengths.max() > FURTHEST or min(camera.width, camera.height) < 1:
+        if not (lengths > 0.0).all() or lengths.max() > MAX_COORDINATE or min(camera.width, camera.height) < 1:
             raise ValueError("its camera sees nothing")
         count = len(self.muscle_bounds)
         _check_rows("muscle_segments", self.muscle_segments, (count, 2), 0, len(ends.indptr) - 1)
@@ -133,7 +135,7 @@ class RenderData:
             raise ValueError("fibre_names and fibre_kinds are not alike")
         if self.muscle_bounds.shape != (count,) or not np.isfinite(self.muscle_bounds).all():
             raise ValueError("muscle_bounds are no bounds")
-        if not (np.abs(ends.data) <= FURTHEST).all():
+        if not (np.abs(ends.data) <= MAX_COORDINATE).all():
             raise ValueError("muscle_end_weights are no weights")
 
 

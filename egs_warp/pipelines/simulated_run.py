@@ -65,7 +65,7 @@ class SimulatedRun:
         """Cause that ended the last motion early, if any."""
         return EndCause(self.fallen, self.simulation.stopped)
 
-    def cut_short(self) -> list[str]:
+    def unfinished_note(self) -> list[str]:
         """Return notes for the user about motions and pushes that the end of the run prevented."""
         ended = self.fallen is not None or self.simulation.stopped
         unapplied = [push.unapplied_note(float(self.trajectory.time[-1])) for push in self.pushes]
@@ -208,7 +208,7 @@ def simulate(
     get_up_frames = round(_MAX_GET_UP_TIME * creature.body.time_unit / frame) if get_up and frames is None else 0
 
     def is_over() -> bool:
-        return watch.is_finished or watch.time + 1e-9 >= (limit - REST_FRAMES) * frame + watch.spent
+        return watch.is_finished or watch.time + 1e-9 >= (limit - REST_FRAMES) * frame + watch.get_up_time
 
     remaining_frames = RemainingFrames(sequence, expected, frame=frame, max_frames=max_frames)
     simulation = roll_out(

@@ -16,7 +16,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import read_points
 from egs_warp.render import render_gaussians
 from egs_warp.training.finetune import Densification, FinetuneOptions, TrainingView, finetune
-from egs_warp.training.initial_cloud import LEAST_POINTS, cloud_from_points, initial_cloud
+from egs_warp.training.initial_cloud import MIN_POINTS, cloud_from_points, initial_cloud
 from egs_warp.training.metrics import match_tone, psnr, ssim_of
 from egs_warp.training.outlier_views import is_outlier
 from egs_warp.training.posed_photos import ExcludedPhoto, backdrop_colour, laid_over, read_views
@@ -162,7 +162,7 @@ def train(
         score_photo(result.cloud, view, background, held_out=out, threads=threads)
         for view, out in zip(views, held_out, strict=True)
     ]
-    outliers = _held_out_outliers(scores) | {trained[number] for number in result.misfits}
+    outliers = _held_out_outliers(scores) | {trained[number] for number in result.outliers}
     left_out = list(photos.left_out)
     for number in sorted(outliers):
         scores[number] = replace(scores[number], is_outlier=True)
@@ -184,7 +184,7 @@ def _start(
 ) -> GaussianCloud:
     """Return the initial cloud: from the triangulated points, otherwise from points on which the photos agree."""
     points = read_points(posed)
-    if points is not None and len(points.positions) >= LEAST_POINTS:
+    if points is not None and len(points.positions) >= MIN_POINTS:
         return cloud_from_points(points, count=max_gaussians, sh_degree=sh_degree, seed=seed, device=device)
     count = max(100, max_gaussians // 3) if max_gaussians is not None else _FIRST_GAUSSIANS
     return initial_cloud(chosen, count=count, sh_degree=sh_degree, seed=seed, device=device)

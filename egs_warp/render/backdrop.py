@@ -79,7 +79,7 @@ def captured_scene(
     *,
     centre: np.ndarray,
     reach: float,
-    grain: float,
+    blur_radius: float,
     height: float,
     shadow: bool = True,
 ) -> Backdrop:
@@ -103,7 +103,7 @@ def captured_scene(
         centre=centre,
         reach=reach,
         device=scene.device,
-        grain=grain,
+        blur_radius=blur_radius,
         height=height,
         depth=np.asarray(cv2.medianBlur(depth, 5)),
     )
@@ -112,7 +112,7 @@ def captured_scene(
     )
     if not shadow:
         return Backdrop(colour_without_shadow, ground, None)
-    lift = ground.lift.numpy().reshape(shape) / (_MAX_BUMP_HEIGHT * reach)
+    lift = ground.surface_height.numpy().reshape(shape) / (_MAX_BUMP_HEIGHT * reach)
     on_plane = np.clip(1.5 - np.where(lift > 0.0, lift, -0.5 * lift), 0.0, 1.0)
     on_plane *= ground.depth.numpy().reshape(shape) > 0.0
     # Floating specks in front of the floor would appear bright in the shadow, and hard edges look cut out.

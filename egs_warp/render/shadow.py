@@ -44,7 +44,7 @@ class ContactShadow:
         centre: np.ndarray,
         reach: float,
         device: wp.Device,
-        grain: float = 0.0,
+        blur_radius: float = 0.0,
         height: float = 0.0,
         depth: np.ndarray | None = None,
     ) -> None:
@@ -64,7 +64,7 @@ class ContactShadow:
         self._layers = kernels.Layers()
         self._layers.low, self._layers.high = wp.vec3(*edges[:, 0].tolist()), wp.vec3(*edges[:, 1].tolist())
         texel, blurs = 2.0 * reach / _MAP, np.array([layer[2] for layer in _LAYERS])
-        self._grain = _taps(np.full(len(_LAYERS), grain) / texel, device)
+        self._grain = _taps(np.full(len(_LAYERS), blur_radius) / texel, device)
         self._blur = _taps(height * blurs / texel, device)
         count = camera.width * camera.height
         self.depth = empty(count, wp.float32, device)
@@ -75,7 +75,7 @@ class ContactShadow:
         """(H W,) 1 around the centre, 0 from ``reach`` on and outside the plane."""
         self.pixel = empty(count, wp.float32, device)
         """(H W,) size of a pixel on the plane, world units."""
-        self.lift = empty(count, wp.float32, device)
+        self.surface_height = empty(count, wp.float32, device)
         """(H W,) height of the ground over the plane, world units."""
         self._texels = empty(count, wp.vec2, device)
         self._ground = _ground(plane, centre, reach)
@@ -85,7 +85,7 @@ class ContactShadow:
             kernels.ground_kernel,
             count,
             [view_from_camera(camera), self._ground, wp.vec3(*(camera.centre - centre).tolist()), surface_depth],
-            [self.depth, self.flat, self.fade, self.pixel, self.lift, self._texels],
+            [self.depth, self.flat, self.fade, self.pixel, self.surface_height, self._texels],
         )
 
     def cover(self, body: GaussianCloud, strength: wp.array) -> wp.array:

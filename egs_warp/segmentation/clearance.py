@@ -21,7 +21,7 @@ from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.deformation.splitting import split_kernel
-from egs_warp.kernels.segmentation.clearance import half_space_kernel, reach_kernel
+from egs_warp.kernels.segmentation.clearance import extent_kernel, half_space_kernel
 from egs_warp.launching import empty, launch_rows
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
@@ -86,7 +86,7 @@ def plane_extents(
     count, device = cloud.count, cloud.device
     outputs = [empty(count, wp.float32, device) for _ in range(3)]
     launch_rows(
-        reach_kernel,
+        extent_kernel,
         count,
         inputs=[wp.vec3(*plane.normal.tolist()), plane.offset, cloud.means, cloud.rotations, cloud.log_scales],
         outputs=outputs,

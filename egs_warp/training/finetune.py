@@ -122,7 +122,7 @@ class FinetuneResult:
     tones: np.ndarray | None = None
     """(views, 3, 4) float64: the colours of each view are these times (the cloud's colours, 1). None without
     ``fit_exposure``."""
-    misfits: tuple[int, ...] = ()
+    outliers: tuple[int, ...] = ()
     """Indices of the excluded views."""
 
 

@@ -17,7 +17,7 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.colmap import SparsePoints
 from egs_warp.training.finetune import TrainingView
 
-LEAST_POINTS = 500
+MIN_POINTS = 500
 """Minimum number of triangulated points from which a training starts."""
 _SIZE_OF_POINT, _OPACITY_OF_POINT = 1.0, 0.1
 """Initial standard deviation, in spacings, and initial opacity of a triangulated point."""

@@ -15,7 +15,7 @@ from egs_warp.kernels.training.photo_loss import (
     blur_derivatives_kernel,
     blur_products_kernel,
     gradient_kernel,
-    likeness_kernel,
+    similarity_kernel,
     tone_kernel,
 )
 from egs_warp.launching import launch_rows
@@ -143,7 +143,7 @@ class _Loss(torch.autograd.Function):
                 **options,
             )
             launch_rows(
-                likeness_kernel,
+                similarity_kernel,
                 pixels,
                 inputs=[
                     *(width, height, w, window, at["mean_a"], at["mean_b"], at["aa"], at["bb"], at["ab"], at["off"])

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import torch
 import warp as wp
 
-from egs_warp.kernels.training.population import jitter_kernel, pull_kernel
+from egs_warp.kernels.training.population import jitter_kernel, regularization_kernel
 from egs_warp.launching import launch_rows
 from egs_warp.render.autograd import torch_stream
 from egs_warp.training.checkpoint import State
@@ -80,7 +80,7 @@ class Population:
         count = len(opacities)
         with torch_stream(opacities.device):
             launch_rows(
-                pull_kernel,
+                regularization_kernel,
                 count,
                 inputs=[
                     _REGULARIZATION / count,

@@ -14,7 +14,7 @@ from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.locomotion.rollout import FRAME_RATE
-from egs_warp.motions.style import LEAST, MOST, PRESETS, Style
+from egs_warp.motions.style import MAX_FACTOR, MIN_FACTOR, PRESETS, Style
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.simulated_run import FILMED_FROM
@@ -61,7 +61,7 @@ class LiveFeed:
             "audit": {},
             "motion": [],
             "notes": [],
-            "limits": {"friction": [0.0, MAX_FRICTION], "sag": [MIN_SAG, MAX_SAG], "style": [LEAST, MOST]},
+            "limits": {"friction": [0.0, MAX_FRICTION], "sag": [MIN_SAG, MAX_SAG], "style": [MIN_FACTOR, MAX_FACTOR]},
             "styles": {"usual": vars(Style()), **{name: dict(style) for name, style in PRESETS.items()}},
         }
         planes = np.array([[*plane.normal, plane.offset] for plane in creature.geometry.planes])
@@ -105,6 +105,6 @@ def live_camera(creature: Creature, *, size: int = 512) -> Camera:
     )
 
 
-def drawn_creature(creature: Creature, splats: GaussianCloud) -> RenderData:
+def live_render_data(creature: Creature, splats: GaussianCloud) -> RenderData:
     """Return the data with which the page draws ``creature``; ``splats`` are its Gaussians, split at rest."""
     return RenderData.of(splats, live_camera(creature), creature.muscles, initial_stance(creature).feet())

@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
 
-from egs_warp.motions.command import FASTEST, Drive
+from egs_warp.motions.command import MAX_SPEED, Drive
 from egs_warp.motions.push import MAX_IMPULSE
 from egs_warp.motions.script import Script, motion
-from egs_warp.motions.style import LEAST, MOST, Style
+from egs_warp.motions.style import MAX_FACTOR, MIN_FACTOR, Style
 
 MAX_TEXT_LENGTH = 200
 """Maximum number of characters of the motions in one message."""
@@ -197,7 +197,9 @@ def _read_go(message: Mapping[str, Any], max_distance: float, node_count: int) -
 
 def _read_steer(message: Mapping[str, Any], max_distance: float, node_count: int) -> Message:
     names = ("forward", "sideways", "turn")
-    return Steer(Drive(*(_read_number(message, name, -FASTEST, FASTEST) if name in message else 0.0 for name in names)))
+    return Steer(
+        Drive(*(_read_number(message, name, -MAX_SPEED, MAX_SPEED) if name in message else 0.0 for name in names))
+    )
 
 
 def _read_pull(message: Mapping[str, Any], max_distance: float, node_count: int) -> Message:
@@ -224,7 +226,9 @@ def _read_change(message: Mapping[str, Any], max_distance: float, node_count: in
 
 
 def _read_style(message: Mapping[str, Any], max_distance: float, node_count: int) -> Message:
-    return Restyle(Style(**{name: _read_number(message, name, LEAST, MOST) for name in STYLE_NAMES if name in message}))
+    return Restyle(
+        Style(**{name: _read_number(message, name, MIN_FACTOR, MAX_FACTOR) for name in STYLE_NAMES if name in message})
+    )
 
 
 def _read_on(message: Mapping[str, Any]) -> bool:

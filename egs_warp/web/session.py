@@ -20,7 +20,7 @@ from egs_warp.errors import UserError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.threads import one_blas_thread
-from egs_warp.motions.script import MOST_MOTIONS
+from egs_warp.motions.script import MAX_MOTIONS
 from egs_warp.pipelines.creature import Creature, changed_creature, initial_stance
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.web.frame_encoding import encode_frame
@@ -226,7 +226,7 @@ class Session:
             case Record(on):
                 self._record(on)
             case RequestScript():
-                requests = self.steering.requests[-MOST_MOTIONS:]
+                requests = self.steering.requests[-MAX_MOTIONS:]
                 self._mailbox.send({"type": "script", "text": script_text(requests), "motions": len(requests)})
 
     def _stand_up(self) -> None:

@@ -22,7 +22,7 @@ from egs_warp.motions.command import Drive
 from egs_warp.motions.drive import LiveDrive
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.get_up import GetUp
-from egs_warp.motions.repertoire import MOTIONS, parts_of
+from egs_warp.motions.repertoire import MOTIONS, tasks_of_request
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script, motion
 from egs_warp.motions.sequence import MotionRecord, MotionTask, Stance
@@ -96,7 +96,7 @@ def tasks_of(script: Script, height: float) -> list[Task]:
     tasks = []
     for request in script.requests:
         once = replace(request, repeat=1)
-        tasks += [Task(part, once) for part in parts_of(request, height)]
+        tasks += [Task(part, once) for part in tasks_of_request(request, height)]
     return tasks
 
 

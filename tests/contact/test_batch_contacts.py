@@ -23,7 +23,7 @@ def creature() -> Creature:
 
 @pytest.fixture(scope="module")
 def points(creature: Creature) -> ContactSelector:
-    return ContactSelector(creature.geometry, near=NEAR, lower=LOWER)
+    return ContactSelector(creature.geometry, activation_distance=NEAR, hysteresis=LOWER)
 
 
 @pytest.fixture(scope="module")

@@ -70,7 +70,9 @@ def solved_together(
     """The contacts that are given, those of the end, and the end: from the points that touch as the bodies fly on, or
     from a ``few``, a third of them."""
     one, device, count = creature.stepper.solver, torch.device("cpu"), len(states)
-    points = ContactSelector(creature.geometry, near=one.points.activation_distance, lower=one.points.hysteresis)
+    points = ContactSelector(
+        creature.geometry, activation_distance=one.points.activation_distance, hysteresis=one.points.hysteresis
+    )
     detector = BatchDetector(creature.geometry, points, count, device=device)
     beside = BatchSolver(
         detector,
@@ -171,7 +173,9 @@ def test_a_world_that_no_tangent_helps_gives_up_at_once(creature: Creature) -> N
 def test_shifts_let_nothing_deeper_and_bring_out_what_is_too_deep(creature: Creature, states: list[BodyState]) -> None:
     """As for one, down to where the speed is capped; no shift where there is no contact."""
     one, dt = creature.stepper.solver, 0.01
-    points = ContactSelector(creature.geometry, near=one.points.activation_distance, lower=one.points.hysteresis)
+    points = ContactSelector(
+        creature.geometry, activation_distance=one.points.activation_distance, hysteresis=one.points.hysteresis
+    )
     detector = BatchDetector(creature.geometry, points, 2, device=torch.device("cpu"))
     beside = BatchSolver(detector, push_out_cap=0.05, penetration_tolerance=0.01, tolerance=1e-8)
     nodes = torch.from_numpy(np.stack([states[0].positions, states[0].positions - np.array([0.0, 0.0, 0.03])]))

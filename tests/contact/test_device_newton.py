@@ -123,7 +123,7 @@ def test_what_was_no_number_is_left_behind(creature: Creature, device: str, monk
         for part in (
             room.columns,
             room.delassus,
-            room.ends,
+            room.end_positions,
             room._base,
             room._trial,
             room._force_velocities,
@@ -193,7 +193,7 @@ def test_a_step_has_the_same_contacts_whatever_was_looked_ahead_for(
     for problem, before in steps:
         ballistic = problem.end_positions(problem.state.velocities + problem.dt * stepper.body.gravity)
         loaded, (gaps, _) = np.ones(len(before), bool), stepper.detector.gaps(ballistic)
-        expected = stepper.points.select(before, loaded, gaps)
+        expected = stepper.selector.select(before, loaded, gaps)
         for ahead, points in [*steps, (problem, np.arange(2))]:
             stepper.linearizer.prefetch_contacts(ahead.state, ahead.dt, points)
             found = stepper.linearizer.select_contacts(problem, before, loaded)

@@ -54,7 +54,10 @@ def test_the_points_of_a_step_are_the_host_s(kind: str, device: str) -> None:
     """
     geometry = ground(kind)
     nodes, random = geometry.mesh.nodes, np.random.default_rng(0)
-    detector, points = ContactDetector(geometry, device=device), ContactSelector(geometry, near=NEAR, lower=1e-3)
+    detector, points = (
+        ContactDetector(geometry, device=device),
+        ContactSelector(geometry, activation_distance=NEAR, hysteresis=1e-3),
+    )
     sight = DeviceContactSelector(detector, points, GraphStream(torch.device(device)), TOLERANCE)
     start, ends = (wp.zeros(len(nodes), dtype=Vec3, device=device) for _ in range(2))
     before, changed, sunk = np.zeros(0, int), 0, 0

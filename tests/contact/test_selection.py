@@ -35,7 +35,7 @@ def gaps_of(geometry: ContactGeometry, tilt: float = 0.0) -> np.ndarray:
 
 
 def test_few_points_one_a_cell(geometry: ContactGeometry) -> None:
-    points = ContactSelector(geometry, near=NEAR, lower=1e-3)
+    points = ContactSelector(geometry, activation_distance=NEAR, hysteresis=1e-3)
     gaps = gaps_of(geometry)
     chosen = points.select(np.zeros(0, int), np.zeros(0, bool), gaps)
     assert 4 <= len(chosen) <= MAX_CELLS_AT_REST
@@ -46,7 +46,7 @@ def test_few_points_one_a_cell(geometry: ContactGeometry) -> None:
 
 
 def test_what_presses_stays_and_the_rest_follows_the_lowest(geometry: ContactGeometry) -> None:
-    points = ContactSelector(geometry, near=NEAR, lower=1e-3)
+    points = ContactSelector(geometry, activation_distance=NEAR, hysteresis=1e-3)
     first = points.select(np.zeros(0, int), np.zeros(0, bool), gaps_of(geometry))
     tilted = gaps_of(geometry, 0.02)
     again = points.select(first, np.ones(len(first), bool), tilted)
@@ -59,7 +59,7 @@ def test_what_presses_stays_and_the_rest_follows_the_lowest(geometry: ContactGeo
 
 
 def test_forces_go_with_their_points_and_the_deep_join(geometry: ContactGeometry) -> None:
-    points = ContactSelector(geometry, near=NEAR, lower=1e-3)
+    points = ContactSelector(geometry, activation_distance=NEAR, hysteresis=1e-3)
     before, forces = np.array([7, 3, 11]), np.arange(9.0).reshape(3, 3)
     matched = points.transfer_forces(np.array([3, 5, 7]), before, forces)
     assert np.array_equal(matched, [[3, 4, 5], [0, 0, 0], [0, 1, 2]])
@@ -76,8 +76,8 @@ def test_cells_are_as_few_wherever_the_ground_is() -> None:
     points = [
         ContactSelector(
             ContactGeometry(mesh, (floor,), 0.8, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0),
-            near=NEAR,
-            lower=1e-3,
+            activation_distance=NEAR,
+            hysteresis=1e-3,
         )
         for floor in (Plane(np.array([0.0, 0.0, 1.0]), 0.0), Plane(np.array([0.0, 0.0, 1.0]), 0.3))
     ]
@@ -91,8 +91,8 @@ def test_rounding_chooses_neither_cells_nor_points(geometry: ContactGeometry) ->
     """
     random = np.random.default_rng(0)
     weights = geometry.weights + 1e-15 * random.standard_normal(geometry.weights.shape)
-    other = ContactSelector(replace(geometry, weights=weights), near=NEAR, lower=1e-3)
-    points, gaps = ContactSelector(geometry, near=NEAR, lower=1e-3), gaps_of(geometry)
+    other = ContactSelector(replace(geometry, weights=weights), activation_distance=NEAR, hysteresis=1e-3)
+    points, gaps = ContactSelector(geometry, activation_distance=NEAR, hysteresis=1e-3), gaps_of(geometry)
     assert np.array_equal(points.cell_from_point, other.cell_from_point)
     none = np.zeros(0, int), np.zeros(0, bool)
     chosen = points.select(*none, gaps)

@@ -46,7 +46,7 @@ def test_programs_of_many_sizes_end_side_by_side_where_osqp_does(device: str) ->
     ends = together.solve(lowers, uppers, [None] * len(made), accuracy=1e-10, iterations=20000)
     for (program, lower, upper), end in zip(made, ends, strict=True):
         asked = by_osqp(program, lower, upper, accuracy=1e-10, iterations=20000)
-        assert end.ending is asked.ending is AdmmStatus.SOLVED
+        assert end.status is asked.status is AdmmStatus.SOLVED
         assert np.abs(end.x - asked.x).max() <= 1e-6 * max(1.0, np.abs(asked.x).max())
         assert np.abs(end.multipliers - asked.multipliers).max() <= 1e-5 * max(1.0, np.abs(asked.multipliers).max())
         slope = program.P @ end.x + program.q + program.A.T @ end.multipliers
@@ -82,7 +82,7 @@ def test_a_solved_program_is_where_the_next_begins(device: str) -> None:
         first = iterations.run(lower, upper, None)
         again = iterations.run(lower, upper + 1e-6, None)
         started = iterations.run(lower, upper, first.x)
-        assert first.ending is again.ending is started.ending is AdmmStatus.SOLVED
+        assert first.status is again.status is started.status is AdmmStatus.SOLVED
         assert first.iterations > 200 > 2 * max(again.iterations, started.iterations)
         assert np.abs(started.x - first.x).max() < 1e-6
         ran.append([first.iterations, again.iterations, started.iterations])
@@ -99,11 +99,11 @@ def test_bounds_that_no_point_satisfies_are_told_apart_and_forgotten(device: str
         asked = by_osqp(given, *out, accuracy=1e-8, iterations=4000)
         programs = AdmmPrograms([given], device=device)
         (made,) = programs.solve([out[0]], [out[1]], [None], accuracy=1e-8, iterations=4000)
-        assert made.ending is asked.ending is AdmmStatus.INFEASIBLE
+        assert made.status is asked.status is AdmmStatus.INFEASIBLE
         back = np.r_[lower, -np.inf], np.r_[upper, np.inf]
         (after,) = programs.solve([back[0]], [back[1]], [None], accuracy=1e-10, iterations=20000)
         fresh = by_osqp(program, lower, upper, accuracy=1e-10, iterations=20000)
-        assert after.ending is AdmmStatus.SOLVED
+        assert after.status is AdmmStatus.SOLVED
         assert np.abs(after.x - fresh.x).max() <= 1e-6 * max(1.0, np.abs(fresh.x).max())
 
 
@@ -115,7 +115,7 @@ def test_a_certificate_is_taken_as_osqp_takes_it(device: str) -> None:
         bounds = np.array([-np.inf, 1.0 + crossed]), np.array([1.0, np.inf])
         asked = by_osqp(program, *bounds, accuracy=1e-8, iterations=300)
         made = by_kernels(program, *bounds, device=device, accuracy=1e-8, iterations=300)
-        assert made.ending is asked.ending is ending
+        assert made.status is asked.status is ending
 
 
 def test_endings_are_those_of_osqp(device: str) -> None:
@@ -126,8 +126,8 @@ def test_endings_are_those_of_osqp(device: str) -> None:
         for accuracy in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5):
             asked = by_osqp(program, lower, upper, accuracy=accuracy, iterations=50)
             made = by_kernels(program, lower, upper, device=device, accuracy=accuracy, iterations=50)
-            assert made.ending is asked.ending and made.iterations == asked.iterations
-            endings.append(made.ending)
+            assert made.status is asked.status and made.iterations == asked.iterations
+            endings.append(made.status)
     assert min(endings.count(one) for one in (AdmmStatus.SOLVED, AdmmStatus.INEXACT, AdmmStatus.LIMIT)) >= 5
 
 
@@ -136,7 +136,7 @@ def test_what_is_no_number_is_no_solution(device: str) -> None:
     q = program.q.copy()
     q[0] = np.nan
     made = by_kernels(DenseQp(program.P, q, program.A), lower, upper, device=device, accuracy=1e-8, iterations=100)
-    assert made.ending is AdmmStatus.FAILED
+    assert made.status is AdmmStatus.FAILED
 
 
 def test_a_singular_hessian_has_one_value_and_many_points(device: str) -> None:
@@ -148,7 +148,7 @@ def test_a_singular_hessian_has_one_value_and_many_points(device: str) -> None:
     lower, upper = np.full(18, -1.0), np.full(18, 1.0)
     made = by_kernels(program, lower, upper, device=device, accuracy=1e-10, iterations=50000)
     asked = by_osqp(program, lower, upper, accuracy=1e-10, iterations=50000)
-    assert made.ending is asked.ending is AdmmStatus.SOLVED
+    assert made.status is asked.status is AdmmStatus.SOLVED
     values = [0.5 * x @ program.P @ x + program.q @ x for x in (made.x, asked.x)]
     assert values[0] == pytest.approx(values[1], abs=1e-8)
     assert np.abs(root.T @ (made.x - asked.x)).max() < 1e-6

@@ -222,7 +222,7 @@ def test_a_search_goes_on_as_the_host_s(
                 lambda found, relaxed, search: (search(relaxed[0]), found)[what == "kept"],
             )
     if what == "astray":
-        monkeypatch.setattr(device_plan, "FOUND", -1)
+        monkeypatch.setattr(device_plan, "OPTIMUM_FOUND", -1)
         monkeypatch.setattr(strategies, "search_modes_device", lambda *_, **__: None)
     elif what == "no bound":
         monkeypatch.setattr(RelaxationWorkspace, "parse_result", lambda _: None)

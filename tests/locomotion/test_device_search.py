@@ -10,7 +10,7 @@ import warp as wp
 
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.kernels.locomotion import block_active_set, block_mode_region, mode_region, mode_search
-from egs_warp.kernels.locomotion.active_set import FOUND, INFEASIBLE
+from egs_warp.kernels.locomotion.active_set import INFEASIBLE, OPTIMUM_FOUND
 from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints
 from egs_warp.kernels.locomotion.block_splitting import Splitting
 from egs_warp.locomotion import active_set, solvers, strategies
@@ -315,6 +315,6 @@ def test_a_block_iterates_as_osqp_does_and_ends_at_the_optimum(seed: int, device
         WhitenedQp.of(np.eye(n), np.zeros(n), units), lower - free, upper - free, free < lower, free > upper
     )
     assert exact is not None
-    assert ended.numpy()[0] == (FOUND if exact.feasible else INFEASIBLE)
+    assert ended.numpy()[0] == (OPTIMUM_FOUND if exact.feasible else INFEASIBLE)
     if exact.feasible:
         np.testing.assert_allclose(holding.z.numpy(), exact.x, atol=1e-6)

@@ -22,7 +22,7 @@ def same(a: Trajectory, b: Trajectory) -> bool:
 
 
 def test_parts_on_disk_are_what_memory_would_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("egs_warp.locomotion.recorder._STEPS_A_PART", 7)
+    monkeypatch.setattr("egs_warp.locomotion.recorder._MIN_STEPS_PER_PART", 7)
     run = slide()
     on_disk, in_memory = run.recorder(folder=lambda: tmp_path / "parts"), run.recorder()
     for report in run.reports[:6]:
@@ -48,7 +48,7 @@ def test_parts_on_disk_are_what_memory_would_hold(tmp_path: Path, monkeypatch: p
 
 
 def test_a_part_that_is_missing_or_of_another_schema_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("egs_warp.locomotion.recorder._STEPS_A_PART", 7)
+    monkeypatch.setattr("egs_warp.locomotion.recorder._MIN_STEPS_PER_PART", 7)
     run = slide()
     recorder = run.recorder(folder=lambda: tmp_path)
     for report in run.reports:

@@ -124,7 +124,7 @@ def test_a_run_goes_on_to_the_same_bits(
 @pytest.mark.slow
 def test_a_run_goes_on_from_any_of_its_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut off after each step: nothing lasts from one step to the next but what is written down."""
-    monkeypatch.setattr("egs_warp.locomotion.recorder._STEPS_A_PART", 1)
+    monkeypatch.setattr("egs_warp.locomotion.recorder._MIN_STEPS_PER_PART", 1)
     whole = run(block(), parts=lambda: tmp_path / "whole")
     parts = sorted(path.name for path in (tmp_path / "whole").iterdir())
     assert len(parts) == 1 + len(whole.reports)

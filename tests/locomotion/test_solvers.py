@@ -74,9 +74,9 @@ def test_a_program_beside_one_that_is_solved_needs_no_iterations(monkeypatch: py
         asked = quadratic_program(P, q, A).solve(lower, upper)
         with monkeypatch.context() as patch:
             patch.setattr(operator_splitting, "_run_osqp", None)
-            beside = quadratic_program(P, q, A).solve(lower, upper, beside=True)
+            beside = quadratic_program(P, q, A).solve(lower, upper, skip_splitting=True)
             rows, below = np.vstack([A, A[:1]]), np.append(lower, 0.3)
-            none = quadratic_program(P, q, rows).solve(below, np.append(upper, 1.0), beside=True)
+            none = quadratic_program(P, q, rows).solve(below, np.append(upper, 1.0), skip_splitting=True)
         assert np.abs(asked.x - beside.x).max() < 1e-9 and asked.status is beside.status is QpStatus.SOLVED
         assert (np.abs(asked.multipliers) > 1e-6).sum() > 5
         assert np.abs(asked.multipliers - beside.multipliers).max() < 1e-7
@@ -101,7 +101,7 @@ class Doubting:
     def warm_start(
         self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None
     ) -> AdmmResult:
-        return AdmmResult(AdmmStatus.DOUBTFUL, np.full(20, 2.143e9), np.zeros(len(lower)), 15)
+        return AdmmResult(AdmmStatus.INFEASIBLE_INEXACT, np.full(20, 2.143e9), np.zeros(len(lower)), 15)
 
     def full_run(self, A: np.ndarray, iterations: int) -> SplittingRun:
         raise AssertionError("nothing is left to iterate on")

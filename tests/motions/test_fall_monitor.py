@@ -96,11 +96,11 @@ def test_a_body_that_gets_up_is_not_watched_meanwhile(made: CoarseCreature) -> N
     seen(made, watch, degrees=90.0, load=1.0, seconds=1.0)
     assert watch.fallen is None and not watch.is_finished
     fell, get_up = sequence.done
-    assert fell.fell == "tilted by 90 degrees at 0.17 s" and not fell.got_up and get_up.name == "get up"
+    assert fell.fall_note == "tilted by 90 degrees at 0.17 s" and not fell.got_up and get_up.name == "get up"
     assert sequence.time_left(1.0, [5.0]) > 0.0 and sequence.unstarted_note() == []
     get_up.motion.phase = GetUpPhase.GIVEN_UP  # type: ignore[attr-defined]
     watch.objectives(replace(made.start, time=1.1), cast(Any, SimpleNamespace()), DT)
-    assert watch.fallen == fell.fell and watch.is_finished
+    assert watch.fallen == fell.fall_note and watch.is_finished
 
 
 def test_keys_may_tip_the_body(made: CoarseCreature) -> None:

@@ -103,7 +103,7 @@ def test_a_body_that_stands_is_up() -> None:
         get_up.objectives(replace(made.start, time=step * DT), None, DT)
         if get_up.is_at_rest:
             break
-    assert get_up.up and get_up.is_at_rest and get_up.tries == 0 and get_up.notes() == []
+    assert get_up.is_up and get_up.is_at_rest and get_up.tries == 0 and get_up.notes() == []
 
 
 def test_a_ball_lies_any_way_up() -> None:
@@ -119,7 +119,7 @@ def test_it_gives_up_after_its_tries() -> None:
         get_up.objectives(replace(state, time=step * DT), None, DT)
         if get_up.is_at_rest:
             break
-    assert get_up.phase is GetUpPhase.GIVEN_UP and not get_up.up and get_up.tries == len(_ATTEMPTS)
+    assert get_up.phase is GetUpPhase.GIVEN_UP and not get_up.is_up and get_up.tries == len(_ATTEMPTS)
     assert get_up.notes() == [f"the body does not get up: it lies after {len(_ATTEMPTS)} tries"]
 
 
@@ -151,8 +151,10 @@ def test_a_block_gets_up_and_goes_on(degrees: float, sideways: bool) -> None:
     assert watch.fallen is None and watch.is_finished
     assert [entry.name for entry in watch.sequence.done] == ["stand", "get up", "stand"]
     fell, get_up, last = watch.sequence.done
-    assert fell.fell is not None and fell.fell.startswith("tilted by") and fell.got_up and last.fell is None
-    assert isinstance(get_up.motion, GetUp) and get_up.motion.up and watch.spent > 0.5
+    assert (
+        fell.fall_note is not None and fell.fall_note.startswith("tilted by") and fell.got_up and last.fall_note is None
+    )
+    assert isinstance(get_up.motion, GetUp) and get_up.motion.is_up and watch.get_up_time > 0.5
     angle, _ = GetUp(block().place)._tilt(end.positions)
     assert np.degrees(angle) < 12.0
 

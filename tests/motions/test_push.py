@@ -163,7 +163,7 @@ def test_a_creature_is_pushed_while_it_stands_or_turns(script: str) -> None:
     creature = coarse_pawn()
     done = simulate(creature, motion(script), pushes=read_pushes("0.1 0.05 left, 0.2-0.3 0.05 back 0.8, 60 0.1 up"))
     t = done.trajectory
-    assert done.fallen is None and done.cut_short() == ["the push at 60 s did not act: the run ended before"]
+    assert done.fallen is None and done.unfinished_note() == ["the push at 60 s did not act: the run ended before"]
     momentum = np.einsum("n,kni->ki", t.node_mass, t.kick_velocity) @ done.place.ground.axes.T
     unit = 0.05 * creature.body.mass * creature.body.speed_unit
     np.testing.assert_allclose(momentum[0] / unit, [0.0, 1.0, 0.0], atol=1e-9)

@@ -44,7 +44,7 @@ def scattered(rng: np.random.Generator) -> MuscleEnergy:
 
 def dense(tension: MuscleEnergy, x: np.ndarray) -> np.ndarray:
     """(3N, 3N) stiffness of all segments."""
-    across, rates = tension.hessian(x).factors(least=0.0)
+    across, rates = tension.hessian(x).factors(min_relative_stiffness=0.0)
     return (across * rates) @ across.T
 
 
@@ -73,7 +73,7 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(shortened: float) -> 
         assert slope == pytest.approx(exact, rel=1e-6, abs=1e-9)
         change = (tension.gradient(x + h * along) - tension.gradient(x - h * along)) / (2 * h)
         assert np.abs((K @ along.ravel()).reshape(x.shape) - change).max() <= 1e-6 * np.abs(change).max()
-    across, rates = tension.hessian(x).factors(least=1e-3)
+    across, rates = tension.hessian(x).factors(min_relative_stiffness=1e-3)
     assert across.shape[1] == len(rates) <= 3 * len(tension.tensions)
     np.testing.assert_allclose((across * rates) @ across.T, K, rtol=0, atol=1e-3 * np.abs(K).max())
 

@@ -89,7 +89,7 @@ def test_a_run_that_is_cut_off_leaves_its_steps(
     run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The simulated steps are read from the parts; the next run moves them aside."""
-    monkeypatch.setattr("egs_warp.locomotion.recorder._STEPS_A_PART", 7)
+    monkeypatch.setattr("egs_warp.locomotion.recorder._MIN_STEPS_PER_PART", 7)
     slid = slide()
 
     def interrupted(*_: object, parts: Callable[[], Path], **__: object) -> None:

@@ -57,7 +57,7 @@ def test_a_bear_looks_where_its_face_is_and_a_stool_away_from_its_back(
         standing = place_cage(lying.cloud, plane=lying.plane, nodes=200)
     found = choose_front(standing)
     assert degrees(standing.frame.axes.T @ found.direction, way) < 8.0
-    told = found.told(standing.frame)
+    told = found.description(standing.frame)
     x, y, z = standing.frame.axes.T @ found.direction
     assert told.startswith(f"front is taken to be {x:.2f},{y:.2f},{z:.2f} (guessed: the body is ")
     assert "times the detail of behind" in told and told.endswith("if not, say which way is front)")

@@ -13,10 +13,10 @@ from egs_warp.pipelines.report import StageTime, stage_times, versions
 
 def test_a_frame_without_a_stage_spends_no_time_in_it() -> None:
     """Three frames of two, one and one steps, of which only the last replans."""
-    spent = [{"foresee": 3.0}, {"foresee": 5.0}, {"foresee": 1.0}, {"foresee": 6.0, "again": 9.0}]
+    spent = [{"predict": 3.0}, {"predict": 5.0}, {"predict": 1.0}, {"predict": 6.0, "replan": 9.0}]
     steps = [cast(StepReport, SimpleNamespace(milliseconds=stages)) for stages in spent]
     timing = stage_times(steps, np.array([0, 2, 3, 4]), {"render": [2.0, 4.0], "split": []})
-    assert timing == {"foresee": StageTime(5.0, 8.0), "again": StageTime(3.0, 9.0), "render": StageTime(3.0, 4.0)}
+    assert timing == {"predict": StageTime(5.0, 8.0), "replan": StageTime(3.0, 9.0), "render": StageTime(3.0, 4.0)}
 
 
 def test_a_package_without_metadata_loses_no_report() -> None:

@@ -37,7 +37,14 @@ def parts() -> tuple[GaussianCloud, GaussianCloud]:
 
 def over_scene(scene: GaussianCloud, body: GaussianCloud, *, shadow: bool) -> np.ndarray:
     behind = captured_scene(
-        scene, camera(), FLOOR, centre=np.zeros(3), reach=2.0, grain=shadow_blur_radius(body), height=1.0, shadow=shadow
+        scene,
+        camera(),
+        FLOOR,
+        centre=np.zeros(3),
+        reach=2.0,
+        blur_radius=shadow_blur_radius(body),
+        height=1.0,
+        shadow=shadow,
     )
     return behind.background(body).numpy()
 
@@ -46,7 +53,9 @@ def on_ground(
     body: GaussianCloud, plane: Plane = FLOOR, centre: np.ndarray | None = None, *, height: float = 1.0
 ) -> ContactShadow:
     where = {"centre": np.zeros(3) if centre is None else centre, "reach": 2.0}
-    return ContactShadow(camera(), plane, **where, device=body.device, grain=shadow_blur_radius(body), height=height)
+    return ContactShadow(
+        camera(), plane, **where, device=body.device, blur_radius=shadow_blur_radius(body), height=height
+    )
 
 
 def square(values: Any) -> np.ndarray:

@@ -103,9 +103,7 @@ def test_files_that_are_no_such_network(program: str, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"two\.onnx: the network takes image, mask; give a network that takes a pict"):
         OnnxClickModel.read(written(tmp_path / "two.onnx", two))
     unknown = alike().replace(b"MatMul", b"MatMuX")
-    with pytest.raises(
-        UserError, match=rf"unknown\.onnx: ({program} cannot read this network|the network failed on)"
-    ):
+    with pytest.raises(UserError, match=rf"unknown\.onnx: ({program} cannot read this network|the network failed on)"):
         OnnxClickModel.read(written(tmp_path / "unknown.onnx", unknown)).mask(
             halves(), np.array([[9.0, 6.0]]), np.array([True])
         )

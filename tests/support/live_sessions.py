@@ -9,7 +9,7 @@ from typing import Any
 
 from egs_warp.assets.pawn import pawn
 from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
-from egs_warp.web.feed import drawn_creature
+from egs_warp.web.feed import live_render_data
 from egs_warp.web.messages import read_message
 from egs_warp.web.packets import Frame
 from egs_warp.web.session import Session, SessionOptions
@@ -24,7 +24,7 @@ def coarse_pawn() -> Creature:
 
 def session_of(creature: Creature, takes: Path) -> Session:
     """Of ``creature``, not started; what it records goes to ``takes``."""
-    return Session(creature, drawn_creature(creature, creature.cloud), SessionOptions(source="pawn", takes=takes))
+    return Session(creature, live_render_data(creature, creature.cloud), SessionOptions(source="pawn", takes=takes))
 
 
 class SteppedSession:

@@ -113,8 +113,8 @@ EQUATIONS: dict[int, Mutation] = {
         (
             *(15, "the turn of the colour", "kernels/deformation/deformer.py"),
             *(
-                "result.turn = quaternion_from_rotation(turned * wp.transpose(axes))",
-                "result.turn = quaternion_from_rotation(axes * wp.transpose(turned))",
+                "result.polar_rotation = quaternion_from_rotation(turned * wp.transpose(axes))",
+                "result.polar_rotation = quaternion_from_rotation(axes * wp.transpose(turned))",
             ),
             "deformation/test_deformer.py::test_a_turned_cage_turns_shape_and_colour_exactly",
         ),

@@ -72,7 +72,7 @@ def passive_body(
     height = body.height
     solver = CoupledSolver(
         ContactDetector(geometry, device=device),
-        ContactSelector(geometry, near=0.01 * height, lower=1e-3 * height),
+        ContactSelector(geometry, activation_distance=0.01 * height, hysteresis=1e-3 * height),
         push_out_cap=0.05 * float(np.sqrt(np.linalg.norm(body.gravity) * height)),
         penetration_tolerance=5e-3 * height,
         tolerance=tolerance,

@@ -32,7 +32,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import PosedImage, read_points
 from egs_warp.io.glb import write_glb
-from egs_warp.io.limits import FURTHEST, MAX_SIDE
+from egs_warp.io.limits import MAX_COORDINATE, MAX_SIDE
 from egs_warp.io.onnx import read_onnx
 from egs_warp.io.photos import read_photo
 from egs_warp.io.planes import read_planes
@@ -150,7 +150,7 @@ def _capture(path: Path) -> None:
     cloud = read_capture(path, device="cpu").cloud
     values = {name: getattr(cloud, name).numpy() for name in ARRAYS}
     assert all(np.isfinite(array).all() for array in values.values())
-    assert (np.abs(values["means"]) <= 2e4 * FURTHEST).all() and (np.abs(values["sh"]) <= 1e3).all()
+    assert (np.abs(values["means"]) <= 2e4 * MAX_COORDINATE).all() and (np.abs(values["sh"]) <= 1e3).all()
     assert values["log_scales"].min() >= -100.0 and values["log_scales"].max() < 40.0
     assert np.allclose(np.linalg.norm(values["rotations"], axis=1), 1.0, atol=1e-5)
 

@@ -76,7 +76,7 @@ def cut_off(views: list[TrainingView], path: Path, at: int, *, resume: bool) -> 
 @pytest.mark.slow
 def test_cut_off_three_times_it_has_the_same_bits(views: list[TrainingView], tmp_path: Path) -> None:
     whole = finetune(start(), views, options=OPTIONS)
-    assert len(whole.misfits) == 1 and whole.cloud.count == 90
+    assert len(whole.outliers) == 1 and whole.cloud.count == 90
     path = tmp_path / "training.npz"
     for at in CUTS:
         cut_off(views, path, at, resume=path.exists())
@@ -89,7 +89,7 @@ def test_cut_off_three_times_it_has_the_same_bits(views: list[TrainingView], tmp
         progress=lambda step, _: seen.append(step),
     )
     assert seen == list(range(CUTS[-1], OPTIONS.iterations)), "steps that were done are not done again"
-    assert bits(again) == bits(whole) and again.misfits == whole.misfits
+    assert bits(again) == bits(whole) and again.outliers == whole.outliers
 
 
 def test_what_cannot_go_on_is_told(views: list[TrainingView], tmp_path: Path) -> None:

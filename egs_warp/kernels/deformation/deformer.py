@@ -81,7 +81,7 @@ class DeformedGaussian:
     mean: wp.vec3
     rotation: wp.vec4
     log_scales: wp.vec3
-    turn: wp.vec4
+    polar_rotation: wp.vec4
 
 
 @wp.func
@@ -120,11 +120,11 @@ def deform_gaussian(
             is_affine = wp.bool(False)
     turned = wp.mat33()
     if is_affine:
-        result.turn = rotation_of_tet(cage, both.tet)
-        turned = rotation_from_quaternion(result.turn) * axes
+        result.polar_rotation = rotation_of_tet(cage, both.tet)
+        turned = rotation_from_quaternion(result.polar_rotation) * axes
     else:
         turned = rotation_of(stretched)
-        result.turn = quaternion_from_rotation(turned * wp.transpose(axes))
+        result.polar_rotation = quaternion_from_rotation(turned * wp.transpose(axes))
     shape = deform_shape(stretched, scales, turned)
     result.rotation = shape.rotation
     result.log_scales = shape.log_scales
@@ -161,7 +161,7 @@ def deform_kernel(
     means_out[row] = result.mean
     store_row(rotations_out, row, result.rotation)
     log_scales_out[row] = result.log_scales
-    store_row(polar_rotations_out, row, result.turn)
+    store_row(polar_rotations_out, row, result.polar_rotation)
 
 
 @wp.func

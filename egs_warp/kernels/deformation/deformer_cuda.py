@@ -135,8 +135,8 @@ def deform_with_colour_kernel(
         means_out[row] = result.mean
         store_row(rotations_out, row, result.rotation)
         log_scales_out[row] = result.log_scales
-        store_row(polar_rotations_out, row, result.turn)
-    colour = rotate_sh(load_colour(space), result.turn, 3)
+        store_row(polar_rotations_out, row, result.polar_rotation)
+    colour = rotate_sh(load_colour(space), result.polar_rotation, 3)
     store_colour(space, sh_out, row, count, colour)
 
 

@@ -218,7 +218,7 @@ def embed_gaussians_kernel(
     rotations: wp.array[wp.vec4],
     log_scales: wp.array[wp.vec3],
     gamma: real,
-    least_arm: real,
+    min_arm: real,
     origin: Vec3,
     extent: real,
     tets: wp.array[wp.vec4i],
@@ -255,7 +255,7 @@ def embed_gaussians_kernel(
         direction = Vec3(axes[0, axis], axes[1, axis], axes[2, axis])
         if k > 3:
             direction = -direction
-        arm = wp.float32(wp.max(gamma * wp.exp(real(log_scales[gaussian][axis])), least_arm))
+        arm = wp.float32(wp.max(gamma * wp.exp(real(log_scales[gaussian][axis])), min_arm))
         attempt = wp.int32(0)
         searching = wp.bool(True)
         while searching:
@@ -266,7 +266,7 @@ def embed_gaussians_kernel(
             searching = least_weight(weights) < real(-1.0) or greatest > real(2.0)
             attempt += 1
             if searching:
-                if attempt == MAX_ARM_LENGTHS or real(arm) * ARM_SHORTENING < least_arm:
+                if attempt == MAX_ARM_LENGTHS or real(arm) * ARM_SHORTENING < min_arm:
                     location = locate(mean, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
                     location[1] = 0
                     searching = wp.bool(False)

@@ -13,7 +13,7 @@ from egs_warp.precision import Vec4, real
 
 wp.set_module_options({"enable_backward": False})
 
-FOUND, INFEASIBLE, NUMERICAL_FAILURE = wp.constant(0), wp.constant(1), wp.constant(2)
+OPTIMUM_FOUND, INFEASIBLE, NUMERICAL_FAILURE = wp.constant(0), wp.constant(1), wp.constant(2)
 """Status of a solve: optimum found, no point satisfies the bounds, or numerical failure."""
 
 _ROUNDS = wp.constant(3)
@@ -481,7 +481,7 @@ def dual_iterations(program: Program, search: ActiveSetState, active: int, pivot
     for _ in range(pivots):
         row = most_violated(program.lower, program.upper, program.slack, search.side, search.values)
         if row < 0:
-            return FOUND
+            return OPTIMUM_FOUND
         count = add_constraint(program, search, count, row)
         if count == -2:
             return NUMERICAL_FAILURE
@@ -500,18 +500,18 @@ def find_optimum(program: Program, pivots: int, search: ActiveSetState):
         if count < 0:
             break
         if drop_wrong_sign(program, search, count) + add_violated(program, search) == 0:
-            return FOUND
+            return OPTIMUM_FOUND
     for _ in range(REFINEMENTS):
         count = crash_start(program, search)
         ended = dual_iterations(program, search, count, pivots)
-        if ended != FOUND:
+        if ended != OPTIMUM_FOUND:
             return ended
         # Solve again from the active set alone, without the accumulated rounding.
         count = solve_active(program, search)
         if count < 0:
             continue
         if drop_wrong_sign(program, search, count) + add_violated(program, search) == 0:
-            return FOUND
+            return OPTIMUM_FOUND
     return NUMERICAL_FAILURE
 
 
@@ -540,7 +540,7 @@ def optimum_kernel(
     """
     ended[0] = find_optimum(program, pivots, search)
     ended[1] = 0
-    if ended[0] != FOUND:
+    if ended[0] != OPTIMUM_FOUND:
         # The active set is meaningless then: more rows than unknowns may have a side.
         return
     count = int(0)

@@ -24,7 +24,7 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 SOLVED, INEXACT, LIMIT = wp.constant(0), wp.constant(1), wp.constant(2)
-INFEASIBLE, DOUBTFUL = wp.constant(3), wp.constant(4)
+INFEASIBLE, INFEASIBLE_INEXACT = wp.constant(3), wp.constant(4)
 """Status of the iterations, see ``AdmmStatus``."""
 BLOCK = 256
 """Threads per program on a GPU."""
@@ -309,7 +309,7 @@ def admm_kernel(
                 if is_within(result, _LOOSE_FACTOR * accuracy):
                     status = INEXACT
                 elif is_infeasible(lane, _LOOSE_FACTOR * _CERTIFICATE_TOLERANCE, own):
-                    status = DOUBTFUL
+                    status = INFEASIBLE_INEXACT
             elif iteration % adapt == 0:
                 better = wp.min(wp.max(rho * wp.sqrt(result.ratio), _MIN_RHO), _MAX_RHO)
                 if better > _RHO_UPDATE_FACTOR * rho or _RHO_UPDATE_FACTOR * better < rho:

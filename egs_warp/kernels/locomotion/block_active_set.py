@@ -12,9 +12,9 @@ from egs_warp.kernels.block import block_max, sum_of_block, sync_block
 from egs_warp.kernels.locomotion.active_set import (
     BOUND_TOLERANCE,
     DEPENDENCE_TOLERANCE,
-    FOUND,
     INFEASIBLE,
     NUMERICAL_FAILURE,
+    OPTIMUM_FOUND,
     REDUNDANCY_TOLERANCE,
     WRONG_SIGN_TOLERANCE,
 )
@@ -458,5 +458,5 @@ def find_optimum(rows: UnitConstraints, state: ActiveSet):
     if count >= 0:
         refine(rows, state, count)
         if drop_wrong_sign(rows, state, count) == 0 and most_violated(rows, state) < 0:
-            return FOUND
+            return OPTIMUM_FOUND
     return NUMERICAL_FAILURE

@@ -14,13 +14,13 @@ from egs_warp.kernels.locomotion.block_active_set import UnitConstraints
 from egs_warp.kernels.locomotion.block_algebra import gemm_add, lane_of_block, multiply, normalize_rows
 from egs_warp.kernels.locomotion.block_elimination import eliminate
 from egs_warp.kernels.locomotion.mode_region import (
-    BROKEN,
     CONE_FACES,
     DELASSUS_REGULARIZATION,
     FREE,
-    ROUNDING,
+    MAX_START_VIOLATION,
     SLIDE,
     SLIDE_SECTOR,
+    START_ROUNDING,
     STICK,
     TO_FREE,
     TO_OTHER_DIRECTION,
@@ -50,7 +50,9 @@ _ANGLES = [2.0 * math.pi * face / CONE_FACES for face in range(CONE_FACES)]
 COSINES, SINES = (wp.constant(_Faces(*map(each, _ANGLES))) for each in (math.cos, math.sin))
 _FACE_COSINE = wp.constant(real(math.cos(math.pi / CONE_FACES)))
 _SECTOR_SINE, _SECTOR_COSINE = wp.constant(real(math.sin(SLIDE_SECTOR))), wp.constant(real(math.cos(SLIDE_SECTOR)))
-_REGULARIZATION, _BROKEN, _ROUNDING = (wp.constant(real(each)) for each in (DELASSUS_REGULARIZATION, BROKEN, ROUNDING))
+_REGULARIZATION, _BROKEN, _ROUNDING = (
+    wp.constant(real(each)) for each in (DELASSUS_REGULARIZATION, MAX_START_VIOLATION, START_ROUNDING)
+)
 _MIN_PIVOT = wp.constant(real(1e-10))
 """Smallest admissible pivot, relative to the mean of the diagonal of the Delassus operator."""
 BOUND_PADDING = wp.constant(real(9e-6))
@@ -104,7 +106,7 @@ class Workspace:
     """(m,) optimum."""
     at_minimum: wp.array[real]
     at_start: wp.array[real]
-    at_found: wp.array[real]
+    at_optimum: wp.array[real]
     """(T + v,) forces and velocities at the minimum, the start and the optimum, without the constant."""
     lengths: wp.array[real]
     """(m + k,) lengths of the rows before scaling."""

@@ -30,13 +30,13 @@ CONE_FRACTION = 1.0 - 1e-6
 """Fraction of the cone's radius from which the contact counts as sliding."""
 ZERO_SPEED = 1e-9
 """Tangential speed, in units of sqrt(g H), below which the slip has no direction."""
-ACTIVE = 1e-3
+MIN_MULTIPLIER = 1e-3
 """Smallest multiplier of a bound that is worth crossing, relative to the objective per unit of the row."""
-GAIN = 5e-3
+MIN_GAIN_FRACTION = 5e-3
 """Smallest relative decrease of the objective for which the search goes on to the next region."""
-BROKEN = 0.02
+MAX_START_VIOLATION = 0.02
 """Amount by which the start may violate a row of its region."""
-ROUNDING = 1e-6
+START_ROUNDING = 1e-6
 """Amount by which rows are relaxed, for a start that is the only point of its region, as where contacts repeat each
 other."""
 _NO_PIVOT = 1e-14

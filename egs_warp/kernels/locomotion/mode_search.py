@@ -6,7 +6,7 @@ The host version is ``contact_modes.search_modes``. See docs/concepts/locomotion
 import warp as wp
 
 from egs_warp.kernels.block import sum_of_block, sync_block
-from egs_warp.kernels.locomotion.active_set import FOUND, INFEASIBLE, NUMERICAL_FAILURE
+from egs_warp.kernels.locomotion.active_set import INFEASIBLE, NUMERICAL_FAILURE, OPTIMUM_FOUND
 from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints, find_optimum
 from egs_warp.kernels.locomotion.block_algebra import (
     apply_factor,
@@ -33,7 +33,16 @@ from egs_warp.kernels.locomotion.block_mode_region import (
     write_speeds,
 )
 from egs_warp.kernels.locomotion.block_splitting import Splitting, iterate
-from egs_warp.kernels.locomotion.mode_region import ACTIVE, FREE, GAIN, SLIDE, STICK, TO_FREE, TO_SLIDE, ZERO_SPEED
+from egs_warp.kernels.locomotion.mode_region import (
+    FREE,
+    MIN_GAIN_FRACTION,
+    MIN_MULTIPLIER,
+    SLIDE,
+    STICK,
+    TO_FREE,
+    TO_SLIDE,
+    ZERO_SPEED,
+)
 from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
@@ -51,7 +60,7 @@ _HEADER = wp.constant(HEADER_SIZE)
 INFEASIBLE_COST = wp.constant(real(1e6))
 """Cost above which a QP counts as infeasible, relative to the decrease of the objective from the origin to the
 unconstrained minimum; as on the host."""
-_ACTIVE, _GAIN, _ZERO_SPEED = (wp.constant(real(each)) for each in (ACTIVE, GAIN, ZERO_SPEED))
+_ACTIVE, _GAIN, _ZERO_SPEED = (wp.constant(real(each)) for each in (MIN_MULTIPLIER, MIN_GAIN_FRACTION, ZERO_SPEED))
 
 
 @wp.func
@@ -76,14 +85,14 @@ def crash_start(rows: UnitConstraints, state: ActiveSet):
 def count_violations(program: Program, workspace: Workspace, map_rows: int, mode_rows: int):
     """Return the number of rows that ``optimum`` violates."""
     m = program.m
-    multiply(workspace.force_map, map_rows, m, workspace.optimum, workspace.at_found)
+    multiply(workspace.force_map, map_rows, m, workspace.optimum, workspace.at_optimum)
     violations = real(0.0)
     for row in range(lane_of_block(), m + mode_rows, wp.block_dim()):
         at = real(0.0)
         if row < m:
             at = workspace.optimum[row]
         else:
-            at = row_value(workspace, row - m, workspace.at_found)
+            at = row_value(workspace, row - m, workspace.at_optimum)
         slack = real(10.0) * ROW_TOLERANCE * wp.max(real(1.0), workspace.lengths[row])
         if not (at > workspace.bounds[0, row] - slack and at < workspace.bounds[1, row] + slack):
             violations += real(1.0)
@@ -103,9 +112,9 @@ def scatter_optimum(program: Program, workspace: Workspace, closed_count: int):
             value = wp.clamp(workspace.optimum[k], program.packed[program.lower + k], program.packed[program.upper + k])
         workspace.trial[k] = value
     sync_block()
-    multiply(workspace.force_map, closed_count, m, workspace.trial, workspace.at_found)
+    multiply(workspace.force_map, closed_count, m, workspace.trial, workspace.at_optimum)
     for g in range(lane, closed_count, wp.block_dim()):
-        workspace.trial[m + workspace.closed_forces[g]] = workspace.at_found[g] + workspace.force_map[g, m]
+        workspace.trial[m + workspace.closed_forces[g]] = workspace.at_optimum[g] + workspace.force_map[g, m]
     sync_block()
     size = program.size
     multiply_at(program.packed, program.cost, size, size, size, workspace.trial, workspace.values)
@@ -256,12 +265,12 @@ def solve_mode_region(
     rows.base_count = m + map_rows
     rows.cost_limit = INFEASIBLE_COST * objective_drop
     active_count = int(0)
-    solved.ended = FOUND
+    solved.ended = OPTIMUM_FOUND
     if crash_start(rows, state) > 0:
         if first == 1:
             iterate(rows, state, splitting)
         solved.ended = find_optimum(rows, state)
-        if solved.ended != FOUND:
+        if solved.ended != OPTIMUM_FOUND:
             return solved
         multiply(workspace.root, m, m, state.z, workspace.optimum)
         active_rows = real(0.0)
@@ -366,7 +375,7 @@ def mode_search_kernel(
     has_several = int(0)
     is_single = int(0)
     best = real(wp.inf)
-    ended = FOUND
+    ended = OPTIMUM_FOUND
     limit = int(packed[4])
     continues = int(1)
     while continues == 1 and count < limit:

@@ -6,7 +6,7 @@ The host version is ``contact_modes.solve_relaxed``. See docs/concepts/locomotio
 import warp as wp
 
 from egs_warp.kernels.block import sum_of_block, sync_block
-from egs_warp.kernels.locomotion.active_set import FOUND, NUMERICAL_FAILURE
+from egs_warp.kernels.locomotion.active_set import NUMERICAL_FAILURE, OPTIMUM_FOUND
 from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints, find_optimum, is_cancelled
 from egs_warp.kernels.locomotion.block_algebra import (
     apply_factor,
@@ -45,7 +45,7 @@ class Relaxed:
     leaving: wp.array2d[real]
     """(n, N) rows of the normal contact velocities."""
     minimum: wp.array[real]
-    found: wp.array[real]
+    optimum: wp.array[real]
     slope: wp.array[real]
     values: wp.array[real]
     """(N,) unconstrained minimum, optimum, gradient, scratch."""
@@ -176,10 +176,10 @@ def write_rows(program: Program, relaxed: Relaxed, rows: UnitConstraints, initia
 @wp.func
 def count_violations(program: Program, relaxed: Relaxed, count: int):
     """Return the number of rows that the point ``relaxed.found`` violates."""
-    normal_velocities(program, relaxed, relaxed.found)
+    normal_velocities(program, relaxed, relaxed.optimum)
     violations = real(0.0)
     for row in range(lane_of_block(), count, wp.block_dim()):
-        at = row_value(program, relaxed, row, relaxed.found)
+        at = row_value(program, relaxed, row, relaxed.optimum)
         slack = real(10.0) * ROW_TOLERANCE * wp.max(real(1.0), relaxed.lengths[row])
         if not (at > relaxed.bounds[0, row] - slack and at < relaxed.bounds[1, row] + slack):
             violations += real(1.0)
@@ -192,10 +192,10 @@ def count_violations(program: Program, relaxed: Relaxed, count: int):
 def objective_at(program: Program, relaxed: Relaxed, shift: real):
     """Return the objective at ``relaxed.found``."""
     size = program.size
-    multiply_at(program.packed, program.cost, size, size, size, relaxed.found, relaxed.values)
+    multiply_at(program.packed, program.cost, size, size, size, relaxed.optimum, relaxed.values)
     total = real(0.0)
     for k in range(lane_of_block(), size, wp.block_dim()):
-        at = relaxed.found[k]
+        at = relaxed.optimum[k]
         total += at * (real(0.5) * (relaxed.values[k] + shift * at) + relaxed.slope[k])
     total = sum_of_block(total)
     sync_block()
@@ -233,23 +233,23 @@ def relaxed_qp_kernel(
         rows.base_count = program.n + size
         rows.cost_limit = INFEASIBLE_COST * objective_drop
         write_rows(program, relaxed, rows, splitting.initial_values)
-        ended = FOUND
+        ended = OPTIMUM_FOUND
         for k in range(lane, size, wp.block_dim()):
-            relaxed.found[k] = real(0.0)
+            relaxed.optimum[k] = real(0.0)
         sync_block()
         if crash_start(rows, state) > 0:
             iterate(rows, state, splitting)
             ended = find_optimum(rows, state)
-            multiply(relaxed.root, size, size, state.z, relaxed.found)
+            multiply(relaxed.root, size, size, state.z, relaxed.optimum)
         for k in range(lane, size, wp.block_dim()):
-            relaxed.found[k] = relaxed.found[k] + relaxed.minimum[k]
+            relaxed.optimum[k] = relaxed.optimum[k] + relaxed.minimum[k]
         sync_block()
-    if ended == FOUND:
+    if ended == OPTIMUM_FOUND:
         if count_violations(program, relaxed, rows.count) > 0:
             ended = NUMERICAL_FAILURE
         objective = objective_at(program, relaxed, shift)
         for k in range(lane, program.m, wp.block_dim()):
-            answer[_HEADER + k] = wp.clamp(relaxed.found[k], packed[program.lower + k], packed[program.upper + k])
+            answer[_HEADER + k] = wp.clamp(relaxed.optimum[k], packed[program.lower + k], packed[program.upper + k])
         if lane == 0:
             answer[1] = objective
     if lane == 0:

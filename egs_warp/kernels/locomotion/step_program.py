@@ -5,14 +5,14 @@ Host code: ``egs_warp/locomotion/device_plan.py``. The packed layout is the one 
 
 import warp as wp
 
-from egs_warp.kernels.locomotion.active_set import FOUND
+from egs_warp.kernels.locomotion.active_set import OPTIMUM_FOUND
 from egs_warp.kernels.locomotion.mode_region import CONE_FRACTION, FREE, SLIDE, STICK, ZERO_FORCE
 from egs_warp.kernels.locomotion.mode_search import HEADER_SIZE, normalized
 from egs_warp.precision import Vec3, real
 
 wp.set_module_options({"enable_backward": False})
 
-_HEADER, _OPTIMUM_FOUND = wp.constant(HEADER_SIZE), wp.constant(int(FOUND))
+_HEADER, _OPTIMUM_FOUND = wp.constant(HEADER_SIZE), wp.constant(int(OPTIMUM_FOUND))
 _FREE, _STICK, _SLIDE = wp.constant(FREE), wp.constant(STICK), wp.constant(SLIDE)
 _ZERO_FORCE, _CONE_FRACTION = wp.constant(real(ZERO_FORCE)), wp.constant(real(CONE_FRACTION))
 

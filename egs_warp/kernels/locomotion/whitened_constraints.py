@@ -47,7 +47,7 @@ class WhitenedConstraints:
     """(``room_of``,) scratch."""
 
 
-def room_of(unknowns: int, wide: int) -> int:
+def scratch_size(unknowns: int, wide: int) -> int:
     """Return the number of float64 of scratch."""
     return 16 * wide + 512 * (wide // 16 + 1) + unknowns
 

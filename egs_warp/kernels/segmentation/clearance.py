@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def reach_kernel(
+def extent_kernel(
     first_row: wp.int32,
     # In:
     normal: wp.vec3,

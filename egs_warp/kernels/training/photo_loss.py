@@ -106,7 +106,7 @@ def blur_products_kernel(
 
 
 @wp.kernel
-def likeness_kernel(
+def similarity_kernel(
     first_row: wp.int32,
     width: wp.int32,
     height: wp.int32,

@@ -19,7 +19,7 @@ def sigmoid(x: wp.float32) -> wp.float32:
 
 
 @wp.kernel
-def pull_kernel(
+def regularization_kernel(
     first_row: wp.int32,
     by_opacity: wp.float32,
     by_scale: wp.float32,

@@ -31,8 +31,8 @@ DEFORMATION = [
     ),
     Survivor(
         "kernels/deformation/embedding.py",
-        "if attempt == MAX_ARM_LENGTHS or real(arm) * ARM_SHORTENING < least_arm:",
-        "if attempt >= MAX_ARM_LENGTHS or real(arm) * ARM_SHORTENING < least_arm:",
+        "if attempt == MAX_ARM_LENGTHS or real(arm) * ARM_SHORTENING < min_arm:",
+        "if attempt >= MAX_ARM_LENGTHS or real(arm) * ARM_SHORTENING < min_arm:",
         "it counts up to the bound by ones",
     ),
     Survivor(
