@@ -91,8 +91,8 @@ class QuadraticProgram(Protocol):
             lower: (m,).
             upper: (m,).
             start: (n,) warm start; None uses the last solution.
-            beside: True if another QP of the same step has been solved; ``SplittingProgram`` then skips operator
-                splitting.
+            skip_splitting: True if another QP of the same step has been solved; ``SplittingProgram`` then skips
+                operator splitting.
         """
         ...
 
@@ -131,7 +131,7 @@ class SplittingProgram:
 
     A few iterations of operator splitting, on the rows that the unconstrained minimum violates, guess the active rows.
     From this guess ``active_set`` finds the optimum to rounding. After a numerical failure, operator splitting
-    continues with all rows to its own accuracy. With ``beside`` the iterations are skipped: the rows that
+    continues with all rows to its own accuracy. With ``skip_splitting`` the iterations are skipped: the rows that
     the unconstrained minimum violates are a guess from which the active-set method is as quick.
     """
 
@@ -147,7 +147,7 @@ class SplittingProgram:
         self._start: np.ndarray | None = None
 
     def solve(
-        self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, beside: bool = False
+        self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, skip_splitting: bool = False
     ) -> QpSolution:
         """Solve with bounds ``lower``, ``upper`` (m,), see ``QuadraticProgram.solve``."""
         start = self._start if start is None else start
@@ -160,7 +160,7 @@ class SplittingProgram:
         if not violated.any():
             # No bound is active, as in flight.
             return self._solved(rows.minimum, np.zeros(len(lower)))
-        if beside:
+        if skip_splitting:
             return self._solve_from_minimum(lower, upper, start)
         index = np.flatnonzero(violated)
         # In whitened coordinates a few iterations are enough.
@@ -240,10 +240,10 @@ class DaqpProgram:
         self._ready = False
 
     def solve(
-        self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, beside: bool = False
+        self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, skip_splitting: bool = False
     ) -> QpSolution:
-        """Solve with bounds ``lower``, ``upper`` (m,). DAQP starts from its last active set; ``start`` and ``beside``
-        are ignored."""
+        """Solve with bounds ``lower``, ``upper`` (m,). DAQP starts from its last active set; ``start`` and
+        ``skip_splitting`` are ignored."""
         low, high = np.maximum(lower, -1e30), np.minimum(upper, 1e30)
         held = np.where(high - low < 1e-13, 5, 0).astype(np.int32)
         # The setup already detects equality rows that contradict each other.

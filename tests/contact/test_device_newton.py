@@ -218,7 +218,9 @@ def test_a_tangent_whose_sum_fails_is_the_host_s(
         .iterate_at(tension, problem.rigid_guess, forces)
         .line_search_point(2.0 * forces)
     )
-    monkeypatch.setattr(dense_cholesky._InverseFactor, "add", lambda root, directions, sign: 0.0 * directions[0, 0])
+    monkeypatch.setattr(
+        dense_cholesky._InverseFactor, "add_low_rank", lambda root, directions, sign: 0.0 * directions[0, 0]
+    )
     found = place.with_new_tangent()
     # The sum has not been synchronised so far.
     assert len(found.free_contact_velocities) == 18

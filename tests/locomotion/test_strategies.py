@@ -203,7 +203,7 @@ def test_strategies_and_solvers_are_chosen_by_name() -> None:
     assert LocomotionSettings().qp_solver_on(gpu) is QpSolver.ADMM
     assert LocomotionSettings(qp_solver="osqp").qp_solver_on(gpu) is QpSolver.OSQP
     assert LocomotionSettings().qp_solver_on(wp.get_device("cpu")) is QpSolver.OSQP
-    with pytest.raises(UserError, match="strategy 'nonsense' is not known; give one of pieces, paper, static, qpcc"):
+    with pytest.raises(UserError, match="strategy 'nonsense' is not known; give one of modes, paper, static, qpcc"):
         LocomotionSettings(strategy="nonsense")
     with pytest.raises(UserError, match="QP solver 'nonsense' is not known; give one of osqp, admm, daqp"):
         LocomotionSettings(qp_solver="nonsense")

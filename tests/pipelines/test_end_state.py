@@ -28,7 +28,7 @@ def reached(distance: float = 0.0, turn: float = 0.0) -> MotionOutcome:
 
 def entry(*, resting: bool = True, fell: str | None = None, got_up: bool = False, **asked: float) -> Any:
     motion = SimpleNamespace(is_at_rest=resting)
-    return cast(Any, SimpleNamespace(asked=asked, motion=motion, fell=fell, got_up=got_up))
+    return cast(Any, SimpleNamespace(asked=asked, motion=motion, fall_note=fell, got_up=got_up))
 
 
 @pytest.mark.parametrize(
