@@ -168,7 +168,7 @@ def mesh_of(name: str, options: argparse.Namespace) -> painted_meshes.PaintedMes
         iterations=options.iterations,
         seed=options.seed,
         device=options.device,
-        kept=options.clouds / "lego_proxy.npz" if options.clouds else None,
+        cache=options.clouds / "lego_proxy.npz" if options.clouds else None,
     )
 
 

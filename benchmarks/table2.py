@@ -8,11 +8,11 @@ that is 60 variables and 50 complementarity pairs a frame. Each frame is one pro
 animation's own motion; every strategy gets the same programs. A second table holds smaller problems of the same bodies,
 and random ones, against the optimum over all contact states (branch and bound).
 
-``pieces``, the engine's own, has the exact friction cone and no unknowns but activations; all others have the pyramid,
-``exact`` among them, so ``pieces`` may be better than it. ``objective`` is the program's, at the activations and forces
-that a strategy found; ``true`` is the same objective at the forces that contact with the exact cone answers to its
-activations, which is what a step then does with them. ``paper`` is the paper's: the states of stage 1 (Eq. 12), then
-one contact at a time.
+``program``, the engine's own, has the exact friction cone and no unknowns but activations; all others have the pyramid,
+``exact`` among them, so ``program`` may be better than it. ``objective`` is the program's, at the activations and
+forces that a strategy found; ``true`` is the same objective at the forces that contact with the exact cone answers to
+its activations, which is what a step then does with them. ``paper`` is the paper's: the states of stage 1 (Eq. 12),
+then one contact at a time.
 
 ``qpcc`` starts from all-static and moves one contact at a time as its own multipliers say; where all-static has no
 solution it is given the states that follow from the last activations. ``qpcc-our-moves`` differs from it only in our
@@ -58,15 +58,17 @@ def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[St
         for frame in frames:
             found, milliseconds = timed(
                 search_program,
-                frame.pieces,
+                frame.program,
                 strategy,
-                frame.foreseen,
+                frame.predicted,
                 directions=directions,
                 qp_limit=QP_LIMIT,
                 solver=solver,
             )
             x = found.x
-            objectives = (np.inf, np.inf) if x is None else [frame.pieces.objective(y) for y in (x, answered(frame, x))]
+            objectives = (
+                (np.inf, np.inf) if x is None else [frame.program.objective(y) for y in (x, answered(frame, x))]
+            )
             figures.append((found.qp_count, *objectives, milliseconds))
         results[strategy] = np.array(figures)
     return results
@@ -74,18 +76,18 @@ def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[St
 
 def answered(frame: Frame, x: np.ndarray) -> np.ndarray:
     """(m + 3n,) the activations of ``x`` (m + 3n,) and the forces that exact contact answers to them."""
-    pieces = frame.pieces
-    activations, forces = np.split(x, [pieces.activation_count])
-    return np.concatenate([activations, contact_forces(pieces, activations, forces).ravel()])
+    program = frame.program
+    activations, forces = np.split(x, [program.activation_count])
+    return np.concatenate([activations, contact_forces(program, activations, forces).ravel()])
 
 
-def contact_forces(pieces: CoulombProgram, activations: np.ndarray, start: np.ndarray) -> np.ndarray:
+def contact_forces(program: CoulombProgram, activations: np.ndarray, start: np.ndarray) -> np.ndarray:
     """(n, 3) body weights that obey contact and friction under ``activations`` (m,)."""
-    m, n = pieces.activation_count, pieces.contact_count
-    free = pieces.rows[:, :m] @ activations + pieces.offset
-    delassus = pieces.rows[:, m:].copy()
+    m, n = program.activation_count, program.contact_count
+    free = program.rows[:, :m] @ activations + program.offset
+    delassus = program.rows[:, m:].copy()
     delassus[np.diag_indices_from(delassus)] += 1e-7 * delassus.diagonal().mean()
-    forces, _ = coulomb_forces(delassus, free, np.zeros(n), pieces.friction, start.reshape(n, 3))
+    forces, _ = coulomb_forces(delassus, free, np.zeros(n), program.friction, start.reshape(n, 3))
     return forces
 
 
@@ -159,11 +161,11 @@ def random_frames(count: int, seed: int) -> list[Frame]:
     """Random programs of three contacts, whose optimum without complementarity says little about the true one."""
     frames = []
     for index in range(count):
-        pieces = small_problem(1000 * seed + index, contacts=3).pieces
-        at_rest = np.zeros(pieces.activation_count)
-        forces = contact_forces(pieces, at_rest, np.zeros((3, 3)))
-        velocities = (pieces.rows[:, pieces.activation_count :] @ forces.ravel() + pieces.offset).reshape(-1, 3)
-        frames.append(Frame(pieces, PredictedContact(at_rest, forces, velocities), at_rest))
+        program = small_problem(1000 * seed + index, contacts=3).program
+        at_rest = np.zeros(program.activation_count)
+        forces = contact_forces(program, at_rest, np.zeros((3, 3)))
+        velocities = (program.rows[:, program.activation_count :] @ forces.ravel() + program.offset).reshape(-1, 3)
+        frames.append(Frame(program, PredictedContact(at_rest, forces, velocities), at_rest))
     return frames
 
 

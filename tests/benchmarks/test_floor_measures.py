@@ -53,9 +53,9 @@ def test_the_true_floor_moved_finds_its_period_and_no_more(measures: ModuleType)
     (squared error 1/6), and a floor without known surroundings offers no place."""
     hole, known = disc(120, 15), np.ones((120, 120), bool)
     stripes = np.repeat((np.arange(120) // 3 % 2)[None, :, None].astype(float), 120, axis=0).repeat(3, axis=2)
-    best = max(one for one, _ in measures.from_beside(stripes, known, hole))
+    best = max(one for one, _ in measures.moved_floor_scores(stripes, known, hole))
     assert best > 60.0
-    scores = np.array(measures.from_beside(noise(120, 0), known, hole))
+    scores = np.array(measures.moved_floor_scores(noise(120, 0), known, hole))
     assert len(scores) == 72
     assert scores[:, 0].mean() == pytest.approx(10 * np.log10(6.0), abs=0.2)
-    assert measures.from_beside(stripes, hole, hole) == []
+    assert measures.moved_floor_scores(stripes, hole, hole) == []

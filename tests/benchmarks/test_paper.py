@@ -67,7 +67,7 @@ def test_a_stage_that_fails_is_told_and_the_others_run(
 ) -> None:
     assert paper.main(["--out", str(tmp_path), "--device", "cpu"]) == 0
     assert paper.main(["--out", str(tmp_path), "--device", "cpu", "--only", "two", "--keep"]) == 0
-    assert "Table 2: kept" in capsys.readouterr().out
+    assert "Table 2: skipped" in capsys.readouterr().out
     assert paper.main(["--out", str(tmp_path), "--device", "cpu", "--seed", "13"]) == 2
     assert f"failed: unlucky ({tmp_path / 'one.txt'})" in capsys.readouterr().out
     assert "failed with 1" in (tmp_path / "paper.md").read_text()

@@ -23,7 +23,7 @@ def test_halving_finds_the_largest_push(script: Any, monkeypatch: pytest.MonkeyP
 
     def stood(_: object, line: str) -> dict[str, Any]:
         asked.append(float(line.split()[1]))
-        return {"kept": asked[-1] < borne + 1e-9, "broken": None}
+        return {"withstood": asked[-1] < borne + 1e-9, "broken": None}
 
     monkeypatch.setattr(pushes, "stood", stood)
     size, tried = pushes.largest(None, "0.3 {} left")

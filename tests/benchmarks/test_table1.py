@@ -52,7 +52,7 @@ def test_a_turned_object_looks_as_from_a_turned_camera(scenes: ModuleType, gloss
 def test_faces_turn_with_their_normals(scenes: ModuleType, glossy_vase: Any) -> None:
     """The turn of each face is a rotation and takes its normal at rest to its normal in the bend."""
     vertices = scenes.bend(glossy_vase.vertices)
-    turns = scenes.face_turns(glossy_vase, vertices)
+    turns = scenes.face_rotations(glossy_vase, vertices)
     a, b, c = glossy_vase.vertices[glossy_vase.faces].transpose(1, 0, 2)
     p, q, r = vertices[glossy_vase.faces].transpose(1, 0, 2)
     before, after = np.cross(b - a, c - a), np.cross(q - p, r - p)
