@@ -64,14 +64,14 @@ def found_by(
 
 
 def clicked(
-    drawn: DrawnScene, cloud: GaussianCloud, cameras: Sequence[Camera], count: int
+    annotated: DrawnScene, cloud: GaussianCloud, cameras: Sequence[Camera], count: int
 ) -> tuple[ObjectSpec, list[str]]:
     """Simulate a user who makes ``count`` clicks, each on the largest error that the clicks before have left.
 
     Returns:
         the object's description, and the clicks in the notation of the command line.
     """
-    views = drawn.views[CLICKED]
+    views = annotated.views[CLICKED]
     clicks: list[Click] = []
     written: list[str] = []
     object_cloud: GaussianCloud | None = None
@@ -84,7 +84,7 @@ def clicked(
                 object_cloud = found_by(cloud, spec, cameras, {})[1]
             except UserError as error:
                 # A user would see one line of error; the next click goes on the object.
-                print(f"{drawn.name}: {number} clicks: {error}")
+                print(f"{annotated.name}: {number} clicks: {error}")
             if object_cloud is not None:
                 _, missing, more = overlap(cloud, object_cloud, view)
                 (depth, missing_pixel), (extra, extra_pixel) = innermost(missing), innermost(more)
@@ -100,8 +100,8 @@ def clicked(
 
 def picture(object_cloud: GaussianCloud, view: DrawnView, missing: np.ndarray, more: np.ndarray) -> np.ndarray:
     """(320, 320, 3) uint8: the object alone, red where it is missing, blue where it is too much."""
-    drawn = render_gaussians(object_cloud, view.camera, background=(0.7, 0.7, 0.7)).colour.numpy()
-    picture = np.clip(drawn.astype(np.float32), 0.0, 1.0)
+    rendered = render_gaussians(object_cloud, view.camera, background=(0.7, 0.7, 0.7)).colour.numpy()
+    picture = np.clip(rendered.astype(np.float32), 0.0, 1.0)
     picture[missing], picture[more] = (1.0, 0.1, 0.1), (0.1, 0.2, 1.0)
     side = min(picture.shape[:2])
     middle = np.argwhere(view.mask).mean(axis=0) if view.mask.any() else np.array(picture.shape[:2]) / 2.0

@@ -39,7 +39,7 @@ VIEW_ELEVATION = 8.0
 
 def rows_of(name: str, device: str, side: int, seed: int, table: Table) -> tuple[list[Row], np.ndarray]:
     """Return one row for each method, and an image of all of them."""
-    parts = table3.taken_apart(name, device)
+    parts = table3.segment_parts(name, device)
     cameras = table3.cameras_in(parts.located.plane, parts.located, side)
     clouds = {HARD: (parts.hard, 0.0)}
     for method, clearing in CLEARINGS.items():

@@ -46,7 +46,7 @@ def coarse_psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float
 
 
 def gradient_energy(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """Ratio of the mean squared gradients in ``mask`` (H, W) without the seam; below 1 is too smooth, above too busy."""
+    """Ratio of mean squared gradients in ``mask`` (H, W) without the seam; below 1 is too smooth, above it too busy."""
     inner = np.asarray(ndimage.binary_erosion(mask, iterations=3), dtype=bool)
 
     def energy(picture: np.ndarray) -> float:

@@ -1,4 +1,4 @@
-"""``make paper``: every stage runs as asked, failures are told, aims are gathered."""
+"""``make paper``: every stage runs with the given flags, failures are reported, aims are collected."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Path(asked.json).write_text(json.dumps({"aims": {"right": True, "fast": None}, "
 
 @pytest.fixture
 def paper(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
-    """With two stages that take no time."""
+    """Return the module with two stages that take no time."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     module = module_of("paper")
     (tmp_path / "script.py").write_text(SCRIPT)
