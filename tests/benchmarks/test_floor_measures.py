@@ -54,8 +54,8 @@ def test_psnr_likes_the_blur_that_likeness_in_the_large_does_not_see(measures: M
 def test_the_true_floor_moved_finds_its_period_and_no_more(measures: ModuleType) -> None:
     """Score shifted floors of stripes and of noise.
 
-    A floor of stripes fits itself at whole periods; noise scores the 7.8 dB of two independent draws (squared error 1/6),
-    and a floor without known surroundings gives no score.
+    A floor of stripes fits itself at whole periods; noise scores the 7.8 dB of two independent draws (squared error
+    1/6), and a floor without known surroundings gives no score.
     """
     hole, known = disc(120, 15), np.ones((120, 120), bool)
     stripes = np.repeat((np.arange(120) // 3 % 2)[None, :, None].astype(float), 120, axis=0).repeat(3, axis=2)

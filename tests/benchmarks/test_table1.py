@@ -75,7 +75,7 @@ def test_the_surface_of_a_capture_lies_on_the_object(scenes: ModuleType, glossy_
 
 
 def rows(table1: ModuleType, ours: dict[str, float]) -> list[dict[str, Any]]:
-    """Every row scores 20 dB and 0.8; ``ours`` gives the rows that are better, in dB, with a hundredth of it in SSIM."""
+    """Every row scores 20 dB and 0.8; ``ours`` gives rows that are better, in dB, by a hundredth in SSIM."""
     return [
         {
             "object": name,
@@ -91,7 +91,7 @@ def rows(table1: ModuleType, ours: dict[str, float]) -> list[dict[str, Any]]:
 
 
 def test_aims_follow_from_the_rows(table1: ModuleType) -> None:
-    """Ours ahead by 2 dB meets every aim; a baseline ahead at equal counts, or the paper's split, fails just its aim."""
+    """Ours ahead by 2 dB meets every aim; a baseline ahead at equal counts, or the paper's split, fails its aim."""
     good = {"ours": 2.0, "ours, no split": 1.0, "ours, no split, as many": 1.0}
     aims, why = table1.judge(rows(table1, good), quick=False)
     assert all(aims.values()) and not why
@@ -119,7 +119,7 @@ def test_what_was_not_measured_is_null_with_a_reason(table1: ModuleType) -> None
 
 
 def test_the_coarsest_setting_near_to_the_best_is_taken(table1: ModuleType) -> None:
-    """The setting is within ``PSNR_TOLERANCE`` of the best mean over objects and motions; order is from coarse to fine."""
+    """The setting is within ``PSNR_TOLERANCE`` of the best mean over objects and motions; coarse ones first."""
     names = list(table1.SETTINGS)
 
     def scored(*psnr: float) -> list[dict[str, Any]]:

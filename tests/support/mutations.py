@@ -1,7 +1,6 @@
-"""Deliberately wrong formulas, each with the test that must notice; ``tests/test_formula_mutations.py`` tries them.
+"""Deliberately wrong formulas, each with the test that must fail; ``tests/test_formula_mutations.py`` runs them.
 
-A formula of the package that is rewritten has its line rewritten here too: the mutation must still be the formula,
-wrong.
+When a formula of the package is rewritten, its line here must be rewritten too.
 """
 
 from __future__ import annotations
@@ -14,14 +13,14 @@ class Mutation:
     """One wrong formula."""
 
     what: str
-    """The formula, with its equation in the paper as "Eq. (n)" if it has one."""
+    """Name of the formula, with its equation in the paper as "Eq. (n)" if it has one."""
     file: str
-    """Of the package."""
+    """File of the package."""
     right: str
-    """Stands once in the file."""
+    """Correct text, which occurs once in the file."""
     wrong: str
     test: str
-    """file::function that fails under it."""
+    """Test that fails, as file::function."""
 
 
 def _equation(number: int, what: str, file: str, right: str, wrong: str, test: str) -> Mutation:
@@ -153,9 +152,9 @@ EQUATIONS: dict[int, Mutation] = {
         ),
     ]
 }
-"""One of each equation of the paper; ``docs/equations.md`` says where else it is and what else tests it."""
+"""One mutation of each equation of the paper; ``docs/equations.md`` lists where else it is implemented and tested."""
 
-BESIDE_THE_PAPER: list[Mutation] = [
+OTHER_FORMULAS: list[Mutation] = [
     Mutation(what, f"egs_warp/{file}", right, wrong, f"tests/{test}")
     for what, file, right, wrong, test in [
         (
@@ -386,6 +385,6 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
     ]
 ]
-"""Formulas that the paper leaves open."""
+"""Mutations of formulas that the paper leaves open."""
 
-ALL = [*EQUATIONS.values(), *BESIDE_THE_PAPER]
+ALL = [*EQUATIONS.values(), *OTHER_FORMULAS]

@@ -1,4 +1,4 @@
-"""Of ``deformation`` and its kernels."""
+"""Surviving mutants of ``deformation`` and its kernels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Of ``fem`` and its kernels."""
+"""Surviving mutants of ``fem`` and its kernels."""
 
 from __future__ import annotations
 

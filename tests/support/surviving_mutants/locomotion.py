@@ -1,4 +1,4 @@
-"""Of ``locomotion`` and its kernels."""
+"""Surviving mutants of ``locomotion`` and its kernels."""
 
 from __future__ import annotations
 

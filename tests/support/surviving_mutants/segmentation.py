@@ -1,4 +1,4 @@
-"""Of ``segmentation`` and its kernels."""
+"""Surviving mutants of ``segmentation`` and its kernels."""
 
 from __future__ import annotations
 
