@@ -29,7 +29,7 @@ from egs_warp.io import read_capture
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import run_folder
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.film import draw_film
 from egs_warp.pipelines.locate_plane import locate_plane, with_measured_ground
 from egs_warp.pipelines.prepare_scene import SceneOptions, segment_scene, snap_to_plane
@@ -108,7 +108,11 @@ def measure(options: argparse.Namespace, stages: Stages) -> None:
         background = bare if hole is None else stages.run("hole", inpaint, bare, hole).cloud
         del bare
         creature = stages.run(
-            "body", make_creature, object_cloud, plane=located.plane, ground=located.ground, nodes=options.nodes
+            "body",
+            make_creature,
+            object_cloud,
+            plane=located.plane,
+            options=CreatureOptions(ground=located.ground, nodes=options.nodes),
         )
         performance = stages.run("animate", simulate, creature, motion("jump"), frames=options.frames)
         with run_folder(Path(folder) / "film", overwrite=True) as run:

@@ -473,7 +473,7 @@ READERS: tuple[Reader, ...] = (
     *(
         Reader(
             **{"name": f"arrays of {name}", "file": name, "good": lambda name=name: arrays_as_json(name)},
-            **{"read": draw_run, "beside": finished_run, "wrap": npz_of_json, "json": True},
+            **{"read": draw_run, "other_files": finished_run, "wrap": npz_of_json, "json": True},
         )
         for name in _NPZ
     ),
