@@ -1,8 +1,8 @@
-"""What goes with a release: a bill of materials (CycloneDX 1.6) and requirements with the hash of every file.
+"""Files of a release besides the wheel: a bill of materials (CycloneDX 1.6) and requirements with hashes of every file.
 
-``make release`` writes both beside the wheel in ``out/dist``, from what pip would install with it under
-``constraints.txt``, on this machine's platform and on others (``--also win_amd64:3.12``), and from the lock file of the
-page. The hashes are those of the index that pip uses. A user then installs exactly what was tested:
+``make release`` writes both to ``out/dist``. They list the packages that pip would install with the wheel under
+``constraints.txt``, on this machine's platform and on others (``--also win_amd64:3.12``), and the packages in the lock
+file of the page. The hashes are those of pip's index. With these files a user installs exactly the tested versions:
 
     pip install --require-hashes -r egs_warp-VERSION-requirements.txt
     pip install --no-deps egs_warp-VERSION-py3-none-any.whl
@@ -26,26 +26,30 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 LOCK = ROOT / "egs_warp" / "web" / "client" / "package-lock.json"
-_LONGEST_LICENCE = 60
-"""Characters; some packages put the whole text into the field of its name."""
+_MAX_LICENCE_LENGTH = 60
+"""Maximum length in characters; some packages put the whole text into the field of its name."""
 
 
 def main() -> int:
-    """Returns 1 where there is not one wheel, or where pip finds no files."""
+    """Write the files; returns 1 if there is not exactly one wheel, or if pip finds no files."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--dist", type=Path, default=ROOT / "out" / "dist", help="where the wheel is (%(default)s)")
-    parser.add_argument("--also", action="append", default=[], metavar="PLATFORM:PYTHON", help="hashes for it, too")
+    parser.add_argument(
+        "--dist", type=Path, default=ROOT / "out" / "dist", help="folder of the wheel (default %(default)s)"
+    )
+    parser.add_argument(
+        "--also", action="append", default=[], metavar="PLATFORM:PYTHON", help="also add hashes for this platform"
+    )
     chosen = parser.parse_args()
     wheels = sorted(chosen.dist.glob("egs_warp-*.whl"))
     if len(wheels) != 1:
-        print(f"{chosen.dist}: {len(wheels)} wheels of egs_warp; make build leaves one", file=sys.stderr)
+        print(f"{chosen.dist}: {len(wheels)} wheels of egs_warp; make build writes one", file=sys.stderr)
         return 1
     (wheel,) = wheels
     try:
         reports = [report_of(wheel), *(report_of(wheel, target) for target in chosen.also)]
     except subprocess.CalledProcessError as error:
-        told = [line for line in error.stderr.splitlines() if line.startswith("ERROR")]
-        print(told[-1] if told else error, file=sys.stderr)
+        errors = [line for line in error.stderr.splitlines() if line.startswith("ERROR")]
+        print(errors[-1] if errors else error, file=sys.stderr)
         return 1
     name = "-".join(wheel.name.split("-")[:2])
     bill = chosen.dist / f"{name}.cdx.json"
@@ -57,7 +61,7 @@ def main() -> int:
 
 
 def report_of(wheel: Path, target: str | None = None) -> dict[str, Any]:
-    """What pip would install with ``wheel`` into an empty environment of this machine, or of ``target``."""
+    """Return pip's report of installing ``wheel`` into an empty environment of this machine, or of ``target``."""
     command = [sys.executable, "-m", "pip", "install", "--dry-run", "--quiet", "--ignore-installed"]
     command += ["--disable-pip-version-check", "--report", "-", "-c", str(ROOT / "constraints.txt")]
     with tempfile.TemporaryDirectory() as nowhere:
@@ -68,23 +72,23 @@ def report_of(wheel: Path, target: str | None = None) -> dict[str, Any]:
 
 
 def installed(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """What comes from the index: all but egs_warp itself, by name."""
+    """Return the packages of a report that come from the index, all but egs_warp itself, sorted by name."""
     others = [one for one in report["install"] if canonical(one["metadata"]["name"]) != "egs-warp"]
     return sorted(others, key=lambda one: canonical(one["metadata"]["name"]))
 
 
 def canonical(name: str) -> str:
-    """As the index knows it."""
+    """Return the normalised name of a package."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def hash_of(one: dict[str, Any]) -> str:
-    """SHA-256 of the file that would be installed."""
+    """Return the SHA-256 of the file that would be installed."""
     return one["download_info"]["archive_info"]["hashes"]["sha256"]
 
 
 def requirements_of(reports: list[dict[str, Any]]) -> str:
-    """Every package once, with the hashes of its files on all platforms."""
+    """Return a requirements file: every package once, with the hashes of its files on all platforms."""
     pinned: dict[str, list[str]] = {}
     for one in (one for report in reports for one in installed(report)):
         known = pinned.setdefault(f"{canonical(one['metadata']['name'])}=={one['metadata']['version']}", [])
@@ -95,7 +99,7 @@ def requirements_of(reports: list[dict[str, Any]]) -> str:
 
 
 def bill_of(wheel: Path, reports: list[dict[str, Any]], lock: dict[str, Any]) -> dict[str, Any]:
-    """CycloneDX: egs_warp, what is installed beside it, and what its page holds; who needs whom."""
+    """Return the CycloneDX document of egs_warp, its installed packages, those of its page, and the dependencies."""
     _, version, *_ = wheel.name.split("-")
     digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
     itself = {
@@ -126,12 +130,12 @@ def bill_of(wheel: Path, reports: list[dict[str, Any]], lock: dict[str, Any]) ->
 
 
 def reference(one: dict[str, Any]) -> str:
-    """Of a Python package."""
+    """Return the package URL of a Python package."""
     return f"pkg:pypi/{canonical(one['metadata']['name'])}@{one['metadata']['version']}"
 
 
 def component(one: dict[str, Any]) -> dict[str, Any]:
-    """Of a Python package."""
+    """Return the CycloneDX component of a Python package."""
     metadata = one["metadata"]
     licence = licence_of(metadata)
     return {
@@ -146,28 +150,30 @@ def component(one: dict[str, Any]) -> dict[str, Any]:
 
 
 def licence_of(metadata: dict[str, Any]) -> str:
-    """As short as the package tells it."""
-    told = metadata.get("license_expression") or metadata.get("license") or ""
-    if told and "\n" not in told and len(told) <= _LONGEST_LICENCE:
-        return told
-    # Older pips do not know of licence expressions; what is installed here says them.
+    """Return the shortest name of the licence in the metadata."""
+    licence = metadata.get("license_expression") or metadata.get("license") or ""
+    if licence and "\n" not in licence and len(licence) <= _MAX_LICENCE_LENGTH:
+        return licence
+    # Older versions of pip do not report licence expressions; the installed metadata have them.
     with contextlib.suppress(PackageNotFoundError):
-        here = distribution(metadata["name"])
-        if here.version == metadata["version"] and "License-Expression" in here.metadata:
-            return here.metadata["License-Expression"]
+        local = distribution(metadata["name"])
+        if local.version == metadata["version"] and "License-Expression" in local.metadata:
+            return local.metadata["License-Expression"]
     classes = [line.split(" :: ")[-1] for line in metadata.get("classifier", ()) if line.startswith("License :: ")]
     return " AND ".join(name for name in classes if name != "OSI Approved")
 
 
 def needed(one: dict[str, Any], references: dict[str, str]) -> list[str]:
-    """Those of ``references`` that a package asks for by name."""
-    asked = (re.match(r"[\w.-]+", line) for line in one["metadata"].get("requires_dist", ()) if "extra ==" not in line)
-    names = {canonical(found.group()) for found in asked if found}
+    """Return the entries of ``references`` that a package requires."""
+    requirements = (
+        re.match(r"[\w.-]+", line) for line in one["metadata"].get("requires_dist", ()) if "extra ==" not in line
+    )
+    names = {canonical(match.group()) for match in requirements if match}
     return sorted(references[name] for name in names if name in references)
 
 
 def bundled(lock: dict[str, Any]) -> list[dict[str, Any]]:
-    """What the page holds: the packages of npm that are no tools."""
+    """Return the components of the page: the npm packages that are not development tools."""
     found = []
     for path, entry in sorted(lock["packages"].items()):
         if not path or entry.get("dev"):

@@ -1,8 +1,8 @@
-"""Objects and ground of real scenes as a person drew them: ``tests/data/rooms``.
+"""Hand-drawn annotations of objects and ground in real scenes, read from ``tests/data/rooms``.
 
-Each scene has eight views, of a ring about the object or photos of it. In each the object's outline was drawn by hand
-on the picture (polygons, then moved by at most five pixels to the picture's own edges by GrabCut, and looked at),
-before any method had been run on them; and six places were marked on what it stands on.
+Each scene has eight views: cameras on a ring around the object, or photos of it. In each view a person drew the
+object's outline by hand (polygons, refined by GrabCut by at most five pixels towards image edges, then checked),
+before any method was run on the scenes, and marked six points on the supporting surface.
 """
 
 from __future__ import annotations
@@ -26,34 +26,34 @@ NAMES = ("koala", "fox", "narcissus", "playbot", "bonsai")
 
 @dataclass(frozen=True)
 class DrawnView:
-    """One picture with what was drawn on it, straightened where its lens bends lines."""
+    """An annotated image, undistorted if its lens has distortion."""
 
     camera: Camera
     mask: np.ndarray
     """(H, W) bool, True on the object."""
     ground: np.ndarray
-    """(k, 2) pixels that show what it stands on."""
+    """(k, 2) pixels that show the supporting surface."""
 
 
 @dataclass(frozen=True)
 class DrawnScene:
-    """A scene with its views."""
+    """An annotated scene with its views."""
 
     name: str
     capture: Path | None
-    """None where photos are to be trained first."""
+    """Path of the capture; None if a capture has to be trained from photos first."""
     photos: Path | None
     views: tuple[DrawnView, ...]
 
     @property
     def is_here(self) -> bool:
-        """Whether the data are."""
+        """True if the scene's data are on this machine."""
         place = self.capture or self.photos
         return place is not None and place.exists()
 
 
 def read_drawn(name: str) -> DrawnScene:
-    """What was drawn of the scene ``name``."""
+    """Read the annotations of the scene ``name``; there are no views if its data are missing."""
     tree = json.loads((FOLDER / f"{name}.json").read_text())
     capture, photos = (None if tree[key] is None else data_folder() / tree[key] for key in ("capture", "photos"))
     scene = DrawnScene(name, capture, photos, ())
@@ -76,7 +76,7 @@ def read_drawn(name: str) -> DrawnScene:
 
 
 def _mask(view: dict[str, Any]) -> np.ndarray:
-    """(H, W) bool: outlines within outlines are holes."""
+    """(H, W) bool: mask of the outlines; an outline inside an outline is a hole."""
     mask = np.zeros((view["height"], view["width"]), np.uint8)
     cv2.fillPoly(mask, [np.array(outline, np.int32).reshape(-1, 2) for outline in view["outline"]], 1)
     return mask > 0

@@ -1,4 +1,4 @@
-"""Bodies of many makes for benchmarks: captures, objects cut out of their scenes, Gaussians laid on textured meshes."""
+"""Benchmark bodies: captures, objects segmented from scenes, and Gaussians sampled on textured meshes."""
 
 from __future__ import annotations
 
@@ -25,41 +25,41 @@ from egs_warp.segmentation.object_spec import ObjectSpec
 from harness import data_folder
 
 _GAUSSIANS = 20000
-"""Of a mesh."""
+"""Number of Gaussians that are sampled on a mesh."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """A capture and what it stands on; scene units."""
+    """A capture and its support plane, in scene units."""
 
     name: str
     cloud: GaussianCloud
     plane: Plane
     origin: str
-    """Where its Gaussians come from."""
+    """Source of its Gaussians."""
 
 
 @dataclass(frozen=True)
 class _Textured:
-    """Triangles with a picture each."""
+    """A triangle mesh with textures."""
 
     vertices: np.ndarray
     """(V, 3) float64, z up, 1 high, on z = 0."""
     faces: np.ndarray
     """(F, 3) int32."""
     places: np.ndarray
-    """(F, 3, 2) texture coordinates, v up."""
+    """(F, 3, 2) texture coordinates of each corner, v up."""
     pictures: tuple[np.ndarray, ...]
-    """(H, W, 3) uint8 each."""
+    """Textures, (H, W, 3) uint8 each."""
     picture_of_face: np.ndarray
-    """(F,)"""
+    """(F,) index into ``pictures``."""
 
 
 def _standing(vertices: np.ndarray) -> np.ndarray:
-    """y up to z up, 1 high, on z = 0."""
-    turned = vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
-    low, high = turned.min(axis=0), turned.max(axis=0)
-    return (turned - [*(0.5 * (low + high)[:2]), low[2]]) / (high[2] - low[2])
+    """Rotate vertices from y up to z up, scale them to height 1 and put them on z = 0."""
+    rotated = vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
+    low, high = rotated.min(axis=0), rotated.max(axis=0)
+    return (rotated - [*(0.5 * (low + high)[:2]), low[2]]) / (high[2] - low[2])
 
 
 def _picture(source: Path | bytes) -> np.ndarray:
@@ -68,7 +68,12 @@ def _picture(source: Path | bytes) -> np.ndarray:
 
 
 def _obj(path: Path, picture_of_material: dict[str, str]) -> _Textured:
-    """``picture_of_material``: files beside ``path``; the one of "" is for faces without a material."""
+    """Read a Wavefront OBJ file.
+
+    Args:
+        path: the OBJ file. picture_of_material: texture files, relative to the folder of ``path``; "" is the key of
+            faces without a material.
+    """
     vertices: list[list[float]] = []
     texture: list[list[float]] = []
     faces: list[list[int]] = []
@@ -101,7 +106,7 @@ def _obj(path: Path, picture_of_material: dict[str, str]) -> _Textured:
 
 
 def _glb(path: Path) -> _Textured:
-    """The one mesh of a binary glTF whose nodes turn nothing, with the first of its pictures."""
+    """Read the only mesh of a binary glTF file whose nodes have no rotation, with its first texture."""
     data = path.read_bytes()
     (length,) = struct.unpack_from("<I", data, 12)
     gltf, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
@@ -125,8 +130,11 @@ def _glb(path: Path) -> _Textured:
     return _Textured(vertices, faces.astype(np.int32), texture[faces], (picture,), np.zeros(len(faces), int))
 
 
-def _laid_on(mesh: _Textured, seed: int) -> GaussianCloud:
-    """Flat Gaussians drawn by area, in the texture's colours under the light of the built-in scenes: not trained."""
+def _sample_gaussians(mesh: _Textured, seed: int) -> GaussianCloud:
+    """Sample flat Gaussians uniformly by area, coloured by the texture under the lights of the built-in scenes.
+
+    The Gaussians are not trained.
+    """
     random = np.random.default_rng(seed)
     corners = mesh.vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -153,32 +161,34 @@ def _laid_on(mesh: _Textured, seed: int) -> GaussianCloud:
 
 
 def _mesh(read: Callable[[], _Textured]) -> Callable[[str], Body]:
-    def made(name: str) -> Body:
-        return Body(name, _laid_on(read(), seed=0), Plane(np.array([0.0, 0.0, 1.0]), 0.0), "Gaussians laid on a mesh")
+    def read_body(name: str) -> Body:
+        return Body(
+            name, _sample_gaussians(read(), seed=0), Plane(np.array([0.0, 0.0, 1.0]), 0.0), "Gaussians laid on a mesh"
+        )
 
-    return made
+    return read_body
 
 
 def _capture(file: str, up: tuple[float, float, float]) -> Callable[[str], Body]:
-    def made(name: str) -> Body:
+    def read_body(name: str) -> Body:
         cloud = read_capture(data_folder() / file, device="cpu").cloud
         return Body(name, cloud, find_base_plane(cloud, np.array(up)), file)
 
-    return made
+    return read_body
 
 
 def _of_scene(file: str, on_it: tuple[float, float, float], plane: Plane | None = None) -> Callable[[str], Body]:
-    def made(name: str) -> Body:
+    def read_body(name: str) -> Body:
         cloud = read_capture(data_folder() / file, device="cpu").cloud
         options = SceneOptions(clearing=StraddlingPolicy.SPLIT, inpaint=False)
         scene = prepare_scene(cloud, ObjectSpec(point=np.array(on_it)), plane=plane, options=options)
         return Body(name, scene.object, scene.plane, f"{file}, cut out")
 
-    return made
+    return read_body
 
 
 def _playbot(name: str) -> Body:
-    """It hovers over its tile, so it stands on its own base."""
+    """Read the robot without its tile. It hovers over the tile, so its support plane is its own base."""
     cloud = read_capture(data_folder() / "scenes" / "playbot", device="cpu").cloud
     tile = Plane(np.array([0.0, -1.0, 0.0]), -0.019)
     above = cloud.subset(tile.heights(cloud.means.numpy()) > 0.13)
@@ -186,11 +196,11 @@ def _playbot(name: str) -> Body:
 
 
 def _built_in(make: Callable[..., object]) -> Callable[[str], Body]:
-    def made(name: str) -> Body:
-        thing = make(device="cpu")
-        return Body(name, thing.cloud, thing.plane, "built in")  # pyright: ignore[reportAttributeAccessIssue]
+    def read_body(name: str) -> Body:
+        scene = make(device="cpu")
+        return Body(name, scene.cloud, scene.plane, "built in")  # pyright: ignore[reportAttributeAccessIssue]
 
-    return made
+    return read_body
 
 
 def _meshes() -> Path:
@@ -222,5 +232,10 @@ NAMES = tuple(_MAKERS)
 
 
 def body(name: str) -> Body:
-    """The body of a ``name``. Raises ``OSError`` or ``UserError`` where its file is not there."""
+    """Return the body ``name``.
+
+    Raises:
+        OSError: its file is missing.
+        UserError: its file cannot be read.
+    """
     return _MAKERS[name](name)

@@ -1,4 +1,4 @@
-"""The surface of a capture as triangles, as SuGaR takes it: where the density of its Gaussians has one value."""
+"""Triangle surface of a capture as in SuGaR: a level set of the density of its Gaussians."""
 
 from __future__ import annotations
 
@@ -10,35 +10,36 @@ from egs_warp.deformation.baselines import BoundSurface
 from egs_warp.geometry.gaussians import GaussianCloud
 
 LEVEL = 0.3
-"""Density of SuGaR's surface: opacities times Gaussians, summed."""
+"""Density of SuGaR's level set: the sum of the Gaussians, each times its opacity."""
 CELLS = 128
-"""Of the lattice along the longest side."""
+"""Number of lattice cells along the longest side."""
 REACH = 3.0
-"""Standard deviations to which a Gaussian is summed."""
+"""Cut-off radius of a Gaussian, in standard deviations."""
 
 
 def capture_surface(cloud: GaussianCloud) -> BoundSurface:
-    """Marching cubes of the density (SuGaR solves Poisson's equation for points of the same level set).
+    """Extract the surface of a capture by marching cubes of its density.
 
-    Gaussians flatter than half a cell count as half a cell thick there, or the lattice would miss them.
+    SuGaR solves Poisson's equation for points of the same level set instead. A Gaussian thinner than half a cell counts
+    as half a cell thick, because the lattice would miss it otherwise.
     """
     means = cloud.means.numpy().astype(np.float64)
     opacities = cloud.opacities()
-    seen = opacities > 0.05
-    low, high = means[seen].min(axis=0), means[seen].max(axis=0)
+    visible = opacities > 0.05
+    low, high = means[visible].min(axis=0), means[visible].max(axis=0)
     cell = float((high - low).max()) / CELLS
     scales = np.maximum(np.exp(cloud.log_scales.numpy().astype(np.float64)), 0.5 * cell)
     w, x, y, z = cloud.rotations.numpy().astype(np.float64).T
-    turns = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
+    rotations = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
     origin = low - 4.0 * cell
     density = np.zeros(np.ceil((high - low) / cell).astype(int) + 9)
-    spread = np.sqrt(np.einsum("nij,nj->ni", turns**2, scales**2))
-    for n in np.flatnonzero(seen):
+    spread = np.sqrt(np.einsum("nij,nj->ni", rotations**2, scales**2))
+    for n in np.flatnonzero(visible):
         start = np.maximum(np.floor((means[n] - REACH * spread[n] - origin) / cell).astype(int), 0)
         stop = np.minimum(np.ceil((means[n] + REACH * spread[n] - origin) / cell).astype(int) + 1, density.shape)
         axes = [origin[k] + cell * np.arange(start[k], stop[k]) - means[n, k] for k in range(3)]
         local = sum(
-            axes[k].reshape([-1 if k == j else 1 for j in range(3)])[..., None] * turns[n][k] / scales[n]
+            axes[k].reshape([-1 if k == j else 1 for j in range(3)])[..., None] * rotations[n][k] / scales[n]
             for k in range(3)
         )
         box = tuple(slice(a, b) for a, b in zip(start, stop, strict=True))
@@ -47,5 +48,5 @@ def capture_surface(cloud: GaussianCloud) -> BoundSurface:
     vertices = vertices.astype(np.float64) * cell + origin
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    # Slivers of marching cubes have no normal to speak of.
+    # Slivers of marching cubes have no well-defined normal.
     return BoundSurface(vertices, faces[areas > 1e-3 * cell**2].astype(np.int32))

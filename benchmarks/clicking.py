@@ -1,4 +1,4 @@
-"""What a patient user would click, and how much of a drawn outline the object then covers."""
+"""Simulated user clicks, and the overlap of the resulting object with a hand-drawn outline."""
 
 from __future__ import annotations
 
@@ -20,15 +20,19 @@ from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.object_spec import ObjectSpec
 from harness import timed
 
-GIVEN, JUDGED = slice(0, None, 2), slice(1, None, 2)
-"""Of a scene's views: whose outlines may be given, and by which others are judged."""
+CLICKED, JUDGED = slice(0, None, 2), slice(1, None, 2)
+"""Views of a scene whose outlines may be used for clicks, and views whose outlines judge the result."""
 VISIBLE = 0.01
-"""Of a picture's shorter side: an error whose innermost place is nearer to its edge than this is not clicked on."""
+"""Minimum depth of a region of errors, relative to the shorter side of the image; shallower ones are not clicked on."""
 
 
-def overlap(cloud: GaussianCloud, thing: GaussianCloud, view: DrawnView) -> tuple[float, np.ndarray, np.ndarray]:
-    """IoU of ``thing``, drawn alone, with the outline; and (H, W) bool of what is missing, and too much."""
-    alone, whole = (render_gaussians(one, view.camera).alpha.numpy() > 0.5 for one in (thing, cloud))
+def overlap(cloud: GaussianCloud, object_cloud: GaussianCloud, view: DrawnView) -> tuple[float, np.ndarray, np.ndarray]:
+    """Compare ``object_cloud``, rendered alone, with the outline of a view.
+
+    Returns:
+        IoU; (H, W) bool, pixels where the object is missing; (H, W) bool, pixels where it is too much.
+    """
+    alone, whole = (render_gaussians(one, view.camera).alpha.numpy() > 0.5 for one in (object_cloud, cloud))
     counts = whole | alone
     missing, more = view.mask & ~alone & counts, alone & ~view.mask
     union = (view.mask | alone) & counts
@@ -36,7 +40,7 @@ def overlap(cloud: GaussianCloud, thing: GaussianCloud, view: DrawnView) -> tupl
 
 
 def innermost(mask: np.ndarray) -> tuple[float, tuple[float, float]]:
-    """How many pixels the innermost place of ``mask`` (H, W) is from its edge, and where it is, (u, v)."""
+    """Return the largest distance of a pixel of ``mask`` (H, W) from its edge, in pixels, and that pixel's (u, v)."""
     depth = depth_inside(np.pad(mask, 1))[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
     return float(depth[row, column]), (column + 0.5, row + 0.5)
@@ -45,7 +49,14 @@ def innermost(mask: np.ndarray) -> tuple[float, tuple[float, float]]:
 def found_by(
     cloud: GaussianCloud, spec: ObjectSpec, cameras: Sequence[Camera], seconds: dict[str, float]
 ) -> tuple[LocatedPlane, GaussianCloud, GaussianCloud]:
-    """Where the object is, it and its background; ``seconds`` of each stage."""
+    """Locate the plane and segment the object that ``spec`` describes.
+
+    Args:
+        seconds: receives the time of each stage, s.
+
+    Returns:
+        the plane, the object and the background.
+    """
     located, seconds["plane"] = timed(locate_plane, cloud, spec, cameras=cameras)
     located, seconds["ground"] = timed(with_measured_ground, cloud, located, spec, cameras)
     parts, seconds["segment"] = timed(segment_scene, cloud, located, SceneOptions(clearing=StraddlingPolicy.SPLIT))
@@ -53,29 +64,33 @@ def found_by(
 
 
 def clicked(
-    drawn: DrawnScene, cloud: GaussianCloud, cameras: Sequence[Camera], count: int
+    annotated: DrawnScene, cloud: GaussianCloud, cameras: Sequence[Camera], count: int
 ) -> tuple[ObjectSpec, list[str]]:
-    """What ``count`` clicks tell, and these clicks as the command takes them."""
-    views = drawn.views[GIVEN]
+    """Simulate a user who makes ``count`` clicks, each on the largest error that the clicks before have left.
+
+    Returns:
+        the object's description, and the clicks in the notation of the command line.
+    """
+    views = annotated.views[CLICKED]
     clicks: list[Click] = []
     written: list[str] = []
-    thing: GaussianCloud | None = None
+    object_cloud: GaussianCloud | None = None
     for number in range(count):
         view = views[number]
         inside, place = True, innermost(view.mask)[1]
         if number:
             spec = ObjectSpec.of_clicks(clicks)
             try:
-                thing = found_by(cloud, spec, cameras, {})[1]
+                object_cloud = found_by(cloud, spec, cameras, {})[1]
             except UserError as error:
-                # What a user gets is one line; the next click is made on the object.
-                print(f"{drawn.name}: {number} clicks: {error}")
-            if thing is not None:
-                _, missing, more = overlap(cloud, thing, view)
-                (depth, lost), (extra, taken) = innermost(missing), innermost(more)
+                # A user would see one line of error; the next click goes on the object.
+                print(f"{annotated.name}: {number} clicks: {error}")
+            if object_cloud is not None:
+                _, missing, more = overlap(cloud, object_cloud, view)
+                (depth, missing_pixel), (extra, extra_pixel) = innermost(missing), innermost(more)
                 if max(depth, extra) < VISIBLE * min(view.mask.shape):
                     continue
-                inside, place = (True, lost) if depth >= extra else (False, taken)
+                inside, place = (True, missing_pixel) if depth >= extra else (False, extra_pixel)
         hit = click_at(cloud, view.camera, *place, inside=inside)
         if hit is not None:
             clicks.append(hit)
@@ -83,10 +98,10 @@ def clicked(
     return ObjectSpec.of_clicks(clicks), written
 
 
-def picture(thing: GaussianCloud, view: DrawnView, missing: np.ndarray, more: np.ndarray) -> np.ndarray:
+def picture(object_cloud: GaussianCloud, view: DrawnView, missing: np.ndarray, more: np.ndarray) -> np.ndarray:
     """(320, 320, 3) uint8: the object alone, red where it is missing, blue where it is too much."""
-    drawn = render_gaussians(thing, view.camera, background=(0.7, 0.7, 0.7)).colour.numpy()
-    picture = np.clip(drawn.astype(np.float32), 0.0, 1.0)
+    rendered = render_gaussians(object_cloud, view.camera, background=(0.7, 0.7, 0.7)).colour.numpy()
+    picture = np.clip(rendered.astype(np.float32), 0.0, 1.0)
     picture[missing], picture[more] = (1.0, 0.1, 0.1), (0.1, 0.2, 1.0)
     side = min(picture.shape[:2])
     middle = np.argwhere(view.mask).mean(axis=0) if view.mask.any() else np.array(picture.shape[:2]) / 2.0

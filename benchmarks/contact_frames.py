@@ -1,4 +1,4 @@
-"""Frames for the solver benchmarks: an animation made with known activations, and each of its steps as a program."""
+"""Frames for the solver benchmarks: an animation with known activations, each step as a Coulomb program."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from egs_warp.segmentation.base_plane import find_base_plane
 from harness import data_folder
 
 CAPTURES = {"monkey": ("monkey.ply", (0.0, 1.0, 0.0)), "plush dog": ("plush_dog.ply", (0.0, -1.0, 0.0))}
-"""File and up axis of real captures in the data folder."""
+"""File and up axis of the real captures in the data folder."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One step of the animation as every strategy gets it."""
+    """One step of the animation, the input of every strategy."""
 
-    pieces: CoulombProgram
-    foreseen: PredictedContact
-    """What the known activations of the step before would bring."""
+    program: CoulombProgram
+    predicted: PredictedContact
+    """Contact state predicted from the known activations of the previous step."""
     known: np.ndarray
-    """(M,) those of this step, in their bounds."""
+    """(M,) known activations of this step, within their bounds."""
 
 
 @dataclass(frozen=True)
 class BenchBody:
-    """A standing body with muscles and a ground."""
+    """A body on the ground with muscles, ready to step."""
 
     stepper: LocomotionStepper
     start: BodyState
@@ -50,8 +50,10 @@ class BenchBody:
 
 
 def body_named(name: str, device: str, *, nodes: int = 300) -> BenchBody:
-    """A built-in body ("pawn", "stool") or a real capture of ``CAPTURES``, 1 m tall,
-    with a cage of about ``nodes`` nodes.
+    """Build a body 1 m tall with a cage of about ``nodes`` nodes.
+
+    Args:
+        name: a built-in body ("pawn", "stool") or a real capture of ``CAPTURES``.
     """
     if name in CAPTURES:
         file, up = CAPTURES[name]
@@ -78,7 +80,7 @@ def body_named(name: str, device: str, *, nodes: int = 300) -> BenchBody:
 
 
 def grouped_segments(muscles: MuscleSet, nodes: np.ndarray, groups: int, seed: int) -> Synergies:
-    """Each group is neighbouring segments of a like direction that act as one; ``nodes`` (N, 3) at rest."""
+    """Group neighbouring muscle segments of similar direction; each group acts as one. ``nodes``: (N, 3) m, at rest."""
     ends = muscles.end_points(nodes)
     first, second = ends[muscles.segments[:, 0]], ends[muscles.segments[:, 1]]
     upright = np.abs(second - first)[:, 2] / np.linalg.norm(second - first, axis=1)
@@ -89,7 +91,7 @@ def grouped_segments(muscles: MuscleSet, nodes: np.ndarray, groups: int, seed: i
 
 
 def spread_points(bench: BenchBody, count: int) -> np.ndarray:
-    """(count,) contact points far apart from each other among those on the ground at rest."""
+    """(count,) indices of contact points on the ground at rest, chosen far apart (farthest-point sampling)."""
     gaps, _ = bench.stepper.detector.gaps(bench.start.positions)
     near = np.flatnonzero(gaps < 0.01 * bench.stepper.body.height)
     nodes = bench.stepper.geometry.mesh.tets[bench.stepper.geometry.tet_from_point[near]]
@@ -102,7 +104,7 @@ def spread_points(bench: BenchBody, count: int) -> np.ndarray:
 
 
 def known_activations(count: int, frames: int, strength: float, seed: int) -> np.ndarray:
-    """(frames + 1, count) smooth signals in [-strength, strength] that begin at rest."""
+    """(frames + 1, count) smooth signals in [-strength, strength] that start at 0."""
     random = np.random.default_rng(seed)
     time = np.arange(frames + 1)[:, None, None]
     periods = random.uniform(5.0, 25.0, (1, count, 3))
@@ -120,23 +122,23 @@ def animation_frames(
     strength: float = 0.3,
     seed: int = 0,
 ) -> list[Frame]:
-    """An animation with known activations of muscle groups and exact contact at a few points; each step as a program.
+    """Simulate an animation with known activations of muscle groups and exact contact at a few points.
 
-    A step asks for the animation's own end velocity: that of the centre of mass, the spin and the pose. Its program is
-    the engine's own.
+    The objectives of a step are the animation's own end velocities: of the centre of mass, the angular momentum and the
+    pose. The engine's planner builds the program of each step.
     """
     body, muscles = bench.stepper.body, bench.stepper.muscles
     stepper = LocomotionStepper(body, muscles, bench.stepper.geometry, device=bench.device)
     synergies = grouped_segments(muscles, body.mesh.nodes, activations, seed)
     steps = make_step_linearizer(stepper.linearizer, muscles, synergies)
     stepper.planner = replace(stepper.planner, synergies=synergies, linear_steps=steps)
-    # No point joins those that were chosen, however deep.
+    # No point is added to the chosen ones, however deep it penetrates.
     stepper.solver = replace(stepper.solver, penetration_tolerance=np.inf)
     points = spread_points(bench, contacts)
     known = known_activations(activations, frames, strength, seed)
     weights, dt = Weights(), 1.0 / FRAME_RATE
     state, forces = bench.start, np.zeros((contacts, 3))
-    made = []
+    animation = []
     for previous, current in zip(known[:-1], known[1:], strict=True):
         before, now = (muscles.bounds * (synergies.members @ a) for a in (previous, current))
         problem = StepProblem(body, state, dt)
@@ -150,7 +152,7 @@ def animation_frames(
             forces=prospect.forces,
         )
         if not result.converged:
-            raise RuntimeError(f"the animation failed at frame {len(made)}; use less strength")
+            raise RuntimeError(f"the animation failed at frame {len(animation)}; use less strength")
         after = BodyState(problem.end_positions(result.velocities), result.velocities, state.time + dt)
         objectives = [
             centre_of_mass_velocity(body, body.centre_of_mass(after.velocities), weights.com),
@@ -158,6 +160,6 @@ def animation_frames(
             node_velocities(body, after.velocities, weights.pose),
         ]
         program = stepper.planner.program(prospect, before, objectives)
-        made.append(Frame(program.program, program.predicted, current))
+        animation.append(Frame(program.program, program.predicted, current))
         state, forces = after, result.forces
-    return made
+    return animation

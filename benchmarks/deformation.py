@@ -1,7 +1,7 @@
-"""Cost of carrying a million Gaussians with degree 3 colour (seven points, covariance, SVD, SH rotation).
+"""Cost of deforming a million Gaussians with colours of degree 3 (seven points, covariance, SVD, SH rotation).
 
-Aims: ``cuda_within_2x_copy`` (on a GPU, at most twice the time that its bytes need at measured copy bandwidth),
-``cpu_5x_twin`` (on a CPU, at least 5 times as fast as the same in vectorised PyTorch on as many threads).
+Aims: ``cuda_within_2x_copy`` (on a GPU, at most twice the time of copying as many bytes), ``cpu_5x_twin`` (on a CPU,
+at least 5 times as fast as vectorised PyTorch on the same number of threads).
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BYTES_READ = 12 + 16 + 12 + 4
-"""Mean, rotation, scales, tetrahedron of the mean; the carried cage itself stays in cache."""
+"""Mean, rotation, scales and tetrahedron of the mean; the deformed cage stays in cache and is not counted."""
 BYTES_READ_ACROSS = 6 * (4 + 4) + 3 * 4
-"""Tetrahedron and share of each arm, weight of each axis, of Gaussians that reach into several tetrahedra."""
+"""Tetrahedron and share of each arm and weight of each axis, for Gaussians that extend into several tetrahedra."""
 BYTES_WRITTEN = 12 + 16 + 12 + 16
-"""Mean, rotation, scales, turn."""
+"""Mean, rotation, scales, rotation of the colour."""
 BYTES_OF_COLOUR = 192 + 192
-"""16 coefficients, read and written."""
+"""16 SH coefficients, read and written."""
 
 
 def random_cloud(count: int, seed: int, device: str) -> GaussianCloud:
-    """Gaussians of many sizes in the unit cube, the larger ones reaching into several tetrahedra."""
+    """Gaussians of many sizes in the unit cube; the larger ones extend into several tetrahedra."""
     rng = np.random.default_rng(seed)
     return GaussianCloud.from_numpy(
         rng.uniform(0.0, 1.0, (count, 3)),
@@ -73,7 +73,7 @@ def _basis_3(d: torch.Tensor) -> torch.Tensor:
 
 
 class TorchTwin:
-    """The same in vectorised PyTorch, whole arrays at a time."""
+    """The same deformation in vectorised PyTorch, on whole arrays."""
 
     def __init__(self, cloud: GaussianCloud, embedding: GaussianEmbedding) -> None:
         points = embedding.points
@@ -98,7 +98,7 @@ class TorchTwin:
         self.from_values_3 = torch.linalg.inv(_basis_3(self.directions))
 
     def deform(self, positions: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Means, covariance factor (rotation, scales) and colour for node positions (N, 3)."""
+        """Return means, covariance factor (rotation, scales) and colour for node positions (N, 3)."""
         ends = (self.weights[..., None] * positions[self.nodes]).sum(2)
         mean = ends[:, 0]
         plus = (ends[:, 1:4] - mean[:, None]) / self.arms[:, :3, None]
@@ -115,12 +115,12 @@ class TorchTwin:
         back = self.directions @ turn
         colour[:, 4:9] = self.from_values_2 @ (_basis_2(back[:, :5]) @ self.sh[:, 4:9])
         colour[:, 9:16] = self.from_values_3 @ (_basis_3(back) @ self.sh[:, 9:16])
-        # The singular values come in falling order; the engine keeps the order of the axes instead.
+        # PyTorch sorts the singular values in descending order; the engine keeps the order of the axes.
         return mean.float(), frame, scales, colour
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
+    """Run the benchmark."""
     parser = flags(__doc__, quick="200,000 Gaussians on a CPU, fewer repeats")
     parser.add_argument("--gaussians", type=int)
     options = parser.parse_args(arguments)
@@ -149,11 +149,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     bytes_moved = count * (BYTES_READ + BYTES_WRITTEN + BYTES_OF_COLOUR) + across * BYTES_READ_ACROSS
     source = wp.zeros(bytes_moved // 32, dtype=wp.vec4, device=device)
     target = wp.empty_like(source)
-    # Reading and writing half of the bytes each moves as many as the deformation does. The faster of two ways counts.
+    # The copy reads half of the bytes and writes the other half, so it moves as many. The faster of two copies counts.
     calls["copy"] = lambda: wp.copy(target, source)
     calls["copy_kernel"] = lambda: wp.launch(copy_kernel, len(source), inputs=[source], outputs=[target], device=device)
     if device.is_cuda:
-        # A launch costs the host 20 us; graphs measure the device.
+        # A launch costs the host 20 us; graphs measure the device alone.
         for name in ("deform", "copy", "copy_kernel"):
             calls[name]()
             with wp.ScopedCapture(device=device) as capture:

@@ -1,4 +1,4 @@
-"""A soft body is dropped on the floor: the simulated displacement of Table 1's fall."""
+"""A soft body dropped on the floor: the simulated deformation of Table 1's fall."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart
 from egs_warp.muscles.muscle_set import automatic_muscles
 
 TIME_STEP = 1.0 / 120.0
-"""Seconds."""
+"""Step size, s."""
 
 NEAREST = 12
-"""Nodes that a place between them looks at."""
+"""Number of nodes that the displacement of a point is fitted to."""
 
 
 @dataclass(frozen=True)
@@ -30,28 +30,28 @@ class Drop:
     """A recorded fall."""
 
     frames: np.ndarray
-    """(F, N, 3) metres, node positions at every step."""
+    """(F, N, 3) m, node positions at every step."""
     energies: np.ndarray
-    """(F,) joules, elastic."""
+    """(F,) J, elastic energy."""
 
     rest: np.ndarray
-    """(N, 3) metres."""
+    """(N, 3) m, nodes at rest."""
 
     def at_impact(self, points: np.ndarray) -> np.ndarray:
-        """Where ``points`` (P, 3) of the rest shape are in the frame of greatest deformation.
+        """Return ``points`` (P, 3) of the rest shape, deformed as in the frame of largest elastic energy.
 
-        Between the nodes, and around them where a coarse cage does not reach, the motion is the affine one that fits
-        the nearest nodes best, their weights falling smoothly to nothing (moving least squares).
+        The deformation at a point is the affine map that best fits the nearest nodes, with weights that fall smoothly
+        to zero (moving least squares). It extrapolates where a coarse cage does not cover a point.
         """
         count = min(NEAREST, len(self.rest))
-        distance, near = (np.asarray(found) for found in KDTree(self.rest).query(points, k=count))
+        distance, near = (np.asarray(result) for result in KDTree(self.rest).query(points, k=count))
         weights = (1.0 - distance / (1.001 * distance[:, -1:])) ** 2
         weights /= weights.sum(axis=1, keepdims=True)
         before, after = self.rest[near], self.frames[int(np.argmax(self.energies))][near]
         from_centre, to_centre = (np.einsum("pk,pki->pi", weights, x)[:, None] for x in (before, after))
         moments = np.einsum("pk,pki,pkj->pij", weights, before - from_centre, before - from_centre)
         mixed = np.einsum("pk,pki,pkj->pij", weights, after - to_centre, before - from_centre)
-        # Nodes in one plane say nothing about the direction across it; little keeps that from growing without bound.
+        # Coplanar nodes do not determine the gradient across their plane; the regularisation bounds it.
         spread = np.einsum("pii->p", moments)[:, None, None] * np.eye(3)
         gradient = mixed @ np.linalg.inv(moments + 1e-3 * spread)
         return to_centre[:, 0] + np.einsum("pij,pj->pi", gradient, points - from_centre[:, 0])
@@ -60,9 +60,9 @@ class Drop:
 def simulated_drop(
     mesh: TetMesh, cloud: GaussianCloud, *, sag: float, height: float, tilt_degrees: float, seconds: float
 ) -> Drop:
-    """Let ``mesh``, which stands on z = 0, fall from ``height`` metres, tilted, and record it until ``seconds`` later.
+    """Drop ``mesh``, which stands on z = 0, tilted from ``height`` m; record ``seconds`` from just before impact.
 
-    E = rho g H / ``sag``: of 0.1 and more, the body crumples.
+    Young's modulus is E = rho g H / ``sag``: from a ``sag`` of 0.1 on, the body crumples.
     """
     plane = Plane.from_coefficients(0.0, 0.0, 1.0, 0.0)
     density, body_height = 1000.0, float(np.ptp(mesh.nodes[:, 2]))
@@ -75,10 +75,10 @@ def simulated_drop(
         mesh, plane.normal, body_weight=body.weight, height=body.height, young_modulus=body.young_modulus
     )
     stepper = LocomotionStepper(body, muscles, geometry, device="cpu")
-    turned = mesh.nodes @ Rotation.from_euler("xy", [tilt_degrees, 0.6 * tilt_degrees], degrees=True).as_matrix().T
-    turned[:, 2] += height - turned[:, 2].min()
-    state = BodyState(turned, np.tile(np.sqrt(2.0 * GRAVITY * height) * gravity / GRAVITY, (len(turned), 1)))
-    # The flight itself deforms nothing: start just above the floor, at the speed of arrival.
+    rotated = mesh.nodes @ Rotation.from_euler("xy", [tilt_degrees, 0.6 * tilt_degrees], degrees=True).as_matrix().T
+    rotated[:, 2] += height - rotated[:, 2].min()
+    state = BodyState(rotated, np.tile(np.sqrt(2.0 * GRAVITY * height) * gravity / GRAVITY, (len(rotated), 1)))
+    # The flight deforms nothing, so start just above the floor at the impact velocity.
     state.positions[:, 2] -= height - 0.01 * body_height
     memory = stepper.initial_memory()
     frames, energies = [state.positions], [0.0]

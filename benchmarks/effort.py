@@ -1,13 +1,14 @@
-"""What motions cost and how smooth they are: muscle work, energy of deformation, chatter of the load and the energy
-ledger of every body of the sweep in every motion, at the command's own settings.
+"""Cost and smoothness of motions: muscle work, energy of deformation, chatter of the ground load and energy balance.
 
 python benchmarks/effort.py [--quick] [--workers 2] [--device cpu] [--seed 0] [--json PATH] [--join PATH] [--plot PATH]
 
-All in m g H and body weights. Work: the sum over segments and steps of what muscles give where they shorten. Of the
-steps before lift-off (of all of them where there is none) a reversal is a step at which the ground's normal load
-changes the other way than in the step before, both times by more than 0.02 body weights. Aims, of the standard jump of
-every body: ``work`` (at most 1.5), ``internal_energy`` (kinetic energy of deformation at most 0.25), ``chatter``
-(reversals in at most 15 % of steps, none above 0.3 body weights); of every run: ``ledger_closes`` (to 1e-6 a step).
+Every body of the sweep does every motion, at the command's default settings. All figures are in m g H and body
+weights. Work is the sum over segments and steps of the work that muscles do while they shorten. A reversal is a step
+at which the ground's normal load changes in the opposite direction than in the step before, both times by more than
+0.02 body weights; steps before lift-off are counted, or all of them if the body never lifts off. Aims, for the standard
+jump of every body: ``work`` (at most 1.5), ``internal_energy`` (kinetic energy of deformation at most 0.25),
+``chatter`` (reversals in at most 15 % of steps, none above 0.3 body weights); for every run: ``ledger_closes`` (energy
+balance to 1e-6 a step).
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ if TYPE_CHECKING:
 
 BODIES = ("pawn", "figurine", "stool", "robot", "monkey")
 MOTIONS = ("jump", "hop 0.7 0.3 x2", "twist 90", "walk 0.4", "turn 30", "stand 2")
-WORK, INTERNAL, REVERSED, LARGEST, CLOSES = 1.5, 0.25, 0.15, 0.3, 1e-6
-CHANGE = 0.02
-"""Body weights: smaller changes of the load are none."""
+MAX_WORK, MAX_INTERNAL, MAX_REVERSED, MAX_REVERSAL, BALANCE_TOLERANCE = 1.5, 0.25, 0.15, 0.3, 1e-6
+MIN_CHANGE = 0.02
+"""Minimum change of the load that counts, body weights."""
 
 
 def load(trajectory: Trajectory) -> np.ndarray:
@@ -50,7 +51,7 @@ def load(trajectory: Trajectory) -> np.ndarray:
 
 
 def before_lift_off(loads: np.ndarray) -> int:
-    """Steps before the longest time without load; all of them where that is under three steps."""
+    """Number of steps before the longest flight; all steps if no flight lasts three steps."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], loads <= 0.0, [0]])))
     starts, ends = edges[::2], edges[1::2]
     longest = int(np.argmax(ends - starts)) if len(starts) else 0
@@ -58,8 +59,9 @@ def before_lift_off(loads: np.ndarray) -> int:
 
 
 def reversals(loads: np.ndarray) -> np.ndarray:
-    """(F-2,) body weights by which the load turns back at each step but the ends: the smaller of two consecutive
-    changes of opposite sign, 0 where they agree.
+    """(F-2,) body weights, reversal of the load at each inner step.
+
+    A reversal is the smaller of two consecutive changes of opposite sign; 0 if the signs agree.
     """
     changes = np.diff(loads)
     turned = changes[1:] * changes[:-1] < 0.0
@@ -67,7 +69,7 @@ def reversals(loads: np.ndarray) -> np.ndarray:
 
 
 def run(body: str, name: str, *, device: str, seed: int, frames: int | None = None) -> Row:
-    """One motion of one body."""
+    """Simulate one motion of one body."""
     judged, milliseconds = timed(_run, body, name, device=device, seed=seed, frames=frames)
     return {"body": body, "motion": name, **judged, "seconds": 1e-3 * milliseconds}
 
@@ -85,19 +87,19 @@ def _run(body: str, name: str, *, device: str, seed: int, frames: int | None) ->
     except (UserError, ArithmeticError, np.linalg.LinAlgError) as error:
         return {"stopped": str(error)}
     trajectory = performance.trajectory
-    books, loads = energy_balance(trajectory), load(trajectory)
+    balance, loads = energy_balance(trajectory), load(trajectory)
     turned = reversals(loads[: before_lift_off(loads)])
     return {
         "stopped": performance.fallen or None,
         "reached": {key: float(value) for key, value in vars(measure(trajectory)).items()},
         "steps": len(trajectory.dt),
-        "work": float(books.muscle_work.sum() / books.energy_unit),
-        "peak_elastic": float(books.elastic.max() / books.energy_unit),
-        "peak_deformation": float(books.kinetic_deformation.max() / books.energy_unit),
-        "reversed": float(np.mean(turned > CHANGE)),
+        "work": float(balance.muscle_work.sum() / balance.energy_unit),
+        "peak_elastic": float(balance.elastic.max() / balance.energy_unit),
+        "peak_deformation": float(balance.kinetic_deformation.max() / balance.energy_unit),
+        "reversed": float(np.mean(turned > MIN_CHANGE)),
         "largest_reversal": float(turned.max(initial=0.0)),
         "largest_load": float(loads.max()),
-        "energy_residual": books.max_residual,
+        "energy_residual": balance.max_residual,
         "load": loads.tolist(),
         "time": trajectory.time[1:].tolist(),
     }
@@ -113,7 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     known = {(row["body"], row["motion"]) for row in rows}
     chosen = [("pawn", "jump")] if options.quick else [(body, name) for name in MOTIONS for body in BODIES]
     one = partial(run, device=options.device, seed=options.seed)
-    # Kernels compile once, here, not in every worker.
+    # Compile the kernels once here, not in every worker.
     one("pawn", "jump", frames=4)
     table = Table(
         **{"body": "<8", "motion": "<14", "work": ".2f", "elastic": ".2f", "deformation": ".3f", "reversed": ".1%"},
@@ -128,25 +130,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def summary(rows: list[Row]) -> dict[str, Any]:
-    """Rows and aims: what ``report`` takes."""
+    """Return the rows and aims, as arguments of ``report``."""
     jumps = [row for row in rows if row["motion"] == "jump" and "work" in row]
     whole = {row["body"] for row in jumps} == set(BODIES)
     aims = {
-        "work": all(row["work"] <= WORK for row in jumps),
-        "internal_energy": all(row["peak_deformation"] <= INTERNAL for row in jumps),
-        "chatter": all(row["reversed"] <= REVERSED and row["largest_reversal"] <= LARGEST for row in jumps),
+        "work": all(row["work"] <= MAX_WORK for row in jumps),
+        "internal_energy": all(row["peak_deformation"] <= MAX_INTERNAL for row in jumps),
+        "chatter": all(row["reversed"] <= MAX_REVERSED and row["largest_reversal"] <= MAX_REVERSAL for row in jumps),
     }
     missing = "the standard jump of every body was not run"
     return {
         "rows": rows,
         "aims": {name: value if whole else None for name, value in aims.items()}
-        | {"ledger_closes": all(row["energy_residual"] <= CLOSES for row in rows if "work" in row)},
+        | {"ledger_closes": all(row["energy_residual"] <= BALANCE_TOLERANCE for row in rows if "work" in row)},
         "why_null": {} if whole else dict.fromkeys(aims, missing),
     }
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """The load over time, a row of pictures for each motion."""
+    """Draw the load over time, one row of plots for each motion."""
     bodies = [body for body in BODIES if any(row["body"] == body for row in rows)]
     motions = [name for name in MOTIONS if any(row["motion"] == name for row in rows)]
     axes = figure.subplots(len(motions), len(bodies), squeeze=False, sharey=True)

@@ -1,5 +1,4 @@
-"""Every example as the paper's supplement tabulates its own: sizes of the body, contacts, QPs and milliseconds a frame
-by stage.
+"""Table of the examples, as in the paper's supplement: size of the body, contacts, QPs and ms per frame by stage.
 
 python benchmarks/examples.py [--quick] [--device cpu] [--json PATH] [--plot PATH]
 """
@@ -31,18 +30,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = []
     for name in EXAMPLES:
         with tempfile.TemporaryDirectory() as folder:
-            asked = ["--out", folder, "--device", options.device, *(["--frames", "6"] if options.quick else [])]
-            told = example(name).main(asked).to_json()
+            arguments_of_example = [
+                "--out",
+                folder,
+                "--device",
+                options.device,
+                *(["--frames", "6"] if options.quick else []),
+            ]
+            summary = example(name).main(arguments_of_example).to_json()
             with np.load(Path(folder) / "trajectory.npz") as trajectory:
                 steps = len(trajectory["time"]) - 1
                 contacts = np.bincount(trajectory["contact_step"], minlength=steps)
-        rows.append(row_of(name, told, contacts))
+        rows.append(row_of(name, summary, contacts))
     print_rows(rows)
     report(options, rows, aims={}, draw=lambda figure: draw(figure, rows), size=(7.0, 3.0))
 
 
 def example(name: str) -> ModuleType:
-    """A script of ``examples/``, which is no package."""
+    """Import a script of ``examples/``, which is not a package."""
     path = Path(__file__).resolve().parents[1] / "examples" / f"{name}.py"
     spec = importlib.util.spec_from_file_location(f"example_{name}", path)
     assert spec is not None and spec.loader is not None
@@ -51,46 +56,46 @@ def example(name: str) -> ModuleType:
     return module
 
 
-def row_of(name: str, told: Row, contacts: np.ndarray) -> Row:
-    """One line of the table; ``contacts`` (F,) in each step."""
+def row_of(name: str, summary: Row, contacts: np.ndarray) -> Row:
+    """Return one row of the table; ``contacts`` (F,) is the number of contacts in each step."""
     return {
         "example": name,
-        "nodes": told["cage"]["nodes"],
-        "tets": told["cage"]["tets"],
-        "fibres": told["muscles"]["fibres"],
-        "segments": told["muscles"]["segments"],
+        "nodes": summary["cage"]["nodes"],
+        "tets": summary["cage"]["tets"],
+        "fibres": summary["muscles"]["fibres"],
+        "segments": summary["muscles"]["segments"],
         "contacts_mean": float(contacts[contacts > 0].mean()) if contacts.any() else 0.0,
-        "contacts_most": int(contacts.max(initial=0)),
-        "qps_a_frame": told["qp"]["mean_per_frame"],
-        "qps_worst": told["qp"]["worst_per_frame"],
-        "milliseconds": {stage: values["mean"] for stage, values in told["timing"].items()},
-        "motions": told["motion"],
-        "audit": told["audit"],
+        "contacts_max": int(contacts.max(initial=0)),
+        "qps_a_frame": summary["qp"]["mean_per_frame"],
+        "qps_worst": summary["qp"]["worst_per_frame"],
+        "milliseconds": {stage: values["mean"] for stage, values in summary["timing"].items()},
+        "motions": summary["motion"],
+        "audit": summary["audit"],
     }
 
 
 def stages_of(rows: list[Row]) -> list[str]:
-    """Of all examples: some never ask twice for a step."""
+    """Return the stages that occur in any example; replanning, for one, does not occur in all of them."""
     return list(dict.fromkeys(stage for row in rows for stage in row["milliseconds"]))
 
 
 def print_rows(rows: list[Row]) -> None:
-    """The table: in brackets the most in a step or frame; stages in milliseconds a frame."""
+    """Print the table: maxima per step or frame in brackets, stages in ms per frame."""
     stages = stages_of(rows)
     columns = {"example": "<8", "nodes": "d", "tets": "d", "fibres": "d", "segments": "d"}
     table = Table(**columns, contacts="10s", QPs="10s", **dict.fromkeys(stages, "8.1f"))
     for row in rows:
         table.row(
             *(row[name] for name in columns),
-            f"{row['contacts_mean']:.0f} ({row['contacts_most']})",
+            f"{row['contacts_mean']:.0f} ({row['contacts_max']})",
             f"{row['qps_a_frame']:.1f} ({row['qps_worst']})",
             *(row["milliseconds"].get(stage, 0.0) for stage in stages),
         )
-    print("in brackets the most in a step or frame; stages in ms a frame")
+    print("in brackets the maximum of a step or frame; stages in ms a frame")
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Milliseconds a frame by stage, one bar an example."""
+    """Draw the ms per frame by stage, one bar for each example."""
     axes = figure.subplots()
     left = np.zeros(len(rows))
     for stage in stages_of(rows):

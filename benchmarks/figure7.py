@@ -1,18 +1,18 @@
-"""Figure 7: an object taken out of a real scene, in four ways side by side.
+"""Figure 7: an object segmented from a real scene, by four methods side by side.
 
-``hard assignment`` is what Gaussian Grouping does: each Gaussian belongs to the group that most of its pixels show, to
-the object if more than half of its blending weight lies in the object's masks of 18 views; the plane has no say. The
-others are Table 3's: what straddles the plane is left out (``remove``), cut at the plane (``static split``), or trained
-until it is clear of it (``L_seg``).
+``hard assignment`` is what Gaussian Grouping does: each Gaussian belongs to the group that most of its pixels show, so
+to the object if more than half of its blending weight lies in the object's masks of 18 views; the plane is not used.
+The other methods are those of Table 3: Gaussians that straddle the plane are removed (``remove``), cut at the plane
+(``static split``), or trained until they are clear of it (``L_seg``).
 
-The measure is Table 3's: cameras in the plane; the residual is the sum of the pixels below the plane over that above
-it, PSNR and SSIM of the upper half are those against the hard assignment, which has all that the masks show. Aim:
-``figure7_best``: in every scene L_seg leaves at most 0.002 below the plane, the paper's figure, and of all ways that
-leave so little none keeps more of the upper half (PSNR). ``whole dB``, which no aim judges, has both in one: PSNR
-of the whole picture against that upper half over nothing.
+The measure is that of Table 3, with cameras in the plane: the residual is the sum of the pixels below the plane over
+the sum above it; PSNR and SSIM compare the upper half with the hard assignment, which has everything that the masks
+show. Aim: ``figure7_best``: in every scene L_seg leaves at most 0.002 below the plane, the paper's figure, and no
+other method with so small a residual has a higher PSNR of the upper half. ``whole dB``, which no aim judges, combines
+both: PSNR of the whole image against that upper half over an empty lower half.
 
-The picture (``--plot``): a row a scene, from just above the plane, the foot of the object close by; the whole scene,
-then the four ways.
+The image (``--plot``) has one row for each scene, seen from just above the plane at the object's foot: the whole
+scene, then the four methods.
 """
 
 from __future__ import annotations
@@ -32,37 +32,39 @@ from harness import Row, Table, data_folder, flags, report, timed
 SCENES = ("koala.ply", "narcissus.sog", "fox.ply")
 HARD, OURS = "hard assignment", "L_seg"
 CLEARINGS = {"remove": StraddlingPolicy.REMOVE, "static split": StraddlingPolicy.SPLIT, OURS: StraddlingPolicy.FINETUNE}
-MOST_RESIDUAL = 0.002
-LOOK_DOWN = 8.0
-"""Degrees."""
+MAX_RESIDUAL = 0.002
+VIEW_ELEVATION = 8.0
+"""Angle of the view from above the plane, degrees."""
 
 
 def rows_of(name: str, device: str, side: int, seed: int, table: Table) -> tuple[list[Row], np.ndarray]:
-    """One row a way, and their pictures."""
-    parts = table3.taken_apart(name, device)
+    """Return one row for each method, and an image of all of them."""
+    parts = table3.segment_parts(name, device)
     cameras = table3.cameras_in(parts.located.plane, parts.located, side)
     clouds = {HARD: (parts.hard, 0.0)}
-    for way, clearing in CLEARINGS.items():
+    for method, clearing in CLEARINGS.items():
         cloud, milliseconds = timed(
             clear_plane, parts.above, parts.located.plane, clearing, options=StraddlingOptions(seed=seed)
         )
-        clouds[way] = (cloud, 1e-3 * milliseconds)
-    wanted = [table3.picture(parts.hard, camera)[: side // 2] for camera in cameras]
+        clouds[method] = (cloud, 1e-3 * milliseconds)
+    targets = [table3.picture(parts.hard, camera)[: side // 2] for camera in cameras]
     rows = []
-    for way, (cloud, seconds) in clouds.items():
-        scores = table3.scores([table3.picture(cloud, camera) for camera in cameras], None if way == HARD else wanted)
-        rows.append({"scene": name, "method": way, "gaussians": cloud.count, "seconds": seconds, **scores})
+    for method, (cloud, seconds) in clouds.items():
+        scores = table3.scores(
+            [table3.picture(cloud, camera) for camera in cameras], None if method == HARD else targets
+        )
+        rows.append({"scene": name, "method": method, "gaussians": cloud.count, "seconds": seconds, **scores})
         figures = (scores[key] for key in ("psnr", "ssim", "flip", "residual", "whole_psnr"))
-        table.row(name, way, *figures, cloud.count, seconds)
-    return rows, close_by(parts, {way: cloud for way, (cloud, _) in clouds.items()})
+        table.row(name, method, *figures, cloud.count, seconds)
+    return rows, close_by(parts, {method: cloud for method, (cloud, _) in clouds.items()})
 
 
 def close_by(parts: table3.Parts, clouds: Mapping[str, GaussianCloud], size: int = 400) -> np.ndarray:
-    """The foot of the object from a little above the plane: in its scene, and taken out in each way, on white."""
+    """Render the object's foot from slightly above the plane: in its scene, and segmented by each method, on white."""
     plane, located = parts.located.plane, parts.located
     first, second = plane.tangents()
     foot = located.centre - plane.heights(located.centre) * plane.normal
-    down = np.radians(LOOK_DOWN)
+    down = np.radians(VIEW_ELEVATION)
     level = np.cos(0.4) * first + np.sin(0.4) * second
     away = np.cos(down) * level + np.sin(down) * plane.normal
     target = foot + 0.12 * located.size * plane.normal
@@ -75,13 +77,13 @@ def close_by(parts: table3.Parts, clouds: Mapping[str, GaussianCloud], size: int
 
 
 def judge(rows: Sequence[Row], missing: Sequence[str]) -> tuple[dict[str, bool | None], dict[str, str]]:
-    """The aim, from the rows."""
+    """Return the aim from the rows."""
     if missing:
         return {"figure7_best": None}, {"figure7_best": f"without {', '.join(missing)}; set EGS_WARP_DATA"}
     verdicts = []
     for name in {row["scene"] for row in rows}:
-        clean = {r["method"]: r for r in rows if r["scene"] == name and r["residual"] <= MOST_RESIDUAL}
-        # Nothing is taken for the upper half but the hard assignment, whose own PSNR is without bound.
+        clean = {r["method"]: r for r in rows if r["scene"] == name and r["residual"] <= MAX_RESIDUAL}
+        # Only the hard assignment has the whole upper half; its own PSNR is unbounded.
         verdicts.append(
             OURS in clean and HARD not in clean and all(clean[OURS]["psnr"] >= row["psnr"] for row in clean.values())
         )
@@ -89,7 +91,7 @@ def judge(rows: Sequence[Row], missing: Sequence[str]) -> tuple[dict[str, bool |
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
+    """Run the benchmark."""
     options = flags(__doc__, quick="pictures half as large", device="cpu").parse_args(arguments)
     side = 400 if options.quick else 800
     rows: list[Row] = []
@@ -97,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     missing = [name for name in SCENES if not (data_folder() / "scenes" / name).exists()]
     table = Table(
         scene="<14",
-        way="<16",
+        method="<16",
         PSNR=".2f",
         SSIM=".4f",
         FLIP=".4f",

@@ -1,9 +1,9 @@
-"""Figure 8: a checkered bar, twisted more and more along its length; Gaussians that do not split stick out as spikes.
+"""Figure 8: a checkered bar with increasing twist; Gaussians that are not split stick out as spikes.
 
-The spike measure is the share of pixels that are drawn (alpha above 0.1) outside the deformed mesh's silhouette dilated
-by one pixel, over all views. At rest it tells how soft the trained edges are: the pictures are half as large as those
-trained on, so that this stays small. Aim: ``spikes_down_5x`` (splitting makes it at least 5 times smaller).
-One more row is at the settings that the library has by itself: at most four times as many Gaussians.
+The spike measure is the fraction of pixels that are drawn (alpha above 0.1) outside the deformed mesh's silhouette,
+dilated by one pixel, over all views. At rest it measures how soft the trained edges are; images are half as large as
+the training images, so this stays small. Aim: ``spikes_down_5x`` (splitting makes it at least 5 times smaller). One
+more row has the library's default settings: at most four times the number of Gaussians.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from harness import Table, flags, report
 from painted_meshes import bar
 
 LIBRARY = "library's default split"
-WAYS = {**{method.value: method for method in DeformationMethod}, LIBRARY: DeformationMethod.BIDIRECTIONAL}
+METHODS = {**{method.value: method for method in DeformationMethod}, LIBRARY: DeformationMethod.BIDIRECTIONAL}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
+    """Run the benchmark."""
     parser = flags(__doc__, quick="pictures half as large, fewer views and training steps")
     parser.add_argument("--gaussians", type=int, default=1500, help="few, as on flat walls of real captures")
     parser.add_argument("--degrees", type=float, default=720.0, help="twist at the top")
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         cameras = scenes.ring(vertices, 8, size, elevations=(5.0, 25.0), phase=0.21)
         truth = scenes.photograph(mesh, vertices, cameras, options.device)
         strip = [truth[0][0]]
-        for name, method in WAYS.items():
+        for name, method in METHODS.items():
             limit = {} if name == LIBRARY else {"max_growth": options.growth}
             (carried,) = deform_with_method(cloud, cage, [nodes], method=method, **limit)
             images = [render_gaussians(carried, camera) for camera in cameras]

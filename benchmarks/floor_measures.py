@@ -1,5 +1,6 @@
-"""How like the true floor a filled hole is: pixel by pixel, in the large, in its detail; and how like itself the true
-floor is, which bounds what any filling with sharp texture can score.
+"""Similarity of an inpainted hole to the true floor: per pixel, after a blur, and in its detail.
+
+The self-similarity of the true floor bounds the score of any inpainting with sharp texture.
 """
 
 from __future__ import annotations
@@ -11,13 +12,13 @@ from scipy import ndimage
 from egs_warp.training.metrics import psnr
 
 COARSE = 0.05
-"""Standard deviation of the blur before which pictures are compared in the large, of the hole's side."""
+"""Standard deviation of the blur for ``coarse_psnr``, relative to the hole's side."""
 SHIFTS = np.array([(r * np.cos(t), r * np.sin(t)) for r in (0.5, 0.75, 1.0) for t in np.radians(np.arange(0, 360, 15))])
-"""(72, 2) of the hole's side: where floor from beside the hole is taken from."""
+"""(72, 2) shifts relative to the hole's side at which true floor is sampled."""
 
 
 def similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(H, W) structural similarity of two pictures: Gaussian window of 11 x 11, sigma 1.5, mean over channels."""
+    """(H, W) structural similarity of two images: Gaussian window of 11 x 11, sigma 1.5, mean over channels."""
 
     def blur(values: np.ndarray) -> np.ndarray:
         return cv2.GaussianBlur(values.astype(np.float64), (11, 11), 1.5)
@@ -32,19 +33,20 @@ def similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def coarse_psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """PSNR in ``mask`` (H, W) of what is left of both pictures (H, W, 3) after a blur that looks at the mask alone."""
+    """PSNR (dB) in ``mask`` (H, W) of two images (H, W, 3) after a blur that uses only pixels of the mask."""
     sigma = COARSE * np.sqrt(mask.sum())
 
     def blurred(picture: np.ndarray) -> np.ndarray:
-        held = ndimage.gaussian_filter(picture * mask[..., None].astype(float), (sigma, sigma, 0.0))
-        return np.asarray(held)[mask] / np.asarray(ndimage.gaussian_filter(mask.astype(float), sigma))[mask][:, None]
+        weighted = ndimage.gaussian_filter(picture * mask[..., None].astype(float), (sigma, sigma, 0.0))
+        return (
+            np.asarray(weighted)[mask] / np.asarray(ndimage.gaussian_filter(mask.astype(float), sigma))[mask][:, None]
+        )
 
     return psnr(blurred(image), blurred(truth))
 
 
 def gradient_energy(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """Mean squared gradient in ``mask`` (H, W), seam left out, over the truth's: below 1 is too smooth, above too
-    busy."""
+    """Ratio of mean squared gradients in ``mask`` (H, W) without the seam; below 1 is too smooth, above it too busy."""
     inner = np.asarray(ndimage.binary_erosion(mask, iterations=3), dtype=bool)
 
     def energy(picture: np.ndarray) -> float:
@@ -54,11 +56,16 @@ def gradient_energy(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> f
     return energy(image) / energy(truth)
 
 
-def from_beside(truth: np.ndarray, known: np.ndarray, hole: np.ndarray) -> list[tuple[float, float]]:
-    """PSNR and PSNR after a blur (dB) in the ``hole`` of the true floor itself, moved there from half a side to a side
-    away, for each place that has floor.
+def moved_floor_scores(truth: np.ndarray, known: np.ndarray, hole: np.ndarray) -> list[tuple[float, float]]:
+    """Score true floor that is moved into the hole from half a side to a side away.
 
-    ``truth`` (rows, columns, 3), ``known`` and ``hole`` (rows, columns) bool.
+    Args:
+        truth: (rows, columns, 3) colours of the floor.
+        known: (rows, columns) bool, pixels that show floor.
+        hole: (rows, columns) bool.
+
+    Returns:
+        PSNR and PSNR after a blur, dB, for each shift whose source is floor.
     """
     rows, columns = np.nonzero(hole)
     side = max(np.ptp(rows), np.ptp(columns)) + 1

@@ -1,21 +1,19 @@
-"""What a step costs by its stages, over the nodes of the cage and the contacts of the step; how that grows, and how far
-it is from real time.
+"""Cost of a step by stage, over the nodes of the cage and the contacts of the step.
 
 python benchmarks/frame.py [--quick] [--nodes N ...] [--frames N] [--old FOLDER] [--json PATH] [--plot PATH]
 
 The pawn jumps with cages of about 250 to 4,000 nodes; each of the first steps is a record of its stages, its nodes and
-its contacts. To all of a stage's records t = c nodes^p contacts^q is fitted (steps with contact, least squares of the
-logarithms). ``--old`` is a checkout of commit 3848750, whose own example is timed in the same run, and so are the jumps
-of the captures that are there (plush dog, monkey, robot) by both, each with the nodes it gives them. Give it two cores
-(``taskset -c 0,1``) and leave them alone.
+its contacts. The model t = c nodes^p contacts^q is fitted to all records of a stage (steps with contact, least squares
+of the logarithms). ``--old`` is a checkout of commit 3848750. Its own example is timed in the same run; the jumps of
+the available captures (plush dog, monkey, robot) are timed with both versions, each with its own number of nodes. Give
+it two idle cores (``taskset -c 0,1``).
 
-On a GPU, once more with 1,000,000 Gaussians on about 1,000 nodes: each step, then its picture of 1920 x 1080, which is
-made beside the next step and whose bytes are taken after that (where that cage is among those asked for).
+On a GPU the jump is timed once more with 1,000,000 Gaussians on about 1,000 nodes, if ``--nodes`` has that cage: each
+step, then its image of 1920 x 1080, which is rendered during the next step and downloaded after it.
 
-Aims on a CPU: ``cpu_541`` (at most 60 ms in the mean and 5 times that in the worst step), ``cpu_10x`` (a tenth of the
-old commit's time, for the pawn and each capture), ``cpu_250_realtime`` (16.7 ms). On a GPU: ``gpu_541`` (8 ms in the
-mean, 16 in the worst step), ``gpu_1000`` (14 and 28), ``gpu_frame_60hz`` (a step and its picture within 16.7 ms in the
-mean).
+Aims on a CPU: ``cpu_541`` (mean at most 60 ms, worst step at most 5 times the mean), ``cpu_10x`` (a tenth of the old
+commit's time, for the pawn and each capture), ``cpu_250_realtime`` (16.7 ms). On a GPU: ``gpu_541`` (mean 8 ms, worst
+step 16), ``gpu_1000`` (14 and 28), ``gpu_frame_60hz`` (mean of a step and its image within 16.7 ms).
 """
 
 from __future__ import annotations
@@ -49,53 +47,59 @@ if TYPE_CHECKING:
 
     from egs_warp.pipelines.creature import Creature
 
-ASKED = (175, 500, 800, 1700, 3500)
-"""--nodes that give the pawn cages of about 250, 541, 1,000, 2,000 and 4,000."""
+REQUESTED_NODES = (175, 500, 800, 1700, 3500)
+"""``--nodes`` that give the pawn cages of about 250, 541, 1,000, 2,000 and 4,000 nodes."""
 BINS = ((1, 8), (9, 16), (17, 32), (33, 64))
-"""Contacts of a step."""
+"""Ranges of the number of contacts of a step."""
 OLD_STAGES = ("detect", "predict", "linearise", "qp", "correct", "audit")
 CAPTURES = {"plush dog": ("plush_dog.ply", "-y"), "monkey": ("monkey.ply", "y"), "robot": ("robot.spz", "y")}
-"""What is timed beside the old commit: file and the axis that points up."""
+"""Captures that are also timed with the old commit: file and up axis."""
 _ANIMATE = "from egs_warp.cli import main; main()"
 _PICTURELESS = ("--no-shadow", "--size", "64")
 
 
 GAUSSIANS, SIZE = 1_000_000, (1920, 1080)
-"""Of the pictures that are made beside the steps."""
+"""Gaussians and image size of the frames that are rendered during the steps."""
 
 
-def measure(asked: int, frames: int, *, device: str, seed: int) -> list[Row]:
-    """A record of each step of the first ``frames`` of a jump; the kernels have been compiled and loaded, and a GPU's
-    graphs recorded, before."""
-    made = pawn(seed=seed, device=device)
-    creature = make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=asked))
+def measure(nodes_requested: int, frames: int, *, device: str, seed: int) -> list[Row]:
+    """Record each step of the first ``frames`` of a jump.
+
+    Kernels are compiled and loaded before, and the GPU graphs are recorded.
+    """
+    scene = pawn(seed=seed, device=device)
+    creature = make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=nodes_requested))
     if device != "cpu":
-        # Of each work the first time is as it is, the second is recorded.
+        # The first run of a graph executes its work directly, the second records it.
         simulate(creature, motion("jump"), frames=frames)
     return _steps(creature, frames, before=2 if device == "cpu" else frames)
 
 
-def measure_pictures(asked: int, frames: int, *, device: str, seed: int) -> Row:
-    """Milliseconds a frame of a jump with pictures, and of its stages: the step, what is waited for the bytes of the
-    picture before, and to begin this one's."""
-    made = pawn(gaussian_count=GAUSSIANS, seed=seed, device=device)
-    plain = make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=asked))
-    stepper = _Watched(plain, SIZE)
+def measure_pictures(nodes_requested: int, frames: int, *, device: str, seed: int) -> Row:
+    """Time the frames of a jump with images.
+
+    Returns:
+        ms per frame in total ("frame") and by stage: the step ("step"), the wait for the bytes of the previous image
+        ("bytes"), the start of this one ("picture").
+    """
+    scene = pawn(gaussian_count=GAUSSIANS, seed=seed, device=device)
+    plain = make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=nodes_requested))
+    stepper = _RenderingStepper(plain, SIZE)
     creature = replace(plain, stepper=stepper)
     for _ in range(2):
         simulate(creature, motion("jump"), frames=frames)
     stepper.pictures.result()
     stepper.stages = {}
-    begun = time.perf_counter()
+    started = time.perf_counter()
     simulate(creature, motion("jump"), frames=frames)
     stepper.pictures.result()
-    whole = 1e3 * (time.perf_counter() - begun)
+    whole = 1e3 * (time.perf_counter() - started)
     means = {name: float(np.sum(spent)) / (frames - 1) for name, spent in stepper.stages.items()}
     return {"nodes": len(plain.body.mesh.nodes), "gaussians": plain.cloud.count, **means, "frame": whole / (frames - 1)}
 
 
-class _Watched(LocomotionStepper):
-    """Steps of which a picture is made each, beside the next."""
+class _RenderingStepper(LocomotionStepper):
+    """Stepper that renders an image of each step during the next step."""
 
     def __init__(self, creature: Creature, size: tuple[int, int]) -> None:
         vars(self).update(vars(creature.stepper))
@@ -105,26 +109,26 @@ class _Watched(LocomotionStepper):
         with self.pictures.stream_context():
             self._studio = Studio(creature, size)
 
-    def advance(self, *given: Any) -> Any:
-        """A step, and its picture."""
+    def advance(self, *arguments: Any) -> Any:
+        """Advance one step and start its image."""
         studio, marks = self._studio, [time.perf_counter()]
-        done = super().advance(*given)
+        result = super().advance(*arguments)
         marks.append(time.perf_counter())
         self.pictures.result()
         marks.append(time.perf_counter())
-        self.pictures.submit(lambda: studio.begun(studio.carried(done[0].positions)))
+        self.pictures.submit(lambda: studio.enqueue(studio.deform(result[0].positions)))
         marks.append(time.perf_counter())
         for name, spent in zip(("step", "bytes", "picture"), 1e3 * np.diff(marks), strict=True):
             self.stages.setdefault(name, []).append(float(spent))
-        return done
+        return result
 
 
 def _steps(creature: Creature, frames: int, *, before: int = 2) -> list[Row]:
     simulate(creature, motion("jump"), frames=before)
-    begun = time.perf_counter()
+    started = time.perf_counter()
     performance = simulate(creature, motion("jump"), frames=frames)
     reports = performance.simulation.reports
-    wall = 1e3 * (time.perf_counter() - begun) / len(reports)
+    wall = 1e3 * (time.perf_counter() - started) / len(reports)
     nodes = len(creature.body.mesh.nodes)
     return [
         {
@@ -137,7 +141,7 @@ def _steps(creature: Creature, frames: int, *, before: int = 2) -> list[Row]:
 
 
 def by_contacts(records: list[Row]) -> list[Row]:
-    """Means of the steps of one cage, and of those with so many contacts."""
+    """Return means over the steps of one cage: over all of them, and over each range of contacts."""
     rows = []
     for low, high in ((0, 10**6), *BINS):
         chosen = [one for one in records if low <= one["contacts"] <= high]
@@ -161,7 +165,7 @@ def _stages(records: list[Row]) -> list[str]:
 
 
 def exponents(records: list[Row]) -> dict[str, list[float]]:
-    """Of each stage and of the total, p and q of c nodes^p contacts^q."""
+    """Return the exponents p and q of c nodes^p contacts^q, for each stage and for the total."""
     chosen = [one for one in records if one["contacts"] > 0]
     if len({one["nodes"] for one in chosen}) < 2:
         return {}
@@ -172,24 +176,29 @@ def exponents(records: list[Row]) -> dict[str, list[float]]:
         solution = np.linalg.lstsq(rows[known], np.log(np.array(values)[known]), rcond=None)[0]
         return [float(solution[1]), float(solution[2])]
 
-    found = {name: fitted([one["stages"].get(name, 0.0) for one in chosen]) for name in _stages(chosen)}
-    return found | {"total": fitted([one["total"] for one in chosen])}
+    fits = {name: fitted([one["stages"].get(name, 0.0) for one in chosen]) for name in _stages(chosen)}
+    return fits | {"total": fitted([one["total"] for one in chosen])}
 
 
 def old_step(folder: Path, frames: int, *capture: str) -> float:
-    """Milliseconds of a step of a jump by the code in ``folder``, by its report: of its own example, or of a
-    ``capture`` that its command is told of."""
-    told = ["-c", _ANIMATE, "animate", *capture, *_PICTURELESS] if capture else ["examples/jump.py"]
+    """Return the ms per step of a jump by the code in ``folder``, from its report.
+
+    Args:
+        folder: checkout of the old commit.
+        frames: number of frames.
+        capture: arguments of its ``animate`` command; without them its example ``jump.py`` runs.
+    """
+    script = ["-c", _ANIMATE, "animate", *capture, *_PICTURELESS] if capture else ["examples/jump.py"]
     with tempfile.TemporaryDirectory() as place:
-        command = [sys.executable, *told, "--out", place, "--frames", str(frames)]
+        command = [sys.executable, *script, "--out", place, "--frames", str(frames)]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])}
         subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
         timing = json.loads((Path(place) / "report.json").read_text())["timing"]
     return float(sum(timing[name]["mean"] for name in OLD_STAGES))
 
 
-def beside_old(folder: Path, frames: int, *, device: str) -> list[Row]:
-    """The captures that are there, each by the code in ``folder`` and by this."""
+def old_captures(folder: Path, frames: int, *, device: str) -> list[Row]:
+    """Time the available captures with the code in ``folder`` and with this code."""
     rows: list[Row] = []
     for name, (file, up) in CAPTURES.items():
         path = data_folder().resolve() / "objects" / file
@@ -205,33 +214,33 @@ def beside_old(folder: Path, frames: int, *, device: str) -> list[Row]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Time, fit, print."""
+    """Run the benchmark."""
     parser = flags(__doc__, quick="250 nodes, 20 frames", device="cpu", seed="of the pawn's Gaussians")
-    parser.add_argument("--nodes", type=int, nargs="*", default=list(ASKED), help="asked for, of each cage")
-    parser.add_argument("--frames", type=int, default=60, help="of each jump (60)")
+    parser.add_argument("--nodes", type=int, nargs="*", default=list(REQUESTED_NODES), help="requested, of each cage")
+    parser.add_argument("--frames", type=int, default=60, help="of each jump (default 60)")
     parser.add_argument("--old", type=Path, help="checkout of commit 3848750")
     options = parser.parse_args(arguments)
-    frames, chosen = (20, list(ASKED[:1])) if options.quick else (options.frames, options.nodes)
+    frames, chosen = (20, list(REQUESTED_NODES[:1])) if options.quick else (options.frames, options.nodes)
     old = old_step(options.old.resolve(), frames) if options.old else None
     captures: list[Row] = []
     if old is not None:
         print(f"3848750: {old:.1f} ms a step")
-        captures = beside_old(options.old.resolve(), frames, device=options.device)
+        captures = old_captures(options.old.resolve(), frames, device=options.device)
     records: list[Row] = []
     table: Table | None = None
-    for asked in chosen:
-        made = measure(asked, frames, device=options.device, seed=options.seed)
-        records += made
+    for nodes_requested in chosen:
+        new_records = measure(nodes_requested, frames, device=options.device, seed=options.seed)
+        records += new_records
         if table is None:
-            stages = {name: ".1f" for name in _stages(made)}
+            stages = {name: ".1f" for name in _stages(new_records)}
             table = Table(**{"nodes": "d", "contacts": "<8", "steps": "d", **stages, "mean": ".1f", "worst": ".1f"})
-        for row in by_contacts(made):
+        for row in by_contacts(new_records):
             figures = [row["stages"].get(name, 0.0) for name in stages]
             table.row(row["nodes"], row["contacts"], row["steps"], *figures, row["mean"], row["worst"])
         record(options, **summary(records, old, options.device, captures))
     pictures = None
-    if options.device != "cpu" and ASKED[2] in chosen:
-        pictures = measure_pictures(ASKED[2], frames, device=options.device, seed=options.seed)
+    if options.device != "cpu" and REQUESTED_NODES[2] in chosen:
+        pictures = measure_pictures(REQUESTED_NODES[2], frames, device=options.device, seed=options.seed)
         print(", ".join(f"{name} {value:.1f}" for name, value in pictures.items()))
     result = summary(records, old, options.device, captures, pictures)
     for name, (p, q) in result["exponents"].items():
@@ -246,7 +255,7 @@ def summary(
     captures: Sequence[Row] = (),
     pictures: Row | None = None,
 ) -> dict[str, Any]:
-    """Rows, exponents and aims: what ``report`` takes."""
+    """Return the rows, exponents and aims, as arguments of ``report``."""
     cages = [by_contacts([one for one in records if one["nodes"] == n]) for n in sorted({r["nodes"] for r in records})]
     whole = [rows[0] for rows in cages]
     small, usual, large = (
@@ -286,7 +295,7 @@ def summary(
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Milliseconds over nodes, by stage."""
+    """Draw ms over nodes, by stage."""
     axes = figure.subplots()
     whole = [row for row in rows if row["contacts"] == "all"]
     for name in whole[0]["stages"]:

@@ -1,11 +1,10 @@
-"""What a picture of a film costs by its stages: the creature carried by its cage, its shadow on the floor, the splats
-drawn over that, and bytes for a video on the host.
+"""Cost of a film's frame by stage: deforming the Gaussians, shadow on the floor, rendering, and download for the video.
 
 python benchmarks/frame_time.py [--quick] [--device cuda:0] [--seed 0] [--json PATH] [--plot PATH]
 
-The pawn in a cage of about 1,000 nodes, which bends to and fro. Stages are timed one by one, the whole without waiting
-between them. Aim: ``picture_60hz`` (1,000,000 Gaussians at 1920 x 1080 within 16.7 ms; null on a CPU). Encoding and the
-step are not in it.
+The pawn, in a cage of about 1,000 nodes, bends back and forth. Stages are timed one by one; the whole is timed without
+synchronisation between them. Aim: ``picture_60hz`` (1,000,000 Gaussians at 1920 x 1080 within 16.7 ms; null on a CPU).
+Encoding and the solver's step are not included.
 """
 
 from __future__ import annotations
@@ -33,13 +32,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NODES = 800
-"""--nodes that give the pawn a cage of about 1,000."""
+"""``--nodes`` that give the pawn a cage of about 1,000 nodes."""
 SIZES = ((512, 512), (1920, 1080))
 FRAME = 1e3 / 60.0
 
 
 class Studio:
-    """What draws a creature from one place over a floor with its shadow."""
+    """Renderer of a creature from one viewpoint, over a floor with its shadow."""
 
     def __init__(self, creature: Creature, size: tuple[int, int]) -> None:
         height = creature.body.height
@@ -52,17 +51,17 @@ class Studio:
         )
         self.behind = grid_floor(ground, cell=0.25 * height)
 
-    def carried(self, nodes: np.ndarray) -> GaussianCloud:
-        """The Gaussians where the cage has ``nodes`` (N, 3)."""
+    def deform(self, nodes: np.ndarray) -> GaussianCloud:
+        """Return the Gaussians, deformed by the cage with nodes at ``nodes`` (N, 3)."""
         return self._deformer.deform(nodes).cloud
 
-    def begun(self, cloud: GaussianCloud) -> PendingImage:
-        """The picture of that."""
+    def enqueue(self, cloud: GaussianCloud) -> PendingImage:
+        """Queue the rendering of ``cloud``; returns at once."""
         return enqueue_image(cloud, self.camera, background=self.behind.background(cloud))
 
 
 def measure(creature: Creature, size: tuple[int, int], *, repeats: int) -> Row:
-    """A row of pictures of ``size`` across and down."""
+    """Return one row for images of ``size`` (width, height)."""
     nodes, height = creature.cage.mesh.nodes, creature.body.height
     studio, device, turn = Studio(creature, size), creature.cloud.device, iter(range(1_000_000))
 
@@ -70,14 +69,14 @@ def measure(creature: Creature, size: tuple[int, int], *, repeats: int) -> Row:
         lean = 0.2 * np.sin(0.3 * next(turn)) * (nodes[:, 2] / height) ** 2
         return nodes + np.outer(height * lean, [1.0, 0.0, 0.0])
 
-    cloud = studio.carried(bent())
-    floor, image = studio.behind.background(cloud), studio.begun(cloud).result().image
+    cloud = studio.deform(bent())
+    floor, image = studio.behind.background(cloud), studio.enqueue(cloud).result().image
     stages = {
-        "carry": lambda: studio.carried(bent()),
+        "carry": lambda: studio.deform(bent()),
         "shadow": lambda: studio.behind.background(cloud),
         "draw": lambda: render_gaussians(cloud, studio.camera, background=floor),
         "bytes": image.colour_srgb8,
-        "whole": lambda: studio.begun(studio.carried(bent())).result().image.colour_srgb8(),
+        "whole": lambda: studio.enqueue(studio.deform(bent())).result().image.colour_srgb8(),
     }
     times = median_ms(stages, repeats=repeats, synchronise=lambda: wp.synchronize_device(device))
     return {"gaussians": cloud.count, "width": size[0], "height": size[1], **times}
@@ -93,8 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     rows: list[Row] = []
     for count in counts:
-        made = pawn(gaussian_count=count, seed=options.seed, device=options.device)
-        creature = make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=NODES))
+        scene = pawn(gaussian_count=count, seed=options.seed, device=options.device)
+        creature = make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=NODES))
         for size in SIZES:
             rows.append(measure(creature, size, repeats=5 if options.quick else 15))
             table.row(*rows[-1].values())
@@ -105,9 +104,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         axes = figure.subplots()
         left = np.zeros(len(rows))
         for stage in ("carry", "shadow", "draw", "bytes"):
-            taken = np.array([row[stage] for row in rows])
-            axes.barh([f"{row['gaussians']}, {row['width']} x {row['height']}" for row in rows], taken, left=left)
-            left += taken
+            durations = np.array([row[stage] for row in rows])
+            axes.barh([f"{row['gaussians']}, {row['width']} x {row['height']}" for row in rows], durations, left=left)
+            left += durations
         axes.axvline(FRAME, color="0.5")
         axes.set_xlabel("milliseconds a picture: carry, shadow, draw, bytes")
 
@@ -115,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options,
         rows,
         aims={"picture_60hz": largest <= FRAME if on_gpu and largest is not None else None},
-        why_null={} if on_gpu else {"picture_60hz": "told of a GPU and of 1,000,000 Gaussians"},
+        why_null={} if on_gpu else {"picture_60hz": "measured on a GPU with 1,000,000 Gaussians only"},
         draw=draw,
     )
 

@@ -1,18 +1,19 @@
-"""Any body, any way: bodies x what they are told (walk ahead, walk to a point, turn, twist, jump, stand and be pushed),
-with one setting for all.
+"""Motions of many bodies with one setting for all: walk ahead, walk to a point, turn, twist, jump, stand and be pushed.
 
 python benchmarks/gaits.py [--quick] [--workers 2] [--nodes 500] [--bodies NAME ...] [--cells NAME ...] [--unseen]
     [--captures FOLDER] [--json PATH] [--join PATH]
 
-A walk succeeds if it ends within 0.1 body heights and 10 degrees of where it was told to, within 60 sqrt(H/g),
-upright; a twist within 10 degrees in at most two jumps, a standard jump within 15 %; one that stands and is pushed by
-0.1 m sqrt(g H) from the side, if it ends upright and no sole was ever 0.1 body heights from where it stood; one that
-is pushed by 1 m sqrt(g H) at 0.8 of its height, if it stands at the end, having got up where that threw it over. Slip
-is that of a foot while it stands over the stride; the cost of transport the muscles' work over m g times the way.
-What a body refuses in one line counts as a failure here; getting up is counted by itself, beside the aim. A ball is
-judged by its place and, where it does not roll, its heading. Captures take part where they are found. ``--unseen``
-takes five bodies that no one had used while the motions were made; ``--captures`` those of a folder, as
-``trained_bodies.py`` writes them.
+A cell is one body with one motion. A walk succeeds if it ends upright within 0.1 body heights and 10 degrees of the
+target, within 60 sqrt(H/g); a twist if it ends within 10 degrees after at most two jumps; a standard jump if it is
+within 15 %. A body that stands and is pushed by 0.1 m sqrt(g H) from the side succeeds if it ends upright and no sole
+was ever 0.1 body heights from its initial place. A body that is pushed by 1 m sqrt(g H) at 0.8 of its height succeeds
+if it stands at the end, possibly after getting up. Slip is the displacement of a foot while it is on the ground, over
+the stride; cost of transport is the muscles' work over m g times the distance.
+
+A body that refuses a motion with an error counts as a failure; getting up is counted separately and has no aim. A ball
+is judged by its position and, if it does not roll, by its heading. Captures are used if they are on this machine.
+``--unseen`` runs five bodies that were not used while the motions were developed, ``--captures`` those of a folder
+written by ``trained_bodies.py``.
 """
 
 from __future__ import annotations
@@ -54,22 +55,22 @@ CELLS = {
 QUICK = {"walk": "walk 0.3", "turn": "turn 30"}
 PUSHES = {"push": "0.5 0.1 left", "get up": "0.2 1 left 0.8"}
 CAPTURED = ("plush dog", "monkey", "robot", "koala", "fox", "armchair", "cat", "spot")
-NEAR, ASIDE, LONGEST = 0.1, 10.0, 60.0
-"""Body heights, degrees, sqrt(H / g)."""
-GET_UP = 15.0
-"""Degrees from upright within which it has got up."""
+POSITION_TOLERANCE, ANGLE_TOLERANCE, MAX_TIME = 0.1, 10.0, 60.0
+"""Maximum error of the position, body heights, and of angles, degrees; maximum time, sqrt(H / g)."""
+MAX_RISEN_TILT = 15.0
+"""Maximum tilt of a body that has got up, degrees."""
 
 
 def names() -> list[str]:
-    """Bodies that can be had here."""
+    """Return the names of the bodies that are available on this machine."""
     return ["pawn", "figurine", "stool", *(name for name in CAPTURED if name in NAMES), *MODELLED]
 
 
 def run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> Row:
-    """Simulate one cell and judge it; the body is one of the folder ``captures``, if that is given."""
+    """Simulate one cell and judge it; with ``captures`` the body is read from that folder."""
     wp.config.log_level = wp.LOG_WARNING
     judged, milliseconds = timed(_run, name, cell, text, nodes, captures)
-    return {"body": name, "cell": cell, "told": text, **judged, "seconds": 1e-3 * milliseconds}
+    return {"body": name, "cell": cell, "motion": text, **judged, "seconds": 1e-3 * milliseconds}
 
 
 def _run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> Row:
@@ -82,7 +83,7 @@ def _run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> 
             motion(text),
             pushes=read_pushes(PUSHES[cell]) if cell in PUSHES else (),
             get_up=cell == "get up",
-            max_seconds=(LONGEST + 1.0) * unit,
+            max_seconds=(MAX_TIME + 1.0) * unit,
         )
     except (UserError, FileNotFoundError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         return {"success": False, "reason": f"stopped: {error}"}
@@ -90,28 +91,28 @@ def _run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> 
     feet = place.feet()
     stands = place.base()
     height, gravity = creature.body.height, float(np.linalg.norm(creature.body.gravity))
-    books = energy_balance(trajectory)
-    work = float(books.muscle_work.sum() / books.energy_unit)
+    balance = energy_balance(trajectory)
+    work = float(balance.muscle_work.sum() / balance.energy_unit)
     moved = _moved(performance)
-    way = float(np.linalg.norm(moved[:2]))
+    distance = float(np.linalg.norm(moved[:2]))
     (done,) = performance.sequence.done[:1]
     own = done.motion.outcome_record(trajectory, 0, len(trajectory.time) - 1)
     reached: dict[str, Any] = asdict(measure(trajectory)) | (asdict(own) if own is not None else {})
     if stands is SupportKind.ROUND_BASE:
-        # A ball lies any way up, and has a heading only as long as it does not roll.
+        # A ball has no upright pose, and has a heading only while it does not roll.
         reached["tilt_degrees"] = 0.0
         moved[2] = moved[2] if cell in ("turn", "twist") else 0.0
     checked = asdict(audit(trajectory, newton_unconverged=sum(not r.converged for r in performance.simulation.reports)))
     time = float(trajectory.time[-1]) * float(np.sqrt(gravity / height))
     reason = f"fell: {performance.fallen}" if performance.fallen else bounds_broken(checked)
     if cell == "get up":
-        reason = reason or _lies(performance, reached)
+        reason = reason or _get_up_failure(performance, reached)
     elif cell == "push":
-        reason = reason or _swept(reached)
+        reason = reason or _push_failure(reached)
     elif cell in ("twist", "jump"):
         reason = reason or judge(cell, {"distance": 0.0, "height": 0.2, **done.asked}, reached)
     else:
-        reason = reason or _missed(dict(done.asked), moved, reached, time)
+        reason = reason or _walk_failure(dict(done.asked), moved, reached, time)
     return {
         "success": reason is None,
         "reason": reason,
@@ -121,7 +122,7 @@ def _run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> 
         "tilt_degrees": reached["tilt_degrees"],
         "slip": reached.get("slip") if stands is SupportKind.FEET else None,
         "work": work,
-        "cost_of_transport": work / way if cell in ("walk", "walk to") and way > NEAR else None,
+        "cost_of_transport": work / distance if cell in ("walk", "walk to") and distance > POSITION_TOLERANCE else None,
         "fallen": performance.fallen,
         "got_up": [entry.fall_note for entry in performance.sequence.done if entry.got_up],
     }
@@ -135,7 +136,7 @@ def _body(name: str, captures: Path | None) -> Body:
 
 
 def creature_of(one: Body, nodes: int) -> Creature:
-    """With a finer cage where so coarse a one falls apart."""
+    """Build the creature, with twice the nodes if the cage of ``nodes`` nodes falls apart."""
     try:
         return make_creature(one.cloud, plane=one.plane, options=CreatureOptions(nodes=nodes))
     except ArgumentError:
@@ -143,58 +144,67 @@ def creature_of(one: Body, nodes: int) -> Creature:
 
 
 def _moved(performance: SimulatedRun) -> np.ndarray:
-    """(3,) body heights ahead and to the left that the centre of mass has gone, and degrees turned."""
+    """(3,) displacement of the centre of mass ahead and to the left, body heights, and rotation, degrees."""
     trajectory, place, body_ = performance.trajectory, performance.place, performance.creature.body
     first, last = (body_.centre_of_mass(place.ground.local(trajectory.positions[k])) for k in (0, -1))
     return np.array([*((last - first)[:2] / body_.height), measure(trajectory).heading_degrees])
 
 
-def _missed(asked: dict[str, float], moved: np.ndarray, reached: dict[str, Any], time: float) -> str | None:
-    goal = np.array([asked.get("ahead", asked["distance"]), asked.get("left", 0.0)])
+def _walk_failure(requested: dict[str, float], moved: np.ndarray, reached: dict[str, Any], time: float) -> str | None:
+    goal = np.array([requested.get("ahead", requested["distance"]), requested.get("left", 0.0)])
     miss = float(np.linalg.norm(moved[:2] - goal))
-    if reached["tilt_degrees"] >= ASIDE:
+    if reached["tilt_degrees"] >= ANGLE_TOLERANCE:
         return f"leans: tilt {reached['tilt_degrees']:.0f} degrees"
-    if miss > NEAR:
-        return f"{miss:.2f} body heights from where it was told to go"
-    heading = asked.get("heading_degrees", 0.0 if "ahead" not in asked else None)
-    if heading is not None and abs((moved[2] - heading + 180.0) % 360.0 - 180.0) > ASIDE:
+    if miss > POSITION_TOLERANCE:
+        return f"{miss:.2f} body heights from the target"
+    heading = requested.get("heading_degrees", 0.0 if "ahead" not in requested else None)
+    if heading is not None and abs((moved[2] - heading + 180.0) % 360.0 - 180.0) > ANGLE_TOLERANCE:
         return f"turned {moved[2]:.0f} degrees"
-    return f"took {time:.0f} sqrt(H/g)" if time > LONGEST else None
+    return f"took {time:.0f} sqrt(H/g)" if time > MAX_TIME else None
 
 
-def _lies(performance: SimulatedRun, reached: dict[str, Any]) -> str | None:
-    if reached["tilt_degrees"] >= GET_UP:
+def _get_up_failure(performance: SimulatedRun, reached: dict[str, Any]) -> str | None:
+    if reached["tilt_degrees"] >= MAX_RISEN_TILT:
         return f"leans: tilt {reached['tilt_degrees']:.0f} degrees"
     rose = all(entry.got_up for entry in performance.sequence.done if entry.fall_note is not None)
-    return None if rose and performance.sequence.is_finished else "it has not got up within its time"
+    return None if rose and performance.sequence.is_finished else "it has not got up in time"
 
 
-def _swept(reached: dict[str, Any]) -> str | None:
-    if reached["tilt_degrees"] >= ASIDE:
+def _push_failure(reached: dict[str, Any]) -> str | None:
+    if reached["tilt_degrees"] >= ANGLE_TOLERANCE:
         return f"leans: tilt {reached['tilt_degrees']:.0f} degrees"
-    return f"a sole was {reached['sole_shift']:.2f} body heights off" if reached["sole_shift"] > NEAR else None
+    return (
+        f"a sole was {reached['sole_shift']:.2f} body heights off"
+        if reached["sole_shift"] > POSITION_TOLERANCE
+        else None
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the cells."""
-    parser = flags(__doc__, quick="three bodies, short ways", device="cpu")
+    parser = flags(__doc__, quick="three bodies, short distances", device="cpu")
     workers_flag(parser)
-    parser.add_argument("--nodes", type=int, default=500, help="of the cages, about")
+    parser.add_argument("--nodes", type=int, default=500, help="approximate number of nodes of the cages")
     parser.add_argument("--bodies", nargs="*", help="only these")
-    parser.add_argument("--unseen", action="store_true", help="the five bodies that were made last, and only these")
-    parser.add_argument("--captures", type=Path, metavar="FOLDER", help="NAME.ply in it, z up, and only these")
+    parser.add_argument("--unseen", action="store_true", help="only the five held-out bodies")
+    parser.add_argument("--captures", type=Path, metavar="FOLDER", help="only the bodies NAME.ply in it, z up")
     parser.add_argument("--cells", nargs="*", help=f"only these of {', '.join(CELLS)}")
     parser.add_argument("--join", type=Path, help="JSON of an earlier run of the same code: its rows are not run again")
     options = parser.parse_args(arguments)
     rows: list[Row] = json.loads(options.join.read_text())["rows"] if options.join else []
-    told = QUICK if options.quick else CELLS
-    usual = ["pawn", "stool", "biped"] if options.quick else names()
-    given = sorted(path.stem for path in options.captures.glob("*.ply")) if options.captures else []
-    if options.captures and not given:
+    cells_of_run = QUICK if options.quick else CELLS
+    default = ["pawn", "stool", "biped"] if options.quick else names()
+    captured = sorted(path.stem for path in options.captures.glob("*.ply")) if options.captures else []
+    if options.captures and not captured:
         parser.error(f"--captures {options.captures}: no NAME.ply there; trained_bodies.py writes some")
-    chosen = options.bodies or given or (list(UNSEEN) if options.unseen else usual)
-    cells = [(name, cell, text) for cell, text in told.items() for name in chosen if cell in (options.cells or told)]
-    known = {(row["body"], row["cell"], row["told"]) for row in rows}
+    chosen = options.bodies or captured or (list(UNSEEN) if options.unseen else default)
+    cells = [
+        (name, cell, text)
+        for cell, text in cells_of_run.items()
+        for name in chosen
+        if cell in (options.cells or cells_of_run)
+    ]
+    known = {(row["body"], row["cell"], row["motion"]) for row in rows}
     table = Table(body="<10", cell="<8", seconds=".0f", time=".0f", slip=".1%", cost=".1f", outcome="<7")
     new = [(*cell, options.nodes, options.captures) for cell in cells if cell not in known]
     for row in rows_of(run, new, options.workers):
@@ -208,24 +218,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def summary(rows: list[Row], *, whole: bool) -> dict[str, Any]:
-    """The aims."""
-    asked = [row["success"] for row in rows if row["cell"] != "get up"]
-    rate = float(np.mean(asked)) if asked else 0.0
+    """Return the aims from the rows."""
+    requested = [row["success"] for row in rows if row["cell"] != "get up"]
+    rate = float(np.mean(requested)) if requested else 0.0
     risen = [row["success"] for row in rows if row["cell"] == "get up"]
     slips = [row["slip"] for row in rows if row.get("slip") is not None and row["cell"] in ("walk", "walk to", "turn")]
     costs = [row["cost_of_transport"] for row in rows if row.get("cost_of_transport") is not None]
     fell = [row for row in rows if row.get("tilt_degrees", 0.0) > 60.0]
     pushed = [row["success"] for row in rows if row["cell"] == "push"]
     bodies = {row["body"] for row in rows}
-    # Bodies that no one has used are judged by themselves.
-    enough = whole and (len(bodies) >= 14 or bodies == set(UNSEEN))
-    why = "" if enough else "not all cells of 14 bodies, or of the unseen ones, were run"
+    # The held-out bodies are judged by themselves.
+    is_complete = whole and (len(bodies) >= 14 or bodies == set(UNSEEN))
+    why = "" if is_complete else "not all cells of 14 bodies, or of the unseen ones, were run"
     aims = {
-        "succeed_90": rate >= 0.9 if enough else None,
-        "slip": (max(slips) <= 0.03 if slips else None) if enough else None,
-        "cost_of_transport": (max(costs) <= 3.0 if costs else None) if enough else None,
+        "succeed_90": rate >= 0.9 if is_complete else None,
+        "slip": (max(slips) <= 0.03 if slips else None) if is_complete else None,
+        "cost_of_transport": (max(costs) <= 3.0 if costs else None) if is_complete else None,
         "falls_reported": all(row["fallen"] for row in fell),
-        "pushes": (all(pushed) if pushed else None) if enough else None,
+        "pushes": (all(pushed) if pushed else None) if is_complete else None,
     }
     nulls = {name: why or "no such cells were run" for name, value in aims.items() if value is None}
     return {"success_rate": rate, "got_up": sum(risen), "thrown_over": len(risen), "aims": aims, "why_null": nulls}

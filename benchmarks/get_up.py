@@ -1,9 +1,9 @@
-"""Getting up: bodies laid over by 80, 90 and 95 degrees on two sides, and left to get up by themselves.
+"""Getting up: bodies that lie on the ground, tilted by 80, 90 and 95 degrees about two axes.
 
 python benchmarks/get_up.py [--quick] [--workers 2] [--nodes 150] [--bodies NAME ...] [--json PATH]
 
-A body lies with nothing moving, just over the ground, and is told to get up. It has if it stands at rest within 15
-degrees of upright. Work is what muscles give, in m g H, in all of its tries; time is from lying down, in sqrt(H/g).
+A body starts at rest, lying just over the ground, with the motion ``get up``. It succeeds if it ends at rest within 15
+degrees of upright. Work is the muscles' work over all tries, in m g H; time counts from the start, in sqrt(H/g).
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from sweep import bounds_broken
 BODIES = ("pawn", "bottle", "biped", "box", "stool")
 DEGREES = (80.0, 90.0, 95.0)
 SIDES = {"front": 1, "side": 0}
-"""Axis of the ground about which it is laid over: its left, its front."""
-LONGEST = 60.0
-"""sqrt(H / g)."""
-CALM_WORK = 10.0
-"""m g H."""
+"""Axis of the ground that the body is tilted about: its left, its front."""
+MAX_TIME = 60.0
+"""Maximum time, sqrt(H / g)."""
+MAX_MEDIAN_WORK = 10.0
+"""Maximum median work, m g H."""
 
 
 def run(name: str, degrees: float, side: str, nodes: int) -> Row:
-    """Lay one body over and see whether it gets up."""
+    """Lay one body down and simulate whether it gets up."""
     wp.config.log_level = wp.LOG_WARNING
-    told, milliseconds = timed(_run, name, degrees, side, nodes)
-    return {"body": name, "degrees": degrees, "side": side, **told, "seconds": 1e-3 * milliseconds}
+    outcome, milliseconds = timed(_run, name, degrees, side, nodes)
+    return {"body": name, "degrees": degrees, "side": side, **outcome, "seconds": 1e-3 * milliseconds}
 
 
 def _run(name: str, degrees: float, side: str, nodes: int) -> Row:
@@ -61,33 +61,33 @@ def _run(name: str, degrees: float, side: str, nodes: int) -> Row:
             creature.geometry,
             BodyState(laid, np.zeros_like(laid)),
             motion,
-            frames=round(60.0 * LONGEST * unit),
+            frames=round(60.0 * MAX_TIME * unit),
             place=creature.frame,
-            finished=lambda: motion.resting,
+            finished=lambda: motion.is_at_rest,
         )
     except (UserError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         return {"up": False, "tries": motion.tries, "reason": f"stopped: {error}"}
     trajectory = simulation.trajectory
-    books = energy_balance(trajectory)
+    balance = energy_balance(trajectory)
     checked = asdict(audit(trajectory, newton_unconverged=sum(not r.converged for r in simulation.reports)))
-    up = motion.is_up and motion.resting
+    up = motion.is_up and motion.is_at_rest
     return {
         "up": up,
         "tries": motion.tries,
-        "work": float(books.muscle_work.sum() / books.energy_unit),
+        "work": float(balance.muscle_work.sum() / balance.energy_unit),
         "time": float(trajectory.time[-1]) / unit,
-        "reason": None if up else "; ".join(motion.notes()) or f"not within {LONGEST:g} sqrt(H/g)",
+        "reason": None if up else "; ".join(motion.notes()) or f"not within {MAX_TIME:g} sqrt(H/g)",
         "audit": bounds_broken(checked),
     }
 
 
 def summary(rows: list[Row]) -> dict[str, Any]:
-    """The aims, of the rows so far."""
+    """Return the aims from the rows so far."""
     works = [row["work"] for row in rows if row["up"]]
-    enough = {row["body"] for row in rows} >= set(BODIES)
+    is_complete = {row["body"] for row in rows} >= set(BODIES)
     aims = {
-        "all_get_up": all(row["up"] for row in rows) if enough else None,
-        "calm": (float(np.median(works)) <= CALM_WORK if works else False) if enough else None,
+        "all_get_up": all(row["up"] for row in rows) if is_complete else None,
+        "calm": (float(np.median(works)) <= MAX_MEDIAN_WORK if works else False) if is_complete else None,
         "audit": all(row.get("audit") is None for row in rows),
     }
     return {"aims": aims, "why_null": {name: "not all bodies were run" for name, aim in aims.items() if aim is None}}
@@ -95,9 +95,9 @@ def summary(rows: list[Row]) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the cells."""
-    parser = flags(__doc__, quick="three bodies, laid over by 90 degrees", device="cpu")
+    parser = flags(__doc__, quick="three bodies, tilted by 90 degrees", device="cpu")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
-    parser.add_argument("--nodes", type=int, default=150, help="of the cages, about")
+    parser.add_argument("--nodes", type=int, default=150, help="approximate number of nodes of the cages")
     parser.add_argument("--bodies", nargs="*", help="only these")
     parser.add_argument("--degrees", nargs="*", type=float, help="only these")
     options = parser.parse_args(arguments)
@@ -110,9 +110,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with ProcessPoolExecutor(options.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         for future in as_completed([pool.submit(run, *cell, options.nodes) for cell in cells]):
             rows.append(row := future.result())
-            told = row["reason"] or row["audit"] or "up"
+            outcome = row["reason"] or row["audit"] or "up"
             figures = [row.get(key) for key in ("work", "time", "seconds")]
-            table.row(row["body"], row["degrees"], row["side"], row["tries"], *figures, told)
+            table.row(row["body"], row["degrees"], row["side"], row["tries"], *figures, outcome)
             record(options, rows, **summary(rows))
     print(f"{sum(row['up'] for row in rows)} of {len(rows)} get up")
     report(options, rows, **summary(rows))

@@ -1,9 +1,9 @@
-"""What every benchmark shares: flags, the data folder, timing, the table, JSON and picture that it leaves.
+"""Shared parts of all benchmarks: flags, the data folder, timing, the printed table, and the JSON and image output.
 
 A benchmark takes ``--quick`` (under ten minutes on two cores), ``--device``, ``--seed``, ``--json PATH`` and
-``--plot PATH``, prints a table, and writes JSON with ``rows`` (the figures), ``environment`` (where they were
-measured), ``aims`` (true or false as the rows say, or null where this device cannot measure it) and ``why_null`` (the
-reason of each null).
+``--plot PATH``, prints a table, and writes JSON with ``rows`` (the figures), ``environment`` (device, versions and
+settings of the measurement), ``aims`` (true or false by the rows, or null if this device cannot measure it) and
+``why_null`` (the reason of each null).
 """
 
 from __future__ import annotations
@@ -33,22 +33,27 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 T = TypeVar("T")
 Row = dict[str, Any]
-"""Figures by name."""
+"""One record of figures by name."""
 
 
 def flags(
     description: str | None, *, quick: str, device: str | None = None, seed: str | None = None, plot: str | None = None
 ) -> argparse.ArgumentParser:
-    """The flags that every benchmark takes; the texts say what they mean here.
+    """Create the parser with the flags that every benchmark takes.
 
-    ``description`` is the script's docstring; ``device`` the default one, None for a GPU where there is one.
+    Args:
+        description: the script's docstring.
+        quick: help text of ``--quick``.
+        device: default of ``--device``; None for the first GPU, or the CPU without one.
+        seed: help text of ``--seed``.
+        plot: help text of ``--plot``.
     """
     wp.config.log_level = wp.LOG_WARNING
     if device is None:
         device = "cuda:0" if wp.is_cuda_available() else "cpu"
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help=quick)
-    parser.add_argument("--device", default=device, help=f"{device} unless told")
+    parser.add_argument("--device", default=device, help=f"{device} by default")
     parser.add_argument("--seed", type=int, default=0, help=seed)
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--plot", type=Path, help=plot or "file for the picture")
@@ -56,17 +61,21 @@ def flags(
 
 
 def workers_flag(parser: argparse.ArgumentParser) -> None:
-    """``--workers``: what ``rows_of`` takes."""
+    """Add ``--workers``, the argument ``workers`` of ``rows_of``."""
     parser.add_argument(
         "--workers",
         type=lambda text: int(text) if text.isdecimal() else text,
-        help="processes, as many as there are cores unless told; ray, or the address of a Ray cluster",
+        help="processes, by default one for each core; ray, or the address of a Ray cluster",
     )
 
 
 def rows_of(run: Callable[..., Row], tasks: Sequence[tuple[Any, ...]], workers: int | str | None) -> Iterator[Row]:
-    """What ``run`` makes of the arguments in each of ``tasks``, as soon as it is known. One whose process dies is done
-    again. Raises ``RuntimeError`` for those that failed, after all others.
+    """Call ``run`` with the arguments of each task in parallel and yield its rows as they are completed.
+
+    A task whose process dies is repeated.
+
+    Raises:
+        RuntimeError: tasks failed; raised after all others are completed.
     """
     failed = []
     for ended in map_tasks(_Run(run), tasks, workers=workers):
@@ -82,17 +91,17 @@ def rows_of(run: Callable[..., Row], tasks: Sequence[tuple[Any, ...]], workers: 
 class _Run:
     run: Callable[..., Row]
 
-    def __call__(self, task: tuple[Any, ...], tell: ProgressCallback) -> Row:
+    def __call__(self, task: tuple[Any, ...], progress: ProgressCallback) -> Row:
         return self.run(*task)
 
 
 def data_folder() -> Path:
-    """Folder of captures, meshes and points: $EGS_WARP_DATA, else beside the repository."""
+    """Return the folder of captures, meshes and points: $EGS_WARP_DATA, else the default next to the repository."""
     return Path(os.environ.get("EGS_WARP_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
 
 def timed(action: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> tuple[T, float]:
-    """What ``action`` returns, and its milliseconds."""
+    """Return the result of ``action`` and its duration in milliseconds."""
     started = time.perf_counter()
     result = action(*arguments, **options)
     return result, 1e3 * (time.perf_counter() - started)
@@ -105,7 +114,7 @@ def median_ms(
     synchronise: Callable[[], Any] = lambda: None,
     warm_up: int = 3,
 ) -> dict[str, float]:
-    """Median milliseconds of each call; the calls take turns, so that a drift of the machine hits all alike."""
+    """Return the median milliseconds of each call; calls alternate, so that drift of the machine affects all alike."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     for turn in range(repeats + warm_up):
         for name, call in calls.items():
@@ -119,10 +128,10 @@ def median_ms(
 
 
 class Table:
-    """Rows of text under one head, each printed as soon as it is known."""
+    """Text table under one header; each row is printed at once."""
 
     def __init__(self, **columns: str) -> None:
-        """A format such as ``8.2f`` or ``<12`` for each heading (``_`` prints as a space)."""
+        """Print the header; each heading has a format such as ``8.2f`` or ``<12`` (``_`` is printed as a space)."""
         self._formats = list(columns.values())
         names = [name.replace("_", " ") for name in columns]
         self._widths = [
@@ -132,7 +141,7 @@ class Table:
         self._line(names)
 
     def row(self, *values: Any) -> None:
-        """Print one row; None is a dash."""
+        """Print one row; None is printed as a dash."""
         self._line([self._cell(form, value) for form, value in zip(self._formats, values, strict=True)])
 
     @staticmethod
@@ -148,7 +157,7 @@ class Table:
 
 
 def environment(options: argparse.Namespace, packages: Sequence[str] = ()) -> dict[str, Any]:
-    """Where the figures were measured, with the versions of ``packages`` beside those that all depend on."""
+    """Return the device, versions and settings of the measurement, with the versions of ``packages``."""
     return {
         "device": options.device,
         "device_name": wp.get_device(options.device).name,
@@ -169,9 +178,13 @@ def record(
     conditions: Mapping[str, Any] | None = None,
     **more: Any,
 ) -> dict[str, Any]:
-    """The result, written to ``--json`` if asked; ``conditions`` are further entries of its environment.
+    """Return the result, and write it to ``--json`` if given.
 
-    Raises ``ValueError`` for an aim that is null without a reason.
+    Args:
+        conditions: further entries of its environment.
+
+    Raises:
+        ValueError: an aim is null without a reason.
     """
     why = dict(why_null or {})
     unexplained = [name for name, value in aims.items() if value is None and name not in why]
@@ -198,12 +211,14 @@ def report(
     size: tuple[float, float] = (7.0, 3.5),
     **result: Any,
 ) -> None:
-    """Everything at the end: ``record``, the aims as text, and ``--plot``, drawn or as it is.
+    """Write the final result: ``record``, the aims as text, and the image of ``--plot``.
 
-    ``draw`` gets an empty figure of ``size`` inches; ``picture`` is (H, W, 3), uint8 or floats from 0 to 1.
+    Args:
+        draw: function that draws into an empty figure of ``size`` inches.
+        picture: (H, W, 3) image instead, uint8 or floats from 0 to 1.
     """
-    made = record(options, rows, **result)
-    print(json.dumps({name: made[name] for name in ("aims", "why_null")}, indent=1))
+    result_record = record(options, rows, **result)
+    print(json.dumps({name: result_record[name] for name in ("aims", "why_null")}, indent=1))
     if options.plot and draw is not None:
         from matplotlib.figure import Figure
 

@@ -1,14 +1,14 @@
-"""Inpainting of the floor under an object, judged against the floor that is known to be there.
+"""Inpainting of the floor under an object, compared with the known floor.
 
-Cases: the three built-in scenes (floor under the object taken out, dark haze put in its place, as a capture has it) and
-holes cut into uncovered floor of real captures. Unseen cameras compare the hole's pixels with the untouched floor.
-Rows: this package; the same with ``cv2.inpaint`` on the plane seen face-on in place of patch synthesis (the same flat
-Gaussians, the same training); ``cv2.inpaint`` in every picture (of its two methods the better one, both times);
-training without the plane: as many Gaussians, scattered where the object stood, against the same one inpainted picture.
+Cases: the three built-in scenes (the floor under the object is removed and replaced by dark haze, as in a capture) and
+holes cut into visible floor of real captures. Held-out cameras compare the hole's pixels with the original floor. Rows:
+this package; the same with ``cv2.inpaint`` on the plane seen face-on in place of patch synthesis (same flat Gaussians,
+same training); ``cv2.inpaint`` in every image (the better of its two methods, both times); training without the plane:
+the same number of Gaussians, scattered where the object stood, against the same single inpainted image.
 
-Beside PSNR and SSIM: PSNR after a blur (``coarse_psnr``) and the gradient energy over the truth's (``detail``, 1 is
-right), because PSNR likes a blur where nobody can know the true pixels. ``face_on`` holds what settles whether that is
-so: both PSNRs on the plane of our picture, of one colour, and of the true floor itself, moved there from beside it.
+Besides PSNR and SSIM there are PSNR after a blur (``coarse_psnr``) and the gradient energy over the truth's
+(``detail``, 1 is right), because PSNR favours a blur where the true pixels cannot be known. ``face_on`` quantifies
+that: both PSNRs on the plane for our inpainting, for one colour, and for the true floor itself, shifted into the hole.
 
 Aims: ``beats_cv2_by_3db``, ``beats_no_prior_by_3db``, ``inpaint_beats_rectified_cv2`` (mean PSNR over the cases),
 ``seconds_on_gpu`` (every case at most 20 s), ``hole_size_independent`` (seconds vary at most 1.5 times over a fourfold
@@ -42,13 +42,13 @@ from egs_warp.render import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
 from egs_warp.training.finetune import FinetuneOptions, TrainingView, finetune
 from egs_warp.training.metrics import psnr
-from floor_measures import coarse_psnr, from_beside, gradient_energy, similarity
+from floor_measures import coarse_psnr, gradient_energy, moved_floor_scores, similarity
 from harness import Row, Table, data_folder, flags, report, timed
 
 OURS, FACE_ON_CV2, CV2, NO_PRIOR = "ours", "cv2 face-on", "cv2 in the picture", "no plane prior"
 METHODS = (OURS, FACE_ON_CV2, CV2, NO_PRIOR)
 REAL = {
-    # File, plane, centre of the hole, its radius; scene units.
+    # File, plane, centre of the hole, radius of the hole; scene units.
     "koala planks": ("koala.ply", (0.003, -1.0, -0.018, -0.023), (0.35, 0.0, -1.15), 0.2),
     "playbot moss": ("playbot", (0.0, -1.0, 0.0, -0.019), (0.6, 0.0, 0.6), 0.14),
 }
@@ -56,25 +56,25 @@ REAL = {
 
 @dataclass(frozen=True)
 class Case:
-    """A floor with a hole, and the truth."""
+    """A floor with a hole, and the original floor."""
 
     name: str
     truth: GaussianCloud
     damaged: GaussianCloud
-    """What segmentation leaves: no floor in the hole, haze instead."""
+    """Background as segmentation leaves it: no floor in the hole, haze instead."""
     hole: Hole
     is_real: bool
 
 
 def built_in(name: str, device: str) -> Case:
-    """The floor under a built-in object."""
-    made = scene(name, device=device)
-    hole = footprint(made.object, made.plane)
-    return Case(name, made.background, damaged(made.background, hole), hole, False)
+    """Build the case of the floor under a built-in object."""
+    built = scene(name, device=device)
+    hole = footprint(built.object, built.plane)
+    return Case(name, built.background, damaged(built.background, hole), hole, False)
 
 
 def real(name: str, device: str) -> Case | None:
-    """A hole in uncovered floor; None where the capture is not on this machine."""
+    """Build the case of a hole in visible floor; None if the capture is not on this machine."""
     file, coefficients, centre, radius = REAL[name]
     path = data_folder() / "scenes" / file
     if not path.exists():
@@ -85,12 +85,14 @@ def real(name: str, device: str) -> Case | None:
 
 
 def damaged(truth: GaussianCloud, hole: Hole) -> GaussianCloud:
-    """Without what lies in the hole; with a little dark haze about the plane there, which no camera of a capture could
-    have denied."""
+    """Remove the Gaussians in the hole and add a little dark haze around the plane there.
+
+    No camera of a capture could have contradicted such haze.
+    """
     _, side = hole.bounds()
     means = truth.means.numpy()
     away = np.abs(hole.plane.heights(means))
-    kept = truth.subset(~(hole.window.sample(hole.mask, means) & (away < 0.5 * side)))
+    remaining = truth.subset(~(hole.window.sample(hole.mask, means) & (away < 0.5 * side)))
     random = np.random.default_rng(0)
     at = np.argwhere(hole.mask)
     count = 40
@@ -103,11 +105,11 @@ def damaged(truth: GaussianCloud, hole: Hole) -> GaussianCloud:
         np.concatenate([np.full((count, 1, 3), -1.2), np.zeros((count, truth.sh.shape[1] - 1, 3))], axis=1),
         device=str(truth.device),
     )
-    return concatenate(kept, haze)
+    return concatenate(remaining, haze)
 
 
 def cameras_around(hole: Hole, size: int) -> list[Camera]:
-    """Eight on two rings; the first is the one that the picture is inpainted for."""
+    """Return eight cameras on two rings; the image is inpainted for the first one."""
     middle, side = hole.bounds()
     first, second = hole.plane.tangents()
     cameras = []
@@ -131,13 +133,13 @@ def hole_pixels(result: InpaintResult, camera: Camera) -> np.ndarray:
 
 
 def picture(cloud: GaussianCloud, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Colour (H, W, 3) and depth (H, W)."""
+    """Render colour (H, W, 3) and depth (H, W)."""
     image = render_gaussians(cloud, camera)
     return np.clip(image.colour.numpy(), 0.0, 1.0), image.depth.numpy()
 
 
 def best_by_opencv(image: np.ndarray, mask: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """``image`` filled by the method of OpenCV that is nearer to the ``truth`` there, all (H, W, 3)."""
+    """Inpaint ``image`` by the OpenCV method that is closer to ``truth`` in the mask; all (H, W, 3)."""
     wide = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
     coded = np.rint(255 * image).astype(np.uint8)
     filled = (cv2.inpaint(coded, wide, 5, flag) / np.float32(255.0) for flag in (cv2.INPAINT_TELEA, cv2.INPAINT_NS))
@@ -147,15 +149,15 @@ def best_by_opencv(image: np.ndarray, mask: np.ndarray, truth: np.ndarray) -> np
 def without_plane(
     case: Case, result: InpaintResult, camera: Camera, target: np.ndarray, steps: int, seed: int
 ) -> GaussianCloud:
-    """As many Gaussians as ours, scattered over the room that the object took, trained against one picture."""
+    """Train as many Gaussians as ours, scattered over the volume of the object, against one image."""
     _, side = case.hole.bounds()
-    kept = result.cloud.subset(~result.is_new)
+    remaining = result.cloud.subset(~result.is_new)
     count = int(result.is_new.sum())
     random = np.random.default_rng(seed)
     at = np.argwhere(result.hole)
     pixels = at[random.integers(len(at), size=count)][:, ::-1] + random.uniform(0, 1, (count, 2))
     rise = random.uniform(-0.25, 0.5, (count, 1)) * side
-    sh = np.zeros((count, kept.sh.shape[1], 3))
+    sh = np.zeros((count, remaining.sh.shape[1], 3))
     sh[:, 0] = (np.median(result.painted[result.hole], axis=0) - 0.5) / SH_BAND_0
     scattered = GaussianCloud.from_numpy(
         result.window.points(pixels) + rise * case.hole.plane.normal,
@@ -163,10 +165,10 @@ def without_plane(
         np.full((count, 3), np.log(1.5 * side / count ** (1 / 2))),
         np.full(count, np.log(0.1 / 0.9)),
         sh,
-        device=str(kept.device),
+        device=str(remaining.device),
     )
-    whole = concatenate(kept, scattered)
-    trainable = np.arange(whole.count) >= kept.count
+    whole = concatenate(remaining, scattered)
+    trainable = np.arange(whole.count) >= remaining.count
     mask = cv2.dilate(hole_pixels(result, camera).astype(np.float32), np.ones((9, 9), np.uint8))
     return finetune(
         whole,
@@ -177,7 +179,7 @@ def without_plane(
 
 
 def judge_case(case: Case, options: argparse.Namespace, table: Table) -> tuple[list[Row], np.ndarray]:
-    """Rows of the methods, and a strip of pictures: colour above depth."""
+    """Return the rows of the methods and a strip of images, colour above depth."""
     runs = [inpaint(case.damaged, case.hole, options=InpaintOptions(seed=options.seed)) for _ in range(options.repeat)]
     # The first run also compiles kernels.
     seconds = [sum(run.seconds.values()) for run in (runs[1:] or runs)]
@@ -198,7 +200,7 @@ def judge_case(case: Case, options: argparse.Namespace, table: Table) -> tuple[l
     views: list[tuple[np.ndarray, ...]] = []
     for camera in cameras[1:]:
         truth, true_depth = picture(case.truth, camera)
-        # What stands before the floor is the same in every picture.
+        # Objects in front of the floor are the same in every image.
         ahead = true_depth - plane_depth(case.hole.plane, camera)
         mask = hole_pixels(result, camera) & (np.abs(ahead) < 0.25 * case.hole.bounds()[1])
         if mask.sum() < 100:
@@ -251,9 +253,10 @@ def judge_case(case: Case, options: argparse.Namespace, table: Table) -> tuple[l
         )
         depth = rows[-1]["depth_error_of_hole_side"]
         table.row(case.name, method, *mean[:4], spent[method], depth)
-    settled = rows[0]["face_on"]
+    face_on_scores = rows[0]["face_on"]
     print(
-        "  face-on, dB: " + ", ".join(f"{name} {one:.2f} ({two:.2f} coarse)" for name, (one, two) in settled.items()),
+        "  face-on, dB: "
+        + ", ".join(f"{name} {one:.2f} ({two:.2f} coarse)" for name, (one, two) in face_on_scores.items()),
         flush=True,
     )
     hollow, flat, ours, telea, navier, unprior, truth = views
@@ -262,8 +265,9 @@ def judge_case(case: Case, options: argparse.Namespace, table: Table) -> tuple[l
 
 
 def face_on(case: Case, result: InpaintResult) -> dict[str, tuple[float, float]]:
-    """PSNR and PSNR after a blur (dB) in the hole, on the plane: of what was painted, of the rim's mean colour, and the
-    mean and the best of the true floor moved there.
+    """Return PSNR and PSNR after a blur (dB) in the hole on the plane.
+
+    Entries: our inpainting, the mean colour of the rim, and the mean and the best of the shifted true floor.
     """
     floor = rectify(case.truth, result.window, thickness=0.15 * case.hole.bounds()[1])
     truth, known = floor.colour, floor.alpha > 0.6
@@ -273,15 +277,18 @@ def face_on(case: Case, result: InpaintResult) -> dict[str, tuple[float, float]]
     scores = {
         name: (psnr(one[inside], truth[inside]), coarse_psnr(one, truth, inside)) for name, one in pictures.items()
     }
-    beside = np.array(from_beside(truth, known, inside))
-    if len(beside):
-        for name, (fine, coarse) in {"moved": beside.mean(axis=0), "moved, best": beside.max(axis=0)}.items():
+    shifted_scores = np.array(moved_floor_scores(truth, known, inside))
+    if len(shifted_scores):
+        for name, (fine, coarse) in {
+            "moved": shifted_scores.mean(axis=0),
+            "moved, best": shifted_scores.max(axis=0),
+        }.items():
             scores[f"true floor {name}"] = (float(fine), float(coarse))
     return scores
 
 
 def sheet(colours: list[np.ndarray], depths: list[np.ndarray], name: str) -> np.ndarray:
-    """Colour above depth, each with its label."""
+    """Arrange colour images above depth images, with labels."""
     near, far = np.quantile(depths[-1][depths[-1] > 0], [0.02, 0.98])
     labels = [f"{name}: hole", CV2, NO_PRIOR, FACE_ON_CV2, OURS, "truth"]
     tiles = [np.rint(255 * colour).astype(np.uint8) for colour in colours] + [
@@ -291,10 +298,10 @@ def sheet(colours: list[np.ndarray], depths: list[np.ndarray], name: str) -> np.
 
 
 def size_rows(options: argparse.Namespace) -> list[Row]:
-    """Seconds for a round hole in the table cloth and for one of four times its area, interleaved."""
-    made = scene("figurine", device=options.device)
-    holes = {radius: disc(made.plane, np.array([0.1, 0.2, 0.0]), radius) for radius in (0.16, 0.32)}
-    clouds = {radius: damaged(made.background, hole) for radius, hole in holes.items()}
+    """Time a round hole in the table cloth and one of four times its area, interleaved."""
+    built = scene("figurine", device=options.device)
+    holes = {radius: disc(built.plane, np.array([0.1, 0.2, 0.0]), radius) for radius in (0.16, 0.32)}
+    clouds = {radius: damaged(built.background, hole) for radius, hole in holes.items()}
     seconds: dict[float, list[float]] = {radius: [] for radius in holes}
     for _ in range(max(3, options.repeat)):
         for radius, hole in holes.items():
@@ -310,7 +317,7 @@ def size_rows(options: argparse.Namespace) -> list[Row]:
 
 
 def judge(rows: list[Row], *, on_gpu: bool) -> tuple[dict[str, bool | None], dict[str, str]]:
-    """The aims, from the rows."""
+    """Return the aims from the rows."""
 
     def mean(method: str) -> float:
         return float(np.mean([row["psnr"] for row in rows if row["case"] != "size" and row["method"] == method]))
@@ -324,18 +331,18 @@ def judge(rows: list[Row], *, on_gpu: bool) -> tuple[dict[str, bool | None], dic
         "seconds_on_gpu": max(ours) <= 20.0 if on_gpu else None,
         "hole_size_independent": max(sizes) <= 1.5 * min(sizes),
     }
-    why = {} if on_gpu else {"seconds_on_gpu": "no GPU here; the same script's JSON from one judges it"}
+    why = {} if on_gpu else {"seconds_on_gpu": "no GPU on this machine; run the script on one"}
     return aims, why
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
+    """Run the benchmark."""
     parser = flags(__doc__, quick="256 x 256, 150 steps without the plane, one run each")
     parser.add_argument("--cases", nargs="+", default=["pawn", "stool", "figurine", *REAL])
-    parser.add_argument("--size", type=int, help="pixels, both sides (400)")
-    parser.add_argument("--baseline-steps", type=int, help="of training without the plane (5000)")
+    parser.add_argument("--size", type=int, help="width and height of the images, pixels (default 400)")
+    parser.add_argument("--baseline-steps", type=int, help="training steps without the plane (default 5000)")
     parser.add_argument("--join", type=Path, help="JSON of an earlier run with other cases, judged together with this")
-    parser.add_argument("--repeat", type=int, help="timed runs (4, the first not counted)")
+    parser.add_argument("--repeat", type=int, help="timed runs (default 4, the first is not counted)")
     options = parser.parse_args(arguments)
     options.size = options.size or (256 if options.quick else 400)
     options.baseline_steps = options.baseline_steps or (150 if options.quick else 5000)

@@ -1,4 +1,4 @@
-"""Milliseconds a frame by stage of the demo: the built-in pawn jumps, from capture to encoded video.
+"""Milliseconds per frame by stage of the demo: the built-in pawn jumps, from capture to encoded video.
 
 python benchmarks/jump.py [--quick] [--device cpu] [--seed 0] [--json PATH] [--plot PATH]
 """
@@ -27,17 +27,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         # The first run compiles the kernels.
         animate(scene.cloud, folder, plane=scene.plane, options=AnimateOptions(frames=2), quiet=True)
-        asked = AnimateOptions(frames=frames, seed=options.seed)
-        told, milliseconds = timed(
-            animate, scene.cloud, folder, plane=scene.plane, options=asked, quiet=True, overwrite=True
+        settings = AnimateOptions(frames=frames, seed=options.seed)
+        result, milliseconds = timed(
+            animate, scene.cloud, folder, plane=scene.plane, options=settings, quiet=True, overwrite=True
         )
     seconds = 1e-3 * milliseconds
-    rows = [{"stage": stage, **asdict(time)} for stage, time in told.timing.items()]
+    rows = [{"stage": stage, **asdict(time)} for stage, time in result.timing.items()]
     gibibytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     table = Table(stage="<12", mean_ms=".1f", worst_ms=".1f")
     for row in rows:
         table.row(row["stage"], row["mean"], row["worst"])
-    print(f"{frames} frames at {asked.size} x {asked.size}: {seconds:.1f} s in all, peak memory {gibibytes:.2f} GiB")
+    print(
+        f"{frames} frames at {settings.size} x {settings.size}: {seconds:.1f} s in all, peak memory {gibibytes:.2f} GiB"
+    )
     full = not options.quick
 
     def draw(figure: Figure) -> None:

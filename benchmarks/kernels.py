@@ -1,4 +1,4 @@
-"""Kernels of the benchmarks: a ray caster, and probes of what a device can do at best."""
+"""Kernels of the benchmarks: a ray caster, and probes of a device's peak bandwidth and arithmetic."""
 
 import warp as wp
 
@@ -22,7 +22,7 @@ def hits_kernel(
     # Out:
     hits_out: wp.array[wp.int32],
 ):
-    """Splats that each pixel blends: what no renderer of the same picture can leave out."""
+    """Count the splats that each pixel blends; every renderer of the same image has to blend them."""
     thread = wp.tid()
     pixel = pixel_of_thread(thread, width)
     if pixel[0] >= width or pixel[1] >= height:
@@ -52,7 +52,7 @@ def arithmetic_kernel(
     # Out:
     sum_out: wp.array[wp.float32],
 ):
-    """Eight independent chains of multiply and add: the most operations that this device can be brought to do."""
+    """Compute eight independent chains of multiply and add, which reach the device's peak arithmetic rate."""
     i = wp.tid() + first
     a = wp.float32(i)
     b = a + 1.0
@@ -89,7 +89,7 @@ def arithmetic_kernel(
 #endif
 """)
 def vector_chains(row: wp.int32, start: wp.float32, factor: wp.float32, sum_out: wp.array[wp.float32]):
-    """``arithmetic_kernel`` in vectors of eight, as compositing on a CPU is written."""
+    """``arithmetic_kernel`` in vectors of eight, like compositing on a CPU."""
     ...
 
 
@@ -101,7 +101,7 @@ def vector_arithmetic_kernel(
     # Out:
     sum_out: wp.array[wp.float32],
 ):
-    """Eight independent chains of multiply and add, each on eight numbers at once: the most that one core can do."""
+    """Compute eight independent chains of multiply and add, eight numbers at once: the peak rate of one core."""
     i = wp.tid() + first
     vector_chains(i, 1.0, factor, sum_out)
 
@@ -113,7 +113,7 @@ def copy_kernel(
     # Out:
     target_out: wp.array[wp.vec4],
 ):
-    """What a kernel that only copies takes."""
+    """Copy one array; its time is that of pure copying."""
     row = wp.tid()
     store_row(target_out, row, load_row(source, row))
 
@@ -124,7 +124,7 @@ GLOSS_POWER = wp.constant(8.0)
 
 @wp.func
 def lamp_direction(lamp: wp.int32) -> wp.vec3:
-    """Towards the lamp, in the axes of the body at rest."""
+    """Return the direction towards the lamp, in the axes of the body at rest."""
     if lamp == 0:
         return wp.normalize(wp.vec3(0.5, -0.6, 0.62))
     return wp.normalize(wp.vec3(-0.7, 0.4, 0.3))
@@ -155,11 +155,11 @@ def trace_kernel(
     light_out: wp.array2d[wp.vec3],
     gloss_out: wp.array2d[wp.vec3],
 ):
-    """Where each sample of each pixel meets the mesh, as the place at rest; the light there, which the paint is
-    multiplied with, and the gloss that is added (Phong).
+    """Intersect each sample ray of each pixel with the mesh.
 
-    Lamps turn with each face (``rest_from_world``): a capture holds no lamps, only colour by direction. Faces have two
-    sides.
+    Outputs are the hit point at rest, the light there, which multiplies the paint, and the gloss, which is added
+    (Phong). Lamps rotate with each face (``rest_from_world``), because a capture has no lamps, only colour by
+    direction. Faces are two-sided.
     """
     pixel, sample = wp.tid()
     x = float(pixel % width) + (float(sample % samples) + 0.5) / float(samples)

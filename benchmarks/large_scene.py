@@ -1,11 +1,11 @@
-"""A scene of millions of Gaussians from capture to film: memory and time of each stage.
+"""Memory and time of each stage from capture to film, for a scene of millions of Gaussians.
 
 A real capture (``--scene``) is repeated side by side along its plane until it has ``--gaussians``, with colours of
-degree 3, the most that a capture can have. The object is the one of its first place, clicked as in ``rooms.py``.
-Stages: ``load`` reads the scene from a file, ``plane`` finds what is under the object, ``object`` takes it out,
-``hole`` fills the floor, ``body`` makes it move, ``film`` draws ``--frames`` frames of it in the scene. ``peak`` is the
-most resident memory of the whole process during the stage; it is the kernel's own count (VmHWM), set back before each
-stage, so that it is measured on Linux only.
+degree 3, the highest degree of a capture. The object is that of the original copy, clicked as in ``scene_quality.py``.
+Stages: ``load`` reads the scene from a file, ``plane`` finds the support plane, ``object`` segments the object,
+``hole`` inpaints the floor, ``body`` builds the creature, ``film`` renders ``--frames`` frames of it in the scene.
+``peak`` is the peak resident memory of the whole process during the stage: the operating system's own count (VmHWM),
+reset before each stage, so it is measured on Linux only.
 
 Aims: ``memory`` (every stage within 16 GiB), ``three_minutes`` (all stages but ``animate`` together; on a GPU).
 """
@@ -29,7 +29,7 @@ from egs_warp.io import read_capture
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import run_folder
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.film import draw_film
 from egs_warp.pipelines.locate_plane import locate_plane, with_measured_ground
 from egs_warp.pipelines.prepare_scene import SceneOptions, segment_scene, snap_to_plane
@@ -42,12 +42,14 @@ T = TypeVar("T")
 MEMORY_GIB = 16.0
 SECONDS = 180.0
 COEFFICIENTS = 16
-"""Of a colour of degree 3."""
+"""SH coefficients of a colour of degree 3."""
 
 
 def repeated(cloud: GaussianCloud, normal: np.ndarray, count: int) -> GaussianCloud:
-    """``cloud`` side by side with itself in rows and columns square to ``normal`` (3,), from its own place outwards;
-    the first ``count`` Gaussians of them, colours of degree 3.
+    """Repeat ``cloud`` in rows and columns orthogonal to ``normal`` (3,), from its own position outwards.
+
+    Returns:
+        the first ``count`` Gaussians of the copies, with colours of degree 3.
     """
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)
@@ -80,7 +82,7 @@ class Stages:
         self._table = table
 
     def run(self, stage: str, action: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
-        """What ``action`` returns; its row is kept, and printed."""
+        """Run ``action``, record and print its row, and return its result."""
         Path("/proc/self/clear_refs").write_text("5")
         result, milliseconds = timed(action, *arguments, **options)
         status = Path("/proc/self/status").read_text()
@@ -91,22 +93,26 @@ class Stages:
 
 
 def measure(options: argparse.Namespace, stages: Stages) -> None:
-    """All stages, one after another."""
-    drawn = read_drawn(options.scene)
+    """Run all stages one after another."""
+    annotated = read_drawn(options.scene)
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "scene.ply"
-        spec = _written(drawn, place, options)
+        spec = _write_scene(annotated, place, options)
         cloud = stages.run("load", read_capture, place, device=options.device).cloud
         located = stages.run("plane", locate_plane, cloud, spec)
         located = stages.run("ground", with_measured_ground, cloud, located, spec)
-        thing, bare, _ = stages.run("object", segment_scene, cloud, located, SceneOptions())
-        thing, _ = snap_to_plane(thing, located)
+        object_cloud, bare, _ = stages.run("object", segment_scene, cloud, located, SceneOptions())
+        object_cloud, _ = snap_to_plane(object_cloud, located)
         hole = hole_under(cloud, located.plane, located.segmentation)
         del cloud
         background = bare if hole is None else stages.run("hole", inpaint, bare, hole).cloud
         del bare
         creature = stages.run(
-            "body", make_creature, thing, plane=located.plane, ground=located.ground, nodes=options.nodes
+            "body",
+            make_creature,
+            object_cloud,
+            plane=located.plane,
+            options=CreatureOptions(ground=located.ground, nodes=options.nodes),
         )
         performance = stages.run("animate", simulate, creature, motion("jump"), frames=options.frames)
         with run_folder(Path(folder) / "film", overwrite=True) as run:
@@ -116,23 +122,23 @@ def measure(options: argparse.Namespace, stages: Stages) -> None:
             run.finish()
 
 
-def _written(drawn: DrawnScene, place: Path, options: argparse.Namespace) -> ObjectSpec:
-    """The repeated scene as a file, and a click on its object."""
-    assert drawn.capture is not None
-    once = read_capture(drawn.capture, device=options.device).cloud
-    spec, _ = clicked(drawn, once, [], 1)
+def _write_scene(annotated: DrawnScene, place: Path, options: argparse.Namespace) -> ObjectSpec:
+    """Write the repeated scene to a file; return a click on its object."""
+    assert annotated.capture is not None
+    once = read_capture(annotated.capture, device=options.device).cloud
+    spec, _ = clicked(annotated, once, [], 1)
     located = locate_plane(once, spec)
     write_ply(place, repeated(once, located.plane.normal, options.gaussians))
     return spec
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
+    """Run the benchmark."""
     parser = flags(__doc__, quick="200,000 Gaussians", device="cpu", plot="the film's frames")
     parser.add_argument("--scene", choices=NAMES[:-1], default="koala", help="the capture that is repeated")
     parser.add_argument("--gaussians", type=int, default=3_000_000)
-    parser.add_argument("--nodes", type=int, default=250, help="of the cage, about")
-    parser.add_argument("--frames", type=int, default=2, help="of the film")
+    parser.add_argument("--nodes", type=int, default=250, help="approximate number of nodes of the cage")
+    parser.add_argument("--frames", type=int, default=2, help="frames of the film")
     options = parser.parse_args(arguments)
     if options.quick:
         options.gaussians = 200_000
@@ -147,7 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "memory": max(row["peak_gib"] for row in stages.rows) <= MEMORY_GIB,
             "three_minutes": seconds <= SECONDS if on_gpu else None,
         },
-        why_null={} if on_gpu else {"three_minutes": "asked of a GPU"},
+        why_null={} if on_gpu else {"three_minutes": "measured on a GPU only"},
         packages=["torch"],
     )
 

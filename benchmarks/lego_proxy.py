@@ -1,6 +1,6 @@
-"""NeRF-synthetic's lego as an object with a true mesh: the surface of a capture of it, coloured as the capture is.
+"""NeRF-synthetic's lego as an object with a true mesh: surface and colours of a capture of it.
 
-The photos hold no shape, so no truth of how the real model would look bent. A capture is trained from them, its surface
+The photos have no geometry, so the true look of the bent model is unknown. A capture is trained from them, its surface
 (``capture_surface``) is the mesh, and its colours, in voxels near that surface, are the solid paint: a proxy that a
 cage deforms exactly. Table 1 then treats it like any other mesh.
 """
@@ -21,15 +21,15 @@ from harness import data_folder, timed
 from painted_meshes import Paint, PaintedMesh, standing, subdivided
 
 VOXELS = 256
-"""Along the height."""
+"""Number of voxels along the height."""
 REACH = 3
-"""Voxels from the surface up to which there is paint."""
+"""Distance from the surface up to which there is paint, voxels."""
 
 
-def lego(*, gaussians: int, iterations: int, seed: int, device: str, kept: Path | None) -> PaintedMesh:
-    """The proxy; ``kept`` is a file that it is read from, or written to."""
-    if kept is not None and kept.exists():
-        with np.load(kept) as arrays:
+def lego(*, gaussians: int, iterations: int, seed: int, device: str, cache: Path | None) -> PaintedMesh:
+    """Build the proxy; if ``cache`` is a file it is read from it, otherwise it is written to it."""
+    if cache is not None and cache.exists():
+        with np.load(cache) as arrays:
             return _painted(**arrays)
     posed = data_folder() / "posed" / "lego"
     result, milliseconds = timed(train, posed, iterations=iterations, max_gaussians=gaussians, seed=seed, device=device)
@@ -49,14 +49,14 @@ def lego(*, gaussians: int, iterations: int, seed: int, device: str, kept: Path 
         near = np.any([np.roll(near, step, axis) for step in range(-REACH, REACH + 1)], axis=0)
     at = np.argwhere(near)
     opaque = cloud.opacities() > 0.3
-    _, found = KDTree((cloud.means.numpy()[opaque] - middle) * scale).query((at + low + 0.5) / VOXELS)
-    colours = np.clip(0.5 + SH_BAND_0 * cloud.sh.numpy()[opaque, 0][found], 0.0, 1.0)
+    _, nearest = KDTree((cloud.means.numpy()[opaque] - middle) * scale).query((at + low + 0.5) / VOXELS)
+    colours = np.clip(0.5 + SH_BAND_0 * cloud.sh.numpy()[opaque, 0][nearest], 0.0, 1.0)
     voxels = np.full((*shape, 3), 128, np.uint8)
     voxels[near] = np.rint(255.0 * colours)
     arrays = {"vertices": vertices, "faces": faces, "voxels": voxels, "low": low}
-    print(f"lego: proxy of {len(faces)} triangles, made in {1e-3 * milliseconds:.0f} s", flush=True)
-    if kept is not None:
-        np.savez_compressed(kept, **arrays)
+    print(f"lego: proxy of {len(faces)} triangles, trained in {1e-3 * milliseconds:.0f} s", flush=True)
+    if cache is not None:
+        np.savez_compressed(cache, **arrays)
     return _painted(**arrays)
 
 
@@ -67,7 +67,7 @@ def _painted(vertices: np.ndarray, faces: np.ndarray, voxels: np.ndarray, low: n
 
 
 def _largest_part(faces: np.ndarray, count: int) -> np.ndarray:
-    """(F,) bool: triangles of the piece with most of them."""
+    """(F,) bool: triangles of the largest connected component."""
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
     graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
     _, part = connected_components(graph, directed=False)

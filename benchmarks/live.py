@@ -1,13 +1,13 @@
-"""How fast does a creature live? ``egs-warp live`` with a page in Chromium beside it, on this very machine.
+"""Frame rate and latency of ``egs-warp live``, with a page in Chromium on the same machine.
 
-A built-in pawn of 20,000 Gaussians, with cages of about 250 and 541 nodes, is asked to jump and turn by keys, in a page
-of 640 x 360 pixels. While it moves: solver steps and pictures a second, bytes a frame, how fast its time goes beside
-ours, and the share of pictures that show no new moment (a stall). From rest: how long it takes from a key to the first
+A built-in pawn of 20,000 Gaussians, with cages of about 250 and 541 nodes, jumps and turns on key presses, in a page of
+640 x 360 pixels. In motion: solver steps and images per second, bytes per frame, speed of its time relative to real
+time, and the fraction of images that show no new moment (stalls). From rest: the latency from a key press to the first
 pixel that differs by more than 4 of 255, over several jumps.
 
-Where Chromium has no GPU it draws in software, on the cores that the solver needs. Aims, for about 250 nodes:
-``solver_fps`` (10 steps a second or more; 60 on a GPU), ``page_fps`` (25 pictures; 60), ``latency`` (at most 150 ms in
-the median; 60 ms). Set EGS_WARP_BROWSER where Chromium is called otherwise.
+Chromium without a GPU renders in software, on the cores that the solver needs. Aims, for about 250 nodes:
+``solver_fps`` (at least 10 steps a second; 60 on a GPU), ``page_fps`` (25 images; 60), ``latency`` (median at most
+150 ms; 60 ms). Set EGS_WARP_BROWSER if Chromium has another name.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 GAUSSIANS = 20_000
 WINDOW = {"width": 640, "height": 360}
-ASKED_NODES = {250: 175, 541: 400}
-"""--nodes that gives the pawn a cage of about so many."""
+REQUESTED_NODES = {250: 175, 541: 400}
+"""``--nodes`` that gives the pawn a cage of about the number of nodes in the key."""
 
 MOVE = """(seconds) => new Promise((resolve) => {
     const viewer = egs.viewers[0], { source } = viewer, { clock } = egs.live;
@@ -54,7 +54,7 @@ MOVE = """(seconds) => new Promise((resolve) => {
     };
     look();
 })"""
-"""What arrives and what is drawn within some seconds."""
+"""Script that counts the frames that arrive and the images that are drawn within some seconds."""
 WAIT_FOR_PIXEL = """() => {
     const viewer = egs.viewers[0], { canvas } = viewer, copy = document.createElement("canvas");
     copy.width = canvas.width; copy.height = canvas.height;
@@ -68,7 +68,7 @@ WAIT_FOR_PIXEL = """() => {
     let before, pressed;
     document.addEventListener("keydown", (event) => { pressed = event.timeStamp; }, { once: true, capture: true });
     const draw = viewer.draw.bind(viewer);
-    // As many pixels before as after.
+    // The resolution must be the same before and after.
     viewer.setResolution = () => {};
     viewer.draw = () => {
         if (!draw()) return false;
@@ -84,11 +84,11 @@ WAIT_FOR_PIXEL = """() => {
     };
     viewer.invalidate();
 }"""
-"""Compares every picture after a key with the last one before it."""
+"""Script that compares every image after a key press with the last one before it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
+    """Run the benchmark."""
     parser = flags(__doc__, quick="10 s of motion and 3 latencies", seed="not used: nothing here is random")
     options = parser.parse_args(arguments)
     seconds, presses = (10.0, 3) if options.quick else (30.0, 9)
@@ -110,8 +110,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         capture = Path(folder) / "pawn.ply"
         write_ply(capture, pawn(gaussian_count=GAUSSIANS).cloud)
-        for nodes in ASKED_NODES:
-            with _address(capture, ASKED_NODES[nodes], options.device, Path(folder)) as address:
+        for nodes in REQUESTED_NODES:
+            with _address(capture, REQUESTED_NODES[nodes], options.device, Path(folder)) as address:
                 row = measured(address, browser, seconds, presses)
             rows.append(row)
             names = ("nodes", "solver_fps", "step_ms", "page_fps", "speed", "stalls", "frame_bytes")
@@ -126,7 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for row in rows:
             wall, shown = zip(*row["shown"], strict=True)
             axes.plot(wall, [moment - shown[0] for moment in shown], label=f"{row['nodes']} nodes")
-        axes.set(xlabel="seconds of ours", ylabel="seconds of the creature's, as shown")
+        axes.set(xlabel="real time, s", ylabel="time shown, s")
         axes.legend()
 
     report(
@@ -144,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def measured(address: str, browser: str, seconds: float, presses: int) -> Row:
-    """The figures of the session at ``address``."""
+    """Measure the session at ``address``."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as started:
@@ -196,7 +196,7 @@ def measured(address: str, browser: str, seconds: float, presses: int) -> Row:
 
 @contextmanager
 def _address(capture: Path, nodes: int, device: str, folder: Path) -> Iterator[str]:
-    """Of ``egs-warp live``, in a process of its own."""
+    """Start ``egs-warp live`` in its own process and yield the address of its page."""
     command = [sys.executable, "-m", "egs_warp.cli", "live", str(capture), "--up", "z", "--no-browser"]
     more = ["--nodes", str(nodes), "--device", device, "--out", str(folder / "takes")]
     process = subprocess.Popen([*command, *more], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

@@ -1,15 +1,14 @@
-"""How many steps of a creature a second are made side by side on one device, over the number of worlds.
+"""Steps per second of many worlds in parallel on one device, over the number of worlds.
 
 python benchmarks/many_worlds.py [--quick] [--worlds B ...] [--nodes N ...] [--steps N] [--alone N] [--panel N]
     [--chunk-bytes N] [--matrices B] [--device cuda:0] [--json PATH] [--plot PATH]
 
-The pawn's jump is recorded once on each cage. Then so many ``--worlds`` make its first ``--steps`` steps with the
-recorded activations, each with its own share of them (0.7 to 1) and on its own friction (0.4 to 1.2). ``--alone`` of
-them are made by ``LocomotionStepper``, too: ``apart`` is how far a node of theirs is from where it is alone, at most,
-in body heights. Where the time goes is told of a few steps from the middle, in which every stage waits for the device.
-
-``--matrices`` compares, beside all that, what factors of so many dense matrices of each cage's size take by panels of
-several widths, and by torch's own Cholesky factorisation, in ms; and what they take to solve with 1 and 96 right sides.
+The pawn's jump is recorded once on each cage. Then each of the ``--worlds`` repeats its first ``--steps`` steps with
+the recorded activations, scaled by a factor of its own (0.7 to 1), and with a friction of its own (0.4 to 1.2).
+``--alone`` of them are also run by ``LocomotionStepper``: ``apart`` is the largest distance of a node between the two
+runs, in body heights. Time by stage is measured over a few steps from the middle, in which every stage synchronises the
+device. ``--matrices`` also times factorisations of this number of dense matrices of each cage's size, by panels of
+several widths and by torch's own Cholesky factorisation, in ms, and solutions with 1 and 96 right-hand sides.
 
 Aims of one GPU: ``many_2000``, 2,000 steps a second at 250 nodes and 600 at 541; ``many_alike``, at most 1e-9 body
 heights apart after 30 steps or more, on any device.
@@ -39,22 +38,22 @@ from harness import Row, Table, flags, record, report
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ASKED = (175, 500)
-"""--nodes that give the pawn cages of about 250 and 541."""
+REQUESTED_NODES = (175, 500)
+"""``--nodes`` that give the pawn cages of about 250 and 541 nodes."""
 AIMS = {250: 2000.0, 541: 600.0}
-"""Steps a second at so many nodes."""
-NEAR = 0.1
-"""Of the nodes that an aim is for."""
-ALIKE, LEAST_STEPS = 1e-9, 30
+"""Steps per second to reach, by number of nodes."""
+NODE_TOLERANCE = 0.1
+"""Relative tolerance of the number of nodes of an aim."""
+MAX_DISTANCE, MIN_STEPS = 1e-9, 30
 STAGES = ("detect", "elasticity", "factor", "substitute", "coulomb")
 PANELS = (32, 64, 96, 128, 192)
 _SPLIT = 3
-"""Steps of which is told where their time goes."""
+"""Number of steps whose time is measured by stage."""
 
 
 @dataclass
 class Stopwatch:
-    """Seconds of each stage, while it is ``on``."""
+    """Stopwatch that sums the seconds of each stage while ``on``."""
 
     device: torch.device
     on: bool = False
@@ -62,27 +61,27 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """``Stages``."""
-        begun = self.now() if self.on else 0.0
+        """Measure the stage ``name``; implements ``Stages``."""
+        started = self.now() if self.on else 0.0
         yield
         if self.on:
-            self.seconds[name] += self.now() - begun
+            self.seconds[name] += self.now() - started
 
     def now(self) -> float:
-        """Seconds, once the device has done what it was asked."""
+        """Synchronise the device and return the time, s."""
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         return time.perf_counter()
 
 
 def recorded(creature: Creature, steps: int) -> np.ndarray:
-    """(steps, M) metres, the activations of the first ``steps`` of a jump."""
+    """(steps, M) m, activations of the first ``steps`` steps of a jump."""
     frames = -(-steps // solver_steps(creature.body)[1])
     return simulate(creature, motion("jump"), frames=frames + 1).trajectory.activations[:steps]
 
 
 def measure(creature: Creature, jump: np.ndarray, worlds: int, *, alone: int, panel: int, chunk_bytes: int) -> Row:
-    """The rate of so many ``worlds``, where the time goes, and how far from their runs alone so many are."""
+    """Measure the rate of ``worlds`` worlds, the time by stage, and how far ``alone`` of them are from single runs."""
     device = torch.device(str(creature.body.assembly.device))
     watch = Stopwatch(device)
     dt, _ = solver_steps(creature.body)
@@ -94,41 +93,41 @@ def measure(creature: Creature, jump: np.ndarray, worlds: int, *, alone: int, pa
         stages=watch,
     )
     start = stepper.start([creature.start] * worlds)
-    given = torch.as_tensor(jump[:, None] * shares[:, None], device=device)
-    stepper.advance(start, given[0], dt)
+    activations = torch.as_tensor(jump[:, None] * shares[:, None], device=device)
+    stepper.advance(start, activations[0], dt)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     state, middle, halved = start, start, 0
-    begun = watch.now()
-    for number, row in enumerate(given):
-        middle = state if number == len(given) // 2 else middle
-        state, done, lost = stepper.advance(state, row, dt)
-        if bool(lost.any()):
-            raise RuntimeError(f"{int(lost.sum())} worlds of {worlds} could not be solved in step {number}")
+    started = watch.now()
+    for number, row in enumerate(activations):
+        middle = state if number == len(activations) // 2 else middle
+        state, done, failed = stepper.advance(state, row, dt)
+        if bool(failed.any()):
+            raise RuntimeError(f"{int(failed.sum())} worlds of {worlds} could not be solved in step {number}")
         halved += worlds - int(done[0].converged.sum()) if done[0].dt == dt else worlds
-    seconds = watch.now() - begun
-    made = {
+    seconds = watch.now() - started
+    result = {
         "nodes": len(creature.body.mesh.nodes),
         "worlds": worlds,
-        "steps": len(given),
-        "rate": worlds * len(given) / seconds,
+        "steps": len(activations),
+        "rate": worlds * len(activations) / seconds,
         "halved": halved,
         "gib": torch.cuda.max_memory_allocated(device) / 2**30 if device.type == "cuda" else None,
     }
-    watch.on, begun = True, watch.now()
-    for row in given[len(given) // 2 :][:_SPLIT]:
+    watch.on, started = True, watch.now()
+    for row in activations[len(activations) // 2 :][:_SPLIT]:
         middle, _, _ = stepper.advance(middle, row, dt)
-    whole = watch.now() - begun
+    whole = watch.now() - started
     split = {name: 1e3 * value / _SPLIT for name, value in watch.seconds.items()}
     split["rest"] = 1e3 * whole / _SPLIT - sum(split.values())
     ends = state.positions.cpu().numpy()
     chosen = np.linspace(0, worlds - 1, alone).astype(int).tolist()
     apart = [_apart(creature, jump * shares[one], float(frictions[one]), dt, ends[one]) for one in chosen]
-    return {**made, "stages": split, "apart": max(apart, default=None)}
+    return {**result, "stages": split, "apart": max(apart, default=None)}
 
 
 def _apart(creature: Creature, activations: np.ndarray, friction: float, dt: float, end: np.ndarray) -> float:
-    """Body heights from ``end`` (N, 3) to the end of the same steps alone, of the node that is furthest off."""
+    """Run the same steps by ``LocomotionStepper``; return its largest distance from ``end`` (N, 3), body heights."""
     device = str(creature.body.assembly.device)
     geometry = replace(creature.geometry, friction=friction)
     stepper = LocomotionStepper(creature.body, creature.muscles, geometry, device=device)
@@ -139,10 +138,10 @@ def _apart(creature: Creature, activations: np.ndarray, friction: float, dt: flo
 
 
 def matrices(size: int, count: int, device: torch.device) -> list[Row]:
-    """What ``count`` factorisations of matrices (size, size) and solutions take."""
+    """Time ``count`` factorisations of matrices (size, size) and solutions with them."""
     watch = Stopwatch(device)
     half = torch.randn((count, size, 8), dtype=torch.float64, device=device)
-    given = half @ half.mT + size * torch.eye(size, dtype=torch.float64, device=device)
+    matrix = half @ half.mT + size * torch.eye(size, dtype=torch.float64, device=device)
     slots = torch.arange(count, device=device)
 
     def factored(factors: BatchCholesky, spent: list[torch.Tensor]) -> None:
@@ -151,15 +150,15 @@ def matrices(size: int, count: int, device: torch.device) -> list[Row]:
     def took(action: Callable[..., object], *arguments: object) -> float:
         best = np.inf
         for _ in range(3):
-            begun = watch.now()
+            started = watch.now()
             action(*arguments)
-            best = min(best, 1e3 * (watch.now() - begun))
+            best = min(best, 1e3 * (watch.now() - started))
         return float(best)
 
-    rows: list[Row] = [{"size": size, "panel": None, "factor": took(torch.linalg.cholesky_ex, given)}]
+    rows: list[Row] = [{"size": size, "panel": None, "factor": took(torch.linalg.cholesky_ex, matrix)}]
     for panel in PANELS:
         factors = BatchCholesky(count, size, device, panel=panel)
-        spent = [given.clone() for _ in range(3)]
+        spent = [matrix.clone() for _ in range(3)]
         row: Row = {"size": size, "panel": panel, "factor": took(factored, factors, spent)}
         for columns in (1, 96):
             right = torch.ones((count, size, columns), dtype=torch.float64, device=device)
@@ -171,22 +170,31 @@ def matrices(size: int, count: int, device: torch.device) -> list[Row]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Time each number of worlds for each cage."""
     parser = flags(__doc__, quick="250 nodes, 4 worlds, 3 steps", seed="of the pawn's Gaussians")
-    parser.add_argument("--worlds", type=int, nargs="*", default=[64, 256, 1024], help="side by side, of each row")
-    parser.add_argument("--nodes", type=int, nargs="*", default=list(ASKED), help="asked for, of each cage")
-    parser.add_argument("--steps", type=int, default=30, help="of each world (30)")
-    parser.add_argument("--alone", type=int, default=3, help="worlds that are run alone, too (3)")
-    parser.add_argument("--panel", type=int, default=96, help="columns that are factored at a time (96)")
-    parser.add_argument("--chunk-bytes", type=int, default=2**31, help="matrices that are factored at a time (2^31)")
-    parser.add_argument("--matrices", type=int, help="dense matrices that are factored in several ways")
+    parser.add_argument(
+        "--worlds", type=int, nargs="*", default=[64, 256, 1024], help="numbers of parallel worlds, one for each row"
+    )
+    parser.add_argument(
+        "--nodes", type=int, nargs="*", default=list(REQUESTED_NODES), help="requested number of nodes of each cage"
+    )
+    parser.add_argument("--steps", type=int, default=30, help="steps of each world (default 30)")
+    parser.add_argument("--alone", type=int, default=3, help="worlds that are also run alone (default 3)")
+    parser.add_argument("--panel", type=int, default=96, help="columns that are factored at a time (default 96)")
+    parser.add_argument(
+        "--chunk-bytes",
+        type=int,
+        default=2**31,
+        help="bytes of the matrices that are factored at a time (default 2^31)",
+    )
+    parser.add_argument("--matrices", type=int, help="number of dense matrices for a comparison of factorisations")
     options = parser.parse_args(arguments)
     if options.quick:
         options.nodes, options.worlds, options.steps = options.nodes[:1], [4], 3
     rows: list[Row] = []
     stages = dict.fromkeys((*STAGES, "rest"), ".1f")
     table = Table(nodes="d", worlds="d", steps_a_second="8.1f", halved="d", gib=".1f", apart="8.1e", **stages)
-    made = pawn(seed=options.seed, device=options.device)
+    scene = pawn(seed=options.seed, device=options.device)
     for nodes in options.nodes:
-        creature = make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=nodes))
+        creature = make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=nodes))
         jump = recorded(creature, options.steps)
         for worlds in options.worlds:
             row = measure(
@@ -208,9 +216,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def summary(rows: list[Row], device: str) -> dict[str, Any]:
-    """The aims, and why one is null."""
+    """Return the aims, and the reasons of null ones."""
     best = {
-        nodes: max((row["rate"] for row in rows if abs(row["nodes"] - nodes) <= NEAR * nodes), default=None)
+        nodes: max((row["rate"] for row in rows if abs(row["nodes"] - nodes) <= NODE_TOLERANCE * nodes), default=None)
         for nodes in AIMS
     }
     known = {nodes: rate for nodes, rate in best.items() if rate is not None}
@@ -218,16 +226,16 @@ def summary(rows: list[Row], device: str) -> dict[str, Any]:
     why = {"many_2000": "a GPU's aim" if device == "cpu" else "not both cages were run"}
     if device != "cpu" and len(known) == len(AIMS):
         aims["many_2000"] = all(rate >= AIMS[nodes] for nodes, rate in known.items())
-    apart = [row["apart"] for row in rows if row["apart"] is not None and row["steps"] >= LEAST_STEPS]
+    apart = [row["apart"] for row in rows if row["apart"] is not None and row["steps"] >= MIN_STEPS]
     if apart:
-        aims["many_alike"] = max(apart) <= ALIKE
+        aims["many_alike"] = max(apart) <= MAX_DISTANCE
     else:
-        why["many_alike"] = f"no world was run alone for {LEAST_STEPS} steps"
+        why["many_alike"] = f"no world was run alone for {MIN_STEPS} steps"
     return {"aims": aims, "why_null": {name: why[name] for name, value in aims.items() if value is None}}
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Steps a second over worlds, by nodes."""
+    """Draw steps per second over worlds, by nodes."""
     axes = figure.subplots()
     for nodes in dict.fromkeys(row["nodes"] for row in rows):
         chosen = [row for row in rows if row["nodes"] == nodes]

@@ -1,4 +1,4 @@
-"""Scenes with a truth for Table 1 and Figure 8: cages, known deformations, a ray caster, training."""
+"""Scenes with a known truth for Table 1 and Figure 8: cages, known deformations, a ray caster, training."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from kernels import trace_kernel
 from painted_meshes import PaintedMesh
 
 Motion = Callable[[np.ndarray], np.ndarray]
-"""Deformed places (P, 3) of rest points (P, 3)."""
+"""Map from rest points (P, 3) to deformed points (P, 3)."""
 
 
 def box_cage(vertices: np.ndarray, cells: int) -> TetMesh:
-    """Tetrahedra in the box around ``vertices``, a twentieth larger, about ``cells`` along its longest side."""
+    """Build a cage: tetrahedra in a box slightly larger than ``vertices``, about ``cells`` along its longest side."""
     lower, upper = vertices.min(axis=0) - 0.025, vertices.max(axis=0) + 0.025
     size = upper - lower
     counts = np.maximum(2, np.round(cells * size / size.max()).astype(int))
@@ -39,7 +39,7 @@ def box_cage(vertices: np.ndarray, cells: int) -> TetMesh:
 
 
 def bend(points: np.ndarray) -> np.ndarray:
-    """The vertical axis bent onto a circle, the top turned by 80 degrees."""
+    """Bend the vertical axis onto a circle, with the top rotated by 80 degrees."""
     radius = 1.0 / np.radians(80.0)
     angle = points[:, 2] / radius
     r = radius - points[:, 0]
@@ -47,7 +47,7 @@ def bend(points: np.ndarray) -> np.ndarray:
 
 
 def twist_by(degrees: float) -> Motion:
-    """Turned about the vertical axis, by ``degrees`` at the top."""
+    """Return the twist about the vertical axis by ``degrees`` at height 1."""
 
     def twist(points: np.ndarray) -> np.ndarray:
         angle = np.radians(degrees) * points[:, 2]
@@ -61,7 +61,7 @@ def twist_by(degrees: float) -> Motion:
 def ring(
     vertices: np.ndarray, count: int, size: int, *, elevations: tuple[float, ...], phase: float = 0.0
 ) -> list[Camera]:
-    """Cameras around ``vertices`` (V, 3), which fill their pictures, at each elevation (degrees) in turn."""
+    """Return cameras around ``vertices`` (V, 3), which fill the images, at each elevation (degrees) in turn."""
     lower, upper = vertices.min(axis=0), vertices.max(axis=0)
     centre, distance = 0.5 * (lower + upper), 1.5 * float(np.linalg.norm(upper - lower))
     vertical = np.array([0.0, 0.0, 1.0])
@@ -71,8 +71,8 @@ def ring(
         up = np.radians(elevations[index % len(elevations)])
         eye = centre + distance * np.array([np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)])
         wide = Camera.look_at(eye, centre, vertical, width=size, height=size)
-        seen = (vertices - eye) @ wide.rotation.T
-        fov = 2.0 * np.degrees(np.arctan(1.05 * np.abs(seen[:, :2] / seen[:, 2:]).max()))
+        local = (vertices - eye) @ wide.rotation.T
+        fov = 2.0 * np.degrees(np.arctan(1.05 * np.abs(local[:, :2] / local[:, 2:]).max()))
         cameras.append(Camera.look_at(eye, centre, vertical, width=size, height=size, vertical_fov_degrees=fov))
     return cameras
 
@@ -80,11 +80,11 @@ def ring(
 def photograph(
     mesh: PaintedMesh, vertices: np.ndarray, cameras: list[Camera], device: str, *, samples: int = 3
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Picture (H, W, 3) on white and coverage (H, W) of the mesh with its vertices at ``vertices``, for each camera."""
+    """Ray-cast the mesh at ``vertices``; returns colour (H, W, 3) on white and coverage (H, W) for each camera."""
     with wp.ScopedDevice(device):
         solid = wp.Mesh(wp.array(vertices, dtype=wp.vec3), wp.array(mesh.faces.ravel(), dtype=wp.int32))
         rest = wp.array(mesh.vertices, dtype=wp.vec3)
-        turns = wp.array(face_turns(mesh, vertices).transpose(0, 2, 1), dtype=wp.mat33)
+        turns = wp.array(face_rotations(mesh, vertices).transpose(0, 2, 1), dtype=wp.mat33)
         pictures = []
         for camera in cameras:
             count = camera.width * camera.height
@@ -108,7 +108,7 @@ def photograph(
                 outputs=[where, hit, light, gloss],
             )
             hits = np.asarray(hit.numpy(), dtype=bool)
-            # Most pixels see nothing; what is left of the samples is small.
+            # Most pixels miss the mesh; compacting the samples saves memory.
             pixels = np.flatnonzero(hits.any(axis=1))
             covered = hits[pixels]
             sampled = np.ones((len(pixels), samples**2, 3))
@@ -124,9 +124,10 @@ def photograph(
     return pictures
 
 
-def face_turns(mesh: PaintedMesh, vertices: np.ndarray) -> np.ndarray:
-    """(F, 3, 3) rotation of each face from rest to where its corners are at ``vertices`` (V, 3): the polar one of the
-    map of its plane, which takes normal to normal.
+def face_rotations(mesh: PaintedMesh, vertices: np.ndarray) -> np.ndarray:
+    """(F, 3, 3) rotation of each face from rest to ``vertices`` (V, 3).
+
+    It is the polar factor of the face's deformation gradient, which maps its normal to its normal.
     """
 
     def frames(points: np.ndarray) -> np.ndarray:
@@ -136,7 +137,7 @@ def face_turns(mesh: PaintedMesh, vertices: np.ndarray) -> np.ndarray:
         return np.stack([b - a, c - a, normal], axis=2)
 
     before, after = frames(mesh.vertices), frames(vertices)
-    # A face without area has no turn; nothing of it is seen.
+    # A degenerate face has no rotation and is invisible.
     sound = (np.linalg.det(before) > 1e-14) & (np.linalg.det(after) > 1e-14)
     turns = np.tile(np.eye(3), (len(mesh.faces), 1, 1))
     u, _, v = np.linalg.svd(after[sound] @ np.linalg.inv(before[sound]))
@@ -145,14 +146,14 @@ def face_turns(mesh: PaintedMesh, vertices: np.ndarray) -> np.ndarray:
 
 
 def carried_vertices(mesh: PaintedMesh, cage: TetMesh, nodes: np.ndarray, device: str) -> np.ndarray:
-    """Vertices of the mesh as the cage carries them to node positions ``nodes``."""
+    """Return the vertices of the mesh, deformed by the cage with nodes at ``nodes``."""
     locator = CageLocator(cage, device=device)
     places = locator.locate(wp.array(mesh.vertices, dtype=Vec3, device=device))
     return places.interpolate(wp.array(nodes, dtype=Vec3, device=device)).numpy()
 
 
 def surface_points(mesh: PaintedMesh, count: int, seed: int) -> np.ndarray:
-    """(count, 3) points spread evenly over the surface."""
+    """(count, 3) points, uniformly distributed over the surface."""
     rng = np.random.default_rng(seed)
     corners = mesh.vertices[mesh.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -163,7 +164,7 @@ def surface_points(mesh: PaintedMesh, count: int, seed: int) -> np.ndarray:
 
 
 def surface_cloud(mesh: PaintedMesh, count: int, *, device: str) -> GaussianCloud:
-    """Small opaque round Gaussians spread evenly over the surface."""
+    """Return small opaque round Gaussians, uniformly distributed over the surface."""
     points = surface_points(mesh, count, seed=0)
     return GaussianCloud.from_numpy(
         points,
@@ -186,15 +187,15 @@ def trained(
     device: str,
     degree: int = 0,
 ) -> GaussianCloud:
-    """Gaussians trained from ``views`` photographs of the mesh at rest, by the project's own trainer."""
+    """Train Gaussians from ``views`` photographs of the mesh at rest, with the project's own trainer."""
     return trained_on(
         mesh, photographs(mesh, size, views, device), gaussians, iterations, seed=seed, degree=degree, device=device
     )
 
 
 def photographs(mesh: PaintedMesh, size: int, views: int, device: str) -> list[TrainingView]:
-    """The mesh at rest from all around, cut out."""
-    # From below and from above too: a deformation turns what was hidden towards the eye.
+    """Render views of the mesh at rest from all around, without background."""
+    # Also from below and above: a deformation exposes what was hidden.
     cameras = ring(mesh.vertices, views, size, elevations=(15.0, 50.0, -15.0, 75.0, -50.0))
     photos = photograph(mesh, mesh.vertices, cameras, device)
     return [
@@ -213,7 +214,7 @@ def trained_on(
     degree: int,
     device: str,
 ) -> GaussianCloud:
-    """``gaussians`` of SH ``degree`` trained from ``photos``, at first spread over the true surface."""
+    """Train ``gaussians`` Gaussians of SH ``degree`` from ``photos``, starting from points on the true surface."""
     points = surface_points(mesh, gaussians, seed)
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
@@ -231,7 +232,7 @@ def trained_on(
         iterations=iterations,
         densification=Densification.RELOCATION if iterations >= 1000 else Densification.NONE,
         max_gaussians=gaussians,
-        # Before white alone, white haze around the object would cost nothing, and a deformation would show it.
+        # Over white alone, white haze around the object would cost nothing, and a deformation would make it visible.
         background=None,
         seed=seed,
     )
@@ -239,6 +240,6 @@ def trained_on(
 
 
 def outside(alpha: np.ndarray, coverage: np.ndarray, threshold: float = 0.1) -> float:
-    """Share of pixels that are drawn outside the silhouette dilated by one pixel."""
+    """Return the fraction of pixels that are drawn outside the silhouette dilated by one pixel."""
     allowed = np.asarray(ndimage.binary_dilation(coverage > 0, structure=np.ones((3, 3))), dtype=bool)
     return float(np.mean((alpha > threshold) & ~allowed))

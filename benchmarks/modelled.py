@@ -1,4 +1,4 @@
-"""Bodies modelled for the benchmarks as signed distances: on two to six legs, on one base, on none."""
+"""Bodies modelled by signed distance functions for the benchmarks: with two to six legs, one base or no feet."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _rod(
 
 
 def _legged(count: int, *, leg: float = 0.05, spread: float = 0.3, short: int | None = None) -> Distance:
-    """An egg with a head on ``count`` legs in a ring, one of which may be 3 % too short."""
+    """Return an egg with a head on ``count`` legs in a ring; leg ``short`` is 3 % too short."""
 
     def distance(points: np.ndarray) -> np.ndarray:
         out = ellipsoid(points, np.array([0.0, 0.0, 0.62]), np.array([0.32, 0.32, 0.16]))
@@ -70,13 +70,13 @@ MODELLED: dict[str, Distance] = {
 
 
 def _toadstool(points: np.ndarray) -> np.ndarray:
-    """Heavy above, on a stem."""
+    """A heavy cap on a stem."""
     stem = _rod(points, [0.0, 0.0, 0.0], [0.0, 0.0, 0.6], 0.17, 0.1)
     return smooth_union(stem, ellipsoid(points, np.array([0.0, 0.0, 0.72]), np.array([0.38, 0.38, 0.2])), 0.05)
 
 
 def _giraffe(points: np.ndarray) -> np.ndarray:
-    """Four long legs under a short trunk, and a neck as long as they are."""
+    """Four long legs under a short trunk, and a neck as long as the legs."""
     out = ellipsoid(points, np.array([0.0, 0.0, 0.52]), np.array([0.26, 0.13, 0.12]))
     for x, y in ((0.2, 0.11), (0.2, -0.11), (-0.2, 0.11), (-0.2, -0.11)):
         out = smooth_union(out, _rod(points, [x, 1.2 * y, -0.05], [0.9 * x, 0.8 * y, 0.5], 0.045, 0.06), 0.03)
@@ -86,7 +86,7 @@ def _giraffe(points: np.ndarray) -> np.ndarray:
 
 
 def _ostrich(points: np.ndarray) -> np.ndarray:
-    """Two legs with long feet under a trunk that lies along the ground, a neck in front."""
+    """Two legs with long feet under a horizontal trunk, and a neck in front."""
     out = ellipsoid(points, np.array([-0.04, 0.0, 0.6]), np.array([0.26, 0.19, 0.16]))
     for y in (0.12, -0.12):
         leg = _rod(points, [0.0, 1.1 * y, 0.05], [-0.02, y, 0.55], 0.055, 0.075)
@@ -97,7 +97,7 @@ def _ostrich(points: np.ndarray) -> np.ndarray:
 
 
 def _spider(points: np.ndarray) -> np.ndarray:
-    """A flat trunk among eight legs that reach wider than it is high."""
+    """A flat trunk among eight legs that extend wider than the body is high."""
     out = ellipsoid(points, np.array([0.0, 0.0, 0.42]), np.array([0.28, 0.2, 0.14]))
     for k in range(8):
         x, y = np.cos(np.pi * (k + 0.5) / 4.0), np.sin(np.pi * (k + 0.5) / 4.0)
@@ -109,7 +109,7 @@ def _spider(points: np.ndarray) -> np.ndarray:
 
 
 def _dachshund(points: np.ndarray) -> np.ndarray:
-    """Twice as long as high, on four short legs."""
+    """A trunk twice as long as high on four short legs."""
     out = _rod(points, [-0.7, 0.0, 0.45], [0.6, 0.0, 0.48], 0.19, 0.2)
     for x, y in ((0.5, 0.13), (0.5, -0.13), (-0.6, 0.13), (-0.6, -0.13)):
         out = smooth_union(out, _rod(points, [x, y, -0.05], [x, 0.9 * y, 0.4], 0.075, 0.085), 0.03)
@@ -125,15 +125,15 @@ UNSEEN: dict[str, Distance] = {
     "spider": _spider,
     "dachshund": _dachshund,
 }
-"""Made when the motions were done, and not looked at while anything was set: what they do is told as it is."""
+"""Held-out bodies: modelled after the motions were finished, and not used to tune anything."""
 
 
 def modelled(name: str) -> Body:
-    """One of ``MODELLED`` or ``UNSEEN`` on the plane z = 0, about 1 high."""
-    given, random = (MODELLED | UNSEEN)[name], np.random.default_rng(0)
+    """Build one of ``MODELLED`` or ``UNSEEN`` on the plane z = 0, about 1 high."""
+    body_distance, random = (MODELLED | UNSEEN)[name], np.random.default_rng(0)
 
     def distance(points: np.ndarray) -> np.ndarray:
-        return np.maximum(given(points), -points[:, 2])
+        return np.maximum(body_distance(points), -points[:, 2])
 
     vertices, faces = surface_mesh(distance, -_REACH * [1.0, 1.0, 0.05], _REACH, 0.02)
     samples = even_samples(distance, vertices, faces, _GAUSSIANS, random)

@@ -13,9 +13,9 @@ import numpy as np
 from harness import data_folder
 
 Paint = Callable[[np.ndarray], np.ndarray]
-"""Colour (P, 3), 0 to 1, of points (P, 3) of the rest shape: a texture that goes through the solid."""
-LONGEST_EDGE = 0.02
-"""Of an object 1 high: bent by 80 degrees, the middle of such an edge is off by 7e-5."""
+"""Solid texture: colours (P, 3), 0 to 1, of points (P, 3) of the rest shape."""
+MAX_EDGE_LENGTH = 0.02
+"""Longest edge on an object 1 high; after a bend by 80 degrees its midpoint is off by 7e-5."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class PaintedMesh:
     """(F, 3) int32."""
     paint: Paint
     glossy: bool = False
-    """Lit by lamps that go along with the body, each part's turn with it: what a capture takes them for."""
+    """True if lit by lamps that rotate with each part of the body, which is how a capture stores light."""
 
 
 def checkers(cell: float, colours: tuple[tuple[float, ...], ...]) -> Paint:
@@ -56,7 +56,7 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The first mesh of a binary glTF file of one buffer, in that mesh's own axes."""
+    """Read the first mesh of a binary glTF file of one buffer, in that mesh's own axes."""
     data = path.read_bytes()
     (length,) = struct.unpack_from("<I", data, 12)
     described, body = json.loads(data[20 : 20 + length]), data[28 + length :]
@@ -74,7 +74,7 @@ def _read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def standing(vertices: np.ndarray) -> tuple[np.ndarray, float]:
-    """What to take off ``vertices`` (V, 3) and what to multiply the rest with, so that they stand on z = 0, 1 high."""
+    """Return the offset to subtract from ``vertices`` (V, 3) and the factor that scales them to 1 high on z = 0."""
     lower, upper = vertices.min(axis=0), vertices.max(axis=0)
     return np.array([*((lower + upper)[:2] / 2), lower[2]]), 1.0 / float(upper[2] - lower[2])
 
@@ -85,12 +85,13 @@ def _standing(vertices: np.ndarray) -> np.ndarray:
 
 
 def subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges are halved until none is longer than ``LONGEST_EDGE``:
-    a deformed mesh is the truth, and a long straight edge is not.
+    """Subdivide edges until none is longer than ``MAX_EDGE_LENGTH``.
+
+    The deformed mesh is the truth, and a long straight edge would be wrong.
     """
     while True:
         sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)
-        long = np.linalg.norm(vertices[sides[..., 0]] - vertices[sides[..., 1]], axis=2) > LONGEST_EDGE
+        long = np.linalg.norm(vertices[sides[..., 0]] - vertices[sides[..., 1]], axis=2) > MAX_EDGE_LENGTH
         if not long.any():
             return vertices, faces.astype(np.int32)
         edges, edge_from_side = np.unique(np.sort(sides[long], axis=1), axis=0, return_inverse=True)
@@ -99,15 +100,15 @@ def subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
         vertices = np.concatenate([vertices, vertices[edges].mean(axis=1)])
         count = long.sum(axis=1)
         parts = [faces[count == 0]]
-        # Turned until the halved side is the first, or the whole one the last.
+        # Rotate the corners so that the halved side is the first, or the whole one the last.
         for halved in (1, 2, 3):
             chosen = count == halved
             first = {1: long.argmax(axis=1), 2: (~long).argmax(axis=1) + 1, 3: np.zeros(len(faces), dtype=int)}[halved][
                 chosen
             ]
-            turned = (first[:, None] + np.arange(3)) % 3
-            x, y, z = np.take_along_axis(faces[chosen], turned, axis=1).T
-            a, b, c = np.take_along_axis(middle[chosen], turned, axis=1).T
+            rotated = (first[:, None] + np.arange(3)) % 3
+            x, y, z = np.take_along_axis(faces[chosen], rotated, axis=1).T
+            a, b, c = np.take_along_axis(middle[chosen], rotated, axis=1).T
             pieces = {
                 1: ((x, a, z), (a, y, z)),
                 2: ((x, a, z), (a, y, b), (a, b, z)),
@@ -192,7 +193,7 @@ def table() -> PaintedMesh:
 
 
 def slender_chair() -> PaintedMesh:
-    """A generated chair on four legs a twenty-fifth of its height thick, its back to -x."""
+    """A generated chair on four legs with a thickness of a twenty-fifth of its height, its back to -x."""
     seat, back = ((-0.22, -0.22, 0.42), (0.22, 0.22, 0.48)), ((-0.22, -0.22, 0.7), (-0.17, 0.22, 1.0))
     legs = [((x - 0.02, y - 0.02, 0.0), (x + 0.02, y + 0.02, 0.45)) for x in (-0.19, 0.19) for y in (-0.19, 0.19)]
     posts = [((-0.215, y - 0.02, 0.45), (-0.175, y + 0.02, 0.8)) for y in (-0.19, 0.19)]
@@ -204,7 +205,7 @@ _Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 def _boxes(corners: Sequence[_Corners]) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes between opposite corners, each whole."""
+    """Boxes between opposite corners, without shared vertices."""
     parts = [_box(low, high) for low, high in corners]
     faces = np.concatenate([part + 8 * number for number, (_, part) in enumerate(parts)])
     return np.concatenate([vertices for vertices, _ in parts]), faces
@@ -221,14 +222,12 @@ def _box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, n
 
 
 def bar() -> PaintedMesh:
-    """The checkered bar of Figure 8: a quarter as thick as it is high, in bricks of long sides,
-    as long Gaussians want.
-    """
+    """The checkered bar of Figure 8: a quarter as thick as it is high, in long bricks, which favour long Gaussians."""
     corners, faces = _box((-0.125, -0.125, 0.0), (0.125, 0.125, 1.0))
     vertices, faces = subdivided(corners, faces)
 
     def paint(points: np.ndarray) -> np.ndarray:
-        # Faces lie on borders between cells; looked up a little inside, so that rounding does not choose their colour.
+        # Faces lie on borders between cells; sample slightly inside, so that rounding does not choose their colour.
         inside = (points - [0.0, 0.0, 0.5]) * 0.99 + [0.0, 0.0, 0.5]
         parity = np.floor(inside / [0.125, 0.125, 0.25]).astype(int).sum(axis=1) % 2
         return np.where(parity[:, None] == 0, [[0.9, 0.9, 0.85]], [[0.15, 0.2, 0.45]])

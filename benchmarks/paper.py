@@ -1,12 +1,11 @@
-"""Every table and figure of the paper, remade from nothing: `make paper`.
+"""Reproduce every table and figure of the paper from scratch: `make paper`.
 
-Runs the scripts of the tables and figures one after the other and says which one is at work, how many there are and how
-long each took. Into ``--out`` (``out/paper``) go, for each, what it printed (``.txt``), its figures (``.json``) and its
-picture (``.png``), the films of the figures with motions, and ``paper.md``: all aims, with the reason of each that this
-device cannot judge. With ``--keep`` stages whose JSON is there already are left as they are, so a run that was broken
-off goes on.
+Runs the scripts of the tables and figures in sequence and prints which one runs, how many there are and how long each
+took. For each, ``--out`` (``out/paper``) receives its output (``.txt``), its figures (``.json``) and its image
+(``.png``), the films of the figures with motions, and ``paper.md``: all aims, with the reason of each that this device
+cannot judge. With ``--keep`` stages whose JSON exists are skipped, so an interrupted run can be continued.
 
-The aims are those of the scripts, ``table1.split_helps`` for example; the rows say how each script ended.
+The aims are those of the scripts, ``table1.split_helps`` for example; the rows give the exit status of each script.
 """
 
 from __future__ import annotations
@@ -31,18 +30,18 @@ class Stage:
     name: str
     what: str
     script: str
-    """In the repository."""
+    """Path in the repository."""
     arguments: tuple[str, ...] = ()
-    """OUT stands for the folder."""
+    """Arguments; OUT stands for the output folder."""
     quick: tuple[str, ...] = ("--quick",)
     device: str | None = None
-    """Where it runs, whatever was asked; None as asked."""
+    """Device it always runs on; None for that of ``--device``."""
     judges: bool = True
-    """It takes the benchmarks' flags and writes JSON."""
+    """True if it takes the benchmarks' flags and writes JSON."""
 
 
 def animated(name: str, figure: int) -> Stage:
-    """A figure with a motion, by an example."""
+    """Return the stage of a figure that shows a motion, run by an example."""
     arguments = ("--out", f"OUT/figure{figure}_{name}")
     return Stage(
         f"figure{figure}",
@@ -59,15 +58,15 @@ STAGES = (
     Stage("settings", "Table 1: settings, on other objects", "benchmarks/table1.py", ("--choose", *CAPTURES)),
     Stage(
         "table1",
-        "Table 1: ways of carrying Gaussians",
+        "Table 1: methods of deforming Gaussians",
         "benchmarks/table1.py",
         ("--chosen", "OUT/settings.json", *CAPTURES),
     ),
     Stage("table2", "Table 2: contact states", "benchmarks/table2.py", device="cpu"),
-    Stage("table3", "Table 3 and Figure 9: an object cut off at its plane", "benchmarks/table3.py"),
-    Stage("figure7", "Figure 7: an object taken out", "benchmarks/figure7.py"),
+    Stage("table3", "Table 3 and Figure 9: an object cut at its plane", "benchmarks/table3.py"),
+    Stage("figure7", "Figure 7: an object segmented from its scene", "benchmarks/figure7.py"),
     Stage("figure8", "Figure 8: spikes of a twisted bar", "benchmarks/figure8.py"),
-    Stage("inpaint", "section 3.7 and Figure 6: the filled floor", "benchmarks/inpaint.py"),
+    Stage("inpaint", "section 3.7 and Figure 6: the inpainted floor", "benchmarks/inpaint.py"),
     Stage("supplement", "Supplement: the examples in numbers", "benchmarks/examples.py", device="cpu"),
     animated("jump", 1),
     animated("walk", 4),
@@ -76,7 +75,7 @@ STAGES = (
 
 
 def command(stage: Stage, options: argparse.Namespace) -> list[str]:
-    """The command line of a stage."""
+    """Return the command line of a stage."""
     arguments = [one.replace("OUT", str(options.out)) for one in stage.arguments]
     if options.quick:
         arguments += stage.quick
@@ -87,23 +86,23 @@ def command(stage: Stage, options: argparse.Namespace) -> list[str]:
     return [sys.executable, str(ROOT / stage.script), *arguments]
 
 
-def made(stage: Stage, options: argparse.Namespace) -> Row:
-    """Run a stage; its row."""
-    told = options.out / f"{stage.name}.txt"
-    with told.open("w") as file:
+def run_stage(stage: Stage, options: argparse.Namespace) -> Row:
+    """Run a stage and return its row."""
+    log = options.out / f"{stage.name}.txt"
+    with log.open("w") as file:
         ended, milliseconds = timed(
             subprocess.run, command(stage, options), cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, check=False
         )
     if ended.returncode:
-        last = told.read_text().strip().splitlines()[-1:] or ["it printed nothing"]
-        print(f"  failed: {last[0]} ({told})", flush=True)
+        last = log.read_text().strip().splitlines()[-1:] or ["it printed nothing"]
+        print(f"  failed: {last[0]} ({log})", flush=True)
     return {"stage": stage.name, "what": stage.what, "status": ended.returncode, "seconds": 1e-3 * milliseconds}
 
 
-def gathered(
+def collect_aims(
     stages: Sequence[Stage], rows: Sequence[Row], folder: Path
 ) -> tuple[dict[str, bool | None], dict[str, str]]:
-    """Aims of all stages by ``stage.aim``, and the reasons of those that are null."""
+    """Return the aims of all stages as ``stage.aim``, and the reasons of null ones."""
     aims: dict[str, bool | None] = {}
     why: dict[str, str] = {}
     failed = {row["stage"] for row in rows if row["status"]}
@@ -118,7 +117,7 @@ def gathered(
 
 
 def summary(rows: Sequence[Row], aims: dict[str, bool | None], why: dict[str, str]) -> str:
-    """What ``paper.md`` says."""
+    """Return the text of ``paper.md``."""
     word = {True: "met", False: "missed", None: "not judged"}
     lines = ["| table or figure | seconds | files |", "|---|---|---|"]
     for row in rows:
@@ -130,26 +129,30 @@ def summary(rows: Sequence[Row], aims: dict[str, bool | None], why: dict[str, st
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, print, write; the number of stages that failed."""
-    parser = flags(__doc__, quick="the quick form of each, and 24 frames of each motion", plot="not used: one a stage")
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "paper", help="folder for everything")
-    parser.add_argument("--only", nargs="+", choices=[stage.name for stage in STAGES], help="these stages")
-    parser.add_argument("--keep", action="store_true", help="leave out stages whose JSON is there")
+    """Run all stages; return the number of stages that failed."""
+    parser = flags(
+        __doc__,
+        quick="--quick of each script, and 24 frames of each motion",
+        plot="not used: each stage writes its own image",
+    )
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "paper", help="folder of all output")
+    parser.add_argument("--only", nargs="+", choices=[stage.name for stage in STAGES], help="only these stages")
+    parser.add_argument("--keep", action="store_true", help="skip stages whose JSON exists")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     stages = [stage for stage in STAGES if not options.only or stage.name in options.only]
     rows: list[Row] = []
     for number, stage in enumerate(stages, start=1):
         if options.keep and (options.out / f"{stage.name}.json").exists():
-            print(f"[{number}/{len(stages)}] {stage.what}: kept", flush=True)
+            print(f"[{number}/{len(stages)}] {stage.what}: skipped, its JSON exists", flush=True)
             continue
         print(f"[{number}/{len(stages)}] {stage.what} ...", flush=True)
-        rows.append(made(stage, options))
+        rows.append(run_stage(stage, options))
         print(f"[{number}/{len(stages)}] {stage.what}: {rows[-1]['seconds']:.0f} s", flush=True)
-    aims, why = gathered(stages, rows, options.out)
-    told = summary(rows, aims, why)
-    (options.out / "paper.md").write_text(told)
-    print(f"\n{told}\nwrote {options.out / 'paper.md'}")
+    aims, why = collect_aims(stages, rows, options.out)
+    text = summary(rows, aims, why)
+    (options.out / "paper.md").write_text(text)
+    print(f"\n{text}\nwrote {options.out / 'paper.md'}")
     record(options, rows, aims=aims, why_null=why)
     return sum(1 for row in rows if row["status"])
 

@@ -1,5 +1,6 @@
-"""How different two pictures look: FLIP, and LPIPS (Zhang et al. 2018, AlexNet) where the ``lpips``
-package and the network's weights are on this machine; nothing is fetched.
+"""Perceptual difference of two images: FLIP, and LPIPS (Zhang et al. 2018, AlexNet).
+
+LPIPS needs the ``lpips`` package and the network's weights on this machine; nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -11,28 +12,29 @@ import numpy as np
 import torch
 
 PIXELS_PER_DEGREE = 67.0206
-"""An eye 0.7 m before a screen 0.7 m wide with 3840 pixels: FLIP's own default."""
+"""Pixels per degree of an eye 0.7 m in front of a screen 0.7 m wide with 3840 pixels: FLIP's default."""
 _XYZ_FROM_RGB = (
     (10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794),
     (2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897),
     (1425376 / 73733382, 8788810 / 73733382, 70074185 / 73733382),
 )
 _SENSITIVITIES = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
-"""Of the eye to contrast, achromatic, red-green and blue-yellow: weight and width of Gaussians in frequency."""
+"""Contrast sensitivity, achromatic, red-green and blue-yellow: weights and widths of Gaussians in frequency."""
 _FEATURE_DEGREES = 0.082
-"""Width of edges and points that the eye looks for."""
+"""Width of the edges and points that the feature detector responds to, degrees."""
 _COLOUR_POWER, _FEATURE_POWER = 0.7, 0.5
 _KNEE, _KNEE_VALUE = 0.4, 0.95
-"""Colour differences up to this share of the largest one take up this share of the scale."""
+"""Colour differences up to this fraction of the largest one are mapped to this fraction of the scale."""
 
 
 def flip_error(picture: torch.Tensor, target: torch.Tensor) -> float:
-    """Mean FLIP (Andersson et al. 2020, low dynamic range) of two pictures (H, W, 3), sRGB from 0 to 1: 0 is alike, 1
-    as different as can be. It tells what one sees who flips between the two.
+    """Mean FLIP (Andersson et al. 2020, low dynamic range) of two images (H, W, 3), sRGB from 0 to 1.
+
+    0 is equal, 1 is the largest difference. It predicts what a viewer sees who flips between the two.
     """
     pair = [one.permute(2, 0, 1)[None].double() for one in (target, picture)]
     opponents = [_opponent(_linear(one.clamp(0.0, 1.0))) for one in pair]
-    colour = _colour_difference(*(_seen(one) for one in opponents))
+    colour = _colour_difference(*(_filtered_lab(one) for one in opponents))
     feature = _feature_difference(*(one[:, :1] for one in opponents))
     return float((colour ** (1.0 - feature)).mean())
 
@@ -46,7 +48,7 @@ def _mixed(matrix: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
 
 
 def _xyz(planes: torch.Tensor) -> torch.Tensor:
-    """(1, 3, H, W) XYZ of linear RGB, the white point's being 1."""
+    """(1, 3, H, W) XYZ of linear RGB, relative to the white point."""
     matrix = torch.tensor(_XYZ_FROM_RGB, dtype=planes.dtype, device=planes.device)
     return _mixed(matrix / matrix.sum(dim=1, keepdim=True), planes)
 
@@ -57,8 +59,8 @@ def _opponent(linear: torch.Tensor) -> torch.Tensor:
     return torch.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], dim=1)
 
 
-def _seen(opponent: torch.Tensor) -> torch.Tensor:
-    """(1, 3, H, W) L*, a*, b* of what the eye resolves, colours less where it is dark (Hunt)."""
+def _filtered_lab(opponent: torch.Tensor) -> torch.Tensor:
+    """(1, 3, H, W) L*, a*, b* after the contrast sensitivity filter; dark colours count less (Hunt effect)."""
     widest = max(width for terms in _SENSITIVITIES for _, width in terms)
     radius = int(np.ceil(3.0 * np.sqrt(widest / (2.0 * np.pi**2)) * PIXELS_PER_DEGREE))
     degrees = torch.arange(-radius, radius + 1, dtype=opponent.dtype, device=opponent.device) / PIXELS_PER_DEGREE
@@ -90,7 +92,7 @@ def _hunted_lab(linear: torch.Tensor) -> torch.Tensor:
 
 
 def _colour_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """(1, 1, H, W) from 0 to 1: HyAB distance, large ones pressed together."""
+    """(1, 1, H, W) from 0 to 1: HyAB distance with large values compressed."""
 
     def distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         off = a - b
@@ -100,11 +102,11 @@ def _colour_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
         _hunted_lab(torch.tensor(rgb, dtype=one.dtype, device=one.device)[None, :, None, None])
         for rgb in ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     )
-    most = float(distance(green, blue))
-    knee = _KNEE * most
+    largest = float(distance(green, blue))
+    knee = _KNEE * largest
     off = distance(one, other)
-    beyond = _KNEE_VALUE + (off - knee) / (most - knee) * (1.0 - _KNEE_VALUE)
-    return torch.where(off < knee, off * (_KNEE_VALUE / knee), beyond)
+    compressed = _KNEE_VALUE + (off - knee) / (largest - knee) * (1.0 - _KNEE_VALUE)
+    return torch.where(off < knee, off * (_KNEE_VALUE / knee), compressed)
 
 
 def _feature_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
@@ -128,7 +130,7 @@ def _feature_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
 
 
 def _convolved(plane: torch.Tensor, along_x: torch.Tensor, along_y: torch.Tensor) -> torch.Tensor:
-    """(1, 1, H, W) correlated with two lines of one length, the border's pixels going on beyond it."""
+    """(1, 1, H, W) correlated with two lines of one length; border pixels are replicated."""
     radius = len(along_x) // 2
     padded = torch.nn.functional.pad(plane, [radius] * 4, mode="replicate")
     rows = torch.nn.functional.conv2d(padded, along_x[None, None, None])
@@ -136,7 +138,7 @@ def _convolved(plane: torch.Tensor, along_x: torch.Tensor, along_y: torch.Tensor
 
 
 def lpips_distance() -> tuple[Callable[[np.ndarray, np.ndarray], float] | None, str | None]:
-    """The distance of two pictures (H, W, 3), 0 to 1, and None; or None and the reason why it cannot be had."""
+    """Return the distance function of two images (H, W, 3), 0 to 1, and None; or None and why it is unavailable."""
     try:
         import lpips  # pyright: ignore[reportMissingImports]
     except ImportError:

@@ -1,8 +1,8 @@
-"""How well is the plane found? 100 synthetic depth pictures with outliers and noise, and real captures view by view.
+"""Accuracy of the fitted plane: 100 synthetic depth images with outliers and noise, and real captures view by view.
 
-A synthetic picture is one view, 240 x 180 pixels, of a random plane with a ball that stands on it (about half of the
+A synthetic image is one view, 240 x 180 pixels, of a random plane with a ball that stands on it (about half of the
 outliers) and scattered wrong depths (the rest): 30 % of the masked pixels are wrong, all have 1 % noise. The extent is
-the diagonal of what is seen of the plane. Real captures: each of eight views alone against all views together.
+the diagonal of the visible part of the plane. Real captures: each of eight views alone against all views together.
 
 Aims: ``normal`` (within 0.1 degree in every scene), ``offset`` (within 0.1 % of the extent in every scene),
 ``paper_start`` (the paper's start leads to the same planes), ``real_views_agree`` (each view alone within 0.5 degree of
@@ -38,11 +38,11 @@ CAPTURES = {
     "scenes/narcissus.sog": ((0.0, -0.8, 0.0), 1.5),
     "scenes/playbot": ((0.0, -0.5, 0.0), 0.8),
 }
-"""A click on the object of each, and how far around it to look, scene units."""
+"""A click on the object of each capture, and the radius around it that views cover, scene units."""
 
 
 def synthetic_view(random: np.random.Generator) -> tuple[Plane, PlaneView, float]:
-    """A plane, a picture of it with noise and outliers, and the extent of what is seen of it."""
+    """Return a plane, an image of it with noise and outliers, and the extent of its visible part."""
     normal = random.normal(size=3)
     normal /= np.linalg.norm(normal)
     centre = 3.0 * random.normal(size=3)
@@ -62,7 +62,7 @@ def synthetic_view(random: np.random.Generator) -> tuple[Plane, PlaneView, float
     truth, rays = plane_depth(plane, camera), camera_rays(camera)
     mask = (truth > 0.0) & (truth < 4.0 * distance)
     depth = truth.copy()
-    # A ball that touches the plane near the middle: outliers that hang together and begin at the plane itself.
+    # A ball that touches the plane near the middle: connected outliers that begin at the plane itself.
     radius = random.uniform(0.1, 0.2) * distance
     ball = centre + 0.2 * distance * (random.normal() * first + random.normal() * second) * 0.5 + radius * normal
     along = rays @ (ball - camera.centre)
@@ -81,12 +81,12 @@ def synthetic_view(random: np.random.Generator) -> tuple[Plane, PlaneView, float
 
 
 def degrees(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle between unit vectors, exact for small ones."""
+    """Return the angle between unit vectors, accurate for small angles."""
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
 def synthetic_rows(count: int, seed: int) -> list[Row]:
-    """One row a scene."""
+    """Return one row for each synthetic scene."""
     random = np.random.default_rng(seed)
     rows = []
     for number in range(count):
@@ -109,18 +109,18 @@ def synthetic_rows(count: int, seed: int) -> list[Row]:
 
 
 def real_row(name: str, click: tuple[float, float, float], radius: float, device: str) -> Row:
-    """Each of eight ring views alone against the fit to all of them, within ``radius`` of the ``click``."""
+    """Fit each of eight ring views alone and all together, within ``radius`` of the ``click``."""
     cloud = read_capture(data_folder() / name, device=device).cloud
     coarse = find_planes(cloud, guess_up(cloud)[0])[0].plane
     point = np.array(click)
     try:
-        found = segment(cloud, coarse, ObjectSpec(point=point))
-        thing = ~found.background_mask
+        segmentation = segment(cloud, coarse, ObjectSpec(point=point))
+        object_mask = ~segmentation.background_mask
     except UserError:
-        thing = None  # The robot of playbot hovers; its tile is a plane all the same.
+        object_mask = None  # The robot of playbot hovers; its tile is still a plane.
     middle = point - coarse.heights(point) * coarse.normal
     cameras = ring_cameras(coarse, middle, radius, count=8, elevations=(40.0, 58.0, 75.0), size=400)
-    views = plane_views(cloud, coarse, cameras, centre=middle, radius=radius, object_mask=thing)
+    views = plane_views(cloud, coarse, cameras, centre=middle, radius=radius, object_mask=object_mask)
     together = fit_plane(views).plane
     alone = [degrees(fit_plane([view]).plane.normal, together.normal) for view in views]
     return {
@@ -133,8 +133,8 @@ def real_row(name: str, click: tuple[float, float, float], radius: float, device
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
-    parser = flags(__doc__, quick="the same: it takes a minute or two", device="cpu")
+    """Run the benchmark."""
+    parser = flags(__doc__, quick="no effect: the full run takes a minute or two", device="cpu")
     parser.add_argument("--scenes", type=int, default=100)
     options = parser.parse_args(arguments)
     rows = synthetic_rows(options.scenes, options.seed)
@@ -147,7 +147,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = Table(capture="<20", worst_view_degrees=".3f", median=".3f")
     for name, (click, radius) in CAPTURES.items():
         if not (data_folder() / name).exists():
-            why_null["real_views_agree"] = f"{name} is not here; set EGS_WARP_DATA"
+            why_null["real_views_agree"] = f"{name} is not on this machine; set EGS_WARP_DATA"
             continue
         real.append(real_row(name, click, radius, options.device))
         table.row(name, real[-1]["worst_view_degrees"], real[-1]["median_view_degrees"])

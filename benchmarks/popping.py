@@ -1,12 +1,11 @@
-"""Does a split pop? Frame-to-frame difference after motion compensation, over an animation that bends and twists.
+"""Popping caused by splits: frame-to-frame difference after motion compensation, in an animation with bend and twist.
 
-Every frame is drawn together with how far each pixel moves to the next one; the next frame, moved back by that, is
-compared with this one. What is left is smooth over time unless something pops. Three clouds: unsplit; split once for
-the whole motion, as the engine does; and, as a control that must be caught, split in each frame by what that frame
-bends.
+Every frame is rendered together with the optical flow to the next frame; the next frame, warped back by it, is compared
+with this one. The residual is smooth over time unless something pops. Three clouds: unsplit; split once for the whole
+motion, as the engine does; and, as a control that has to be detected, split in each frame by that frame's bend.
 
-A frame pops where the difference exceeds 1.3 times that of the frames around it. Aims: ``no_popping`` (split for the
-motion, no frame pops), ``control_pops`` (the measure sees what it is meant to see).
+A frame pops if the difference exceeds 1.3 times that of the frames around it. Aims: ``no_popping`` (split for the
+motion, no frame pops), ``control_pops`` (the measure detects the control).
 """
 
 from __future__ import annotations
@@ -38,26 +37,26 @@ POP = 1.3
 
 def projected(camera: Camera, points: np.ndarray) -> np.ndarray:
     """(P, 2) pixels."""
-    seen = points @ camera.rotation.T + camera.translation
-    return seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    local = points @ camera.rotation.T + camera.translation
+    return local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 
 
 def flow_to(camera: Camera, now: GaussianCloud, after: GaussianCloud) -> np.ndarray:
-    """(H, W, 2) pixels from each pixel's place in ``now`` to its place in ``after``, blended as colour is."""
+    """(H, W, 2) pixels, optical flow from ``now`` to ``after``, blended like colour."""
     moved = projected(camera, after.means.numpy()) - projected(camera, now.means.numpy())
     reach = max(float(np.abs(moved).max()), 1e-6)
     colour = np.zeros((now.count, 1, 3))
-    # Colours lie between 0 and 1: half is no motion.
+    # Colours lie between 0 and 1: 0.5 encodes no motion.
     colour[:, 0, :2] = moved / (2.0 * reach) / SH_BAND_0
-    drawn = render_gaussians(
+    image = render_gaussians(
         replace(now, sh=wp.array(colour, dtype=wp.vec3, device=now.device)), camera, background=(0.0, 0.0, 0.0)
     )
-    alpha = np.maximum(drawn.alpha.numpy(), 1e-3)[..., None]
-    return np.where(alpha > 0.05, 2.0 * reach * (drawn.colour.numpy()[..., :2] / alpha - 0.5), 0.0)
+    alpha = np.maximum(image.alpha.numpy(), 1e-3)[..., None]
+    return np.where(alpha > 0.05, 2.0 * reach * (image.colour.numpy()[..., :2] / alpha - 0.5), 0.0)
 
 
 def differences(camera: Camera, clouds: list[GaussianCloud], flows: list[np.ndarray]) -> np.ndarray:
-    """(F - 1,) root mean square of each frame less the next one moved back by ``flows``."""
+    """(F - 1,) root mean square of each frame minus the next one warped back by ``flows``."""
     pictures = [render_gaussians(cloud, camera).colour.numpy() for cloud in clouds]
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(float)
     result = []
@@ -71,13 +70,13 @@ def differences(camera: Camera, clouds: list[GaussianCloud], flows: list[np.ndar
 
 
 def pops(values: np.ndarray) -> np.ndarray:
-    """Each value over the median of the six around it."""
+    """Return each value over the median of the six around it."""
     around = np.stack([np.roll(values, shift) for shift in (-3, -2, -1, 1, 2, 3)])[:, 3:-3]
     return values[3:-3] / np.median(around, axis=0)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
+    """Run the benchmark."""
     parser = flags(__doc__, quick="200 pixels and 40 frames", seed="not used: nothing here is random")
     parser.add_argument("--capture", type=Path, default=data_folder() / "objects" / "plush_dog.ply")
     options = parser.parse_args(arguments)
@@ -91,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     embedding = embed_gaussians(cloud, locator)
 
     def frame(time: float) -> np.ndarray:
-        """The captures' vertical axis is y: bent forward and twisted, up to 60 degrees each, and back."""
+        """Return the nodes bent forward and twisted, up to 60 degrees each, and back; the vertical axis is y."""
         amount = np.radians(60.0) * np.sin(np.pi * time) ** 2
         local = cage.nodes - middle
         height = local[:, 1] / extent
@@ -108,11 +107,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     unsplit = [Deformer(cloud, embedding).deform(nodes).cloud for nodes in frames]
     flows = [flow_to(camera, a, b) for a, b in zip(unsplit, unsplit[1:], strict=False)]
     split = split_for_motion(cloud, embedding, frames[:: max(1, count // 12)])
-    ahead = [Deformer(split.cloud, split.embedding).deform(nodes).cloud for nodes in frames]
+    split_ahead = [Deformer(split.cloud, split.embedding).deform(nodes).cloud for nodes in frames]
     each = []
     state = None
     for nodes in frames:
-        # Three frames pass between two splits, as a solver that looks now and then would do it.
+        # Split in every fourth frame, like a solver that checks now and then.
         if len(each) % 4 == 0:
             measured, where = (cloud, embedding) if state is None else (state.cloud, state.embedding)
             state = split_bent(
@@ -126,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         each.append(Deformer(state.cloud, state.embedding).deform(nodes).cloud)
     rows: list[Row] = []
     table = Table(cloud="<21", Gaussians="7d", at_the_end="7d", difference=".3e", worst_frame=".2f", that_pop="d")
-    for name, clouds in (("unsplit", unsplit), ("split for the motion", ahead), ("split in each frame", each)):
+    for name, clouds in (("unsplit", unsplit), ("split for the motion", split_ahead), ("split in each frame", each)):
         values = differences(camera, clouds, flows)
         ratios = pops(values)
         rows.append(

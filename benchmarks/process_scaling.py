@@ -1,14 +1,14 @@
-"""How many steps of a creature a second `simulate_many` makes, over the number of processes.
+"""Steps per second of `simulate_many`, over the number of processes.
 
 python benchmarks/process_scaling.py [--quick] [--workers N ...] [--nodes N ...] [--frames N] [--jobs N] [--device cpu]
     [--json PATH] [--plot PATH]
 
-Each of so many ``--workers`` does ``--jobs`` standing jumps of the pawn, each of another distance, of each the first
-``--frames``. The rate is that of the middle 70 % of all frames: all workers have begun by then, and none has run out of
-jobs; what they take to load is told apart. Each process has one thread, so a machine gives less to each where its cores
-share memory or clock.
+Each of the ``--workers`` processes simulates the first ``--frames`` frames of ``--jobs`` standing jumps of the pawn,
+each of another distance. The rate is that of the middle 70 % of all frames: by then all workers have started, and none
+is out of jobs; the time that they take to load is reported separately. Each process has one thread, so a machine gives
+less to each if its cores share memory or clock.
 
-It judges no aim: worlds side by side on a GPU are ``many_worlds.py``'s.
+It has no aim; parallel worlds on a GPU are measured by ``many_worlds.py``.
 """
 
 from __future__ import annotations
@@ -30,41 +30,43 @@ from harness import Row, Table, flags, record, report
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ASKED = (175, 500)
-"""--nodes that give the pawn cages of about 250 and 541."""
+REQUESTED_NODES = (175, 500)
+"""``--nodes`` that give the pawn cages of about 250 and 541 nodes."""
 FIRST, LAST = 0.15, 0.85
-"""Of all frames, between which the rate is taken."""
+"""Fractions of all frames between which the rate is measured."""
 
 
 def measure(creature: Creature, workers: int, *, jobs: int, frames: int) -> Row:
-    """The rate of so many ``workers``, each with so many ``jobs``."""
-    asked = [Job(motion(f"jump {distance:.3f}"), frames=frames) for distance in np.linspace(0.2, 0.8, jobs * workers)]
-    seen: list[tuple[float, int]] = [(0.0, 0)]
-    begun = time.perf_counter()
+    """Measure the rate of ``workers`` processes with ``jobs`` jobs each."""
+    job_list = [
+        Job(motion(f"jump {distance:.3f}"), frames=frames) for distance in np.linspace(0.2, 0.8, jobs * workers)
+    ]
+    samples: list[tuple[float, int]] = [(0.0, 0)]
+    started = time.perf_counter()
 
-    def told(done: int, _: int) -> None:
-        seen.append((time.perf_counter() - begun, done))
+    def note_progress(done: int, _: int) -> None:
+        samples.append((time.perf_counter() - started, done))
 
-    outcomes = simulate_many(creature, asked, workers=workers, progress=told)
-    whole = time.perf_counter() - begun
+    outcomes = simulate_many(creature, job_list, workers=workers, progress=note_progress)
+    whole = time.perf_counter() - started
     if wrong := next((one.error for one in outcomes if one.error is not None), None):
         raise RuntimeError(wrong)
     steps = sum(len(one.trajectory.dt) for one in outcomes)
-    (first, early), (last, late) = window(seen)
+    (first, early), (last, late) = window(samples)
     return {
         "nodes": len(creature.body.mesh.nodes),
         "workers": workers,
-        "jobs": len(asked),
+        "jobs": len(job_list),
         "steps": steps,
-        "rate": steps * (late - early) / seen[-1][1] / (last - first),
-        "loading": seen[1][0],
+        "rate": steps * (late - early) / samples[-1][1] / (last - first),
+        "loading": samples[1][0],
         "seconds": whole,
     }
 
 
-def window(seen: Sequence[tuple[float, int]]) -> tuple[tuple[float, int], tuple[float, int]]:
-    """The first and the last of ``seen``, seconds and frames done, between ``FIRST`` and ``LAST`` of all frames."""
-    inside = [one for one in seen if FIRST * seen[-1][1] <= one[1] <= LAST * seen[-1][1]]
+def window(samples: Sequence[tuple[float, int]]) -> tuple[tuple[float, int], tuple[float, int]]:
+    """Return the first and last of ``samples`` (seconds, frames done) between ``FIRST`` and ``LAST`` of all frames."""
+    inside = [one for one in samples if FIRST * samples[-1][1] <= one[1] <= LAST * samples[-1][1]]
     return inside[0], inside[-1]
 
 
@@ -73,19 +75,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = flags(__doc__, quick="250 nodes, 12 frames, 2 jobs", device="cpu", seed="of the pawn's Gaussians")
     cores = available_threads()
     powers = [2**power for power in range(cores.bit_length()) if 2**power < cores]
-    parser.add_argument("--workers", type=int, nargs="*", default=[*powers, cores], help="processes, of each row")
-    parser.add_argument("--nodes", type=int, nargs="*", default=list(ASKED), help="asked for, of each cage")
-    parser.add_argument("--frames", type=int, default=60, help="of each jump (60)")
-    parser.add_argument("--jobs", type=int, default=3, help="of each worker (3)")
+    parser.add_argument(
+        "--workers", type=int, nargs="*", default=[*powers, cores], help="numbers of processes, one for each row"
+    )
+    parser.add_argument(
+        "--nodes", type=int, nargs="*", default=list(REQUESTED_NODES), help="requested number of nodes of each cage"
+    )
+    parser.add_argument("--frames", type=int, default=60, help="frames of each jump (default 60)")
+    parser.add_argument("--jobs", type=int, default=3, help="jobs of each worker (default 3)")
     options = parser.parse_args(arguments)
     if options.quick:
         options.nodes, options.frames, options.jobs = options.nodes[:1], 12, 2
     rows: list[Row] = []
     table = Table(nodes="d", workers="d", steps="d", steps_a_second=".1f", of_first=".2f", loading=".1f", seconds=".0f")
-    made = pawn(seed=options.seed, device=options.device)
+    scene = pawn(seed=options.seed, device=options.device)
     for nodes in options.nodes:
-        creature = make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=nodes))
-        # Kernels compile once, here, not in every worker.
+        creature = make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=nodes))
+        # Compile the kernels once here, not in every worker.
         Job(motion("jump"), frames=3).run(creature)
         first = len(rows)
         for workers in options.workers:
@@ -98,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Steps a second over processes, by nodes."""
+    """Draw steps per second over processes, by nodes."""
     axes = figure.subplots()
     for nodes in dict.fromkeys(row["nodes"] for row in rows):
         chosen = [row for row in rows if row["nodes"] == nodes]

@@ -1,10 +1,10 @@
-"""How hard can a standing body be pushed? The largest push, and gust of one second, under which it keeps its feet.
+"""Largest push, and largest gust of one second, that a standing body withstands.
 
 python benchmarks/pushes.py [--quick] [--nodes N] [--bodies NAME ...] [--pushes LINE ...] [--json PATH]
 
-A body keeps its feet where it has not fallen, no sole was ever 0.05 body heights from where it stood, and it ends calm
-and within 5 degrees of upright. Sizes are multiples of 0.05 m sqrt(g H), the whole impulse of a gust, too, up to
-3.15, found by halving: one that is kept is taken to say that smaller ones are.
+A body withstands a push if it does not fall, no sole is ever 0.05 body heights from its initial place, and it ends at
+rest within 5 degrees of upright. Sizes are multiples of 0.05 m sqrt(g H), for a gust the whole impulse, up to 3.15.
+They are found by bisection, which assumes that a body that withstands a push also withstands smaller ones.
 """
 
 from __future__ import annotations
@@ -24,61 +24,65 @@ from harness import Row, Table, flags, record, report, timed
 from sweep import bounds_broken
 
 KINDS = ("0.3 {} ahead", "0.3 {} left", "0.3 {} left 0.8", "0.3-1.3 {} left")
-STEP, MOST = 0.05, 63
-"""m sqrt(g H), and how many of it are tried at most."""
+STEP, MAX_STEPS = 0.05, 63
+"""Step of the sizes, m sqrt(g H), and largest number of steps that is tried."""
 STAND = "stand 2"
-SHIFT, TILT = 0.05, 5.0
-"""Body heights, degrees."""
+MAX_SHIFT, MAX_TILT = 0.05, 5.0
+"""Maximum displacement of a sole, body heights, and maximum tilt, degrees."""
 
 
 def stood(creature: Creature, line: str) -> Row:
-    """One push, and how the body stood it."""
+    """Simulate one push and judge the result."""
     performance = simulate(creature, motion(STAND), pushes=read_pushes(line), get_up=False)
     trajectory = performance.trajectory
-    books = energy_balance(trajectory)
+    balance = energy_balance(trajectory)
     (done,) = performance.sequence.done
     reached = done.motion.outcome_record(trajectory, 0, len(trajectory.dt))
     assert isinstance(reached, StandOutcome)
     tilt = measure(trajectory).tilt_degrees
-    kept = performance.fallen is None and done.motion.is_at_rest and reached.sole_shift < SHIFT and tilt < TILT
+    is_withstood = (
+        performance.fallen is None and done.motion.is_at_rest and reached.sole_shift < MAX_SHIFT and tilt < MAX_TILT
+    )
     unconverged = sum(not one.converged for one in performance.simulation.reports)
     return {
         "push": line,
-        "kept": kept,
+        "withstood": is_withstood,
         "fallen": performance.fallen,
         "resting": done.motion.is_at_rest,
         "sole_shift": reached.sole_shift,
         "lean": reached.lean,
         "tilt_degrees": tilt,
-        "work": float(books.pushes.sum() / books.energy_unit),
-        "muscle_work": float(books.muscle_work.sum() / books.energy_unit),
-        "energy_residual": books.max_residual,
-        "broken": bounds_broken(vars(audit(trajectory, energy=books, newton_unconverged=unconverged))),
+        "work": float(balance.pushes.sum() / balance.energy_unit),
+        "muscle_work": float(balance.muscle_work.sum() / balance.energy_unit),
+        "energy_residual": balance.max_residual,
+        "broken": bounds_broken(vars(audit(trajectory, energy=balance, newton_unconverged=unconverged))),
     }
 
 
 def largest(creature: Creature, kind: str) -> tuple[float, list[Row]]:
-    """The largest size of pushes of a ``kind`` that is kept, and all that were tried."""
-    low, high, tried = 0, MOST + 1, []
+    """Return the largest size of pushes of a ``kind`` that is withstood, and all rows that were tried."""
+    low, high, tried = 0, MAX_STEPS + 1, []
     while high - low > 1:
         middle = (low + high) // 2
         tried.append(stood(creature, kind.format(f"{middle * STEP:.2f}")))
-        low, high = (middle, high) if tried[-1]["kept"] else (low, middle)
+        low, high = (middle, high) if tried[-1]["withstood"] else (low, middle)
     return low * STEP, tried
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
+    """Run the benchmark."""
     parser = flags(__doc__, quick="the pawn, pushed ahead alone", device="cpu", seed="not used: nothing is random")
-    parser.add_argument("--nodes", type=int, default=400, help="of the cage, about (400)")
-    parser.add_argument("--bodies", nargs="*", default=["pawn", "stool"], help="built-in scenes (pawn stool)")
-    parser.add_argument("--pushes", nargs="*", default=KINDS, help=f"with {{}} for the size ({', '.join(KINDS)})")
+    parser.add_argument("--nodes", type=int, default=400, help="approximate number of nodes of the cage (default 400)")
+    parser.add_argument("--bodies", nargs="*", default=["pawn", "stool"], help="built-in scenes (default pawn stool)")
+    parser.add_argument(
+        "--pushes", nargs="*", default=KINDS, help=f"lines with {{}} for the size (default {', '.join(KINDS)})"
+    )
     options = parser.parse_args(arguments)
     table = Table(body="<8", push="<18", largest=".2f", runs="d", seconds=".0f", residual=".0e")
     rows: list[Row] = []
     for name in options.bodies[:1] if options.quick else options.bodies:
-        made = scene(name, device=options.device)
-        creature = make_creature(made.object, plane=made.plane, options=CreatureOptions(nodes=options.nodes))
+        built = scene(name, device=options.device)
+        creature = make_creature(built.object, plane=built.plane, options=CreatureOptions(nodes=options.nodes))
         for kind in options.pushes[:1] if options.quick else options.pushes:
             (size, tried), milliseconds = timed(largest, creature, kind)
             rows.append({"body": name, "kind": kind, "largest": size, "tried": tried})
@@ -89,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def aims(rows: Sequence[Row]) -> dict[str, bool]:
-    """Whether every run passed the audit, and every body bears a push of 0.1 m sqrt(g H)."""
+    """Return the aims: every run passed the audit, and every body withstands a push of 0.1 m sqrt(g H)."""
     return {
         "audit": all(run["broken"] is None for row in rows for run in row["tried"]),
         "bear_0.1": all(row["largest"] >= 0.1 for row in rows),

@@ -1,19 +1,21 @@
-"""OSQP's iterations as kernels, against OSQP itself, on recorded programs of motions.
+"""OSQP's iterations as kernels, compared with OSQP itself on recorded programs of motions.
 
 python benchmarks/qp_kernels.py [--quick] [--device cuda:0] [--programs 1000] [--json PATH] [--plot PATH]
 
-Built-in bodies with cages of about 250 nodes jump and walk (a snake crawls) on the CPU, solved by OSQP there; each QP
-of their steps is recorded with its bounds, its start and whether it was one beside another. Then both solve all of
-them: ``full`` by iterations alone, to 1e-12, at most 20,000; ``few`` as the first program of a step, 50 iterations on
-the rows that matter; ``whole`` as the engine does (few iterations and the active set, or that alone). Milliseconds are
-medians of a program, of OSQP with its set-up, of the kernels for one program (``alone``, every tenth), and a share of
-all programs at once (``together``), both with the copies to and from the device.
+Built-in bodies with cages of about 250 nodes jump and walk (a snake crawls) on the CPU, with OSQP as the solver. Each
+QP of their steps is recorded with its bounds, its start and whether it is a trial next to another one (``beside``).
+Then both solvers solve all of them: ``full`` by iterations alone, to 1e-12, at most 20,000; ``few`` like the first
+program of a step, 50 iterations on the rows that matter; ``whole`` as the engine does (few iterations and the active
+set, or that alone). Milliseconds are medians per program: of OSQP with its set-up, of the kernels for one program
+(``alone``, every tenth), and the share of one program when all are solved at once (``together``), both with the copies
+to and from the device.
 
-|x - x'| is relative to the largest |x|. Where P is flat (its least eigenvalue below 1e-6 of the largest: optima that
-need not obey contact) x is not unique: objective and A x, relative to their own size, are compared instead.
+|x - x'| is relative to the largest |x|. If P is nearly singular (``flat``: smallest eigenvalue below 1e-6 of the
+largest; optima that need not satisfy the contact laws) x is not unique: objective and A x are compared instead,
+relative to their own size.
 
-Aims: ``cpu_equal`` and ``gpu_equal``, for the device that is given: every program ends as OSQP ends on it, and |x - x'|
-(or what stands for it) is at most 1e-6 wherever both solve it; ``thousand``: there were 1,000 programs.
+Aims: ``cpu_equal`` and ``gpu_equal``, for the device of this run: every program ends with OSQP's status, and |x - x'|
+(or its substitute) is at most 1e-6 wherever both solve it; ``thousand``: there were 1,000 programs.
 """
 
 from __future__ import annotations
@@ -45,13 +47,13 @@ MOTIONS = (
     *((snake, 250, "walk"), (pawn, 175, "jump"), (figurine, 150, "jump")),
     *((pawn, 175, "walk"), (figurine, 150, "walk")),
 )
-"""Bodies, --nodes that give them cages of about 250, and what they do."""
-FULL, MOST = 1e-12, 20000
-"""Accuracy and iterations of ``full``."""
-FEW, ROUGH = 50, 3e-5
-"""Iterations and accuracy of ``few``: those of the engine."""
-FLAT = 1e-6
-EQUAL = 1e-6
+"""Bodies, ``--nodes`` that give them cages of about 250 nodes, and motions."""
+FULL_ACCURACY, MAX_ITERATIONS = 1e-12, 20000
+"""Accuracy and maximum number of iterations of ``full``."""
+FEW_ITERATIONS, FEW_ACCURACY = 50, 3e-5
+"""Number of iterations and accuracy of ``few``, the engine's own."""
+FLAT_RATIO = 1e-6
+MAX_DIFFERENCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -62,29 +64,29 @@ class Recorded:
     program: DenseQp
     lower: np.ndarray
     upper: np.ndarray
-    """(m,)."""
+    """(m,) bounds."""
     start: np.ndarray | None
-    """(n,)."""
+    """(n,) start of the iterations; None for a cold start."""
     beside: bool
 
     @property
     def flat(self) -> bool:
-        """Whether its optimum is not one point."""
-        least, *_, largest = np.linalg.eigvalsh(self.program.P)
-        return bool(least < FLAT * largest)
+        """True if its optimum is not unique."""
+        smallest, *_, largest = np.linalg.eigvalsh(self.program.P)
+        return bool(smallest < FLAT_RATIO * largest)
 
 
 class _EnoughError(Exception):
-    """As many are recorded as were wanted."""
+    """Stops the recorded motion when enough programs are recorded."""
 
 
 @contextmanager
-def recording(name: str, most: int) -> Iterator[list[Recorded]]:
-    """While it lasts, the QPs of steps by pieces are kept in the list; it is left when there are ``most``."""
-    made: list[Recorded] = []
+def recording(name: str, limit: int) -> Iterator[list[Recorded]]:
+    """Record the QPs of the mode search in the yielded list, and stop the enclosed motion after ``limit`` of them."""
+    records: list[Recorded] = []
 
     class Recorder:
-        """A ``QuadraticProgram`` that is told of."""
+        """A ``QuadraticProgram`` that records its inputs."""
 
         def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, **options: Any) -> None:
             self._program, self._solver = DenseQp(P, q, A), quadratic_program(P, q, A, **options)
@@ -92,29 +94,29 @@ def recording(name: str, most: int) -> Iterator[list[Recorded]]:
         def solve(
             self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, beside: bool = False
         ) -> QpSolution:
-            """See ``QuadraticProgram``."""
-            if len(made) == most:
+            """Record the program and solve it; see ``QuadraticProgram.solve`` for the arguments."""
+            if len(records) == limit:
                 raise _EnoughError
-            kept = None if start is None else start.copy()
-            made.append(Recorded(name, self._program, lower.copy(), upper.copy(), kept, beside))
+            start_copy = None if start is None else start.copy()
+            records.append(Recorded(name, self._program, lower.copy(), upper.copy(), start_copy, beside))
             return self._solver.solve(lower, upper, start, skip_splitting=beside)
 
     with patch.object(contact_modes, "quadratic_program", Recorder), suppress(_EnoughError):
-        yield made
+        yield records
 
 
-def recorded(body: Callable[..., Any], nodes: int, text: str, *, most: int, seed: int) -> list[Recorded]:
-    """The first ``most`` QPs of a motion, or all of them."""
-    made = body(seed=seed, device="cpu")
+def recorded(body: Callable[..., Any], nodes: int, text: str, *, limit: int, seed: int) -> list[Recorded]:
+    """Record the first ``limit`` QPs of a motion, or all of them if there are fewer."""
+    scene = body(seed=seed, device="cpu")
     settings = LocomotionSettings(qp_solver=QpSolver.OSQP)
-    creature = make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=nodes, settings=settings))
-    with recording(f"{body.__name__} {text}", most) as programs:
+    creature = make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=nodes, settings=settings))
+    with recording(f"{body.__name__} {text}", limit) as programs:
         simulate(creature, motion(text))
     return programs
 
 
-def missed(one: Recorded, x: np.ndarray, other: np.ndarray) -> float:
-    """By how much two solutions differ: in x, or where that is not unique in objective and A x; relative."""
+def relative_difference(one: Recorded, x: np.ndarray, other: np.ndarray) -> float:
+    """Return the relative difference of two solutions: of x, or of objective and A x if x is not unique."""
     if not one.flat:
         return _apart(x, other)
     values = [np.array([0.5 * at @ one.program.P @ at + one.program.q @ at]) for at in (x, other)]
@@ -126,8 +128,7 @@ def _apart(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def on_rows_that_matter(one: Recorded) -> Recorded:
-    """The program that its step's first iterations see: rows that the minimum without bounds breaks; all if it breaks
-    none."""
+    """Return the program with only the rows that the unconstrained minimum violates, or with all if there are none."""
     free = WhitenedQp.of(one.program.P, one.program.q, one.program.A).values_at_minimum
     broken = (free < one.lower) | (free > one.upper)
     index = np.flatnonzero(broken) if broken.any() else np.arange(len(free))
@@ -136,13 +137,15 @@ def on_rows_that_matter(one: Recorded) -> Recorded:
 
 
 def iterated(
-    programs: Sequence[Recorded], splitting_of: Callable[[DenseQp], OperatorSplitting], most: int
+    programs: Sequence[Recorded], splitting_of: Callable[[DenseQp], OperatorSplitting], limit: int
 ) -> tuple[list[AdmmResult], float]:
-    """Where each ends, one after another, and the median of their milliseconds with their set-up."""
+    """Solve the programs one after another; return the results and the median of the milliseconds with set-up."""
     ends, times = [], []
     for one in programs:
         end, milliseconds = timed(
-            lambda one=one: splitting_of(one.program).full_run(one.program.A, most).run(one.lower, one.upper, one.start)
+            lambda one=one: (
+                splitting_of(one.program).full_run(one.program.A, limit).run(one.lower, one.upper, one.start)
+            )
         )
         ends.append(end)
         times.append(milliseconds)
@@ -150,9 +153,9 @@ def iterated(
 
 
 def together(
-    programs: Sequence[Recorded], device: str, *, accuracy: float, most: int
+    programs: Sequence[Recorded], device: str, *, accuracy: float, limit: int
 ) -> tuple[list[AdmmResult], float]:
-    """Where each ends, all at once, and the milliseconds of one's share."""
+    """Solve all programs at once; return the results and the milliseconds per program."""
 
     def solve() -> list[AdmmResult]:
         return AdmmPrograms([one.program for one in programs], device=device).solve(
@@ -160,7 +163,7 @@ def together(
             [one.upper for one in programs],
             [one.start for one in programs],
             accuracy=accuracy,
-            iterations=most,
+            iterations=limit,
         )
 
     ends, milliseconds = timed(solve)
@@ -168,9 +171,9 @@ def together(
 
 
 def compared(
-    programs: Sequence[Recorded], device: str, *, accuracy: float, most: int
+    programs: Sequence[Recorded], device: str, *, accuracy: float, limit: int
 ) -> tuple[Row, list[AdmmResult], list[AdmmResult]]:
-    """Milliseconds of both, and where all have ended, OSQP's first."""
+    """Run both solvers; return their milliseconds, OSQP's results and the kernels' results."""
 
     def osqp(program: DenseQp) -> OperatorSplitting:
         return OsqpSplitting(program.P, program.q, accuracy=accuracy)
@@ -178,33 +181,39 @@ def compared(
     def kernels(program: DenseQp) -> OperatorSplitting:
         return AdmmSplitting(program.P, program.q, accuracy=accuracy, device=device)
 
-    asked, osqp_ms = iterated(programs, osqp, most)
+    osqp_results, osqp_ms = iterated(programs, osqp, limit)
     iterated(programs[:1], kernels, 1)  # compiles
-    _, alone_ms = iterated(programs[:: max(1, len(programs) // 100)], kernels, most)
-    made, together_ms = together(programs, device, accuracy=accuracy, most=most)
+    _, alone_ms = iterated(programs[:: max(1, len(programs) // 100)], kernels, limit)
+    kernel_results, together_ms = together(programs, device, accuracy=accuracy, limit=limit)
     row = {
         "osqp_ms": osqp_ms,
         "alone_ms": alone_ms,
         "together_ms": together_ms,
-        "osqp_iterations": float(np.mean([end.iterations for end in asked])),
-        "iterations": float(np.mean([end.iterations for end in made])),
-        "as_many": sum(one.iterations == other.iterations for one, other in zip(asked, made, strict=True)),
+        "osqp_iterations": float(np.mean([end.iterations for end in osqp_results])),
+        "iterations": float(np.mean([end.iterations for end in kernel_results])),
+        "same_iterations": sum(
+            one.iterations == other.iterations for one, other in zip(osqp_results, kernel_results, strict=True)
+        ),
     }
-    return row, asked, made
+    return row, osqp_results, kernel_results
 
 
 def full(programs: Sequence[Recorded], device: str) -> list[Row]:
-    """A row for each motion and one for all: how often both end alike, and how far their solutions are apart."""
-    times, asked, made = compared(programs, device, accuracy=FULL, most=MOST)
+    """Return a row for each motion and one for all: how often both end alike, and the distance of their solutions."""
+    times, osqp_results, kernel_results = compared(programs, device, accuracy=FULL_ACCURACY, limit=MAX_ITERATIONS)
     differences = [
-        missed(one, b.x, a.x) if a.status is b.status is AdmmStatus.SOLVED else None
-        for one, a, b in zip(programs, asked, made, strict=True)
+        relative_difference(one, b.x, a.x) if a.status is b.status is AdmmStatus.SOLVED else None
+        for one, a, b in zip(programs, osqp_results, kernel_results, strict=True)
     ]
     rows = []
     for name in ["all", *dict.fromkeys(one.motion for one in programs)]:
         of = [i for i, one in enumerate(programs) if name in ("all", one.motion)]
         apart = [value for i in of if (value := differences[i]) is not None]
-        unlike = [f"{i}: {asked[i].status.name} {made[i].status.name}" for i in of if asked[i].status != made[i].status]
+        unlike = [
+            f"{i}: {osqp_results[i].status.name} {kernel_results[i].status.name}"
+            for i in of
+            if osqp_results[i].status != kernel_results[i].status
+        ]
         rows.append(
             {
                 **{"kind": "full", "motion": name, "programs": len(of), "solved": len(apart)},
@@ -217,11 +226,11 @@ def full(programs: Sequence[Recorded], device: str) -> list[Row]:
 
 
 def few(programs: Sequence[Recorded], device: str) -> Row:
-    """What the first programs of steps take of the iterations."""
+    """Return the row of the first programs of steps under few iterations."""
     first = [on_rows_that_matter(one) for one in programs if not one.beside]
-    times, asked, made = compared(first, device, accuracy=ROUGH, most=FEW)
-    ends = list(enumerate(zip(asked, made, strict=True)))
-    # What a certificate has ended is no point.
+    times, osqp_results, kernel_results = compared(first, device, accuracy=FEW_ACCURACY, limit=FEW_ITERATIONS)
+    ends = list(enumerate(zip(osqp_results, kernel_results, strict=True)))
+    # After a certificate of infeasibility x is not a solution.
     points = (AdmmStatus.SOLVED, AdmmStatus.INEXACT, AdmmStatus.LIMIT)
     apart = [_apart(b.x, a.x) for _, (a, b) in ends if a.status in points and b.status in points]
     return {
@@ -232,29 +241,33 @@ def few(programs: Sequence[Recorded], device: str) -> Row:
 
 
 def whole(programs: Sequence[Recorded], device: str) -> Row:
-    """Each program as the engine solves it."""
+    """Return the row of all programs, solved as the engine solves them."""
 
     def solved(solver: QpSolver) -> tuple[list[QpSolution], float]:
         ends, times = [], []
         for one in programs:
 
             def solve(one: Recorded = one) -> QpSolution:
-                made: QuadraticProgram = quadratic_program(
+                program: QuadraticProgram = quadratic_program(
                     one.program.P, one.program.q, one.program.A, solver=solver, device=device
                 )
-                return made.solve(one.lower, one.upper, one.start, skip_splitting=one.beside)
+                return program.solve(one.lower, one.upper, one.start, skip_splitting=one.beside)
 
             end, milliseconds = timed(solve)
             ends.append(end)
             times.append(milliseconds)
         return ends, float(np.median(times))
 
-    asked, osqp_ms = solved(QpSolver.OSQP)
-    made, alone_ms = solved(QpSolver.ADMM)
-    apart = [missed(one, b.x, a.x) for one, a, b in zip(programs, asked, made, strict=True) if a.usable and b.usable]
+    osqp_results, osqp_ms = solved(QpSolver.OSQP)
+    kernel_results, alone_ms = solved(QpSolver.ADMM)
+    apart = [
+        relative_difference(one, b.x, a.x)
+        for one, a, b in zip(programs, osqp_results, kernel_results, strict=True)
+        if a.usable and b.usable
+    ]
     unlike = [
         f"{i}: {a.status.name} {b.status.name}"
-        for i, (a, b) in enumerate(zip(asked, made, strict=True))
+        for i, (a, b) in enumerate(zip(osqp_results, kernel_results, strict=True))
         if a.status is not b.status
     ]
     return {
@@ -264,25 +277,25 @@ def whole(programs: Sequence[Recorded], device: str) -> Row:
 
 
 def aims(rows: Sequence[Row], device: str) -> tuple[dict[str, bool | None], dict[str, str]]:
-    """What the rows of ``full`` say, and why what they say nothing about is null."""
+    """Return the aims from the row of ``full``, and the reasons of null ones."""
     everything = next(row for row in rows if row["kind"] == "full" and row["motion"] == "all")
-    equal = not everything["unlike"] and everything["worst"] <= EQUAL
-    here, there = ("cpu_equal", "gpu_equal") if device == "cpu" else ("gpu_equal", "cpu_equal")
-    found: dict[str, bool | None] = {here: equal, there: None, "thousand": everything["programs"] >= 1000}
-    return found, {there: f"the kernels ran on {device}"}
+    equal = not everything["unlike"] and everything["worst"] <= MAX_DIFFERENCE
+    measured, other = ("cpu_equal", "gpu_equal") if device == "cpu" else ("gpu_equal", "cpu_equal")
+    values: dict[str, bool | None] = {measured: equal, other: None, "thousand": everything["programs"] >= 1000}
+    return values, {other: f"the kernels ran on {device}"}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
     parser = flags(__doc__, quick="96 programs in place of 1,000")
-    parser.add_argument("--programs", type=int, help="to record (1,000)")
+    parser.add_argument("--programs", type=int, help="number of programs to record (default 1,000)")
     options = parser.parse_args(arguments)
     count = options.programs or (96 if options.quick else 1000)
     programs: list[Recorded] = []
     for i, (body, nodes, text) in enumerate(MOTIONS):
-        # What one motion has too few of, the next ones make up for.
+        # If one motion has too few programs, the next ones make up for it.
         share = -(-(count - len(programs)) // (len(MOTIONS) - i))
-        programs += recorded(body, nodes, text, most=share, seed=options.seed)
+        programs += recorded(body, nodes, text, limit=share, seed=options.seed)
         print(f"{body.__name__} {text}: {len(programs)} programs by now", flush=True)
     rows = [*full(programs, options.device), few(programs, options.device), whole(programs, options.device)]
     table = Table(
@@ -293,11 +306,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for row in rows:
         times = [row.get(name) for name in ("osqp_ms", "alone_ms", "together_ms", "osqp_iterations", "iterations")]
         table.row(row["kind"], row["motion"], row["programs"], len(row["unlike"]), row["worst"], *times)
-    found, why = aims(rows, options.device)
+    values, why = aims(rows, options.device)
     report(
         options,
         rows,
-        aims=found,
+        aims=values,
         why_null=why,
         packages=["osqp"],
         conditions={
@@ -309,7 +322,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Milliseconds of a program, by kind."""
+    """Draw milliseconds per program, by kind."""
     axes = figure.subplots()
     kinds = [row for row in rows if "osqp_ms" in row]
     for offset, name, label in (

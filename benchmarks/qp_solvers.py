@@ -1,13 +1,12 @@
-"""OSQP, its iterations as kernels and DAQP on the engine's quadratic programs, over the number of contacts.
+"""OSQP, its iterations as kernels, and DAQP on the engine's quadratic programs, over the number of contacts.
 
 python benchmarks/qp_solvers.py [--quick] [--device cpu] [--seed 0] [--body pawn] [--json PATH] [--plot PATH]
 
 The programs are steps of an animation (Eq. 13) with 40 muscle groups, 4 friction directions and 1 to 32 contacts.
-``first`` is set-up and solve of the program with complementarity, ``again`` a re-solve for other contact states by a
-change of bounds alone, ``search`` the engine's whole search of a step, by pieces over the activations alone. All
-solvers get the same programs in turn. ``breach`` is the worst violation of a
-bound (forces in body weights, speeds in sqrt(g H)); ``objective`` is relative to DAQP's. No aim is named for this
-benchmark.
+``first`` is set-up and solve of the program with complementarity, ``again`` a re-solve for other contact states with
+changed bounds only, ``search`` the engine's whole search of a step over contact modes, with activations as the only
+unknowns. All solvers get the same programs in turn. ``breach`` is the largest violation of a bound (forces in body
+weights, velocities in sqrt(g H)); ``objective`` is relative to DAQP's. This benchmark has no aim.
 """
 
 from __future__ import annotations
@@ -35,9 +34,9 @@ QP_LIMIT = LocomotionSettings.qp_limit
 
 
 def frame_figures(frame: Frame, solver: QpSolver, device: str) -> Row:
-    """Figures of one program; ``device`` is that of kernels."""
-    program = ContactProgram.of(frame.pieces, DIRECTIONS)
-    y = contact_response(program, frame.foreseen.activations)
+    """Return the figures of one program; the kernels run on ``device``."""
+    program = ContactProgram.of(frame.program, DIRECTIONS)
+    y = contact_response(program, frame.predicted.activations)
     separate = np.full(program.layout.contacts, SEPARATE)
     states = separate if y is None else states_of_pairs(program.layout, *program.pairs(y))
     other = contact_response(program, frame.known)
@@ -48,19 +47,19 @@ def frame_figures(frame: Frame, solver: QpSolver, device: str) -> Row:
         return qp, qp.solve(*program.bounds(states))
 
     (qp, solution), first_time = timed(first)
-    again, again_time = timed(qp.solve, *program.bounds(changed))
-    found, search_time = timed(
+    resolved, again_time = timed(qp.solve, *program.bounds(changed))
+    searched, search_time = timed(
         search_program,
-        frame.pieces,
+        frame.program,
         Strategy.MODES,
-        frame.foreseen,
+        frame.predicted,
         directions=DIRECTIONS,
         qp_limit=QP_LIMIT,
         solver=solver,
         device=device,
     )
     breach = 0.0
-    for result, chosen in ((solution, states), (again, changed)):
+    for result, chosen in ((solution, states), (resolved, changed)):
         if result.usable:
             lower, upper = program.bounds(chosen)
             rows = program.A @ result.x
@@ -70,9 +69,9 @@ def frame_figures(frame: Frame, solver: QpSolver, device: str) -> Row:
         "again": again_time,
         "search": search_time,
         "breach": breach,
-        "lost": int(not solution.usable) + int(not again.usable),
-        "objective": found.objective,
-        "qps": found.qp_count,
+        "failed": int(not solution.usable) + int(not resolved.usable),
+        "objective": searched.objective,
+        "qps": searched.qp_count,
     }
 
 
@@ -94,10 +93,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         QPs="5.2f",
         breach=".1e",
         objective=".4f",
-        lost="d",
+        failed="d",
     )
     for contacts in CONTACTS:
-        made = animation_frames(
+        frames_of_body = animation_frames(
             bench,
             frames=frames + 4,
             activations=GROUPS,
@@ -106,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             seed=options.seed,
         )[4:]
         figures: dict[QpSolver, list[Row]] = {solver: [] for solver in QpSolver}
-        for frame in made:
+        for frame in frames_of_body:
             for solver in QpSolver:
                 figures[solver].append(frame_figures(frame, solver, options.device))
         reference = np.array([row["objective"] for row in figures[QpSolver.DAQP]])
@@ -114,13 +113,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
             column = {name: np.array([row[name] for row in measured]) for name in measured[0]}
             row = {
                 "contacts": contacts,
-                "variables": ContactProgram.of(made[0].pieces, DIRECTIONS).layout.variables,
+                "variables": ContactProgram.of(frames_of_body[0].program, DIRECTIONS).layout.variables,
                 "solver": solver.value,
                 **{name: float(np.median(column[name])) for name in ("first", "again", "search")},
                 "qps": float(column["qps"].mean()),
                 "breach": float(column["breach"].max()),
                 "objective": float(np.median((column["objective"] + 1e-12) / (reference + 1e-12))),
-                "lost": int(column["lost"].sum()),
+                "failed": int(column["failed"].sum()),
             }
             rows.append(row)
             table.row(*row.values())
@@ -136,7 +135,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Milliseconds, and the worst violation of a bound, over the number of contacts."""
+    """Draw milliseconds, and the largest violation of a bound, over the number of contacts."""
     left, right = figure.subplots(1, 2)
     for solver, colour in zip(QpSolver, ("tab:orange", "tab:green", "tab:blue"), strict=True):
         own = [row for row in rows if row["solver"] == solver.value]

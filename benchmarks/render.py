@@ -1,13 +1,12 @@
-"""Speed and likeness of the renderer: against gsplat and gswarp on a GPU, against a PyTorch twin on a CPU.
+"""Speed and image difference of the renderer: against gsplat and gswarp on a GPU, against a PyTorch twin on a CPU.
 
 Aims: ``cuda_beats_gswarp`` (faster in every cell), ``cuda_within_1_3_of_gsplat`` (geometric mean of all cells),
 ``ahead_of_gsplat_every_cell`` (packed or not, whichever is faster), ``same_picture`` (mean difference below 1e-5, and
-below 1e-3 off the alpha-cut boundaries), ``same_in_every_mode`` (likewise antialiased, the depth over its mean, tiles
-left out, three cameras with a background each), ``cpu_vs_twin`` (20 times a tile-batched PyTorch rasteriser with the
-same culling),
-``cpu_two_threads`` (1.7 times one thread).
+below 1e-3 away from the alpha-cut boundaries), ``same_in_every_mode`` (likewise antialiased, mean depth, masked tiles,
+three cameras with a background each), ``cpu_vs_twin`` (20 times as fast as a tile-batched PyTorch rasteriser with the
+same culling), ``cpu_two_threads`` (1.7 times as fast as one thread).
 
-No peer that claims a CPU runs on one: ``render_peers.cpu_peers`` tries and says why.
+No other renderer that claims CPU support runs on a CPU: ``render_peers.cpu_baselines`` tries them and records why.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CELLS = ((1, 648, 420), (1, 1944, 1260), (5, 648, 420), (5, 1944, 1260), (11, 648, 420))
-PEERS: dict[str, Callable[[], peers.Renderer]] = {
+BASELINES: dict[str, Callable[[], peers.Renderer]] = {
     "gsplat": lambda: peers.gsplat_renderer(packed=True),
     "gsplat_unpacked": lambda: peers.gsplat_renderer(packed=False),
     "gswarp": peers.gswarp_renderer,
@@ -48,15 +47,15 @@ AIMS = (
 
 
 def cuda_rows(
-    points: dict[str, np.ndarray], *, cells: tuple, seed: int, repeats: int, table: Table, beside: Sequence[str]
+    points: dict[str, np.ndarray], *, cells: tuple, seed: int, repeats: int, table: Table, others: Sequence[str]
 ) -> list[Row]:
-    """One row for each cell: forward, and forward with backward, of ours and of those ``beside`` that are installed."""
+    """Return one row per cell: forward, and forward with backward, of ours and of the installed ones in ``others``."""
     renderers: dict[str, peers.Renderer] = {"ours": peers.ours}
-    for name in beside:
+    for name in others:
         try:
-            renderers[name] = PEERS[name]()
+            renderers[name] = BASELINES[name]()
         except ImportError as error:
-            print(f"{name} is not here: {error}")
+            print(f"{name} is not installed: {error}")
     rows = []
     for grid, width, height in cells:
         plain = peers.garden_scene(points, grid=grid, seed=seed, device="cuda")
@@ -78,8 +77,8 @@ def cuda_rows(
         for label, call in (("forward", forward), ("forward_backward", both)):
             calls = {name: (lambda call=call, name=name: call(name)) for name in renderers}
             row[label] = median_ms(calls, repeats=repeats, synchronise=torch.cuda.synchronize)
-        # Matching settings: gswarp stops every splat at three sigma and at an alpha of 0.99, which below 0.35 do
-        # nothing.
+        # At matching settings: gswarp stops every splat at three sigma and at an alpha of 0.99, without effect below
+        # 0.35.
         fainter = replace(plain, opacities=plain.opacities.detach() * 0.35)
         faint = {name: peers.ours_scene(fainter) if name == "ours" else fainter for name in renderers}
         with torch.no_grad():
@@ -87,7 +86,7 @@ def cuda_rows(
         row["difference"] = {
             name: difference(pictures["ours"], picture) for name, picture in pictures.items() if name != "ours"
         }
-        # Last, for the peers share their leaves.
+        # Last, because the other renderers share their leaves.
         for name in ("ours", "gsplat"):
             if name in renderers:
                 both(name)
@@ -102,7 +101,7 @@ def cuda_rows(
 
 
 def _gradient_differences(scenes: dict[str, peers.Scene]) -> dict[str, float]:
-    """Relative L2 difference to gsplat's gradients, brought to gsplat's terms by the chain rule."""
+    """Relative L2 difference to gsplat's gradients, converted to the parameters of captures by the chain rule."""
     if "gsplat" not in scenes:
         return {}
     own, other = scenes["ours"], scenes["gsplat"]
@@ -112,14 +111,14 @@ def _gradient_differences(scenes: dict[str, peers.Scene]) -> dict[str, float]:
         "means": (mine["means"], theirs["means"]),
         "log_scales": (mine["scales"], theirs["scales"] * other.scales.detach()),
         "opacity_logits": (mine["opacities"], theirs["opacities"] * opacity * (1 - opacity)),
-        # A colour of 0 sits on our clamp, where gsplat, given colours, has none.
+        # A colour of 0 is at our clamp; gsplat does not clamp given colours.
         "sh": (mine["colours"][:, 0], theirs["colours"] * peers.SH_BAND_0 * (mine["colours"][:, 0] != 0)),
     }
     return {name: float((one - two).norm() / two.norm()) for name, (one, two) in pairs.items()}
 
 
 def memory_row(*, seed: int) -> Row:
-    """Peak GPU memory of one 1920 x 1080 picture of five million Gaussians with SH of degree 3, capture included."""
+    """Peak GPU memory of one 1920 x 1080 image of five million Gaussians with SH of degree 3, capture included."""
     device, count = wp.get_device("cuda:0"), 5_000_000
     random = torch.Generator(device="cuda").manual_seed(seed)
 
@@ -150,7 +149,7 @@ def memory_row(*, seed: int) -> Row:
 
 
 def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
-    """112k Gaussians at 640 x 480: one thread, two threads, the PyTorch twin from the same lists on as many."""
+    """Time 112k Gaussians at 640 x 480: one thread, two threads, and the PyTorch twin on the same tile lists."""
     scene = peers.ours_scene(peers.garden_scene(points, grid=1, seed=seed, device="cpu"))
     camera = peers.garden_camera(points, width=640, height=480)
     cloud, view = peers.cloud_of(scene), view_from_camera(camera)
@@ -186,7 +185,7 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
     project_and_list = by_stage[f"project {threads}"] + by_stage[f"lists {threads}"]
     twin_times: dict[int, float] = {}
     twin = torch.empty(0)
-    # The better of both counts: on a busy machine PyTorch's threads wait for one another at every operation.
+    # Take the better of both counts: on a busy machine PyTorch's threads block one another at every operation.
     with torch.no_grad():
         for count in sorted({1, threads}):
             torch.set_num_threads(count)
@@ -194,7 +193,7 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
     picture = wp.to_torch(render_gaussians(cloud, camera, background=(0, 0, 0), threads=threads).colour)
     return {
         "kind": "cpu",
-        "peers": peers.cpu_peers(scene, camera),
+        "peers": peers.cpu_baselines(scene, camera),
         "gaussians": cloud.count,
         "pairs": projected.slot_count,
         "width": 640,
@@ -209,24 +208,24 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
 
 
 def judge(rows: list[Row]) -> tuple[dict[str, bool | None], dict[str, str]]:
-    """The aims from the rows alone; None, with the reason, where this run could not measure one."""
+    """Return the aims from the rows alone; None, with the reason, if this run could not measure one."""
     aims: dict[str, bool | None] = dict.fromkeys(AIMS)
     why: dict[str, str] = {}
     cuda = [row for row in rows if row["kind"] == "cuda"]
     labels = ("forward", "forward_backward")
-    for aim, peer in (("cuda_beats_gswarp", "gswarp"), ("cuda_within_1_3_of_gsplat", "gsplat")):
-        if not cuda or any(peer not in row["forward"] for row in cuda):
-            why[aim] = "no CUDA device" if not cuda else f"{peer} is not installed, or was left out"
+    for aim, baseline in (("cuda_beats_gswarp", "gswarp"), ("cuda_within_1_3_of_gsplat", "gsplat")):
+        if not cuda or any(baseline not in row["forward"] for row in cuda):
+            why[aim] = "no CUDA device" if not cuda else f"{baseline} is not installed, or was left out"
             continue
-        ratios = [row[label]["ours"] / _best(row[label], peer) for row in cuda for label in labels]
-        aims[aim] = max(ratios) < 1.0 if peer == "gswarp" else float(np.exp(np.mean(np.log(ratios)))) <= 1.3
-        if peer == "gsplat":
+        ratios = [row[label]["ours"] / _best(row[label], baseline) for row in cuda for label in labels]
+        aims[aim] = max(ratios) < 1.0 if baseline == "gswarp" else float(np.exp(np.mean(np.log(ratios)))) <= 1.3
+        if baseline == "gsplat":
             aims["ahead_of_gsplat_every_cell"] = max(ratios) < 1.0
     if aims["ahead_of_gsplat_every_cell"] is None:
         why["ahead_of_gsplat_every_cell"] = why["cuda_within_1_3_of_gsplat"]
     modes = [row for row in rows if row["kind"] == "modes"]
     if not modes:
-        why["same_in_every_mode"] = "measured beside gsplat on a GPU"
+        why["same_in_every_mode"] = "measured against gsplat on a GPU"
     for row in modes:
         aims["same_in_every_mode"] = all(_same(d) for d in row["difference"].values())
     differences = [d for row in cuda for d in row["difference"].values()] + [
@@ -256,7 +255,7 @@ def judge(rows: list[Row]) -> tuple[dict[str, bool | None], dict[str, str]]:
 
 
 def _same(off: dict[str, float]) -> bool:
-    """Equal but for rounding.
+    """Return True if two images are equal up to rounding.
 
     A splat at its alpha cut, worth at most 1/255, may come or go with the last bit: that shows above 1e-3 in fewer than
     one pixel in a thousand, and never as more than two such splats.
@@ -264,13 +263,13 @@ def _same(off: dict[str, float]) -> bool:
     return off["mean"] < 1e-5 and off["above_1e-3"] < 1e-3 and off["largest"] < 2 / 255
 
 
-def _best(times: dict[str, float], peer: str) -> float:
-    """Milliseconds of ``peer``, in the faster of its ways where it has several."""
-    return min(ms for name, ms in times.items() if name.startswith(peer))
+def _best(times: dict[str, float], baseline: str) -> float:
+    """Milliseconds of the renderer ``baseline``, of its fastest variant."""
+    return min(ms for name, ms in times.items() if name.startswith(baseline))
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Bars of milliseconds by cell and renderer; below them, on a GPU, each stage's share of the device's limit."""
+    """Draw milliseconds by cell and renderer; on a GPU also each stage's share of the device's limit."""
     bars: list[tuple[str, dict[str, float]]] = []
     for row in rows:
         size = f"{row['gaussians'] / 1e3:.0f}k\n{row['width']}x{row['height']}"
@@ -295,7 +294,7 @@ def draw(figure: Figure, rows: list[Row]) -> None:
 
 
 def plot_roofline(rows: list[Row], axes: Any) -> None:
-    """Percent of the limit that each stage reaches, by cell; the letter says which: bandwidth or arithmetic."""
+    """Draw the percentage of the limit that each stage reaches, by cell; the letter says bandwidth or arithmetic."""
     names = ("project", "lists", "composite", "backward")
     for index, name in enumerate(names):
         stages = [row["stages"][name] for row in rows]
@@ -315,7 +314,7 @@ def plot_roofline(rows: list[Row], axes: Any) -> None:
 
 
 def against_gsplat(rows: list[Row]) -> Row | None:
-    """Our time over gsplat's, cell by cell, and what the aims make of it; None where it is not installed."""
+    """Return our time over gsplat's in every cell, and a summary; None if gsplat is not installed."""
     ratios = {
         f"{row['gaussians']} {row['width']}x{row['height']} {label}": row[label]["ours"] / _best(row[label], "gsplat")
         for row in rows
@@ -333,10 +332,14 @@ def against_gsplat(rows: list[Row]) -> Row | None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
+    """Run the benchmark."""
     parser = flags(__doc__, quick="four cells in place of five on a GPU, fewer repeats")
     parser.add_argument(
-        "--beside", nargs="+", choices=list(PEERS), default=list(PEERS), help="on a GPU; all unless told"
+        "--beside",
+        nargs="+",
+        choices=list(BASELINES),
+        default=list(BASELINES),
+        help="other renderers to time on a GPU (default all)",
     )
     options = parser.parse_args(arguments)
     points = dict(np.load(data_folder() / "points" / "garden.npz"))
@@ -345,9 +348,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = Table(gaussians="9d", size="9s", what="<16", renderer="<12", ms="9.3f")
     if options.device.startswith("cuda"):
         cells = CELLS[:4] if options.quick else CELLS
-        # First, because the memory pool only knows the highest mark since the process began.
+        # First, because the memory pool only has the peak since the process started.
         rows.append(memory_row(seed=options.seed))
-        rows += cuda_rows(points, cells=cells, seed=options.seed, repeats=repeats, table=table, beside=options.beside)
+        rows += cuda_rows(points, cells=cells, seed=options.seed, repeats=repeats, table=table, others=options.beside)
         if "gsplat" in rows[-1]["forward"]:
             rows.append(mode_row(points, seed=options.seed, repeats=repeats))
             for name, off in rows[-1]["difference"].items():
@@ -360,18 +363,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows.append(row)
         for name in ("one_thread", "two_threads", "all_threads", "twin"):
             table.row(row["gaussians"], f"{row['width']}x{row['height']}", "cpu", name, row[name])
-        for name, peer in row["peers"].items():
-            print(f"{name}: {peer['ms'] or peer['outcome']}")
+        for name, baseline in row["peers"].items():
+            print(f"{name}: {baseline['ms'] or baseline['outcome']}")
     aims, why_null = judge(rows)
-    beside = against_gsplat(rows)
-    if beside is not None:
+    ratios = against_gsplat(rows)
+    if ratios is not None:
         print(
-            f"over gsplat's time: {beside['geometric_mean']:.2f} (geometric mean), faster in {beside['cells_faster']}"
+            f"over gsplat's time: {ratios['geometric_mean']:.2f} (geometric mean), faster in {ratios['cells_faster']}"
         )
     report(
         options,
         rows,
-        against_gsplat=beside,
+        against_gsplat=ratios,
         aims=aims,
         why_null=why_null,
         packages=["torch"],

@@ -1,4 +1,4 @@
-"""What the renderer offers besides one picture over black, each beside gsplat's own result for the same Gaussians."""
+"""Other modes of the renderer, each compared with gsplat's own result for the same Gaussians."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from egs_warp.render import render_gaussians, render_views
 from harness import Row, median_ms
 
 _WIDTH, _HEIGHT = 648, 420
-_FAINTER = 0.35
-"""Times the opacities: below an alpha of 0.99 nobody's limit does anything."""
+_OPACITY_FACTOR = 0.35
+"""Factor on the opacities, so that no alpha reaches 0.99, where the renderers' limits differ."""
 _BACKGROUNDS = ((0.9, 0.2, 0.1), (0.1, 0.8, 0.3), (0.2, 0.3, 1.0))
-_SEEN = 0.01
-"""Alpha from which a mean depth is compared."""
+_MIN_ALPHA = 0.01
+"""Minimum alpha of pixels whose mean depth is compared."""
 
 
 def difference(ours: torch.Tensor, other: torch.Tensor) -> dict[str, float]:
-    """Mean absolute difference, and the share of pixels above 1e-3 (splats that come or go at their alpha cut)."""
+    """Mean and largest absolute difference, and the fraction of pixels above 1e-3 (splats at their alpha cut)."""
     off = (ours - other).abs()
     return {"mean": float(off.mean()), "largest": float(off.max()), "above_1e-3": float((off > 1e-3).float().mean())}
 
 
 def mode_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
-    """Antialiased pictures, mean depth, tiles left out, three cameras with a background each, and the time of these."""
+    """Compare antialiased images, mean depth, masked tiles and three cameras with backgrounds, and time the latter."""
     from gsplat import rasterize_to_pixels  # type: ignore[import-not-found]
     from gsplat.rendering import rasterization  # type: ignore[import-not-found]
 
     plain = peers.garden_scene(points, grid=1, seed=seed, device="cuda")
-    scene = replace(plain, opacities=plain.opacities.detach() * _FAINTER)
+    scene = replace(plain, opacities=plain.opacities.detach() * _OPACITY_FACTOR)
     cloud = peers.cloud_of(peers.ours_scene(scene))
     cameras = [peers.garden_camera(points, width=_WIDTH, height=_HEIGHT, number=number) for number in range(3)]
     matrices = [peers.gsplat_matrices(camera) for camera in cameras]
@@ -47,12 +47,17 @@ def mode_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
         return picture, alpha
 
     def their_masked(mask: np.ndarray) -> torch.Tensor:
-        """gsplat offers masks a step below its face."""
+        """Render with masked tiles, which gsplat's low-level functions offer."""
         with torch.no_grad():
-            made = rasterization(*values, poses[:1], intrinsics[:1], _WIDTH, _HEIGHT, packed=False)[2]
+            projection = rasterization(*values, poses[:1], intrinsics[:1], _WIDTH, _HEIGHT, packed=False)[2]
             picture, _ = rasterize_to_pixels(
-                *(made["means2d"], made["conics"], scene.colours[None].contiguous(), made["opacities"]),
-                *(_WIDTH, _HEIGHT, made["tile_size"], made["isect_offsets"], made["flatten_ids"]),
+                *(
+                    projection["means2d"],
+                    projection["conics"],
+                    scene.colours[None].contiguous(),
+                    projection["opacities"],
+                ),
+                *(_WIDTH, _HEIGHT, projection["tile_size"], projection["isect_offsets"], projection["flatten_ids"]),
                 backgrounds=colours[:1],
                 masks=torch.as_tensor(mask, device="cuda")[None],
             )
@@ -64,9 +69,9 @@ def mode_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
     their_depth, alpha = theirs(one, render_mode="ED")
     mask = np.random.default_rng(seed).random((-(-_HEIGHT // 16), -(-_WIDTH // 16))) < 0.5
     masked = wp.to_torch(render_gaussians(cloud, cameras[0], background=_BACKGROUNDS[0], mask=mask).colour)
-    seen = alpha[0, :, :, 0] > _SEEN
-    unit = float(depth[seen].mean())
-    # Packed, gsplat takes no more than one background.
+    covered = alpha[0, :, :, 0] > _MIN_ALPHA
+    unit = float(depth[covered].mean())
+    # With packed=True, gsplat takes at most one background.
     their_three = theirs(every, backgrounds=colours, packed=False)[0]
 
     def ours_of_three() -> list[torch.Tensor]:
@@ -79,7 +84,7 @@ def mode_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
         "height": _HEIGHT,
         "difference": {
             "antialiased": difference(sharp, theirs(one, rasterize_mode="antialiased")[0][0]),
-            "depth": difference(depth[seen] / unit, their_depth[0, :, :, 0][seen] / unit),
+            "depth": difference(depth[covered] / unit, their_depth[0, :, :, 0][covered] / unit),
             "mask": difference(masked, their_masked(mask)),
             "three cameras": difference(torch.stack(ours_of_three()), their_three),
         },

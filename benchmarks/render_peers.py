@@ -1,4 +1,4 @@
-"""The other renderers of ``benchmarks/render.py`` behind one signature, and a plain PyTorch twin."""
+"""The other renderers of ``benchmarks/render.py`` with a common signature, and a plain PyTorch twin."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from egs_warp.render.tiles import TileLists
 
 @dataclass(frozen=True)
 class Scene:
-    """Gaussians as every peer wants them: leaf tensors of activated values."""
+    """Gaussians in the form that the other renderers take: leaf tensors of activated values."""
 
     means: torch.Tensor
     rotations: torch.Tensor
@@ -32,7 +32,10 @@ class Scene:
 
 
 def garden_scene(points: dict[str, np.ndarray], *, grid: int, seed: int, device: str) -> Scene:
-    """gsplat's own test recipe: points within 2 of the origin, random Gaussians, repeated grid x grid at spacing 4."""
+    """Build the scene of gsplat's own benchmark.
+
+    Points within 2 of the origin become random Gaussians, repeated grid x grid times at spacing 4.
+    """
     means, colours = points["means3d"], points["colors"] / 255.0
     inside = (np.abs(means) <= 2.0).all(axis=1)
     steps = np.arange(-(grid // 2), grid // 2 + 1)
@@ -54,7 +57,7 @@ def garden_scene(points: dict[str, np.ndarray], *, grid: int, seed: int, device:
 
 
 def cloud_of(scene: Scene) -> GaussianCloud:
-    """The capture's own terms, from tensors already in them, without a copy."""
+    """Wrap tensors in the parameters of captures as a cloud, without a copy."""
     return GaussianCloud(
         means=wp.from_torch(scene.means.detach(), dtype=wp.vec3),
         rotations=wp.from_torch(scene.rotations.detach(), dtype=wp.vec4),
@@ -65,7 +68,7 @@ def cloud_of(scene: Scene) -> GaussianCloud:
 
 
 def garden_camera(points: dict[str, np.ndarray], *, width: int, height: int, number: int = 0) -> Camera:
-    """One of the garden's three cameras, its image resampled to ``width`` x ``height``."""
+    """Return one of the garden's three cameras, its image resampled to ``width`` x ``height``."""
     view, k = points["viewmats"][number].astype(float), points["Ks"][number].astype(float)
     x, y = width / float(points["width"]), height / float(points["height"])
     return Camera(width, height, k[0, 0] * x, k[1, 1] * y, k[0, 2] * x, k[1, 2] * y, view[:3, :3], view[:3, 3])
@@ -75,14 +78,14 @@ Renderer = Callable[[Scene, Camera], torch.Tensor]
 
 
 def ours(scene: Scene, camera: Camera) -> torch.Tensor:
-    """(H, W, 3). The leaves are turned into logarithms and logits outside of the timed calls by ``ours_scene``."""
+    """Render ``scene`` of ``ours_scene``, (H, W, 3); that conversion is outside of the timed calls."""
     return render_torch(
         scene.means, scene.rotations, scene.scales, scene.opacities, scene.colours, camera, background=(0.0, 0.0, 0.0)
     ).colour
 
 
 def ours_scene(scene: Scene) -> Scene:
-    """The same Gaussians in the capture's own terms: log scales, opacity logits, SH of degree 0."""
+    """Return the same Gaussians in the parameters of captures: log scales, opacity logits, SH of degree 0."""
     return Scene(
         means=scene.means.detach().clone().requires_grad_(),
         rotations=scene.rotations.detach().clone().requires_grad_(),
@@ -93,20 +96,20 @@ def ours_scene(scene: Scene) -> Scene:
 
 
 def _once_per_camera(make: Callable[[Camera], Any]) -> Callable[[Camera], Any]:
-    """``make`` of each camera kept: peers take cameras as tensors on the GPU, whose making is not what is timed."""
-    kept: dict[int, tuple[Camera, Any]] = {}
+    """Cache ``make`` by camera, because the other renderers take GPU tensors, whose creation is not to be timed."""
+    cache: dict[int, tuple[Camera, Any]] = {}
 
     def get(camera: Camera) -> Any:
-        if id(camera) not in kept:
-            # The camera is kept too, so that its id is not used again.
-            kept[id(camera)] = (camera, make(camera))
-        return kept[id(camera)][1]
+        if id(camera) not in cache:
+            # The camera is stored too, so that its id is not reused.
+            cache[id(camera)] = (camera, make(camera))
+        return cache[id(camera)][1]
 
     return get
 
 
 def gsplat_matrices(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """Pose (1, 4, 4) and intrinsics (1, 3, 3) on the GPU."""
+    """Return pose (1, 4, 4) and intrinsics (1, 3, 3) on the GPU."""
     view = torch.eye(4)
     view[:3, :3] = torch.as_tensor(camera.rotation)
     view[:3, 3] = torch.as_tensor(camera.translation)
@@ -115,7 +118,7 @@ def gsplat_matrices(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def gsplat_renderer(*, packed: bool) -> Renderer:
-    """gsplat 1.5.3; raises ImportError where it is not installed."""
+    """Return gsplat 1.5.3; raises ImportError if it is not installed."""
     from gsplat.rendering import rasterization
 
     matrices_of = _once_per_camera(gsplat_matrices)
@@ -132,7 +135,7 @@ def gsplat_renderer(*, packed: bool) -> Renderer:
 
 
 def gswarp_renderer() -> Renderer:
-    """gswarp 1.1; raises ImportError where it is not installed."""
+    """Return gswarp 1.1; raises ImportError if it is not installed."""
     from gswarp import GaussianRasterizationSettings, GaussianRasterizer
 
     def settings(camera: Camera) -> GaussianRasterizationSettings:
@@ -177,20 +180,24 @@ def gswarp_renderer() -> Renderer:
     return draw
 
 
-def cpu_peers(scene: Scene, camera: Camera) -> dict[str, dict[str, Any]]:
-    """Each renderer of the package index that claims a CPU, by name: its milliseconds, or None and why not.
+def cpu_baselines(scene: Scene, camera: Camera) -> dict[str, dict[str, Any]]:
+    """Try each renderer of the package index that claims CPU support.
 
-    ``scene`` is in the capture's own terms (``ours_scene``).
-
-    Tried with splax 0.2.3 on JAX 0.10.2, which refuses splax's Warp calls on a CPU ("JaxCallableGraphMode.WARP is not
-    supported for JAX CPU FFI calls"), and taichi-splatting 0.13 on taichi 1.7.4 (the taichi-nightly that it asks for is
+    Tried with splax 0.2.3 on JAX 0.10.2, which rejects splax's Warp calls on a CPU ("JaxCallableGraphMode.WARP is not
+    supported for JAX CPU FFI calls"), and taichi-splatting 0.13 on taichi 1.7.4 (the taichi-nightly that it requires is
     in no index), whose import compiles CUDA code ("CUDA_HOME environment variable is not set").
+
+    Args:
+        scene: Gaussians in the parameters of captures (``ours_scene``).
+
+    Returns:
+        milliseconds by name, or None and the error.
     """
     outcomes: dict[str, dict[str, Any]] = {}
     for name, attempt in (("splax", _splax_ms), ("taichi-splatting", _taichi_splatting_ms)):
         try:
             outcomes[name] = {"ms": attempt(scene, camera), "outcome": "runs"}
-        # A stranger's package fails in its own ways; which one is the result.
+        # A third-party package may raise anything; the error is the result.
         except Exception as error:
             reason = str(error).strip().splitlines()
             outcomes[name] = {"ms": None, "outcome": f"{type(error).__name__}: {reason[0] if reason else ''}"}
@@ -222,15 +229,15 @@ def _splax_ms(scene: Scene, camera: Camera) -> float:
 
 
 def _taichi_splatting_ms(scene: Scene, camera: Camera) -> float | None:
-    """None: nothing past the import has been reached on a CPU."""
+    """None: on a CPU the import already fails."""
     importlib.import_module("taichi_splatting")
     return None
 
 
 def composite_in_torch(projected: ProjectedGaussians, lists: TileLists, camera: Camera) -> torch.Tensor:
-    """(H, W, 3): the tiles blended in plain PyTorch from the very same lists, so that culling is the same.
+    """Blend the tiles in plain PyTorch from the same tile lists, so that culling is the same; (H, W, 3).
 
-    Tiles of like length share a batch (tiles, 256 pixels, splats), which keeps PyTorch busy without padding.
+    Tiles of similar length share a batch (tiles, 256 pixels, splats), which keeps PyTorch busy with little padding.
     """
     ellipse, falloff, colour = (
         wp.to_torch(array) for array in (projected.ellipse, projected.falloff, projected.colour_depth)

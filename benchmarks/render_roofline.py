@@ -1,6 +1,4 @@
-"""What limits each stage of the renderer:
-bytes that must move, operations that must be done, and the machine's speed at both.
-"""
+"""Roofline of the renderer's stages: bytes to move, operations to do, and the machine's speed at both."""
 
 from __future__ import annotations
 
@@ -22,7 +20,7 @@ from kernels import PROBE_STEPS, arithmetic_kernel, hits_kernel, vector_arithmet
 
 
 def stage_rows(cloud: GaussianCloud, camera: Camera, *, repeats: int, threads: int) -> dict[str, dict[str, Any]]:
-    """Each stage's milliseconds, megabytes, millions of operations, and share of what the device's limits would allow.
+    """Measure each stage's milliseconds, megabytes, millions of operations, and share of the device's limit.
 
     The share is the time that the scarcer of bandwidth and arithmetic needs at full speed, over the time taken, which
     includes the calls from Python. Both speeds are measured here: a copy of 1 GiB, and chains of multiply and add.
@@ -74,13 +72,13 @@ def stage_rows(cloud: GaussianCloud, camera: Camera, *, repeats: int, threads: i
 
 
 def device_limits(device: wp.Device) -> tuple[float, float]:
-    """Bytes a second of a long copy, read and write together, and single-precision operations a second."""
+    """Bytes per second of a long copy, read and write together, and single-precision operations per second."""
     size = 2**30 if device.is_cuda else 2**27
     source = wp.zeros(size // 4, dtype=wp.int32, device=device)
     target = wp.empty_like(source)
     lanes = 2**20 if device.is_cuda else 64
     sums = wp.zeros(lanes, dtype=wp.float32, device=device)
-    # A core does eight numbers at once only where it is told to.
+    # A core computes eight numbers at once only with explicit vectors.
     kernel, width = (arithmetic_kernel, 1) if device.is_cuda else (vector_arithmetic_kernel, 8)
     times = median_ms(
         {
@@ -96,7 +94,7 @@ def device_limits(device: wp.Device) -> tuple[float, float]:
 
 
 def arithmetic_by_threads(threads: int, sums: wp.array) -> None:
-    """Work that any second core halves: what ``threads`` threads of this machine can do at best."""
+    """Run work that scales perfectly with cores: the upper bound for ``threads`` threads of this machine."""
     launch_rows(
         arithmetic_kernel,
         len(sums),
@@ -148,7 +146,7 @@ def _bytes(count: int, counts: dict[str, float], pixels: int, *, cuda: bool, til
 
 
 def _operations(count: int, counts: dict[str, float]) -> dict[str, float]:
-    """Counted in the kernels' source: a multiply, an add and a special function are one each."""
+    """Operations as counted in the kernels' source: a multiply, an add and a special function are one each."""
     visible, pairs, hits = counts["visible"], counts["pairs"], counts["pixel_hits"]
     return {
         # Rotation, product with the camera's and scales for all; ellipse and colour for the visible ones.

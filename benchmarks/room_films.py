@@ -1,9 +1,9 @@
-"""From photos or a capture to a film, each stage timed: what a user does, with three clicks at most.
+"""Films from photos or a capture, each stage timed: what a user does, with three clicks at most.
 
-``rooms.py --films FOLDER`` runs all of them, ``rooms.py --films FOLDER --one koala`` a single scene, in this process.
-Clicks are those of ``clicking.py`` where outlines were drawn, else the ones below. Into a folder of its own go the
-film, its contact sheet ``sheet.png`` of twelve frames, the pictures that ``egs-warp animate`` leaves of each step, the
-capture that was trained, and ``row.json``.
+``scene_quality.py --films FOLDER`` runs all of them, ``scene_quality.py --films FOLDER --one koala`` a single scene, in
+this process. Clicks are those of ``clicking.py`` for annotated scenes, else the ones below. The folder of a scene
+receives the film, its contact sheet ``sheet.png`` of twelve frames, the images that ``egs-warp animate`` writes of each
+stage, the trained capture, and ``row.json``.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ STAGES = ("load", "train", "plane", "object", "hole", "body", "animate", "film")
 
 @dataclass(frozen=True)
 class Filmed:
-    """A scene, and what its object is to do."""
+    """A scene and the motion of its object."""
 
     motion: str
     photos: str | None = None
-    """Folder of posed photos below ``posed``, where nothing was drawn."""
+    """Folder of posed photos below ``posed``, for scenes without annotations."""
     clicks: tuple[str, ...] = ()
-    """As ``--object`` takes them, where nothing was drawn."""
+    """Clicks in the notation of ``--object``, for scenes without annotations."""
 
 
 FILMS: Mapping[str, Filmed] = {
@@ -69,7 +69,7 @@ FILMS: Mapping[str, Filmed] = {
 
 
 def is_here(name: str) -> bool:
-    """Whether the data of a scene are."""
+    """Return True if the data of a scene are on this machine."""
     photos = FILMS[name].photos
     return (data_folder() / "posed" / photos).exists() if photos else read_drawn(name).is_here
 
@@ -77,23 +77,25 @@ def is_here(name: str) -> bool:
 def film(
     name: str, out: Path, *, device: str, nodes: int, frames: int | None = None, trained: Path | None = None
 ) -> Row:
-    """The whole way of one scene into the folder ``out``; seconds of each stage, and how it ended."""
-    asked = FILMS[name]
+    """Make the film of one scene in the folder ``out``; return the seconds of each stage and the outcome."""
+    filmed = FILMS[name]
     seconds: dict[str, float] = {}
-    drawn = None if asked.photos else read_drawn(name)
-    photos = data_folder() / "posed" / asked.photos if asked.photos else drawn.photos if drawn else None
+    annotated = None if filmed.photos else read_drawn(name)
+    photos = data_folder() / "posed" / filmed.photos if filmed.photos else annotated.photos if annotated else None
     with run_folder(out, overwrite=True) as run:
-        cloud = _capture(drawn, photos, seconds, device, trained)
+        cloud = _capture(annotated, photos, seconds, device, trained)
         if photos is not None and trained is None:
             write_ply(run.file("capture.ply"), cloud)
         posed, seconds["load"] = timed(read_cameras, photos) if photos else ([], seconds["load"])
         cameras = [one.camera for one in posed]
         spec = (
-            clicked(drawn, cloud, cameras, CLICKS)[0] if drawn is not None else read_object(asked.clicks, cloud, posed)
+            clicked(annotated, cloud, cameras, CLICKS)[0]
+            if annotated is not None
+            else read_object(filmed.clicks, cloud, posed)
         )
         photographs = photographs_in_colours_of(cloud, posed) or None
-        scene = _taken_apart(cloud, spec, cameras, photographs, seconds)
-        said = _pictures(run, cloud, scene, cameras)
+        scene = _prepare(cloud, spec, cameras, photographs, seconds)
+        warnings = _pictures(run, cloud, scene, cameras)
         creature, seconds["body"] = timed(
             make_creature,
             scene.object,
@@ -102,8 +104,8 @@ def film(
                 ground=scene.ground, seen_from=mean_view(cameras, scene.located.centre), nodes=nodes
             ),
         )
-        performance, seconds["animate"] = timed(simulate, creature, motion(asked.motion), frames=frames)
-        made, seconds["film"] = timed(
+        performance, seconds["animate"] = timed(simulate, creature, motion(filmed.motion), frames=frames)
+        rendered, seconds["film"] = timed(
             draw_film,
             performance,
             run,
@@ -115,16 +117,16 @@ def film(
         )
         simulation = performance.simulation
         behind = creature.placed(scene.background)
-        left = ground_coverage_warning(
+        coverage_warnings = ground_coverage_warning(
             simulation.trajectory.positions[-1], behind, creature.solids[0], creature.body.height
         )
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
             *(performance.sequence.done, energy_balance(performance.trajectory)),
-            gaussians=GaussianCounts.of(creature, made.splats.count),
-            drawing=made.milliseconds,
+            gaussians=GaussianCounts.of(creature, rendered.splats.count),
+            drawing=rendered.milliseconds,
             source=name,
-            notes=(*scene.notes, *performance.unfinished_note(), *left),
+            notes=(*scene.notes, *performance.unfinished_note(), *coverage_warnings),
             seed=0,
             asked={},
             ending=performance.ending,
@@ -140,7 +142,7 @@ def film(
             "seconds": {stage: 1e-3 * seconds[stage] for stage in STAGES if stage in seconds},
             "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
             "ended": report.state.value,
-            "said": [*said, *left],
+            "messages": [*warnings, *coverage_warnings],
             "notes": list(scene.notes),
         }
         run.file("row.json").write_text(json.dumps(row, indent=1) + "\n")
@@ -149,10 +151,10 @@ def film(
 
 
 def _capture(
-    drawn: DrawnScene | None, photos: Path | None, seconds: dict[str, float], device: str, trained: Path | None
+    annotated: DrawnScene | None, photos: Path | None, seconds: dict[str, float], device: str, trained: Path | None
 ) -> GaussianCloud:
-    """Read, or trained from photos as ``egs-warp train`` does on this device."""
-    place = trained or (drawn.capture if drawn is not None else None)
+    """Read the capture, or train it from photos as ``egs-warp train`` does on this device."""
+    place = trained or (annotated.capture if annotated is not None else None)
     if place is not None:
         read, seconds["load"] = timed(read_capture, place, device=device)
         return read.cloud
@@ -171,17 +173,17 @@ def _capture(
 
 
 _STAGE_OF = {"plane": "plane", "ground": "plane", "segment": "object", "inpaint": "hole"}
-"""Of the stages that ``prepare_scene`` tells: which of ours each belongs to."""
+"""Stage of this benchmark for each stage that ``prepare_scene`` reports."""
 
 
-def _taken_apart(
+def _prepare(
     cloud: GaussianCloud,
     spec: ObjectSpec,
     cameras: Sequence[Camera],
     photographs: list[TrainingView] | None,
     seconds: dict[str, float],
 ) -> PreparedScene:
-    """By ``prepare_scene``; milliseconds of its stages into ``seconds``."""
+    """Call ``prepare_scene`` and add the milliseconds of its stages to ``seconds``."""
     began: dict[str, float] = {}
 
     def note(stage: str, done: float) -> None:
@@ -195,7 +197,7 @@ def _taken_apart(
 
 
 def _pictures(run: RunFolder, cloud: GaussianCloud, scene: PreparedScene, cameras: Sequence[Camera]) -> list[str]:
-    """Written as ``egs-warp animate`` does; returns what looks wrong, in words."""
+    """Write the images that ``egs-warp animate`` writes; return the warnings about the segmentation."""
     centre, size = scene.located.centre, scene.located.size
     eyes = picture_cameras(scene.plane, centre, size, cameras)
     words = segmentation_warnings(cloud, scene.located, scene.object, eyes)

@@ -1,4 +1,4 @@
-"""How near a plane is to what is known of the ground: of built-in scenes its truth, of real ones what was marked."""
+"""Error of a plane: for built-in scenes against the truth, for real ones against marked points."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from annotated_scenes import DrawnScene, DrawnView
-from clicking import GIVEN, JUDGED
+from clicking import CLICKED, JUDGED
 from egs_warp.assets import scene
 from egs_warp.geometry.camera import camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -19,23 +19,24 @@ from harness import Row
 
 
 def marked_plane(cloud: GaussianCloud, views: Sequence[DrawnView], up: np.ndarray) -> Plane:
-    """Through the places that are marked on the ground, the worst fifth of them left out; where a mark is, the heights
-    of splats tell, as their depths would put it too high.
+    """Fit a plane to the marked ground points of ``views``, without the worst fifth of them.
+
+    The height at a mark is that of the splats there, because their rendered depth would put it too high.
     """
-    seen = [SeenSurface.of(cloud, view.camera) for view in views]
-    plane = _through(seen, views, up, None)
-    return _through(seen, views, up, plane)
+    surfaces = [SeenSurface.of(cloud, view.camera) for view in views]
+    plane = _through(surfaces, views, up, None)
+    return _through(surfaces, views, up, plane)
 
 
-def _through(seen: Sequence[SeenSurface], views: Sequence[DrawnView], up: np.ndarray, about: Plane | None) -> Plane:
-    """Through the marks, by depth, or by height over a plane ``about`` there."""
+def _through(surfaces: Sequence[SeenSurface], views: Sequence[DrawnView], up: np.ndarray, about: Plane | None) -> Plane:
+    """Fit a plane to the marks, by depth, or by height over the plane ``about``."""
     places = []
-    for surface, view in zip(seen, views, strict=True):
+    for surface, view in zip(surfaces, views, strict=True):
         depth = surface.depth if about is None else surface.depth_over(about)
         column, row = view.ground.astype(int).T
         away = depth[row, column]
-        held = away > 0.0
-        places.append(view.camera.centre + away[held, None] * camera_rays(view.camera)[row[held], column[held]])
+        valid = away > 0.0
+        places.append(view.camera.centre + away[valid, None] * camera_rays(view.camera)[row[valid], column[valid]])
     points = np.concatenate(places)
     for _ in range(2):
         plane = _fitted(points, up)
@@ -52,31 +53,31 @@ def _fitted(points: np.ndarray, up: np.ndarray) -> Plane:
 
 
 def apart(first: Plane, second: Plane, foot: np.ndarray, height: float) -> tuple[float, float]:
-    """Degrees between two planes, and their distance at ``foot`` (3,) in the object's heights."""
+    """Return the degrees between two planes, and their distance at ``foot`` (3,) in heights of the object."""
     cosine = float(np.clip(first.normal @ second.normal, -1.0, 1.0))
     return float(np.degrees(np.arccos(cosine))), abs(float(first.heights(foot) - second.heights(foot))) / height
 
 
-def real_ground(drawn: DrawnScene, cloud: GaussianCloud, located: LocatedPlane) -> Row:
-    """Ours, the ground where that is not flat, against the mean of two markings, and these against each other."""
+def real_ground(annotated: DrawnScene, cloud: GaussianCloud, located: LocatedPlane) -> Row:
+    """Compare our plane (or ground if not flat) with the mean of two markings, and those with each other."""
     plane = located.plane
     foot = located.centre - plane.heights(located.centre) * plane.normal
     height = float(np.quantile(plane.heights(cloud.means.numpy()[located.segmentation.object_mask]), 0.995))
-    even, odd = (marked_plane(cloud, drawn.views[half], plane.normal) for half in (GIVEN, JUDGED))
+    even, odd = (marked_plane(cloud, annotated.views[half], plane.normal) for half in (CLICKED, JUDGED))
     between = even.normal + odd.normal
     middle = foot - 0.5 * (even.heights(foot) + odd.heights(foot)) * plane.normal
     between /= np.linalg.norm(between)
     degrees, offset = apart(plane, Plane(between, float(-between @ middle)), foot, height)
     if located.ground is not None:
-        # What it stands on is not the plane there.
+        # The supporting ground is not the plane there.
         offset = abs(float(located.ground.heights(middle[None])[0])) / height
-    told_degrees, told_offset = apart(even, odd, foot, height)
-    row = {"scene": drawn.name, "how": "ground", "degrees": degrees, "offset": offset}
-    return {**row, "markings_degrees": told_degrees, "markings_offset": told_offset}
+    markings_degrees, markings_offset = apart(even, odd, foot, height)
+    row = {"scene": annotated.name, "how": "ground", "degrees": degrees, "offset": offset}
+    return {**row, "markings_degrees": markings_degrees, "markings_offset": markings_offset}
 
 
 def known_ground(name: str, device: str) -> Row:
-    """The plane of a built-in scene from a point in the middle of its object, against the one it was made on."""
+    """Compare the plane located from a point in the middle of a built-in object with the true one."""
     made = scene(name, device=device)
     cloud, truth = made.whole()
     heights = made.plane.heights(cloud.means.numpy()[truth])
@@ -89,7 +90,7 @@ def known_ground(name: str, device: str) -> Row:
 
 
 def judged_ground(rows: Sequence[Row]) -> bool:
-    """Whether every plane is near enough to what is known of it."""
+    """Return True if every plane is close enough to the truth."""
     return all(
         row["degrees"] <= 2.0 * row["markings_degrees"] and row["offset"] <= 2.0 * row["markings_offset"]
         if "markings_degrees" in row

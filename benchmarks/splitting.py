@@ -1,12 +1,11 @@
-"""How visible is a split? Image error of every rule, over opacity and viewing direction, and the opacities of least
-error.
+"""Visibility of a split: image error of every rule over opacity and viewing direction, and the optimal opacities.
 
-A round needle (thickness 0.3 of its length) is drawn whole and as children, from seven directions spread over the
-sphere; the error is root mean square over directions and pixels, in percent of the opacity. The last columns are the
-opacities of the outer and the middle child of the MEASURED rule that minimise it: the table in
+A round needle (thickness 0.3 of its length) is rendered whole and as children, from seven directions spread over the
+sphere; the error is the root mean square over directions and pixels, in percent of the opacity. The last columns are
+the opacities of the outer and the middle child of the MEASURED rule that minimise it: the table in
 egs_warp/deformation/splitting.py.
 
-Aims: ``table_is_optimal`` (no opacity of the table is more than 0.002 from the optimum found here),
+Aims: ``table_is_optimal`` (no opacity of the table is more than 0.002 from the optimum computed here),
 ``measured_beats_paper`` (at every opacity).
 """
 
@@ -30,8 +29,13 @@ ALONG, ACROSS = np.linspace(-4.0, 4.0, 81), np.linspace(0.0, 3.0, 16)
 
 
 def image_error(opacity: float, rule: SplitRule, peaks: np.ndarray, tilt: float) -> np.ndarray:
-    """Children minus parent over the opacity, on a grid (16, 81);
-    ``tilt`` is the angle of the axis to the line of sight.
+    """Children minus parent over the opacity, on a grid (16, 81).
+
+    Args:
+        opacity: peak opacity of the parent.
+        rule: layout of the children.
+        peaks: peak opacities of the children.
+        tilt: angle of the axis to the line of sight, rad.
     """
     offsets, shrink = child_layout(rule)
 
@@ -47,8 +51,9 @@ def image_error(opacity: float, rule: SplitRule, peaks: np.ndarray, tilt: float)
 
 
 def all_errors(opacity: float, rule: SplitRule, peaks: np.ndarray) -> np.ndarray:
-    """Errors of all directions, weighted by their share of the sphere;
-    the root of the sum of squares is the measure.
+    """Errors of all directions, weighted by the square root of their share of the sphere.
+
+    The root of the sum of squares is the measure.
     """
     shares = np.sin(TILTS) / np.sin(TILTS).sum()
     parts = [image_error(opacity, rule, peaks, tilt).ravel() for tilt in TILTS]
@@ -56,7 +61,7 @@ def all_errors(opacity: float, rule: SplitRule, peaks: np.ndarray) -> np.ndarray
 
 
 def best_opacities(opacity: float) -> np.ndarray:
-    """(2,) outer and middle peak opacity of the three children, of least error."""
+    """(2,) outer and middle peak opacity of the three children that minimise the error."""
 
     def residuals(logits: np.ndarray) -> np.ndarray:
         outer, middle = 1.0 / (1.0 + np.exp(-logits))
@@ -67,10 +72,10 @@ def best_opacities(opacity: float) -> np.ndarray:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
+    """Run the benchmark."""
     options = flags(
         __doc__,
-        quick="the same: it takes seconds",
+        quick="no effect: the full run takes seconds",
         device="cpu",
         seed="not used: nothing here is random, nor runs on a device",
     ).parse_args(arguments)

@@ -1,13 +1,13 @@
-"""What the choices inside a step are worth, on every step of the pawn's jump.
+"""Effect of the choices inside a step, measured on every step of the pawn's jump.
 
 python benchmarks/step.py [--quick] [--device cpu] [--seed 0] [--json PATH] [--plot PATH]
 
-Three tables. Newton's iterations: as the jump took them, and done again from what the step's own activations foresee,
-with the true Hessian of the elements and with the projected one in its place. Contact speeds: by how much what the
-tangent expects of a step's activations misses what is then solved, with the tangent where the body goes on rigidly and
-where the step is foreseen to end (rms and largest over the loaded contacts of all steps, m/s; the pawn is 1 m tall).
-Factors: a step's matrix factored, and solved for a right-hand side per muscle and contact row, by ours and by scipy's
-SuperLU. No aim is named for this benchmark.
+Three tables. Newton iterations: those of the jump, and those of steps repeated from the prediction of their own
+activations, with the true Hessian of the elements and with the projected one. Contact velocities: the error of the
+linearised velocities of a step's activations against the solved ones, with the tangent at the rigid guess and at the
+predicted end (rms and largest over the loaded contacts of all steps, m/s; the pawn is 1 m tall). Factors: a step's
+matrix factored, and solved for a right-hand side per muscle and contact row, by ours and by scipy's SuperLU. This
+benchmark has no aim.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ PLACES = ("ground", "flight")
 
 
 def iterations(creature: Creature, before: StepReport, step: StepReport) -> Row:
-    """Newton's iterations of one step by Hessian."""
+    """Count the Newton iterations of one step by Hessian."""
 
-    def again() -> int:
+    def repeated() -> int:
         return creature.stepper.step_with_activations(before.state, memory_of(before), step.activations, step.dt)[
             2
         ].newton_iterations
@@ -52,26 +52,26 @@ def iterations(creature: Creature, before: StepReport, step: StepReport) -> Row:
     def projected(assembly: ElasticAssembly, *arguments: Any, **options: Any) -> np.ndarray:
         return hessian_entries(assembly, *arguments, **{**options, "projected": True})
 
-    figures = {"as it was": step.newton_iterations, "true": again()}
+    figures = {"in the jump": step.newton_iterations, "true": repeated()}
     with patch.object(ElasticAssembly, "hessian_entries", projected):
-        return {**figures, "projected": again()}
+        return {**figures, "projected": repeated()}
 
 
 def memory_of(step: StepReport) -> WarmStart:
-    """What a step handed to the next."""
+    """Return the warm start that a step leaves for the next one."""
     return WarmStart(step.contacts.points, step.forces, step.activations)
 
 
 def contact_errors(creature: Creature, before: StepReport, step: StepReport) -> dict[str, np.ndarray]:
-    """(3k,) m/s by which a tangent misses the speeds of the k loaded contacts, by where it is."""
+    """(3k,) m/s, errors of the linearised velocities of the k loaded contacts, by the point of the tangent."""
     stepper, contacts, muscles = creature.stepper, step.contacts, creature.muscles
     problem = StepProblem(creature.body, before.state, step.dt)
-    foreseen = stepper.predict(stepper.step_inputs(problem, contacts, memory_of(before))).velocities
+    predicted = stepper.predict(stepper.step_inputs(problem, contacts, memory_of(before))).velocities
     factors = MultifrontalLdl(creature.body.assembly.upper_pattern)
     now = MuscleEnergy.of(muscles, step.activations)
     loaded = np.repeat(step.forces[:, 0] > 0.0, 3)
     errors = {}
-    for place, velocities in (("rigid start", problem.rigid_guess), ("foreseen end", foreseen)):
+    for place, velocities in (("rigid start", problem.rigid_guess), ("predicted end", predicted)):
         tangent = problem.tangent(factors, velocities, None)
         response = ContactLinearization.of(tangent, contacts)
         free = velocities.ravel() - tangent.solve(problem.residual(velocities, now).ravel())
@@ -85,7 +85,7 @@ def contact_errors(creature: Creature, before: StepReport, step: StepReport) -> 
 
 
 def factor_times(creature: Creature, repeats: int) -> list[Row]:
-    """Milliseconds of ours and SuperLU."""
+    """Time factorisation and solution, ms, with ours and with SuperLU."""
     assembly, body = creature.body.assembly, creature.body
     entries = assembly.hessian_entries(creature.start.positions, factor=(1.0 / 60.0) ** 2)
     entries[assembly.diagonal_entries] += np.repeat(body.node_mass, 3)
@@ -128,9 +128,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows: list[Row] = []
     table = Table(Hessian="<10", ground_mean=".1f", ground_worst="d", flight_mean=".1f", flight_worst="d")
     for hessian in counts[0][1]:
-        found = {place: [one[hessian] for flies, one in counts if flies == (place == "flight")] for place in PLACES}
+        counts_by_place = {
+            place: [one[hessian] for flies, one in counts if flies == (place == "flight")] for place in PLACES
+        }
         row: Row = {"hessian": hessian}
-        for place, numbers in found.items():
+        for place, numbers in counts_by_place.items():
             row |= {f"{place}_mean": float(np.mean(numbers)), f"{place}_worst": max(numbers)}
         rows.append(row)
         table.row(*row.values())
@@ -138,9 +140,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     speeds: list[Row] = []
     table = Table(tangent_at="<14", rms=".1e", largest=".1e")
     for place in errors[0]:
-        missed = np.concatenate([one[place] for one in errors])
-        rms = float(np.sqrt(np.mean(missed**2)))
-        speeds.append({"tangent_at": place, "rms": rms, "largest": float(np.abs(missed).max())})
+        error = np.concatenate([one[place] for one in errors])
+        rms = float(np.sqrt(np.mean(error**2)))
+        speeds.append({"tangent_at": place, "rms": rms, "largest": float(np.abs(error).max())})
         table.row(*speeds[-1].values())
     factors = factor_times(creature, 5 if options.quick else 20)
     table = Table(solver="<8", unknowns="d", right_hand_sides="d", factor_ms=".1f", solve_ms=".1f")
@@ -151,7 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         axes = figure.subplots()
         for hessian in counts[0][1]:
             axes.plot([one[hessian] for _, one in counts], label=hessian)
-        axes.set(xlabel="step", ylabel="Newton's iterations")
+        axes.set(xlabel="step", ylabel="Newton iterations")
         axes.legend()
 
     report(options, rows, contact_speeds=speeds, factors=factors, aims={}, draw=draw)

@@ -1,12 +1,11 @@
-"""Robustness: bodies x motions x friction x sag x solver step, and targets, hops, slopes, scripts and sizes, each run
-judged by its targets and by every bound of the audit.
+"""Robustness: bodies x motions x friction x sag x step size, and targets, hops, slopes, scripts and sizes.
 
 python benchmarks/sweep.py [--quick] [--workers 2] [--device cpu] [--seed 0] [--json PATH] [--join PATH] [--plot PATH]
 
-A run succeeds if the motion reaches what was asked (distance and height within 15 %, a twist's heading within 10
-degrees and its drift within 0.1 body heights, a walk's distance within 10 % and its feet slipping less than 2 % of a
-stride), the body ends upright (tilt under 10 degrees) and the audit holds. Each failure has its reason. Captures take
-part where they are found (``EGS_WARP_DATA``, else ../shared/data).
+A run succeeds if the motion reaches its target (distance and height within 15 %, a twist's heading within 10 degrees
+and its drift within 0.1 body heights, a walk's distance within 10 % and its feet slipping less than 2 % of a stride),
+the body ends upright (tilt under 10 degrees) and the audit holds. Each failure has its reason. Captures are used if
+they are on this machine (``EGS_WARP_DATA``, else ../shared/data).
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ BOUNDS = {
     "inverted_elements": 0,
     "newton_unconverged": 0,
 }
-"""Largest values that the audit of a success may have."""
+"""Upper bounds of the audit of a success."""
 
 
 @dataclass(frozen=True)
@@ -66,15 +65,15 @@ class Case:
     friction: float
     sag: float
     step: float
-    """Seconds."""
+    """Step size, s."""
     slope: float = 0.0
-    """Degrees that the ground rises ahead."""
+    """Slope of the ground, rising ahead, degrees."""
     height: float = 1.0
-    """Metres."""
+    """Height of the body, m."""
 
 
 def cases(quick: bool) -> list[Case]:
-    """All runs; ``quick`` gives three."""
+    """Return all runs; ``quick`` gives three."""
     if quick:
         return [Case("pawn", "jump", friction, 0.05, 1 / 60) for friction in FRICTIONS]
     captures = [name for name, (file, _) in CAPTURES.items() if (data_folder() / "objects" / file).exists()]
@@ -91,26 +90,26 @@ def cases(quick: bool) -> list[Case]:
 
 
 def further(captures: Sequence[str]) -> list[Case]:
-    """Runs at the usual friction, sag and step that vary what is asked and where."""
+    """Return runs at the default friction, sag and step size with other targets, slopes, scripts and sizes."""
 
-    def usual(body: str, motion: str, **rest: float) -> Case:
+    def default(body: str, motion: str, **rest: float) -> Case:
         return Case(body, motion, 0.8, DEFAULT_SAG, 1 / 60, **rest)
 
     runs = [
-        usual(body, f"jump {distance} {height}")
+        default(body, f"jump {distance} {height}")
         for body in ("pawn", "figurine")
         for distance in (0.2, 0.6, 1.0)
         for height in (0.1, 0.2, 0.4)
     ]
-    runs += [usual(body, "hop 0.7 0.3 x2") for body in ("pawn", "figurine", *captures)]
-    runs += [usual(body, "jump", slope=slope) for body in ("pawn", "stool", *captures) for slope in (-8.0, 8.0)]
-    runs += [usual(body, "jump, twist 90, jump 0.3 0.15") for body in ("pawn", "figurine", *captures)]
-    runs += [usual(body, "jump", height=height) for body in ("pawn", "stool", *captures) for height in (0.1, 3.0)]
+    runs += [default(body, "hop 0.7 0.3 x2") for body in ("pawn", "figurine", *captures)]
+    runs += [default(body, "jump", slope=slope) for body in ("pawn", "stool", *captures) for slope in (-8.0, 8.0)]
+    runs += [default(body, "jump, twist 90, jump 0.3 0.15") for body in ("pawn", "figurine", *captures)]
+    runs += [default(body, "jump", height=height) for body in ("pawn", "stool", *captures) for height in (0.1, 3.0)]
     return runs
 
 
 def run(case: Case, *, device: str, seed: int, frames: int | None = None) -> Row:
-    """Simulate one case, ``frames`` of it, and judge it; ``seed`` is of the built-in bodies' Gaussians."""
+    """Simulate the first ``frames`` frames of one case and judge it; ``seed`` is for the built-in bodies' Gaussians."""
     wp.config.log_level = wp.LOG_WARNING
     judged, milliseconds = timed(_run, case, device=device, seed=seed, frames=frames)
     return {**asdict(case), **judged, "seconds": 1e-3 * milliseconds}
@@ -151,11 +150,11 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
         reason = reason or judge(done.name, {"distance": 0.0, "height": 0.2, **done.asked}, reached, metres=case.height)
     reason = reason or (f"{left[0]}" if (left := sequence.unfinished_note()) and frames is None else None)
     if reason and friction_spent(trajectory) > 0.5:
-        reason += "; friction was spent for over half of the time on the ground"
+        reason += "; friction was at its limit for over half of the time on the ground"
     return {
         "success": reason is None,
         "reason": reason,
-        "asked": [dict(done.asked) for done in sequence.done],
+        "requested": [dict(done.asked) for done in sequence.done],
         "reached": parts,
         "audit": {name: float(value) for name, value in checked.items()},
         "young_modulus": float(creature.body.young_modulus),
@@ -164,46 +163,46 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
 
 
 def bounds_broken(checked: dict[str, float]) -> str | None:
-    """The first bound of the audit that a run breaks."""
+    """Return the first bound of the audit that a run breaks; None if it breaks none."""
     for name, bound in BOUNDS.items():
         if not checked[name] <= bound:
             return f"audit: {name} {checked[name]:.2g}"
     return None
 
 
-def judge(motion: str, asked: dict[str, float], reached: dict[str, float], *, metres: float = 1.0) -> str | None:
-    """Why a motion of a body of so many ``metres`` failed; None for a success."""
+def judge(motion: str, requested: dict[str, float], reached: dict[str, float], *, metres: float = 1.0) -> str | None:
+    """Return why a motion of a body ``metres`` tall failed; None for a success."""
     if reached["tilt_degrees"] >= 10.0:
         return f"fell or leans: tilt {reached['tilt_degrees']:.0f} degrees"
     if motion == "walk":
         if reached["slip"] >= 0.02:
             return f"a foot slipped {reached['slip']:.1%} of the stride"
-        wrong = abs(reached["distance"] - asked["distance"]) > 0.1 * asked["distance"]
-        return f"walked {reached['distance']:.3f}, asked {asked['distance']:.3f}" if wrong else None
-    free_flight = 60.0 * 2.0 * np.sqrt(2.0 * asked["height"] * metres / 9.81)
+        wrong = abs(reached["distance"] - requested["distance"]) > 0.1 * requested["distance"]
+        return f"walked {reached['distance']:.3f}, requested {requested['distance']:.3f}" if wrong else None
+    free_flight = 60.0 * 2.0 * np.sqrt(2.0 * requested["height"] * metres / 9.81)
     if reached["airborne_frames"] < free_flight / 3.0:
-        return f"hardly left the ground: {reached['airborne_frames']:.0f} frames"
-    if abs(reached["height"] - asked["height"]) > 0.15 * asked["height"]:
-        return f"rose {reached['height']:.3f}, asked {asked['height']:.3f}"
+        return f"barely left the ground: {reached['airborne_frames']:.0f} frames"
+    if abs(reached["height"] - requested["height"]) > 0.15 * requested["height"]:
+        return f"rose {reached['height']:.3f}, requested {requested['height']:.3f}"
     if motion == "twist":
-        short = abs((reached["heading_degrees"] - asked["heading_degrees"] + 180.0) % 360.0 - 180.0)
+        short = abs((reached["heading_degrees"] - requested["heading_degrees"] + 180.0) % 360.0 - 180.0)
         if short > 10.0:
             return f"turned {short:.0f} degrees too little or too much"
         return f"drifted {reached['distance']:.3f}" if reached["distance"] > 0.1 else None
-    if abs(reached["distance"] - asked["distance"]) > 0.15 * asked["distance"]:
-        return f"went {reached['distance']:.3f}, asked {asked['distance']:.3f}"
+    if abs(reached["distance"] - requested["distance"]) > 0.15 * requested["distance"]:
+        return f"went {reached['distance']:.3f}, requested {requested['distance']:.3f}"
     return None
 
 
 def friction_spent(trajectory: Trajectory) -> float:
-    """Share of the steps with contact in which the whole friction force is within 1 % of its limit."""
+    """Return the fraction of the steps with contact whose friction force is within 1 % of its limit."""
     normal = np.einsum("ci,ci->c", trajectory.contact_force, trajectory.contact_normal)
     tangential = np.linalg.norm(trajectory.contact_force - normal[:, None] * trajectory.contact_normal, axis=1)
     steps = len(trajectory.time) - 1
     used = np.bincount(trajectory.contact_step, tangential, steps)
     limit = np.bincount(trajectory.contact_step, trajectory.friction * normal, steps)
-    pressed = limit > 1e-6 * limit.max(initial=0.0)
-    return float(np.mean(used[pressed] > 0.99 * limit[pressed])) if pressed.any() else 0.0
+    loaded = limit > 1e-6 * limit.max(initial=0.0)
+    return float(np.mean(used[loaded] > 0.99 * limit[loaded])) if loaded.any() else 0.0
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -215,7 +214,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = json.loads(options.join.read_text())["rows"] if options.join else []
     known = [Case(**{name: row[name] for name in Case.__dataclass_fields__}) for row in rows]
     runs = [case for case in cases(options.quick) if case not in known]
-    # Kernels compile once, here, not in every worker.
+    # Compile the kernels once here, not in every worker.
     one = partial(run, device=options.device, seed=options.seed)
     one(Case("pawn", "jump", 0.6, 0.05, 1 / 60), frames=4)
     print(f"{len(runs) + len(known)} runs, {len(known)} of them known")
@@ -234,7 +233,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def summary(rows: list[Row]) -> dict[str, Any]:
-    """Rates of success by every factor, worst audits of the successes, and the aims: what ``report`` takes."""
+    """Return success rates by every factor, worst audits of the successes, and the aims, as arguments of ``report``."""
     good = [row for row in rows if row["success"]]
     rates = {
         factor: {
@@ -244,7 +243,7 @@ def summary(rows: list[Row]) -> dict[str, Any]:
         for factor in ("body", "motion", "friction", "sag", "step", "slope", "height")
     }
     rate = len(good) / len(rows)
-    enough = len(rows) >= 100
+    is_complete = len(rows) >= 100
     return {
         "rows": rows,
         "success_rate": rate,
@@ -256,17 +255,17 @@ def summary(rows: list[Row]) -> dict[str, Any]:
             {key: row[key] for key in (*Case.__dataclass_fields__, "reason")} for row in rows if not row["success"]
         ],
         "aims": {
-            "ninety_five_percent_succeed": rate >= 0.95 if enough else None,
+            "ninety_five_percent_succeed": rate >= 0.95 if is_complete else None,
             "every_success_meets_the_audit": all(
                 row["audit"][name] <= bound for row in good if "audit" in row for name, bound in BOUNDS.items()
             ),
         },
-        "why_null": {} if enough else {"ninety_five_percent_succeed": f"{len(rows)} runs, not 100"},
+        "why_null": {} if is_complete else {"ninety_five_percent_succeed": f"{len(rows)} runs, not 100"},
     }
 
 
 def print_summary(result: dict[str, Any]) -> None:
-    """As text."""
+    """Print the summary as text."""
     print(f"{result['success_rate']:.0%} of {len(result['rows'])} runs succeed")
     for factor, values in result["successes_of_runs"].items():
         shares = "  ".join(f"{value}: {good}/{count}" for value, (good, count) in values.items())
@@ -277,7 +276,7 @@ def print_summary(result: dict[str, Any]) -> None:
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Tilt against distance, successes and failures."""
+    """Draw tilt against distance, for successes and failures."""
     axes = figure.subplots()
     for success, colour in ((True, "tab:green"), (False, "tab:red")):
         chosen = [row for row in rows if row["success"] is success and "reached" in row]

@@ -1,20 +1,20 @@
-"""Table 1: ways of carrying Gaussians with a cage, against the truth of a deformed mesh.
+"""Table 1: methods of deforming Gaussians with a cage, against the truth of a deformed mesh.
 
 Glossy objects with true meshes are photographed at rest by a ray caster, trained to Gaussians of SH degree 3 by the
 project's own trainer, and then bent, twisted and dropped on the floor: one displacement of the cage nodes, known or
-simulated, carries the mesh's vertices and the Gaussians alike. The gloss turns with the surface, as a capture has it,
-so turning colour counts. Unseen cameras compare the two. Three objects make the table; two more stand beside it, and
-three others (``--choose``) are those on which the settings of splitting were chosen, which no table shows.
+simulated, deforms both the mesh's vertices and the Gaussians. The gloss rotates with the surface, as in a capture, so
+the rotation of colour counts. Held-out cameras compare the two. Three objects make up the table; two more are held out,
+and three others (``--choose``) are those on which the settings of splitting were chosen, which no table shows.
 
 Rows: SuGaR (bound to a surface of the capture, and once to the cage's faces), PhysGaussian, VR-GS; ours unsplit, with
-the paper's split (Eq. 17 as corrected), and with ours. Then at equal counts: the others carry the very Gaussians that
-our split has made, and all, ours without splits, carry a capture trained with as many.
+the paper's split (Eq. 17 as corrected), and with ours. Then at equal counts: the others deform the same Gaussians that
+our split has made, and all, ours without splits, deform a capture trained with the same number.
 
-Aims, from means over objects: ``best_psnr_every_deformation`` and ``best_ssim_every_deformation`` (ours before all rows
-that start from the same capture), ``margin_over_vrgs`` (by at least the paper's margins), ``split_helps`` (over ours
-unsplit, PSNR and SSIM, every deformation), ``equal_count_best`` (PSNR and SSIM, every deformation: ours over the others
-that carry its split, and ours unsplit over the others on the capture trained with as many), ``paper_margins_held_out``
-(the paper's margins over VR-GS on the two objects beside the table).
+Aims, from means over objects: ``best_psnr_every_deformation`` and ``best_ssim_every_deformation`` (ours ahead of all
+rows that start from the same capture), ``margin_over_vrgs`` (by at least the paper's margins), ``split_helps`` (over
+ours unsplit, PSNR and SSIM, every deformation), ``equal_count_best`` (PSNR and SSIM, every deformation: ours over the
+others on its split, and ours unsplit over the others on the capture trained with the same number),
+``paper_margins_held_out`` (the paper's margins over VR-GS on the two held-out objects).
 """
 
 from __future__ import annotations
@@ -36,34 +36,34 @@ from table1_rows import MAIN, MOTIONS, ROWS, SAME_SPLIT, SAME_TRAINING, Splittin
 OBJECTS = ("chair", "plant", "microphone")
 HELD_OUT = ("spot", "stool")
 FROM_PHOTOS = "lego"
-"""A proxy of NeRF-synthetic's model, made from its photos (``lego_proxy.py``); only when asked for, in no aim."""
+"""A proxy of NeRF-synthetic's model, built from its photos (``lego_proxy.py``); only on request, in no aim."""
 CHOOSING = ("cat", "vase", "table")
-"""The settings below were chosen on them."""
-DEGREES, MISFIT, DEPTH, GROWTH = 4.0, 7e-4, 4, 20.0
-"""What --choose took, in pictures of 256 x 256 after 3000 steps: the first two are the library's own."""
+"""Objects on which the settings below were chosen."""
+DEGREES, MIN_ERROR, DEPTH, GROWTH = 4.0, 7e-4, 4, 20.0
+"""Result of --choose, in images of 256 x 256 after 3000 steps: the first two are the library's defaults."""
 SETTINGS = {
-    f"{degrees:g} degrees, {misfit:g}": (degrees, misfit)
-    for misfit, degrees in product((7e-4, 4e-4, 2e-4, 1e-4), (9.0, 4.0))
+    f"{degrees:g} degrees, {error:g}": (degrees, error)
+    for error, degrees in product((7e-4, 4e-4, 2e-4, 1e-4), (9.0, 4.0))
 }
-"""What --choose compares, the coarsest first."""
-ENOUGH = 0.02
-"""dB: the coarsest setting that is this near to the best is taken (PSNR, mean over objects and motions)."""
+"""Settings that --choose compares, the coarsest first."""
+PSNR_TOLERANCE = 0.02
+"""dB: --choose takes the coarsest setting that is this close to the best (PSNR, mean over objects and motions)."""
 PAPER_MARGINS = {"bend": (0.16, 0.006), "twist": (0.36, 0.017), "fall": (0.36, 0.013)}
-"""PSNR (dB) and SSIM of the paper's full method over its VR-GS row."""
+"""Margins of the paper's full method over its VR-GS row, PSNR (dB) and SSIM."""
 SCORES = ("psnr", "ssim", "flip")
 
 
 def means(rows: list[Row], objects: Sequence[str]) -> dict[tuple[str, str], tuple[float, ...]]:
-    """PSNR, SSIM, FLIP and Gaussians over ``objects`` for each motion and row."""
-    found = {}
+    """Return PSNR, SSIM, FLIP and number of Gaussians over ``objects`` for each motion and row."""
+    table = {}
     for motion, name in product(MOTIONS, ROWS):
         chosen = [r for r in rows if (r["motion"], r["row"]) == (motion, name) and r["object"] in objects]
-        found[motion, name] = tuple(float(np.mean([row[key] for row in chosen])) for key in (*SCORES, "gaussians"))
-    return found
+        table[motion, name] = tuple(float(np.mean([row[key] for row in chosen])) for key in (*SCORES, "gaussians"))
+    return table
 
 
 def judge(rows: list[Row], *, quick: bool) -> tuple[dict[str, bool | None], dict[str, str]]:
-    """The aims, from the rows."""
+    """Return the aims from the rows."""
     present = {row["object"] for row in rows}
     small = "--quick judges only the ordering; see the full run"
 
@@ -110,10 +110,10 @@ def judge(rows: list[Row], *, quick: bool) -> tuple[dict[str, bool | None], dict
 
 
 def show(rows: list[Row]) -> None:
-    """Means over the objects of the table, and over those beside it."""
+    """Print means over the objects of the table, and over the held-out ones."""
     for title, objects in (
         ("the table's objects", OBJECTS),
-        ("the objects beside it", HELD_OUT),
+        ("the held-out objects", HELD_OUT),
         ("from photos", (FROM_PHOTOS,)),
     ):
         chosen = [name for name in objects if any(row["object"] == name for row in rows)]
@@ -122,15 +122,15 @@ def show(rows: list[Row]) -> None:
         print(f"\n{title}: mean over {', '.join(chosen)}")
         columns = {f"{m}_{what}": f for m in MOTIONS for what, f in (("dB", ".2f"), ("SSIM", ".4f"), ("FLIP", ".4f"))}
         table = Table(row="<26", **columns)
-        found = means(rows, chosen)
+        averages = means(rows, chosen)
         for name in ROWS:
-            table.row(name, *(value for motion in MOTIONS for value in found[motion, name][:3]))
+            table.row(name, *(value for motion in MOTIONS for value in averages[motion, name][:3]))
 
 
 def choose(options: argparse.Namespace) -> list[Row]:
-    """Rows of every setting on the objects that choose."""
+    """Return the rows of every setting on the objects of ``CHOOSING``."""
     settings = {
-        name: Splitting(degrees, misfit, options.depth, options.growth) for name, (degrees, misfit) in SETTINGS.items()
+        name: Splitting(degrees, error, options.depth, options.growth) for name, (degrees, error) in SETTINGS.items()
     }
     rows: list[Row] = []
     for name in options.objects:
@@ -140,27 +140,27 @@ def choose(options: argparse.Namespace) -> list[Row]:
     for name in settings:
         chosen = [row for row in rows if row["setting"] == name]
         table.row(name, *(float(np.mean([row[key] for row in chosen])) for key in (*SCORES, "gaussians")))
-    print(f"taken: {taken(rows)}")
+    print(f"selected: {selected_setting(rows)}")
     return rows
 
 
-def taken(rows: list[Row]) -> str:
-    """The setting that the rule takes from the rows of ``choose``."""
-    found = {
+def selected_setting(rows: list[Row]) -> str:
+    """Return the setting that the rule of --choose selects from its rows."""
+    averages = {
         name: np.mean([row["psnr"] for row in rows if row["setting"] == name])
         for name in SETTINGS
         if any(row["setting"] == name for row in rows)
     }
-    return next(name for name, value in found.items() if value >= max(found.values()) - ENOUGH)
+    return next(name for name, value in averages.items() if value >= max(averages.values()) - PSNR_TOLERANCE)
 
 
 def rows_in(paths: Sequence[Path]) -> list[Row]:
-    """The rows of several JSON files."""
+    """Return the rows of several JSON files."""
     return [row for path in paths for row in json.loads(path.read_text())["rows"]]
 
 
 def mesh_of(name: str, options: argparse.Namespace) -> painted_meshes.PaintedMesh:
-    """The object of this name."""
+    """Return the object of this name."""
     if name != FROM_PHOTOS:
         return getattr(painted_meshes, name)()
     return lego(
@@ -168,33 +168,40 @@ def mesh_of(name: str, options: argparse.Namespace) -> painted_meshes.PaintedMes
         iterations=options.iterations,
         seed=options.seed,
         device=options.device,
-        kept=options.clouds / "lego_proxy.npz" if options.clouds else None,
+        cache=options.clouds / "lego_proxy.npz" if options.clouds else None,
     )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
+    """Run the benchmark."""
     parser = flags(__doc__, quick="128 x 128, few training steps")
     parser.add_argument(
         "--objects",
         nargs="+",
         choices=[*OBJECTS, *HELD_OUT, FROM_PHOTOS, *CHOOSING],
-        help="all meshes of the table and beside it",
+        help="objects (default all of the table and the held-out ones)",
     )
     parser.add_argument("--held-out", dest="objects", action="store_const", const=HELD_OUT, help=f"{HELD_OUT} instead")
     parser.add_argument("--choose", action="store_true", help=f"compare settings of splitting on {CHOOSING}")
-    parser.add_argument("--chosen", nargs="+", type=Path, help="JSON of --choose: split as its rule takes it")
+    parser.add_argument("--chosen", nargs="+", type=Path, help="JSON of --choose, whose selected setting is used")
     parser.add_argument("--matt", action="store_true", help="no lamps, no gloss, SH of degree 0")
-    parser.add_argument("--size", type=int, help="pixels, both sides (800)")
-    parser.add_argument("--gaussians", type=int, help="of a capture (4000)")
-    parser.add_argument("--iterations", type=int, help="of training (7000)")
-    parser.add_argument("--nodes", type=int, help="nodes of the cage, about")
-    parser.add_argument("--clouds", type=Path, help="folder in which clouds and falls are kept, and looked for")
+    parser.add_argument("--size", type=int, help="width and height of the images, pixels (default 800)")
+    parser.add_argument("--gaussians", type=int, help="number of Gaussians of a capture (default 4000)")
+    parser.add_argument("--iterations", type=int, help="training steps (default 7000)")
+    parser.add_argument("--nodes", type=int, help="approximate number of nodes of the cage")
+    parser.add_argument("--clouds", type=Path, help="cache folder of clouds and falls")
     parser.add_argument("--rows", nargs="+", type=Path, help="judge the rows in these JSON files together")
-    parser.add_argument("--degrees", type=float, default=DEGREES, help="least turn between the ends that splits")
-    parser.add_argument("--misfit", type=float, default=MISFIT, help="least misfit that splits, over the diagonal")
+    parser.add_argument(
+        "--degrees", type=float, default=DEGREES, help="minimum rotation between the ends of a Gaussian that is split"
+    )
+    parser.add_argument(
+        "--misfit",
+        type=float,
+        default=MIN_ERROR,
+        help="minimum fit error of a Gaussian that is split, over the cage's diagonal",
+    )
     parser.add_argument("--depth", type=int, default=DEPTH)
-    parser.add_argument("--growth", type=float, help=f"at most this many times as many Gaussians ({GROWTH:g})")
+    parser.add_argument("--growth", type=float, help=f"maximum growth of the number of Gaussians (default {GROWTH:g})")
     options = parser.parse_args(arguments)
     quick = options.quick
     shown = OBJECTS if quick else (*OBJECTS, *HELD_OUT)
@@ -206,7 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options.gaussians = options.gaussians or (1500 if quick else 4000)
     options.iterations = options.iterations or (1000 if quick else 7000)
     if options.chosen:
-        options.degrees, options.misfit = SETTINGS[taken(rows_in(options.chosen))]
+        options.degrees, options.misfit = SETTINGS[selected_setting(rows_in(options.chosen))]
     options.growth = options.growth or (5.0 if quick else GROWTH)
     if options.clouds:
         options.clouds.mkdir(parents=True, exist_ok=True)

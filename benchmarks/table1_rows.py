@@ -1,4 +1,4 @@
-"""One object of Table 1: its captures, its motions, and what every way of carrying makes of them."""
+"""One object of Table 1: its captures, its motions, and the scores of every deformation method."""
 
 from __future__ import annotations
 
@@ -31,51 +31,53 @@ from perceptual import flip_error, lpips_distance
 
 MOTIONS = ("bend", "twist", "fall")
 CAGE_NODES = {"plant": 2000, "microphone": 500}
-"""1000 where nothing is said. Enough that the cage holds the whole mesh, thin leaves too: beyond a cage there is no
-truth to compare with."""
+"""Number of nodes by object, otherwise 1000: enough for the cage to contain the whole mesh, thin leaves too, because
+there is no truth outside a cage.
+"""
 ON_LEGS, ON_LEAVES = (0.15, 0.6, 20.0), (0.3, 0.8, 150.0)
-"""Sag, height (metres) and tilt (degrees) of a fall; the plant falls on its leaves."""
+"""Sag, height (m) and tilt (degrees) of a fall; the plant falls on its leaves."""
 FLOOR = Plane.from_coefficients(0.0, 0.0, 1.0, 0.0)
-GIVEN, SPLIT, PAPER_SPLIT, AS_MANY = "as trained", "our split", "the paper's split", "trained with as many"
-"""Captures: what training gave, two splits of it for the motion, and one trained with as many Gaussians as our split
-has, in the mean over the motions."""
+AS_TRAINED, SPLIT, PAPER_SPLIT, AS_MANY = "as trained", "our split", "the paper's split", "trained with as many"
+"""Captures: as trained, two splits of it for the motion, and one trained with as many Gaussians as our split has in the
+mean over the motions.
+"""
 PAPER_DEGREES = 9.0
-"""The paper's 15 degrees between arms of 3 standard deviations, for those of sqrt 3."""
+"""The paper's 15 degrees between arms of 3 standard deviations, converted to arms of sqrt 3."""
 
 
 @dataclass(frozen=True)
-class Carried:
+class TableRow:
     """One row of the table."""
 
     capture: str
     method: DeformationMethod
     on_cage: bool = False
-    """``SURFACE`` binds to the cage's own faces, not to a surface of the capture."""
-    turns_colour: bool = True
+    """True if ``SURFACE`` binds to the cage's own faces, not to a surface of the capture."""
+    rotates_colour: bool = True
 
 
 WHOLE = DeformationMethod.BIDIRECTIONAL_NO_SPLIT
-PEERS = {
+BASELINES = {
     "SuGaR": DeformationMethod.SURFACE,
     "PhysGaussian": DeformationMethod.MEAN_GRADIENT,
     "VR-GS": DeformationMethod.LOCAL_TETRAHEDRON,
 }
 MAIN = {
-    **{name: Carried(GIVEN, method) for name, method in PEERS.items()},
-    "ours, no split": Carried(GIVEN, WHOLE),
-    "ours, paper's split": Carried(PAPER_SPLIT, WHOLE),
-    "ours": Carried(SPLIT, WHOLE),
+    **{name: TableRow(AS_TRAINED, method) for name, method in BASELINES.items()},
+    "ours, no split": TableRow(AS_TRAINED, WHOLE),
+    "ours, paper's split": TableRow(PAPER_SPLIT, WHOLE),
+    "ours": TableRow(SPLIT, WHOLE),
 }
-SAME_SPLIT = {f"{name}, our split": Carried(SPLIT, method) for name, method in PEERS.items()}
-"""Beside "ours": the very Gaussians that ours carries, so as many, and the same picture at rest."""
+SAME_SPLIT = {f"{name}, our split": TableRow(SPLIT, method) for name, method in BASELINES.items()}
+"""Rows next to "ours" with the same Gaussians, so the same number and the same image at rest."""
 SAME_TRAINING = {
-    **{f"{name}, as many": Carried(AS_MANY, method) for name, method in PEERS.items()},
-    "ours, no split, as many": Carried(AS_MANY, WHOLE),
+    **{f"{name}, as many": TableRow(AS_MANY, method) for name, method in BASELINES.items()},
+    "ours, no split, as many": TableRow(AS_MANY, WHOLE),
 }
 ROWS = {
     **MAIN,
-    "ours, colours not turned": Carried(SPLIT, WHOLE, turns_colour=False),
-    "SuGaR, on the cage's faces": Carried(GIVEN, DeformationMethod.SURFACE, on_cage=True),
+    "ours, colours not rotated": TableRow(SPLIT, WHOLE, rotates_colour=False),
+    "SuGaR, on the cage's faces": TableRow(AS_TRAINED, DeformationMethod.SURFACE, on_cage=True),
     **SAME_SPLIT,
     **SAME_TRAINING,
 }
@@ -83,25 +85,25 @@ ROWS = {
 
 @dataclass(frozen=True)
 class Splitting:
-    """When a Gaussian is split; see ``split_for_motion``."""
+    """Settings of splitting; see ``split_for_motion``."""
 
     degrees: float
-    misfit: float
-    """Over the cage's diagonal."""
+    min_error: float
+    """Minimum fit error over the cage's diagonal."""
     depth: int
     growth: float
 
     def apply(
         self, cloud: GaussianCloud, cage: TetMesh, nodes: np.ndarray, rule: SplitRule = SplitRule.MEASURED
     ) -> GaussianCloud:
-        """``cloud`` at rest, split for ``nodes`` (N, 3)."""
+        """Return ``cloud`` at rest, split for ``nodes`` (N, 3)."""
         locator = CageLocator(cage, device=cloud.device)
         return split_for_motion(
             cloud,
             embed_gaussians(cloud, locator),
             [nodes],
             threshold_degrees=self.degrees,
-            min_error=self.misfit * locator.extent,
+            min_error=self.min_error * locator.extent,
             rule=rule,
             max_depth=self.depth,
             max_growth=self.growth,
@@ -119,14 +121,14 @@ class Subject:
 
     @cached_property
     def photos(self) -> list[TrainingView]:
-        """To train from."""
+        """Training views."""
         return scenes.photographs(self.mesh, self.options.size, self.options.views, self.options.device)
 
     def moved_nodes(self) -> dict[str, np.ndarray]:
-        """(N, 3) places of the cage's nodes in each motion. The drop is simulated with a coarse cage."""
-        kept = self.options.clouds / f"{self.mesh.name}_drop.npz" if self.options.clouds else None
-        if kept is not None and kept.exists():
-            with np.load(kept) as arrays:
+        """(N, 3) positions of the cage's nodes in each motion; the drop is simulated with a coarse cage."""
+        cached = self.options.clouds / f"{self.mesh.name}_drop.npz" if self.options.clouds else None
+        if cached is not None and cached.exists():
+            with np.load(cached) as arrays:
                 dropped = Drop(**arrays)
         else:
             coarse = build_cage(self._surface, FLOOR, target_nodes=250).mesh
@@ -135,18 +137,18 @@ class Subject:
                 simulated_drop, coarse, self._surface, sag=sag, height=height, tilt_degrees=tilt, seconds=0.3
             )
             print(f"  drop: {len(coarse.nodes)} nodes, simulated in {1e-3 * milliseconds:.0f} s", flush=True)
-            if kept is not None:
-                np.savez_compressed(kept, frames=dropped.frames, energies=dropped.energies, rest=dropped.rest)
+            if cached is not None:
+                np.savez_compressed(cached, frames=dropped.frames, energies=dropped.energies, rest=dropped.rest)
         motions = {"bend": scenes.bend, "twist": scenes.twist_by(150.0), "fall": dropped.at_impact}
         return {name: motions[name](self.cage.nodes) for name in MOTIONS}
 
     def trained(self, gaussians: int) -> GaussianCloud:
-        """The object at rest, or what an earlier run has kept in ``--clouds``."""
+        """Train the object at rest, or read the cloud from the cache ``--clouds``."""
         options = self.options
         look = "matt" if options.matt else "glossy"
-        kept = options.clouds / f"{self.mesh.name}_{look}_{options.size}_{gaussians}.npz" if options.clouds else None
-        if kept is not None and kept.exists():
-            with np.load(kept) as arrays:
+        cached = options.clouds / f"{self.mesh.name}_{look}_{options.size}_{gaussians}.npz" if options.clouds else None
+        if cached is not None and cached.exists():
+            with np.load(cached) as arrays:
                 return GaussianCloud.from_numpy(**arrays, device=options.device)
         cloud, milliseconds = timed(
             scenes.trained_on,
@@ -159,35 +161,35 @@ class Subject:
             device=options.device,
         )
         print(f"{self.mesh.name}: {cloud.count} Gaussians trained in {1e-3 * milliseconds:.0f} s", flush=True)
-        if kept is not None:
+        if cached is not None:
             arrays = {field: getattr(cloud, field).numpy() for field in cloud.__dataclass_fields__}
-            np.savez_compressed(kept, **arrays)
+            np.savez_compressed(cached, **arrays)
         return cloud
 
     def views(self, vertices: np.ndarray) -> list[View]:
-        """Unseen pictures of the mesh with its vertices at ``vertices``: the truth."""
+        """Render held-out images of the mesh with its vertices at ``vertices``: the truth."""
         options = self.options
         cameras = scenes.ring(vertices, options.judges, options.size, elevations=(10.0, 40.0), phase=0.37)
         photos = scenes.photograph(self.mesh, vertices, cameras, options.device)
         return [View(camera, *photo) for camera, photo in zip(cameras, photos, strict=True)]
 
-    def held(self) -> float:
-        """Share of the mesh's vertices in the cage."""
+    def inside_share(self) -> float:
+        """Return the fraction of the mesh's vertices inside the cage."""
         return float(embed_points(self.cage, self.mesh.vertices, device=self.options.device).inside.numpy().mean())
 
 
 @dataclass(frozen=True)
 class View:
-    """A picture that was not trained on."""
+    """A held-out image."""
 
     camera: Camera
     picture: np.ndarray
-    """(H, W, 3)"""
+    """(H, W, 3) colour."""
     coverage: np.ndarray
-    """(H, W)"""
+    """(H, W) coverage."""
 
     def judge(self, cloud: GaussianCloud) -> tuple[dict[str, float], np.ndarray]:
-        """Scores of the cloud's picture, and that picture."""
+        """Return the scores of the cloud's image, and that image."""
         image = render_gaussians(cloud, self.camera)
         picture = np.clip(image.colour.numpy(), 0.0, 1.0)
         pair = [torch.as_tensor(one, dtype=torch.float32) for one in (picture, self.picture)]
@@ -203,13 +205,13 @@ class View:
         }, picture
 
 
-def _told(scores: Mapping[str, float]) -> dict[str, float | None]:
-    """As JSON has it: no number that is none."""
+def _without_nan(scores: Mapping[str, float]) -> dict[str, float | None]:
+    """Replace NaN by None, because JSON has no NaN."""
     return {key: None if np.isnan(value) else value for key, value in scores.items()}
 
 
 def judged(cloud: GaussianCloud, views: list[View]) -> tuple[dict[str, float], np.ndarray]:
-    """Mean scores over the views, and the first picture."""
+    """Return mean scores over the views, and the first image."""
     results = [view.judge(cloud) for view in views]
     return {key: float(np.mean([one[key] for one, _ in results])) for key in results[0][0]}, results[0][1]
 
@@ -217,20 +219,21 @@ def judged(cloud: GaussianCloud, views: list[View]) -> tuple[dict[str, float], n
 def object_rows(
     mesh: PaintedMesh, options: argparse.Namespace, splitting: Splitting
 ) -> tuple[list[Row], list[np.ndarray]]:
-    """Scores of every row and motion for one object, and a strip of pictures for each motion."""
+    """Return scores of every row and motion for one object, and a strip of images for each motion."""
     subject = Subject(mesh, options)
     moved = subject.moved_nodes()
     cloud = subject.trained(options.gaussians)
     split = {motion: splitting.apply(cloud, subject.cage, nodes) for motion, nodes in moved.items()}
     many = subject.trained(round(np.mean([one.count for one in split.values()])))
-    surfaces = {GIVEN: capture_surface(cloud), AS_MANY: capture_surface(many)}
-    surfaces[SPLIT] = surfaces[GIVEN]
+    surfaces = {AS_TRAINED: capture_surface(cloud), AS_MANY: capture_surface(many)}
+    surfaces[SPLIT] = surfaces[AS_TRAINED]
     at_rest = {
-        name: judged(one, subject.views(mesh.vertices))[0]["psnr"] for name, one in ((GIVEN, cloud), (AS_MANY, many))
+        name: judged(one, subject.views(mesh.vertices))[0]["psnr"]
+        for name, one in ((AS_TRAINED, cloud), (AS_MANY, many))
     }
     print(
-        f"  cage {len(subject.cage.nodes)} nodes, {100 * subject.held():.2f} % of the vertices inside; unseen views at"
-        f" rest {at_rest[GIVEN]:.2f} dB, {at_rest[AS_MANY]:.2f} dB with {many.count} Gaussians",
+        f"  cage {len(subject.cage.nodes)} nodes, {100 * subject.inside_share():.2f} % of the vertices inside;"
+        f" held-out views at rest {at_rest[AS_TRAINED]:.2f} dB, {at_rest[AS_MANY]:.2f} dB with {many.count} Gaussians",
         flush=True,
     )
     rows: list[Row] = []
@@ -240,13 +243,13 @@ def object_rows(
         vertices = scenes.carried_vertices(subject.mesh, subject.cage, nodes, options.device)
         views = subject.views(vertices)
         paper = replace(splitting, degrees=PAPER_DEGREES).apply(cloud, subject.cage, nodes, SplitRule.PAPER)
-        captures = {GIVEN: cloud, SPLIT: split[motion], PAPER_SPLIT: paper, AS_MANY: many}
+        captures = {AS_TRAINED: cloud, SPLIT: split[motion], PAPER_SPLIT: paper, AS_MANY: many}
         strip = [views[0].picture]
         for name, row in ROWS.items():
             capture = captures[row.capture]
             surface = None if row.on_cage else surfaces.get(row.capture)
             (carried,) = deform_with_method(capture, subject.cage, [nodes], method=row.method, surface=surface)
-            if not row.turns_colour:
+            if not row.rotates_colour:
                 carried = replace(carried, sh=capture.sh)
             scores, picture = judged(carried, views)
             if name in MAIN:
@@ -259,19 +262,19 @@ def object_rows(
                     "method": row.method.value,
                     "capture": row.capture,
                     "gaussians": carried.count,
-                    **_told(scores),
+                    **_without_nan(scores),
                     "psnr_at_rest": at_rest.get(row.capture),
                 }
             )
             table.row(motion, name, scores["psnr"], scores["ssim"], scores["flip"], carried.count)
-        # 400 pixels show what there is to see.
+        # 400 pixels are enough to show the differences.
         coarser = max(1, strip[0].shape[0] // 400)
         strips.append(np.concatenate([p[::coarser, ::coarser] for p in strip], axis=1))
     return rows, strips
 
 
 def settings_rows(mesh: PaintedMesh, options: argparse.Namespace, settings: Mapping[str, Splitting]) -> list[Row]:
-    """Ours with each of ``settings``, for one object and every motion."""
+    """Return rows of ours with each of ``settings``, for one object and every motion."""
     subject = Subject(mesh, options)
     cloud = subject.trained(options.gaussians)
     rows = []
@@ -284,7 +287,13 @@ def settings_rows(mesh: PaintedMesh, options: argparse.Namespace, settings: Mapp
             )
             scores, _ = judged(carried, views)
             rows.append(
-                {"object": mesh.name, "motion": motion, "setting": name, "gaussians": carried.count, **_told(scores)}
+                {
+                    "object": mesh.name,
+                    "motion": motion,
+                    "setting": name,
+                    "gaussians": carried.count,
+                    **_without_nan(scores),
+                }
             )
             table.row(motion, name, scores["psnr"], scores["ssim"], scores["flip"], carried.count)
     return rows

@@ -1,24 +1,22 @@
-"""Table 2: quadratic programs and objective of every strategy for the contact states, frame by frame.
+"""Table 2: number of quadratic programs and objective of every strategy for the contact states, frame by frame.
 
 python benchmarks/table2.py [--quick] [--device cpu] [--seed 0] [--solver daqp] [--bodies pawn stool monkey]
     [--json PATH] [--plot PATH]
 
-The paper's protocol: 50 frames made with known activations, 10 muscle groups and 5 contacts of 8 friction directions,
-that is 60 variables and 50 complementarity pairs a frame. Each frame is one program (Eq. 13) that asks for the
-animation's own motion; every strategy gets the same programs. A second table holds smaller problems of the same bodies,
-and random ones, against the optimum over all contact states (branch and bound).
+The paper's protocol: 50 frames animated with known activations, 10 muscle groups and 5 contacts of 8 friction
+directions, that is 60 variables and 50 complementarity pairs a frame. Each frame is one program (Eq. 13) whose target
+is the animation's own motion; every strategy gets the same programs. A second table has smaller problems of the same
+bodies, and random ones, compared with the optimum over all contact states (branch and bound).
 
 ``pieces``, the engine's own, has the exact friction cone and no unknowns but activations; all others have the pyramid,
 ``exact`` among them, so ``pieces`` may be better than it. ``objective`` is the program's, at the activations and forces
-that a strategy found; ``true`` is the same objective at the forces that contact with the exact cone answers to its
-activations, which is what a step then does with them. ``paper`` is the paper's: the states of stage 1 (Eq. 12), then
-one contact at a time.
+that a strategy returns; ``true`` is the same objective with the contact forces of the exact cone under its activations,
+which is what a step then computes. ``paper`` is the paper's: the states of stage 1 (Eq. 12), then one contact at a
+time. ``qpcc`` starts from all-static and changes one contact at a time by its own multipliers; if all-static has no
+solution, it starts from the states that follow from the last activations. ``qpcc-our-moves`` differs from it only in
+our rules for the moves, so that rules and start can be judged separately.
 
-``qpcc`` starts from all-static and moves one contact at a time as its own multipliers say; where all-static has no
-solution it is given the states that follow from the last activations. ``qpcc-our-moves`` differs from it only in our
-rules for the moves, so that rules and start can be judged apart.
-
-The ratios of ``exact`` to ``qpcc`` are told, too: they say how much there is to gain. Aims, over all frames together:
+The ratios of ``exact`` to ``qpcc`` are also reported; they bound the possible gain. Aims, over all frames together:
 ``qps_vs_qpcc`` (pieces takes at most 0.37 of qpcc's QPs) and ``objective_vs_qpcc`` (its mean objective is at most 0.64
 of qpcc's): the paper's own ratios.
 """
@@ -46,53 +44,55 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAPER_QPS, PAPER_OBJECTIVE = 17.01 / 46.19, 0.83 / 1.29
-"""Of the paper's own strategy over QPCC in its Table 2: 0.37 and 0.64."""
+"""Ratios of the paper's own strategy to QPCC in its Table 2: 0.37 and 0.64."""
 QP_LIMIT = 1000
 
 
 def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[Strategy, np.ndarray]:
-    """For each strategy (frames, 4): QPs, objective, true objective, milliseconds."""
+    """(frames, 4) for each strategy: QPs, objective, true objective, milliseconds."""
     results = {}
     for strategy in Strategy:
         figures = []
         for frame in frames:
-            found, milliseconds = timed(
+            search, milliseconds = timed(
                 search_program,
-                frame.pieces,
+                frame.program,
                 strategy,
-                frame.foreseen,
+                frame.predicted,
                 directions=directions,
                 qp_limit=QP_LIMIT,
                 solver=solver,
             )
-            x = found.x
-            objectives = (np.inf, np.inf) if x is None else [frame.pieces.objective(y) for y in (x, answered(frame, x))]
-            figures.append((found.qp_count, *objectives, milliseconds))
+            x = search.x
+            objectives = (
+                (np.inf, np.inf)
+                if x is None
+                else [frame.program.objective(y) for y in (x, with_exact_forces(frame, x))]
+            )
+            figures.append((search.qp_count, *objectives, milliseconds))
         results[strategy] = np.array(figures)
     return results
 
 
-def answered(frame: Frame, x: np.ndarray) -> np.ndarray:
-    """(m + 3n,) the activations of ``x`` (m + 3n,) and the forces that exact contact answers to them."""
-    pieces = frame.pieces
-    activations, forces = np.split(x, [pieces.activation_count])
-    return np.concatenate([activations, contact_forces(pieces, activations, forces).ravel()])
+def with_exact_forces(frame: Frame, x: np.ndarray) -> np.ndarray:
+    """(m + 3n,) activations of ``x`` (m + 3n,) and the forces of exact contact under them."""
+    program = frame.program
+    activations, forces = np.split(x, [program.activation_count])
+    return np.concatenate([activations, contact_forces(program, activations, forces).ravel()])
 
 
-def contact_forces(pieces: CoulombProgram, activations: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """(n, 3) body weights that obey contact and friction under ``activations`` (m,)."""
-    m, n = pieces.activation_count, pieces.contact_count
-    free = pieces.rows[:, :m] @ activations + pieces.offset
-    delassus = pieces.rows[:, m:].copy()
+def contact_forces(program: CoulombProgram, activations: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """(n, 3) body weights, the contact forces that satisfy the contact laws under ``activations`` (m,)."""
+    m, n = program.activation_count, program.contact_count
+    free = program.rows[:, :m] @ activations + program.offset
+    delassus = program.rows[:, m:].copy()
     delassus[np.diag_indices_from(delassus)] += 1e-7 * delassus.diagonal().mean()
-    forces, _ = coulomb_forces(delassus, free, np.zeros(n), pieces.friction, start.reshape(n, 3))
+    forces, _ = coulomb_forces(delassus, free, np.zeros(n), program.friction, start.reshape(n, 3))
     return forces
 
 
 def lively_frames(bench: BenchBody, strength: float, **options: Any) -> tuple[list[Frame], float]:
-    """Frames of an animation, as strong as the body bears:
-    halved from ``strength`` until every step of it converges.
-    """
+    """Animate the body, halving ``strength`` until every step converges; return the frames and the strength."""
     while True:
         try:
             return animation_frames(bench, strength=strength, **options), strength
@@ -101,7 +101,7 @@ def lively_frames(bench: BenchBody, strength: float, **options: Any) -> tuple[li
 
 
 def table_rows(table: str, body: str, results: dict[Strategy, np.ndarray], **more: Any) -> list[Row]:
-    """One row a strategy."""
+    """Return one row for each strategy."""
     best = results[Strategy.EXACT][:, 1]
     rows = []
     for strategy, figures in results.items():
@@ -134,7 +134,7 @@ def table_rows(table: str, body: str, results: dict[Strategy, np.ndarray], **mor
 
 
 def print_rows(rows: list[Row]) -> None:
-    """QPs and objectives: average, best, worst; then milliseconds and the objective over the exact optimum's."""
+    """Print QPs and objectives (average, best, worst), milliseconds, and the objective over the exact optimum's."""
     table = Table(
         **{"body": "<12", "strategy": "<14", "frames": "d"},
         **{"QPs_avg": ".2f", "QPs_best": "d", "QPs_worst": "d"},
@@ -151,19 +151,19 @@ def print_rows(rows: list[Row]) -> None:
 
 
 def pooled(parts: list[dict[Strategy, np.ndarray]]) -> dict[Strategy, np.ndarray]:
-    """All frames together."""
+    """Concatenate all frames."""
     return {strategy: np.concatenate([part[strategy] for part in parts]) for strategy in Strategy}
 
 
 def random_frames(count: int, seed: int) -> list[Frame]:
-    """Random programs of three contacts, whose optimum without complementarity says little about the true one."""
+    """Return random programs of three contacts, whose optimum without complementarity is far from the true one."""
     frames = []
     for index in range(count):
-        pieces = small_problem(1000 * seed + index, contacts=3).pieces
-        at_rest = np.zeros(pieces.activation_count)
-        forces = contact_forces(pieces, at_rest, np.zeros((3, 3)))
-        velocities = (pieces.rows[:, pieces.activation_count :] @ forces.ravel() + pieces.offset).reshape(-1, 3)
-        frames.append(Frame(pieces, PredictedContact(at_rest, forces, velocities), at_rest))
+        program = small_problem(1000 * seed + index, contacts=3).pieces
+        at_rest = np.zeros(program.activation_count)
+        forces = contact_forces(program, at_rest, np.zeros((3, 3)))
+        velocities = (program.rows[:, program.activation_count :] @ forces.ravel() + program.offset).reshape(-1, 3)
+        frames.append(Frame(program, PredictedContact(at_rest, forces, velocities), at_rest))
     return frames
 
 
@@ -183,12 +183,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             skipped.append(name)
             continue
         bench = body_named(name, options.device)
-        for wanted in strengths:
-            frames, strength = lively_frames(bench, wanted, seed=options.seed)
+        for target_strength in strengths:
+            frames, strength = lively_frames(bench, target_strength, seed=options.seed)
             large.append(solve_all(frames, solver, 8))
-            made = table_rows("frames", f"{name} {strength:g}", large[-1], strength=strength)
-            rows += made
-            print_rows(made)
+            body_rows = table_rows("frames", f"{name} {strength:g}", large[-1], strength=strength)
+            rows += body_rows
+            print_rows(body_rows)
         frames, strength = lively_frames(bench, strengths[0], activations=4, contacts=3, seed=options.seed + 1)
         small.append(solve_all(frames, solver, 4))
         rows += table_rows("small", f"{name} {strength:g}", small[-1], strength=strength)
@@ -221,9 +221,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows,
         ratios={
             strategy.value: dict(
-                zip(("qps_vs_qpcc", "objective_vs_qpcc", "true_objective_vs_qpcc"), found, strict=True)
+                zip(("qps_vs_qpcc", "objective_vs_qpcc", "true_objective_vs_qpcc"), values, strict=True)
             )
-            for strategy, found in ratios.items()
+            for strategy, values in ratios.items()
         },
         beyond={
             "qps_a_frame": float(total[Strategy.MODES][:, 0].mean()),
@@ -239,7 +239,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def draw(figure: Figure, total: dict[Strategy, np.ndarray], near: dict[Strategy, np.ndarray]) -> None:
-    """QPs a frame; and how near to the exact optimum each strategy comes, over the share of frames."""
+    """Draw QPs per frame, and the objective over the exact optimum's, over the share of frames."""
     left, *others = figure.subplots(1, 3)
     shown = [strategy for strategy in Strategy if strategy is not Strategy.EXACT]
     palette = ("tab:blue", "tab:green", "tab:gray", "tab:orange", "tab:olive", "tab:purple")

@@ -1,14 +1,14 @@
-"""Table 3 of the paper: an object cut off at its plane, seen from within the plane. Also writes its figure 9.
+"""Table 3 of the paper: an object cut at its plane, viewed from within the plane. Also writes the paper's figure 9.
 
-Scenes are taken apart as ``egs-warp segment`` does, from masks in 18 views: of the true object in the built-in scenes,
-and in real captures of what a click finds. ``mask only`` is everything that the masks claim, the plane left aside. Four
-cameras of 800 x 800 pixels lie in the plane, so that its horizon is the middle row. PSNR and SSIM compare the upper
-halves with those of ``mask only``, on black; the residual is the sum of the pixels of the lower half over that of the
-upper half.
+Scenes are segmented as in ``egs-warp segment``, from masks in 18 views: of the true object in the built-in scenes, and
+of the object that a click selects in real captures. ``mask only`` is everything that the masks claim, without the
+plane. Four cameras of 800 x 800 pixels lie in the plane, so that its horizon is the middle row. PSNR and SSIM compare
+the upper halves with those of ``mask only``, on black; the residual is the sum of the pixels of the lower half over
+that of the upper half.
 
 Aims: ``residual`` (L_seg: at most 0.002 in every scene), ``psnr`` (L_seg: at least 35.3 dB in every scene). ``L_seg, no
-subdivision`` is the paper's own way; ours splits large straddling Gaussians before it trains, and cuts those that are
-left.
+subdivision`` is the paper's own method; ours splits large straddling Gaussians before training, and cuts the remaining
+ones.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from perceptual import flip_error, lpips_distance
 BUILT_IN = ("pawn", "stool", "figurine")
 CAPTURES = ("koala.ply", "narcissus.sog")
 CLICKS = {"koala.ply": (0.1, -0.7, 0.15), "narcissus.sog": (0.0, -0.8, 0.0), "fox.ply": (0.0, 0.0, 2.0)}
-"""One on the object of each capture."""
+"""A click on the object of each capture."""
 METHODS: dict[str, tuple[StraddlingPolicy, StraddlingOptions | None]] = {
     "mask only": (StraddlingPolicy.NONE, None),
     "remove": (StraddlingPolicy.REMOVE, None),
@@ -51,24 +51,24 @@ BLACK = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Parts:
-    """A scene taken apart."""
+    """The parts of a segmented scene."""
 
     whole: GaussianCloud
     hard: GaussianCloud
-    """More than half of what each Gaussian shows lies in the masks; the plane has no say."""
+    """Gaussians with more than half of their blending weight in the masks, without regard to the plane."""
     claimed: GaussianCloud
-    """The same without what hangs elsewhere: the object, and what of it lies below the plane."""
+    """The same without detached parts: the object, and its part below the plane."""
     above: GaussianCloud
     """The object above the plane."""
     located: LocatedPlane
 
 
-def taken_apart(name: str, device: str) -> Parts:
-    """From masks in 18 views of what is marked: the truth in built-in scenes, what a click finds in captures."""
+def segment_parts(name: str, device: str) -> Parts:
+    """Segment the scene from masks in 18 views: of the truth in built-in scenes, of a click's object in captures."""
     if name in BUILT_IN:
-        made = scene(name, device=device)
-        cloud, chosen = made.whole()
-        plane, size = made.plane, 1.5
+        built = scene(name, device=device)
+        cloud, chosen = built.whole()
+        plane, size = built.plane, 1.5
         centre = np.array([0.0, 0.0, 0.5])
     else:
         cloud = read_capture(data_folder() / "scenes" / name, device=device).cloud
@@ -76,14 +76,14 @@ def taken_apart(name: str, device: str) -> Parts:
         chosen, plane, centre, size = clicked.segmentation.object_mask, clicked.plane, clicked.centre, clicked.size
     masks = masks_from_selection(cloud, chosen, ring_cameras(plane, centre, 0.6 * size, size=256))
     located = locate_plane(cloud, ObjectSpec(masks=tuple(masks)), up=plane.normal)
-    found = located.segmentation
+    segmentation = located.segmentation
     hard = blending_votes(cloud, [view for view in masks if view.mask.any()]).share_inside() > 0.5
-    claimed = (found.object_mask | found.buried_mask) & hard
-    return Parts(cloud, cloud.subset(hard), cloud.subset(claimed), cloud.subset(found.object_mask), located)
+    claimed = (segmentation.object_mask | segmentation.buried_mask) & hard
+    return Parts(cloud, cloud.subset(hard), cloud.subset(claimed), cloud.subset(segmentation.object_mask), located)
 
 
 def cameras_in(plane: Plane, located: LocatedPlane, side: int) -> list[Camera]:
-    """Four cameras with their centres in the plane that look along it."""
+    """Return four cameras with their centres in the plane that look along it."""
     tall = 2.0 * float(plane.heights(located.centre))
     middle = located.centre - plane.heights(located.centre) * plane.normal
     return ring_cameras(plane, middle, tall, count=4, elevations=(0.0,), size=side, margin=1.15)
@@ -94,16 +94,18 @@ def picture(cloud: GaussianCloud, camera: Camera) -> np.ndarray:
     return np.clip(render_gaussians(cloud, camera, background=BLACK).colour.numpy(), 0.0, 1.0)
 
 
-def scores(pictures: Sequence[np.ndarray], wanted: Sequence[np.ndarray] | None) -> dict[str, float | None]:
-    """Residual, and the upper halves against those ``wanted``, None where the pictures themselves are those;
-    ``whole_psnr`` compares all of a picture with that upper half over nothing, so residual and looks in one number.
+def scores(pictures: Sequence[np.ndarray], targets: Sequence[np.ndarray] | None) -> dict[str, float | None]:
+    """Return the scores of images against the upper halves ``targets``.
+
+    ``targets`` is None for the images that they were taken from. ``whole_psnr`` compares the whole image with that
+    upper half over an empty lower half, so it combines residual and similarity.
     """
     half = len(pictures[0]) // 2
     residual = float(np.mean([one[half:].sum() / one[:half].sum() for one in pictures]))
-    if wanted is None:
+    if targets is None:
         below = float(np.mean([-10.0 * np.log10(max((one[half:] ** 2).sum() / one.size, 1e-10)) for one in pictures]))
         return {"psnr": None, "ssim": None, "flip": None, "lpips": None, "residual": residual, "whole_psnr": below}
-    pairs = [(one[:half], other) for one, other in zip(pictures, wanted, strict=True)]
+    pairs = [(one[:half], other) for one, other in zip(pictures, targets, strict=True)]
     distance, _ = lpips_distance()
     tensors = [tuple(torch.tensor(one) for one in pair) for pair in pairs]
     return {
@@ -113,18 +115,18 @@ def scores(pictures: Sequence[np.ndarray], wanted: Sequence[np.ndarray] | None) 
         "lpips": float(np.mean([distance(*pair) for pair in pairs])) if distance else None,
         "residual": residual,
         "whole_psnr": float(
-            np.mean([psnr(a, np.concatenate([b, np.zeros_like(b)])) for a, b in zip(pictures, wanted, strict=True)])
+            np.mean([psnr(a, np.concatenate([b, np.zeros_like(b)])) for a, b in zip(pictures, targets, strict=True)])
         ),
     }
 
 
 def rows_of(name: str, device: str, side: int, seed: int, table: Table) -> tuple[list[Row], np.ndarray]:
-    """One row a method, and their pictures from one camera side by side."""
-    parts = taken_apart(name, device)
+    """Return one row for each method, and their images from one camera side by side."""
+    parts = segment_parts(name, device)
     plane = parts.located.plane
     cameras = cameras_in(plane, parts.located, side)
     half = side // 2
-    wanted = [picture(parts.claimed, camera)[:half] for camera in cameras]
+    targets = [picture(parts.claimed, camera)[:half] for camera in cameras]
     rows, shown = [], []
     for method, (clearing, chosen) in METHODS.items():
         options = StraddlingOptions(seed=seed) if chosen is None else chosen
@@ -137,7 +139,7 @@ def rows_of(name: str, device: str, side: int, seed: int, table: Table) -> tuple
             "method": method,
             "gaussians": cloud.count,
             "seconds": 1e-3 * milliseconds,
-            **scores(pictures, None if clearing is StraddlingPolicy.NONE else wanted),
+            **scores(pictures, None if clearing is StraddlingPolicy.NONE else targets),
         }
         rows.append(row)
         table.row(name, method, row["psnr"], row["ssim"], row["flip"], row["residual"], row["seconds"])
@@ -146,12 +148,12 @@ def rows_of(name: str, device: str, side: int, seed: int, table: Table) -> tuple
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
+    """Run the benchmark."""
     options = flags(
         __doc__,
         quick="the pawn, the stool and the koala only",
         device="cpu",
-        plot="figure 9: a row a scene; columns in the table's order",
+        plot="file for figure 9: one row for each scene, columns in the table's order",
     ).parse_args(arguments)
     names = ["pawn", "stool", "koala.ply"] if options.quick else [*BUILT_IN, *CAPTURES]
     _, no_lpips = lpips_distance()
@@ -161,7 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = Table(scene="<14", method="<22", PSNR=".3f", SSIM=".4f", FLIP=".4f", residual=".5f", seconds="6.1f")
     for name in names:
         if name in CAPTURES and not (data_folder() / "scenes" / name).exists():
-            print(f"{name}: not here; set EGS_WARP_DATA")
+            print(f"{name}: not on this machine; set EGS_WARP_DATA")
             continue
         more, shown = rows_of(name, options.device, 800, options.seed, table)
         rows += more

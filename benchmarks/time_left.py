@@ -1,7 +1,8 @@
-"""Is the time left true that the progress bars of a scene and of a simulation tell?
+"""Accuracy of the remaining time that the progress bars of a scene and of a simulation show.
 
-The built-in pawn is taken out of its room, and jumps, hops, twists and walks. Each time that the bar is drawn, what it
-says is left is compared with what turns out to be left, where that is 5 s or more: the bar tells whole seconds.
+The built-in pawn is segmented from its scene, and jumps, hops, twists and walks. At each update of the bar, the
+remaining time that it shows is compared with the true remaining time, if that is 5 s or more: the bar shows whole
+seconds.
 
 python benchmarks/time_left.py [--quick] [--device cpu] [--seed 0] [--json PATH] [--plot PATH]
 """
@@ -31,33 +32,33 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCRIPTS = ("jump", "hop x2", "twist", "walk 0.2")
-LEAST = 5.0
-"""Seconds."""
+MIN_REMAINING = 5.0
+"""Minimum true remaining time of a comparison, s."""
 
 
 class Watched(io.StringIO):
-    """A stream that keeps when the bar was drawn, and the seconds left that it told."""
+    """A stream that records the time of each update of the bar, and the remaining seconds shown."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.told: list[tuple[float, float]] = []
+        self.updates: list[tuple[float, float]] = []
 
     def write(self, text: str, /) -> int:
-        """Reads what the user would see."""
-        if found := re.search(r"<(?:(\d+):)?(\d+):(\d+)", text):
-            hours, minutes, seconds = (float(part or 0) for part in found.groups())
-            self.told.append((time.perf_counter(), 3600.0 * hours + 60.0 * minutes + seconds))
+        """Parse the remaining time in the text of a progress bar."""
+        if match := re.search(r"<(?:(\d+):)?(\d+):(\d+)", text):
+            hours, minutes, seconds = (float(part or 0) for part in match.groups())
+            self.updates.append((time.perf_counter(), 3600.0 * hours + 60.0 * minutes + seconds))
         return len(text)
 
 
 def measured(name: str, run: Callable[[TextIO], int]) -> Row:
-    """Of a ``run`` that draws its bar on what it is given, and returns how many frames it made."""
+    """Measure ``run``, which draws its progress bar on the given stream and returns its number of frames."""
     stream = Watched()
     began = time.perf_counter()
     frames = run(stream)
     ended = time.perf_counter()
-    at, said = np.array(stream.told).T
-    far = ended - at >= LEAST
+    at, said = np.array(stream.updates).T
+    far = ended - at >= MIN_REMAINING
     return {
         "run": name,
         "frames": frames,
@@ -68,34 +69,34 @@ def measured(name: str, run: Callable[[TextIO], int]) -> Row:
 
 
 def simulated(creature: Creature, script: str, file: TextIO) -> int:
-    """The creature moves."""
-    with simulation_bar(file=file) as told:
-        return len(simulate(creature, motion(script), progress=told).frames) - 1
+    """Simulate the creature; return the number of frames."""
+    with simulation_bar(file=file) as progress:
+        return len(simulate(creature, motion(script), progress=progress).frames) - 1
 
 
-def taken_out(room: GaussianCloud, file: TextIO) -> int:
-    """The pawn of a room, clicked on."""
+def segmented(scene_cloud: GaussianCloud, file: TextIO) -> int:
+    """Segment the pawn of a scene from a click."""
     options = SceneOptions()
-    with scene_bar(options.stages, file=file) as told:
-        prepare_scene(room, ObjectSpec(point=np.array([0.0, 0.0, 0.5])), options=options, progress=told)
+    with scene_bar(options.stages, file=file) as progress:
+        prepare_scene(scene_cloud, ObjectSpec(point=np.array([0.0, 0.0, 0.5])), options=options, progress=progress)
     return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
+    """Run the benchmark."""
     parser = flags(
-        __doc__, quick="the room, the jump and the walk alone", device="cpu", seed="not used: nothing here is random"
+        __doc__, quick="only the scene, the jump and the walk", device="cpu", seed="not used: nothing here is random"
     )
     options = parser.parse_args(arguments)
-    made = pawn(device=options.device)
-    creature = make_creature(made.cloud, plane=made.plane)
+    built = pawn(device=options.device)
+    creature = make_creature(built.cloud, plane=built.plane)
     # The first frames compile the kernels.
     simulate(creature, motion("jump"), frames=2)
     table = Table(
-        run="<10", frames="6d", seconds="7.0f", told="5d", least=".2f", median=".2f", most=".2f", within=".0%"
+        run="<10", frames="6d", seconds="7.0f", updates="5d", min=".2f", median=".2f", max=".2f", within=".0%"
     )
-    room = scene("pawn", device=options.device).whole()[0]
-    runs = {"room": partial(taken_out, room)}
+    scene_cloud = scene("pawn", device=options.device).whole()[0]
+    runs = {"scene": partial(segmented, scene_cloud)}
     runs |= {script: partial(simulated, creature, script) for script in (SCRIPTS[::3] if options.quick else SCRIPTS)}
     rows = []
     for name, run in runs.items():
@@ -111,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for row in rows:
             axes.plot(np.array(row["past"]) / row["seconds"], row["ratios"], label=row["run"])
         axes.axhspan(0.5, 2.0, alpha=0.1)
-        axes.set(xlabel="of the run", ylabel="time left, told over true")
+        axes.set(xlabel="fraction of the run", ylabel="time left, shown over true")
         axes.legend()
 
     every = np.concatenate([row["ratios"] for row in rows])

@@ -1,8 +1,9 @@
-"""Captures trained from real photos, ours and gsplat's MCMC strategy side by side: held-out PSNR and SSIM, and time.
+"""Captures trained from real photos by ours and by gsplat's MCMC strategy: held-out PSNR and SSIM, and time.
 
-Both get the same photos (straightened, every eighth held out), the same iterations and the same cap on Gaussians, and
-are judged by the same renderer: once as they are, once after one affine map of colours was fitted to each whole
-held-out photo, the usual way to remove exposure. The means count every held-out photo, a wrongly posed one, too.
+Both get the same photos (undistorted, every eighth held out), the same iterations and the same cap on Gaussians, and
+are judged with the same renderer: once without and once with an affine colour correction fitted to each whole held-out
+photo, the common method to remove differences in exposure. The means include every held-out photo, also one with a
+wrong pose.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ _SHOWN = (
     *("case", "method", "gaussians", "seconds", "held_out_psnr", "held_out_ssim"),
     *("held_out_plain_psnr", "held_out_plain_ssim", "trained_on_psnr", "trained_on_ssim"),
 )
-"""Columns of the table, by their names in the rows."""
+"""Columns of the table, by their keys in the rows."""
 _WARM_UP = 20
-"""Steps of both before the first timed case, so that kernels are compiled."""
+"""Training steps of both before the first timed case, so that kernels are compiled."""
 
 
 def row_of(case: str, method: str, cloud: GaussianCloud, seconds: float, scores: Sequence[PhotoScore]) -> Row:
-    """Means of the ``scores`` of one cloud."""
+    """Return the means of the ``scores`` of one cloud."""
     row: Row = {"case": case, "method": method, "gaussians": cloud.count, "seconds": seconds}
     for which, out in (("held_out", True), ("trained_on", False)):
         chosen = [score for score in scores if score.held_out is out]
@@ -44,7 +45,7 @@ def row_of(case: str, method: str, cloud: GaussianCloud, seconds: float, scores:
 
 
 def run_case(case: str, options: argparse.Namespace, table: Table) -> tuple[list[Row], np.ndarray]:
-    """Rows of both methods, and a strip of photo and renders."""
+    """Return the rows of both methods, and a strip of a photo and its renders."""
     folder = data_folder() / "posed" / case
     marks: dict[str, float] = {}
     has_peer = options.device.startswith("cuda") and has_gsplat()
@@ -78,7 +79,7 @@ def run_case(case: str, options: argparse.Namespace, table: Table) -> tuple[list
             seed=options.seed,
             device=options.device,
         )
-        # Each is judged over what it was trained over: where light gets through, another colour would count against it.
+        # Each is judged over its training background: otherwise light that passes through would count against it.
         behind = result.background if result.cut_out else (0.0, 0.0, 0.0)
         scores = [
             score_photo(peer.cloud, view, behind, held_out=score.held_out)
@@ -98,7 +99,7 @@ def run_case(case: str, options: argparse.Namespace, table: Table) -> tuple[list
 
 
 def warm_up(options: argparse.Namespace) -> None:
-    """Compile every kernel outside of the timed runs."""
+    """Compile every kernel before the timed runs."""
     folder = data_folder() / "posed" / options.cases[0]
     result = train(folder, iterations=_WARM_UP, max_gaussians=1000, max_side=120, device=options.device)
     if options.device.startswith("cuda") and has_gsplat():
@@ -112,11 +113,11 @@ def warm_up(options: argparse.Namespace) -> None:
 
 
 def judge(rows: list[Row]) -> tuple[dict[str, bool | None], dict[str, str]]:
-    """The aims, from the rows."""
+    """Return the aims from the rows."""
     aims: dict[str, bool | None] = {"psnr_vs_gsplat": None, "not_slower": None}
     cases = {row["case"] for row in rows if row["method"] == GSPLAT}
     if not cases:
-        return aims, dict.fromkeys(aims, "gsplat needs a GPU and is not installed here")
+        return aims, dict.fromkeys(aims, "gsplat needs a GPU and is not installed")
     pairs = [
         [next(row for row in rows if row["case"] == case and row["method"] == method) for method in (OURS, GSPLAT)]
         for case in sorted(cases)
@@ -127,12 +128,16 @@ def judge(rows: list[Row]) -> tuple[dict[str, bool | None], dict[str, str]]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print, write."""
-    parser = flags(__doc__, quick="300 iterations, 3,000 Gaussians, 120 pixels", plot="file for photo beside renders")
+    """Run the benchmark."""
+    parser = flags(
+        __doc__, quick="300 iterations, 3,000 Gaussians, 120 pixels", plot="file for an image of photos and renders"
+    )
     parser.add_argument("--cases", nargs="+", default=list(CASES))
-    parser.add_argument("--iterations", type=int, help="7000")
-    parser.add_argument("--gaussians", type=int, help="cap for both (200000)")
-    parser.add_argument("--max-side", type=int, help="photos are reduced to this many pixels (as they are)")
+    parser.add_argument("--iterations", type=int, help="training steps (default 7000)")
+    parser.add_argument("--gaussians", type=int, help="maximum number of Gaussians of both (default 200000)")
+    parser.add_argument(
+        "--max-side", type=int, help="reduce the longer side of photos to this many pixels (default full size)"
+    )
     options = parser.parse_args(arguments)
     options.iterations = options.iterations or (300 if options.quick else 7000)
     options.gaussians = options.gaussians or (3000 if options.quick else 200_000)

@@ -27,15 +27,15 @@ _RANDOM_POINTS, _RANDOM_EXTENT = 100_000, 3.0
 
 @dataclass(frozen=True)
 class PeerResult:
-    """What gsplat made."""
+    """Result of a training by gsplat."""
 
     cloud: GaussianCloud
     seconds: float
-    """Of the training loop."""
+    """Duration of the training loop."""
 
 
 def has_gsplat() -> bool:
-    """Whether the peer can run here."""
+    """Return True if gsplat is installed and there is a GPU."""
     try:
         import gsplat  # noqa: F401  # type: ignore[import-not-found]
     except ImportError:
@@ -53,11 +53,11 @@ def train_with_gsplat(
     seed: int = 0,
     device: str = "cuda:0",
 ) -> PeerResult:
-    """gsplat 1.5.3 as its ``simple_trainer.py mcmc`` sets it up, MCMC strategy untouched but for the cap.
+    """Train with gsplat 1.5.3, set up as in its ``simple_trainer.py mcmc``, with only the cap of the strategy changed.
 
-    The world is scaled to the cameras; it begins with triangulated points or a random cube; SH gets one degree more
-    each 1,000 steps; what is behind is black. Photos with alpha are laid over a random colour each step, as ours are;
-    SSIM is ``likeness.ssim``, for fused_ssim is another package.
+    The world is scaled to the cameras; training starts from triangulated points or a random cube; the SH degree rises
+    by one every 1,000 steps; the background is black. Photos with alpha are composited over a random colour in each
+    step, as in ours; SSIM is ``metrics.ssim``, because fused_ssim is a separate package.
     """
     from gsplat import rasterization  # type: ignore[import-not-found]
     from gsplat.strategy import MCMCStrategy  # type: ignore[import-not-found]

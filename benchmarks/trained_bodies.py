@@ -1,8 +1,8 @@
-"""Captures of meshes by the package's own trainer, from photographs drawn by a ray caster, for ``gaits.py --captures``.
+"""Captures of meshes for ``gaits.py --captures``, trained by the package from photographs of a ray caster.
 
 python benchmarks/trained_bodies.py [--quick] [--device cpu] [--seed 0] [--names NAME ...] [--out FOLDER] [--json PATH]
 
-The legs and feet of what is trained are rough, end at other heights and melt together, as those of a user's capture do.
+The legs and feet of the trained captures are rough, differ in height and merge, like those of a user's capture.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ MESHES: dict[str, Callable[[], PaintedMesh]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train and write them."""
-    parser = flags(__doc__, quick="one small capture of the slender chair", device="cpu", seed="of the training")
+    """Train the captures and write them."""
+    parser = flags(__doc__, quick="one small capture of the slender chair", device="cpu", seed="seed of the training")
     parser.add_argument("--names", nargs="*", choices=MESHES, help="only these")
     parser.add_argument("--out", type=Path, default=Path("out/trained"), help="folder of NAME.ply (%(default)s)")
     options = parser.parse_args(arguments)

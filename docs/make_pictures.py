@@ -1,7 +1,7 @@
-"""Every picture of these pages, from the built-in captures alone: runs the commands that the pages show, then shrinks.
+"""Make every image of the documentation from the built-in captures: run the commands that the pages show, then shrink.
 
-python docs/make_pictures.py [NAME ...] makes all, or those named, of what ``out`` does not have yet. All of it takes
-about half an hour on two cores.
+python docs/make_pictures.py [NAME ...] makes all images or the named ones; sources that exist in ``out`` are reused.
+All of it takes about half an hour on two cores.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from tests.support.chromium import opened, started
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "docs" / "assets"
 RECORDED, RECORDED_RATE = (720, 360), 20
-"""Pixels of the window in which a page is recorded, and pictures a second of its run."""
-BESIDE = """() => {
+"""Window size in pixels in which a page is recorded, and frames per second of its recording."""
+SIDE_VIEW = """() => {
     const [viewer] = egs.viewers, { centre } = viewer.bounds;
     egs.player.seek(0);
     const from = viewer.centreOfMass;
@@ -54,15 +54,15 @@ class Picture:
 
     name: str
     command: str
-    """That makes its source; the page shows it."""
+    """Command that creates its source; the page shows it."""
     source: str
-    """In ``out``."""
+    """Path of the source in ``out``."""
     width: int
-    """Pixels."""
+    """Width, pixels."""
     at: float = 0.0
-    """Share of the film that a still is taken at."""
+    """Fraction of the film's duration at which a still is taken."""
     sky: float = 0.0
-    """Share of the height that is cut off above."""
+    """Fraction of the height that is cropped at the top."""
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,9 @@ class Page:
     """A page of docs/assets/pages, which is not in git: ``egs-warp view RUN --export``."""
 
     run: str
-    """Folder in ``out``, and its name."""
+    """Folder of the run in ``out``, and name of the page."""
     command: str
-    """That makes the run."""
+    """Command that makes the run."""
 
 
 PAGES = (Page("hop", HOP), Page("jump", JUMP), Page("twist", TWIST), Page("stool", WALK), Page("figurine", SCENE))
@@ -120,14 +120,14 @@ def ffmpeg(*arguments: str) -> None:
 
 
 def seconds(film: Path) -> float:
-    """Length of a film of 60 frames a second."""
-    told = subprocess.run([get_ffmpeg_exe(), "-i", str(film)], capture_output=True, text=True).stderr
-    hours, minutes, rest = told.split("Duration: ")[1].split(",")[0].split(":")
+    """Return the duration of a film in seconds."""
+    output = subprocess.run([get_ffmpeg_exe(), "-i", str(film)], capture_output=True, text=True).stderr
+    hours, minutes, rest = output.split("Duration: ")[1].split(",")[0].split(":")
     return 3600 * int(hours) + 60 * int(minutes) + float(rest)
 
 
 def exported(page: Page) -> Path:
-    """The ``page``, written if it is not there, and its run."""
+    """Return the path of the exported ``page``; make it and its run if they do not exist."""
     folder, path = ROOT / "out" / page.run, ASSETS / "pages" / f"{page.run}.html"
     if not (folder / "creature.npz").is_file():
         run(page.command)
@@ -139,12 +139,12 @@ def exported(page: Page) -> Path:
 
 
 def record(page: Path, film: Path) -> None:
-    """A film of what a ``page`` shows in the system's Chromium, from the side: the way of the centre of mass, too."""
+    """Record a ``page`` in the system's Chromium, from the side, with the path of the centre of mass."""
     with started() as browser, tempfile.TemporaryDirectory() as folder:
         shown, _ = opened(browser, page.as_uri(), *RECORDED)
         bare = "for (const part of document.querySelectorAll('.tools, .dock, figcaption')) part.style.display = 'none'"
         shown.evaluate(f"() => {{ {bare} }}")
-        shown.evaluate(BESIDE)
+        shown.evaluate(SIDE_VIEW)
         count = shown.evaluate("egs.viewers[0].source.frames.length")
         for number, frame in enumerate(range(0, count, 60 // RECORDED_RATE)):
             shown.evaluate("async (frame) => { egs.player.seek(frame); await egs.viewers[0].drawSorted(); }", frame)
@@ -154,14 +154,14 @@ def record(page: Path, film: Path) -> None:
 
 
 def make(picture: Picture) -> None:
-    """Write ``picture`` into docs/assets, running its command if its source is not there."""
+    """Write ``picture`` to docs/assets; run its command if its source does not exist."""
     source, target = ROOT / "out" / picture.source, ASSETS / picture.name
     if source.name == "page.mp4" and not source.is_file():
         record(exported(next(page for page in PAGES if page.command == picture.command)), source)
     elif not source.is_file():
         run(picture.command)
     if target.suffix == ".mp4" or target.stem.endswith("_loop"):
-        # The last frame is held, so that the loop has a rest.
+        # The last frame is repeated, so that the loop pauses.
         film = target.suffix == ".mp4"
         cut = f"crop=iw:trunc(ih*{1 - picture.sky:g}/2)*2:0:ih-oh"
         shrink = f"fps={30 if film else 20},{cut},scale={picture.width}:-2:flags=lanczos"
@@ -187,16 +187,16 @@ def make(picture: Picture) -> None:
         ffmpeg("-ss", f"{picture.at * seconds(source):.3f}", "-i", str(source), "-frames:v", "1", str(still))
     with Image.open(still) as opened:
         small = opened.convert("RGB")
-        kept = int(small.height * (1 - picture.sky) / 2) * 2
-        small = small.crop((0, small.height - kept, small.width, small.height))
+        height = int(small.height * (1 - picture.sky) / 2) * 2
+        small = small.crop((0, small.height - height, small.width, small.height))
         small.thumbnail((picture.width, picture.width), Image.Resampling.LANCZOS)
         small.save(target, quality=86, method=6)
 
 
 def main() -> None:
-    """Make the pictures."""
+    """Make the images."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", help="of docs/assets, or NAME.html of a page; all without any")
+    parser.add_argument("names", nargs="*", help="files of docs/assets, or NAME.html of a page (default all)")
     chosen = parser.parse_args()
     if not (ROOT / "out" / "captures").is_dir():
         run(CAPTURES)

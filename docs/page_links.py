@@ -1,4 +1,4 @@
-"""For mkdocs: links to pages that ``make pictures`` has not made are left out, so that no site has dead ones."""
+"""Hook of mkdocs: remove links to pages that ``make pictures`` has not made, so that the site has no dead links."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ _LINK = re.compile(r"^\[[^]]*\]\((assets/pages/[\w-]+\.html)\).*\n", re.MULTILIN
 
 
 def on_page_markdown(markdown: str, files: Any, **_: Any) -> str:
-    """Called by mkdocs with the text of each page; ``files`` are those of the site."""
+    """Edit the text of each page, called by mkdocs; ``files`` are those of the site."""
     return _LINK.sub(lambda link: link[0] if files.get_file_from_path(link[1]) else "", markdown)

@@ -1,7 +1,7 @@
-"""Advice for photos, and what goes wrong with them, as pictures of the built-in rooms.
+"""Illustrations of advice for photos, and of typical failures, rendered from the built-in scenes.
 
-python docs/photo_sheets.py --out out/photos writes taking.png, photos.png and object.png: each failure is made, not
-drawn.
+python docs/photo_sheets.py --out out/photos writes taking.png, photos.png and object.png. Each failure is simulated,
+not drawn.
 """
 
 from __future__ import annotations
@@ -30,25 +30,27 @@ BACKDROP = (0.55, 0.75, 0.55)
 
 
 def eye(degrees: float, elevation: float = 28.0, away: float = 3.2) -> np.ndarray:
-    """(3,) where a photographer stands on the way round."""
+    """(3,) position of a photographer on a circle around the object."""
     a, e = np.radians([degrees, elevation])
     return MIDDLE + away * np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)])
 
 
 def camera(place: np.ndarray, fov: float = 38.0, target: np.ndarray = MIDDLE) -> Camera:
-    """A look at the object."""
+    """Return a camera that looks at the object."""
     return Camera.look_at(place, target, np.array([0.0, 0.0, 1.0]), width=SIDE, height=SIDE, vertical_fov_degrees=fov)
 
 
-def drawn(cloud: GaussianCloud, view: Camera, background: tuple[float, float, float] = (0.75, 0.78, 0.8)) -> np.ndarray:
-    """(SIDE, SIDE, 3) uint8."""
+def render(
+    cloud: GaussianCloud, view: Camera, background: tuple[float, float, float] = (0.75, 0.78, 0.8)
+) -> np.ndarray:
+    """(SIDE, SIDE, 3) uint8 render."""
     return render_gaussians(cloud, view, background=background).colour_srgb8()
 
 
-def way_round(cloud: GaussianCloud, places: list[np.ndarray]) -> np.ndarray:
-    """The scene from above, with a dot where each photo is taken, the higher the lighter."""
+def positions_from_above(cloud: GaussianCloud, places: list[np.ndarray]) -> np.ndarray:
+    """Render the scene from above with a dot at the position of each photo, lighter for higher ones."""
     above = camera(np.array([0.0, -3.2, 7.5]), 50.0)
-    picture = np.ascontiguousarray(drawn(cloud, above))
+    picture = np.ascontiguousarray(render(cloud, above))
     for place in places:
         x, y, z = above.rotation @ place + above.translation
         at = (round(above.cx + above.fx * x / z), round(above.cy + above.fy * y / z))
@@ -58,43 +60,44 @@ def way_round(cloud: GaussianCloud, places: list[np.ndarray]) -> np.ndarray:
 
 
 def blurred(picture: np.ndarray) -> np.ndarray:
-    """As a hand shakes."""
+    """Blur an image as by camera shake."""
     kernel = np.zeros((25, 25), np.float32)
     cv2.line(kernel, (2, 6), (22, 18), 1.0)
     return cv2.filter2D(picture, -1, kernel / kernel.sum())
 
 
 def toned(picture: np.ndarray, gains: tuple[float, float, float]) -> np.ndarray:
-    """At another exposure and white balance."""
+    """Change exposure and white balance."""
     return np.clip(picture * np.array(gains), 0, 255).astype(np.uint8)
 
 
-def moved(cloud: GaussianCloud, way: np.ndarray) -> GaussianCloud:
-    """``cloud`` elsewhere."""
+def moved(cloud: GaussianCloud, shift: np.ndarray) -> GaussianCloud:
+    """Translate ``cloud``."""
     fields = (getattr(cloud, name).numpy() for name in ("rotations", "log_scales", "opacity_logits", "sh"))
-    return GaussianCloud.from_numpy(cloud.means.numpy() + way, *fields)
+    return GaussianCloud.from_numpy(cloud.means.numpy() + shift, *fields)
 
 
 def foggy(cloud: GaussianCloud) -> GaussianCloud:
-    """What a capture of too few photos is like: few Gaussians, too large and too faint, strays among them."""
+    """Imitate a capture of too few photos: few Gaussians, too large and too faint, some of them misplaced."""
     random = np.random.default_rng(0)
-    kept = cloud.subset(np.sort(random.choice(cloud.count, cloud.count // 9, replace=False)))
-    means, scales = kept.means.numpy(), kept.log_scales.numpy()
-    strays = random.random(kept.count) < 0.05
+    sparse = cloud.subset(np.sort(random.choice(cloud.count, cloud.count // 9, replace=False)))
+    means, scales = sparse.means.numpy(), sparse.log_scales.numpy()
+    strays = random.random(sparse.count) < 0.05
     means = means + np.where(strays[:, None], random.normal(0.0, 0.6, means.shape), 0.0)
-    rest = (kept.rotations.numpy(), scales + 0.9, kept.opacity_logits.numpy() - 1.5, kept.sh.numpy())
+    rest = (sparse.rotations.numpy(), scales + 0.9, sparse.opacity_logits.numpy() - 1.5, sparse.sh.numpy())
     return GaussianCloud.from_numpy(means, *rest)
 
 
 def on_haze(made: Scene, degrees: float = 8.0) -> tuple[GaussianCloud, Plane]:
-    """The object where its ground was white and plain, so that training laid wide Gaussians through its foot in a plane
-    that leans; and that plane.
+    """Return the object on plain white ground, and the plane of the haze.
+
+    Training on such ground puts wide Gaussians through the object's foot, in a plane that leans.
     """
     count, bands = 1000, made.object.sh.shape[1]
     leaning = Plane(np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))]), -0.02)
     flat = np.random.default_rng(5).uniform(-2.0, 2.0, (count, 2)) @ np.stack(leaning.tangents())
     white = np.tile(1.4 * (np.arange(bands) == 0)[:, None], (count, 1, 3))
-    # (w, x, y, z) of a turn about y.
+    # (w, x, y, z) of a rotation about y.
     half = np.radians(degrees) / 2.0
     haze = GaussianCloud.from_numpy(
         flat - leaning.offset * leaning.normal,
@@ -107,38 +110,38 @@ def on_haze(made: Scene, degrees: float = 8.0) -> tuple[GaussianCloud, Plane]:
 
 
 def taking(made: Scene) -> np.ndarray:
-    """Ten photos' worth of advice."""
+    """Illustrate ten pieces of advice for taking photos."""
     whole, _ = made.whole()
     round_once = [eye(d, e, a) for e, a in ((22.0, 3.4), (48.0, 3.2)) for d in range(0, 360, 18)]
     spin = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
     on_the_spot = [eye(0.0, 22.0, 3.4) + 0.25 * np.array([np.cos(a), np.sin(a), 0.0]) for a in spin]
-    good = drawn(whole, camera(eye(0.0)))
+    good = render(whole, camera(eye(0.0)))
     shade = np.linspace(0.0, 1.0, SIDE)[None, :, None] + np.linspace(-0.4, 0.4, SIDE)[:, None, None] > 0.62
-    turned_away = drawn(joined_at(made, np.array([0.35, 0.25, 0.0])), camera(eye(0.0)))
+    turned_away = render(with_moved_object(made, np.array([0.35, 0.25, 0.0])), camera(eye(0.0)))
     pictures = [
-        (way_round(whole, round_once), "1 round it, from two heights"),
-        (np.concatenate([good, drawn(whole, camera(eye(18.0)))], axis=1), "2 each shows most of the last"),
+        (positions_from_above(whole, round_once), "1 round it, from two heights"),
+        (np.concatenate([good, render(whole, camera(eye(18.0)))], axis=1), "2 each shows most of the last"),
         (good, "3 it fills a third to a half"),
-        (drawn(whole, camera(eye(0.0), 110.0)), "4 not: too small"),
-        (drawn(whole, camera(eye(0.0), 17.0)), "5 not: no ground beside it"),
+        (render(whole, camera(eye(0.0), 110.0)), "4 not: too small"),
+        (render(whole, camera(eye(0.0), 17.0)), "5 not: no ground beside it"),
         (blurred(good), "6 not: shaken"),
         (np.concatenate([good, toned(good, (0.55, 0.6, 0.75))], axis=1), "7 better: one exposure"),
         (np.concatenate([good, turned_away], axis=1), "8 not: it was moved"),
         (np.where(shade, (0.45 * good).astype(np.uint8), good), "9 not: your own shadow"),
-        (way_round(whole, on_the_spot), "10 not: turning on the spot"),
+        (positions_from_above(whole, on_the_spot), "10 not: turning on the spot"),
     ]
     return sheet(pictures, 5)
 
 
-def joined_at(made: Scene, way: np.ndarray) -> GaussianCloud:
-    """The room with its object elsewhere in it."""
-    return replace(made, object=moved(made.object, way)).whole()[0]
+def with_moved_object(made: Scene, shift: np.ndarray) -> GaussianCloud:
+    """Return the scene with its object translated."""
+    return replace(made, object=moved(made.object, shift)).whole()[0]
 
 
 def photos(made: Scene) -> np.ndarray:
-    """What goes wrong between photos and capture."""
+    """Illustrate failures between photos and capture."""
     whole, _ = made.whole()
-    good = drawn(whole, camera(eye(0.0)))
+    good = render(whole, camera(eye(0.0)))
     arcs = [eye(d, 22.0, 3.4) for d in (*range(-40, 41, 10), *range(150, 211, 10))]
     cut = good.copy()
     cut[int(0.55 * SIDE) :] = 128
@@ -149,13 +152,16 @@ def photos(made: Scene) -> np.ndarray:
     laid = locate_plane(haze, ObjectSpec(point=np.array([0.0, 0.0, 0.6])), cameras=eyes).plane
     noise = np.random.default_rng(1).integers(170, 256, (SIDE // 10, SIDE // 10, 3)).astype(np.uint8)
     pictures = [
-        (way_round(whole, arcs), "a two groups"),
+        (positions_from_above(whole, arcs), "a two groups"),
         (blurred(blurred(good)), "b nothing to match"),
-        (np.concatenate([good, drawn(joined_at(made, np.array([0.35, 0.25, 0.0])), camera(eye(0.0)))], 1), "c moved"),
+        (
+            np.concatenate([good, render(with_moved_object(made, np.array([0.35, 0.25, 0.0])), camera(eye(0.0)))], 1),
+            "c moved",
+        ),
         (cropped, "d cropped afterwards"),
         (cv2.resize(noise, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST), "e no picture to us"),
         (cut, "f cut short"),
-        (drawn(foggy(whole), camera(eye(70.0))), "g fog in new views"),
+        (render(foggy(whole), camera(eye(70.0))), "g fog in new views"),
         (np.concatenate([good, toned(good, (0.5, 0.55, 0.7))], axis=1), "h exposures differ: found"),
         *(
             (grid(made.object, plane, camera(eye(-10.0, 14.0))), words)
@@ -165,28 +171,30 @@ def photos(made: Scene) -> np.ndarray:
     return sheet(pictures, 5)
 
 
-def taken_out(made: Scene) -> np.ndarray:
-    """What goes wrong between capture and object."""
-    whole, thing = made.whole()
+def segmentation(made: Scene) -> np.ndarray:
+    """Illustrate failures between capture and object."""
+    whole, object_mask = made.whole()
     heights, means = made.plane.heights(whole.means.numpy()), whole.means.numpy()
     view = camera(eye(-20.0))
 
     def alone(chosen: np.ndarray) -> np.ndarray:
-        return drawn(whole.subset(chosen), view, BACKDROP)
+        return render(whole.subset(chosen), view, BACKDROP)
 
     near = np.linalg.norm(means[:, :2], axis=1)
     foot = (heights < 0.02) & (near < 0.75)
-    left = drawn(whole.subset(~thing & ~((near < 0.3) & (heights < 0.02))), view)
+    hole = render(whole.subset(~object_mask & ~((near < 0.3) & (heights < 0.02))), view)
     pictures = [
         (grid(whole, made.plane, view), "j the plane as it should lie"),
         (grid(whole, Plane(made.plane.normal, made.plane.offset - 0.3), view), "k it lies too high"),
-        (alone(thing), "l the object as it should be"),
-        (alone(thing & (heights < 0.62)), "m a part is missing"),
-        (alone(thing & (heights > 0.12)), "n its foot is missing"),
-        (alone(thing | foot), "o floor taken along"),
-        (left, "p the hole, not filled"),
+        (alone(object_mask), "l the object as it should be"),
+        (alone(object_mask & (heights < 0.62)), "m a part is missing"),
+        (alone(object_mask & (heights > 0.12)), "n its foot is missing"),
+        (alone(object_mask | foot), "o floor taken along"),
+        (hole, "p the hole, not filled"),
         (
-            drawn(joined_at(made, np.array([1.9, 0.0, 0.0])), camera(eye(-20.0), 60.0, np.array([0.7, 0.0, 0.3]))),
+            render(
+                with_moved_object(made, np.array([1.9, 0.0, 0.0])), camera(eye(-20.0), 60.0, np.array([0.7, 0.0, 0.3]))
+            ),
             "q beyond the edge",
         ),
     ]
@@ -194,13 +202,13 @@ def taken_out(made: Scene) -> np.ndarray:
 
 
 def grid(cloud: GaussianCloud, plane: Plane, view: Camera) -> np.ndarray:
-    """``plane`` as plane.png shows it, without the words of that picture."""
+    """Render ``plane`` as plane.png shows it, without its text."""
     picture = plane_picture(cloud, [plane], [view], centre=MIDDLE, size=1.3)
     return cv2.resize(picture[24:SIDE, 12 : SIDE - 12], (SIDE, SIDE), interpolation=cv2.INTER_AREA)
 
 
 def sheet(pictures: list[tuple[np.ndarray, str]], columns: int) -> np.ndarray:
-    """Tiles of one size, each with its words; pairs are shown at half their size."""
+    """Arrange tiles of one size with captions; pairs are shown at half their size."""
     tiles = []
     for picture, _ in pictures:
         wide = picture.shape[1] > picture.shape[0]
@@ -219,7 +227,7 @@ def main() -> None:
     out = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
     made = scene("figurine")
-    for name, make in (("taking", taking), ("photos", photos), ("object", taken_out)):
+    for name, make in (("taking", taking), ("photos", photos), ("object", segmentation)):
         write_png(out / f"{name}.png", make(made))
 
 

@@ -1,6 +1,7 @@
-"""In Blender 4.5 or newer (Scripting, Open, Run): what ``egs-warp export RUN --to bundle`` wrote, as moving ellipsoids.
+"""Show a bundle of ``egs-warp export RUN --to bundle`` as moving ellipsoids; run in Blender 4.5 or newer.
 
-Beside it must lie ``read_bundle.py``; BUNDLE names the file. See docs/guide/export.md.
+Open it in the Scripting workspace and run it. ``read_bundle.py`` must be in the same folder; BUNDLE names the file. See
+docs/guide/export.md.
 """
 
 from __future__ import annotations
@@ -14,34 +15,34 @@ import numpy as np
 
 BUNDLE = os.environ.get("BUNDLE", "jump.npz")
 SIGMAS = 1.3
-"""Size of an ellipsoid, in standard deviations: a solid one looks like a splat that fades at about so many."""
-LEAST_OPACITY = 0.3
-"""Splats that let more light through are left out: solid, they would be a crust."""
+"""Size of an ellipsoid in standard deviations: a solid ellipsoid of this size looks like a splat, which fades out."""
+MIN_OPACITY = 0.3
+"""Minimum opacity of a shown splat; fainter ones would look like a crust if they were solid."""
 
 sys.path.append(str(Path(bpy.context.space_data.text.filepath if bpy.context.space_data else __file__).parent))
 from read_bundle import Bundle  # noqa: E402
 
 bundle = Bundle(BUNDLE)
-kept = np.flatnonzero(1 / (1 + np.exp(-bundle.arrays["opacity_logits"])) > LEAST_OPACITY)
+visible = np.flatnonzero(1 / (1 + np.exp(-bundle.arrays["opacity_logits"])) > MIN_OPACITY)
 mesh = bpy.data.meshes.new("splats")
-mesh.from_pydata(bundle.arrays["means"][kept].tolist(), [], [])
-thing = bpy.data.objects.new("splats", mesh)
-bpy.context.scene.collection.objects.link(thing)
+mesh.from_pydata(bundle.arrays["means"][visible].tolist(), [], [])
+splats = bpy.data.objects.new("splats", mesh)
+bpy.context.scene.collection.objects.link(splats)
 for name, kind in (("turn", "QUATERNION"), ("size", "FLOAT_VECTOR"), ("colour", "FLOAT_COLOR")):
     mesh.attributes.new(name, kind, "POINT")
-srgb = np.clip(0.5 + 0.28209479 * bundle.arrays["sh"][kept, 0], 0, 1)
+srgb = np.clip(0.5 + 0.28209479 * bundle.arrays["sh"][visible, 0], 0, 1)
 linear = np.where(srgb < 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-mesh.attributes["colour"].data.foreach_set("color", np.c_[linear, np.ones(len(kept))].astype(np.float32).ravel())
+mesh.attributes["colour"].data.foreach_set("color", np.c_[linear, np.ones(len(visible))].astype(np.float32).ravel())
 
 
 def show(scene: bpy.types.Scene, _: object = None) -> None:
-    """The frame of the bundle at the time of ``scene``."""
+    """Show the frame of the bundle at the time of ``scene``."""
     seconds = (scene.frame_current - scene.frame_start) * scene.render.fps_base / scene.render.fps
     index = round(seconds * float(bundle.arrays["fps"]))
     means, covariances, _ = bundle.frame(min(max(index, 0), len(bundle.arrays["nodes"]) - 1))
-    squares, axes = np.linalg.eigh(covariances[kept])
+    squares, axes = np.linalg.eigh(covariances[visible])
     axes[:, :, 0] *= np.linalg.det(axes)[:, None]
-    mesh.attributes["position"].data.foreach_set("vector", means[kept].astype(np.float32).ravel())
+    mesh.attributes["position"].data.foreach_set("vector", means[visible].astype(np.float32).ravel())
     sizes = SIGMAS * np.sqrt(np.maximum(squares, 0))
     mesh.attributes["size"].data.foreach_set("vector", sizes.astype(np.float32).ravel())
     mesh.attributes["turn"].data.foreach_set("value", _quaternions(axes).astype(np.float32).ravel())
@@ -88,7 +89,7 @@ def _material() -> bpy.types.Material:
     return material
 
 
-thing.modifiers.new("ellipsoids", "NODES").node_group = _ellipsoids()
+splats.modifiers.new("ellipsoids", "NODES").node_group = _ellipsoids()
 scene = bpy.context.scene
 scene.render.fps = round(float(bundle.arrays["fps"]))
 scene.frame_start, scene.frame_end = 0, len(bundle.arrays["nodes"]) - 1

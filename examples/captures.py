@@ -1,4 +1,4 @@
-"""The built-in objects and rooms as captures on disk, to try every command on: each object alone, and in its room."""
+"""Write the built-in objects and scenes as captures, to try every command on: each object alone, and in its room."""
 
 from __future__ import annotations
 

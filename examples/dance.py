@@ -12,8 +12,10 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     """Run the example; returns the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/dance"))
-    parser.add_argument("--beats", default="120 0.6 10", help="beats a minute, the first, how many; or a file")
-    parser.add_argument("--frames", type=int, help="default: until it rests")
+    parser.add_argument(
+        "--beats", default="120 0.6 10", help="beats per minute, time of the first beat, number of beats; or a file"
+    )
+    parser.add_argument("--frames", type=int, help="number of frames (default: until it is at rest)")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)

@@ -1,5 +1,4 @@
-"""Torch interop: a pawn that lost its colours gets them back from pictures, pixels to Gaussians with gradients all the
-way.
+"""Torch interop: a pawn without colours gets them back from images, by gradients from pixels to Gaussians.
 
 The renderer is an ordinary differentiable torch function (``render_torch``); ``finetune`` is the loop around it.
 """
@@ -18,7 +17,7 @@ import egs_warp as egs
 
 
 def ring_of_cameras(cloud: egs.GaussianCloud, up: np.ndarray, *, count: int, size: int) -> list[egs.Camera]:
-    """Cameras around the object, a little above its middle."""
+    """Return cameras around the object, slightly above its middle."""
     means = cloud.means.numpy().astype(float)
     low, high = np.percentile(means, [1, 99], axis=0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
@@ -39,7 +38,7 @@ def ring_of_cameras(cloud: egs.GaussianCloud, up: np.ndarray, *, count: int, siz
 
 
 def brightness_gradient(cloud: egs.GaussianCloud, camera: egs.Camera) -> torch.Tensor:
-    """(n, 3): by how much the picture gets brighter as each Gaussian moves: autograd through the renderer."""
+    """(n, 3) gradient of the image's mean brightness with respect to the Gaussians' means, by autograd."""
     means = torch.tensor(cloud.means.numpy(), requires_grad=True)
     rest = [torch.tensor(getattr(cloud, name).numpy()) for name in ("rotations", "log_scales", "opacity_logits", "sh")]
     rotations, log_scales, opacity_logits, sh = rest
@@ -71,8 +70,8 @@ def main() -> None:
     )
 
     pictures = {
-        "as it was": built_in.object,
-        "colours lost": grey,
+        "original": built_in.object,
+        "without colours": grey,
         f"after {arguments.steps} steps": result.cloud,
     }
     frames = [egs.render_gaussians(cloud, cameras[0]).colour_srgb8() for cloud in pictures.values()]

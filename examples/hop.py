@@ -1,5 +1,6 @@
-"""The pawn hops across the chess board of its scene, a square at a time:
-video, contact sheet, report and trajectory.
+"""The pawn hops across the chess board of its scene, one square at a time.
+
+Writes video, contact sheet, report and trajectory.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/hop"))
     parser.add_argument("--hops", type=int, default=5)
-    parser.add_argument("--frames", type=int, help="default: until it rests")
+    parser.add_argument("--frames", type=int, help="number of frames (default: until it is at rest)")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)

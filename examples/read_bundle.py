@@ -1,4 +1,4 @@
-"""Read the one file that ``egs-warp export RUN --to bundle`` writes; needs numpy alone (docs/guide/export.md)."""
+"""Read the file that ``egs-warp export RUN --to bundle`` writes; needs only numpy (docs/guide/export.md)."""
 
 import sys
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Bundle:
-    """Rest splats, their cage, and where its nodes are in each frame; metres, z up."""
+    """Splats at rest, their cage, and the positions of its nodes in each frame; metres, z up."""
 
     def __init__(self, path: str) -> None:
         with np.load(path, allow_pickle=False) as data:
@@ -18,7 +18,10 @@ class Bundle:
         self.inverse = np.linalg.inv((self.corners[:, 1:] - self.corners[:, :1]).transpose(0, 2, 1))
 
     def frame(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Means (n, 3), covariances (n, 3, 3), turns (n, 3, 3): along d the colour is that of sh along turn^T d."""
+        """Return means (n, 3), covariances (n, 3, 3) and rotations (n, 3, 3) of a frame.
+
+        The colour in direction d is that of ``sh`` in direction rotation^T d.
+        """
         a, tet, rows = self.arrays, self.arrays["mean_tets"], self.arrays["arm_rows"]
         moved = a["nodes"][index][a["tets"]].astype(float)
         gradients = (moved[:, 1:] - moved[:, :1]).transpose(0, 2, 1) @ self.inverse
@@ -26,15 +29,18 @@ class Bundle:
         carriers = np.where(a["rigid"][:, None, None], turns, gradients[tet])  # rigid: far outside the cage
         means = moved[tet, 0] + _apply(carriers, a["means"] - self.corners[tet, 0])
         stretched = carriers @ self.axes
-        through, sides = stretched[rows], np.zeros((2, len(rows), 3, 3))  # across several tetrahedra: each end its own
+        through, sides = (
+            stretched[rows],
+            np.zeros((2, len(rows), 3, 3)),
+        )  # across several tetrahedra: each end in its own
         for k, (end, share) in enumerate(zip(a["arm_tets"], a["arm_shares"][:, :, None], strict=True)):
             sign = 1.0 if k < 3 else -1.0
-            inner, there = sign * through[:, :, k % 3], sign * _apply(gradients[end], self.axes[rows, :, k % 3])
+            inner, outer = sign * through[:, :, k % 3], sign * _apply(gradients[end], self.axes[rows, :, k % 3])
             image = moved[end, 0] + _apply(gradients[end], a["means"][rows] - self.corners[end, 0])
-            bridged = there + (image - means[rows]) / np.where(share < 0, -share, 1.0)
-            limit = a["max_stretch"] * np.maximum(np.linalg.norm(inner, axis=1), np.linalg.norm(there, axis=1))
+            bridged = outer + (image - means[rows]) / np.where(share < 0, -share, 1.0)
+            limit = a["max_stretch"] * np.maximum(np.linalg.norm(inner, axis=1), np.linalg.norm(outer, axis=1))
             bridged *= np.minimum(1.0, limit / np.maximum(np.linalg.norm(bridged, axis=1), 1e-30))[:, None]
-            arm = np.where(share < 0, bridged, share * inner + (1.0 - share) * there)
+            arm = np.where(share < 0, bridged, share * inner + (1.0 - share) * outer)
             sides[k // 3, :, :, k % 3] = sign * np.where((end == tet[rows])[:, None], inner, arm)
         average = sides.mean(axis=0)
         upright = np.linalg.det(average) > 0
@@ -56,5 +62,5 @@ def _rotations(matrices: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    found = Bundle(sys.argv[1]).arrays
-    print(f"{len(found['means'])} splats, {len(found['nodes'])} frames at {float(found['fps']):g} a second")
+    arrays = Bundle(sys.argv[1]).arrays
+    print(f"{len(arrays['means'])} splats, {len(arrays['nodes'])} frames at {float(arrays['fps']):g} a second")

@@ -1,4 +1,4 @@
-"""The built-in bear turns on the spot, from one foot to the other: video, contact sheet, report and trajectory."""
+"""The built-in bear turns on the spot, step by step: video, contact sheet, report and trajectory."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     """Run the example; returns the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/turn"))
-    parser.add_argument("--degrees", type=float, default=-90.0, help="to the left")
-    parser.add_argument("--frames", type=int, help="default: until it rests")
+    parser.add_argument("--degrees", type=float, default=-90.0, help="angle to the left, degrees")
+    parser.add_argument("--frames", type=int, help="number of frames (default: until it is at rest)")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)

@@ -1,4 +1,4 @@
-"""The built-in chess pawn jumps and turns about: video, contact sheet, report and trajectory."""
+"""The built-in chess pawn jumps and turns around: video, contact sheet, report and trajectory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/twist"))
     parser.add_argument("--degrees", type=float, default=180.0)
-    parser.add_argument("--frames", type=int, help="default: until it rests")
+    parser.add_argument("--frames", type=int, help="number of frames (default: until it is at rest)")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)

@@ -1,4 +1,4 @@
-"""The built-in pawn waddles on its base, as one walks a wardrobe: video, contact sheet, report and trajectory."""
+"""The built-in pawn waddles on its base, like a wardrobe being walked: video, contact sheet, report and trajectory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/waddle"))
     parser.add_argument("--distance", type=float, default=0.6, help="body heights")
-    parser.add_argument("--frames", type=int, help="default: until it rests")
+    parser.add_argument("--frames", type=int, help="number of frames (default: until it is at rest)")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)

@@ -14,7 +14,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     parser.add_argument("--out", type=Path, default=Path("out/walk"))
     parser.add_argument("--distance", type=float, default=0.4, help="body heights")
     parser.add_argument("--step-length", type=float, default=0.1, help="body heights")
-    parser.add_argument("--frames", type=int, help="default: until it rests")
+    parser.add_argument("--frames", type=int, help="number of frames (default: until it is at rest)")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)

@@ -1,4 +1,4 @@
-"""Fixtures: devices and the folder of real captures."""
+"""Fixtures: devices, and the folder of real captures."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from hypothesis import settings
 from tests.support.properties import example_lines
 
 wp.config.log_level = wp.LOG_WARNING
-# The same examples in every run, and no example has a time limit. ``make fuzz`` sets HYPOTHESIS_PROFILE=fuzz: random
-# examples, ten times as many. A test that it breaks gets the @example line that the end of its output shows.
+# Every run has the same examples, without time limit. ``make fuzz`` sets HYPOTHESIS_PROFILE=fuzz: random examples, ten
+# times as many. For a failing one, the @example line to add to the test is printed at the end of the output.
 settings.register_profile("fixed", derandomize=True, database=None, deadline=None)
 settings.register_profile("fuzz", derandomize=False, database=None, deadline=None, max_examples=1000, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
@@ -22,11 +22,11 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 _DATA = Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 _LONG_FIRST = ("pipelines", "segmentation", "inpainting", "locomotion", "meshing", "commands", "assets", "web")
-"""Folders whose tests take longest."""
+"""Folders of the slowest tests."""
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip, with the reason, what this machine cannot run; put folders of long tests first."""
+    """Skip, with the reason, tests that this machine cannot run; put folders of slow tests first."""
     items.sort(key=lambda item: item.path.parent.name not in _LONG_FIRST)
     no_data = pytest.mark.skip(reason=f"real captures not found in {_DATA}; set EGS_WARP_DATA")
     no_cuda = pytest.mark.skip(reason="no CUDA device")
@@ -46,19 +46,19 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """Folder of real captures; tests that use it carry the marker ``data``."""
+    """Return the folder of real captures; tests that use it have the marker ``data``."""
     return _DATA
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
 def device(request: pytest.FixtureRequest) -> str:
-    """Each Warp device in turn."""
+    """Return each Warp device in turn."""
     return request.param
 
 
 @pytest.fixture
 def coarse() -> Iterator[None]:
-    """``animate`` gives bodies some 200 nodes: as soon made as 500, and stepped twice as fast."""
+    """Make ``animate`` build bodies of some 200 nodes, which are stepped twice as fast as 500."""
     from tests.support.coarse import coarse_cages
 
     with coarse_cages(120):
@@ -67,7 +67,7 @@ def coarse() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What ``egs-warp animate`` writes: thirteen pictures of a small, coarse pawn that crouches."""
+    """Return a folder written by ``egs-warp animate``: thirteen images of a small, coarse pawn that crouches."""
     from egs_warp.assets.pawn import pawn
     from egs_warp.pipelines.animate import AnimateOptions, animate
     from tests.support.coarse import coarse_cages

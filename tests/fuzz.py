@@ -1,7 +1,7 @@
-"""``make fuzz MINUTES=10``: many damaged files for every reader; ``python -m tests.fuzz --help``.
+"""``make fuzz MINUTES=10``: many corrupted files for every reader; ``python -m tests.fuzz --help``.
 
-The strategies of ``tests/support/corruption.py`` are driven by Atheris (coverage of the package) where it is installed,
-else by random bytes. A case that breaks a promise is kept in ``tests/corpus/READER/``, where the tests find it.
+The strategies of ``tests/support/corruption.py`` are driven by Atheris (coverage of the package) if it is installed,
+otherwise by random bytes. A case that fails is written to ``tests/corpus/READER/``, where the tests find it.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from tests.support.memory import peak_bytes
 
 CORPUS = Path(__file__).parent / "corpus"
 _MEMORY = 256
-"""MiB that the readers of a process may take beyond what it began with: its inputs hold some kilobytes."""
-_LARGEST_BUFFER = 4096
-"""Bytes from which Hypothesis draws one input."""
+"""Maximum growth of the memory of a process, MiB; its inputs have some kilobytes."""
+_MAX_BUFFER = 4096
+"""Number of bytes from which Hypothesis draws one input."""
 _COUNTS: tuple[str, ...] = ("inputs", "valid", "refused", "broken")
 _PIECE = 20_000
-"""Inputs of one process, where there is a number to reach."""
-_MOST_REASONS = 50
-"""Kept of one reader."""
+"""Number of inputs per process if a number of inputs is given."""
+_MAX_REASONS = 50
+"""Maximum number of failures that are recorded for one reader."""
 _SEED = 20_261_122
 
 
 def main() -> int:
-    """Give each reader its share of the time; returns 1 where any promise was broken."""
+    """Give each reader its share of the time; returns 1 if any reader failed."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=10.0, help="for all readers together (%(default)s)")
-    parser.add_argument("--inputs", type=int, default=0, help="a reader that has had so many is done (0: never)")
-    parser.add_argument("--reader", action="append", help="only this one; may be repeated")
-    parser.add_argument("--processes", type=int, default=1, help="at once (%(default)s)")
-    parser.add_argument("--counts", type=Path, help="adds to the counts of earlier runs, which this file holds")
+    parser.add_argument("--minutes", type=float, default=10.0, help="total time of all readers (default %(default)s)")
+    parser.add_argument("--inputs", type=int, default=0, help="maximum number of inputs per reader (0: no limit)")
+    parser.add_argument("--reader", action="append", help="only this reader; may be repeated")
+    parser.add_argument("--processes", type=int, default=1, help="parallel processes (default %(default)s)")
+    parser.add_argument("--counts", type=Path, help="file of counts, to which those of this run are added")
     parser.add_argument("--child", nargs=2, metavar=("READER", "SEED"), help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.child:
@@ -56,17 +56,17 @@ def main() -> int:
     tally = Tally(names, chosen.counts)
     deadline = time.monotonic() + 60.0 * chosen.minutes
     share = 60.0 * chosen.minutes * chosen.processes / len(names)
-    # With a number of inputs to reach, in pieces that the processes share.
+    # With a given number of inputs, they are divided into pieces that the processes share.
     rounds = 1 if chosen.inputs == 0 else math.ceil(chosen.inputs / _PIECE)
     with ThreadPoolExecutor(chosen.processes) as pool:
         for _ in range(rounds):
             for name in names:
                 pool.submit(_piece, name, tally, deadline, share, chosen.inputs)
-    return tally.tell()
+    return tally.report()
 
 
 class Tally:
-    """Counts of each reader, kept in a file if there is one."""
+    """Counts of each reader, stored in a file if a path is given."""
 
     def __init__(self, names: list[str], path: Path | None) -> None:
         self._path, self._lock = path, threading.Lock()
@@ -74,28 +74,28 @@ class Tally:
             name: dict.fromkeys(_COUNTS, 0) | {"mib": 0, "by": "", "why": []} for name in names
         }
         self.died: list[str] = []
-        self._begun = dict.fromkeys(names, 0)
+        self._started = dict.fromkeys(names, 0)
         if path is not None and path.is_file():
             self.counts |= json.loads(path.read_text())
 
     def seed(self, name: str) -> int:
-        """Of the next piece: another for each, in later runs too."""
+        """Return the seed of the next piece, a different one each time, in later runs too."""
         with self._lock:
-            self._begun[name] += 1
-            return _SEED + self.counts[name]["inputs"] + 1_000_003 * self._begun[name]
+            self._started[name] += 1
+            return _SEED + self.counts[name]["inputs"] + 1_000_003 * self._started[name]
 
     def add(self, name: str, found: dict[str, Any]) -> None:
         with self._lock:
             known = self.counts[name]
             self.counts[name] = {key: known[key] + found[key] for key in _COUNTS}
             self.counts[name] |= {"mib": max(known["mib"], found["mib"]), "by": found["by"]}
-            self.counts[name]["why"] = [*known.get("why", []), *found["why"]][:_MOST_REASONS]
+            self.counts[name]["why"] = [*known.get("why", []), *found["why"]][:_MAX_REASONS]
             if self._path is not None:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 self._path.write_text(json.dumps(self.counts, indent=1) + "\n")
 
-    def tell(self) -> int:
-        """A table; returns 1 where a promise was broken."""
+    def report(self) -> int:
+        """Print a table; returns 1 if any reader failed."""
         print("| reader | inputs | valid | refused | broken | peak MiB | driven by |\n|---|---|---|---|---|---|---|")
         for name, found in self.counts.items():
             print(f"| {name} |", " | ".join(str(found[key]) for key in (*_COUNTS, "mib", "by")), "|")
@@ -107,7 +107,7 @@ class Tally:
 
 
 def _piece(name: str, tally: Tally, deadline: float, share: float, inputs: int) -> None:
-    """One process of one reader, to the end of its share of the time or of what it lacks."""
+    """Run one reader in a process until its share of the time, or its number of inputs, is used."""
     seconds = min(deadline - time.monotonic(), share if inputs == 0 else math.inf)
     lacking = min(inputs - tally.counts[name]["inputs"], _PIECE)
     if seconds < 1.0 or (inputs and lacking <= 0):
@@ -123,7 +123,7 @@ def _piece(name: str, tally: Tally, deadline: float, share: float, inputs: int) 
 
 
 def _fuzz(name: str, seed: int, seconds: float, inputs: int) -> None:
-    """Drive one reader and print what came out as a line of JSON."""
+    """Drive one reader and print the counts as a line of JSON."""
     atheris: Any = None
     if find_spec("atheris") is not None:
         import atheris
@@ -168,7 +168,7 @@ def _fuzz(name: str, seed: int, seconds: float, inputs: int) -> None:
         def end() -> None:
             by = "Atheris" if atheris is not None else "random bytes"
             print(json.dumps({"reader": name, **counts, "mib": _peak() - base, "by": by, "why": why}), flush=True)
-            # libFuzzer does not come back.
+            # libFuzzer does not return.
             os._exit(0)
 
         def drive(buffer: bytes) -> None:
@@ -177,13 +177,13 @@ def _fuzz(name: str, seed: int, seconds: float, inputs: int) -> None:
             one.hypothesis.fuzz_one_input(buffer)  # pyright: ignore[reportFunctionMemberAccess]
 
         if atheris is not None:
-            options = [sys.argv[0], f"-max_len={_LARGEST_BUFFER}", f"-seed={seed}", "-verbosity=0", "-rss_limit_mb=0"]
+            options = [sys.argv[0], f"-max_len={_MAX_BUFFER}", f"-seed={seed}", "-verbosity=0", "-rss_limit_mb=0"]
             options.append(f"-artifact_prefix={place}/")
             atheris.Setup(options, drive)
             atheris.Fuzz()
         generator = random.Random(seed)
         while True:
-            drive(generator.randbytes(generator.randint(0, _LARGEST_BUFFER)))
+            drive(generator.randbytes(generator.randint(0, _MAX_BUFFER)))
 
 
 def _keep(name: str, data: bytes) -> str:
@@ -196,7 +196,7 @@ def _keep(name: str, data: bytes) -> str:
 
 
 def _peak() -> int:
-    """MiB that this process has held at most."""
+    """Return the peak memory of this process, MiB."""
     return peak_bytes() // 2**20
 
 

@@ -1,4 +1,4 @@
-"""``make mutation``; ``python -m tests.mutation --help``. What it does is in ``tests/support/mutation.py``."""
+"""``make mutation``; ``python -m tests.mutation --help``. The implementation is in ``tests/support/mutation.py``."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def test_cases_that_were_found(found: Path, tmp_path: Path) -> None:
 
 def test_slow_is_what_is_slow_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine that stands still for a moment breaks no promise, a reader that is slow does."""
-    monkeypatch.setattr(readers, "LONGEST", 0.1)
+    monkeypatch.setattr(readers, "MAX_SECONDS", 0.1)
     times: list[float] = []
 
     def read(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The figures of the effort benchmark: the load of a record, its steps before lift-off, and how often it turns back."""
+"""Figures of the effort benchmark: the load of a record, the number of steps before lift-off, and reversals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_lift_off_is_where_the_longest_flight_begins(effort: ModuleType, loads: 
 
 
 def test_the_load_is_what_the_ground_gives(effort: ModuleType) -> None:
-    """In every step it changes the momentum upwards, beside gravity and drag."""
+    """The load changes the upward momentum in every step, together with gravity and drag."""
     trajectory = slide().trajectory()
     t, mass = trajectory, trajectory.node_mass
     up = -t.gravity / np.linalg.norm(t.gravity)

@@ -18,8 +18,11 @@ def figure7(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_scores_of_a_known_picture(figure7: ModuleType) -> None:
-    """Upper half 0.5 where 0.6 is wanted: 20 dB; 0.1 in the lower half: a fifth of the upper half remains below, and
-    over the whole picture the mean square is the same 0.01."""
+    """Measure a known image.
+
+    Upper half 0.5 with target 0.6: 20 dB; 0.1 in the lower half: a residual of a fifth of the upper half, and the
+    mean square over the whole image is the same 0.01.
+    """
     picture = np.concatenate([np.full((16, 32, 3), 0.5), np.full((16, 32, 3), 0.1)]).astype(np.float32)
     wanted = np.full((16, 32, 3), 0.6, np.float32)
     scores = figure7.table3.scores([picture], [wanted])

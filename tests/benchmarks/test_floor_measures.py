@@ -1,4 +1,4 @@
-"""The measures beside PSNR of a filled floor: detail, likeness in the large, the true floor moved."""
+"""Measures of an inpainted floor besides PSNR: detail, similarity after a blur, and the shifted true floor."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def noise(size: int, seed: int) -> np.ndarray:
 
 
 def test_detail_is_one_for_other_texture_of_the_same_kind_and_small_for_a_blur(measures: ModuleType) -> None:
-    """Energy of white noise's gradients does not depend on the draw; what it looks like outside does not count."""
+    """The gradient energy of white noise does not depend on the draw; pixels outside the mask do not count."""
     truth, mask = noise(96, 0), disc(96, 36)
     assert measures.gradient_energy(noise(96, 1), truth, mask) == pytest.approx(1.0, abs=0.05)
     blurred = ndimage.gaussian_filter(truth, (2.0, 2.0, 0.0))
@@ -37,8 +37,11 @@ def test_detail_is_one_for_other_texture_of_the_same_kind_and_small_for_a_blur(m
 
 
 def test_psnr_likes_the_blur_that_likeness_in_the_large_does_not_see(measures: ModuleType) -> None:
-    """Independent noise has twice the squared error of its mean, 3.01 dB; a blur takes that difference away only where
-    pictures agree in the large, and a wrong colour stays wrong."""
+    """Compare independent noise and its mean before and after a blur.
+
+    Independent noise has twice the squared error of its mean, 3.01 dB; a blur removes that difference only where images
+    agree on a coarse scale, and a wrong colour stays wrong.
+    """
     truth, other, mask = noise(128, 0), noise(128, 1), disc(128, 50)
     mean = np.full_like(truth, 0.5)
     assert psnr(mean[mask], truth[mask]) - psnr(other[mask], truth[mask]) == pytest.approx(3.01, abs=0.1)
@@ -49,13 +52,16 @@ def test_psnr_likes_the_blur_that_likeness_in_the_large_does_not_see(measures: M
 
 
 def test_the_true_floor_moved_finds_its_period_and_no_more(measures: ModuleType) -> None:
-    """A floor of stripes fits itself at whole periods; unlike noise scores the 7.8 dB of two independent draws
-    (squared error 1/6), and a floor without known surroundings offers no place."""
+    """Score shifted floors of stripes and of noise.
+
+    A floor of stripes fits itself at whole periods; noise scores the 7.8 dB of two independent draws (squared error
+    1/6), and a floor without known surroundings gives no score.
+    """
     hole, known = disc(120, 15), np.ones((120, 120), bool)
     stripes = np.repeat((np.arange(120) // 3 % 2)[None, :, None].astype(float), 120, axis=0).repeat(3, axis=2)
-    best = max(one for one, _ in measures.from_beside(stripes, known, hole))
+    best = max(one for one, _ in measures.moved_floor_scores(stripes, known, hole))
     assert best > 60.0
-    scores = np.array(measures.from_beside(noise(120, 0), known, hole))
+    scores = np.array(measures.moved_floor_scores(noise(120, 0), known, hole))
     assert len(scores) == 72
     assert scores[:, 0].mean() == pytest.approx(10 * np.log10(6.0), abs=0.2)
-    assert measures.from_beside(stripes, hole, hole) == []
+    assert measures.moved_floor_scores(stripes, hole, hole) == []

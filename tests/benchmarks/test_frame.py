@@ -1,4 +1,4 @@
-"""The fits, bins and aims of the frame benchmark."""
+"""Fits, bins and aims of the frame benchmark."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_steps_are_told_by_their_contacts(frame: ModuleType) -> None:
 
 
 def test_aims(frame: ModuleType) -> None:
-    """541 nodes take 35.7 ms in the mean: ten times as fast as 360 ms, not as 350; captures count as the pawn does."""
+    """541 nodes take a mean of 35.7 ms: a tenth of 360 ms, not of 350; captures count like the pawn."""
     for old, fast in ((360.0, True), (350.0, False)):
         aims = frame.summary(records(), old, "cpu")["aims"]
         assert (aims["cpu_541"], aims["cpu_10x"], aims["cpu_250_realtime"]) == (True, fast, True)

@@ -1,4 +1,4 @@
-"""The benchmarks' harness: every script has its flags, and what it leaves is table, JSON and picture."""
+"""Harness of the benchmarks: every script has its flags and writes table, JSON and image."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from PIL import Image
 from tests.support.scripts import BENCHMARKS, module_of
 
 SCRIPTS = sorted(path.stem for path in BENCHMARKS.glob("*.py") if "\ndef main(" in path.read_text())
-"""Those that are run; the others are what they share."""
+"""Scripts that can be run; the other modules are shared by them."""
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def harness() -> ModuleType:
 def test_every_benchmark_takes_the_flags(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It imports, and ``--help`` names the flags that all have, and its docstring."""
+    """The script imports, and ``--help`` prints the common flags and its docstring."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     script = module_of(name)
     with pytest.raises(SystemExit) as end:
@@ -44,7 +44,7 @@ def test_there_are_benchmarks() -> None:
 
 
 def test_what_a_benchmark_leaves(harness: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Table with its head, JSON of the contract, and a drawn picture."""
+    """Print a table with its header, and write JSON of the agreed form and an image."""
     files = {"json": tmp_path / "figures.json", "plot": tmp_path / "picture.png"}
     asked = ["--quick", "--seed", "3", "--json", str(files["json"]), "--plot", str(files["plot"])]
     options = harness.flags("What.", quick="less", device="cpu").parse_args(asked)
@@ -79,7 +79,7 @@ def test_what_a_benchmark_leaves(harness: ModuleType, tmp_path: Path, capsys: py
 
 
 def test_picture_of_floats(harness: ModuleType, tmp_path: Path) -> None:
-    """A picture of 0 to 1 is written in bytes, rounded and cut off."""
+    """An image of floats from 0 to 1 is written in bytes, rounded and clipped."""
     options = harness.flags("What.", quick="less", device="cpu").parse_args(["--plot", str(tmp_path / "p.png")])
     harness.report(options, [], aims={}, picture=np.full((2, 2, 3), [0.5, 1.7, -1.0]))
     with Image.open(tmp_path / "p.png") as picture:
@@ -93,7 +93,7 @@ def test_an_aim_is_judged_or_explained(harness: ModuleType) -> None:
 
 
 def test_data_folder(harness: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The environment's, else the one beside the repository."""
+    """The folder is that of the environment variable, else the one next to the repository."""
     monkeypatch.setenv("EGS_WARP_DATA", "/elsewhere")
     assert harness.data_folder() == Path("/elsewhere")
     monkeypatch.delenv("EGS_WARP_DATA")
@@ -101,7 +101,7 @@ def test_data_folder(harness: ModuleType, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_calls_take_turns(harness: ModuleType) -> None:
-    """One after the other in every turn, warm-up turns uncounted, and the median is theirs."""
+    """Calls alternate, warm-up calls do not count, and the median is over the others."""
     order: list[str] = []
     naps = iter([0.5, 0.0, 0.02, 0.02, 0.02])
 

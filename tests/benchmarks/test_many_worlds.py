@@ -1,4 +1,4 @@
-"""The figures of worlds side by side: the aims, and why one is null; and a row of a small one."""
+"""Figures of parallel worlds: the aims, the reasons of null ones, and a row of a small run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``make paper``: every stage runs as asked, failures are told, aims are gathered."""
+"""``make paper``: every stage runs with the given flags, failures are reported, aims are collected."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Path(asked.json).write_text(json.dumps({"aims": {"right": True, "fast": None}, "
 
 @pytest.fixture
 def paper(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
-    """With two stages that take no time."""
+    """Return the module with two stages that take no time."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     module = module_of("paper")
     (tmp_path / "script.py").write_text(SCRIPT)
@@ -67,7 +67,7 @@ def test_a_stage_that_fails_is_told_and_the_others_run(
 ) -> None:
     assert paper.main(["--out", str(tmp_path), "--device", "cpu"]) == 0
     assert paper.main(["--out", str(tmp_path), "--device", "cpu", "--only", "two", "--keep"]) == 0
-    assert "Table 2: kept" in capsys.readouterr().out
+    assert "Table 2: skipped" in capsys.readouterr().out
     assert paper.main(["--out", str(tmp_path), "--device", "cpu", "--seed", "13"]) == 2
     assert f"failed: unlucky ({tmp_path / 'one.txt'})" in capsys.readouterr().out
     assert "failed with 1" in (tmp_path / "paper.md").read_text()

@@ -1,4 +1,4 @@
-"""The figures of many runs: the rate of the middle; and rows that outlive an error."""
+"""Figures of many runs: the rate of the middle frames, and rows of tasks that outlast an error."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from tests.support.tasks import half
 @pytest.fixture
 def many(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return module_of("many")
+    return module_of("process_scaling")
 
 
 def test_the_rate_is_that_of_the_middle(many: ModuleType) -> None:
-    """Slow to start and to end, ten frames a second between."""
+    """Slow at the start and the end, ten frames a second between."""
     seen = [(0.0, 0), (30.0, 10), *((30.0 + 0.1 * k, 10 + k) for k in range(1, 90)), (80.0, 100)]
     (first, early), (last, late) = many.window(seen)
     assert (early, late) == (15, 85)

@@ -1,4 +1,4 @@
-"""What a body bears: halving finds the largest, and the aims say so."""
+"""Pushes that a body withstands: bisection finds the largest one, and the aims judge it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_halving_finds_the_largest_push(script: Any, monkeypatch: pytest.MonkeyP
 
     def stood(_: object, line: str) -> dict[str, Any]:
         asked.append(float(line.split()[1]))
-        return {"kept": asked[-1] < borne + 1e-9, "broken": None}
+        return {"withstood": asked[-1] < borne + 1e-9, "broken": None}
 
     monkeypatch.setattr(pushes, "stood", stood)
     size, tried = pushes.largest(None, "0.3 {} left")
@@ -33,11 +33,11 @@ def test_halving_finds_the_largest_push(script: Any, monkeypatch: pytest.MonkeyP
 
 
 def test_a_body_that_is_pushed_is_judged_by_its_soles(script: Any) -> None:
-    """The aim wants every body of at least 14 to stand."""
+    """The aim requires at least 14 bodies, all of which withstand the push."""
     gaits: ModuleType = script("gaits")
-    assert gaits._swept({"tilt_degrees": 2.0, "sole_shift": 0.02}) is None
-    assert gaits._swept({"tilt_degrees": 20.0, "sole_shift": 0.02}) == "leans: tilt 20 degrees"
-    assert gaits._swept({"tilt_degrees": 2.0, "sole_shift": 0.4}) == "a sole was 0.40 body heights off"
+    assert gaits._push_failure({"tilt_degrees": 2.0, "sole_shift": 0.02}) is None
+    assert gaits._push_failure({"tilt_degrees": 20.0, "sole_shift": 0.02}) == "leans: tilt 20 degrees"
+    assert gaits._push_failure({"tilt_degrees": 2.0, "sole_shift": 0.4}) == "a sole was 0.40 body heights off"
     rows = [{"body": str(k), "cell": "push", "success": True, "fallen": None} for k in range(14)]
     found = gaits.summary(rows, whole=True)
     assert found["aims"]["pushes"] is True and "pushes" not in found["why_null"]

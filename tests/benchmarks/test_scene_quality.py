@@ -1,4 +1,4 @@
-"""What the benchmark of rooms measures with: outlines, overlap, where its clicks go, planes through markings."""
+"""Measures of the scene quality benchmark: outlines, overlap, positions of clicks, planes through markings."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def annotated(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return module_of("drawn")
+    return module_of("annotated_scenes")
 
 
 @pytest.fixture
@@ -42,38 +42,38 @@ def front() -> Camera:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_scene_has_eight_outlines_and_markings_beside_them(name: str, drawn: ModuleType) -> None:
-    tree = json.loads((drawn.FOLDER / f"{name}.json").read_text())
+def test_every_scene_has_eight_outlines_and_markings_beside_them(name: str, annotated: ModuleType) -> None:
+    tree = json.loads((annotated.FOLDER / f"{name}.json").read_text())
     assert len(tree["views"]) == 8 and len({view["name"] for view in tree["views"]}) == 8
-    assert name in drawn.NAMES
+    assert name in annotated.NAMES
     for view in tree["views"]:
-        mask = drawn._mask(view)
+        mask = annotated._mask(view)
         assert mask.shape == (view["height"], view["width"])
         assert 0.03 < mask.mean() < 0.4
         ground = np.array(view["ground"])
         assert len(ground) >= 6
-        assert not mask[ground[:, 1], ground[:, 0]].any(), "the ground is beside the object"
+        assert not mask[ground[:, 1], ground[:, 0]].any(), "the ground is next to the object"
 
 
-def test_outlines_within_outlines_are_holes(drawn: ModuleType) -> None:
+def test_outlines_within_outlines_are_holes(annotated: ModuleType) -> None:
     ring = {"width": 20, "height": 20, "outline": [[0, 0, 15, 0, 15, 15, 0, 15], [5, 5, 10, 5, 10, 10, 5, 10]]}
-    mask = drawn._mask(ring)
+    mask = annotated._mask(ring)
     assert mask[2, 2] and not mask[7, 7] and not mask[18, 18]
 
 
-def test_overlap_counts_what_is_missing_and_too_much(drawn: ModuleType, clicking: ModuleType) -> None:
-    """A ball against its own outline, and against one that is shifted by its radius."""
+def test_overlap_counts_what_is_missing_and_too_much(annotated: ModuleType, clicking: ModuleType) -> None:
+    """Compare a ball with its own outline, and with one that is shifted by its radius."""
     ball = round_ones(shell(), 0.03)
     cloud = concatenate(ball, lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.05)))
     camera = front()
     own = clicking.render_gaussians(ball, camera).alpha.numpy() > 0.5
-    view = drawn.DrawnView(camera, own, np.zeros((0, 2)))
+    view = annotated.DrawnView(camera, own, np.zeros((0, 2)))
     iou, missing, more = clicking.overlap(cloud, ball, view)
     assert iou == 1.0 and not missing.any() and not more.any()
     shifted = np.roll(own, 8, axis=1)
-    iou, missing, more = clicking.overlap(cloud, ball, drawn.DrawnView(camera, shifted, np.zeros((0, 2))))
+    iou, missing, more = clicking.overlap(cloud, ball, annotated.DrawnView(camera, shifted, np.zeros((0, 2))))
     both = (own & shifted).sum()
-    # Where the shifted outline lies on sky, the capture has nothing, and it does not count.
+    # Where the shifted outline covers sky, the capture is empty, and it does not count.
     assert both / (own | shifted).sum() <= iou < 1.0
     assert more.sum() == (own & ~shifted).sum() and 0 < missing.sum() <= (shifted & ~own).sum()
 
@@ -86,10 +86,10 @@ def test_clicks_go_to_the_innermost_place(clicking: ModuleType) -> None:
     assert clicking.innermost(np.zeros((5, 5), bool))[0] == 0.0
 
 
-def test_a_marked_plane_and_how_far_it_is_from_another(drawn: ModuleType, ground: ModuleType) -> None:
+def test_a_marked_plane_and_how_far_it_is_from_another(annotated: ModuleType, ground: ModuleType) -> None:
     cloud: GaussianCloud = lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.05))
     pixels = np.array([[30.0, 70.0], [90.0, 70.0], [60.0, 90.0], [40.0, 85.0], [80.0, 85.0], [60.0, 65.0]])
-    view = drawn.DrawnView(front(), np.zeros((120, 120), bool), pixels)
+    view = annotated.DrawnView(front(), np.zeros((120, 120), bool), pixels)
     plane = ground.marked_plane(cloud, [view], UP)
     degrees, offset = ground.apart(plane, Plane(UP, 0.0), np.zeros(3), 1.0)
     assert degrees < 0.05 and offset < 0.001

@@ -21,7 +21,7 @@ ARRAYS = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
 
 def make_cloud(count: int, degree: int = 0, *, seed: int = 1, device: str = "cpu") -> GaussianCloud:
-    """Random Gaussians whose values every format can hold."""
+    """Return random Gaussians with values that every format can store."""
     rng = np.random.default_rng(seed)
     return GaussianCloud.from_numpy(
         rng.uniform(-2.0, 2.0, (count, 3)),
@@ -39,7 +39,7 @@ def assert_same_bits(actual: GaussianCloud, expected: GaussianCloud) -> None:
 
 
 def digest(cloud: GaussianCloud) -> str:
-    """Of every bit of the cloud."""
+    """Return the SHA-256 digest of all arrays of the cloud."""
     return hashlib.sha256(b"".join(getattr(cloud, name).numpy().tobytes() for name in ARRAYS)).hexdigest()
 
 
@@ -56,7 +56,10 @@ def small_cloud() -> GaussianCloud:
 
 
 def spz_of_streams(plain: bytes, count: int, sh_bytes: int, records: bytes = b"") -> bytes:
-    """Version 4 of ``plain``, a .spz of version 3 without its gzip: header, records, table, streams."""
+    """Return a .spz file of version 4 (header, records, table, streams) with the content of one of version 3.
+
+    ``plain`` is without its gzip compression.
+    """
     ends = 16 + count * np.cumsum([0, 9, 1, 3, 3, 4, sh_bytes])
     blocks = [plain[start:end] for start, end in zip(ends[:-1], ends[1:], strict=True) if end > start]
     streams = [zstandard.ZstdCompressor().compress(block) for block in blocks]
@@ -84,7 +87,7 @@ def good_bytes(name: str) -> bytes:
 
 
 def message(path: Path) -> str:
-    """The one line that reading ``path`` ends with, without the path it starts with."""
+    """Return the one-line error of reading ``path``, without the path at its start."""
     with pytest.raises(UserError) as caught:
         read_capture(path, device="cpu")
     text = str(caught.value)

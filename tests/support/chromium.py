@@ -1,4 +1,4 @@
-"""The system's Chromium, which draws in software where there is no GPU."""
+"""The system's Chromium, which renders in software on a machine without a GPU."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BROWSER = os.environ.get("EGS_WARP_BROWSER") or next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
 SHOTS = os.environ.get("EGS_WARP_SHOTS")
-"""Folder in which each page is kept as it looks when its test closes it, to be looked at."""
+"""Folder for a screenshot of each page when its test closes it."""
 NEEDED = [
     pytest.mark.browser,
     pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it"),
@@ -30,17 +30,17 @@ NEEDED = [
 
 @contextmanager
 def started() -> Iterator[Any]:
-    """A browser of Playwright."""
+    """Start a browser with Playwright."""
     playwright = pytest.importorskip("playwright.sync_api")
-    with playwright.sync_playwright() as begun:
+    with playwright.sync_playwright() as playwright_context:
         arguments = ["--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--no-sandbox"]
-        browser = begun.chromium.launch(executable_path=BROWSER, args=arguments)
+        browser = playwright_context.chromium.launch(executable_path=BROWSER, args=arguments)
         yield browser
         browser.close()
 
 
 def opened(chromium: Any, address: str, width: int = 480, height: int = 480) -> tuple[Any, list[str]]:
-    """The page once it stands, and what the browser complains of."""
+    """Open a page and wait until it is loaded; returns the page and the list of the browser's errors and warnings."""
     page = chromium.new_page(viewport={"width": width, "height": height})
     if SHOTS is not None:
         _keep_shot(page, Path(SHOTS))
@@ -65,7 +65,10 @@ def _keep_shot(page: Any, folder: Path) -> None:
 
 
 def wait_until(page: Any, condition: str, *, seconds: float = 60.0) -> None:
-    """Until the JavaScript ``condition`` holds; Playwright's own waiting is what the page's security policy forbids."""
+    """Wait until the JavaScript ``condition`` holds.
+
+    Playwright's own waiting is forbidden by the page's security policy.
+    """
     end = time.monotonic() + seconds
     while not page.evaluate(condition):
         assert time.monotonic() < end, condition

@@ -1,4 +1,4 @@
-"""A network that takes clicks: what has the colour of what was clicked on, as an ONNX file."""
+"""A network that takes clicks, as an ONNX file: it marks everything of the colour that was clicked on."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ SIDE = 1024
 
 
 def alike(*, threshold: float = 0.01, gain: float = 1.0, inputs: tuple[str, ...] = ("", "", "")) -> bytes:
-    """Marks pixels whose squared difference from the mean colour under the clicks on the object, which it finds by hat
-    functions about them, is below ``threshold``; ``gain`` scales what it answers.
+    """Return a network that marks pixels of the colour under the clicks on the object.
+
+    It marks pixels whose squared difference from the mean colour under the clicks is below ``threshold``. It finds the
+    clicked pixels by hat functions; ``gain`` scales its output.
     """
     image, coords, labels = (
-        given or usual
-        for given, usual in zip(inputs, ("batched_images", "batched_point_coords", "batched_point_labels"), strict=True)
+        name or default
+        for name, default in zip(
+            inputs, ("batched_images", "batched_point_coords", "batched_point_labels"), strict=True
+        )
     )
     middles = [k + 0.5 for k in range(SIDE)]
     nodes = [
@@ -63,7 +67,7 @@ def alike(*, threshold: float = 0.01, gain: float = 1.0, inputs: tuple[str, ...]
 
 
 def _hat(grid: str, centre: str, name: str) -> list[bytes]:
-    """max(0, 1 - |grid - centre|)."""
+    """Return the nodes of max(0, 1 - |grid - centre|)."""
     return [
         onnx.node("Sub", [grid, centre], [f"{name}_off"]),
         onnx.node("Abs", [f"{name}_off"], [f"{name}_away"]),

@@ -11,11 +11,11 @@ from tests.support.grounds import level
 from tests.support.scenes import lying, round_ones, shell
 
 SPAN = 1.0
-"""Between the middles of two balls that touch."""
+"""Distance between the centres of two balls that touch."""
 
 
 def balls(tones: tuple[float, float], between: float = SPAN) -> GaussianCloud:
-    """Two balls of one unit on a floor, in greys of their own; each has 1500 Gaussians, the left one first."""
+    """Two balls of diameter 1 on a floor, each in its own grey; each has 1500 Gaussians, the left one first."""
     skin = shell()
     left, right = skin - [0.5 * between, 0.0, 0.0], skin + [0.5 * between, 0.0, 0.0]
     cloud = concatenate(
@@ -29,15 +29,15 @@ def balls(tones: tuple[float, float], between: float = SPAN) -> GaussianCloud:
 
 
 def front(width: int = 200) -> Camera:
-    """A look at both, from before."""
+    """Camera that shows both balls from the front."""
     eye = np.array([0.0, -5.0, 1.2])
     return Camera.look_at(eye, np.array([0.0, 0.0, 0.4]), np.array([0.0, 0.0, 1.0]), width=width, height=width)
 
 
 def click(cloud: GaussianCloud, point: tuple[float, float, float], *, inside: bool = True) -> Click:
-    """Where ``front`` sees a point."""
+    """Return a click on a point as seen by ``front``."""
     camera = front()
     x, y, z = camera.rotation @ np.array(point) + camera.translation
-    found = click_at(cloud, camera, camera.cx + camera.fx * x / z, camera.cy + camera.fy * y / z, inside=inside)
-    assert found is not None
-    return found
+    hit = click_at(cloud, camera, camera.cx + camera.fx * x / z, camera.cy + camera.fy * y / z, inside=inside)
+    assert hit is not None
+    return hit

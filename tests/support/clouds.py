@@ -9,7 +9,7 @@ from egs_warp.geometry.tetmesh import TetMesh
 
 
 def surface_cloud(mesh: TetMesh, count: int, *, lowest: float = 0.0, scale: float = 0.01) -> GaussianCloud:
-    """Gaussians of random rotation scattered over the mesh's surface, means kept above ``lowest``."""
+    """Scatter Gaussians of random rotation over the mesh's surface, with means clamped to at least ``lowest``."""
     rng = np.random.default_rng(0)
     faces = mesh.boundary_faces()
     shares = rng.dirichlet([1.0, 1.0, 1.0], count)

@@ -1,4 +1,4 @@
-"""``python -m tests.support.coarse animate ...``: the command on coarse cages, so that a whole run takes seconds."""
+"""``python -m tests.support.coarse animate ...``: the command with coarse cages, so that a whole run takes seconds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from egs_warp.cli import main
 from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 
 NODES = 60
-"""Where ``EGS_WARP_TEST_NODES`` does not say otherwise."""
+"""Default number of nodes, without ``EGS_WARP_TEST_NODES``."""
 
 
 def coarse_maker(nodes: int) -> Callable[..., Creature]:
@@ -28,13 +28,13 @@ def coarse_maker(nodes: int) -> Callable[..., Creature]:
 
 @contextmanager
 def coarse_cages(nodes: int) -> Iterator[None]:
-    """``animate`` gives bodies about ``nodes`` nodes."""
+    """Make ``animate`` build cages of about ``nodes`` nodes."""
     with patch("egs_warp.pipelines.animate.make_creature", coarse_maker(nodes)):
         yield
 
 
 def coarse_main(arguments: Sequence[str] | None = None) -> int:
-    """``egs-warp`` with these arguments, the process's own if there are none; its exit status."""
+    """Run ``egs-warp`` with these arguments, or with the process's own; returns its exit status."""
     with coarse_cages(int(os.environ.get("EGS_WARP_TEST_NODES", NODES))):
         return main(arguments)
 

@@ -1,4 +1,4 @@
-"""What a second process is told that asks for what the first one writes to."""
+"""Error of a second process that requests a file that the first one writes."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from egs_warp.errors import UserError
 
 
 def told_elsewhere(enter: Callable[[Path], AbstractContextManager[Any]], path: Path) -> str | None:
-    """Its error when another process enters ``path``; None if it can."""
+    """Return the error of another process that enters ``path``; None if it succeeds."""
     context = multiprocessing.get_context("spawn")
-    said = context.Queue()
-    other = context.Process(target=_try, args=(enter, path, said))
+    answers = context.Queue()
+    other = context.Process(target=_try, args=(enter, path, answers))
     other.start()
     other.join(60)
-    return said.get(timeout=5)
+    return answers.get(timeout=5)
 
 
-def _try(enter: Callable[[Path], AbstractContextManager[Any]], path: Path, said: multiprocessing.Queue) -> None:
+def _try(enter: Callable[[Path], AbstractContextManager[Any]], path: Path, answers: multiprocessing.Queue) -> None:
     try:
         with enter(path):
-            said.put(None)
+            answers.put(None)
     except UserError as error:
-        said.put(str(error))
+        answers.put(str(error))

@@ -1,4 +1,4 @@
-"""Small random contact programs whose every contact state can be tried."""
+"""Small random contact programs, with few enough contact states to try all of them."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ FRICTION = 0.8
 
 @dataclass(frozen=True)
 class SmallProblem:
-    """A program and the mechanics behind it; units of weight and speed are 1."""
+    """A program and its mechanics; units of weight and speed are 1."""
 
     pieces: CoulombProgram
     program: ContactProgram
     shift: np.ndarray
 
     def velocities(self, y: np.ndarray) -> np.ndarray:
-        """(n, 3) of the contacts."""
+        """(n, 3) contact velocities at the solution ``y``."""
         velocities = (self.pieces.rows @ self.program.forces_of(y) + self.pieces.offset).reshape(-1, 3)
         velocities[:, 0] -= self.shift
         return velocities
@@ -39,7 +39,7 @@ def small_problem(
     freedoms: int = 8,
     frame: np.ndarray | None = None,
 ) -> SmallProblem:
-    """v = base + R a + J^T f with random J whose normals share a direction, asked to reach a random velocity.
+    """Build v = base + R a + J^T f with a random J whose normals share a direction, and a random target velocity.
 
     ``frame`` replaces J.
     """
@@ -51,8 +51,8 @@ def small_problem(
     base = rng.standard_normal(freedoms) - 1.5 * np.eye(freedoms)[0]
     response = np.hstack([rng.standard_normal((freedoms, activations)), frame.T])
     shift = rng.uniform(-0.1, 0.3, contacts)
-    wanted = rng.standard_normal((4, freedoms))
-    rows, gap = wanted @ response, wanted @ base - rng.standard_normal(4)
+    target = rng.standard_normal((4, freedoms))
+    rows, gap = target @ response, target @ base - rng.standard_normal(4)
     P = 2.0 * rows.T @ rows
     m = np.arange(activations)
     P[m, m] += 1e-3
@@ -66,17 +66,17 @@ def small_problem(
 
 
 def all_states(layout: ContactLayout) -> list[np.ndarray]:
-    """Every combination of separate, static, slide k and slide between k and k + 1."""
+    """Return every combination of separate, static, slide k and slide between k and k + 1."""
     choices = range(SEPARATE, 2 * layout.directions)
     return [np.array(states) for states in itertools.product(choices, repeat=layout.contacts)]
 
 
 def optimum_of_each(program: ContactProgram) -> dict[tuple[int, ...], tuple[float, np.ndarray]]:
-    """Objective and y of every feasible choice of states."""
+    """Return objective and y of every feasible choice of states."""
     qp = quadratic_program(program.P, program.q, program.A, solver=QpSolver.DAQP)
-    found = {}
+    optima = {}
     for states in all_states(program.layout):
         solution = qp.solve(*program.bounds(states))
         if solution.usable:
-            found[tuple(states)] = (program.objective(solution.x), solution.x)
-    return found
+            optima[tuple(states)] = (program.objective(solution.x), solution.x)
+    return optima

@@ -1,4 +1,4 @@
-"""Files with wounds: Hypothesis strategies for the tests, and for Atheris (``tests/fuzz.py``)."""
+"""Corrupted files: Hypothesis strategies for the tests, and for Atheris (``tests/fuzz.py``)."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _LEAVES = st.one_of(
 
 
 def damaged(reader: Reader) -> st.SearchStrategy[bytes]:
-    """The good file of ``reader``, with up to six wounds."""
+    """Return the valid file of ``reader`` with up to six corruptions."""
     return _damaged_json(reader.good()) if reader.json else _damaged_bytes(reader.good())
 
 
@@ -50,7 +50,7 @@ def damaged(reader: Reader) -> st.SearchStrategy[bytes]:
 def _damaged_bytes(draw: st.DrawFn, good: bytes) -> bytes:
     data = bytearray(good)
     for _ in range(draw(st.integers(0, 6))):
-        # Where headers are, damage does most.
+        # Corruption of headers has the largest effect.
         place = draw(st.integers(0, max(len(data) - 1, 0)) | st.integers(0, min(len(data), 64)))
         match draw(st.integers(0, 5)):
             case 0:

@@ -1,4 +1,4 @@
-"""Coarse bodies with muscles that stand where a motion begins."""
+"""Coarse bodies with muscles that stand at the start of a motion."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from tests.support.stances import DT, FLOOR
 
 @cache
 def coarse_pawn(*, friction: float = 0.8, device: str = "cpu") -> Creature:
-    """The built-in pawn of few Gaussians, made by the package in a cage of about 50 nodes, once a process."""
-    made = pawn(gaussian_count=3000, device=device)
-    return make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=50, friction=friction))
+    """The built-in pawn with few Gaussians, in a cage of about 50 nodes, built once per process."""
+    scene = pawn(gaussian_count=3000, device=device)
+    return make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=50, friction=friction))
 
 
 @dataclass(frozen=True)
 class CoarseCreature:
-    """A stepper, the place where its body stands, and its state there."""
+    """A stepper, the stance of its body, and its state there."""
 
     stepper: LocomotionStepper
     place: Stance
@@ -50,8 +50,11 @@ def coarse_creature(
     field: HeightField | None = None,
     all_round: bool = False,
 ) -> CoarseCreature:
-    """A body of ``mesh`` on its lowest nodes, facing ``forward`` (3,); ``up`` (3,) is against gravity. On ``field`` in
-    place of the floor it may stand on all of its base, ``all_round`` on any node of its surface."""
+    """Build a body of ``mesh`` on its lowest nodes, facing ``forward`` (3,); ``up`` (3,) is opposite to gravity.
+
+    With ``field`` instead of the floor it may touch the ground with all of its base, with ``all_round`` with any node
+    of its surface.
+    """
     body = make_body(mesh, FLOOR, up=up, sag=sag, device="cpu")
     muscles = automatic_muscles(
         mesh, UP, body_weight=body.weight, height=body.height, young_modulus=body.young_modulus, strength=strength

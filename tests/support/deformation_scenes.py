@@ -1,4 +1,4 @@
-"""Small cages, motions and clouds for the tests that carry Gaussians."""
+"""Small cages, motions and clouds for the tests of deformation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from egs_warp.geometry.tetmesh import TetMesh
 
 
 def box(cells: tuple[int, int, int] = (3, 3, 3), size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> TetMesh:
-    """A box cage, slightly jittered inside so that Delaunay's choice is unique."""
+    """A box cage with slightly jittered inner nodes, so that the Delaunay tetrahedralisation is unique."""
     axes = [np.linspace(0, length, count + 1) for count, length in zip(cells, size, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     jitter = np.random.default_rng(0).uniform(-0.06, 0.06, nodes.shape) * (np.array(size) / cells)
@@ -47,7 +47,7 @@ def covariances(cloud: GaussianCloud) -> np.ndarray:
 
 
 def bent(points: np.ndarray, radius: float) -> np.ndarray:
-    """A bar along x bent onto a circle of ``radius`` around the y axis."""
+    """Bend a bar along x onto a circle of ``radius`` around the y axis."""
     angle = points[:, 0] / radius
     r = radius - (points[:, 2] - 0.2)
     return np.stack([r * np.sin(angle), points[:, 1], radius - r * np.cos(angle)], axis=1)

@@ -1,4 +1,4 @@
-"""Steppers whose matrices stay where a GPU has them: on a GPU, or on a CPU by a GPU's kernels."""
+"""Steppers with matrices in device memory: on a GPU, or on a CPU with a GPU's kernels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from egs_warp.pipelines.creature import Creature
 def on_device(
     creature: Creature, device: str, patch: pytest.MonkeyPatch, settings: LocomotionSettings | None = None
 ) -> LocomotionStepper:
-    """A stepper of the ``creature``'s body and muscles on ``device``."""
+    """Return a stepper of the ``creature``'s body and muscles on ``device``."""
     patch.setattr(
         "egs_warp.locomotion.stepper.linear_solver_on", lambda _, pattern: DenseCholesky(pattern, device=device)
     )

@@ -1,4 +1,4 @@
-"""Faults of the disk, and how a command must tell them."""
+"""Disk faults, and the error messages that commands must print for them."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from pathlib import Path
 import pytest
 
 RENAMING = ("egs_warp.io.atomic", "egs_warp.pipelines.pose_photos")
-"""Modules that give files their final names."""
+"""Modules that rename files to their final names."""
 
 
 @contextmanager
 def largest_file(size: int) -> Iterator[None]:
-    """As on a full disk, no file grows beyond ``size`` bytes; programs that are started inherit it. No bytecode is
-    kept: that of a library which is first imported meanwhile would be cut short, and stay so."""
+    """Limit files to ``size`` bytes, as on a full disk; started programs inherit the limit.
+
+    No bytecode is written: that of a library that is first imported meanwhile would be truncated, and stay so.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "dont_write_bytecode", True)
@@ -33,31 +35,33 @@ def largest_file(size: int) -> Iterator[None]:
 
 
 def assert_one_line(said: str, reason: str) -> None:
-    """The last line tells it; those before are of what was being done."""
+    """Assert that the last line is the error; earlier lines are progress."""
     assert "Traceback" not in said
     assert said.splitlines()[-1].startswith("egs-warp: ") and reason in said.splitlines()[-1], said
 
 
 def fail_once(patch: pytest.MonkeyPatch, number: int, reason: int) -> list[Path]:
-    """Of the openings of new files and the renamings in ``RENAMING`` the one with this number fails, which then is in
-    the list.
+    """Let the opening of a new file or the renaming in ``RENAMING`` with this number fail.
+
+    Returns:
+        list that receives the path of the failed call.
     """
     failed: list[Path] = []
     calls = count()
 
-    def failing(usual: Callable[..., object], path: Path, *given: int) -> object:
+    def failing(function: Callable[..., object], path: Path, *arguments: int) -> object:
         # Locks are opened as well; they are not exclusive.
-        if (usual is os.replace or (given and given[0] & os.O_EXCL)) and next(calls) == number:
+        if (function is os.replace or (arguments and arguments[0] & os.O_EXCL)) and next(calls) == number:
             failed.append(path)
             raise OSError(reason, os.strerror(reason))
-        return usual(path, *given)
+        return function(path, *arguments)
 
     class System:
-        """The ``os`` that the module sees."""
+        """Replacement of the module's ``os``."""
 
         def __getattr__(self, name: str) -> object:
-            usual = getattr(os, name)
-            return partial(failing, usual) if name in ("open", "replace") else usual
+            function = getattr(os, name)
+            return partial(failing, function) if name in ("open", "replace") else function
 
     for module in RENAMING:
         patch.setattr(f"{module}.os", System())

@@ -1,4 +1,4 @@
-"""A small run as ``animate`` leaves it, damaged inside of its checksums, for the readers of runs."""
+"""A small run in the format of ``animate``, corrupted inside its checksums, for the readers of runs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.support.slides import slide
 
 @cache
 def finished_run() -> dict[str, bytes]:
-    """Files of a block that is thrown and struck: 24 steps."""
+    """Files of a run of 24 steps of a block that is thrown and struck."""
     slid = slide(struck=True)
     camera = Camera.look_at(np.array([3.0, 0.0, 1.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]), width=32, height=24)
     with tempfile.TemporaryDirectory() as place:
@@ -32,15 +32,16 @@ def finished_run() -> dict[str, bytes]:
 
 
 def arrays_as_json(name: str) -> bytes:
-    """The arrays of a file of the run as a tree, whose leaves can be damaged one by one; without empty ones, whose
-    shape it cannot tell.
+    """Return the arrays of a file of the run as JSON, whose leaves can be corrupted one by one.
+
+    Empty arrays are left out, because JSON does not store their shape.
     """
     with np.load(io.BytesIO(finished_run()[name]), allow_pickle=False) as arrays:
         return json.dumps({key: arrays[key].tolist() for key in arrays.files if arrays[key].size}).encode()
 
 
 def npz_of_json(data: bytes) -> bytes:
-    """The other way, for any tree; what is no tree is left as it is."""
+    """Convert JSON of arrays to an .npz file; data that are not such JSON are returned unchanged."""
     try:
         tree = json.loads(data)
         arrays = {key: _array(values) for key, values in tree.items() if key.isidentifier() and key != "file"}
@@ -55,13 +56,13 @@ def _array(values: Any) -> np.ndarray:
     try:
         array = np.asarray(values)
     except ValueError:
-        # Rows of several lengths.
+        # Rows of different lengths.
         return np.zeros(0)
     return np.asarray(str(values)[:100]) if array.dtype == object else array
 
 
 def draw_run(path: Path) -> None:
-    """The run in whose folder ``path`` lies, as a page is sent it and as a film draws it."""
+    """Read the run in the folder of ``path`` as a page and as a film do."""
     run = Recording.read(path.parent)
     assert run.bytes()
     last = len(run.steps) - 1

@@ -1,4 +1,4 @@
-"""A trajectory written by hand: a rigid block in the air."""
+"""A hand-written trajectory: a rigid block in the air."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
 def rigid_flight() -> Trajectory:
-    """A block that takes off with (1, 0, 2) m/s and is posed turning about the vertical, by the implicit integrator's
-    own rule.
+    """Return the flight of a block that takes off with (1, 0, 2) m/s and rotates about the vertical.
+
+    Its velocities follow the implicit integrator's own rule.
     """
     mesh = block_mesh()
     mass = mesh.lumped_masses(1000.0)
@@ -22,8 +23,8 @@ def rigid_flight() -> Trajectory:
     velocity = np.array([1.0, 0.0, 2.0]) + np.arange(steps + 1)[:, None] * DT * GRAVITY
     com = np.concatenate([np.zeros((1, 3)), DT * np.cumsum(velocity[1:], axis=0)])
     rest_com = mass @ mesh.nodes / mass.sum()
-    turns = Rotation.from_rotvec(np.outer(np.arange(steps + 1) * 0.03, [0, 0, 1]))
-    arms = np.einsum("fij,nj->fni", turns.as_matrix(), mesh.nodes - rest_com)
+    rotations = Rotation.from_rotvec(np.outer(np.arange(steps + 1) * 0.03, [0, 0, 1]))
+    arms = np.einsum("fij,nj->fni", rotations.as_matrix(), mesh.nodes - rest_com)
     return Trajectory(
         time=DT * np.arange(steps + 1),
         dt=np.full(steps, DT),

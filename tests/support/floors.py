@@ -1,4 +1,4 @@
-"""Painted floors for the tests of inpainting: a pattern that repeats exactly, on a slanted plane."""
+"""Painted floors for the tests of inpainting: an exactly periodic pattern on a slanted plane."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PERIOD = 0.4
 
 
 def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(..., 3) checks with soft edges and a stripe, of period 0.4 both ways."""
+    """(..., 3) checks with soft edges and a stripe, of period 0.4 in both directions."""
     u, v = 2.0 * np.pi * x / PERIOD, 2.0 * np.pi * y / PERIOD
     checks = np.tanh(3.0 * np.sin(u) * np.sin(v))
     return np.stack([0.5 + 0.3 * checks, 0.5 - 0.2 * checks, 0.45 + 0.15 * np.cos(u)], axis=-1)
@@ -22,7 +22,7 @@ def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def floor(
     *, half: float = 1.0, spacing: float = 0.025, height: float = 0.0, gloss: float = 0.0, device: str | None = None
 ) -> GaussianCloud:
-    """Flat Gaussians on a grid, ``height`` above ``PLANE``; glossy ones have SH degree 3."""
+    """Return flat Gaussians on a grid, ``height`` above ``PLANE``; glossy ones have SH degree 3."""
     line = np.arange(-half, half, spacing) + 0.5 * spacing
     x, y = (values.ravel() for values in np.meshgrid(line, line))
     first, second = PLANE.tangents()
@@ -41,7 +41,7 @@ def floor(
 
 
 def centre() -> np.ndarray:
-    """(3,) point of the plane where the pattern has its origin."""
+    """(3,) origin of the pattern on the plane."""
     return -PLANE.offset * PLANE.normal
 
 

@@ -1,4 +1,4 @@
-"""The same capture as another file might hold it: shuffled, in another unit, moved, turned."""
+"""The same capture in other coordinates: shuffled, in another unit, moved, rotated."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TURN = Rotation.from_rotvec([0.7, -1.1, 0.4]).as_matrix()
 
 @dataclass(frozen=True)
 class Lying:
-    """A capture, what it stands on, and which way is up in it."""
+    """A capture with its support plane, whose normal is up."""
 
     cloud: GaussianCloud
     plane: Plane
@@ -28,7 +28,7 @@ class Lying:
         return self.plane.normal
 
     def on_grid(self, step: float = 2.0**-12) -> Lying:
-        """With means that moves by whole numbers leave exact."""
+        """Round means to a grid, so that integer translations are exact."""
         return Lying(self._with(np.round(self.cloud.means.numpy().astype(np.float64) / step) * step), self.plane)
 
     def shuffled(self, seed: int = 0) -> Lying:

@@ -1,4 +1,4 @@
-"""Objects on grounds that are known: a ball in a furnished room, a ball on a folded cloth, a ball sunk into a dent."""
+"""Objects on known grounds: a ball in a furnished room, a ball on a folded cloth, a ball sunk into a dent."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from tests.support.waves import wave
 
 RADIUS = 0.5
-"""Of the ball, whose height is one unit."""
+"""Radius of the ball, whose height is 1."""
 
 
 def sheet(points: np.ndarray, normals: np.ndarray, spacing: float, colour: tuple[float, float, float]) -> GaussianCloud:
-    """Flat opaque Gaussians at ``points`` (n, 3) square to ``normals`` (n, 3)."""
+    """Return flat opaque Gaussians at ``points`` (n, 3), orthogonal to ``normals`` (n, 3)."""
     scales = np.full((len(points), 3), np.log(0.62 * spacing))
     scales[:, 2] = np.log(0.05 * spacing)
     dc = (np.tile(colour, (len(points), 1)) - 0.5) / 0.28209479
@@ -38,7 +38,7 @@ def ball(lift: float = 0.0) -> GaussianCloud:
 
 
 def furnished_room() -> GaussianCloud:
-    """A ball on a table of 2.4 x 2 whose top is z = 0; a floor of 8 x 8 at z = -1.5, a cupboard and a wall."""
+    """A ball on a table of 2.4 x 2 with its top at z = 0; a floor of 8 x 8 at z = -1.5, a cupboard and a wall."""
     up = np.array([[0.0, 0.0, 1.0]])
 
     def flat(points: np.ndarray, spacing: float, colour: tuple[float, float, float]) -> GaussianCloud:
@@ -47,7 +47,7 @@ def furnished_room() -> GaussianCloud:
     parts = [
         ball(),
         flat(level((-1.2, -1.0), (1.2, 1.0), 0.0, 0.018), 0.018, (0.5, 0.35, 0.2)),
-        # One layer lets a twentieth of what is far below through.
+        # A single layer would transmit a twentieth of the light from below.
         flat(level((-1.2, -1.0), (1.2, 1.0), -0.02, 0.05), 0.05, (0.5, 0.35, 0.2)),
         flat(level((-4.0, -4.0), (4.0, 4.0), -1.5, 0.08), 0.08, (0.4, 0.4, 0.45)),
         flat(level((2.2, 1.5), (3.8, 3.8), 0.6, 0.08), 0.08, (0.7, 0.7, 0.65)),
@@ -61,8 +61,9 @@ def furnished_room() -> GaussianCloud:
 
 
 def on_folds(amplitude: float, *, length: float = 0.8, reach: float = 2.2) -> tuple[GaussianCloud, np.ndarray]:
-    """A ball on a cloth in folds; and which of the Gaussians (n,) are its. It touches the cloth where that is highest
-    under it.
+    """Return a ball on a folded cloth, and which of the Gaussians (n,) belong to the ball.
+
+    It touches the cloth at the highest point under it.
     """
     points = level((-reach, -reach), (reach, reach), 0.0, 0.03)
     points[:, 2] = wave(points[:, :2], amplitude, length)
@@ -75,5 +76,5 @@ def on_folds(amplitude: float, *, length: float = 0.8, reach: float = 2.2) -> tu
     cloth = sheet(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), 0.03, (0.3, 0.4, 0.6))
     shell = ball().means.numpy().astype(np.float64)
     rest = float((wave(shell[:, :2], amplitude, length) - shell[:, 2]).max())
-    thing = ball(rest)
-    return concatenate(thing, cloth), np.arange(thing.count + cloth.count) < thing.count
+    lifted = ball(rest)
+    return concatenate(lifted, cloth), np.arange(lifted.count + cloth.count) < lifted.count

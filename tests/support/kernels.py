@@ -1,4 +1,4 @@
-"""Kernels that call device functions one by one."""
+"""Kernels that call single device functions."""
 
 import warp as wp
 
@@ -41,25 +41,25 @@ def algebra_kernel(
     product: wp.array2d[real],
     turned: wp.array2d[real],
     marks: wp.array[int],
-    found: wp.array[int],
-    told: wp.array[int],
+    indices: wp.array[int],
+    counts: wp.array[int],
     parts: wp.array2d[int],
     shares: wp.array2d[real],
     lengths: wp.array[real],
     across: wp.array[real],
 ):
-    """Each of the block's functions once."""
+    """Call each of the block's functions once."""
     for e in range(algebra.lane_of_block(), unknowns * unknowns, wp.block_dim()):
         product[e / unknowns, e % unknowns] = real(0.0)
         turned[e / unknowns, e % unknowns] = real(0.0)
     sync_block()
     algebra.gemm_add(product, matrix, symmetric, unknowns, unknowns, unknowns, 0)
     algebra.gemm_add(turned, matrix, symmetric, unknowns, unknowns, unknowns, 1)
-    told[0] = inverse_cholesky(symmetric, unknowns, root)
-    told[1] = eliminate(matrix, unknowns, columns, real(1e-12))
-    told[2] = algebra.compact_indices(marks, columns, unknowns, found)
+    counts[0] = inverse_cholesky(symmetric, unknowns, root)
+    counts[1] = eliminate(matrix, unknowns, columns, real(1e-12))
+    counts[2] = algebra.compact_indices(marks, columns, unknowns, indices)
     mine = real(algebra.lane_of_block() % 7)
-    told[3] = int(algebra.argmax_of_block(mine, algebra.lane_of_block())[1])
+    counts[3] = int(algebra.argmax_of_block(mine, algebra.lane_of_block())[1])
     algebra.normalize_rows(matrix, columns, parts, shares, unknowns, lengths)
     algebra.multiply_transposed(product, unknowns, unknowns, lengths, across)
 
@@ -68,7 +68,7 @@ def algebra_kernel(
 def iterate_kernel(
     rows: UnitConstraints, holding: ActiveSet, splitting: Splitting, guessed: wp.array[int], ended: wp.array[int]
 ):
-    """OSQP's iterations from the sides, which are ``guessed`` then, and the optimum from there."""
+    """Run OSQP's iterations from the sides, store these in ``guessed``, and find the optimum from there."""
     iterate(rows, holding, splitting)
     for row in range(algebra.lane_of_block(), rows.count, wp.block_dim()):
         guessed[row] = holding.side[row]

@@ -21,11 +21,11 @@ KEEP_SENT = """() => {
     window.sent = [];
     source.send = (message) => { window.sent.push(message); send(message); };
 }"""
-"""Keeps what the page asks for from then on."""
+"""Script that records the page's requests from then on."""
 
 
 def in_browser(test: Any) -> Any:
-    """The marks of a test in Chromium."""
+    """Apply the marks of a test in Chromium."""
     for mark in NEEDED:
         test = mark(test)
     return test
@@ -33,14 +33,14 @@ def in_browser(test: Any) -> Any:
 
 @contextmanager
 def living(session: Session, **place: Any) -> Iterator[PageServer]:
-    """The server of a live session."""
+    """Run the server of a live session."""
     with served(feed=LiveFeed(session), **place) as server:
         yield server
 
 
 @contextmanager
 def watched(chromium: Any, session: Session, *size: int) -> Iterator[Any]:
-    """The page of a live session, which must not complain."""
+    """Open the page of a live session, which must not report errors."""
     with living(session) as server:
         page, complaints = opened(chromium, server.address, *size)
         yield page

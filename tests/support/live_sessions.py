@@ -1,4 +1,4 @@
-"""A coarse creature that lives, step by step or in its thread."""
+"""A coarse creature in a live session, stepped by the test or in its own thread."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from egs_warp.web.session import Session, SessionOptions
 
 @cache
 def coarse_pawn() -> Creature:
-    """About a hundred nodes."""
-    made = pawn(gaussian_count=2000)
-    return make_creature(made.cloud, plane=made.plane, options=CreatureOptions(nodes=50))
+    """The built-in pawn in a cage of about a hundred nodes."""
+    scene = pawn(gaussian_count=2000)
+    return make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=50))
 
 
 def session_of(creature: Creature, takes: Path) -> Session:
-    """Of ``creature``, not started; what it records goes to ``takes``."""
+    """Return a session of ``creature`` that is not started; it records to ``takes``."""
     return Session(creature, live_render_data(creature, creature.cloud), SessionOptions(source="pawn", takes=takes))
 
 
@@ -37,7 +37,7 @@ class SteppedSession:
         self.news: list[dict[str, Any]] = []
 
     def ask(self, kind: str, **fields: Any) -> None:
-        """What the page would send."""
+        """Send a request, as the page would."""
         body = self.session.creature.body
         message = read_message({"type": kind, **fields}, height=body.height, node_count=len(body.node_mass))
         self.session.put_request(message)
@@ -45,13 +45,13 @@ class SteppedSession:
         self._hear()
 
     def step(self, count: int = 1) -> None:
-        """So many steps."""
+        """Step ``count`` times."""
         for _ in range(count):
             self.session.advance()
             self._hear()
 
     def until(self, condition: Callable[[], bool], *, most: int = 400) -> int:
-        """Steps until ``condition`` holds."""
+        """Step until ``condition`` holds; returns the number of steps."""
         for count in range(most):
             if condition():
                 return count
@@ -59,13 +59,13 @@ class SteppedSession:
         raise AssertionError(f"not within {most} steps")
 
     def until_idle(self, *, most: int = 400) -> int:
-        """Steps until it stands with nothing to come; at least one."""
+        """Step, at least once, until it stands with nothing left to do."""
         self.step()
         return self.until(lambda: self.session.steering.idle, most=most)
 
     @property
     def told(self) -> list[str]:
-        """Lines for the user."""
+        """Messages for the user."""
         return [str(news["text"]) for news in self.news if news["type"] == "told"]
 
     def _hear(self) -> None:

@@ -1,6 +1,6 @@
-"""The most memory that this process has held (Linux).
+"""Peak memory of this process (Linux).
 
-Not ``ru_maxrss``, which a child begins with that of the process that started it: beside a large one it never grows.
+Not ``ru_maxrss``, because a child process starts with its parent's value, and does not exceed that of a large parent.
 """
 
 from __future__ import annotations
@@ -12,36 +12,36 @@ from pathlib import Path
 from typing import Any
 
 _IMPORTS = ("numpy", "warp", "cv2", "PIL.Image", "PIL.WebPImagePlugin", "PIL.PngImagePlugin", "egs_warp.io")
-"""What no reader is charged for."""
-_PATIENCE = 60.0
+"""Modules whose memory is not counted."""
+_MAX_SECONDS = 60.0
 
 
 def reset_peak() -> None:
-    """From now on the peak is that of what is held now and later."""
+    """Reset the peak to the memory in use."""
     Path("/proc/self/clear_refs").write_text("5")
 
 
 def peak_bytes() -> int:
-    """Of resident memory."""
+    """Return the peak of the resident memory, bytes."""
     (line,) = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM:")]
     return 1024 * int(line.split()[1])
 
 
 def megabytes_of(read: Callable[..., Any], *arguments: Any) -> float:
-    """Memory that ``read(*arguments)`` takes at most beyond its imports, in a process of its own.
+    """Return the peak memory of ``read(*arguments)`` beyond its imports, MiB, measured in its own process.
 
-    ``read`` is a function of a module; one that raises ``UserError`` counts as well.
+    ``read`` is a function of a module; it may raise ``UserError``.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([*_IMPORTS, __name__])
-    here, there = context.Pipe(duplex=False)
-    process = context.Process(target=_measured, args=(there, read, arguments))
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_measured, args=(sender, read, arguments))
     process.start()
-    there.close()
-    assert here.poll(_PATIENCE), f"{read} has not ended after {_PATIENCE:g} s"
-    taken = here.recv()
+    sender.close()
+    assert receiver.poll(_MAX_SECONDS), f"{read} has not ended after {_MAX_SECONDS:g} s"
+    megabytes = receiver.recv()
     process.join()
-    return taken
+    return megabytes
 
 
 def _measured(answer: Connection, read: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
@@ -54,8 +54,8 @@ def _measured(answer: Connection, read: Callable[..., Any], arguments: tuple[Any
     reset_peak()
     before = peak_bytes()
     try:
-        kept = read(*arguments)
+        result = read(*arguments)
     except UserError as error:
-        kept = error
+        result = error
     answer.send((peak_bytes() - before) / 2**20)
-    del kept
+    del result

@@ -13,7 +13,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def block_mesh(nx: int = 3, ny: int = 3, nz: int = 5, size: tuple[float, float, float] = (0.4, 0.4, 1.0)) -> TetMesh:
-    """A box centred on the z axis, standing on z = 0: nx x ny x nz nodes, six tetrahedra a cell, irregular inside."""
+    """A box centred on the z axis, standing on z = 0: nx x ny x nz nodes, six tetrahedra per cell, irregular inside."""
     axes = [np.linspace(-size[0] / 2, size[0] / 2, nx), np.linspace(-size[1] / 2, size[1] / 2, ny)]
     axes.append(np.linspace(0, size[2], nz))
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
@@ -51,7 +51,7 @@ def box_mesh(counts: tuple[int, int, int], size: tuple[float, float, float]) -> 
 
 
 def carved(size: tuple[float, float, float], cell: float, keep: Callable[[np.ndarray], np.ndarray]) -> TetMesh:
-    """Cells of a lattice over a box standing on z = 0 whose centres ``keep`` accepts, six tetrahedra each."""
+    """Cells of a lattice over a box on z = 0 whose centres ``keep`` accepts, six tetrahedra each."""
     counts = np.round(np.array(size) / cell).astype(int)
     grid = np.stack(np.meshgrid(*[np.arange(n + 1) for n in counts], indexing="ij"), axis=-1)
     nodes = (grid * cell - [size[0] / 2, size[1] / 2, 0.0]).reshape(-1, 3)
@@ -85,7 +85,7 @@ def coarse_stool() -> TetMesh:
 
 
 def figure() -> TetMesh:
-    """Two legs, a trunk that ends in a head, two arms held out."""
+    """Two legs, a trunk that ends in a head, two extended arms."""
 
     def keep(c: np.ndarray) -> np.ndarray:
         x, z = np.abs(c[:, 0]), c[:, 2]
@@ -98,21 +98,22 @@ def figure() -> TetMesh:
 
 
 def ball_mesh(cells: int = 4) -> TetMesh:
-    """A ball of diameter 1 on z = 0: a cube of so many cells each way, drawn out smoothly to a ball."""
+    """A ball of diameter 1 on z = 0: a cube of ``cells`` cells along each side, mapped smoothly to a ball."""
     cube = box_mesh((cells, cells, cells), (2.0, 2.0, 2.0))
     x, y, z = (cube.nodes - [0.0, 0.0, 1.0]).T
     squares = x * x, y * y, z * z
 
-    def drawn(along: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    def mapped(along: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return along * np.sqrt(1.0 - 0.5 * a - 0.5 * b + a * b / 3.0)
 
     nodes = np.stack(
-        [drawn(x, squares[1], squares[2]), drawn(y, squares[2], squares[0]), drawn(z, squares[0], squares[1])], axis=1
+        [mapped(x, squares[1], squares[2]), mapped(y, squares[2], squares[0]), mapped(z, squares[0], squares[1])],
+        axis=1,
     )
     nodes = 0.5 * nodes
     return TetMesh(nodes - [0.0, 0.0, nodes[:, 2].min()], cube.tets)
 
 
 def worm_mesh(cells: int = 14) -> TetMesh:
-    """A bar on z = 0, 1 high and wide, along x: longer than three times that."""
+    """A bar on z = 0, 1 high and wide, along x, more than three times as long."""
     return box_mesh((cells, 2, 2), (0.5 * cells, 1.0, 1.0))

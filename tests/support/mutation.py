@@ -1,9 +1,9 @@
-"""``make mutation``: small changes of the code, one by one, that the fast tests of a package must notice.
+"""``make mutation``: small changes of the code, one by one, that the fast tests of a package must detect.
 
-``python -m tests.mutation --help``. Each process has its own copy of the package and of the tests, and its own cache of
-kernels. What is found is kept in a session as it comes, so that a run that was cut off goes on where it stopped; a
-result holds as long as the changed file stays as it is. Survivors that are no gap are listed with reasons in
-``tests/support/surviving_mutants/``. Nothing is fetched: cosmic-ray's operators and pytest are all that it takes.
+``python -m tests.mutation --help``. Each process has its own copy of the package and of the tests, and its own kernel
+cache. Results are appended to a session file at once, so that an interrupted run can be continued; a result is valid
+while the changed file is unchanged. Survivors that are not gaps of the tests are listed with reasons in
+``tests/support/surviving_mutants/``. Nothing is downloaded; only cosmic-ray's operators and pytest are needed.
 """
 
 from __future__ import annotations
@@ -32,28 +32,28 @@ from tests.support.surviving_mutants import reason_for
 OUT = Path("out/mutation")
 _SEED = 20_261_123
 _FAST = "not (slow or data or example or cuda)"
-_LEAST_KILLED = 0.8
-"""Share of a package's mutants, without those that are no gap."""
-_PATIENCE = 4.0
-"""Times what a package's tests take unchanged; a mutant that takes longer is killed by time."""
+_MIN_KILLED = 0.8
+"""Minimum fraction of a package's mutants that are killed, without those that are not gaps."""
+_TIME_FACTOR = 4.0
+"""Time limit as a factor of the duration of the package's tests; a mutant that takes longer is killed by time."""
 _HEAD_START = 60.0
-"""s beside that, for kernels that are compiled anew."""
+"""Additional time, s, for kernels that are recompiled."""
 _KINDS = ("assertion", "exception", "time", "survived")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one mutant."""
+    """Result of one mutant."""
 
     kind: str
-    """How its test failed: by an assertion, by an exception, by time; or ``survived``."""
+    """Way in which its test failed: by an assertion, by an exception, by time; or ``survived``."""
     seconds: float
     test: str
     """The test that failed."""
 
 
 class Session:
-    """The results so far: lines of JSON, one a mutant, and the time that a package's tests take unchanged."""
+    """The results so far: lines of JSON, one per mutant, and the durations of the packages' unchanged tests."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -93,7 +93,7 @@ class Copy:
             shutil.copytree(kernels, self._kernels)
 
     def run(self, tests: Sequence[str], limit: float) -> Outcome:
-        """Of the copy as it stands, until a test fails."""
+        """Run the tests in the copy until one fails."""
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", _FAST, "--tb=native", "--durations=0"]
         command += ["-p", "no:cacheprovider", "-p", "no:randomly", *tests]
         began = time.monotonic()
@@ -132,19 +132,19 @@ class Copy:
             shutil.copy2(ROOT / mutant.file, place)
 
     def keep_kernels(self, kernels: Path) -> None:
-        """What this copy has compiled, for other copies."""
+        """Copy the kernels that were compiled here, for other copies."""
         shutil.copytree(self._kernels, kernels, dirs_exist_ok=True)
 
     def _environment(self) -> dict[str, str]:
         paths = [str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])]
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
         own = {"PYTHONPATH": os.pathsep.join(paths), "WARP_CACHE_PATH": str(self._kernels)}
-        # No stale bytecode of a change that is as long as what it replaces; no network, should a test ask for it.
+        # No stale bytecode of a change of the same length; no GPU.
         return os.environ | threads | own | {"PYTHONDONTWRITEBYTECODE": "1", "CUDA_VISIBLE_DEVICES": ""}
 
 
 def main() -> int:
-    """Returns 1 where fewer are killed than must be, or where the tests fail on the code as it is."""
+    """Run the mutation tests; returns 1 if too few mutants are killed, or if the tests fail on the unchanged code."""
     chosen = _arguments()
     began = time.monotonic()
     session = Session(chosen.session)
@@ -155,19 +155,21 @@ def main() -> int:
         open_ones = [mutant for mutant in mutants if _is_open(mutant, session, chosen.again)]
         print(f"{len(mutants)} mutants, {len(open_ones)} to try", flush=True)
         _try_all(open_ones, chosen, session, Path(place), began + 60.0 * chosen.minutes)
-    return _tell(mutants, session, chosen.json)
+    return _report(mutants, session, chosen.json)
 
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--packages", default=",".join(PACKAGES), help="with commas between; all unless told")
-    parser.add_argument("--count", type=int, default=200, help="mutants a package (%(default)s)")
-    parser.add_argument("--seed", type=int, default=_SEED, help="of the sample (%(default)s)")
-    parser.add_argument("--processes", type=int, default=1, help="at once, each with its own copy (%(default)s)")
-    parser.add_argument("--minutes", type=float, default=1e6, help="no mutant begins later; those that run are ended")
+    parser.add_argument("--packages", default=",".join(PACKAGES), help="comma-separated (default all)")
+    parser.add_argument("--count", type=int, default=200, help="mutants per package (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=_SEED, help="seed of the sample (default %(default)s)")
+    parser.add_argument(
+        "--processes", type=int, default=1, help="parallel processes, each with its own copy (default %(default)s)"
+    )
+    parser.add_argument("--minutes", type=float, default=1e6, help="time limit; running mutants are stopped")
     parser.add_argument("--session", type=Path, default=OUT / "session.jsonl", help="(%(default)s)")
     parser.add_argument("--json", type=Path, default=OUT / "survivors.json", help="survivors (%(default)s)")
-    parser.add_argument("--again", action="store_true", help="try those that survived once more")
+    parser.add_argument("--again", action="store_true", help="repeat mutants that survived")
     chosen = parser.parse_args()
     chosen.packages = chosen.packages.split(",")
     unknown = sorted(set(chosen.packages) - set(PACKAGES))
@@ -177,21 +179,21 @@ def _arguments() -> argparse.Namespace:
 
 
 def _samples(chosen: argparse.Namespace) -> list[Mutant]:
-    """Of all packages in turn, so that a run that is cut off has seen of each."""
+    """Return the mutants of all packages in turn, so that an interrupted run covers each package."""
     with ProcessPoolExecutor(min(chosen.processes, len(chosen.packages))) as pool:
         count = len(chosen.packages)
         samples = list(pool.map(sample, chosen.packages, [chosen.count] * count, [chosen.seed] * count))
     longest = max(map(len, samples))
-    return [found[i] for i in range(longest) for found in samples if i < len(found)]
+    return [mutants[i] for i in range(longest) for mutants in samples if i < len(mutants)]
 
 
-def _is_open(mutant: Mutant, session: Session, again: bool) -> bool:
+def _is_open(mutant: Mutant, session: Session, repeat_survivors: bool) -> bool:
     known = session.results.get(mutant.key)
-    return known is None or (again and known["kind"] == "survived" and reason_for(mutant) is None)
+    return known is None or (repeat_survivors and known["kind"] == "survived" and reason_for(mutant) is None)
 
 
 def _baselines(chosen: argparse.Namespace, session: Session, place: Path) -> bool:
-    """Each package's tests on the code as it is: whether they pass, how long they take, and their kernels."""
+    """Run each package's tests on the unchanged code; record their duration and kernels. Returns False if one fails."""
     state = _digest(ROOT.joinpath(name) for name in ("egs_warp", "tests"))
     kernels = OUT / "kernels"
     packages = [
@@ -205,8 +207,8 @@ def _baselines(chosen: argparse.Namespace, session: Session, place: Path) -> boo
         return package, outcome
 
     with ThreadPoolExecutor(chosen.processes) as pool:
-        found = list(pool.map(one, packages))
-    for package, outcome in found:
+        outcomes = list(pool.map(one, packages))
+    for package, outcome in outcomes:
         if outcome.kind != "survived":
             print(f"{package}: a test fails on the code as it is: {outcome.test or outcome.kind}")
             return False
@@ -229,7 +231,7 @@ def _try_all(
         except queue.Empty:
             copy = Copy(Path(tempfile.mkdtemp(dir=place)) / "tree", OUT / "kernels")
         try:
-            limit = _HEAD_START + _PATIENCE * session.baselines[mutant.package]
+            limit = _HEAD_START + _TIME_FACTOR * session.baselines[mutant.package]
             left = deadline - time.monotonic()
             if left <= 0.0 or mutant.is_stale:
                 return
@@ -248,11 +250,9 @@ def _try_all(
             done.result()
 
 
-def _tell(mutants: list[Mutant], session: Session, path: Path) -> int:
-    """A table of the packages, and the survivors as a file."""
-    print(
-        "| package | tried | by assertion | by exception | by time | survived | of these no gap | killed | s a mutant |"
-    )
+def _report(mutants: list[Mutant], session: Session, path: Path) -> int:
+    """Print a table of the packages, and write the survivors to a file."""
+    print("| package | tried | by assertion | by exception | by time | survived | no gap | killed | s per mutant |")
     print("|---|---|---|---|---|---|---|---|---|")
     survivors, short = [], False
     for package in dict.fromkeys(mutant.package for mutant in mutants):
@@ -267,7 +267,7 @@ def _tell(mutants: list[Mutant], session: Session, path: Path) -> int:
         killed = len(known) - len(alive)
         share = killed / max(len(known) - no_gap, 1)
         mean = sum(result["seconds"] for result in results) / len(results)
-        short |= share < _LEAST_KILLED
+        short |= share < _MIN_KILLED
         cells = (package, len(known), *count.values(), no_gap, f"{100 * share:.0f} %", f"{mean:.1f}")
         print("| " + " | ".join(map(str, cells)) + " |")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -284,7 +284,7 @@ def _digest(folders: Iterable[Path]) -> str:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """With all that it has started."""
+    """Kill the process and its children."""
     try:
         os.killpg(process.pid, signal.SIGKILL)
     except ProcessLookupError:

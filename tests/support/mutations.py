@@ -1,7 +1,6 @@
-"""Deliberately wrong formulas, each with the test that must notice; ``tests/test_formula_mutations.py`` tries them.
+"""Deliberately wrong formulas, each with the test that must fail; ``tests/test_formula_mutations.py`` runs them.
 
-A formula of the package that is rewritten has its line rewritten here too: the mutation must still be the formula,
-wrong.
+When a formula of the package is rewritten, its line here must be rewritten too.
 """
 
 from __future__ import annotations
@@ -14,14 +13,14 @@ class Mutation:
     """One wrong formula."""
 
     what: str
-    """The formula, with its equation in the paper as "Eq. (n)" if it has one."""
+    """Name of the formula, with its equation in the paper as "Eq. (n)" if it has one."""
     file: str
-    """Of the package."""
+    """File of the package."""
     right: str
-    """Stands once in the file."""
+    """Correct text, which occurs once in the file."""
     wrong: str
     test: str
-    """file::function that fails under it."""
+    """Test that fails, as file::function."""
 
 
 def _equation(number: int, what: str, file: str, right: str, wrong: str, test: str) -> Mutation:
@@ -37,12 +36,12 @@ EQUATIONS: dict[int, Mutation] = {
             "segmentation/test_plane_fit.py::test_plane_measures_height_towards_the_objects_side",
         ),
         (
-            *(2, "which weight is whose", "kernels/deformation/embedding.py"),
+            *(2, "the order of the weights", "kernels/deformation/embedding.py"),
             *("w[2], w[0], w[1], w[2])", "w[2], w[1], w[0], w[2])"),
             "deformation/test_embedding.py::test_weights_reproduce_points_and_shared_faces_take_the_lowest_tet",
         ),
         (
-            *(3, "the shortening of what reaches below the plane", "contact/detection.py"),
+            *(3, "the shortening of arms that extend below the plane", "contact/detection.py"),
             *("means[above] + reach[:, None] * arm", "means[above] + arm"),
             "contact/test_detection.py::test_endpoints_are_shortened_to_the_plane_at_rest",
         ),
@@ -65,7 +64,7 @@ EQUATIONS: dict[int, Mutation] = {
             "fem/test_step_problem.py::test_drag_slows_free_flight_exponentially",
         ),
         (
-            *(7, "the direction of a segment's pull", "muscles/tension.py"),
+            *(7, "the direction of a segment's tension", "muscles/tension.py"),
             *("pulls = -(muscles.stiffness * share)", "pulls = (muscles.stiffness * share)"),
             "muscles/test_muscle_set.py::test_columns_are_equation_7",
         ),
@@ -83,7 +82,7 @@ EQUATIONS: dict[int, Mutation] = {
             "contact/test_detection.py::test_coulomb_forces_on_random_problems",
         ),
         (
-            *(10, "the normal measure of the foreseen contact", "contact/newton.py"),
+            *(10, "the velocity bias of the predicted contact", "contact/newton.py"),
             *(
                 "(self._regular, speeds, shift, friction, start)",
                 "(self._regular, speeds, shift + 0.1, friction, start)",
@@ -111,7 +110,7 @@ EQUATIONS: dict[int, Mutation] = {
             "deformation/test_deformer.py::test_arms_go_where_their_ends_go",
         ),
         (
-            *(15, "the turn of the colour", "kernels/deformation/deformer.py"),
+            *(15, "the rotation of the colour", "kernels/deformation/deformer.py"),
             *(
                 "result.polar_rotation = quaternion_from_rotation(turned * wp.transpose(axes))",
                 "result.polar_rotation = quaternion_from_rotation(axes * wp.transpose(turned))",
@@ -147,15 +146,15 @@ EQUATIONS: dict[int, Mutation] = {
             "segmentation/test_clearance.py::test_reach_is_that_of_the_six_tips_or_of_the_whole_ellipsoid",
         ),
         (
-            *(21, "the loss of one that straddles", "segmentation/clearance.py"),
+            *(21, "the loss of a straddling Gaussian", "segmentation/clearance.py"),
             *("torch.relu(eta - height.abs())", "torch.relu(eta - height)"),
             "segmentation/test_clearance.py::test_loss_is_the_sum_over_straddling_gaussians",
         ),
     ]
 }
-"""One of each equation of the paper; ``docs/equations.md`` says where else it is and what else tests it."""
+"""One mutation of each equation of the paper; ``docs/equations.md`` lists where else it is implemented and tested."""
 
-BESIDE_THE_PAPER: list[Mutation] = [
+OTHER_FORMULAS: list[Mutation] = [
     Mutation(what, f"egs_warp/{file}", right, wrong, f"tests/{test}")
     for what, file, right, wrong, test in [
         (
@@ -195,12 +194,12 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "meshing/test_cage.py::test_tetwild",
         ),
         (
-            *("the work of a push: the half of what it gives", "locomotion/ledger.py"),
+            *("the work of a push: the factor 1/2 of the velocity change", "locomotion/ledger.py"),
             *("t.velocities[step] + 0.5 * kick", "t.velocities[step] + kick"),
             "locomotion/test_ledger.py::test_the_work_of_a_push_is_the_kinetic_energy_that_it_gives",
         ),
         (
-            *("what implicit Euler takes of a push", "locomotion/ledger.py"),
+            *("the loss of a push by implicit Euler", "locomotion/ledger.py"),
             *("velocity - t.velocities[step] - kick)", "velocity - t.velocities[step])"),
             "locomotion/test_ledger.py::test_every_step_closes",
         ),
@@ -220,12 +219,12 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "motions/test_push.py::test_steps_share_out_all_of_a_push",
         ),
         (
-            *("the curve of what the momentum misses: pushes", "web/recording.py"),
+            *("the curve of the momentum residual: pushes", "web/recording.py"),
             *("force + kicked - t.drag", "force - t.drag"),
             "web/test_recording.py::test_the_curve_of_the_momentum_knows_of_pushes",
         ),
         (
-            *("a pull's impulse over a step", "web/spring.py"),
+            *("the impulse of a pull over a step", "web/spring.py"),
             *("return dt * self._shares", "return 0.5 * dt * self._shares"),
             "web/test_spring.py::test_a_step_under_a_pull_has_its_impulse_and_its_torque",
         ),
@@ -260,7 +259,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "motions/test_stance.py::test_the_nearest_end_of_a_step_that_does_not_tip",
         ),
         (
-            *("balance: what friction gives under load", "motions/stance.py"),
+            *("balance: the friction limit under load", "motions/stance.py"),
             *("np.array([0.0, 0.0, up]), self._normal", "np.array([0.0, 0.0, gravity]), self._normal"),
             "motions/test_stance.py::test_no_more_is_asked_than_friction_gives",
         ),
@@ -270,23 +269,23 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "motions/test_stance.py::test_the_nearest_end_of_a_step_that_does_not_tip",
         ),
         (
-            *("the largest turn: the lever of a disc", "motions/turn.py"),
+            *("the maximum rotation: the lever arm of a disc", "motions/turn.py"),
             *("2.0 / 3.0 * float(", "3.0 / 4.0 * float("),
             "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground",
         ),
         (
-            *("the largest turn: the impulse of the weight", "motions/turn.py"),
+            *("the maximum rotation: the impulse of the weight", "motions/turn.py"),
             *("(plan.speed_up + jump.gravity * plan.thrust_time)", "plan.speed_up"),
             "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground",
         ),
         (
-            *("the largest turn: the pyramid of friction", "motions/turn.py"),
+            *("the maximum rotation: the friction pyramid", "motions/turn.py"),
             *("rate = PYRAMID_FRICTION_RATIO * stance.friction", "rate = stance.friction"),
             "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground",
         ),
         (
-            *("twist: the spin of the standing body, not of the crouched one", "motions/twist.py"),
-            *("return inertia @ spin_for_rotation(", "return measurement.inertia @ spin_for_rotation("),
+            *("twist: the angular velocity of the standing body, not of the crouched one", "motions/twist.py"),
+            *("return inertia @ spin_for_rotation(", "return seen.inertia @ spin_for_rotation("),
             "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
         ),
         (
@@ -295,7 +294,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
         ),
         (
-            *("twist: a free body keeps its momentum, not its spin", "motions/free_turn.py"),
+            *("twist: a free body conserves its angular momentum, not its angular velocity", "motions/free_turn.py"),
             *("axes @ np.linalg.solve(inertia, axes.T @ momentum)", "np.linalg.solve(inertia, momentum)"),
             "motions/test_free_turn.py::test_the_axis_of_a_symmetric_top_goes_round_its_angular_momentum",
         ),
@@ -305,47 +304,47 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "motions/test_twist.py::test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn",
         ),
         (
-            *("radial fibres: their pull", "muscles/tension.py"),
+            *("radial fibres: their tension", "muscles/tension.py"),
             *("entries = rows.data[:, None] *", "entries = 1.1 * rows.data[:, None] *"),
             "muscles/test_muscle_set.py::test_radial_fibres_lengthen_by_poissons_ratio",
         ),
         (
-            *("radial fibres: how far out they end", "muscles/branch_cylinder.py"),
+            *("radial fibres: the radius of their ends", "muscles/branch_cylinder.py"),
             *("_RADIUS_FRACTION * reach * outwards", "0.5 * reach * outwards"),
             "muscles/test_muscle_set.py::test_radial_fibres_are_diameters_spread_over_length_and_directions",
         ),
         (
-            *("radial fibres: spread over the directions", "muscles/branch_cylinder.py"),
+            *("radial fibres: the distribution over directions", "muscles/branch_cylinder.py"),
             *("diameter * count // (2 * self.detail.diameters)", "0"),
             "muscles/test_muscle_set.py::test_radial_fibres_are_diameters_spread_over_length_and_directions",
         ),
         (
-            *("ledger: the half of lambda log^2 J", "locomotion/ledger.py"),
+            *("energy balance: the factor 1/2 of lambda log^2 J", "locomotion/ledger.py"),
             *("+ 0.5 * self.lam * log_j**2", "+ 0.51 * self.lam * log_j**2"),
             "locomotion/test_ledger.py::test_every_step_closes",
         ),
         (
-            *("ledger: the damping's rate of strain", "locomotion/ledger.py"),
+            *("energy balance: the strain rate of the damping", "locomotion/ledger.py"),
             *("np.swapaxes(F0, 1, 2) @ F0) / (2.0 * dt)", "np.swapaxes(F0, 1, 2) @ F0) / (1.98 * dt)"),
             "locomotion/test_ledger.py::test_every_step_closes",
         ),
         (
-            *("ledger: what a step loses of the elastic energy", "locomotion/ledger.py"),
+            *("energy balance: the loss of elastic energy in a step", "locomotion/ledger.py"),
             *("(self.lam * log_j - self.mu) * curved", "(self.lam * log_j + self.mu) * curved"),
             "locomotion/test_ledger.py::test_every_step_closes",
         ),
         (
-            *("ledger: the half of what a turning muscle loses", "locomotion/ledger.py"),
+            *("energy balance: the factor 1/2 of the loss of a rotating muscle", "locomotion/ledger.py"),
             *("turned = 0.5 * share * long", "turned = 0.6 * share * long"),
             "locomotion/test_ledger.py::test_every_step_closes",
         ),
         (
-            *("ledger: the half of what the integrator takes of the inertia", "locomotion/ledger.py"),
+            *("energy balance: the factor 1/2 of the integrator's loss of kinetic energy", "locomotion/ledger.py"),
             *("-0.5 * _squared(mass, velocity - t.", "-0.51 * _squared(mass, velocity - t."),
             "locomotion/test_ledger.py::test_every_step_closes",
         ),
         (
-            *("ledger: the arms of the torque that is taken off", "locomotion/ledger.py"),
+            *("energy balance: the lever arms of the removed torque", "locomotion/ledger.py"),
             *(
                 "inner_spin @ _momentum(mass, before, velocity)",
                 "inner_spin @ _momentum(mass, after, t.velocities[step])",
@@ -353,7 +352,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "locomotion/test_ledger.py::test_every_step_closes",
         ),
         (
-            *("ledger: the energy of the spin that is added", "locomotion/ledger.py"),
+            *("energy balance: the energy of the added angular velocity", "locomotion/ledger.py"),
             *("+ 0.5 * _inertia(mass, after) @ added", "+ 1.0 * _inertia(mass, after) @ added"),
             "locomotion/test_ledger.py::test_spin_that_is_added_after_a_step_counts",
         ),
@@ -363,7 +362,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "locomotion/test_audit.py::test_a_run_that_slides_passes",
         ),
         (
-            *("audit: the gap at the end", "locomotion/audit.py"),
+            *("audit: the gap at the end of the step", "locomotion/audit.py"),
             *("normal * np.maximum(_start_gaps(t) + along, 0.0)", "normal * np.maximum(_start_gaps(t), 0.0)"),
             "locomotion/test_audit.py::test_a_run_that_slides_passes",
         ),
@@ -389,6 +388,6 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
     ]
 ]
-"""Formulas that the paper leaves open."""
+"""Mutations of formulas that the paper leaves open."""
 
-ALL = [*EQUATIONS.values(), *BESIDE_THE_PAPER]
+ALL = [*EQUATIONS.values(), *OTHER_FORMULAS]

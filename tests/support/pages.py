@@ -13,25 +13,25 @@ from egs_warp.web.server import FrameFeed, PageServer
 
 
 class RecordedFeed:
-    """A recording sent frame by frame, over and over."""
+    """A recording sent frame by frame in a loop."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self.received: list[dict[str, object]] = []
 
     def header(self) -> bytes:
-        """See ``FrameFeed``."""
+        """Return the header of the recording."""
         return self._recording.header()
 
     async def packets(self) -> AsyncGenerator[bytes | str]:
-        """See ``FrameFeed``."""
+        """Yield the frames of the recording in a loop."""
         while True:
             for frame in self._recording.frames():
                 yield frame.packet()
                 await asyncio.sleep(0.01)
 
     def receive(self, message: dict[str, object]) -> None:
-        """See ``FrameFeed``; only a pause makes sense."""
+        """Record a pause message; other messages raise ``ValueError``."""
         if message.get("type") != "pause":
             raise ValueError(f"type {message.get('type')}")
         self.received.append(message)
@@ -39,7 +39,7 @@ class RecordedFeed:
 
 @contextmanager
 def served(*runs: Recording, feed: FrameFeed | None = None, **place: Any) -> Iterator[PageServer]:
-    """A server that runs within the block; ``place`` is its port and token."""
+    """Run a server within the block; ``place`` has its port and token."""
     server = PageServer([run.bytes for run in runs], feed=feed, **place)
     thread = threading.Thread(target=server.serve)
     thread.start()

@@ -1,4 +1,4 @@
-"""A body without muscles of its own, stepped as the engine steps it: contact found, forces and velocities solved."""
+"""A body without muscle control, stepped like in the engine: contact detection, then forces and velocities."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.muscles.tension import MuscleEnergy
 
 ABYSS = Plane(np.array([0.0, 0.0, 1.0]), 1e9)
-"""A ground that nothing reaches."""
+"""A ground far below every body."""
 
 
 @dataclass
 class PassiveBody:
-    """Its state and its contacts from step to step."""
+    """The state of a body and its contacts from step to step."""
 
     body: SoftBody
     solver: CoupledSolver
     factors: MultifrontalLdl
     state: BodyState
     points: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
-    """(n,) of the last step."""
+    """(n,) contact points of the last step."""
     forces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(n, 3) newtons."""
+    """(n, 3) N, contact forces of the last step."""
 
     def advance(
         self, dt: float, tension: MuscleEnergy | None = None, *, drag: float = 0.0
     ) -> tuple[StepProblem, CoupledResult]:
-        """One step of ``dt`` seconds."""
+        """Advance one step of ``dt`` s."""
         body, state, solver = self.body, self.state, self.solver
         problem = StepProblem(body, state, dt, drag)
         gaps, _ = solver.detector.gaps(problem.end_positions(state.velocities + dt * body.gravity))
@@ -62,8 +62,9 @@ def passive_body(
     tolerance: float = 1e-8,
     device: str = "cpu",
 ) -> PassiveBody:
-    """``body`` over ``plane`` with contact points at ``places`` (P, 3) of its rest shape, one at its middle if it is to
-    fly; at rest unless ``state`` is given.
+    """Place ``body`` over ``plane``, at rest unless ``state`` is given.
+
+    Contact points are at ``places`` (P, 3) of its rest shape, or a single one at its middle for a body in flight.
     """
     nodes = body.mesh.nodes
     middle = body.mesh.nodes[body.mesh.tets[len(body.mesh.tets) // 2]].mean(axis=0)

@@ -14,7 +14,7 @@ from tests.support.training_views import ball, ring
 
 
 def posed_folder(folder: Path, *, count: int = 9, size: int = 32, alpha: bool = False) -> Path:
-    """Renders of a ball of Gaussians as a NeRF-synthetic set."""
+    """Write renders of a ball of Gaussians as a NeRF-synthetic data set."""
     folder.mkdir(parents=True, exist_ok=True)
     cloud = GaussianCloud.from_numpy(**ball(80), device="cpu")
     frames = []

@@ -1,4 +1,4 @@
-"""Numbers of examples of the property tests, and what a failing one looks like as a line of code."""
+"""Number of examples of the property tests, and failing examples as lines of code."""
 
 from __future__ import annotations
 

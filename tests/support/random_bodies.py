@@ -1,4 +1,4 @@
-"""Soft bodies, poses and motions drawn by Hypothesis, for laws that hold whatever they are."""
+"""Random soft bodies, poses and motions for property tests with Hypothesis."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 
 @dataclass(frozen=True)
 class Shape:
-    """A block with a flat base on z = 0, of any measures and matter, wider or narrower at its top, its nodes moved."""
+    """A block with a flat base on z = 0 of any size and material, wider or narrower at its top, with jittered nodes."""
 
     counts: tuple[int, int, int]
-    """Nodes along x, y and z."""
+    """Number of nodes along x, y and z."""
     size: tuple[float, float, float]
-    """Metres."""
+    """Size along x, y and z, m."""
     taper: float
-    """Of the top against the base."""
+    """Width of the top over that of the base."""
     sag: float
     poisson_ratio: float
     damping_ratio: float
     seed: int
 
     def mesh(self) -> TetMesh:
-        """Mirrors in no plane."""
-        made = block_mesh(*self.counts, self.size)
-        nodes = made.nodes.copy()
+        """Return the mesh, which has no mirror plane."""
+        block = block_mesh(*self.counts, self.size)
+        nodes = block.nodes.copy()
         high = nodes[:, 2] > 0.0
         cell = np.array(self.size) / (np.array(self.counts) - 1)
         nodes[high] += cell * np.random.default_rng(self.seed).uniform(-0.1, 0.1, nodes[high].shape)
         nodes[:, :2] *= 1.0 + (self.taper - 1.0) * nodes[:, 2:] / self.size[2]
-        return TetMesh.oriented(nodes, made.tets)
+        return TetMesh.oriented(nodes, block.tets)
 
     def body(self, *, device: str = "cpu", mirrored: bool = False, up: np.ndarray | None = None) -> SoftBody:
-        """Mirrored in x = 0 if asked, node by node; ``up`` (3,) is against gravity."""
+        """Return the body, optionally mirrored in x = 0 node by node; ``up`` (3,) is opposite to gravity."""
         mesh = self.mesh()
         if mirrored:
             mesh = TetMesh.oriented(mesh.nodes * [-1.0, 1.0, 1.0], mesh.tets)
@@ -52,7 +52,7 @@ class Shape:
 
 
 def shapes(*, stiff: bool = False) -> st.SearchStrategy[Shape]:
-    """Blocks of 8 to 36 nodes, half as high as wide to three times as high; ``stiff`` ones do not tip."""
+    """Blocks of 8 to 36 nodes, half to three times as high as wide; ``stiff`` ones do not tip over."""
     side = st.floats(0.25, 0.5)
     return st.builds(
         Shape,
@@ -68,20 +68,20 @@ def shapes(*, stiff: bool = False) -> st.SearchStrategy[Shape]:
 
 @dataclass(frozen=True)
 class Throw:
-    """A pose and a motion: turned, strained, its nodes moved, thrown and spinning, each as far as its number says."""
+    """A pose and a motion: rotation, strain, jitter of the nodes, velocity and angular velocity."""
 
     turn: tuple[float, float, float]
-    """Rotation vector, radians."""
+    """Rotation vector, rad."""
     strain: tuple[float, float, float]
     velocity: tuple[float, float, float]
-    """In units of sqrt(g H)."""
+    """Velocity in units of sqrt(g H)."""
     spin: tuple[float, float, float]
-    """rad/s times sqrt(H / g)."""
+    """Angular velocity, rad/s times sqrt(H / g)."""
     noise: float
     seed: int
 
     def state(self, body: SoftBody, *, lift: float | None = None) -> BodyState:
-        """Of ``body``; its lowest node ``lift`` heights above the floor if given."""
+        """Return the state of ``body``, with its lowest node ``lift`` body heights above the floor if given."""
         random, nodes = np.random.default_rng(self.seed), body.mesh.nodes
         turn = Rotation.from_rotvec(self.turn)
         x = turn.apply((nodes - body.centre_of_mass(nodes)) * (1.0 + np.array(self.strain)))
@@ -94,10 +94,10 @@ class Throw:
 
 
 def throws(*, turn: float = 3.0, fastest: float = 0.5) -> st.SearchStrategy[Throw]:
-    """Velocities up to ``fastest`` sqrt(g H) in each direction, turns up to ``turn`` radians about each axis."""
+    """Velocities up to ``fastest`` sqrt(g H) in each direction, rotations up to ``turn`` rad about each axis."""
 
-    def three(most: float) -> st.SearchStrategy[tuple[float, float, float]]:
-        return st.tuples(*[st.floats(-most, most)] * 3)
+    def three(limit: float) -> st.SearchStrategy[tuple[float, float, float]]:
+        return st.tuples(*[st.floats(-limit, limit)] * 3)
 
     return st.builds(
         Throw,
@@ -111,7 +111,7 @@ def throws(*, turn: float = 3.0, fastest: float = 0.5) -> st.SearchStrategy[Thro
 
 
 def standing(body: SoftBody, friction: float, state: BodyState, *, device: str = "cpu") -> PassiveBody:
-    """``body`` over the floor with contact points at the nodes of its base and at its highest ones."""
+    """Place ``body`` over the floor with contact points at the nodes of its base and at its highest ones."""
     nodes = body.mesh.nodes
     places = np.concatenate([nodes[nodes[:, 2] == 0.0], nodes[nodes[:, 2] > 0.8 * nodes[:, 2].max()]])
     return passive_body(body, places, plane=FLOOR, friction=friction, state=state, device=device)

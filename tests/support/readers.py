@@ -1,6 +1,6 @@
-"""Every reader of strangers' files, with good files to begin from and what a file that is read must fulfil.
+"""Every reader of external files, with valid files to start from and the requirements on what is read.
 
-``tests/support/corruption.py`` makes inputs of them.
+``tests/support/corruption.py`` derives inputs from them.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ from tests.support.meshes import block_mesh
 from tests.support.reconstruction import COLMAP_BIN
 from tests.support.slides import slide
 
-LONGEST = 2.0
-"""Seconds that reading a small file may take."""
+MAX_SECONDS = 2.0
+"""Maximum time to read a small file, s."""
 
 
 @dataclass(frozen=True)
@@ -66,54 +66,53 @@ class Reader:
 
     name: str
     file: str
-    """Name that the input gets."""
+    """File name of the input."""
     good: Callable[[], bytes]
     read: Callable[[Path], Any]
-    """Reads the file and asserts what it must fulfil."""
-    beside: Callable[[], dict[str, bytes]] = dict
-    """Other files of the folder, by their names."""
+    """Read the file and assert the requirements on its content."""
+    other_files: Callable[[], dict[str, bytes]] = dict
+    """Other files of the folder, by name."""
     wrap: Callable[[bytes], bytes] = bytes
-    """From an input to the file's bytes: damage behind a checksum."""
+    """Conversion of an input to the file's bytes, for corruption inside a checksum."""
     json: bool = False
-    """Inputs are trees."""
+    """True if inputs are JSON trees."""
 
 
 class BrokenPromiseError(AssertionError):
-    """Neither a valid object nor one line, or too slow."""
+    """A reader returned neither a valid object nor a one-line error, or was too slow."""
 
 
 def outcome(reader: Reader, folder: Path, data: bytes) -> str:
-    """``valid`` or ``refused``; anything else raises ``BrokenPromiseError``.
+    """Read a file; return ``valid`` or ``refused``, or raise ``BrokenPromiseError``.
 
-    What takes too long is read once more, and only the second time counts: a reader that is slow is so twice, a machine
-    that stood still for a moment is not.
+    A slow reading is repeated, and only the second time counts, because the machine may have paused during the first.
     """
     path = folder / reader.file
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(reader.wrap(data))
     first = _read(reader, path)
     if not first.slow:
-        return first.said
+        return first.result
     second = _read(reader, path)
     if second.slow:
         raise BrokenPromiseError(f"{reader.name}: {second}; {first} the first time")
-    return second.said
+    return second.result
 
 
 @dataclass(frozen=True)
 class _Reading:
-    """How one reading of a file ended."""
+    """Result of one reading of a file."""
 
-    said: str
+    result: str
     took: float
-    """Seconds of the clock."""
+    """Wall-clock time, s."""
     work: float
-    """Seconds of the processor, of all threads."""
+    """CPU time of all threads, s."""
 
     @property
     def slow(self) -> bool:
-        """Of the processor, since the machine may be busy; of the clock, since it may wait."""
-        return self.work > LONGEST or self.took > 10.0 * LONGEST
+        """True if it took too long by CPU time, since the machine may be busy; by wall-clock time, as it may block."""
+        return self.work > MAX_SECONDS or self.took > 10.0 * MAX_SECONDS
 
     def __str__(self) -> str:
         return f"{self.work:.1f} s of work in {self.took:.1f} s"
@@ -124,21 +123,21 @@ def _read(reader: Reader, path: Path) -> _Reading:
     try:
         with np.errstate(all="ignore"):
             reader.read(path)
-        said = "valid"
+        result = "valid"
     except UserError as error:
         if "\n" in str(error):
             raise BrokenPromiseError(f"{reader.name}: more than one line: {error}") from error
-        said = "refused"
+        result = "refused"
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt | SystemExit):
             raise
         raise BrokenPromiseError(f"{reader.name}: {type(error).__name__}: {error}") from error
-    return _Reading(said, time.perf_counter() - began, time.process_time() - worked)
+    return _Reading(result, time.perf_counter() - began, time.process_time() - worked)
 
 
 def prepare(reader: Reader, folder: Path) -> None:
-    """Put what lies beside the input into ``folder``."""
-    for name, data in reader.beside().items():
+    """Write the other files of the input's folder."""
+    for name, data in reader.other_files().items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(data)
 
@@ -345,7 +344,7 @@ def _spz_of_streams() -> bytes:
 
 @cache
 def _record() -> dict[str, bytes]:
-    """What a recorder leaves of eight steps."""
+    """Files of a recorder after eight steps."""
     slid = slide()
     with tempfile.TemporaryDirectory() as folder:
         recorder = slid.recorder(folder=lambda: Path(folder))
@@ -367,7 +366,7 @@ def _beats(path: Path) -> None:
     assert beats and np.isfinite(beats).all() and (np.diff(beats) > 0.0).all()
 
 
-def _way(path: Path) -> None:
+def _path(path: Path) -> None:
     assert np.isfinite(read_path(path)).all()
 
 
@@ -385,7 +384,7 @@ _MESSAGES = [
 
 
 def _messages(path: Path) -> None:
-    """As the server of ``live`` takes them: what makes no sense goes back in one line."""
+    """Read messages like the server of ``live``: invalid ones give a one-line error."""
     try:
         tree = json.loads(path.read_bytes())
         for message in tree if isinstance(tree, list) else [tree]:
@@ -410,10 +409,10 @@ def _manifest(path: Path) -> None:
 @cache
 def _training() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        kept = Checkpoint(Path(folder) / "a.training.npz")
-        kept.begin("digest")
-        kept.write({"step": 3, "losses": np.arange(3.0), "queue": [1, 2], "order": {"state": 2**100}})
-        return kept.path.read_bytes()
+        checkpoint = Checkpoint(Path(folder) / "a.training.npz")
+        checkpoint.begin("digest")
+        checkpoint.write({"step": 3, "losses": np.arange(3.0), "queue": [1, 2], "order": {"state": 2**100}})
+        return checkpoint.path.read_bytes()
 
 
 def _trained(path: Path) -> None:
@@ -434,10 +433,12 @@ READERS: tuple[Reader, ...] = (
     Reader("splat", "a.splat", lambda: good_bytes("a.splat"), _capture),
     Reader("sog", "a.sog", lambda: good_bytes("a.sog"), _capture),
     Reader("sog meta", "a.sog", lambda: _sog()["meta.json"], _capture, wrap=_zip_with_meta, json=True),
-    Reader("sog picture", "means_u.webp", lambda: _sog()["means_u.webp"], lambda p: _capture(p.parent), beside=_sog),
+    Reader(
+        "sog picture", "means_u.webp", lambda: _sog()["means_u.webp"], lambda p: _capture(p.parent), other_files=_sog
+    ),
     Reader(
         **{"name": "lod-meta", "file": "lod-meta.json", "good": _lod_meta, "read": _capture, "json": True},
-        beside=lambda: {f"0_0/{name}": data for name, data in _sog().items()},
+        other_files=lambda: {f"0_0/{name}": data for name, data in _sog().items()},
     ),
     Reader("cameras.json", "cameras.json", lambda: _json(_INRIA), _cameras, json=True),
     Reader("transforms.json", "transforms.json", lambda: _json(_TRANSFORMS), _cameras, json=True),
@@ -456,14 +457,14 @@ READERS: tuple[Reader, ...] = (
     Reader("key frames csv", "keys.csv", lambda: _CSV, _keys),
     Reader("camera path", "path.json", lambda: _json(_PATH), _camera_path, json=True),
     Reader("run.yaml", "run.yaml", lambda: _CONFIG, _config),
-    Reader("recorded start", "start.npz", lambda: _record()["start.npz"], _replayed, beside=_record),
-    Reader("recorded steps", "steps-000000.npz", lambda: _record()["steps-000000.npz"], _replayed, beside=_record),
+    Reader("recorded start", "start.npz", lambda: _record()["start.npz"], _replayed, other_files=_record),
+    Reader("recorded steps", "steps-000000.npz", lambda: _record()["steps-000000.npz"], _replayed, other_files=_record),
     Reader("mask", "mask.png", lambda: _picture("PNG", "L"), read_mask),
     Reader("photo png", "a.png", lambda: _picture("PNG", "RGB"), _photo),
     Reader("photo jpeg", "a.jpg", lambda: _picture("JPEG", "RGB"), _photo),
     Reader("onnx", "a.onnx", _network, read_onnx),
     Reader("beats", "beats.csv", lambda: b"beat\n0.5\n1.0\n1.5\n", _beats),
-    Reader("way", "way.csv", lambda: b"ahead,left\n0.2,0\n0.5,0.1\n0.9,-0.2\n", _way),
+    Reader("way", "way.csv", lambda: b"ahead,left\n0.2,0\n0.5,0.1\n0.9,-0.2\n", _path),
     Reader("drive", "drive.csv", lambda: b"time,forward,sideways,turn\n0,0.3,0,0\n2,0.1,0.1,0.5\n4,0,0,0\n", _drive),
     Reader("message of the page", "message.json", lambda: _json(_MESSAGES), _messages, json=True),
     Reader("manifest", MANIFEST, lambda: _json(_MANIFEST), _manifest, json=True),
@@ -472,7 +473,7 @@ READERS: tuple[Reader, ...] = (
     *(
         Reader(
             **{"name": f"arrays of {name}", "file": name, "good": lambda name=name: arrays_as_json(name)},
-            **{"read": draw_run, "beside": finished_run, "wrap": npz_of_json, "json": True},
+            **{"read": draw_run, "other_files": finished_run, "wrap": npz_of_json, "json": True},
         )
         for name in _NPZ
     ),

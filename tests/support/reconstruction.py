@@ -1,4 +1,4 @@
-"""Photos, and a stand-in for pycolmap, which finds where they were taken from."""
+"""Photos, and a substitute for pycolmap, which estimates camera poses."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-_SEEN = struct.pack("<Q2dq", 1, 3.0, 4.0, 1)
+_OBSERVATION = struct.pack("<Q2dq", 1, 3.0, 4.0, 1)
 COLMAP_BIN = {
     "cameras.bin": struct.pack("<QiiQQ4d", 1, 1, 1, 24, 16, 30.0, 30.0, 12.0, 8.0),
-    "images.bin": struct.pack("<Qi7di", 1, 1, 1, 0, 0, 0, 0, 0, 2, 1) + b"a.png\0" + _SEEN,
+    "images.bin": struct.pack("<Qi7di", 1, 1, 1, 0, 0, 0, 0, 0, 2, 1) + b"a.png\0" + _OBSERVATION,
     "points3D.bin": struct.pack("<QQ3d3Bd", 1, 1, 0.5, 0.5, 2.0, 255, 128, 0, 0.3) + struct.pack("<Q2i", 1, 1, 0),
 }
-"""A binary model of COLMAP by the names of its files: one photo, ``a.png``, two points."""
+"""Files of a binary COLMAP model by name: one photo, ``a.png``, two points."""
 
 
 def photos_of_noise(folder: Path) -> Path:
-    """Three photos of 64 by 48 pixels, each some kilobytes."""
+    """Write three photos of 64 by 48 pixels, each some kilobytes."""
     folder.mkdir()
     random = np.random.default_rng(0)
     for number in range(3):
@@ -31,9 +31,7 @@ def photos_of_noise(folder: Path) -> Path:
 
 
 def model(*_: object, room: int | None = None, **__: object) -> SimpleNamespace:
-    """What COLMAP's reconstruction is asked for. Of each file it writes ``room`` bytes at most and keeps silent, as
-    COLMAP does on a full disk.
-    """
+    """Substitute of COLMAP's reconstruction; each file is silently truncated to ``room`` bytes, as on a full disk."""
 
     def write_binary(folder: str) -> None:
         for name, data in COLMAP_BIN.items():
@@ -48,6 +46,6 @@ def model(*_: object, room: int | None = None, **__: object) -> SimpleNamespace:
 
 
 def reconstruct_by(patch: pytest.MonkeyPatch, reconstructed: Callable[..., object]) -> None:
-    """``pose`` asks this in place of pycolmap."""
+    """Let ``pose`` call ``reconstructed`` in place of pycolmap."""
     patch.setitem(sys.modules, "pycolmap", ModuleType("pycolmap"))
     patch.setattr("egs_warp.pipelines.pose_photos._reconstructed", reconstructed)

@@ -1,4 +1,4 @@
-"""A slow, obvious renderer in NumPy and float64, to compare the fast one with: one pixel at a time, no tiles."""
+"""A slow reference renderer in NumPy and float64: one pixel at a time, without tiles."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def rotation_matrices(q: np.ndarray) -> np.ndarray:
 
 
 def sh_basis(d: np.ndarray) -> np.ndarray:
-    """(n, 16) real spherical harmonics of the unit directions (n, 3), in the signs of the INRIA code."""
+    """(n, 16) real spherical harmonics of the unit directions (n, 3), with the signs of the INRIA code."""
     x, y, z = d.T
     root = np.sqrt
     pi = np.pi
@@ -55,8 +55,10 @@ def render_twin(
     background: np.ndarray | tuple[float, float, float] = (1.0, 1.0, 1.0),
     antialiased: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Colour (H, W, 3), alpha, expected and median depth,
-    normal of the Gaussians in ``values`` (the cloud's fields).
+    """Render the Gaussians in ``values`` (the cloud's fields).
+
+    Returns:
+        colour (H, W, 3), alpha, expected and median depth, and normal.
     """
     m, q, log_scales, logits, sh = (
         np.asarray(values[k], dtype=np.float64) for k in ("means", "rotations", "log_scales", "opacity_logits", "sh")
@@ -68,7 +70,7 @@ def render_twin(
     colour = np.maximum(np.einsum("nk,nkc->nc", sh_basis(directions)[:, : sh.shape[1]], sh) + 0.5, 0)
     axes = rotation_matrices(q)
     covariance = np.einsum("nij,nj,nkj->nik", axes, np.exp(2 * log_scales), axes)
-    # The normal is the thinnest axis, turned towards the camera, in camera axes.
+    # The normal is the thinnest axis, pointing towards the camera, in camera axes.
     thinnest = axes[np.arange(len(m)), :, np.argmin(log_scales, axis=1)] @ camera.rotation.T
     thinnest *= -np.sign(np.einsum("ni,ni->n", thinnest, p))[:, None]
     shape = (camera.height, camera.width)
@@ -95,12 +97,12 @@ def render_twin(
         power = 0.5 * np.einsum("hwi,ij,hwj->hw", offset, np.linalg.inv(blurred), offset)
         alpha = np.minimum(peak * np.exp(-power), 0.999)
         after = passing * (1 - alpha)
-        seen = (alpha >= 1 / 255) & ~done
-        done |= seen & (after <= 1e-4)
-        seen &= ~done
-        weight = np.where(seen, passing * alpha, 0)
-        median = np.where(seen & (passing > 0.5) & (after <= 0.5), z, median)
-        passing = np.where(seen, after, passing)
+        visible = (alpha >= 1 / 255) & ~done
+        done |= visible & (after <= 1e-4)
+        visible &= ~done
+        weight = np.where(visible, passing * alpha, 0)
+        median = np.where(visible & (passing > 0.5) & (after <= 0.5), z, median)
+        passing = np.where(visible, after, passing)
         sums += weight[..., None] * np.append(colour[g], z)
         normal += weight[..., None] * thinnest[g]
     opaque = 1 - passing

@@ -18,7 +18,7 @@ from tests.support.stances import FORWARD
 
 @dataclass(frozen=True)
 class Run:
-    """What a simulated script left."""
+    """Result of a simulated script."""
 
     body: SoftBody
     sequence: MotionSequence
@@ -27,18 +27,19 @@ class Run:
 
 
 def coarse_block_run(script: str, field: HeightField | None = None) -> Run:
-    """``script`` on a block of 45 nodes, 0.5 x 0.5 x 1 metres: a few hundred steps of the whole stepper; on ``field``
-    in place of the floor.
+    """Simulate ``script`` on a block of 45 nodes, 0.5 x 0.5 x 1 m, with the whole stepper, for a few hundred steps.
+
+    ``field`` replaces the floor.
     """
-    made = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD, field=field)
-    asked = motion(script)
-    sequence = MotionSequence(made.place, asked.parts(made.place.body.height))
+    creature = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD, field=field)
+    requested = motion(script)
+    sequence = MotionSequence(creature.place, requested.parts(creature.place.body.height))
     done = roll_out(
-        made.stepper,
-        made.stepper.geometry,
-        made.start,
+        creature.stepper,
+        creature.stepper.geometry,
+        creature.start,
         sequence,
-        frames=asked.frames(),
+        frames=requested.frames(),
         finished=lambda: sequence.is_finished,
     )
-    return Run(made.place.body, sequence, done.trajectory, done.reports)
+    return Run(creature.place.body, sequence, done.trajectory, done.reports)

@@ -1,4 +1,4 @@
-"""A ball on a floor, and what scenes are put together from."""
+"""A ball on a floor, and the parts of such scenes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 
 
 def ball_on_floor(lift: float = 0.0) -> tuple[GaussianCloud, np.ndarray]:
-    """A hollow ball with loose matter inside, on a square of floor, with a floater above; and which are the ball's."""
+    """Return a ball on a floor, and which Gaussians belong to the ball.
+
+    The ball is hollow with loose Gaussians inside, the floor is square, and there is a floater above.
+    """
     random = np.random.default_rng(1)
     shell = random.normal(size=(1500, 3))
     shell = 0.5 * shell / np.linalg.norm(shell, axis=1, keepdims=True) + [0.0, 0.0, 0.5 + lift]
@@ -41,8 +44,11 @@ def ball_on_floor(lift: float = 0.0) -> tuple[GaussianCloud, np.ndarray]:
 
 
 def write_scene(folder: Path, *, views: int, size: int) -> np.ndarray:
-    """Write ``ball_on_floor`` as scene.ply, so many ``views`` of ``size`` pixels round it as cameras.json, and the mask
-    of the second as photo1.png; that mask (size, size)."""
+    """Write a scene with cameras and a mask, and return the mask (size, size).
+
+    Files: ``ball_on_floor`` as scene.ply, ``views`` cameras of ``size`` pixels around it as cameras.json, and the mask
+    of the second one as photo1.png.
+    """
     cloud, truth = ball_on_floor()
     write_ply(folder / "scene.ply", cloud)
     cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=views, size=size)
@@ -53,7 +59,7 @@ def write_scene(folder: Path, *, views: int, size: int) -> np.ndarray:
 
 
 def round_ones(means: np.ndarray, radius: float, bands: int = 1) -> GaussianCloud:
-    """Opaque Gaussians at ``means`` (n, 3)."""
+    """Return round opaque Gaussians at ``means`` (n, 3)."""
     return GaussianCloud.from_numpy(
         means,
         np.tile([1.0, 0.0, 0.0, 0.0], (len(means), 1)),
@@ -64,12 +70,12 @@ def round_ones(means: np.ndarray, radius: float, bands: int = 1) -> GaussianClou
 
 
 def lying(means: np.ndarray) -> GaussianCloud:
-    """Opaque Gaussians at ``means`` (n, 3) that lie flat, as a floor's do."""
+    """Return flat opaque Gaussians at ``means`` (n, 3), like those of a floor."""
     return sheet(means, np.tile(FLOOR.normal, (len(means), 1)), 0.03, (0.5, 0.5, 0.5))
 
 
 def shell(count: int = 1500) -> np.ndarray:
-    """(n, 3) points spread evenly over a ball of one unit that touches the floor at the origin (Fibonacci lattice)."""
+    """(n, 3) even points on a ball of diameter 1 that touches the floor at the origin (Fibonacci lattice)."""
     z = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
     angle = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count)
     around = np.sqrt(1.0 - z**2)

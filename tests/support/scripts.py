@@ -1,4 +1,4 @@
-"""The scripts of ``benchmarks/``, which no package holds, as modules."""
+"""The scripts of ``benchmarks/``, which is not a package, as modules."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
 def module_of(name: str) -> ModuleType:
-    """A script or what scripts share, under a name that nothing else has."""
+    """Import a script or a shared module of ``benchmarks/`` under a unique name."""
     spec = importlib.util.spec_from_file_location(f"benchmark_{name}", BENCHMARKS / f"{name}.py")
     assert spec is not None and spec.loader is not None
-    # Frozen records look their module up.
+    # Frozen dataclasses look up their module.
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -1,4 +1,4 @@
-"""Matrices of bodies in slabs."""
+"""Matrices of bodies that are partitioned into slabs."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import numpy as np
 
 
 def slab_matrix(parts: Sequence[int], between: int, *, seed: int) -> np.ndarray:
-    """(n, n) random, positive definite: ``parts`` of so many unknowns, none of which an entry joins to another, then so
-    many ``between`` them."""
+    """(n, n) random positive definite matrix with independent diagonal blocks of ``parts`` unknowns.
+
+    They are only coupled by the last ``between`` unknowns.
+    """
     count = sum(parts) + between
     half = np.random.default_rng(seed).normal(size=(count, count))
     matrix = (half + half.T) / 2.0

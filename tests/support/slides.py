@@ -1,4 +1,4 @@
-"""A coarse block, thrown: it lands, slides and turns while its muscles work, so that every term of a ledger counts."""
+"""A thrown coarse block that lands, slides and rotates under muscle work: all terms of an energy balance occur."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from tests.support.stances import DT, FORWARD
 
 @dataclass(frozen=True)
 class Slide:
-    """What was simulated."""
+    """The simulated motion."""
 
     stepper: LocomotionStepper
     start: BodyState
     reports: tuple[StepReport, ...]
     kicks: tuple[np.ndarray | None, ...]
-    """(N, 3) m/s that its nodes were given from outside as each step began."""
+    """(N, 3) m/s, velocity change of the nodes from outside at the start of each step."""
 
-    def recorder(self, **given: Any) -> Recorder:
-        """A recorder that has seen nothing of it yet."""
+    def recorder(self, **options: Any) -> Recorder:
+        """Return a recorder without any steps yet."""
         stepper = self.stepper
         gaps, _ = stepper.detector.gaps(self.start.positions)
         drag = stepper.settings.drag
         return Recorder(
-            stepper.body, stepper.muscles, stepper.geometry, self.start, float(gaps.min()), drag=drag, **given
+            stepper.body, stepper.muscles, stepper.geometry, self.start, float(gaps.min()), drag=drag, **options
         )
 
     def trajectory(self) -> Trajectory:
-        """All of it."""
+        """Return the trajectory of all steps."""
         recorder = self.recorder()
         for report, kick in zip(self.reports, self.kicks, strict=True):
             recorder.add([report], kick=kick)
@@ -48,11 +48,11 @@ class Slide:
 
 @cache
 def slide(*, struck: bool = False) -> Slide:
-    """24 steps in air that drags; ``struck`` on one side in the ninth, and blown at all over from then on."""
-    made = coarse_creature(block_mesh(), forward=FORWARD)
-    body, muscles, geometry = made.stepper.body, made.stepper.muscles, made.stepper.geometry
+    """Simulate 24 steps with drag; with ``struck`` a blow on one side in the ninth step, and wind from then on."""
+    creature = coarse_creature(block_mesh(), forward=FORWARD)
+    body, muscles, geometry = creature.stepper.body, creature.stepper.muscles, creature.stepper.geometry
     stepper = LocomotionStepper(body, muscles, geometry, settings=LocomotionSettings(drag=0.3), device="cpu")
-    positions = made.start.positions + np.array([0.0, 0.0, 0.01])
+    positions = creature.start.positions + np.array([0.0, 0.0, 0.01])
     arms = positions - body.centre_of_mass(positions)
     start = BodyState(positions, np.array([0.8, 0.2, -0.5]) + np.cross([0.5, 0.3, 1.0], arms))
     state, memory, reports = start, stepper.initial_memory(), []
@@ -61,11 +61,11 @@ def slide(*, struck: bool = False) -> Slide:
     wind = np.tile([0.0, 0.02, 0.0], (len(positions), 1))
     kicks = [None if not struck or step < 8 else blow + wind if step == 8 else wind for step in range(24)]
     for step, kick in enumerate(kicks):
-        wanted = np.array([0.0, 0.0, -0.12 * np.sin(6.0 * DT * (step + 1))])
+        target = np.array([0.0, 0.0, -0.12 * np.sin(6.0 * DT * (step + 1))])
         objectives = [
-            centre_of_mass_velocity(body, wanted, 2.0),
+            centre_of_mass_velocity(body, target, 2.0),
             AngularMomentumObjective(np.zeros(3), 5.0),
-            node_velocities(body, np.tile(wanted, (len(positions), 1)), 0.01),
+            node_velocities(body, np.tile(target, (len(positions), 1)), 0.01),
         ]
         state, memory, done = stepper.advance(state.with_velocity_kick(kick), memory, objectives, DT)
         assert len(done) == 1, "a kick is of one step"

@@ -7,14 +7,14 @@ import scipy.sparse as sparse
 
 
 def upper_of(matrix: sparse.csc_matrix) -> sparse.csc_matrix:
-    """The upper triangle, sorted."""
+    """Return the upper triangle, sorted."""
     upper = sparse.csc_matrix(sparse.triu(matrix))
     upper.sort_indices()
     return upper
 
 
 def dominant(pattern: np.ndarray, seed: int = 0) -> sparse.csc_matrix:
-    """Random numbers where ``pattern`` (n, n) is set, in either triangle, and larger ones on the diagonal."""
+    """Return random numbers where ``pattern`` (n, n) is set, in either triangle, and a dominant diagonal."""
     either = np.triu(pattern | pattern.T, 1)
     values = np.where(either, np.random.default_rng(seed).standard_normal(either.shape), 0.0)
     values += values.T
@@ -23,7 +23,7 @@ def dominant(pattern: np.ndarray, seed: int = 0) -> sparse.csc_matrix:
 
 def _grid(nx: int, ny: int, nz: int) -> np.ndarray:
     places = np.stack(np.meshgrid(*map(np.arange, (nx, ny, nz)), indexing="ij"), axis=-1).reshape(-1, 3)
-    # As they come from a mesher: in no order.
+    # A mesher numbers nodes in no particular order.
     places = np.random.default_rng(8).permutation(places)
     near = np.abs(places[:, None] - places).max(axis=-1) <= 1
     return np.kron(near, np.ones((3, 3), dtype=bool))
@@ -57,4 +57,4 @@ PATTERNS = {
     "two apart": dominant(_apart(_random(20, 0.2), np.ones((17, 17), dtype=bool))),
     "grid of nodes": dominant(_grid(6, 5, 4)),
 }
-"""By name."""
+"""Matrices by name."""

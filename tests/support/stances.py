@@ -1,4 +1,4 @@
-"""A block that stands where a motion begins, and the same block posed by hand."""
+"""A block that stands at the start of a motion, and the same block posed by hand."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DT = 1 / 60
 
 
 def block_place(mesh: TetMesh | None = None) -> Stance:
-    """A block of 0.4 x 0.4 x 1 metres, irregular inside, or another ``mesh`` that stands on z = 0 and faces +x."""
+    """Return a block of 0.4 x 0.4 x 1 m, irregular inside, or another ``mesh`` that stands on z = 0 and faces +x."""
     mesh = mesh or block_mesh()
     body = make_body(mesh, FLOOR, device="cpu")
     standing = mesh.nodes - [0.0, 0.0, mesh.nodes[:, 2].min()]
@@ -27,6 +27,6 @@ def block_place(mesh: TetMesh | None = None) -> Stance:
 
 
 def moved(place: Stance, angle: float, shift: np.ndarray) -> np.ndarray:
-    """(N, 3) nodes of the standing block turned by ``angle`` radians about up and moved by ``shift`` (3,)."""
+    """(N, 3) nodes of the standing block, rotated by ``angle`` rad about up and translated by ``shift`` (3,)."""
     com = place.body.centre_of_mass(place.standing)
     return com + (place.standing - com) @ place.ground.rotation_about_up(angle).T + shift

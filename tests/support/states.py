@@ -1,4 +1,4 @@
-"""States of a body that no rest is like: turned, bent, thrown and spinning."""
+"""States of a body far from rest: rotated, bent, thrown and spinning."""
 
 from __future__ import annotations
 

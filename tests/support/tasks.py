@@ -1,4 +1,4 @@
-"""Work for processes that may die."""
+"""Tasks for processes that may die."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from egs_warp.launching import available_threads
 from egs_warp.pipelines.worker_pool import ProgressCallback
 
 
-def square(task: int, tell: ProgressCallback) -> int:
-    """Told on the way; refuses 3, cannot send what it makes of 4."""
-    tell(task, 2 * task)
+def square(task: int, progress: ProgressCallback) -> int:
+    """Report progress and return the square; raises for 3 and 5, and returns something that cannot be sent for 4."""
+    progress(task, 2 * task)
     if task == 3:
         raise ArgumentError("task", "give another", value=3)
     if task == 4:
@@ -28,12 +28,12 @@ def square(task: int, tell: ProgressCallback) -> int:
 
 
 class Dying:
-    """Kills its process when it is given a task, each as often as that says; writes down each time that it begins."""
+    """Task that kills its process the number of times given for it; it records each start in a file."""
 
     def __init__(self, folder: Path, deaths: dict[int, int]) -> None:
         self.folder, self.deaths = folder, deaths
 
-    def __call__(self, task: int, tell: ProgressCallback) -> int:
+    def __call__(self, task: int, progress: ProgressCallback) -> int:
         with (self.folder / f"{task}").open("a") as file:
             file.write("x")
         if len((self.folder / f"{task}").read_text()) <= self.deaths.get(task, 0):
@@ -41,22 +41,22 @@ class Dying:
         return task
 
 
-def threads(task: Any, tell: ProgressCallback) -> dict[str, Any]:
-    """How many threads a worker has."""
+def threads(task: Any, progress: ProgressCallback) -> dict[str, Any]:
+    """Return the number of threads of a worker."""
     import numpy
 
-    # That it is loaded is what counts.
+    # Only its import matters.
     assert numpy is not None
     blas = [info["num_threads"] for info in threadpool_info() if info["user_api"] == "blas"]
     return {"blas": blas, "available": available_threads(), "process": os.getpid()}
 
 
-def sleeping(folder: str, tell: ProgressCallback) -> None:
-    """Writes its process's number down, then sleeps for minutes."""
+def sleeping(folder: str, progress: ProgressCallback) -> None:
+    """Record the process id, then sleep for minutes."""
     (Path(folder) / str(os.getpid())).touch()
     time.sleep(300)
 
 
 def half(whole: float, by: float) -> dict[str, float]:
-    """A benchmark's row."""
+    """Return a benchmark's row."""
     return {"share": whole / by}

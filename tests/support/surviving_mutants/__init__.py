@@ -1,4 +1,4 @@
-"""Mutants that no test can kill, or none need kill, each with its reason: ``make mutation`` counts them apart."""
+"""Mutants that no test can or needs to kill, each with its reason; ``make mutation`` counts them separately."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SURVIVORS: list[Survivor] = [*CONTACT, *LOCOMOTION, *FEM, *DEFORMATION, *SEGMENT
 
 
 def reason_for(mutant: Mutant) -> str | None:
-    """Why this mutant may live; None where it may not."""
+    """Return why this mutant may survive; None if it must not."""
     for survivor in SURVIVORS:
         if (f"egs_warp/{survivor.file}", survivor.before, survivor.after) == (
             mutant.file,

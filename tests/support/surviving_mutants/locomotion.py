@@ -1,4 +1,4 @@
-"""Of ``locomotion`` and its kernels."""
+"""Surviving mutants of ``locomotion`` and its kernels."""
 
 from __future__ import annotations
 
@@ -9,55 +9,55 @@ LOCOMOTION = [
         "locomotion/strategies.py",
         "def is_within_gap(self, factor: float, share: float = 0.0) -> bool:",
         "def is_within_gap(self, factor: float, share: float = -1.0) -> bool:",
-        "the bound is a sum of squares and the factor at least one: the factor's side of the maximum decides",
+        "the bound is a sum of squares and the factor at least one, so the term with the factor is the maximum",
     ),
     Survivor(
         "locomotion/lemke.py",
         "return int(rows[basis[rows] == cover][0])",
         "return int(rows[basis[rows] == cover][ -1])",
-        "no variable is in the basis twice: there is one such row",
+        "no variable is in the basis twice, so there is one such row",
     ),
     Survivor(
         "locomotion/active_set.py",
         "_INFEASIBLE_COST = 1e6",
         "_INFEASIBLE_COST = 1000001.0",
-        "a bound that is far beyond all that matters, by a millionth farther",
+        "a bound far outside the relevant range, changed by a millionth",
     ),
     Survivor(
         "locomotion/planner.py",
         "if not problem.is_inversion_free(velocities):",
         "if not not problem.is_inversion_free(velocities):",
-        "where the search for the step's end begins; it ends in the same place",
+        "it changes the start of the search for the step's end, not its result",
     ),
     Survivor(
         "locomotion/solvers.py",
         "held = np.where(high - low < 1e-13, 5, 0).astype(np.int32)",
         "held = np.where(high - low < -0.9999999999999, 5, 0).astype(np.int32)",
-        "an equality is given to the solver as two bounds in place of one row",
+        "an equality is passed to the solver as two bounds instead of one row",
     ),
     Survivor(
         "locomotion/contact_modes.py",
         "if len(active) > 1:",
         "if len(active) > 2:",
-        "one neighbour fewer is looked at",
+        "one neighbour fewer is tested",
     ),
     Survivor(
         "locomotion/lemke.py",
         "tableau = dger(-1.0, column, pivot_row, a=tableau, overwrite_a=True)",
         "tableau = dger(-1.0, column, pivot_row, a=tableau, overwrite_a=False)",
-        "whether memory is written over: the caller goes on with what is returned",
+        "it only changes whether memory is overwritten: the caller uses the returned array",
     ),
     Survivor(
         "locomotion/operator_splitting.py",
         "verbose=False,",
         "verbose=True,",
-        "the solver prints what it does",
+        "the solver prints its progress",
     ),
     Survivor(
         "kernels/locomotion/active_set.py",
         "for row in range(search.side.shape[0]):",
         "for row in range(search.side.shape[ 1]):",
-        "reached only where rounding takes the factor from a part of rows that have one together",
+        "reached only if rounding makes the factor of a subset of rows fail that have one together",
     ),
     Survivor(
         "locomotion/audit.py",
@@ -69,30 +69,30 @@ LOCOMOTION = [
         "locomotion/batch.py",
         "break",
         "continue",
-        "it goes round once more and finds as little to do",
+        "one more iteration, which has nothing to do",
     ),
     Survivor(
         "locomotion/lemke.py",
         "rows = rows[ratios <= low + 1e-12 * max(1.0, abs(low))]",
         "rows = rows[ratios <= low + 1e-12 * max( 0.0, abs(low))]",
-        "what ties at nothing: of 1,950 degenerate problems each ends in the same solution",
+        "it changes ties at zero: 1,950 degenerate problems all have the same solution",
     ),
     Survivor(
         "locomotion/solvers.py",
         "low, high = at - below < -multipliers, above - at < multipliers",
         "low, high = at - below < -multipliers, above - at != multipliers",
-        "a guess: the search from any other ends at the same optimum",
+        "an initial guess: the search from any other ends at the same optimum",
     ),
     Survivor(
         "locomotion/synergies.py",
         "if muscles.segment_count <= max_count:",
         "if muscles.segment_count < max_count:",
-        "as many groups as muscles: each is one of its own either way",
+        "with as many groups as muscles each muscle is its own group in both cases",
     ),
     Survivor(
         "locomotion/threads.py",
         "@cache",
         "",
-        "the libraries are looked for again each time, for some milliseconds, and are the same",
+        "the libraries are searched again each time, in some milliseconds, with the same result",
     ),
 ]

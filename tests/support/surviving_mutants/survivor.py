@@ -1,4 +1,4 @@
-"""A mutant that may live."""
+"""A mutant that may survive."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Survivor:
-    """A line that may change so."""
+    """A line, its change, and the reason why it may survive."""
 
     file: str
-    """Of the package."""
+    """File of the package."""
     before: str
     after: str
     reason: str
