@@ -3,7 +3,7 @@
 python benchmarks/qp_kernels.py [--quick] [--device cuda:0] [--programs 1000] [--json PATH] [--plot PATH]
 
 Built-in bodies with cages of about 250 nodes jump and walk (a snake crawls) on the CPU, with OSQP as the solver. Each
-QP of their steps is recorded with its bounds, its start and whether it is a trial next to another one (``beside``).
+QP of their steps is recorded with its bounds, its start and whether it is a trial next to another one (``skip_splitting``).
 Then both solvers solve all of them: ``full`` by iterations alone, to 1e-12, at most 20,000; ``few`` like the first
 program of a step, 50 iterations on the rows that matter; ``whole`` as the engine does (few iterations and the active
 set, or that alone). Milliseconds are medians per program: of OSQP with its set-up, of the kernels for one program
@@ -67,7 +67,7 @@ class Recorded:
     """(m,) bounds."""
     start: np.ndarray | None
     """(n,) start of the iterations; None for a cold start."""
-    beside: bool
+    skip_splitting: bool
 
     @property
     def flat(self) -> bool:
@@ -92,14 +92,14 @@ def recording(name: str, limit: int) -> Iterator[list[Recorded]]:
             self._program, self._solver = DenseQp(P, q, A), quadratic_program(P, q, A, **options)
 
         def solve(
-            self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, beside: bool = False
+            self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, skip_splitting: bool = False
         ) -> QpSolution:
             """Record the program and solve it; see ``QuadraticProgram.solve`` for the arguments."""
             if len(records) == limit:
                 raise _EnoughError
             start_copy = None if start is None else start.copy()
-            records.append(Recorded(name, self._program, lower.copy(), upper.copy(), start_copy, beside))
-            return self._solver.solve(lower, upper, start, skip_splitting=beside)
+            records.append(Recorded(name, self._program, lower.copy(), upper.copy(), start_copy, skip_splitting))
+            return self._solver.solve(lower, upper, start, skip_splitting=skip_splitting)
 
     with patch.object(contact_modes, "quadratic_program", Recorder), suppress(_EnoughError):
         yield records
@@ -133,7 +133,7 @@ def on_rows_that_matter(one: Recorded) -> Recorded:
     broken = (free < one.lower) | (free > one.upper)
     index = np.flatnonzero(broken) if broken.any() else np.arange(len(free))
     program = DenseQp(one.program.P, one.program.q, one.program.A[index])
-    return Recorded(one.motion, program, one.lower[index], one.upper[index], one.start, one.beside)
+    return Recorded(one.motion, program, one.lower[index], one.upper[index], one.start, one.skip_splitting)
 
 
 def iterated(
@@ -227,7 +227,7 @@ def full(programs: Sequence[Recorded], device: str) -> list[Row]:
 
 def few(programs: Sequence[Recorded], device: str) -> Row:
     """Return the row of the first programs of steps under few iterations."""
-    first = [on_rows_that_matter(one) for one in programs if not one.beside]
+    first = [on_rows_that_matter(one) for one in programs if not one.skip_splitting]
     times, osqp_results, kernel_results = compared(first, device, accuracy=FEW_ACCURACY, limit=FEW_ITERATIONS)
     ends = list(enumerate(zip(osqp_results, kernel_results, strict=True)))
     # After a certificate of infeasibility x is not a solution.
@@ -251,7 +251,7 @@ def whole(programs: Sequence[Recorded], device: str) -> Row:
                 program: QuadraticProgram = quadratic_program(
                     one.program.P, one.program.q, one.program.A, solver=solver, device=device
                 )
-                return program.solve(one.lower, one.upper, one.start, skip_splitting=one.beside)
+                return program.solve(one.lower, one.upper, one.start, skip_splitting=one.skip_splitting)
 
             end, milliseconds = timed(solve)
             ends.append(end)

@@ -1,6 +1,5 @@
-"""Types that all packages share: Gaussian clouds, cameras, planes, tetrahedral meshes, frames (the paper's section
-3.1).
+"""Types that all packages share: Gaussian clouds, cameras, planes, tetrahedral meshes, frames (section 3.1 of the paper).
 
-Input: arrays. Output: frozen records of them, with shapes and units under each field. Nothing here reads a file; no
-kernels are launched.
+Input: arrays. Output: frozen records of them, with shapes and units under each field. Nothing here reads a file or
+launches a kernel.
 """

@@ -1,6 +1,6 @@
 """Tile-based Gaussian splatting (section 3.1; Kerbl et al. 2023): projection, tiles, compositing, and its gradients.
 
-It takes a cloud and a camera and returns colour, alpha and depth; ``autograd`` adds gradients for PyTorch.
+Input: a cloud and a camera. Output: colour, alpha and depth; ``autograd`` adds gradients for PyTorch.
 """
 
 from egs_warp.render.compositing import RenderedImage

@@ -189,7 +189,7 @@ def test_the_highest_of_ground_and_solids_is_stood_on() -> None:
 @cache
 def drop() -> tuple[Trajectory, LocomotionStepper, int]:
     """A squat block let fall by 0.1 m onto waves, without muscle work, until it has come to rest."""
-    made = coarse_creature(block_mesh(4, 4, 3, size=(0.6, 0.6, 0.4)), forward=FORWARD, settled=False)
+    made = coarse_creature(block_mesh(4, 4, 3, size=(0.6, 0.6, 0.4)), forward=FORWARD, settle_first=False)
     body, muscles = made.stepper.body, made.stepper.muscles
     base = np.stack(np.meshgrid(*[np.linspace(-0.3, 0.3, 13)] * 2, [0.0]), axis=-1).reshape(-1, 3)
     soles = embed_points(body.mesh, base, device="cpu")

@@ -9,7 +9,7 @@ import pytest
 
 from egs_warp.errors import UserError
 from egs_warp.io.named_files import check_named_files, named_files
-from tests.support.concurrent_runs import told_elsewhere
+from tests.support.concurrent_runs import error_of_second_process
 
 
 def write(*paths: Path, text: str, overwrite: bool = False) -> None:
@@ -44,10 +44,10 @@ def test_a_run_that_fails_before_its_first_file_leaves_the_earlier_one(tmp_path:
 def test_two_runs_at_once(tmp_path: Path) -> None:
     """One name at a time; another name in the same folder is free."""
     with named_files(tmp_path / "a.ply"):
-        assert told_elsewhere(named_files, tmp_path / "a.ply") == (
+        assert error_of_second_process(named_files, tmp_path / "a.ply") == (
             f"{tmp_path / 'a.ply'}: another run is writing this file; wait for it, or choose another name"
         )
-        assert told_elsewhere(named_files, tmp_path / "b.ply") is None
+        assert error_of_second_process(named_files, tmp_path / "b.ply") is None
     assert os.listdir(tmp_path) == []
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from egs_warp.errors import UserError
 from egs_warp.io.run_folder import MANIFEST, check_run_folder, clean_up, run_folder
-from tests.support.concurrent_runs import told_elsewhere
+from tests.support.concurrent_runs import error_of_second_process
 
 
 def finished(folder: Path, **files: str) -> None:
@@ -106,7 +106,7 @@ def test_files_of_nobody_are_not_overwritten(tmp_path: Path) -> None:
 
 def test_two_runs_at_once(tmp_path: Path) -> None:
     with run_folder(tmp_path):
-        assert told_elsewhere(run_folder, tmp_path) == (
+        assert error_of_second_process(run_folder, tmp_path) == (
             f"{tmp_path}: another run is writing into this folder; wait for it, or choose another folder"
         )
     with run_folder(tmp_path):

@@ -49,7 +49,7 @@ def test_muscles_are_grouped_by_what_they_do_in_a_step(monkeypatch: pytest.Monke
     that step, is along that of the muscle."""
     given = []
     monkeypatch.setattr(module, "find_synergies", lambda *rest: given.append(rest) or find_synergies(*rest))
-    stepper = coarse_creature(block_mesh(), forward=FORWARD, settled=False).stepper
+    stepper = coarse_creature(block_mesh(), forward=FORWARD, settle_first=False).stepper
     ((muscles, effects, _),) = given
     body = stepper.body
     rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))

@@ -147,7 +147,7 @@ def test_a_base_does_not_run_ahead_of_what_is_above_it(data_dir: Path) -> None:
 def test_a_pace_that_slipping_feet_have_lost_is_made_again() -> None:
     """Feet at their footholds continue; feet that lag by half a step repeat it, with one message, and the route ends at
     the same place."""
-    place = coarse_creature(block_mesh(), forward=AHEAD, settled=False).place
+    place = coarse_creature(block_mesh(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, straight_route(0.12), 0.04)
     standing, before, paces = place.ground.local(place.standing), walk.planar_poses.copy(), walk.gait.step_count
     walk._arrived_footholds = [1, 1]
@@ -162,7 +162,7 @@ def test_a_pace_that_slipping_feet_have_lost_is_made_again() -> None:
 
 
 def test_the_plan_tells_what_the_legs_can_do() -> None:
-    place = coarse_creature(stool(), forward=AHEAD, settled=False).place
+    place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, straight_route(0.24), 0.08)
     planned = walk.plan_record()
     assert planned.paces == 3.0 and planned.pace_length == pytest.approx(0.08)
@@ -182,7 +182,7 @@ def test_the_plan_tells_what_the_legs_can_do() -> None:
 def test_feet_go_to_where_they_belong_when_the_body_turns() -> None:
     """Compared with rotating the whole standing body to each planar pose of the route, about its initial centre of
     mass."""
-    place = coarse_creature(stool(), forward=AHEAD, settled=False).place
+    place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, path_route(np.array([[0.2, 0.3]])), 0.1)
     standing, com = place.ground.local(place.standing), place.body.centre_of_mass(place.ground.local(place.standing))
     for x, y, heading in walk.planar_poses:
@@ -196,7 +196,7 @@ def test_feet_go_to_where_they_belong_when_the_body_turns() -> None:
 @pytest.mark.parametrize("mesh", [stool, figure, biped, block_mesh])
 def test_it_is_planned_to_press_where_its_feet_are(mesh: Callable[[], TetMesh]) -> None:
     """The centre of pressure of the first swing lies under the feet that stand then; all of the plan is bounded."""
-    place = coarse_creature(mesh(), forward=AHEAD, settled=False).place
+    place = coarse_creature(mesh(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, straight_route(0.3), 0.06)
     walk._advance_phase(place.ground.local(place.standing), None, 0.0)
     plan = walk._plan
@@ -215,7 +215,7 @@ def test_it_is_planned_to_press_where_its_feet_are(mesh: Callable[[], TetMesh]) 
 
 def test_a_foot_that_has_turned_all_the_way_round_is_told_so() -> None:
     """A measured heading is unwrapped to the value nearest to the planned one."""
-    place = coarse_creature(stool(), forward=AHEAD, settled=False).place
+    place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, turn_route(np.radians(420.0)), 0.08)
     walk.swing = walk.gait.swings - 1
     local = place.ground.local(place.standing)
@@ -227,7 +227,7 @@ def test_a_foot_that_has_turned_all_the_way_round_is_told_so() -> None:
 
 
 def test_a_base_on_ice_is_told_that_it_cannot_turn() -> None:
-    place = replace(coarse_creature(block_mesh(), forward=AHEAD, settled=False).place, friction=0.001)
+    place = replace(coarse_creature(block_mesh(), forward=AHEAD, settle_first=False).place, friction=0.001)
     with pytest.raises(UserError, match=r"walk: friction 0\.001 cannot turn the body about a side of its base"):
         Walk(place, straight_route(0.2), 0.1)
 
@@ -236,7 +236,7 @@ def test_what_has_no_feet_and_what_stands_in_the_way_is_told() -> None:
     bar = block_mesh(12, 3, 3, (2.0, 0.3, 0.3))
     with pytest.raises(UserError, match="walk: the body has no feet, and no flat base of which it could lift a side"):
         Walk(block_place(bar), straight_route(0.2), 0.1)
-    place = coarse_creature(stool(), forward=AHEAD, settled=False).place
+    place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
     wall = Solid(
         tuple(
             Plane(np.array(normal, float), offset)

@@ -89,7 +89,7 @@ def test_a_model_that_does_not_fit_on_the_disk_is_told(
     room: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """COLMAP does not report it."""
-    reconstruct_by(monkeypatch, partial(model, room=room))
+    reconstruct_by(monkeypatch, partial(model, capacity=room))
     out = tmp_path / "out"
     assert main(["pose", str(photos_of_noise(tmp_path / "photos")), "--out", str(out)]) == 1
     assert "out: COLMAP's model is not whole, most likely the disk is full; free" in capsys.readouterr().err

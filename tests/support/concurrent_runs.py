@@ -11,7 +11,7 @@ from typing import Any
 from egs_warp.errors import UserError
 
 
-def told_elsewhere(enter: Callable[[Path], AbstractContextManager[Any]], path: Path) -> str | None:
+def error_of_second_process(enter: Callable[[Path], AbstractContextManager[Any]], path: Path) -> str | None:
     """Return the error of another process that enters ``path``; None if it succeeds."""
     context = multiprocessing.get_context("spawn")
     answers = context.Queue()

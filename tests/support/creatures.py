@@ -46,7 +46,7 @@ def coarse_creature(
     up: np.ndarray = UP,
     sag: float = 0.05,
     strength: float = 4.0,
-    settled: bool = True,
+    settle_first: bool = True,
     field: HeightField | None = None,
     all_round: bool = False,
 ) -> CoarseCreature:
@@ -68,7 +68,7 @@ def coarse_creature(
     soles = embed_points(mesh, places, device="cpu")
     geometry = ContactGeometry(mesh, (FLOOR,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0, field=field)
     stepper = LocomotionStepper(body, muscles, geometry, device="cpu")
-    start = settle(stepper) if settled else BodyState(mesh.nodes, np.zeros_like(mesh.nodes))
+    start = settle(stepper) if settle_first else BodyState(mesh.nodes, np.zeros_like(mesh.nodes))
     ground = GroundFrame.on_plane(FLOOR, forward, body.centre_of_mass(start.positions), up=up)
     touching = stepper.detector.points_within(start.positions, 0.01)
     return CoarseCreature(stepper, Stance(body, ground, start.positions, touching, DT), start)

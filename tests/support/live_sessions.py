@@ -36,7 +36,7 @@ class SteppedSession:
         self.frames: list[Frame] = []
         self.news: list[dict[str, Any]] = []
 
-    def ask(self, kind: str, **fields: Any) -> None:
+    def request(self, kind: str, **fields: Any) -> None:
         """Send a request, as the page would."""
         body = self.session.creature.body
         message = read_message({"type": kind, **fields}, height=body.height, node_count=len(body.node_mass))
@@ -50,21 +50,21 @@ class SteppedSession:
             self.session.advance()
             self._hear()
 
-    def until(self, condition: Callable[[], bool], *, most: int = 400) -> int:
+    def until(self, condition: Callable[[], bool], *, max_steps: int = 400) -> int:
         """Step until ``condition`` holds; returns the number of steps."""
-        for count in range(most):
+        for count in range(max_steps):
             if condition():
                 return count
             self.step()
-        raise AssertionError(f"not within {most} steps")
+        raise AssertionError(f"not within {max_steps} steps")
 
-    def until_idle(self, *, most: int = 400) -> int:
+    def until_idle(self, *, max_steps: int = 400) -> int:
         """Step, at least once, until it stands with nothing left to do."""
         self.step()
-        return self.until(lambda: self.session.steering.idle, most=most)
+        return self.until(lambda: self.session.steering.idle, max_steps=max_steps)
 
     @property
-    def told(self) -> list[str]:
+    def messages(self) -> list[str]:
         """Messages for the user."""
         return [str(news["text"]) for news in self.news if news["type"] == "told"]
 

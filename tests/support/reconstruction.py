@@ -30,12 +30,12 @@ def photos_of_noise(folder: Path) -> Path:
     return folder
 
 
-def model(*_: object, room: int | None = None, **__: object) -> SimpleNamespace:
-    """Substitute of COLMAP's reconstruction; each file is silently truncated to ``room`` bytes, as on a full disk."""
+def model(*_: object, capacity: int | None = None, **__: object) -> SimpleNamespace:
+    """Substitute of COLMAP's reconstruction; each file is truncated to ``capacity`` bytes, as on a full disk."""
 
     def write_binary(folder: str) -> None:
         for name, data in COLMAP_BIN.items():
-            (Path(folder) / name).write_bytes(data[:room])
+            (Path(folder) / name).write_bytes(data[:capacity])
 
     return SimpleNamespace(
         images={},

@@ -28,11 +28,11 @@ def test_a_pushed_body_comes_back_over_its_feet(tmp_path: Path):
     body = played.session.creature.body
     node = int(np.argmax(body.mesh.nodes[:, 2]))
     place, start = played.session.state.positions[node], body.centre_of_mass(played.session.state.positions)
-    played.ask("pull", node=node, x=place[0] + 0.15, y=place[1], z=place[2])
+    played.request("pull", node=node, x=place[0] + 0.15, y=place[1], z=place[2])
     played.step(20)
     pushed = body.centre_of_mass(played.session.state.positions)
     assert pushed[0] - start[0] > 0.01 * body.height
-    played.ask("release")
+    played.request("release")
     played.step(36)
     feet_moved = played.session.steering.place.moved_to(played.session.state.positions).ground.origin
     over = body.centre_of_mass(played.session.state.positions)[:2] - feet_moved[:2]
@@ -49,18 +49,18 @@ def test_one_that_is_thrown_over_lies_relaxed_and_stands_up_when_told(tmp_path: 
     lying = Rotation.from_euler("y", 90.0, degrees=True).apply(session.state.positions)
     lying[:, 2] -= lying[:, 2].min()
     session.state = BodyState(lying, np.tile([0.0, 0.0, -0.2], (len(lying), 1)), session.state.time)
-    played.until(lambda: session.steering.doing == "fallen", most=5)
-    assert played.told == ["the body has fallen; type get up, or press Backspace to put it back at its start"]
-    played.ask("motion", text="jump")
+    played.until(lambda: session.steering.doing == "fallen", max_steps=5)
+    assert played.messages == ["the body has fallen; type get up, or press Backspace to put it back at its start"]
+    played.request("motion", text="jump")
     played.step(10)
     assert played.session.steering.doing == "fallen" and played.session.steering.queued is None
-    played.ask("motion", text="get up")
+    played.request("motion", text="get up")
     played.step()
     assert played.session.steering.doing == "get up"
     assert [entry.name for entry in session.steering.records] == ["get up"]
     played.step(10)
-    assert played.session.steering.doing == "get up" and len(played.told) == 1
-    played.ask("stand")
+    assert played.session.steering.doing == "get up" and len(played.messages) == 1
+    played.request("stand")
     np.testing.assert_allclose(played.session.state.positions, played.session.creature.start.positions)
     played.step(5)
     assert played.session.steering.doing == "stand"

@@ -46,20 +46,20 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> tuple[SteppedSession, Path
     """A jump on the spot, recorded from its crouch to rest; before it, a twist that is not part of it."""
     folder = tmp_path_factory.mktemp("takes")
     played = SteppedSession(coarse_pawn(), folder)
-    played.ask("motion", text="twist 20 0 0.1")
+    played.request("motion", text="twist 20 0 0.1")
     played.until_idle()
-    played.ask("record", on=True)
-    played.ask("motion", text="jump 0.2 0.15")
+    played.request("record", on=True)
+    played.request("motion", text="jump 0.2 0.15")
     played.until_idle()
-    played.ask("record", on=False)
+    played.request("record", on=False)
     return played, folder / "take-1"
 
 
 @pytest.mark.slow
 def test_a_take_is_a_run_like_any_other(take: tuple[SteppedSession, Path]):
     played, path = take
-    assert played.told[-1].startswith(f"wrote {path} (")
-    assert played.told[-1].endswith(f"egs-warp view {path}")
+    assert played.messages[-1].startswith(f"wrote {path} (")
+    assert played.messages[-1].endswith(f"egs-warp view {path}")
     assert json.loads((path / "manifest.json").read_text())["finished"]
     recording = Recording.read(path)
     assert recording.title == "pawn · jump"
@@ -88,9 +88,9 @@ def test_its_script_repeats_its_motions_alone(take: tuple[SteppedSession, Path])
 @pytest.mark.slow
 def test_a_script_of_all_that_it_did_is_told(take: tuple[SteppedSession, Path], tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
-    played.ask("script")
+    played.request("script")
     assert played.news[-1] == {"type": "script", "text": "[\n\n]\n", "motions": 0}
-    take[0].ask("script")
+    take[0].request("script")
     told, path = take[0].news[-1], tmp_path / "script.json"
     path.write_text(str(told["text"]))
     assert told["motions"] == 2 and motion(str(path)) == motion("twist 20 0 0.1, jump 0.2 0.15")
@@ -99,12 +99,12 @@ def test_a_script_of_all_that_it_did_is_told(take: tuple[SteppedSession, Path], 
 def test_a_take_with_a_pull_passes_the_audit_and_a_second_take_is_another_folder(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
     for _ in range(2):
-        played.ask("record", on=True)
+        played.request("record", on=True)
         played.step(2)
-        played.ask("pull", node=0, x=0.1, y=0.0, z=0.2)
+        played.request("pull", node=0, x=0.1, y=0.0, z=0.2)
         played.step(3)
-        played.ask("release")
-        played.ask("record", on=False)
+        played.request("release")
+        played.request("record", on=False)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["take-1", "take-2"]
     report = json.loads((tmp_path / "take-2" / "report.json").read_text())
     assert report["notes"] == ["the user pulled or pushed the body; script.json does not repeat this"]
@@ -116,14 +116,14 @@ def test_a_take_with_a_pull_passes_the_audit_and_a_second_take_is_another_folder
 
 def test_an_empty_take_and_a_folder_that_cannot_be_written_are_told(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path / "file" / "takes")
-    played.ask("record", on=True)
-    played.ask("record", on=False)
-    assert played.told[-1] == "nothing has moved since the take started; no take is written"
+    played.request("record", on=True)
+    played.request("record", on=False)
+    assert played.messages[-1] == "nothing has moved since the take started; no take is written"
     (tmp_path / "file").write_text("")
-    played.ask("record", on=True)
+    played.request("record", on=True)
     played.step()
-    played.ask("record", on=False)
-    assert played.told[-1].startswith("the take cannot be written: ")
+    played.request("record", on=False)
+    assert played.messages[-1].startswith("the take cannot be written: ")
     assert not played.session.state_message()["recording"]
 
 
@@ -142,16 +142,19 @@ def test_each_opening_and_renaming_of_a_take_fails_once(
     for number in range(100):
         folder = tmp_path / str(number)
         played = SteppedSession(coarse_pawn(), folder)
-        played.ask("record", on=True)
+        played.request("record", on=True)
         played.step()
         with monkeypatch.context() as patch:
             failed = fail_once(patch, number, reason)
-            played.ask("record", on=False)
+            played.request("record", on=False)
         finished = [path for path in folder.glob("*/manifest.json") if json.loads(path.read_text())["finished"]]
         assert not list(folder.rglob(".egs-*"))
         if not failed:
             break
-        assert played.told[-1].startswith("the take cannot be written: ") and os.strerror(reason) in played.told[-1]
+        assert (
+            played.messages[-1].startswith("the take cannot be written: ")
+            and os.strerror(reason) in played.messages[-1]
+        )
         assert not finished and not played.session.state_message()["recording"]
         played.step()
-    assert number > 8 and len(finished) == 1 and played.told[-1].startswith("wrote ")
+    assert number > 8 and len(finished) == 1 and played.messages[-1].startswith("wrote ")

@@ -133,17 +133,17 @@ def test_friction_and_stiffness_change_under_it(tmp_path: Path):
     played.step(2)
     before = played.session.state
     young = played.session.creature.body.young_modulus
-    played.ask("set", friction=0.3)
+    played.request("set", friction=0.3)
     assert played.session.creature.geometry.friction == 0.3
     assert played.session.creature.body.young_modulus == young
-    played.ask("set", sag=0.025)
+    played.request("set", sag=0.025)
     assert played.session.creature.body.young_modulus == pytest.approx(2.0 * young)
     assert played.session.state is before
     assert [news for news in played.news if news["type"] == "busy"] == 2 * [
         {"type": "busy", "on": True},
         {"type": "busy", "on": False},
     ]
-    played.ask("motion", text="jump 0 0.1")
+    played.request("motion", text="jump 0 0.1")
     for _ in range(12):
         played.step()
         assert played.session.report is not None and played.session.report.converged
@@ -151,7 +151,7 @@ def test_friction_and_stiffness_change_under_it(tmp_path: Path):
     assert played.session.state_message()["friction"] == 0.3 and played.session.state_message()["sag"] == 0.025
     # A repeated request changes nothing.
     made = played.session.creature
-    played.ask("set", sag=0.025)
+    played.request("set", sag=0.025)
     assert played.session.creature is made
 
 
@@ -174,11 +174,11 @@ def test_a_solver_that_fails_does_not_end_the_session(
     with monkeypatch.context() as broken:
         broken.setattr(type(played.session.creature.stepper), "advance", fail)
         played.step()
-    assert played.told == ["the solver failed; the creature is back at its start"]
+    assert played.messages == ["the solver failed; the creature is back at its start"]
     assert capsys.readouterr().err == "egs-warp: live: FloatingPointError: no definite matrix\n"
     np.testing.assert_array_equal(played.session.state.positions, played.session.creature.start.positions)
     played.step(2)
-    assert len(played.told) == 1
+    assert len(played.messages) == 1
 
 
 def test_a_page_that_takes_nothing_loses_the_oldest_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -197,23 +197,23 @@ def test_a_push_strikes_it_in_the_next_step_and_its_take_passes_the_audit(tmp_pa
     played = SteppedSession(coarse_pawn(), tmp_path)
     session, body = played.session, played.session.creature.body
     played.until(lambda: session.resting)
-    played.ask("push", x=0.05, y=-0.1, z=0.0)
+    played.request("push", x=0.05, y=-0.1, z=0.0)
     assert not session.resting
-    played.ask("record", on=True)
+    played.request("record", on=True)
     played.step()
     gained = body.centre_of_mass(session.state.velocities) / body.speed_unit
     # The ground has had a step to take some of it, by friction; the books of the take say how much.
     assert 0.2 < gained[0] / 0.05 <= 1.0 and 0.2 < gained[1] / -0.1 <= 1.0
     played.step(4)
     spin = body.angular_momentum(session.state.positions, session.state.velocities)
-    played.ask("push", x=0.0, y=0.1, z=0.0, height=0.9)
-    played.ask("push", x=0.0, y=0.05, z=0.0, height=0.9)
+    played.request("push", x=0.0, y=0.1, z=0.0, height=0.9)
+    played.request("push", x=0.0, y=0.05, z=0.0, height=0.9)
     played.step()
     turned = body.angular_momentum(session.state.positions, session.state.velocities) - spin
     assert turned[0] < -0.02 * body.mass * body.speed_unit * body.height
     played.until(lambda: session.steering.idle and session.state.time > 1.0)
     assert session.steering.doing == "stand"
-    played.ask("record", on=False)
+    played.request("record", on=False)
     path = tmp_path / "take-1"
     t, report = Trajectory.load(path / "trajectory.npz"), json.loads((path / "report.json").read_text())
     given = np.einsum("n,kni->ki", t.node_mass, t.kick_velocity) / (body.mass * body.speed_unit)
@@ -225,8 +225,8 @@ def test_a_push_strikes_it_in_the_next_step_and_its_take_passes_the_audit(tmp_pa
 
 def test_a_push_that_waits_is_dropped_where_the_creature_stands_up_anew(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
-    played.ask("push", x=0.3, y=0.0, z=0.0)
-    played.ask("stand")
+    played.request("push", x=0.3, y=0.0, z=0.0)
+    played.request("stand")
     played.step()
     body = played.session.creature.body
     assert np.linalg.norm(body.centre_of_mass(played.session.state.velocities)) < 0.01 * body.speed_unit

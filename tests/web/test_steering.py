@@ -23,16 +23,16 @@ from tests.support.meshes import stool
 
 def test_what_is_asked_meanwhile_takes_the_place_of_what_was_to_come(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
-    played.ask("motion", text="jump 0 0.1, hop")
+    played.request("motion", text="jump 0 0.1, hop")
     played.step()
     assert (played.session.steering.doing, played.session.steering.queued) == ("jump", "hop")
-    played.ask("motion", text="twist 20 0 0.1")
+    played.request("motion", text="twist 20 0 0.1")
     assert played.session.steering.queued == "twist"
     played.until(lambda: played.session.steering.doing == "twist")
     assert [entry.name for entry in played.session.steering.records] == ["jump", "twist"]
-    played.ask("motion", text="hop")
+    played.request("motion", text="hop")
     assert played.session.steering.queued == "hop"
-    played.ask("cancel")
+    played.request("cancel")
     played.step()
     assert (played.session.steering.doing, played.session.steering.queued) == ("twist", None)
     assert [entry.name for entry in played.session.steering.records] == ["jump", "twist"]
@@ -42,16 +42,16 @@ def test_it_is_driven_until_something_else_is_asked(tmp_path: Path):
     """A command waits for the motion that goes on; the next command, or motion, takes its place."""
     played = SteppedSession(coarse_pawn(), tmp_path)
     steering = played.session.steering
-    played.ask("drive", forward=0.1)
+    played.request("drive", forward=0.1)
     assert steering.queued == "drive" and not steering.idle
     played.step(2)
     driven = steering._active.motion
     assert steering.doing == "drive" and steering.queued is None and isinstance(driven, LiveDrive)
     assert driven.command == Drive(0.1) and steering.drive_starts == [0.0] and steering.records == []
-    played.ask("drive", turn=0.1)
+    played.request("drive", turn=0.1)
     played.step()
     assert driven.command == Drive(turn=0.1) and steering._active.motion is driven
-    played.ask("motion", text="jump 0 0.1")
+    played.request("motion", text="jump 0 0.1")
     played.step()
     assert driven.command.is_zero and (steering.doing, steering.queued) == ("drive", "jump")
 
@@ -59,27 +59,27 @@ def test_it_is_driven_until_something_else_is_asked(tmp_path: Path):
 @pytest.mark.slow
 def test_what_was_driven_stands_once_it_is_told_to(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
-    played.ask("drive", forward=0.1)
+    played.request("drive", forward=0.1)
     played.step(60)
-    played.ask("drive")
+    played.request("drive")
     played.until_idle()
-    assert played.session.steering.doing == "stand" and played.told == []
+    assert played.session.steering.doing == "stand" and played.messages == []
 
 
 def test_a_style_is_of_the_motions_that_begin_after_it(tmp_path: Path):
     """The active jump keeps its style; after standing up or a rebuild, the new style stays."""
     played = SteppedSession(coarse_pawn(), tmp_path)
     session = played.session
-    played.ask("motion", text="jump 0 0.1, jump 0 0.1")
+    played.request("motion", text="jump 0 0.1, jump 0 0.1")
     played.step()
     usual = session.steering._active.motion
     assert isinstance(usual, Jump)
-    played.ask("style", **PRESETS["heavy"])
+    played.request("style", **PRESETS["heavy"])
     played.step()
     assert session.steering._active.motion is usual and session.state_message()["style"] == PRESETS["heavy"]
-    played.ask("stand")
-    played.ask("set", friction=0.5)
-    played.ask("motion", text="jump 0 0.1, walk 0.1")
+    played.request("stand")
+    played.request("set", friction=0.5)
+    played.request("motion", text="jump 0 0.1, walk 0.1")
     played.step()
     heavy = session.steering._active.motion
     assert isinstance(heavy, Jump)
@@ -91,9 +91,9 @@ def test_a_style_is_of_the_motions_that_begin_after_it(tmp_path: Path):
 
 def test_a_motion_that_the_body_cannot_do_is_told(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
-    played.ask("motion", text="walk to 9,9 0.01, jump")
+    played.request("motion", text="walk to 9,9 0.01, jump")
     played.step()
-    assert played.told == ["walk: the path takes more than 400 steps; choose a shorter one"]
+    assert played.messages == ["walk: the path takes more than 400 steps; choose a shorter one"]
     assert played.session.steering.idle or played.session.steering.doing == "stand"
     assert played.session.steering.records == []
 
@@ -130,7 +130,9 @@ def test_a_journey_that_comes_no_nearer_is_given_up():
 
 def test_a_body_with_feet_walks_there():
     """To where it lies, ahead and aside as it is, at most a leg's length at once."""
-    place = coarse_creature(stool(), forward=np.array([0.9, 0.3, 0.0]), sag=0.01, strength=20.0, settled=False).place
+    place = coarse_creature(
+        stool(), forward=np.array([0.9, 0.3, 0.0]), sag=0.01, strength=20.0, settle_first=False
+    ).place
     steering = MotionScheduler(place, print)
     assert steering.walks
     feet, height = sole_shares(place.body, place.ground, place.standing) @ place.standing, place.body.height
@@ -153,8 +155,8 @@ def test_a_click_sends_it_there(tmp_path: Path):
     feet = sole_shares(place.body, place.ground, place.standing)
     start = feet @ played.session.state.positions
     goal = start + 0.16 * place.ground.axes[0]
-    played.ask("go", x=goal[0], y=goal[1])
-    played.until_idle(most=900)
+    played.request("go", x=goal[0], y=goal[1])
+    played.until_idle(max_steps=900)
     end = feet @ played.session.state.positions
     assert np.linalg.norm((end - goal)[:2]) < ARRIVAL_DISTANCE * body.height
     assert played.session.steering.goal is None
