@@ -75,6 +75,7 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/actionlint .github/workflows/*.yml
+	$(BIN)/python -m tests.wording
 
 types: setup
 	$(BIN)/pyright
