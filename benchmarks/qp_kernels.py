@@ -3,7 +3,7 @@
 python benchmarks/qp_kernels.py [--quick] [--device cuda:0] [--programs 1000] [--json PATH] [--plot PATH]
 
 Built-in bodies with cages of about 250 nodes jump and walk (a snake crawls) on the CPU, with OSQP as the solver. Each
-QP of their steps is recorded with its bounds, its start and whether it is a trial next to another one (``skip_splitting``).
+QP of their steps is recorded with its bounds, its start and ``skip_splitting`` (another QP of the step was solved).
 Then both solvers solve all of them: ``full`` by iterations alone, to 1e-12, at most 20,000; ``few`` like the first
 program of a step, 50 iterations on the rows that matter; ``whole`` as the engine does (few iterations and the active
 set, or that alone). Milliseconds are medians per program: of OSQP with its set-up, of the kernels for one program
