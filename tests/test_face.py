@@ -108,7 +108,7 @@ def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(egs, "simulate", lambda creature, motion: simulate(creature, motion, frames=25))
     names: dict[str, object] = {}
     exec(compile(readme_lines(), "README.md", "exec"), names)
-    performance = names["performance"]
+    performance = names["run"]
     assert isinstance(performance, egs.SimulatedRun) and len(performance.frames) == 25
     heights = performance.frames @ performance.place.ground.axes[2]
     assert heights[-1].max() < heights[0].max() - 0.005

@@ -32,7 +32,11 @@ def test_recorded_programs_end_as_osqp_ends_on_them(benchmark: ModuleType, progr
 
     This holds by iterations alone, after 50 iterations, and solved as in the engine.
     """
-    assert len(programs) == 14 and any(one.beside for one in programs) and not all(one.beside for one in programs)
+    assert (
+        len(programs) == 14
+        and any(one.skip_splitting for one in programs)
+        and not all(one.skip_splitting for one in programs)
+    )
     everything, alone = benchmark.full(programs, device)
     assert everything["programs"] == everything["solved"] == alone["programs"] == 14 and alone["motion"] == "pawn jump"
     assert not everything["unlike"] and 0.0 < everything["worst"] <= 1e-6

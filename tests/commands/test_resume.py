@@ -82,7 +82,7 @@ def has_begun(out: Path) -> bool:
     try:
         has_finished(out)
     except UserError as error:
-        assert "no run has begun" in str(error)
+        assert "no run has written here" in str(error)
         return False
     return True
 
