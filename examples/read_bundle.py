@@ -18,10 +18,7 @@ class Bundle:
         self.inverse = np.linalg.inv((self.corners[:, 1:] - self.corners[:, :1]).transpose(0, 2, 1))
 
     def frame(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return means (n, 3), covariances (n, 3, 3) and rotations (n, 3, 3) of a frame.
-
-        The colour in direction d is that of ``sh`` in direction rotation^T d.
-        """
+        """Return means (n, 3), covariances and rotations (n, 3, 3); colour along d is ``sh`` along rotation^T d."""
         a, tet, rows = self.arrays, self.arrays["mean_tets"], self.arrays["arm_rows"]
         moved = a["nodes"][index][a["tets"]].astype(float)
         gradients = (moved[:, 1:] - moved[:, :1]).transpose(0, 2, 1) @ self.inverse
@@ -29,10 +26,8 @@ class Bundle:
         carriers = np.where(a["rigid"][:, None, None], turns, gradients[tet])  # rigid: far outside the cage
         means = moved[tet, 0] + _apply(carriers, a["means"] - self.corners[tet, 0])
         stretched = carriers @ self.axes
-        through, sides = (
-            stretched[rows],
-            np.zeros((2, len(rows), 3, 3)),
-        )  # across several tetrahedra: each end in its own
+        # A splat across several tetrahedra: each end of its axes moves with its own tetrahedron.
+        through, sides = stretched[rows], np.zeros((2, len(rows), 3, 3))
         for k, (end, share) in enumerate(zip(a["arm_tets"], a["arm_shares"][:, :, None], strict=True)):
             sign = 1.0 if k < 3 else -1.0
             inner, outer = sign * through[:, :, k % 3], sign * _apply(gradients[end], self.axes[rows, :, k % 3])
