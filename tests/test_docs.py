@@ -81,6 +81,22 @@ def test_every_page_of_concepts_says_where_its_code_is() -> None:
             assert (ROOT / room).exists() or (ROOT / f"{room}.py").exists(), f"{page.name}: no {room}"
 
 
+def test_stages_of_a_step_are_in_the_files_that_the_architecture_names() -> None:
+    table = (DOCS / "architecture.md").read_text().partition("| stage | on a CPU | on a GPU |")[2].partition("\n\n")[0]
+    cells = [cell for row in table.splitlines()[2:] for cell in row.strip("|").split("|")[1:]]
+    assert len(cells) > 20
+    for cell in cells:
+        folder = ROOT / "egs_warp"
+        for name in re.findall(r"`(\S+)`", cell):
+            if not name.endswith(".py"):
+                owner, _, method = name.partition(".")
+                texts = [path.read_text() for path in (ROOT / "egs_warp" / "locomotion").glob("*.py")]
+                assert any(f"class {owner}" in text and f"def {method}(" in text for text in texts), name
+                continue
+            folder = ROOT / "egs_warp" / Path(name).parent if "/" in name else folder
+            assert (folder / Path(name).name).is_file(), f"{name} in {cell}"
+
+
 @pytest.mark.example
 def test_pages_start_from_captures_and_keys_that_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made_once = cache(scene)

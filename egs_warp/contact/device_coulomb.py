@@ -37,7 +37,7 @@ class CoulombWorkspace:
         )
         self.friction, self.normal_bias = self._parameters.device.split([1, capacity])
         self.counts = torch.zeros(1, dtype=torch.int32, device=device)
-        """(1,) int32, contacts of the operator. ``friction`` is (1,), ``shifts`` (K,) m/s."""
+        """(1,) int32, contacts of the operator. ``friction`` is (1,), ``normal_bias`` (K,) m/s."""
         self._regular = torch.zeros((width, width), dtype=torch.float64, device=device)
         self._vectors, self._indices = self._regular.new_zeros((1, 5, width)), self.counts.new_zeros((1, 2, width))
         self._matrices = self._regular.new_zeros((1, width, (width + 4) // 4, 4))

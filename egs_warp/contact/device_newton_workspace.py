@@ -317,7 +317,7 @@ class NewtonWorkspace:
             convergence: state and tolerances of the loop.
             base: slot to start from, ``FROM_BASE`` or ``FROM_TRIAL``.
             residual_norm: residual there over dt x weight; None reads that of the last trial.
-            usual: (1,) int32 on the device; 0 skips the loop. None always runs it.
+            enabled: (1,) int32 on the device; 0 skips the loop. None always runs it.
         """
         dt, ratio = problem.dt, 1.0 + problem.dt * problem.drag
         self.convergence, self.owner.last_solve = convergence, None

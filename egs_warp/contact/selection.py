@@ -37,9 +37,9 @@ class ContactSelector:
 
         Args:
             geometry: the points.
-            near: activation distance, m. A cell is active if its lowest point may come this close to a solid in the
+            activation_distance: m. A cell is active if its lowest point may come this close to a solid in the
                 step.
-            lower: hysteresis, m. Another point of the cell replaces an unloaded one only if it is lower by this much.
+            hysteresis: m. Another point of the cell replaces an unloaded one only if it is lower by this much.
         """
         self.geometry, self.activation_distance, self.hysteresis, self.gap_tolerance = (
             geometry,

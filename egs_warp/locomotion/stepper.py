@@ -93,7 +93,7 @@ class StepReport:
     newton_iterations: int
     converged: bool
     added_spin: float
-    """rad/s, rotation added to the end velocities to conserve the angular momentum that implicit Euler loses, see
+    """rad/s, rotation in the equation of motion that conserves the angular momentum which implicit Euler loses, see
     ``StepProblem``."""
     milliseconds: dict[str, float] = field(default_factory=dict)
     """Wall-clock time of each stage, ms."""
@@ -102,7 +102,7 @@ class StepReport:
 class LocomotionStepper:
     """Stepper of one body with its muscles and its ground.
 
-    Attributes that other packages use: ``detector`` and ``points`` detect gaps and select contacts, ``solver`` solves
+    Attributes that other packages use: ``detector`` and ``selector`` detect gaps and select contacts, ``solver`` solves
     motion and contact, ``planner`` plans activations.
     """
 

@@ -90,7 +90,7 @@ def captured_scene(
         camera: camera.
         plane: ground.
         centre, reach: (3,) and radius of the disc that can be in shadow, world units.
-        grain, height: as for ``ContactShadow``.
+        blur_radius, height: as for ``ContactShadow``.
         shadow: False for no shadow.
     """
     import cv2

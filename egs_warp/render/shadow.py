@@ -55,7 +55,7 @@ class ContactShadow:
             plane: ground.
             centre, reach: (3,) and radius of the disc that can be in shadow, world units.
             device: device of the arrays.
-            grain: blur radius of the body, see ``shadow_blur_radius``; 0 without a body.
+            blur_radius: world units, blur radius of the body, see ``shadow_blur_radius``; 0 without a body.
             height: height of the body, world units; 0 without a body.
             depth: (H, W) z-depth of the uneven ground that receives the shadow, 0 where that is the plane.
         """
