@@ -14,7 +14,8 @@ from egs_warp.fem.step_problem import StepProblem
 from egs_warp.io import read_capture
 from egs_warp.locomotion.contact_modes import CoulombProgram
 from egs_warp.locomotion.objectives import AngularMomentumObjective, centre_of_mass_velocity, node_velocities
-from egs_warp.locomotion.rollout import FRAME_RATE, settle
+from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart, make_step_linearizer
 from egs_warp.locomotion.strategies import PredictedContact
 from egs_warp.locomotion.synergies import Synergies

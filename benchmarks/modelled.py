@@ -56,6 +56,62 @@ def _ball(points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points - [0.0, 0.0, 0.49], axis=1) - 0.5
 
 
+def _chair(points: np.ndarray) -> np.ndarray:
+    """Four slender legs under a thick seat with a high back."""
+    out = rounded_box(points, np.array([0.0, 0.0, 0.49]), np.array([0.24, 0.22, 0.05]), 0.02)
+    back = rounded_box(points, np.array([-0.2, 0.0, 0.75]), np.array([0.045, 0.2, 0.24]), 0.02)
+    for x, y in ((0.19, 0.17), (0.19, -0.17), (-0.19, 0.17), (-0.19, -0.17)):
+        out = np.minimum(out, _rod(points, [1.1 * x, 1.1 * y, -0.05], [x, y, 0.48], 0.032, 0.035))
+    return smooth_union(out, back, 0.02)
+
+
+def _soldier(points: np.ndarray) -> np.ndarray:
+    """A figure with one foot ahead of the other and a pole in one hand."""
+    out = ellipsoid(points, np.array([0.0, 0.0, 0.62]), np.array([0.09, 0.13, 0.19]))
+    head = ellipsoid(points, np.array([0.01, 0.0, 0.9]), np.array([0.075, 0.065, 0.09]))
+    for x, y in ((0.07, 0.08), (-0.06, -0.07)):
+        leg = smooth_union(
+            _rod(points, [x, y, 0.05], [0.3 * x, 0.8 * y, 0.5], 0.042, 0.06),
+            _rod(points, [x - 0.03, y, 0.025], [x + 0.07, 1.1 * y, 0.025], 0.04, 0.035),
+            0.03,
+        )
+        out = smooth_union(out, leg, 0.03)
+    right = _rod(points, [0.0, -0.13, 0.74], [0.12, -0.19, 0.58], 0.045, 0.035)
+    left = _rod(points, [0.0, 0.13, 0.74], [0.02, 0.17, 0.45], 0.045, 0.035)
+    pole = _rod(points, [0.12, -0.2, 0.4], [0.13, -0.2, 0.86], 0.03, 0.03)
+    for part in (head, right, left, pole):
+        out = smooth_union(out, part, 0.03)
+    return out
+
+
+def _guitar(points: np.ndarray) -> np.ndarray:
+    """A slab with a slender neck that leans back against a narrow stand with three feet."""
+    lower = ellipsoid(points, np.array([0.0, 0.0, 0.27]), np.array([0.09, 0.2, 0.19]))
+    upper = ellipsoid(points, np.array([-0.03, 0.0, 0.47]), np.array([0.08, 0.15, 0.14]))
+    neck = _rod(points, [-0.04, 0.0, 0.5], [-0.1, 0.0, 0.92], 0.045, 0.035)
+    head = rounded_box(points, np.array([-0.105, 0.0, 0.94]), np.array([0.03, 0.06, 0.06]), 0.015)
+    out = smooth_union(smooth_union(lower, upper, 0.06), smooth_union(neck, head, 0.02), 0.03)
+    for foot in ([0.13, 0.14, -0.02], [0.13, -0.14, -0.02], [-0.15, 0.0, -0.02]):
+        out = smooth_union(out, _rod(points, foot, [-0.02, 0.4 * foot[1], 0.25], 0.035, 0.04), 0.02)
+    return out
+
+
+def _lamp(points: np.ndarray) -> np.ndarray:
+    """A wide shade on a stem that stands on a small disc."""
+    foot = _rod(points, [0.0, 0.0, 0.0], [0.0, 0.0, 0.05], 0.15, 0.13)
+    stem = _rod(points, [0.0, 0.0, 0.05], [0.0, 0.0, 0.7], 0.045, 0.04)
+    shade = _rod(points, [0.0, 0.0, 0.76], [0.0, 0.0, 0.9], 0.2, 0.1)
+    return smooth_union(smooth_union(foot, stem, 0.04), shade, 0.03)
+
+
+def _table(points: np.ndarray) -> np.ndarray:
+    """A thick top, longer than wide, on four slender legs."""
+    out = rounded_box(points, np.array([0.0, 0.0, 0.92]), np.array([0.7, 0.42, 0.07]), 0.02)
+    for x, y in ((0.6, 0.33), (0.6, -0.33), (-0.6, 0.33), (-0.6, -0.33)):
+        out = np.minimum(out, _rod(points, [x, y, -0.05], [x, y, 0.9], 0.04, 0.05))
+    return out
+
+
 MODELLED: dict[str, Distance] = {
     "biped": _legged(2, leg=0.1),
     "tripod": _legged(3),
@@ -66,6 +122,11 @@ MODELLED: dict[str, Distance] = {
     "box": _box,
     "snake": _snake,
     "ball": _ball,
+    "chair": _chair,
+    "soldier": _soldier,
+    "guitar": _guitar,
+    "lamp": _lamp,
+    "table": _table,
 }
 
 

@@ -24,7 +24,7 @@ DEFAULT_SAG = 0.05
 MIN_HEIGHT, MAX_HEIGHT = 0.001, 1000.0
 """Heights of a body, m; others are rejected as a probable mistake in the units."""
 MAX_SAG = 0.02
-"""Maximum displacement of the centre of mass from the unloaded to the standing body, in body heights."""
+"""Maximum displacement of the centre of mass of the body under its weight, in body heights."""
 
 _MAX_LINEAR_SAG = 1e4
 """Linear sag, in body heights, that only a body with a mechanism (a part on a hinge) exceeds."""
@@ -35,9 +35,9 @@ class SoftBody:
     """A tetrahedral body under gravity."""
 
     mesh: TetMesh
-    """Rest shape, m."""
+    """Cage as captured, m; muscles, contact points and Gaussians are embedded in it."""
     assembly: ElasticAssembly
-    """Elasticity of the mesh."""
+    """Elasticity; its mesh is the unloaded shape, which gravity deforms into ``mesh`` on the ground."""
     node_mass: np.ndarray
     """(N,) float64, kg, lumped masses."""
     gravity: np.ndarray

@@ -36,6 +36,10 @@ class ElasticAssembly:
         """Pickle the mesh and the material only; the copy rebuilds the arrays on its device."""
         return partial(ElasticAssembly, device=str(self.device)), (self.mesh, self.material)
 
+    def with_rest_shape(self, nodes: np.ndarray) -> ElasticAssembly:
+        """Return the elasticity of the same elements and material with the rest positions ``nodes`` (N, 3) m."""
+        return ElasticAssembly(TetMesh(nodes, self.mesh.tets), self.material, device=str(self.device))
+
     @cached_property
     def analysis(self) -> SymbolicFactorization:
         """Symbolic factorization of ``upper_pattern``."""

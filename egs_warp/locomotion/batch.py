@@ -21,8 +21,8 @@ from egs_warp.fem.batch_factors import CHUNK_BYTES, PANEL
 from egs_warp.fem.batch_problem import BatchBody, BatchProblem, apply_inverse
 from egs_warp.fem.batched import BatchedRecord, nonzero
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.locomotion.rollout import SETTLING_STEP, SETTLING_STEPS, has_settled
 from egs_warp.locomotion.settings import LocomotionSettings
+from egs_warp.locomotion.settling import SETTLING_STEP, SETTLING_STEPS, has_settled
 from egs_warp.locomotion.stepper import MAX_HALVINGS, PREDICTION_ITERATIONS, StepReport, WarmStart
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.render.autograd import torch_stream

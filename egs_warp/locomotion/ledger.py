@@ -237,7 +237,7 @@ class _Elements:
 
     @classmethod
     def of(cls, t: Trajectory) -> _Elements:
-        edges = _edges(t.rest_positions, t.tets)
+        edges = _edges(t.unloaded_positions, t.tets)
         young, nu = t.young_modulus, t.poisson_ratio
         mu, lam = young / (2.0 * (1.0 + nu)), young * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
         return cls(t.tets, np.linalg.inv(edges), np.linalg.det(edges) / 6.0, mu, lam, t.damping_time)

@@ -117,6 +117,7 @@ class Recorder:
             "velocities": start.velocities[None],
             "min_gap": np.array([start_gap]),
             "rest_positions": body.mesh.nodes,
+            "unloaded_positions": body.assembly.mesh.nodes,
             "tets": body.mesh.tets,
             "node_mass": body.node_mass,
             "gravity": body.gravity,

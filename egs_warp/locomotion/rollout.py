@@ -1,12 +1,12 @@
-"""The loop over the steps of a run: motion, stepper, recorder; and the settling of a body on its ground."""
+"""The loop over the steps of a run: motion, stepper, recorder."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -24,8 +24,6 @@ from egs_warp.locomotion.trajectory import Trajectory
 
 FRAME_RATE = 60
 """Frames of a video, 1/s."""
-SETTLING_STEP, SETTLING_STEPS = 0.25, 12
-"""Step size in sqrt(H / g), and maximum number of steps, in which a body comes to rest on its ground."""
 REST_FRAMES = 20
 """Number of frames after the last motion has finished."""
 
@@ -58,43 +56,6 @@ def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]
     frame = max(1.0 / FRAME_RATE, step or 0.0)
     count = int(np.ceil(frame / min(max_step, step or max_step) - 1e-3))
     return frame / count, count
-
-
-def settle(stepper: LocomotionStepper) -> BodyState:
-    """Let the body come to rest on its ground: long contact steps without muscles, each started without velocity.
-
-    A body that collapses is not followed to the ground: the loop ends once a node moves by 0.2 H in one step, or the
-    centre of mass has moved by 0.1 H in all.
-    """
-    body = stepper.body
-    state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
-    dt = SETTLING_STEP * body.time_unit
-    memory = stepper.initial_memory()
-    for _ in range(SETTLING_STEPS):
-        with one_blas_thread():
-            result = stepper.passive_step(state, memory, dt)
-        max_displacement = dt * float(np.abs(result.velocities).max())
-        state = BodyState(state.positions + dt * result.velocities, np.zeros_like(state.positions))
-        memory = replace(memory, points=result.contacts.points, forces=result.forces)
-        centre_displacement = body.centre_of_mass(state.positions) - body.centre_of_mass(body.mesh.nodes)
-        if has_settled(body, max_displacement, np.linalg.norm(centre_displacement)):
-            break
-    return state
-
-
-def has_settled(body: SoftBody, max_displacement: Any, centre_displacement: Any) -> Any:
-    """Return True if a body is at rest or collapses.
-
-    Args:
-        body: the body.
-        max_displacement: m, largest displacement of a node along an axis in the last step, a number or an array.
-        centre_displacement: m, displacement of the centre of mass in all, a number or an array.
-    """
-    return (
-        (max_displacement > 0.2 * body.height)
-        | (centre_displacement > 0.1 * body.height)
-        | (max_displacement < 2e-4 * body.height)
-    )
 
 
 def roll_out(

@@ -130,6 +130,11 @@ class LocomotionStepper:
             penetration_tolerance=self.settings.penetration_tolerance * body.height,
         )
         self.factors = linear_solver_on(body.assembly.device, body.assembly.upper_pattern)
+        self._make_planners(linear_solver_on(body.assembly.device, body.assembly.upper_pattern))
+
+    def _make_planners(self, planning_factors: LinearSolver) -> None:
+        """Build what depends on the elasticity of the body: linearizer, synergies and planners."""
+        body, muscles = self.body, self.muscles
         self.linearizer = _make_linearizer(self.factors, body, muscles, self.solver)
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
         # One thread, so that the synergies do not depend on the number of threads.
@@ -142,14 +147,23 @@ class LocomotionStepper:
             body,
             muscles,
             synergies,
-            geometry.friction,
+            self.geometry.friction,
             self.settings,
-            linear_solver_on(body.assembly.device, body.assembly.upper_pattern),
+            planning_factors,
             make_step_linearizer(self.linearizer, muscles, synergies),
         )
         self._device_planner = _make_device_planner(self.planner, self.linearizer, self.solver)
         # The prefetched inputs of the next step, with the warm start for which they are valid.
         self._prefetched: tuple[WarmStart, StepInputs] | None = None
+
+    def with_unloaded_shape(self, nodes: np.ndarray) -> LocomotionStepper:
+        """Return a stepper of the same body with the unloaded positions ``nodes`` (N, 3) m. It shares the factors and
+        buffers of this one; therefore use both in one thread only."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
+        other.body = replace(self.body, assembly=self.body.assembly.with_rest_shape(nodes))
+        other._make_planners(self.planner.factors)
+        return other
 
     def with_friction(self, friction: float) -> LocomotionStepper:
         """Return a stepper for the same ground with another Coulomb coefficient. It is cheap, because it shares the

@@ -14,7 +14,7 @@ from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.io.arrays import read_npz
 from egs_warp.io.atomic import atomic_write
 
-SCHEMA = 2
+SCHEMA = 3
 """Version of ``trajectory.npz`` (docs/guide/report.md)."""
 STATES = ("time", "positions", "velocities", "min_gap")
 """Arrays of F+1 rows."""
@@ -53,7 +53,9 @@ class Trajectory:
     velocities: np.ndarray
     """(F+1, N, 3) m/s."""
     rest_positions: np.ndarray
-    """(N, 3) m."""
+    """(N, 3) m, as captured; Gaussians and muscles are embedded in this shape."""
+    unloaded_positions: np.ndarray
+    """(N, 3) m, without elastic stress."""
     tets: np.ndarray
     """(T, 4) int32."""
     node_mass: np.ndarray

@@ -16,6 +16,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "positions": ("states", "nodes", 3),
     "velocities": ("states", "nodes", 3),
     "rest_positions": ("nodes", 3),
+    "unloaded_positions": ("nodes", 3),
     "tets": ("tets", 4),
     "node_mass": ("nodes",),
     "gravity": (3,),
@@ -90,8 +91,9 @@ def check_trajectory(t: Trajectory) -> None:
         raise ValueError("muscle_end_starts has an index out of range")
     if (np.diff(t.time) <= 0.0).any() or t.time[-1] - t.time[0] > MAX_DURATION:
         raise ValueError("time does not increase from step to step, or spans more than a day")
-    if not (TetMesh(t.rest_positions, t.tets).volumes() > 0.0).all():
-        raise ValueError("tets have no positive volume in rest_positions")
+    for name in ("rest_positions", "unloaded_positions"):
+        if not (TetMesh(getattr(t, name), t.tets).volumes() > 0.0).all():
+            raise ValueError(f"tets have no positive volume in {name}")
     if np.linalg.norm(t.gravity) == 0.0:
         raise ValueError("gravity is zero")
     if np.abs(t.body_axes @ t.body_axes.T - np.eye(3)).max() > 1e-6:

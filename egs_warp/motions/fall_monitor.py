@@ -80,7 +80,7 @@ class FallMonitor:
         # A body that bounces on its side has not come to its feet in between.
         if report.forces[:, 0].sum() <= 0.0:
             return
-        lies = self._lying_note(state, report) if not _tips(self.sequence.done[-1].motion) else None
+        lies = self._lying_note(state, report) if not tips_body(self.sequence.done[-1].motion) else None
         self._lying_time = 0.0 if lies is None else self._lying_time + elapsed
         if self._lying_time >= self._fallen_time:
             self._record_fall(f"{lies} at {state.time:.2f} s")
@@ -119,7 +119,7 @@ class FallMonitor:
         return None
 
 
-def _tips(motion: BodyMotion) -> bool:
+def tips_body(motion: BodyMotion) -> bool:
     """Return True if the user's key frames may tip the body."""
     return isinstance(motion, Follow) and any(
         key.part == "body" and key.quantity in (Quantity.ORIENTATION, Quantity.ANGULAR_MOMENTUM) for key in motion.keys

@@ -19,6 +19,9 @@ from egs_warp.muscles.skeleton import skeleton
 
 _MIN_AUTOMATIC_EDGES = 0.25
 """Minimum segment length of an automatic fibre, in mean edges; ends of shorter segments share their nodes."""
+_MAX_STRESS, _MAX_LEG_STRESS = 2.0, 1.0
+"""Maximum stress of all longitudinal fibres of a section together, in units of E, and that of a body on three legs or
+more. Slender legs collapse with more, and saturate in the thrust and on landing with 0.4."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +160,7 @@ def automatic_muscles(
     """Make muscles for any body: fibres of every kind along each branch of its skeleton (docs/concepts/muscles.md).
 
     The strength is reduced where the body is thin: the total force of all longitudinal fibres of a section is at most
-    twice its area times E, or 0.4 times for a body on three legs or more, whose legs would collapse.
+    ``_MAX_STRESS`` times its area times E, or ``_MAX_LEG_STRESS`` times for a body on three legs or more.
 
     Args:
         mesh: cage at rest, m.
@@ -176,7 +179,7 @@ def automatic_muscles(
         mesh,
         branches,
         max_force=strength * body_weight,
-        max_stress=(0.4 if is_legged(branches) else 2.0) * young,
+        max_stress=(_MAX_LEG_STRESS if is_legged(branches) else _MAX_STRESS) * young,
         max_segments=max_segments,
     )
     return attach_fibres(mesh, _long_enough(mesh, fibres), max_strain=max_strain)

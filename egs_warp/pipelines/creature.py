@@ -18,8 +18,9 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
-from egs_warp.locomotion.rollout import settle, solver_steps
+from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.settings import LocomotionSettings
+from egs_warp.locomotion.settling import SHAPE_TOLERANCE, settle, settle_as_captured
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
 from egs_warp.meshing.cage import Cage, cage_of_body
@@ -206,8 +207,8 @@ def make_creature(
         muscles = body_muscles(body, options.muscles_file, frame)
         stepper = LocomotionStepper(body, muscles, geometry, settings=options.settings, device=device)
         progress("stand")
-        start = settle(stepper)
-        if sag < MIN_SAG or _stands(stepper, start):
+        stepper, start, shape_error = settle_as_captured(stepper)
+        if sag < MIN_SAG or (shape_error <= SHAPE_TOLERANCE and _stands(stepper, start)):
             surfaces = (field or Solid((GROUND,)), *solids)
             placed = to_body_frame(cloud, frame)
             return Creature(frame, placed, facing, standing.limbs, cage, stepper, start, surfaces)
@@ -243,7 +244,8 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
     new_body = make_body(creature.cage.mesh, GROUND, up=up, sag=sag, device=device)
     muscles = body_muscles(new_body, muscles_file, creature.frame)
     stepper = LocomotionStepper(new_body, muscles, geometry, settings=creature.stepper.settings, device=device)
-    return replace(creature, stepper=stepper, start=settle(stepper))
+    stepper, start, _ = settle_as_captured(stepper)
+    return replace(creature, stepper=stepper, start=start)
 
 
 @dataclass(frozen=True)

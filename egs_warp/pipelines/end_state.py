@@ -7,10 +7,17 @@ from dataclasses import dataclass
 from enum import Enum
 
 from egs_warp.locomotion.trajectory import MotionOutcome
+from egs_warp.motions.fall_monitor import tips_body
+from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.sequence import MotionRecord
 
-MIN_PROGRESS = 0.1
-"""Minimum fraction of the requested distance or heading: a motion that ends with less has failed."""
+MAX_END_TILT = 30.0
+"""Degrees of tilt at the end of a motion above which the body counts as fallen."""
+MAX_SLIP = 0.1
+"""Largest slip of a foot, as a fraction of the stride."""
+_TOLERANCES = {"distance": (0.1, 0.1), "height": (0.05, 0.15), "heading_degrees": (10.0, 0.0)}
+"""Largest error of each target: body heights or degrees, and as a fraction of the target; the larger one counts."""
+_UNITS = {"distance": "body heights", "height": "body heights", "heading_degrees": "degrees"}
 
 
 class State(Enum):
@@ -18,9 +25,11 @@ class State(Enum):
 
     DONE = "done"
     CUT_OFF = "cut off"
-    """The requested number of frames, or the maximum time of the motion, was reached first."""
+    """The requested number of frames was reached first."""
     GOT_UP = "got up"
     """The body fell, which ended it, and has got up."""
+    MISSED = "missed"
+    """It ended upright, but did not reach its target or not in time, or its feet slid."""
     FALLEN = "fallen"
     STOPPED = "stopped"
     """A step could not be solved."""
@@ -28,7 +37,7 @@ class State(Enum):
     @property
     def is_failure(self) -> bool:
         """True if the exit status reports it."""
-        return self in (State.FALLEN, State.STOPPED)
+        return self in (State.MISSED, State.FALLEN, State.STOPPED)
 
     @classmethod
     def worst(cls, states: tuple[State, ...]) -> State:
@@ -38,19 +47,26 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class EndCause:
-    """Cause that ended the last motion early, if any."""
+    """Cause that ended the last motion early, if any, and what the motions are judged by."""
 
     fallen: str | None = None
     """Description of a fall; None if the body has not fallen."""
     stopped: bool = False
     """True if a step could not be solved."""
+    has_time_limit: bool = False
+    """True if no number of frames was requested, so that a motion has to come to rest in time."""
+    base: SupportKind | None = None
+    """Support of the body; None if tilt and slip are not judged."""
 
-    def of(self, entry: MotionRecord, reached: MotionOutcome, *, last: bool) -> tuple[State, list[str]]:
+    def of(
+        self, entry: MotionRecord, reached: MotionOutcome, also_reached: object = None, *, last: bool
+    ) -> tuple[State, list[str]]:
         """Return the state of a motion and notes for the user.
 
         Args:
             entry: Record of a motion that has started.
             reached: Its measured outcome.
+            also_reached: Measured values that only this kind of motion has.
             last: True for the last motion of the run.
         """
         if last and self.stopped:
@@ -60,21 +76,34 @@ class EndCause:
             return state, [f"fallen: {entry.fall_note}; it {outcome}"]
         if last and self.fallen is not None:
             return State.FALLEN, [f"fallen: {self.fallen}"]
+        has_upright = self.base not in (None, SupportKind.ROUND_BASE) and not tips_body(entry.motion)
+        if has_upright and reached.tilt_degrees > MAX_END_TILT:
+            return State.FALLEN, [f"fallen: at the end it is tilted by {reached.tilt_degrees:.0f} degrees"]
+        missed = missed_targets(entry.asked, reached) if entry.motion.is_at_rest else []
         if not entry.motion.is_at_rest:
-            return State.CUT_OFF, []
-        failure = no_progress(entry.asked, reached)
-        return (State.FALLEN, [f"fallen: {failure}"]) if failure is not None else (State.DONE, [])
+            if not self.has_time_limit:
+                return State.CUT_OFF, []
+            missed = ["not at rest within the time limit of the motion"]
+        slip = getattr(also_reached, "slip", 0.0)
+        if self.base is SupportKind.FEET and slip > MAX_SLIP:
+            missed.append(f"feet slide by {100.0 * slip:.0f} % of a stride")
+        return (State.MISSED, [f"missed: {', '.join(missed)}"]) if missed else (State.DONE, [])
 
 
-def no_progress(requested: Mapping[str, float], reached: MotionOutcome) -> str | None:
-    """Return a description of a target that was not approached, None if there is none.
+def missed_targets(requested: Mapping[str, float], reached: MotionOutcome) -> list[str]:
+    """Return a description of each target that was missed.
 
     Args:
         requested: Targets by name, body heights and degrees.
         reached: Measured outcome.
     """
-    for name, unit in (("distance", "body heights"), ("heading_degrees", "degrees")):
-        target, value = requested.get(name, 0.0), getattr(reached, name)
-        if abs(target) > 0.0 and abs(value) < MIN_PROGRESS * abs(target):
-            return f"no progress, {name.partition('_')[0]} {value:.2g} of {target:g} {unit}"
-    return None
+    missed = []
+    for name, (absolute, relative) in _TOLERANCES.items():
+        if name not in requested:
+            continue
+        target, value = requested[name], getattr(reached, name)
+        # A jump may rise higher than requested, onto a step.
+        error = target - value if name == "height" else abs(target - value)
+        if error > max(absolute, relative * abs(target)):
+            missed.append(f"{name.partition('_')[0]} {value:.2g} of {target:g} {_UNITS[name]}")
+    return missed

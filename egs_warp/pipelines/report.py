@@ -342,8 +342,8 @@ def _motion_reports(trajectory: Trajectory, done: Sequence[MotionRecord], ending
     reports = []
     for entry, (first, last) in zip(done, spans_of(done, trajectory.time), strict=True):
         reached = measure(trajectory, first=first, last=last)
-        state, why = ending.of(entry, reached, last=entry is done[-1])
         also = entry.motion.outcome_record(trajectory, first, last)
+        state, why = ending.of(entry, reached, also, last=entry is done[-1])
         notes = (*entry.motion.notes(), *why)
         reports.append(MotionReport(entry.name, entry.asked, entry.motion.plan_record(), reached, state, also, notes))
     return tuple(reports)

@@ -59,11 +59,14 @@ class SimulatedRun:
     """Description of the fall that ended the run; None if there was none."""
     pushes: tuple[Push, ...] = ()
     """Pushes that were requested."""
+    has_frame_count: bool = False
+    """True if the number of frames was requested."""
 
     @property
     def ending(self) -> EndCause:
         """Cause that ended the last motion early, if any."""
-        return EndCause(self.fallen, self.simulation.stopped)
+        base = self.place.base()
+        return EndCause(self.fallen, self.simulation.stopped, has_time_limit=not self.has_frame_count, base=base)
 
     def unfinished_note(self) -> list[str]:
         """Return notes for the user about motions and pushes that the end of the run prevented."""
@@ -234,7 +237,8 @@ def simulate(
     trajectory = simulation.trajectory
     trajectory = trajectory.with_plan(planned_com(sequence, creature.body, trajectory))
     simulation = replace(simulation, trajectory=trajectory)
-    return SimulatedRun(creature, place, sequence, simulation, watch.fallen, tuple(pushes))
+    has_frame_count = frames is not None or activations is not None
+    return SimulatedRun(creature, place, sequence, simulation, watch.fallen, tuple(pushes), has_frame_count)
 
 
 def checked_activations(creature: Creature, activations: np.ndarray, step: float | None) -> np.ndarray:

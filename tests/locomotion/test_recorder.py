@@ -13,7 +13,7 @@ from egs_warp.fem.body import BodyState
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.recorder import Recorder
-from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.locomotion.trajectory import SCHEMA, Trajectory
 from tests.support.slides import slide
 
 
@@ -57,7 +57,7 @@ def test_a_part_that_is_missing_or_of_another_schema_is_told(tmp_path: Path, mon
     with pytest.raises(FileNotFoundError):
         Trajectory.load(tmp_path)
     np.savez(tmp_path / "steps-000000.npz", time=np.zeros(1))
-    with pytest.raises(ValueError, match="it is of schema 1, this version reads schema 2"):
+    with pytest.raises(ValueError, match=f"it is of schema 1, this version reads schema {SCHEMA}"):
         Trajectory.load(tmp_path)
 
 

@@ -10,7 +10,8 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import UnsolvableStepError
-from egs_warp.locomotion.rollout import REST_FRAMES, RolloutResult, roll_out, settle
+from egs_warp.locomotion.rollout import REST_FRAMES, RolloutResult, roll_out
+from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence

@@ -17,13 +17,14 @@ from egs_warp.io import write_ply
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.trajectory import MotionOutcome
 from egs_warp.motions.fall_monitor import FallMonitor
+from egs_warp.motions.feet import SupportKind
 from egs_warp.pipelines.end_state import EndCause, State
 from egs_warp.pipelines.finished_run import FinishedRun
 from tests.support.coarse import NODES, coarse_maker
 
 
-def reached(distance: float = 0.0, turn: float = 0.0) -> MotionOutcome:
-    return MotionOutcome(distance, 0.1, turn, 0.0, 0.0)
+def reached(distance: float = 0.0, turn: float = 0.0, *, height: float = 0.1, tilt: float = 0.0) -> MotionOutcome:
+    return MotionOutcome(distance, height, turn, tilt, 0.0)
 
 
 def entry(*, resting: bool = True, fell: str | None = None, got_up: bool = False, **asked: float) -> Any:
@@ -31,20 +32,43 @@ def entry(*, resting: bool = True, fell: str | None = None, got_up: bool = False
     return cast(Any, SimpleNamespace(asked=asked, motion=motion, fall_note=fell, got_up=got_up))
 
 
+ON_FEET = EndCause(has_time_limit=True, base=SupportKind.FEET)
+
+
 @pytest.mark.parametrize(
     ("ending", "of", "result", "last", "state", "why"),
     [
-        (EndCause(), entry(distance=0.5), reached(0.4), True, State.DONE, []),
+        (EndCause(), entry(distance=0.5), reached(0.41), True, State.DONE, []),
         (EndCause(), entry(distance=0.5, resting=False), reached(), True, State.CUT_OFF, []),
         (
-            *(EndCause(), entry(distance=0.5), reached(0.049), False, State.FALLEN),
-            ["fallen: no progress, distance 0.049 of 0.5 body heights"],
+            *(ON_FEET, entry(distance=0.5, resting=False), reached(), True, State.MISSED),
+            ["missed: not at rest within the time limit of the motion"],
         ),
         (
-            *(EndCause(), entry(heading_degrees=-90.0, distance=0.0), reached(0.0, 8.0), True, State.FALLEN),
-            ["fallen: no progress, heading 8 of -90 degrees"],
+            *(EndCause(), entry(distance=0.5), reached(0.39), False, State.MISSED),
+            ["missed: distance 0.39 of 0.5 body heights"],
         ),
-        (EndCause(), entry(heading_degrees=-90.0, distance=0.0), reached(0.0, -9.1), True, State.DONE, []),
+        (EndCause(), entry(distance=5.0), reached(4.6), False, State.DONE, []),
+        (
+            *(EndCause(), entry(heading_degrees=-90.0, distance=0.0), reached(0.0, 8.0), True, State.MISSED),
+            ["missed: heading 8 of -90 degrees"],
+        ),
+        (EndCause(), entry(heading_degrees=-90.0, distance=0.0), reached(0.0, -80.1), True, State.DONE, []),
+        (
+            *(EndCause(), entry(distance=0.5, height=0.2), reached(0.2, height=0.14), True, State.MISSED),
+            ["missed: distance 0.2 of 0.5 body heights, height 0.14 of 0.2 body heights"],
+        ),
+        (EndCause(), entry(height=0.2), reached(height=0.5), True, State.DONE, []),
+        (
+            *(ON_FEET, entry(), reached(tilt=31.0), True, State.FALLEN),
+            ["fallen: at the end it is tilted by 31 degrees"],
+        ),
+        (
+            *(ON_FEET, entry(resting=False), reached(tilt=61.0), False, State.FALLEN),
+            ["fallen: at the end it is tilted by 61 degrees"],
+        ),
+        (ON_FEET, entry(), reached(tilt=29.0), True, State.DONE, []),
+        (EndCause(base=SupportKind.ROUND_BASE), entry(), reached(tilt=90.0), True, State.DONE, []),
         (
             *(EndCause(), entry(resting=False, fell="tilted", got_up=True), reached(), False, State.GOT_UP),
             ["fallen: tilted; it got up again"],
@@ -67,11 +91,18 @@ def test_each_motion_has_a_state(
     assert ending.of(of, result, last=last) == (state, why)
 
 
+@pytest.mark.parametrize(("base", "state"), [(SupportKind.FEET, State.MISSED), (SupportKind.SINGLE_BASE, State.DONE)])
+def test_feet_that_slide_are_reported(base: SupportKind, state: State) -> None:
+    result, why = EndCause(base=base).of(entry(), reached(), SimpleNamespace(slip=0.35), last=True)
+    assert result is state
+    assert why == (["missed: feet slide by 35 % of a stride"] if state is State.MISSED else [])
+
+
 def test_a_run_ends_in_the_worst_state_of_its_motions() -> None:
     assert State.worst(()) is State.DONE
     assert State.worst((State.FALLEN, State.DONE)) is State.FALLEN
     assert State.worst((State.FALLEN, State.STOPPED, State.CUT_OFF)) is State.STOPPED
-    assert [state.is_failure for state in State] == [False, False, False, True, True]
+    assert [state for state in State if not state.is_failure] == [State.DONE, State.CUT_OFF, State.GOT_UP]
 
 
 @pytest.mark.parametrize("after", [*(pytest.param(step, marks=pytest.mark.slow) for step in (0, 3)), "fall"])

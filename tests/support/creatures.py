@@ -13,7 +13,7 @@ from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, make_body
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.locomotion.rollout import settle
+from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import GroundFrame

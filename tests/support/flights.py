@@ -31,6 +31,7 @@ def rigid_flight() -> Trajectory:
         positions=rest_com + com[:, None] + arms,
         velocities=velocity[:, None] + np.zeros_like(arms),
         rest_positions=mesh.nodes,
+        unloaded_positions=mesh.nodes,
         tets=mesh.tets,
         node_mass=mass,
         gravity=GRAVITY,
