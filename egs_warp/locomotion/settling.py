@@ -60,7 +60,9 @@ def has_settled(body: SoftBody, max_displacement: Any, centre_displacement: Any)
     )
 
 
-def settle_as_captured(stepper: LocomotionStepper) -> tuple[LocomotionStepper, BodyState, float]:
+def settle_as_captured(
+    stepper: LocomotionStepper, state: BodyState
+) -> tuple[LocomotionStepper, BodyState, float]:
     """Find the unloaded shape whose rest on the ground is the captured shape, so that the body does not sag.
 
     A fixed-point iteration (Sellier, "An iterative method for the inverse elasto-static problem", Journal of Fluids and
@@ -69,12 +71,15 @@ def settle_as_captured(stepper: LocomotionStepper) -> tuple[LocomotionStepper, B
     their rest lengths in the captured shape. A rigid displacement, as of a body that rocks onto its third foot, is not
     an error of the shape, but the iteration goes on as long as it shrinks.
 
+    Args:
+        stepper: stepper of the body, which takes its unloaded shape to be the captured one.
+        state: its state at rest (``settle``).
+
     Returns:
         A stepper of the body with its unloaded shape, its state at rest, and the largest displacement of a node from
         the captured shape after the best-fit rigid motion, in body heights. The displacement exceeds
         ``SHAPE_TOLERANCE`` if the iteration did not converge.
     """
-    state = settle(stepper)
     correction, error, displacement = _displacements(stepper.body, state)
     best = (stepper, state, error)
     best_displacement = displacement

@@ -41,6 +41,9 @@ FORWARD_TIME_FRACTION = 0.7
 """Fraction of the time of a thrust in which the forward speed is reached."""
 MAX_FOOTHOLD_OFFSET = 0.4
 """Fraction of the footprint by which the foothold may differ from the capture point for the sake of the target."""
+NARROW_SUPPORT, WIDE_SUPPORT = np.tan(np.radians([8.0, 17.0]))
+"""Distance of the edge of the footprint, relative to the height of the centre of mass: the foothold may not differ from
+the capture point below the first, and by ``MAX_FOOTHOLD_OFFSET`` from the second on."""
 STEP_CLEARANCE = 0.15
 """Clearance of the feet above a step, as a fraction of its height, before they swing forward."""
 APPROACH_RATE = 2.5
@@ -432,9 +435,14 @@ class Jump:
         falling = max(left * self.gravity - measurement.velocity[2], 0.0)
         capture_time = stopping_time(self.controller.standing_height, falling, self.gravity, self._landing_time)
         capture = touch_down[:2] + measurement.velocity[:2] * capture_time + self.controller.base_offset
-        low, high = self.controller.support_low, self.controller.support_high
-        # The capture point stays within this fraction of the feet, wherever they land.
-        return np.clip(self._start_base, capture - MAX_FOOTHOLD_OFFSET * high, capture - MAX_FOOTHOLD_OFFSET * low)
+        # The capture point stays within this part of the feet, wherever they land.
+        low, high = (self._max_foothold_offset(edge) for edge in (self.controller.support_low, self.controller.support_high))
+        return np.clip(self._start_base, capture - high, capture - low)
+
+    def _max_foothold_offset(self, edge: np.ndarray) -> np.ndarray:
+        """Return the largest offset (2,) in metres of the capture point towards an ``edge`` (2,) of the footprint."""
+        width = np.abs(edge) / self.controller.standing_height
+        return MAX_FOOTHOLD_OFFSET * np.clip((width - NARROW_SUPPORT) / (WIDE_SUPPORT - NARROW_SUPPORT), 0.0, 1.0) * edge
 
     def _body_objectives(
         self,

@@ -207,8 +207,12 @@ def make_creature(
         muscles = body_muscles(body, options.muscles_file, frame)
         stepper = LocomotionStepper(body, muscles, geometry, settings=options.settings, device=device)
         progress("stand")
-        stepper, start, shape_error = settle_as_captured(stepper)
-        if sag < MIN_SAG or (shape_error <= SHAPE_TOLERANCE and _stands(stepper, start)):
+        start = settle(stepper)
+        is_stiff_enough = _stands(stepper, start)
+        if is_stiff_enough or sag < MIN_SAG:
+            stepper, start, shape_error = settle_as_captured(stepper, start)
+            is_stiff_enough = shape_error <= SHAPE_TOLERANCE
+        if is_stiff_enough or sag < MIN_SAG:
             surfaces = (field or Solid((GROUND,)), *solids)
             placed = to_body_frame(cloud, frame)
             return Creature(frame, placed, facing, standing.limbs, cage, stepper, start, surfaces)
@@ -244,7 +248,7 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
     new_body = make_body(creature.cage.mesh, GROUND, up=up, sag=sag, device=device)
     muscles = body_muscles(new_body, muscles_file, creature.frame)
     stepper = LocomotionStepper(new_body, muscles, geometry, settings=creature.stepper.settings, device=device)
-    stepper, start, _ = settle_as_captured(stepper)
+    stepper, start, _ = settle_as_captured(stepper, settle(stepper))
     return replace(creature, stepper=stepper, start=start)
 
 
