@@ -56,7 +56,7 @@ def main() -> int:
     tally = Tally(names, chosen.counts)
     deadline = time.monotonic() + 60.0 * chosen.minutes
     share = 60.0 * chosen.minutes * chosen.processes / len(names)
-    # With a given number of inputs, they are divided into pieces that the processes share.
+    # A given number of inputs is divided into chunks for the processes.
     rounds = 1 if chosen.inputs == 0 else math.ceil(chosen.inputs / _PIECE)
     with ThreadPoolExecutor(chosen.processes) as pool:
         for _ in range(rounds):
@@ -79,7 +79,7 @@ class Tally:
             self.counts |= json.loads(path.read_text())
 
     def seed(self, name: str) -> int:
-        """Return the seed of the next piece, a different one each time, in later runs too."""
+        """Return the seed of the next chunk, a different one each time, also in later runs."""
         with self._lock:
             self._started[name] += 1
             return _SEED + self.counts[name]["inputs"] + 1_000_003 * self._started[name]

@@ -146,7 +146,7 @@ def test_flat_object_leaves_an_earlier_result_alone(tmp_path: Path, capsys: pyte
 
 
 def test_own_muscles_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The picture shows what the file says; a fibre outside of the body is refused by name."""
+    """The plot shows the fibres of the file; a fibre outside the body is refused by name."""
     thing = pawn()
     write_ply(tmp_path / "pawn.ply", thing.cloud)
     flags = ["muscles", str(tmp_path / "pawn.ply"), "--plot", str(tmp_path / "muscles.png")]
@@ -215,7 +215,7 @@ def test_axes_and_planes_are_read() -> None:
 
 @pytest.mark.parametrize(("given", "taken"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "4"}, "4")])
 def test_small_matrices_take_one_thread_unless_told(given: dict[str, str], taken: str) -> None:
-    """The variable stands before NumPy, which reads it, is loaded."""
+    """The variable is set before NumPy, which reads it, is loaded."""
     script = """
 import atexit, os, sys
 import egs_warp.cli

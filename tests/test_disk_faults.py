@@ -1,4 +1,4 @@
-"""Every file that a command writes cannot be written once: the disk is full, or the place is another's."""
+"""Every file that a command writes fails once: the disk is full, or access is denied."""
 
 from __future__ import annotations
 
@@ -123,14 +123,14 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
     capsys: pytest.CaptureFixture[str],
     request: pytest.FixtureRequest,
 ) -> None:
-    """The write itself fails, at its first byte or in its midst: status 1; files that are there are whole."""
+    """The write fails at its first byte or later: the status is 1, and existing files are complete."""
     for made in {"scene", "photos"} & set(re.findall(r"{(\w+)}", line)):
         request.getfixturevalue(made)
     with largest_file(size):
         status = command(line, tmp_path / "out") if line.endswith("{out}") else command(line, tmp_path)
     assert status == 1
     assert_one_line(capsys.readouterr().err, "File too large")
-    # Of a run that was cut off, what it began with, and what is small enough to be whole.
+    # An interrupted run leaves its initial files, which are small enough to be complete.
     assert {path.name for path in files(tmp_path)} <= {"manifest.json", "run.yaml", "plane.json"}
     assert all(read_planes(path) for path in files(tmp_path) if path.name == "plane.json")
 
@@ -160,8 +160,8 @@ def test_each_opening_and_renaming_fails_once(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One after the other, until none is left: one line, no temporary file, and a last run without a fault writes
-    everything. (Of ``animate``: ``tests/pipelines/test_animate.py``.)
+    """Each opening and renaming fails in turn: a one-line error, no temporary file. A last run without a fault writes
+    everything. (``tests/pipelines/test_animate.py`` tests ``animate``.)
     """
     out = tmp_path / "out"
     for number in range(200):
@@ -182,8 +182,8 @@ def test_each_opening_and_renaming_fails_once(
 def test_a_clock_that_jumps_changes_nothing(
     command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By a day forward or back at each look at it, with a file of a killed process beside that seems to come from
-    tomorrow: the run is finished, nothing of it is swept, what was left is.
+    """At each reading the clock jumps by a day forward or back, beside a file of a killed process with a date in the
+    future: the run finishes, none of its files is removed, and the remnant is.
     """
     left = tmp_path / ".egs-0123456789abcdef.ply"
     left.write_text("half")

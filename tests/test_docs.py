@@ -1,4 +1,4 @@
-"""Pages that code and texts cite exist, and every picture of the docs stands by the command that makes it."""
+"""Cited pages exist, and every picture of the docs is listed with the command that makes it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_cited_pages_exist() -> None:
 
 
 def test_no_page_that_is_not_in_the_tree_is_cited() -> None:
-    """No text refers to the DESIGN of the first days, whose content is in docs/concepts."""
+    """No text refers to the first design document, whose content is in docs/concepts."""
     elsewhere = re.compile(r"\bDESIGN\b(?! of the first days)")
     assert not [str(path) for path in TEXTS if elsewhere.search(path.read_text())]
 

@@ -1,8 +1,8 @@
-"""``docs/equations.md`` is complete and true: names exist, no equation of a docstring is missing, and a cited test is
-one.
+"""``docs/equations.md`` is complete and true: names exist, no equation of a docstring is missing, and cited tests test
+their equation.
 
-A test that only mentions its equation is none: it must call the code of that row, and for each equation one of the
-row's tests is shown to fail when the code of the row is wrong (``tests/test_formula_mutations.py``).
+A test must not only mention its equation: it must call the code of that row, and for each equation one of the row's
+tests is shown to fail when the code of the row is wrong (``tests/test_formula_mutations.py``).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MENTION = re.compile(rf"Eq\.\s*(\(\d+\)(?:{JOIN}\(\d+\))*|\(?\d+(?:{JOIN}\d+)*)"
 
 
 def table(text: str) -> dict[int, str]:
-    """Equation -> its row."""
+    """Return the row of each equation."""
     rows = [line for line in text.splitlines() if re.match(r"\| \d+ \|", line)]
     numbers = [int(line.split("|")[1]) for line in rows]
     assert len(set(numbers)) == len(numbers), "an equation has two rows"
@@ -30,7 +30,7 @@ def table(text: str) -> dict[int, str]:
 
 
 def mentioned(text: str | None) -> set[int]:
-    """Numbers of "Eq. (9), (13)", "Eq. (14) to (16)", "Eq. 4, 6" and "Eq. 8-10"."""
+    """Return the numbers in "Eq. (9), (13)", "Eq. (14) to (16)", "Eq. 4, 6" and "Eq. 8-10"."""
     numbers: set[int] = set()
     for found in MENTION.findall(text or ""):
         for part in re.split(r",|\band\b", found):
@@ -40,7 +40,7 @@ def mentioned(text: str | None) -> set[int]:
 
 
 def definitions(path: Path) -> dict[str, str]:
-    """Qualified name -> docstring of every function and class of a file; the module's own under ""."""
+    """Return the docstring of every function and class of a file by qualified name, and the module's under ""."""
     tree = ast.parse(path.read_text())
     found = {"": ast.get_docstring(tree) or ""}
 
@@ -66,7 +66,7 @@ class Reached:
 
 @cache
 def contents(path: Path) -> tuple[dict[str, ast.stmt], dict[str, tuple[Path, str]]]:
-    """The definitions of a file by name, and where its imports come from: (file, name)."""
+    """Return the definitions of a file by name, and the origin (file, name) of its imports."""
     defined: dict[str, ast.stmt] = {}
     imported: dict[str, tuple[Path, str]] = {}
     tree = ast.parse(path.read_text())
@@ -85,7 +85,8 @@ def contents(path: Path) -> tuple[dict[str, ast.stmt], dict[str, tuple[Path, str
 
 
 def names_reached(path: Path, name: str) -> Reached:
-    """Follows calls, fixtures, imports and re-exports by name, within the package and its tests."""
+    """Return the definitions that a test reaches by calls, fixtures, imports and re-exports, within the package and its
+    tests."""
     reached, open_ends = Reached(), [(path, name)]
     while open_ends:
         path, name = open_ends.pop()
@@ -178,7 +179,7 @@ def test_the_reader_of_calls_sees_through_helpers_and_knows_a_mention_from_a_cal
 def test_every_equation_has_a_test_that_a_wrong_formula_fails() -> None:
     for number, row in ROWS.items():
         mutation = EQUATIONS[number]
-        # A function that a place of the row is made of may be what is wrong.
+        # The wrong formula may be in a function that the code of the row calls.
         assert mutation.file in {file for file, _ in PLACE.findall(row)}, (
             f"Eq. ({number}): {mutation.file} is not in its row"
         )

@@ -38,7 +38,7 @@ def test_a_program_ends_with_one_line(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_only_the_commands_speak_of_flags() -> None:
-    """No text of the library, docstrings apart, holds ``--flag``."""
+    """No string of the library contains ``--flag``, except docstrings."""
     for path in sorted(PACKAGE.rglob("*.py")):
         if path.is_relative_to(PACKAGE / "commands") or path.name == "cli.py":
             continue

@@ -1,4 +1,4 @@
-"""The examples of single motions, each for a few frames: they run, and write what docs/guide/report.md says."""
+"""The examples of single motions, each for a few frames: they run, and write the files of docs/guide/report.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""However a program is stopped, it says one line, has a status of its own and leaves nothing half-written."""
+"""However a program is stopped, it prints one line, has a defined exit status and leaves no half-written file."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_each_end_is_one_line(error: BaseException, status: int, line: str, caps
 def test_a_file_that_cannot_be_written(
     number: int, status: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A full or broken disk is no bad input; a place where one may not write is."""
+    """A full or broken disk is not bad input; a place without write access is."""
     reason = os.strerror(number)
     with pytest.raises(HandledExit) as end, one_line_errors("prog"), atomic_write(tmp_path / "a.json"):
         raise OSError(number, reason)
@@ -131,9 +131,9 @@ def test_a_closed_pipe_only_silences() -> None:
 
 
 def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
-    """Status and output of a command of the shell, in which ``egs-warp`` stands for the program."""
+    """Return status, output and errors of a shell command in which ``egs-warp`` stands for the program."""
     line = command.replace("egs-warp", f"{sys.executable} -m egs_warp.cli")
-    # Unbuffered output, the default of some machines, would report each error at its write.
+    # Unbuffered output, the default of some machines, would report each error when it is written.
     environment = os.environ | {"PYTHONIOENCODING": encoding, "PYTHONUNBUFFERED": ""}
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env=environment, timeout=120)
     return done.returncode, done.stdout, done.stderr
@@ -150,7 +150,7 @@ def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
     ],
 )
 def test_output_that_goes_nowhere_changes_no_status(command: str, status: int) -> None:
-    """The exception is a command whose result is its output."""
+    """A command whose result is its output is the exception."""
     ended, _, said = told_by(command)
     assert ended == status and "Traceback" not in said and said.count("\n") <= 1
 
@@ -197,7 +197,7 @@ def test_a_machine_without_a_gpu_is_not_warned() -> None:
 
 
 def test_ctrl_c_that_a_library_makes_an_error_of_its_own_of_is_still_one() -> None:
-    """scipy's HiGHS, while it is imported: "ImportError: initialization failed"."""
+    """SciPy's HiGHS raises "ImportError: initialization failed" if it is interrupted while it is imported."""
     body = """
         try:
             os.kill(os.getpid(), signal.SIGINT)
@@ -209,7 +209,7 @@ def test_ctrl_c_that_a_library_makes_an_error_of_its_own_of_is_still_one() -> No
 
 
 def test_what_fails_after_a_ctrl_c_that_was_meant_keeps_its_line() -> None:
-    """A take that cannot be saved when the live page has been ended so."""
+    """For example, a take cannot be saved when the live page is ended by Ctrl-C."""
     body = """
         from egs_warp.errors import UserError
         try:
@@ -226,7 +226,8 @@ def test_what_fails_after_a_ctrl_c_that_was_meant_keeps_its_line() -> None:
     "after", [0.05, 0.8, 4.0, *(pytest.param(after, marks=pytest.mark.slow) for after in (0.3, 1.5, 2.5))]
 )
 def test_ctrl_c_in_any_phase_is_one_line(after: float, tmp_path: Path) -> None:
-    """Imports, preparation, simulation and film of a short run: none leaves a traceback or a half-written file."""
+    """During imports, preparation, simulation and video of a short run; it leaves neither a traceback nor a
+    half-written file."""
     code = """
         import numpy as np
         import egs_warp as egs
@@ -236,7 +237,7 @@ def test_ctrl_c_in_any_phase_is_one_line(after: float, tmp_path: Path) -> None:
     """
     out = tmp_path / "out"
     run = subprocess.Popen([*program(code), str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    # Python itself takes a moment until anything of ours runs.
+    # Python needs a moment before it executes the program.
     time.sleep(0.5 + after)
     run.send_signal(signal.SIGINT)
     said = run.communicate(timeout=60)[1]

@@ -1,5 +1,5 @@
-"""Whatever the numbers of a Gaussian, it is refused by name, or picture, gradients, motion, splits and training stay
-finite, and what is not about this Gaussian keeps every bit.
+"""For any values of a Gaussian, it is refused by name, or images, gradients, motion, splits and training stay finite
+and all other Gaussians keep their bits.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def assert_finite(values: dict[str, Any]) -> None:
 
 
 def tried(law: Any) -> Any:
-    """40 cases in ``make test``."""
+    """Run the law on 40 cases in ``make test``."""
     profile = settings(max_examples=examples(40), phases=[Phase.generate])
     return profile(given(changed=changes())(law))
 
@@ -105,7 +105,7 @@ def test_gradients_are_finite(changed: dict[str, tuple[int, float]]) -> None:
 
 @tried
 def test_a_cage_carries_it_and_all_others_as_if_it_were_not_there(changed: dict[str, tuple[int, float]]) -> None:
-    """Eq. (14) to (17): moved, bent, turned inside out, flattened; split where they bend."""
+    """Eq. (14) to (17): moved, bent, inverted and flattened cages; splits where they bend."""
     cloud, usual = cloud_of(odd(changed)), cloud_of(ordinary())
     others = np.arange(COUNT) != ODD
     carriers = [Deformer(one, embed_gaussians(one, CAGE)) for one in (cloud, usual)]

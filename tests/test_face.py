@@ -1,4 +1,4 @@
-"""``import egs_warp as egs``: small, lazy, complete, and as README and docs say."""
+"""``import egs_warp as egs``: small, lazy, complete, and as documented in README and docs."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def classes_of(annotation: object) -> list[set[str]]:
 
 
 def test_whatever_a_public_function_takes_can_be_given_by_the_face() -> None:
-    """Each parameter has an alternative that is made of public classes, or of records that a public function gives; so
-    do the constructors of classes that no function gives."""
+    """Each parameter has an alternative that consists of public classes, or of records that a public function returns;
+    so do the constructors of classes that no function returns."""
     public: dict[str, Any] = {name: getattr(egs, name) for name in egs.__all__}
     functions: dict[str, Any] = {name: given for name, given in public.items() if inspect.isfunction(given)}
     returned = [inspect.signature(one).return_annotation for one in functions.values()]
@@ -98,8 +98,8 @@ def test_the_readme_shows_the_paper_in_fifteen_lines() -> None:
 
 @pytest.mark.slow
 def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Word for word, on the pawn and the floor near it, cut off early: a video of some size comes out, and the pawn has
-    crouched."""
+    """Unchanged except for the scene, the pawn with the floor near it, and fewer frames: a video is written, and the
+    pawn crouches."""
     room = egs.scene("pawn", device="cpu").whole()[0]
     near = np.linalg.norm(room.means.numpy()[:, :2], axis=1) < 1.2
     egs.write_ply(tmp_path / "scene.ply", room.subset(near))

@@ -1,4 +1,4 @@
-"""Teeth: under each deliberately wrong formula of ``tests/support/mutations.py`` the test named beside it fails."""
+"""Under each deliberately wrong formula of ``tests/support/mutations.py``, the test named with it fails."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ by_formula = pytest.mark.parametrize("mutation", ALL, ids=lambda mutation: mutat
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The package and its tests, to be spoiled; every test that shall notice passes before."""
+    """A copy of the package and its tests to be mutated; all tests that must fail pass before."""
     folder = tmp_path_factory.mktemp("spoiled")
     shutil.copy(ROOT / "pyproject.toml", folder)
     for name in ("egs_warp", "tests"):
@@ -42,7 +42,7 @@ def test_every_equation_of_the_paper_is_spoiled_once() -> None:
 
 @by_formula
 def test_the_formula_stands_where_it_is_spoiled(mutation: Mutation) -> None:
-    """Once, or what is tried would be another formula; and the test that shall notice exists."""
+    """Otherwise another formula would be changed; the test that must fail exists."""
     found = (ROOT / mutation.file).read_text().count(mutation.right)
     assert found == 1, f"{mutation.file} has {found} times: {mutation.right}; rewrite the mutation with the formula"
     file, name = mutation.test.split("::")
@@ -52,7 +52,7 @@ def test_the_formula_stands_where_it_is_spoiled(mutation: Mutation) -> None:
 @pytest.mark.slow
 @by_formula
 def test_a_wrong_formula_is_noticed(copy: Path, mutation: Mutation) -> None:
-    """The test fails by an assertion of its own, not because the spoiled program cannot run."""
+    """The test fails by an assertion, not because the mutated program cannot run."""
     place = copy / mutation.file
     right = place.read_text()
     place.write_text(right.replace(mutation.right, mutation.wrong))

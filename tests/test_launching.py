@@ -1,4 +1,4 @@
-"""Rows shared out between threads, and launches made again with other arguments."""
+"""Partition of rows among threads, and repeated launches with other arguments."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_launch_made_again_takes_its_new_arguments(device: str) -> None:
         outputs=[wp.zeros(1, dtype=wp.vec3, device=target)],
         device=target,
     )
-    # Warp turns to another stream while it copies: two threads at once may leave it there.
+    # Warp switches to another stream while it copies: two threads at once may leave it there.
     stream = target.stream if target.is_cuda else None
     with wp.ScopedStream(stream, sync_enter=False), ThreadPoolExecutor(2) as pool:
         for done in [pool.submit(run, seed) for seed in (1, 2)]:
@@ -113,7 +113,7 @@ def test_arrays_in_one_piece_of_memory_do_not_touch_and_keep_it(device: str) -> 
         piece.fill_(number + 1)
     one = pieces[1]
     del pieces, piece
-    # What the others had is free for others only once this one is gone.
+    # The memory of the other arrays is free only when this array is released.
     others = [wp.full(64, 9.0, dtype=wp.float32, device=device) for _ in range(50)]
     assert len(others) == 50 and (one.numpy() == 2).all()
 
@@ -125,7 +125,7 @@ def test_arrays_that_nobody_holds_are_given_again(device: str) -> None:
     assert empty_pooled(device, *wanted)[0].ptr not in places
     view = first[1].numpy() if device == "cpu" else pytest.importorskip("torch").as_tensor(first[1], device="cuda")
     del first
-    # A view from outside keeps the whole, too.
+    # A view by another library keeps the memory, too.
     assert empty_pooled(device, *wanted)[0].ptr not in places
     del view
     second, third = empty_pooled(device, *wanted), empty_pooled(device, *wanted)
@@ -143,7 +143,7 @@ def test_sizes_with_room_are_few_and_not_much_larger() -> None:
 def test_the_environment_may_ask_for_fewer_threads(
     told: str, most: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Never for more than there are, and none is one."""
+    """At most the available number, and at least one."""
     monkeypatch.delenv(THREADS, raising=False)
     there = available_threads()
     monkeypatch.setenv(THREADS, told)
@@ -154,7 +154,8 @@ def test_the_environment_may_ask_for_fewer_threads(
     ("cores", "told", "used"), [(4, "", 3), (2, "", 1), (1, "", 1), (4, "4", 4), (4, "2", 2), (4, "9", 4)]
 )
 def test_a_core_is_left_to_others(cores: int, told: str, used: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """For a while, where there is more than one and the environment says nothing; nested blocks leave more."""
+    """One core is reserved within the block, if there are several and the environment sets no number; nested blocks
+    reserve more."""
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(cores)), raising=False)
     monkeypatch.setenv(THREADS, told)
     before = available_threads()
@@ -176,7 +177,7 @@ def test_beside_on_one_thread_is_one_after_the_other(told: str, monkeypatch: pyt
 
 
 def test_what_goes_on_beside_an_error_has_ended_when_that_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The data of both tasks can be reused at once."""
+    """When the error is raised, the data of both tasks can be reused."""
     monkeypatch.setenv(THREADS, "2")
     begun, ended = threading.Event(), threading.Event()
 
@@ -195,7 +196,7 @@ def test_what_goes_on_beside_an_error_has_ended_when_that_is_told(monkeypatch: p
 
 
 def test_each_thread_keeps_its_own() -> None:
-    """The last few, by their arguments; another thread has others."""
+    """The cache keeps the most recent results by their arguments; another thread has its own."""
     make = thread_local_cache(2)(lambda *given: [*given])
     first = make(1, 2)
     assert first == [1, 2] and make(1, 2) is first and make(2, 1) is not first

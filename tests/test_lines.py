@@ -1,4 +1,4 @@
-"""The sources of the page keep the house's lines."""
+"""Line lengths of the web page's sources."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ SOURCES = Path(egs_warp.web.__file__).parent / "client" / "src"
 
 
 def test_no_line_of_the_page_is_longer_than_120() -> None:
-    """As ruff holds it for Python."""
+    """The same limit as ruff's for Python."""
     files = sorted(SOURCES.iterdir())
     assert len(files) > 20
     long = [

@@ -1,6 +1,4 @@
-"""Laws that hold whatever the body, its pose and its motion: Hypothesis draws them, few in the quick form, hundreds in
-the long one.
-"""
+"""Laws for any body, pose and motion: Hypothesis generates a few cases in the quick form, hundreds in the long one."""
 
 from __future__ import annotations
 
@@ -34,10 +32,10 @@ frictions = st.sampled_from([0.0, 0.3, 0.8, 1.5])
 
 
 def drawn(count: int, **given_: st.SearchStrategy[Any]) -> Callable[[Callable[..., None]], Callable[[], None]]:
-    """A law that is tried on ``count`` cases."""
+    """Return a decorator that tests a law on ``count`` cases."""
     profile = settings(
         max_examples=examples(count),
-        # Making a case smaller takes minutes; it is printed as it was drawn.
+        # Shrinking takes minutes; a failing case is printed as generated.
         phases=[Phase.generate],
         suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
     )
@@ -45,7 +43,7 @@ def drawn(count: int, **given_: st.SearchStrategy[Any]) -> Callable[[Callable[..
 
 
 def some_tension(shape: Shape, share: float) -> MuscleEnergy:
-    """Random pulls, and pushes a third as strong, of muscles that fit the body."""
+    """Return random tensions, and compressions of at most a third, of muscles that fit the body."""
     body = shape.body()
     muscles = automatic_muscles(body.mesh, FLOOR.normal, body_weight=body.weight, height=body.height)
     pulls = np.random.default_rng(shape.seed).uniform(-share / 3.0, share, muscles.segment_count)
@@ -54,7 +52,7 @@ def some_tension(shape: Shape, share: float) -> MuscleEnergy:
 
 @at_length
 def test_both_momenta_of_free_flight(count: int) -> None:
-    """Eq. (4), closed form: p grows by m g dt a step and L stays, to rounding, whatever muscles pull."""
+    """Eq. (4), closed form: in each step p grows by m g dt and L is constant, to rounding, for any muscle forces."""
 
     @drawn(count, shape=shapes(), throw=throws(), share=st.sampled_from([0.0, 0.1, 0.5]))
     def law(shape: Shape, throw: Throw, share: float) -> None:
@@ -76,17 +74,16 @@ def test_both_momenta_of_free_flight(count: int) -> None:
 
 
 def spin_work(problem: StepProblem, result: CoupledResult) -> float:
-    """Joules of the turn w x r that a step without muscles takes off its forces: w times the momentum, with the arms of
-    the start, of the velocities at its end."""
+    """Return the work, J, of the momentum correction w x r in a step without muscles: w times the angular momentum of
+    the end velocities with the lever arms of the start."""
     given = problem.momentum_correction(problem.internal_gradient(result.velocities, None))
     momenta = problem.mass * np.cross(problem.lever_arms, result.velocities)
     return float(given @ momenta.sum(axis=0))
 
 
 def test_a_spin_that_nothing_bears_yet_gives_energy_once() -> None:
-    """Set spinning as fast as bodies are thrown here, but not stretched, a soft block stretches in its first step, and
-    more energy than that takes may come of the spin that is given back: less than its work, and within three steps it
-    is gone."""
+    """A soft block that spins as fast as in these tests, but is not stretched yet, stretches in its first step. The
+    spin that is restored may add more energy than that takes: less than its work, and within three steps it is gone."""
     shape = Shape((3, 2, 4), (0.294, 0.392, 0.333), 1.16, sag=0.05, poisson_ratio=0.137, damping_ratio=0.05, seed=3657)
     throw = Throw((2.72, 0.0, 0.5), (0.0, 0.0186, 0.0), (0.0, 0.0, 0.0), (1.5, 0.0, -1.42), noise=0.0, seed=0)
     body = shape.body()
@@ -103,9 +100,9 @@ def test_a_spin_that_nothing_bears_yet_gives_energy_once() -> None:
 
 @at_length
 def test_contact_gives_no_energy_and_both_momenta_are_its_impulse(count: int) -> None:
-    """Eq. (4), (8), (9): of a body thrown at the floor without muscles the mechanical energy falls in every step, but
-    for the work of the spin that the step gives back, no force of contact does work, and momenta change by the impulses
-    and arms of weight and contact alone.
+    """Eq. (4), (8), (9): for a body thrown at the floor without muscles, the mechanical energy decreases in every step
+    except for the work of the restored spin, contact forces do no positive work, and momenta change only by the
+    impulses and torques of weight and contact.
     """
 
     @drawn(count, shape=shapes(), throw=throws(), friction=frictions)
@@ -136,8 +133,8 @@ def test_contact_gives_no_energy_and_both_momenta_are_its_impulse(count: int) ->
 
 @at_length
 def test_a_mirror_a_turn_and_another_place_change_nothing(count: int) -> None:
-    """Eq. (4), (8), (9): the mirrored body, thrown as in the mirror, moves as in the mirror; so does the body that is
-    turned about the vertical and begins elsewhere.
+    """Eq. (4), (8), (9): the mirrored body with a mirrored throw has the mirrored motion; a body that is rotated about
+    the vertical and translated has the same motion.
     """
     sideways = np.array([3.0, -2.0, 0.0])
 
@@ -163,8 +160,8 @@ def test_a_mirror_a_turn_and_another_place_change_nothing(count: int) -> None:
 
 @at_length
 def test_more_friction_never_slips_more(count: int) -> None:
-    """Eq. (9): of a flat block that is pushed, uphill, downhill or across a slope, the more friction the shorter the
-    way; on level ground as 1 / mu.
+    """Eq. (9): a flat block that is pushed uphill, downhill or across a slope slides less far with more friction; on
+    level ground the distance is proportional to 1 / mu.
     """
 
     @drawn(
@@ -189,14 +186,14 @@ def test_more_friction_never_slips_more(count: int) -> None:
 
 
 def stopping_way(speed: float, friction: float) -> float:
-    """Body heights that a point goes at first ``speed`` sqrt(g H), in 30 steps of implicit Euler, which count each
-    step's lower speed: v^2 / (2 mu g) less about half a step's way."""
+    """Return the sliding distance in body heights of a point with initial ``speed`` sqrt(g H), in 30 steps of implicit
+    Euler, which uses the lower speed of each step: v^2 / (2 mu g), minus half a step's displacement."""
     step = 0.1
     return sum(step * max(speed - k * step * friction, 0.0) for k in range(1, 31))
 
 
 def slipped(body: SoftBody, push: np.ndarray, friction: float) -> float:
-    """Metres that the centre of mass goes along the ground in 30 steps."""
+    """Return the path length of the centre of mass along the ground in 30 steps, m."""
     nodes = body.mesh.nodes
     pushed = standing(body, friction, BodyState(nodes, np.tile(push, (len(nodes), 1))))
     way, before = 0.0, body.centre_of_mass(nodes)
@@ -210,8 +207,8 @@ def slipped(body: SoftBody, push: np.ndarray, friction: float) -> float:
 
 @at_length
 def test_steps_converge_at_order_one(count: int) -> None:
-    """Eq. (4), Eq. (6): a free body's motion over a tenth of its longest oscillation in n, 2 n and 4 n steps: the
-    second difference is half of the first.
+    """Eq. (4), Eq. (6): the motion of a free body over a fraction of its longest oscillation, in n, 2 n and 4 n steps:
+    the second difference is half of the first.
     """
 
     @drawn(count // 2 if count > QUICK else 3, shape=shapes(), throw=throws())
@@ -242,7 +239,7 @@ def test_steps_converge_at_order_one(count: int) -> None:
     ],
 )
 def test_no_element_is_inverted_in_2000_frames_of_random_activations(mesh: TetMesh, strength: float) -> None:
-    """Every frame all muscles get another length within their bounds, ten times as strong as they are, too."""
+    """In every frame all muscles get random lengths within their bounds, or within ten times their bounds."""
     made = coarse_creature(mesh, forward=np.array([1.0, 0.0, 0.0]), strength=strength)
     stepper, state, memory = made.stepper, made.start, made.stepper.initial_memory()
     random, bounds, least = np.random.default_rng(7), made.stepper.muscles.bounds, np.inf
@@ -258,8 +255,8 @@ def test_no_element_is_inverted_in_2000_frames_of_random_activations(mesh: TetMe
 @pytest.mark.cuda
 @at_length
 def test_cpu_and_cuda_move_a_body_alike(count: int) -> None:
-    """Eq. (4), (8), (9): a thrown body's 15 steps, elements and gaps on either device, to 1e-9 H, whatever its muscles
-    pull.
+    """Eq. (4), (8), (9): 15 steps of a thrown body with elements and gaps on either device agree to 1e-9 H, for any
+    muscle forces.
     """
 
     @drawn(count, shape=shapes(), throw=throws(), friction=frictions, share=st.sampled_from([0.0, 0.1, 0.5]))

@@ -29,7 +29,7 @@ def wheel(tmp_path: Path) -> Path:
 
 
 def reports() -> list[dict[str, Any]]:
-    """As pip writes them: here, and on another platform, where one package has another file."""
+    """Reports in pip's format: for this platform, and for one on which a package has another file."""
     own = {"metadata": {"name": "egs_warp", "version": "0.1.0", "requires_dist": ["NumPy>=1.26", "scipy>=1.12"]}}
     scipy = entry("scipy", "1.17.1", "b" * 64, ["numpy<3", 'pytest; extra == "test"'], license="BSD\n" * 40)
     here = [own, scipy, entry("numpy", "2.4.6", "a" * 64, [], license_expression="BSD-3-Clause")]
@@ -53,7 +53,7 @@ def test_the_bill_names_every_part_and_who_needs_it(wheel: Path) -> None:
     assert parts["pkg:pypi/numpy@2.4.6"]["licenses"] == [{"license": {"name": "BSD-3-Clause"}}]
     assert "licenses" not in parts["pkg:pypi/scipy@1.17.1"]
     page = {part["name"]: part for part in parts.values() if part["purl"].startswith("pkg:npm/")}
-    # As THIRD_PARTY.md has them.
+    # The libraries that THIRD_PARTY.md lists.
     assert set(page) == {"three", "@sparkjsdev/spark", "fflate"}
     for name, part in page.items():
         assert f"{part['version']}" in (ROOT / "THIRD_PARTY.md").read_text(), name

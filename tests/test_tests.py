@@ -1,4 +1,4 @@
-"""The tests' own house: they mirror the rooms of the package, and share through ``tests/support`` alone."""
+"""Structure of the tests: they mirror the packages, and share code only through ``tests/support``."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ ACROSS = {
     "web/test_live_page.py",
     "web/test_steered.py",
 }
-"""Tests of a whole room, or of a way through several: no single module is theirs."""
+"""Tests of a whole package, or of several modules."""
 
 
 def imports(path: Path) -> set[str]:
-    """Every module that a file imports, and every name from it."""
+    """Return every module that a file imports, and every name from it."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):

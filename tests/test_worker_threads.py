@@ -37,7 +37,7 @@ def test_each_work_is_done_once() -> None:
 
 
 def test_work_goes_on_beside() -> None:
-    """Each of two waits for the other, which none could alone."""
+    """Each of two tasks waits for the other, which neither could do in sequence."""
     first, second = threading.Event(), threading.Event()
 
     def work() -> bool:
@@ -94,7 +94,7 @@ def test_an_error_is_raised_by_result() -> None:
 
 
 def test_each_of_the_first_tasks_has_a_thread() -> None:
-    """Though the ones before are busy."""
+    """Even if the previous ones are still running."""
     go, begun = threading.Event(), [threading.Event(), threading.Event()]
 
     def long(number: int) -> bool:
@@ -126,7 +126,7 @@ def test_a_forked_process_has_helpers_of_its_own() -> None:
 
 @pytest.mark.slow
 def test_ctrl_c_at_any_moment_ends_the_process() -> None:
-    """``ThreadPoolExecutor`` in its place left 3 of these 200 processes waiting for ever."""
+    """With ``ThreadPoolExecutor`` instead, 3 of these 200 processes never ended."""
     moments = random.Random(7)
     for _ in range(200):
         run = subprocess.Popen([sys.executable, "-c", BUSY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

@@ -34,8 +34,8 @@ def _thing(make: Callable[..., BuiltInObject], device: str) -> BuiltInObject:
 
 @pytest.mark.parametrize("make", _OBJECTS)
 def test_object_stands_on_its_plane(make: Callable[..., BuiltInObject], device: str) -> None:
-    """One unit tall, the snake two long; SH with a view-dependent part, flat splats, a base that straddles the plane by
-    a little."""
+    """The object is one unit tall (the snake two units long), has SH with a view-dependent part and flat splats, and
+    its base straddles the plane slightly."""
     thing = _thing(make, device)
     cloud = thing.cloud
     heights, opacities = thing.plane.heights(cloud.means.numpy()), cloud.opacities()
@@ -48,7 +48,7 @@ def test_object_stands_on_its_plane(make: Callable[..., BuiltInObject], device: 
     assert np.abs(cloud.sh.numpy()[:, 1:]).max() > 0.05
     scales = np.exp(np.sort(cloud.log_scales.numpy(), axis=1))
     assert np.median(scales[:, 0] / scales[:, 1]) < 0.35
-    # Three-sigma reach through the plane, as in a capture.
+    # Gaussians reach through the plane by three standard deviations, as in a capture.
     reach = (
         3.0
         * np.exp(cloud.log_scales.numpy()[:, :2]).max(axis=1)
@@ -65,7 +65,7 @@ def _cage(make: Callable[..., BuiltInObject]) -> Cage:
 
 @pytest.mark.parametrize("make", _OBJECTS)
 def test_object_has_a_cage(make: Callable[..., BuiltInObject]) -> None:
-    """Every built-in object gets a cage that keeps all promises."""
+    """Every built-in object gets a cage that satisfies all guarantees."""
     cage = _cage(make)
     assert cage.enclosed_opacity_mass >= 0.999
     assert cage.min_dihedral_degrees >= 8.0
@@ -95,7 +95,7 @@ def test_same_bits_in_another_process() -> None:
 
 
 def test_pawn_normals_point_outwards() -> None:
-    """The splats of the head lie flat on it."""
+    """The splats of the pawn's head are flat and tangential to its surface."""
     cloud = pawn().cloud
     offset = cloud.means.numpy() - [0.0, 0.0, 0.826]
     head = cloud.means.numpy()[:, 2] > 0.75

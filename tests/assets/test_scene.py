@@ -46,6 +46,6 @@ def test_board_squares() -> None:
 
 
 def test_unknown_scene() -> None:
-    """The names are given."""
+    """The message lists the available names."""
     with pytest.raises(UserError, match="scene 'castle' is unknown; built in are pawn, stool, figurine, snake"):
         scene("castle")

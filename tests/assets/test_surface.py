@@ -28,7 +28,7 @@ def test_baked_light_against_closed_forms(device: str) -> None:
 
 
 def test_sh_of_a_highlight() -> None:
-    """Seen along the lobe the highlight adds its strength to the colour; from behind next to nothing."""
+    """Along the lobe, the highlight adds its strength to the colour; from behind it adds almost nothing."""
     direction = np.array([[0.48, -0.6, 0.64]])
     sh = sh_from_colour(np.full((1, 3), 0.4), direction, np.array([0.2]), lobe_colour=(1.0, 1.0, 1.0))
     from egs_warp.geometry.camera import Camera
@@ -48,7 +48,7 @@ def test_sh_of_a_highlight() -> None:
 
 
 def test_quaternions_from_normals() -> None:
-    """The third axis is the normal for any direction, straight down included."""
+    """The third axis is the normal for any direction, including straight down."""
     normals = np.random.default_rng(0).normal(size=(50, 3))
     normals = np.concatenate([normals / np.linalg.norm(normals, axis=1, keepdims=True), [[0, 0, -1.0], [0, 0, 1.0]]])
     w, x, y, z = quaternions_from_normals(normals, np.linspace(0, 6, 52)).T

@@ -31,7 +31,7 @@ def test_lift_off_is_where_the_longest_flight_begins(effort: ModuleType, loads: 
 
 
 def test_the_load_is_what_the_ground_gives(effort: ModuleType) -> None:
-    """The load changes the upward momentum in every step, together with gravity and drag."""
+    """Load, gravity and drag together account for the change of upward momentum in every step."""
     trajectory = slide().trajectory()
     t, mass = trajectory, trajectory.node_mass
     up = -t.gravity / np.linalg.norm(t.gravity)

@@ -1,4 +1,4 @@
-"""Figure 7's measure, and its aim."""
+"""The image measure of Figure 7 and its target."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_scores_of_a_known_picture(figure7: ModuleType) -> None:
     assert scores["whole_psnr"] == pytest.approx(20.0, abs=1e-4)
     own = figure7.table3.scores([picture], None)
     assert own["psnr"] is None
-    # Only the lower half is off, by 0.01 over half of the pixels.
+    # Only the lower half has an error: 0.01 over half of the pixels.
     assert own["whole_psnr"] == pytest.approx(-10 * np.log10(0.005), abs=1e-4)
 
 

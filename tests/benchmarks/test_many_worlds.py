@@ -1,4 +1,4 @@
-"""Figures of parallel worlds: the aims, the reasons of null ones, and a row of a small run."""
+"""Figures of parallel worlds: targets, reasons for missing values, and a row of a small run."""
 
 from __future__ import annotations
 

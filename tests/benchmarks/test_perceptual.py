@@ -1,4 +1,4 @@
-"""FLIP against the figures of its authors' own program."""
+"""FLIP against the values of the reference implementation."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ def noise(seed: int, width: float) -> np.ndarray:
     return ((picture - picture.min()) / np.ptp(picture)).astype(np.float32)
 
 
-# Mean errors by flip-evaluator 1.7, the program of Andersson et al., of the same pictures at its own 67.02 pixels per
-# degree: unlike noise, unlike patches, a blur, a little more light, black and white.
+# Mean errors by flip-evaluator 1.7, the reference implementation of Andersson et al., for the same image pairs at its
+# default of 67.02 pixels per degree: noise against noise, patches against patches, a blur, a slight brightening, black
+# against white.
 PICTURES = {
     "noise": (noise(0, 0.0), noise(1, 0.0), 0.4408529),
     "patches": (noise(0, 3.0), noise(1, 3.0), 0.6401296),

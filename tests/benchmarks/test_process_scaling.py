@@ -1,4 +1,5 @@
-"""Figures of many runs: the rate of the middle frames, and rows of tasks that outlast an error."""
+"""Throughput of many processes: the frame rate over the middle frames, and result rows of tasks that continue after an
+error."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ def many(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_the_rate_is_that_of_the_middle(many: ModuleType) -> None:
-    """Slow at the start and the end, ten frames a second between."""
+    """The run is slow at its start and its end, with ten frames per second between."""
     seen = [(0.0, 0), (30.0, 10), *((30.0 + 0.1 * k, 10 + k) for k in range(1, 90)), (80.0, 100)]
     (first, early), (last, late) = many.window(seen)
     assert (early, late) == (15, 85)

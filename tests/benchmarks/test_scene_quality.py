@@ -1,4 +1,4 @@
-"""Measures of the scene quality benchmark: outlines, overlap, positions of clicks, planes through markings."""
+"""Measures of the scene quality benchmark: outlines, overlap, click positions, and planes through marked points."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_overlap_counts_what_is_missing_and_too_much(annotated: ModuleType, clic
     shifted = np.roll(own, 8, axis=1)
     iou, missing, more = clicking.overlap(cloud, ball, annotated.DrawnView(camera, shifted, np.zeros((0, 2))))
     both = (own & shifted).sum()
-    # Where the shifted outline covers sky, the capture is empty, and it does not count.
+    # Where the shifted outline covers sky, the capture is empty, and those pixels do not count.
     assert both / (own | shifted).sum() <= iou < 1.0
     assert more.sum() == (own & ~shifted).sum() and 0 < missing.sum() <= (shifted & ~own).sum()
 

@@ -1,4 +1,4 @@
-"""Requirements of Table 1: a truth whose gloss rotates with the surface, and aims that follow from the rows."""
+"""Requirements of Table 1: a reference whose gloss rotates with the surface, and targets computed from the rows."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_what_was_not_measured_is_null_with_a_reason(table1: ModuleType) -> None
 
 
 def test_the_coarsest_setting_near_to_the_best_is_taken(table1: ModuleType) -> None:
-    """The setting is within ``PSNR_TOLERANCE`` of the best mean over objects and motions; coarse ones first."""
+    """The selected setting is the coarsest within ``PSNR_TOLERANCE`` of the best mean over objects and motions."""
     names = list(table1.SETTINGS)
 
     def scored(*psnr: float) -> list[dict[str, Any]]:

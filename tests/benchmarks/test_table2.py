@@ -62,7 +62,8 @@ def test_exact_forces_satisfy_coulomb(table2: ModuleType) -> None:
 
 @pytest.mark.slow
 def test_every_strategy_solves_frames_of_an_animation(table2: ModuleType) -> None:
-    """The programs have only the activations of its muscle groups, and the known ones are within the bounds."""
+    """The programs have only the activations of the frame's muscle groups, and the known activations are within the
+    bounds."""
     frames = table2.animation_frames(table2.body_named("pawn", "cpu", nodes=60), frames=6, activations=4, contacts=3)
     assert len(frames) == 6
     for frame in frames:
@@ -80,6 +81,7 @@ def test_every_strategy_solves_frames_of_an_animation(table2: ModuleType) -> Non
             for frame in frames
         ]
     )
-    # Strategies over all contact states, or with the cone, do as well as the known activations of the frames.
+    # Strategies over all contact states, or with the exact cone, do at least as well as the known activations of the
+    # frames.
     for strategy in (Strategy.MODES, Strategy.EXACT):
         assert (figures[strategy][:, 2] <= made + 1e-6).all(), strategy

@@ -1,4 +1,4 @@
-"""A run from the file that another run wrote is that run; bad files are one line."""
+"""A run from the configuration file that another run wrote repeats that run; each bad file gives a one-line error."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.Ca
     assert cli.main(again) == 0
     for name in ("jump.mp4", "sheet.png", "trajectory.npz", "creature.npz", "run.yaml"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
-    # The requested number of frames, the first at rest.
+    # The requested number of frames; the first shows the body at rest.
     assert count_frames_and_secs(str(tmp_path / "a" / "jump.mp4"))[0] == 4
     run = FinishedRun.read(tmp_path / "a")
     assert len(run.steps) == run.report["asked"]["frames"] == 4
@@ -46,7 +46,7 @@ def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.Ca
 
 @pytest.mark.usefixtures("coarse")
 def test_a_run_that_is_interrupted_has_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is there as soon as a step of the simulation is; bad input that shows before leaves nothing."""
+    """The file exists as soon as a simulation step is made; bad input found before that leaves no file."""
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=4000).cloud)
     flags = ["animate", str(tmp_path / "pawn.ply"), "--up", "z", "--friction", "0.7", "--qp", "daqp"]
     flags += ["--out", str(tmp_path / "a")]
@@ -154,7 +154,8 @@ def test_bad_files_are_one_line(text: str, said: str, tmp_path: Path, capsys: py
 
 @pytest.mark.parametrize("way", ["lists", "merged"])
 def test_a_few_lines_that_stand_for_billions(way: str, tmp_path: Path) -> None:
-    """Lists of lists nine times over, told in a message, or keys merged as often: neither fits into any memory."""
+    """Nine levels of nested aliases, quoted in an error message, or keys merged as often: expanded, neither fits into
+    memory."""
     inner = {"lists": "[z, z]", "merged": "{up: z}"}[way]
     lines = [f"a0: &a0 {inner}"]
     for level in range(1, 12):

@@ -34,7 +34,7 @@ def test_a_capture_becomes_another(kind: str, tmp_path: Path, capsys: pytest.Cap
 
 
 def test_what_is_said_is_what_was_done(tmp_path: Path) -> None:
-    """Known changes in a shuffled order."""
+    """The changes are known, and the Gaussians are in a shuffled order."""
     cloud = make_cloud(500, 1)
     rng = np.random.default_rng(0)
     step = np.array([0.003, 0.0, 0.0])

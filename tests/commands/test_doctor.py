@@ -42,7 +42,7 @@ def test_an_unknown_device_is_one_line(capsys: pytest.CaptureFixture[str]) -> No
 
 @pytest.mark.slow
 def test_after_warm_a_run_compiles_nothing(tmp_path: Path) -> None:
-    """In a cache of its own: what lies there after the run lay there before."""
+    """The run uses a kernel cache of its own, whose files are the same before and after the run."""
     environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
 
     def run(*flags: str) -> str:

@@ -1,4 +1,4 @@
-"""``egs-warp resume``: a run that is killed at any moment goes on to the bits of one that was not."""
+"""``egs-warp resume``: a run killed at any moment continues to the bits of an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from tests.support.disk_faults import assert_one_line, fail_once
 PATIENCE = 900.0
 """Seconds that a run may take on a busy machine."""
 MOMENTS = int(os.environ.get("EGS_WARP_MOMENTS", "4"))
-"""At which each command is killed once; the short form of docs/reliability.md unless told."""
+"""Times at which each command is killed once; by default the short form of docs/reliability.md."""
 SEED = os.environ.get("EGS_WARP_SEED", "")
-"""Other moments, so that several processes can share them."""
+"""Seed of the times, so that several processes can test different ones."""
 SMALL = ("--up", "z", "--size", "32")
 COMMANDS = {
     "jump": ("pawn.ply", "--frames", "28"),
@@ -56,7 +56,7 @@ def animate(name: str, folder: Path, out: Path) -> list[str]:
 
 
 def bits(folder: Path) -> dict[str, bytes | str]:
-    """Return the contents of all files, without the timings of the report and its checksum."""
+    """Return the contents of all files, without the timings of the report and without its checksum."""
     found: dict[str, bytes | str] = {path.name: path.read_bytes() for path in folder.iterdir()}
     report = json.loads(found["report.json"])
     found["report.json"] = json.dumps(report | {"timing": None})
@@ -66,12 +66,12 @@ def bits(folder: Path) -> dict[str, bytes | str]:
 
 
 def process(arguments: Sequence[str]) -> list[str]:
-    """The command on coarse cages in a process of its own."""
+    """Return a command line that runs the command with coarse cages in its own process."""
     return [sys.executable, "-m", "tests.support.coarse", *arguments]
 
 
 def finishes(arguments: Sequence[str]) -> int:
-    """Its status: a coarse body may fall."""
+    """Run the command and return its exit status; a coarse body may fall."""
     done = subprocess.run(process(arguments), capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode in (0, 3), done.stderr
     return done.returncode
@@ -88,7 +88,8 @@ def has_begun(out: Path) -> bool:
 
 
 def ended_by(arguments: Sequence[str], number: int, ready: Path, after: float) -> tuple[int, str]:
-    """Status and message of a run that gets a signal ``after`` seconds from when the file ``ready`` is there."""
+    """Return the status and the message of a run that gets a signal ``after`` seconds after the file ``ready``
+    appears."""
     run = subprocess.Popen(process(arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     give_up = time.monotonic() + PATIENCE
     while not ready.exists() and run.poll() is None and time.monotonic() < give_up:
@@ -101,9 +102,8 @@ def ended_by(arguments: Sequence[str], number: int, ready: Path, after: float) -
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_again_and_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Before it has a part, between parts, in the film; by SIGKILL and by Ctrl-C. What nothing ends runs in this
-    process.
-    """
+    """The run is killed by SIGKILL and by Ctrl-C before its first part, between parts and in the video. Runs that need
+    not be killed execute in this process."""
     folder, whole, out = made(tmp_path), tmp_path / "whole", tmp_path / "out"
     assert coarse_main(animate("jump", folder, whole)) == 0
     parts = out / "trajectory.parts"
@@ -119,7 +119,7 @@ def test_a_run_that_is_killed_again_and_again(tmp_path: Path, capsys: pytest.Cap
     assert coarse_main(again) == 0
     assert bits(out) == bits(whole)
     capsys.readouterr()
-    # As one leaves it that is killed as it ends.
+    # As a run leaves it that is killed at its very end.
     parts.mkdir()
     (out / ".egs-run.lock").touch()
     assert coarse_main(again) == 0 and bits(out) == bits(whole)
@@ -133,13 +133,13 @@ def test_random_moments(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """SIGKILL and Ctrl-C at any time, including preparation and video; a run without files is started again."""
     folder, whole = made(tmp_path), tmp_path / "whole"
     if name == "walk":
-        # A coarser stool has no four feet.
+        # A coarser stool does not have four feet.
         monkeypatch.setenv("EGS_WARP_TEST_NODES", "500")
     write_ply(folder / "stool.ply", stool(device="cpu").cloud)
     write_ply(folder / "room.ply", scene("pawn", device="cpu").whole()[0])
     began = time.monotonic()
     status = finishes(animate(name, folder, whole))
-    # Nothing but what the run has made, whatever is killed below.
+    # The folder contains only files of the run, whichever process is killed below.
     assert not [path for path in whole.iterdir() if path.is_dir() or path.name.startswith(".")]
     length = time.monotonic() - began
     moments = random.Random(name + SEED)

@@ -1,4 +1,4 @@
-"""The plane under the object and further ones: level patches in colours of their own."""
+"""The plane under the object and further planes: level patches, each in its own colour."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from tests.support.scenes import FLOOR
 
 
 def test_further_planes_are_level_patches_in_colours_of_their_own() -> None:
-    """Beside a bedroom's floor only the stool's board and cushion are level; slices of walls and legs are no planes."""
+    """Beside the floor of a bedroom, only the stool's board and cushion are level; slices of walls and legs are not
+    planes."""
     made = scene("stool")
     cloud = concatenate(made.background, made.object)
     given = SceneInput(cloud, [], ObjectSpec(point=np.array([0.0, 0.0, 0.68])), None, made.plane, ())
@@ -31,7 +32,7 @@ def test_further_planes_are_level_patches_in_colours_of_their_own() -> None:
 
 
 def test_a_capture_with_nothing_flat_has_one_plane() -> None:
-    """Round Gaussians on a grid: the plane that is given, and none beside it."""
+    """For round Gaussians on a grid, the given plane is the only one."""
     x, y = (values.ravel() for values in np.meshgrid(np.linspace(-1.0, 1.0, 40), np.linspace(-1.0, 1.0, 40)))
     means = np.stack([x, y, np.zeros_like(x)], axis=1)
     box = (np.abs(x) < 0.2) & (np.abs(y) < 0.2)

@@ -1,4 +1,4 @@
-"""The commands from a scene to its parts: files, and one line for every mistake."""
+"""The commands from a scene to its parts: their files, and a one-line error for every mistake."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_without_cameras_a_ring_is_used_and_written(
     assert f"{out}: egs-warp plane wrote here, which cannot be resumed; start it again" in capsys.readouterr().err
     assert main([*again, "--overwrite"]) == 0
     assert (out / "earlier-1" / "images" / "ring11.png").is_file() and len(list((out / "images").iterdir())) == 12
-    # What was written can be clicked on.
+    # The file that was written can be clicked on.
     flags = ["--object", "256,256", "--cameras", str(out / "cameras.json"), "--view", "0", "--straddling", "none"]
     assert main(["segment", str(folder / "scene.ply"), *flags, "--out", str(tmp_path / "parts")]) == 0
 
@@ -149,7 +149,8 @@ def test_mistakes_are_one_line(
 
 @pytest.mark.slow
 def test_inpaint_fills_the_hole_that_animate_fills(folder: Path, tmp_path: Path) -> None:
-    """Outline and margin go from segment to inpaint by plane.json; an object elsewhere has its own foot."""
+    """``plane.json`` passes outline and margin from ``segment`` to ``inpaint``; an object elsewhere has its own
+    footprint."""
     cloud, spec = read_capture(folder / "scene.ply").cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
     flags = ["--object", "0,-0.5,0.5", "--plane", "0,0,1,0", "--straddling", "split", "--out", str(tmp_path)]
     assert main(["segment", str(folder / "scene.ply"), *flags]) == 0

@@ -1,4 +1,4 @@
-"""``egs-warp train --resume``, and what belongs to an earlier training."""
+"""``egs-warp train --resume``, and the files of an earlier training."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OFTEN = (
     "import sys; from egs_warp.training import checkpoint; checkpoint.SECONDS = 0.0;"
     " from egs_warp.cli import main; sys.exit(main(sys.argv[1:]))"
 )
-"""The command, which keeps what it has done as often as it can."""
+"""The command with checkpoints as frequent as possible."""
 
 
 def line(folder: Path, out: Path, device: str = "cpu") -> list[str]:
@@ -30,7 +30,7 @@ def line(folder: Path, out: Path, device: str = "cpu") -> list[str]:
 
 
 def bits(folder: Path) -> dict[str, bytes]:
-    """The report has times."""
+    """Return the contents of all files, without the times in the report."""
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix != ".json"}
 
 
@@ -85,7 +85,7 @@ def test_random_moments(tmp_path: Path, device: str) -> None:
     """
     posed, whole = posed_folder(tmp_path / "posed"), tmp_path / "whole" / "a.ply"
     command = [sys.executable, "-c", OFTEN]
-    # Kernels are compiled, and each start is as quick as the next.
+    # The kernels are compiled already, so every start takes equally long.
     subprocess.run([*command, *line(posed, tmp_path / "first" / "a.ply", device)], check=True, capture_output=True)
     began = time.monotonic()
     subprocess.run([*command, *line(posed, whole, device)], check=True, capture_output=True)

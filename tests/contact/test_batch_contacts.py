@@ -33,7 +33,7 @@ def detector(creature: Creature, points: ContactSelector) -> BatchDetector:
 
 @pytest.fixture(scope="module")
 def positions(creature: Creature) -> np.ndarray:
-    """(4, N, 3): it stands, leans, lies deep in the ground, flies."""
+    """(4, N, 3) positions of a body that stands, leans, lies deep in the ground, and flies."""
     nodes, random = creature.start.positions, np.random.default_rng(0)
     lean = nodes + 0.1 * nodes[:, 2:] * np.array([1.0, 0.0, -0.2])
     deep = nodes + 1e-3 * random.normal(size=nodes.shape) - np.array([0.0, 0.0, 0.02])
@@ -52,7 +52,7 @@ def alone(creature: Creature, chosen: list[np.ndarray], positions: np.ndarray) -
 def test_points_are_chosen_step_by_step_as_for_one(
     creature: Creature, points: ContactSelector, detector: BatchDetector, positions: np.ndarray
 ) -> None:
-    """Three steps, in which points come, stay for their load and go, and joins of deeper ones."""
+    """In three steps, points are added, retained because of their load, removed, and joined by deeper ones."""
     random = np.random.default_rng(1)
     before = [np.zeros(0, int)] * WORLDS
     loads, joins = [np.zeros(0)] * WORLDS, 0
@@ -69,7 +69,7 @@ def test_points_are_chosen_step_by_step_as_for_one(
         for world, place in enumerate(places):
             expected = points.select(before[world], loads[world] > 0.0, one.gaps(place)[0])
             assert np.array_equal(taken(contacts, world), expected)
-        # Noise, or all points of a cell would be as deep.
+        # Without noise, all points of a cell would be equally deep.
         noisy = gaps + 0.01 * torch.from_numpy(random.normal(size=gaps.shape))
         deep = detector.find_deeper(contacts, noisy, 0.005)
         added = detector.contacts(deep, gaps, faces, order=noisy)

@@ -30,7 +30,7 @@ def creature() -> Creature:
 
 @pytest.fixture(scope="module")
 def states(creature: Creature) -> list[BodyState]:
-    """It stands, slides, falls on its base and on an edge of it, and flies."""
+    """States of a body that stands, slides, falls on its base, falls on an edge of its base, and flies."""
     nodes, unit = creature.start.positions, creature.body.speed_unit
     still = np.zeros_like(nodes)
     leaning = nodes + 0.25 * nodes[:, 2:] * np.array([1.0, 0.3, 0.0])
@@ -46,7 +46,7 @@ def states(creature: Creature) -> list[BodyState]:
 
 @pytest.fixture(scope="module")
 def activations(creature: Creature) -> np.ndarray:
-    """(5, M) metres."""
+    """(5, M) m, random contractions and extensions."""
     shares = np.random.default_rng(1).uniform(-0.2, 0.6, (len(FRICTIONS), creature.muscles.segment_count))
     return shares * creature.muscles.bounds
 
@@ -67,8 +67,8 @@ def solved_alone(
 def solved_together(
     creature: Creature, states: list[BodyState], activations: np.ndarray, dt: float, *, few: bool = False
 ) -> tuple[BatchContacts, BatchContacts, BatchResult]:
-    """The contacts that are given, those of the end, and the end: from the points that touch as the bodies fly on, or
-    from a ``few``, a third of them."""
+    """Return the contacts at the start and at the end, and the result. The start contacts are the points that touch the
+    ground in free motion; with ``few`` only a third of them."""
     one, device, count = creature.stepper.solver, torch.device("cpu"), len(states)
     points = ContactSelector(
         creature.geometry, activation_distance=one.points.activation_distance, hysteresis=one.points.hysteresis
@@ -107,8 +107,8 @@ def solved_together(
 def test_ends_are_those_of_each_alone(
     creature: Creature, states: list[BodyState], activations: np.ndarray, few: bool
 ) -> None:
-    """From the points that touch as the bodies fly on, or from a third of them, so that many join on the way:
-    velocities, points in their order, forces, and iterations."""
+    """From the points that touch in free motion, or from a third of them so that many are added during the solve: the
+    velocities, the points in their order, the forces and the iteration count are equal."""
     body = creature.body
     dt = body.time_unit / 20.0
     contacts, touched, made = solved_together(creature, states, activations, dt, few=few)
@@ -122,7 +122,7 @@ def test_ends_are_those_of_each_alone(
         assert alone.converged and not made.is_singular[world]
         np.testing.assert_allclose(made.velocities[world].numpy(), alone.velocities, atol=1e-9 * body.speed_unit)
         forces = made.forces[world, :n].numpy()
-        # Redundant points share a load in more than one way.
+        # Redundant points can share a load in several ways.
         nodal = [alone.contacts.nodal_forces(each) for each in (forces, alone.forces)]
         np.testing.assert_allclose(*nodal, rtol=0, atol=1e-6 * body.weight)
         joined += n - len(chosen)
@@ -133,8 +133,9 @@ def test_ends_are_those_of_each_alone(
 
 @pytest.mark.slow
 def test_steps_that_hardly_converge_go_the_way_of_each_alone(creature: Creature) -> None:
-    """Crushed, thrown at the ground, torn by all muscles at odds, in steps four times too long: lengths of steps and
-    tangents are chosen as alone, so that even what has not converged when time is up is the same."""
+    """Bodies are crushed, thrown at the ground, and torn by opposing muscles, with time steps four times too long. Step
+    lengths and tangents are chosen as for a single world, so even unconverged results are equal at the iteration limit.
+    """
     body, nodes = creature.body, creature.start.positions
     up, still, random = np.array([0.0, 0.0, 1.0]), np.zeros_like(nodes), np.random.default_rng(0)
     states = [
@@ -157,8 +158,8 @@ def test_steps_that_hardly_converge_go_the_way_of_each_alone(creature: Creature)
 
 
 def test_a_world_that_no_tangent_helps_gives_up_at_once(creature: Creature) -> None:
-    """One whose muscles pull by no number, on the ground and in the air: in its second iteration, after a tangent of
-    its own; the others go on."""
+    """Worlds with NaN activations, on the ground and in the air, stop in their second iteration, after one new tangent;
+    the others continue."""
     nodes = creature.start.positions
     still, up = np.zeros_like(nodes), np.array([0.0, 0.0, 1.0])
     states = [BodyState(nodes + (world > 1) * up, still) for world in range(4)]
@@ -171,7 +172,7 @@ def test_a_world_that_no_tangent_helps_gives_up_at_once(creature: Creature) -> N
 
 
 def test_shifts_let_nothing_deeper_and_bring_out_what_is_too_deep(creature: Creature, states: list[BodyState]) -> None:
-    """As for one, down to where the speed is capped; no shift where there is no contact."""
+    """The push-out speeds are equal up to the cap; capacity without a contact has no bias."""
     one, dt = creature.stepper.solver, 0.01
     points = ContactSelector(
         creature.geometry, activation_distance=one.points.activation_distance, hysteresis=one.points.hysteresis

@@ -23,9 +23,8 @@ COUNT = 5
 
 
 def problem(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A Delassus operator (3n, 3n) in which one tangent is nine times as soft as the other, now the first, now the
-    second; velocities (3n,) that press and slide, shifts (n,) and forces (n, 3) to start from.
-    """
+    """Return a random contact problem: a Delassus operator (3n, 3n) in which alternately the first or the second
+    tangent is nine times as compliant as the other; velocities (3n,), shifts (n,), and initial forces (n, 3)."""
     random = np.random.default_rng(seed)
     soft = np.where(np.arange(COUNT)[:, None] % 2, [1.0, 0.6, 1.8], [1.0, 1.8, 0.6])
     half = random.normal(size=(3 * COUNT, 3 * COUNT + 4)) * soft.reshape(-1, 1)
@@ -36,7 +35,8 @@ def problem(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 def swept_twin(
     delassus: np.ndarray, free: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray, sweeps: int
 ) -> np.ndarray:
-    """Contact by contact: the normal force that stops its approach, then the tangents', shortened to the cone."""
+    """Sweep contact by contact: the normal force that stops the approach, then the tangential forces, projected onto
+    the cone."""
     f = start.ravel().copy()
     for _ in range(sweeps):
         for n in range(0, 3 * COUNT, 3):
@@ -52,7 +52,7 @@ def swept_twin(
 @pytest.mark.parametrize("sweeps", [1, 3])
 @pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
 def test_sweeps_equal_their_twin(friction: float, sweeps: int) -> None:
-    """Eq. (8), (9): to rounding, where contacts separate, stick and slide."""
+    """Eq. (8), (9): equal to rounding for separating, sticking and sliding contacts."""
     kinds = set()
     for seed in range(60):
         delassus, free, shift, start = problem(seed)
@@ -69,7 +69,7 @@ def test_sweeps_equal_their_twin(friction: float, sweeps: int) -> None:
 
 @pytest.mark.parametrize("friction", [0.0, 0.4, 1.5])
 def test_the_answer_obeys_where_tangents_differ(friction: float) -> None:
-    """Eq. (8), (9): complementarity, the cone, and friction straight against the slip, to 1e-9, from any start."""
+    """Eq. (8), (9): complementarity, the cone, and friction opposite to the slip hold to 1e-9 from any start."""
     for seed in range(6):
         delassus, free, shift, start = problem(seed)
         forces, size = coulomb_forces(delassus, free, shift, friction, start)
@@ -115,7 +115,8 @@ def test_problems_side_by_side_have_the_bits_of_each_alone() -> None:
 
 
 def test_problems_that_take_all_iterations_have_the_same_bits_side_by_side() -> None:
-    """20 points that move as 30 unknowns do, and cling: some are not solved, after as many steps as alone."""
+    """20 sticking points with 30 degrees of freedom: some problems are not solved within the iteration limit, in a
+    batch as alone."""
     count, friction, problems = 20, 1.5, []
     for seed in range(40):
         random = np.random.default_rng(seed)
@@ -154,9 +155,8 @@ def test_a_block_of_threads_finds_the_forces_of_one(friction: float) -> None:
 @pytest.mark.cuda
 @pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
 def test_a_block_of_threads_finds_the_forces_of_many_contacts_that_press(friction: float) -> None:
-    """More unknowns than the capacity of one pass: full and partial passes and tiles, more unknowns than the passes
-    take, and more contacts than one block sweeps.
-    """
+    """Numbers of unknowns above the capacity of one pass: full and partial passes and tiles, more unknowns than all
+    passes hold, and more contacts than one block sweeps."""
     counts, room = [41, 42, 43, 50, 53, 62, 64, 65, 80, 85, 86, 100, 130], 130
     random = np.random.default_rng(4)
     delassus, free = np.zeros((len(counts), 3 * room, 3 * room)), random.normal(size=(len(counts), 3 * room))
@@ -178,9 +178,8 @@ def test_a_block_of_threads_finds_the_forces_of_many_contacts_that_press(frictio
 
 
 def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:
-    """25 points with 12 degrees of freedom, regularised as in a step, pressed, pushed and turned. The equations
-    hold, and no force is large.
-    """
+    """25 points with 12 degrees of freedom, regularised as in a step, under normal, tangential and rotational load. The
+    equations hold, and no force is large."""
     random = np.random.default_rng(2)
     place = np.stack(np.meshgrid(np.linspace(-1.0, 1.0, 5), np.linspace(-1.0, 1.0, 5)), axis=-1).reshape(-1, 2)
     corners = np.stack([(1 - place[:, 0]) * (1 - place[:, 1]), (1 + place[:, 0]) * (1 - place[:, 1])], axis=1)
@@ -196,7 +195,7 @@ def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:
 
 
 def test_what_was_solved_before_changes_nothing() -> None:
-    """Memory is reused: the bits are the same after a problem with NaN, and after one that took all attempts."""
+    """Memory is reused: the bits are the same after a problem with NaN, and after one that used all attempts."""
     delassus, free, shift, start = problem(1)
     expected, missed = coulomb_forces(delassus, free, shift, 0.4, start)
     assert missed < 1e-10 and np.abs(expected).max() > 0.1

@@ -36,9 +36,8 @@ def block(
     slope: float = 0.0,
     lift: float = 0.0,
 ) -> PassiveBody:
-    """A soft block with 25 contact points under its base and four at its top, ``lift`` metres above a floor that falls
-    off to +x by ``slope`` radians: gravity is turned in its place.
-    """
+    """A soft block with 25 contact points under its base and four at its top, ``lift`` metres above a floor that slopes
+    down towards +x by ``slope`` radians: gravity is rotated instead of the floor."""
     level = make_body(mesh or block_mesh(), FLOOR, sag=sag, damping_ratio=damping_ratio, device="cpu")
     gravity = 9.81 * np.array([np.sin(slope), 0.0, -np.cos(slope)])
     body = SoftBody(level.mesh, level.assembly, level.node_mass, gravity, level.height)
@@ -50,7 +49,8 @@ def block(
 
 
 def assert_obeys(standing: PassiveBody, before: BodyState, problem: StepProblem, result: CoupledResult) -> None:
-    """Contact, Coulomb's law with the velocities that are kept, maximal dissipation, and both momenta."""
+    """Assert contact, Coulomb's law with the stored velocities, maximal dissipation, and the balance of both
+    momenta."""
     body, friction = standing.body, standing.solver.detector.geometry.friction
     contacts, forces = result.contacts, result.forces
     assert result.converged and result.residual < 1e-8
@@ -79,7 +79,7 @@ def assert_obeys(standing: PassiveBody, before: BodyState, problem: StepProblem,
 
 @pytest.mark.parametrize("push", [0.0, 0.5])
 def test_a_block_comes_to_rest_and_every_step_obeys(push: float) -> None:
-    """Eq. (4), Eq. (9): dropped by 2 %, pushed sideways or not."""
+    """Eq. (4), Eq. (9): the block is dropped by 2 % of its height, with and without a sideways push."""
     falling = block(lift=0.02)
     body = falling.body
     falling.state.velocities[:] = [push, 0.3 * push, 0.0]
@@ -97,7 +97,7 @@ def test_a_block_comes_to_rest_and_every_step_obeys(push: float) -> None:
 
 
 def test_an_oblique_spinning_impact_obeys() -> None:
-    """Eq. (4), Eq. (9): contact, friction and both momenta where everything moves."""
+    """Eq. (4), Eq. (9): contact, friction and both momenta for a body that translates and spins."""
     thrown = block(0.8, lift=0.03)
     body, x = thrown.body, thrown.state.positions
     v = np.array([1.5, 0.3, -1.0]) + np.cross([0.5, -1.0, 2.0], x - body.centre_of_mass(x))
@@ -144,9 +144,9 @@ def test_dropped_body_comes_to_rest_without_gaining_energy() -> None:
 
 @pytest.mark.parametrize("degrees", [15.0, 21.0, 22.6, 30.0])
 def test_block_on_an_incline_sticks_or_slides(degrees: float) -> None:
-    """Eq. (9), closed form: with mu = 0.4 (21.8 degrees) it sticks or slides with a = g (sin - mu cos).
+    """Eq. (9), closed form: with mu = 0.4 (21.8 degrees) the block sticks or slides with a = g (sin - mu cos).
 
-    The block is stiff and flat (it must not tip), starts at rest, and its mean over 20 steps is taken.
+    The block is stiff and flat so that it does not tip. It starts at rest, and the mean over 20 steps is used.
     """
     angle, friction = np.radians(degrees), 0.4
     moving = block(friction, sag=0.002, mesh=block_mesh(4, 4, 3, (0.8, 0.8, 0.3)), slope=angle)
@@ -163,7 +163,8 @@ def test_block_on_an_incline_sticks_or_slides(degrees: float) -> None:
 
 @pytest.mark.parametrize("degrees", [0.0, 15.0])
 def test_a_resting_body_neither_sinks_nor_creeps(degrees: float) -> None:
-    """Eq. (8), Eq. (9): on level ground and on a slope that it holds on; its forces carry the weight."""
+    """Eq. (8), Eq. (9): at rest on level ground and on a slope with enough friction; the contact forces carry the
+    weight."""
     resting = block(0.5, sag=0.01, damping_ratio=0.5, slope=np.radians(degrees))
     body = resting.body
     for _ in range(200):
@@ -181,7 +182,8 @@ def test_a_resting_body_neither_sinks_nor_creeps(degrees: float) -> None:
 
 
 def test_a_sliding_block_stops_and_stays() -> None:
-    """Eq. (9): from speed v a stiff flat block slides v^2 / (2 mu g), less half a step's way, and then sticks."""
+    """Eq. (9): from speed v a stiff flat block slides v^2 / (2 mu g), minus half a step's displacement, and then
+    sticks."""
     friction, speed = 0.5, 1.5
     sliding = block(friction, sag=0.002, mesh=block_mesh(4, 4, 3, (0.8, 0.8, 0.3)))
     body = sliding.body
@@ -194,16 +196,15 @@ def test_a_sliding_block_stops_and_stays() -> None:
         problem, result = sliding.advance(DT / 2)
         assert_obeys(sliding, before, problem, result)
     way = body.centre_of_mass(sliding.state.positions)[0] - start
-    # Implicit Euler counts each step's lower speed, so the way is short by v dt / 2.
+    # Implicit Euler uses the lower speed of each step, so the distance is shorter by v dt / 2.
     assert way == pytest.approx(speed**2 / (2 * friction * 9.81) - 0.25 * speed * DT, rel=0.02)
     assert np.abs(sliding.state.velocities).max() < 1e-2
 
 
 @pytest.mark.parametrize("depth", [0.006, 0.02, 0.3])
 def test_a_sunk_body_comes_out_gently_to_the_tolerance(depth: float) -> None:
-    """Eq. (8): points deeper than the tolerance rise by a fifth of the excess a step, at most at the cap; those that
-    are not keep their depth.
-    """
+    """Eq. (8): points deeper than the tolerance rise by a fifth of the excess per step, up to the speed cap; other
+    points stay at their depth."""
     sunk = block(sag=0.002, lift=-depth)
     height = sunk.body.height
     tolerance, cap = sunk.solver.penetration_tolerance, sunk.solver.push_out_cap
@@ -244,7 +245,7 @@ def test_points_that_would_sink_join_the_set() -> None:
 
 
 def test_points_join_before_the_step_without_them_has_converged(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Early activation adds the same points and reaches the same end, in fewer iterations."""
+    """Early activation adds the same points and gives the same result in fewer iterations."""
     falling = block()
     _, soon = on_one_corner(falling)
     monkeypatch.setattr(coupled_step, "ACTIVATION_RESIDUAL", 0.0)
@@ -256,8 +257,7 @@ def test_points_join_before_the_step_without_them_has_converged(monkeypatch: pyt
 
 def test_a_tangent_that_leads_nowhere_is_made_anew() -> None:
     """The tangent of a body with no stiffness and a billionth of the mass inverts elements at any step length. The
-    end is that of the body's own tangent, which is computed once.
-    """
+    result is that of the body's own tangent, which is computed once."""
     standing = block()
     body, solver = standing.body, standing.solver
     squashed = BodyState(body.mesh.nodes * [1.0, 1.0, 0.9], np.zeros_like(body.mesh.nodes))
@@ -275,7 +275,8 @@ def test_a_tangent_that_leads_nowhere_is_made_anew() -> None:
 
 
 def test_a_response_is_the_linear_answer_of_the_step() -> None:
-    """Eq. (8): columns of known points are kept, and forces bring about what the tangent says of their impulse."""
+    """Eq. (8): columns of known points are reused, and forces change the velocities as the tangent predicts for their
+    impulse."""
     standing = block()
     x, solver = standing.state.positions @ Rotation.from_rotvec([0.0, 0.1, 0.2]).as_matrix().T, standing.solver
     problem = StepProblem(standing.body, BodyState(x, np.zeros_like(x)), DT)
@@ -292,9 +293,8 @@ def test_a_response_is_the_linear_answer_of_the_step() -> None:
 
 
 def test_foreseen_forces_press_and_rub_no_more_than_they_may() -> None:
-    """In place of the paper's penalties (Eq. 10, 11) stage 1 has exact contact: zero or pressing, within Coulomb's
-    cone, straight against the slip, whatever the free velocities.
-    """
+    """In place of the paper's penalties (Eq. 10, 11), stage 1 has exact contact: normal forces are not negative, forces
+    are within Coulomb's cone, and friction is opposite to the slip, for any free velocities."""
     standing = block()
     solver, x = standing.solver, standing.state.positions
     problem = StepProblem(standing.body, standing.state, DT)
@@ -324,21 +324,20 @@ def test_foreseen_forces_press_and_rub_no_more_than_they_may() -> None:
 
 
 def test_a_step_that_nothing_joins_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The gaps at the end are evaluated twice: when the activation threshold is passed, and at the end."""
+    """The gaps at the end of the step are evaluated twice: when the activation threshold is passed, and at the end."""
     resting = block(sag=0.01, damping_ratio=0.5)
     for _ in range(5):
         resting.advance(DT)
     looks, gaps = [], ContactDetector.gaps
     monkeypatch.setattr(ContactDetector, "gaps", lambda *given: looks.append(1) or gaps(*given))
     _, result = resting.advance(DT)
-    # Two more are of the choice of points and of the contact set, before the step.
+    # Two further evaluations belong to point selection and contact set, before the step.
     assert result.converged and result.contacts.count > 4 and len(looks) == 4
 
 
 def test_forces_that_miss_coulombs_law_end_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The equation of motion may hold. Where the forces violate Coulomb's law, another tangent is tried, and then
-    the solve fails, so that the caller takes two half steps.
-    """
+    """The equation of motion alone is not enough. Where the forces violate Coulomb's law, another tangent is tried;
+    then the solve fails, so that the caller takes two half steps."""
     resting, answered = block(sag=0.01, damping_ratio=0.5), responses.coulomb_forces
     for _ in range(5):
         resting.advance(DT)

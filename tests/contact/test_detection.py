@@ -38,7 +38,8 @@ def seven_points(cloud: GaussianCloud, gamma: float = 3.0) -> np.ndarray:
 
 
 def test_hull_points_hold_the_lowest_of_all_points(device: str) -> None:
-    """Eq. (3), Eq. (8): over 50 deformations of the cage the least gap of the points kept is that of all 7 n points."""
+    """Eq. (3), Eq. (8): over 50 deformations of the cage, the minimum gap of the hull points is that of all 7 n
+    points."""
     mesh = block_mesh()
     cloud = surface_cloud(mesh, 3000, lowest=0.05)
     tilted = (FLOOR, Plane.from_coefficients(0.3, 0.1, 1.0, 0.4))
@@ -54,7 +55,7 @@ def test_hull_points_hold_the_lowest_of_all_points(device: str) -> None:
         x = mesh.nodes @ rng.standard_normal((3, 3)) + 0.1 * rng.standard_normal(mesh.nodes.shape)
         points = np.einsum("pw,pwi->pi", weights, x[corners])
         lowest = min(plane.heights(points).min() for plane in tilted)
-        # Means are float32 on both sides, their sums are not in the same order.
+        # Means are float32 on both sides; their sums are in different order.
         assert detector.gaps(x)[0].min() == pytest.approx(lowest, abs=1e-6)
 
 
@@ -72,7 +73,8 @@ def test_gaps_kernel_equals_its_twin(device: str) -> None:
 
 
 def test_gaps_to_a_step_and_a_wall_equal_their_twin(device: str) -> None:
-    """Eq. (8): a step (two faces) and a wall beside the floor; on the step its top counts, before it its riser."""
+    """Eq. (8): a step (two faces) and a wall beside the floor; on the step its top face counts, in front of it its
+    riser."""
     mesh = block_mesh()
     low = mesh.nodes.min(axis=0)
     size = np.ptp(mesh.nodes, axis=0)
@@ -94,7 +96,8 @@ def test_gaps_to_a_step_and_a_wall_equal_their_twin(device: str) -> None:
 
 
 def test_endpoints_are_shortened_to_the_plane_at_rest() -> None:
-    """Eq. (3): arms through the plane end on it, in their own direction; the others keep gamma sigma."""
+    """Eq. (3): arms that pass through the plane end on it and keep their direction; the others keep the length gamma
+    sigma."""
     mesh = block_mesh()
     mean = np.array([[0.05, 0.02, 0.03]])
     cloud = GaussianCloud.from_numpy(
@@ -112,7 +115,7 @@ def test_endpoints_are_shortened_to_the_plane_at_rest() -> None:
 
 
 def flat_base(noise: float) -> GaussianCloud:
-    """Gaussians inside the block, and discs that lie in its base, all of whose numbers are off by up to ``noise``."""
+    """Return Gaussians inside the block, and discs in its base; all values have an error of up to ``noise``."""
     rng, off = np.random.default_rng(4), np.random.default_rng(5)
     count = 2000
     means = np.column_stack([rng.uniform(-0.18, 0.18, (count, 2)), rng.uniform(0.0, 0.9, count)])
@@ -126,10 +129,9 @@ def flat_base(noise: float) -> GaussianCloud:
 
 
 def test_points_on_a_grid_do_not_hang_on_the_last_bits_of_a_file() -> None:
-    """They lie on it, none is below the floor, in the order of their places, and hardly one is another where all
-    numbers differ by single precision's rounding: of those that touch the floor none, though its means and arms lie
-    half of the time below it, half above. Without a grid nearly all are others.
-    """
+    """Points on the grid are not below the floor and are sorted by position. Under rounding errors of single precision,
+    fewer than 0.3 % of them change, and none that touches the floor, although half of the means and arms there lie
+    below it. Without a grid, most points change."""
     mesh, grid = block_mesh(), 2.0**-10
 
     def places(noise: float, grid: float | None) -> np.ndarray:
@@ -159,7 +161,7 @@ def test_what_lies_in_an_edge_or_a_face_of_the_hull_is_no_vertex() -> None:
 
 
 def test_gaussians_below_the_plane_are_left_out_and_counted() -> None:
-    """A Gaussian whose mean lies below the plane takes no part; its share of the opacity mass is reported.
+    """A Gaussian whose mean lies below the plane is ignored; its fraction of the opacity mass is reported.
 
     See docs/concepts/contact.md.
     """
@@ -177,9 +179,8 @@ def test_gaussians_below_the_plane_are_left_out_and_counted() -> None:
 
 
 def test_contact_frame_maps_nodes_to_points(device: str) -> None:
-    """Eq. (8): frame rows give normal and tangential velocity of each point; axes are orthonormal;
-    end gaps are linear.
-    """
+    """Eq. (8): frame rows give the normal and tangential velocity of each point; axes are orthonormal; gaps at the end
+    are linear in the velocities."""
     mesh = block_mesh()
     slope = Plane.from_coefficients(0.4, -0.2, 1.0, 0.3)
     geometry = contact_geometry(surface_cloud(mesh, 200, lowest=0.1), mesh, (slope,), device=device)
@@ -236,15 +237,14 @@ def assert_coulomb(
 @pytest.mark.parametrize(("count", "unknowns"), [(1, 6), (4, 20), (12, 60), (12, 24), (40, 150), (40, 60)])
 @pytest.mark.parametrize("friction", [0.0, 0.3, 0.8])
 def test_coulomb_forces_on_random_problems(count: int, unknowns: int, friction: float) -> None:
-    """Eq. (8), Eq. (9): complementarity and exact cone;
-    with fewer unknowns than rows G is singular, and one contact is doubled.
-    """
+    """Eq. (8), Eq. (9): complementarity and the exact cone. With fewer unknowns than rows, G is singular; one contact
+    is duplicated."""
     for seed in range(4):
         rng = np.random.default_rng(seed)
         rows = rng.standard_normal((3 * count, unknowns)) * rng.uniform(0.3, 2.0, unknowns)
         if count > 1:
             rows[-3:] = rows[:3]
-        # All normals share a component, as on a floor, so that some motion separates every contact.
+        # All normals share a component, as on a floor, so that some motion separates all contacts.
         rows[0::3, 0] = 4.0 + np.abs(rows[0::3, 0])
         falling = rng.standard_normal(unknowns) - 2.0 * np.eye(unknowns)[0]
         shift = rng.uniform(-0.1, 0.3, count)
@@ -290,7 +290,7 @@ def test_block_on_an_incline() -> None:
 
 
 def test_separating_and_absent_contacts_need_no_force() -> None:
-    """Eq. (9): a body that leaves the ground, or has no contact, gets none."""
+    """Eq. (9): a body that leaves the ground, or has no contact, gets no contact force."""
     delassus, acceleration, _ = block_on_incline(0.0)
     force, _ = coulomb_forces(delassus, -acceleration, np.zeros(4), 0.5, np.ones((4, 3)))
     assert np.abs(force).max() < 1e-12
@@ -300,7 +300,8 @@ def test_separating_and_absent_contacts_need_no_force() -> None:
 
 @pytest.mark.parametrize("regularisation", [0.0, 1e-7])
 def test_coulomb_forces_of_forty_points_under_a_rigid_base(regularisation: float) -> None:
-    """Eq. (9): 120 rows of rank 6, sticking, sliding and spinning; all forty touch and the net wrench obeys Coulomb."""
+    """Eq. (9): 120 rows of rank 6, sticking, sliding and spinning; all forty points touch, and the net wrench obeys
+    Coulomb's law."""
     rng = np.random.default_rng(5)
     mass, inertia = 2.0, np.diag([0.3, 0.4, 0.2])
     arms = np.column_stack([rng.uniform(-0.5, 0.5, (40, 2)), np.full(40, -0.5)])

@@ -54,9 +54,8 @@ def assert_alike(one: NewtonIterate, other: NewtonIterate) -> None:
 def test_iterates_go_the_host_s_way(
     creature: Creature, points: np.ndarray, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Start, full and partial trials, further trials, and a new tangent with the muscles' stiffness. Everything runs
-    twice, because a GPU replays graphs the second time.
-    """
+    """Initial iterate, full and partial trial steps, further trials, and a new tangent with the muscles' stiffness.
+    Everything runs twice, because a GPU replays graphs the second time."""
     stepper = on_device(creature, device, monkeypatch)
     respond, factors = stepper.linearizer, stepper.factors
     assert isinstance(respond, DeviceContactLinearizer)
@@ -108,7 +107,8 @@ def test_what_inverts_an_element_is_no_number(creature: Creature, device: str, m
 
 
 def test_what_was_no_number_is_left_behind(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step does not depend on NaN left by an earlier one, from a matrix without factors or a diverged end."""
+    """A step does not depend on NaN that an earlier one left, from a matrix without factors or from a diverged
+    iterate."""
     stepper = on_device(creature, device, monkeypatch)
     respond, (problem, *_) = stepper.linearizer, problems(stepper, creature)
     assert isinstance(respond, DeviceContactLinearizer)
@@ -157,7 +157,7 @@ def test_what_is_at_hand_no_more_is_told_again(
     assert_alike(first.line_search_point(forces), second)
     shift = np.zeros(6)
     begun = first.newton_steps(shift, 0.8)
-    # The device continues past the first result.
+    # The device continues beyond the first result.
     again = first.newton_steps(shift, 0.8, ConvergenceState(1e-12, 0.0, np.inf))
     assert len(again.accepted_residuals) > 1
     for one, other in (
@@ -180,7 +180,7 @@ def test_what_is_at_hand_no_more_is_told_again(
 def test_a_step_has_the_same_contacts_whatever_was_looked_ahead_for(
     creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The prefetch is for that very step, or for one with another state, step size or set of points."""
+    """The prefetch is for the same step, or for one with another state, step size or set of points."""
     stepper = on_device(creature, device, monkeypatch)
     first, second, _ = problems(stepper, creature)
     lifted = BodyState(creature.start.positions + [0.0, 0.0, 0.004], first.state.velocities)
@@ -206,8 +206,7 @@ def test_a_tangent_whose_sum_fails_is_the_host_s(
     creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The muscles' stiffness is not definite by itself: the whole matrix is factored, and the iterate stays the
-    same.
-    """
+    same."""
     stepper = on_device(creature, device, monkeypatch)
     problem, *_ = problems(stepper, creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
@@ -222,7 +221,7 @@ def test_a_tangent_whose_sum_fails_is_the_host_s(
         dense_cholesky._InverseFactor, "add_low_rank", lambda root, directions, sign: 0.0 * directions[0, 0]
     )
     found = place.with_new_tangent()
-    # The sum has not been synchronised so far.
+    # The sum has not been synchronised before.
     assert len(found.free_contact_velocities) == 18
     whole = problem.tangent(stepper.factors, place.velocities, tension)
     expected = ContactLinearization.of(whole, contacts).iterate_at(tension, place.velocities, place.forces)

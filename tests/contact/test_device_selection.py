@@ -49,9 +49,8 @@ def assert_alike(there: ContactSet, here: ContactSet) -> None:
 
 @pytest.mark.parametrize("kind", ["flat", "corner", "waves"])
 def test_the_points_of_a_step_are_the_host_s(kind: str, device: str) -> None:
-    """A body comes down, leans, slides to the wall and leaves. Each selection follows the previous points, some of
-    them loaded. Penetrating points are counted except those in contact.
-    """
+    """A body approaches the ground, leans, slides to the wall and leaves. Each selection starts from the previous
+    points, some of which are loaded. Penetrating points are counted unless they are in contact."""
     geometry = ground(kind)
     nodes, random = geometry.mesh.nodes, np.random.default_rng(0)
     detector, points = (
@@ -87,14 +86,14 @@ def test_the_points_of_a_step_are_the_host_s(kind: str, device: str) -> None:
             detector.gaps(at),
             points.find_deeper(taken, np.where(sinks, gaps, 0.0), ACTIVATION_DEPTH * TOLERANCE),
         )
-        # The next step starts at the end of this one.
+        # The next step starts from the end of this one.
         after = then + 0.002 * random.standard_normal(nodes.shape)
         next_ends = wp.array(after, dtype=Vec3, device=device)
         places = torch.as_tensor(np.append(taken, [0] * 5).astype(np.int32), device=device)
         sight.enqueue_prefetch(next_ends, places)
         sight.advance_prefetch()
         if torch.device(device).type == "cuda":
-            # The workspaces wait for their graph; here nothing else has waited for the download.
+            # The workspaces synchronise with their graph; here nothing else has synchronised with the download.
             torch.cuda.synchronize()
         found = sight.deepest(len(places))
         found = found[points.order_by_gap(found[:, 0], found[:, 1])]

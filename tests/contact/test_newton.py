@@ -96,7 +96,7 @@ def test_a_wider_response_is_that_of_all_its_contacts(creature: Creature) -> Non
 
 
 def test_a_step_ahead_is_newton_s_with_forces_as_they_are(creature: Creature) -> None:
-    """The result is None where the step would invert an element."""
+    """The result is None if the step would invert an element."""
     problem, tension, random = falling(creature)
     respond = HostContactLinearizer()
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
@@ -118,9 +118,8 @@ def test_a_step_ahead_is_newton_s_with_forces_as_they_are(creature: Creature) ->
 
 @pytest.mark.parametrize("pulled", [True, False])
 def test_kernels_say_what_arrays_say(creature: Creature, pulled: bool) -> None:
-    """Residual norms, contact velocities and Newton steps, full and partial, also with the muscles' stiffness in the
-    tangent.
-    """
+    """Residual norms, contact velocities, and full and partial Newton steps, also with the muscles' stiffness in the
+    tangent."""
     problem, tension, random = falling(creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(0, 36, 5), problem.state.positions)
     stiff = tension if pulled else None

@@ -84,7 +84,7 @@ def plain(*sizes: float) -> list[tuple[float, float, float]]:
     ("course", "steps", "taken"),
     [
         (FIRST, plain(0.1, 0.01, 1e-4, 1e-6, 1e-9, 1e-12), 5),
-        # The first step may make it worse, a later one must not fall too little.
+        # The first step may increase the residual; a later one must reduce it sufficiently.
         (FIRST, plain(3.0, 2.9, 0.1), 2),
         (FIRST, plain(3.0, 2.0, 0.1), 3),
         (FIRST, plain(0.1, np.nan, 0.1), 2),
@@ -113,7 +113,7 @@ def test_a_loop_takes_the_steps_that_need_no_look(
 
 
 def test_a_loop_goes_the_host_s_way(device: str) -> None:
-    """Residuals that fall and rise at random, from the middle of a round."""
+    """Residuals decrease and increase at random; the loop starts in the middle of a round."""
     random, lengths = np.random.default_rng(0), set()
     for _ in range(100):
         course = replace(FIRST, max_steps=int(random.integers(6, 20)))

@@ -1,4 +1,4 @@
-"""Contact selection: one point for each cell, the lowest, and stable from step to step."""
+"""Contact selection: the lowest point of each cell, stable from step to step."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_forces_go_with_their_points_and_the_deep_join(geometry: ContactGeometry
 
 
 def test_cells_are_as_few_wherever_the_ground_is() -> None:
-    """A wide body that begins above the ground has the cells under it that it has where it stands."""
+    """A wide body that starts above the ground has the same cells under it as where it stands."""
     mesh = block_mesh(7, 7, 3, (1.2, 1.2, 0.4))
     side = np.linspace(-0.6, 0.6, 30)
     embedding = embed_points(mesh, np.array([[x, y, 0.0] for x in side for y in side]), device="cpu")
@@ -86,9 +86,8 @@ def test_cells_are_as_few_wherever_the_ground_is() -> None:
 
 
 def test_rounding_chooses_neither_cells_nor_points(geometry: ContactGeometry) -> None:
-    """The last bits of weights and gaps differ between machines. Of points that lie alike on the ground, the one
-    closest to the centre of its cell is selected.
-    """
+    """The last bits of weights and gaps differ between machines. Of points with equal gaps, the one closest to the
+    centre of its cell is selected."""
     random = np.random.default_rng(0)
     weights = geometry.weights + 1e-15 * random.standard_normal(geometry.weights.shape)
     other = ContactSelector(replace(geometry, weights=weights), activation_distance=NEAR, hysteresis=1e-3)

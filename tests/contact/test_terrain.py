@@ -50,9 +50,8 @@ def test_tops_of_a_step_a_ramp_a_wall_and_a_box() -> None:
 
 
 def test_the_top_of_what_hangs_over() -> None:
-    """A solid under a level face at 1 and over one that rises by 2: it ends above the point where that face has not
-    reached the other yet, and is nowhere beyond.
-    """
+    """A solid below a level face at z = 1 and below a face z = 2 x: a vertical line through the part with x < 0.5
+    leaves it at z = 1; beyond, it misses the solid."""
     wedge = Solid((Plane.from_coefficients(0.0, 0.0, 1.0, -1.0), Plane.from_coefficients(2.0, 0.0, -1.0, 0.0)))
     for x, z in ((0.0, 0.0), (0.0, -3.0), (0.4, 0.1), (-2.0, -1.0)):
         assert wedge.distance_along(np.array([x, 0.0, z]), UP) == pytest.approx(1.0 - z)
@@ -117,7 +116,7 @@ WALL = Solid((Plane.from_coefficients(-1.0, 0.0, 0.0, 0.15),))
 
 
 def test_the_kernel_equals_its_twin(device: str) -> None:
-    """Eq. (8): gaps to waves and to a wall beside them, which of both is nearer, and frames, against plain NumPy."""
+    """Eq. (8): gaps to waves and to a wall beside them, the nearer of both, and contact frames, against plain NumPy."""
     mesh = block_mesh()
     field = wavy_ground(reach=0.3)
     cloud = surface_cloud(mesh, 400, lowest=0.04)
@@ -125,7 +124,7 @@ def test_the_kernel_equals_its_twin(device: str) -> None:
     geometry = contact_geometry(cloud, mesh, (FLOOR,), field=field, solids=(wall,), device=device)
     detector = ContactDetector(geometry, device=device)
     random = np.random.default_rng(2)
-    # Half of it far beyond the grid.
+    # Half of the points are far beyond the grid.
     x = 2.0 * mesh.nodes + 0.2 * random.standard_normal(mesh.nodes.shape) - [0.0, 0.0, 0.3]
     points = np.einsum("pw,pwi->pi", geometry.weights, x[mesh.tets[geometry.tet_from_point]])
     both = np.stack([field.gaps(points), wall.faces[0].heights(points)])
@@ -140,7 +139,8 @@ def test_the_kernel_equals_its_twin(device: str) -> None:
 
 
 def test_contact_velocities_are_the_gaps_change(device: str) -> None:
-    """For points on the ground: the gap after a short way is what the frame's normal row says, to second order."""
+    """For points on the ground: after a small displacement the gap is, to second order, what the frame's normal row
+    predicts."""
     mesh = block_mesh()
     field = wavy_ground()
     x = mesh.nodes.copy()
@@ -149,7 +149,7 @@ def test_contact_velocities_are_the_gaps_change(device: str) -> None:
     geometry = ContactGeometry(mesh, (FLOOR,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0, field=field)
     detector = ContactDetector(geometry, device=device)
     contacts = detector.contact_set(np.arange(len(geometry.weights)), x)
-    # Weights are of single precision.
+    # The weights are in single precision.
     assert np.abs(contacts.gaps).max() < 1e-6
     v = np.random.default_rng(3).standard_normal(x.shape)
     for dt in (1e-3, 1e-4):
@@ -158,9 +158,8 @@ def test_contact_velocities_are_the_gaps_change(device: str) -> None:
 
 
 def test_arms_end_on_the_ground_at_rest_and_bumps_between_them_are_seen() -> None:
-    """Eq. (3): no point begins inside; more points stay than on flat ground, and none is lower than they, by bumps as
-    wide as two edges of a cage whose base is flat.
-    """
+    """Eq. (3): no point begins inside the ground. More points remain than on flat ground, and above bumps as wide as
+    two cage edges no Gaussian mean is deeper than the deepest point."""
     mesh = block_mesh()
     field = wavy_ground(0.02, spacing=0.05)
     cloud = surface_cloud(mesh, 20000, lowest=0.03)
@@ -188,7 +187,7 @@ def test_the_highest_of_ground_and_solids_is_stood_on() -> None:
 
 @cache
 def drop() -> tuple[Trajectory, LocomotionStepper, int]:
-    """A squat block let fall by 0.1 m onto waves, without muscle work, until it has come to rest."""
+    """Drop a squat block by 0.1 m onto waves, without muscle work, until it is at rest."""
     made = coarse_creature(block_mesh(4, 4, 3, size=(0.6, 0.6, 0.4)), forward=FORWARD, settle_first=False)
     body, muscles = made.stepper.body, made.stepper.muscles
     base = np.stack(np.meshgrid(*[np.linspace(-0.3, 0.3, 13)] * 2, [0.0]), axis=-1).reshape(-1, 3)
@@ -209,9 +208,8 @@ def drop() -> tuple[Trajectory, LocomotionStepper, int]:
 
 
 def test_a_body_dropped_onto_waves_comes_to_rest_in_balance() -> None:
-    """It stops, at more than one slope; forces carry the weight, and without slip their torque about its middle is
-    nothing.
-    """
+    """It comes to rest on several slopes; forces carry the weight, and without slip their torque about the centre is
+    zero."""
     t, stepper, _ = drop()
     speed = np.linalg.norm(t.velocities[-1], axis=1).max()
     assert speed < 2e-3 * np.sqrt(9.81)
@@ -225,7 +223,8 @@ def test_a_body_dropped_onto_waves_comes_to_rest_in_balance() -> None:
 
 
 def test_the_drop_passes_the_audit() -> None:
-    """All of its bounds, from the file alone: nothing goes deeper than 0.5 % of its height, the ledger closes."""
+    """All bounds of the audit hold, from the file alone: no point is deeper than 0.5 % of the height, and the energy
+    balance closes."""
     t, _, unconverged = drop()
     found = audit(t, newton_unconverged=unconverged)
     for name, limit in AUDIT_LIMITS.items():
@@ -234,7 +233,7 @@ def test_the_drop_passes_the_audit() -> None:
 
 
 def test_the_audit_recomputes_the_ground() -> None:
-    """Ground that was another, or normals that are not the ground's, are seen."""
+    """Another ground, or normals that are not those of the ground, are detected."""
     t, _, _ = drop()
     lifted = replace(t, ground_coefficients=t.ground_coefficients + 0.02)
     assert audit(lifted).penetration > 0.015
@@ -242,6 +241,6 @@ def test_the_audit_recomputes_the_ground() -> None:
     assert audit(lowered).complementarity_gap > 1e-4
     moved = replace(t, ground_origin=t.ground_origin + [0.2, 0.0, 0.0])
     assert audit(moved).complementarity_gap > 1e-3 or audit(moved).cone_violation > 1e-3
-    # What is stored of normals is of no account: forces obey the ground's.
+    # The stored normals are ignored: forces must obey those of the ground.
     upright = replace(t, contact_normal=np.tile([0.0, 0.0, 1.0], (len(t.contact_normal), 1)))
     assert audit(upright).cone_violation == audit(t).cone_violation

@@ -38,7 +38,7 @@ def test_volume_methods_are_exact_for_a_shear(method: DeformationMethod, device:
 
 
 def test_only_splitting_follows_a_bend() -> None:
-    """Eq. (14)-(17): for a needle bent onto a circle, only the split one keeps its mass on the circle."""
+    """Eq. (14)-(17): for a needle bent onto a circle, only the split needle keeps its mass on the circle."""
     mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
     cloud = GaussianCloud.from_numpy(
         np.array([[2.0, 0.2, 0.2]]),
@@ -59,7 +59,7 @@ def test_only_splitting_follows_a_bend() -> None:
         return float(np.average(distance, weights=np.tile(weights, 2)))
 
     whole = off_circle(DeformationMethod.BIDIRECTIONAL_NO_SPLIT)
-    # Two standard deviations out along the tangent, less the mean's own shift s^2 / 2 radius.
+    # Two standard deviations along the tangent, minus the shift of the mean itself, s^2 / 2 radius.
     assert whole == pytest.approx(np.hypot(radius, 0.8) - radius - 0.4**2 / (2 * radius), rel=0.25)
     assert off_circle(DeformationMethod.BIDIRECTIONAL) < 0.6 * whole
 

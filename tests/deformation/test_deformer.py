@@ -203,8 +203,8 @@ def test_colour_turns_with_the_mean_of_the_arms(device: str) -> None:
 
 
 def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
-    """Eq. (16): a needle whose two arms are bent by 40 degrees measures 40, not half; one across the bend measures
-    nothing."""
+    """Eq. (16): the bend is 40 degrees, not half of it, for a needle whose two arms are bent by 40 degrees, and zero
+    for a needle across the bend."""
     mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
     scales = np.log([[0.4, 0.004, 0.004], [0.004, 0.05, 0.004], [0.4, 0.4 / 3, 0.004]])
     means = np.tile([2.0, 0.2, 0.2], (3, 1))
@@ -219,7 +219,7 @@ def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
     assert measure.bend_degrees[1] < 4.0
     assert measure.bend_degrees[2] == pytest.approx(40.0, rel=0.15)
     assert np.argmax(measure.fit_error[0]) == 0
-    # The sagitta of the arc at one standard deviation, s^2 / 2 radius, is what an affine map leaves out.
+    # An affine map leaves out the sagitta of the arc at one standard deviation, s^2 / 2 radius.
     assert measure.fit_error[0, 0] == pytest.approx(0.4**2 / (2 * radius), rel=0.1)
     assert measure.curl_degrees[0, 0] == pytest.approx(40.0, abs=1.0)
     assert deformer.measure_bend([mesh.nodes]).bend_degrees.max() < 0.05
@@ -295,8 +295,8 @@ def test_no_spike_and_no_nan_whatever_the_cage_does(seed: int, noise: float, fla
 
 
 def test_the_mean_goes_where_the_mass_goes(device: str) -> None:
-    """Eq. (14) and second order: the deformed mean of a long Gaussian is the mean of its deformed mass, sampled
-    here."""
+    """Eq. (14) and second order: the deformed mean of a long Gaussian is the mean of its deformed mass, estimated by
+    sampling."""
     mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
     scales = np.array([0.3, 0.02, 0.03])
     cloud = GaussianCloud.from_numpy(
@@ -319,7 +319,7 @@ def test_scale_and_rotation_do_not_flicker() -> None:
     """Eq. (15): under a slow twist by 360 degrees with stretch, axes keep their order and move little in every
     frame."""
     mesh, cloud = box(), random_cloud(200, degree=0)
-    # Scales differ by twice the stretch; closer ones may swap at any speed.
+    # Scales differ by more than the stretch can change; axes of closer scales may swap within one frame.
     scales = np.random.default_rng(1).permuted(np.tile(np.log([0.06, 0.03, 0.01]), (200, 1)), axis=1)
     cloud = GaussianCloud.from_numpy(
         cloud.means.numpy(),

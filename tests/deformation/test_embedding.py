@@ -75,7 +75,8 @@ def test_points_are_located_as_by_brute_force(device: str) -> None:
 
 
 def test_weights_reproduce_points_and_shared_faces_take_the_lowest_tet(device: str) -> None:
-    """Eq. (2): sum 1 and sum w x = p to rounding, far from the origin too; ties go to the lowest index."""
+    """Eq. (2): weights sum to 1 and sum w x = p to rounding, also far from the origin; on shared faces the lowest index
+    is taken."""
     mesh = blob(seed=3)
     far = TetMesh(mesh.nodes + np.array([100.0, -200.0, 50.0]), mesh.tets)
     corners = far.nodes[far.tets]

@@ -1,4 +1,4 @@
-"""A capture in the frame of its body: shapes, sizes and colours transform with it."""
+"""A capture in the frame of its body: shapes, sizes and colours are transformed with it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.deformation_scenes import covariances
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_shapes_turn_and_grow_with_the_frame(degree: int) -> None:
-    """C -> s^2 A C A^T and m -> s A (m - o), A the frame's axes; the same colour is seen from the same side."""
+    """C -> s^2 A C A^T and m -> s A (m - o), with the frame's axes A; the same colour is seen from the same side."""
     random = np.random.default_rng(3)
     count = 40
     cloud = GaussianCloud.from_numpy(

@@ -80,8 +80,8 @@ def profile_error(opacity: float, rule: SplitRule, tilt: float) -> float:
 
 @pytest.mark.parametrize("opacity", [0.05, 0.2, 0.5, 0.8, 0.9, 0.99])
 def test_a_split_is_hard_to_see_from_the_side_and_from_the_end(opacity: float) -> None:
-    """Eq. (17): side-on the image changes by at most 8 % of the opacity, end-on by a third for a faint one; the paper's
-    two children change it by a third and more side-on."""
+    """Eq. (17): seen from the side, the image changes by at most 8 % of the opacity; seen from the end, by at most a
+    third. The paper's two children change the side view by more than 30 %."""
     side, end = (profile_error(opacity, SplitRule.MEASURED, tilt) for tilt in (np.pi / 2, 0.0))
     assert side < 0.08
     assert end < 0.33
@@ -108,8 +108,8 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
 
 
 def test_where_not_all_can_be_split_the_worst_are() -> None:
-    """With a limit on the count, those with the largest fit error are split, among those that would be split without a
-    limit."""
+    """With a limit on the count, the Gaussians with the largest fit error are split, all of which would be split
+    without a limit too."""
     mesh, cloud = box((24, 2, 2), (4.0, 0.4, 0.4)), bar_cloud()
     embedding = embed_gaussians(cloud, mesh)
     bend = Deformer(cloud, embedding).measure_bend([bent(mesh.nodes, 1.5)])
@@ -184,7 +184,8 @@ def test_nothing_pops_in_an_animation_that_splits() -> None:
 
 @pytest.mark.data
 def test_a_split_at_rest_cannot_be_seen(data_dir: Path) -> None:
-    """Eq. (17): the PSNR of split against unsplit at rest is at least 45 dB on a real capture that a bend has split."""
+    """Eq. (17): the PSNR of split against unsplit at rest is at least 45 dB on a real capture that was split for a
+    bend."""
     cloud = read_capture(data_dir / "objects" / "plush_dog.ply", device="cpu").cloud
     means = cloud.means.numpy().astype(float)
     lower, upper = np.percentile(means, [0.5, 99.5], axis=0)
@@ -206,9 +207,9 @@ def test_a_split_at_rest_cannot_be_seen(data_dir: Path) -> None:
 
 
 def test_children_are_as_opaque_as_the_rules_say() -> None:
-    """Eq. (17): the paper's two children share the mass, with sigma^2 = 1 - 2 / pi each and peaks of at most 0.99. Of
-    the measured three none is more opaque than the parent, the middle one is more opaque than the outer ones, and all
-    increase with the parent."""
+    """Eq. (17): the paper's two children share the mass, each with sigma^2 = 1 - 2 / pi and a peak of at most 0.99. Of
+    the three children of the measured rule, none is more opaque than the parent, the middle one is the most opaque, and
+    all opacities increase with the parent's."""
     opacities = np.linspace(0.0, 1.0, 401)
     pair = child_opacities(opacities, SplitRule.PAPER)
     peaks = 0.5 * opacities / np.sqrt(1.0 - 2.0 / np.pi)

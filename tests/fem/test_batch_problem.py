@@ -96,7 +96,7 @@ def test_residuals(
     alone: list[StepProblem],
     pulling: bool,
 ) -> None:
-    """Forces, momentum corrections and residuals, with muscles and without."""
+    """Forces, momentum corrections and residuals equal those of single worlds, with and without muscles."""
     given = tried(states)
     velocities, tensions = torch.from_numpy(given), torch.from_numpy(muscles.stiffness * activations)
     pulls = [MuscleEnergy.of(muscles, one) if pulling else None for one in activations]
@@ -140,7 +140,8 @@ def test_tangents(
     pulling: bool,
     chunk_bytes: int,
 ) -> None:
-    """Velocity changes by impulses, with and without the stiffness of muscles; a given momentum projection is used."""
+    """Velocity changes by impulses equal those of single worlds, with and without the stiffness of muscles; a given
+    momentum projection is reused."""
     beside = problem_of(BatchBody(body, muscles, 4, panel=32, chunk_bytes=chunk_bytes), states)
     given, impulses = tried(states), np.random.default_rng(3).standard_normal((3, given_size(body), 4))
     pulls = [MuscleEnergy.of(muscles, one) for one in activations] if pulling else [None] * 3
@@ -178,7 +179,7 @@ def given_size(body: SoftBody) -> int:
 def test_an_indefinite_world_is_projected_and_one_without_numbers_has_no_factors(
     body: SoftBody, muscles: MuscleSet
 ) -> None:
-    """Squashed to 40 % in a long step; the second has NaN velocities, the third is at rest."""
+    """The first world is compressed to 40 % in a long step, the second has NaN velocities, the third is at rest."""
     rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
     squashed = BodyState(body.mesh.nodes * [1.1, 1.1, 0.4], rest.velocities)
     states = [squashed, rest, rest]

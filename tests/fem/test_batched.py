@@ -1,4 +1,4 @@
-"""Batched records: gather and scatter of some worlds."""
+"""Batched records: gathering and scattering of some worlds."""
 
 from __future__ import annotations
 

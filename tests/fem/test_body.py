@@ -49,8 +49,8 @@ def test_damping_ratio_of_the_first_mode(body: SoftBody) -> None:
 
 
 def test_momenta_of_a_rigid_motion(body: SoftBody) -> None:
-    """For v = u + omega x (x - c): the centre moves with u, L = I omega,
-    kinetic energy = m u^2/2 + omega . I omega / 2.
+    """For v = u + omega x (x - c): the velocity of the centre of mass is u, L = I omega, and the kinetic energy is m
+    u^2 / 2 + omega . I omega / 2.
     """
     x = body.mesh.nodes @ Rotation.from_rotvec([0.1, 0.7, -0.4]).as_matrix().T + [0.3, 0.2, 1.0]
     centre = body.centre_of_mass(x)
@@ -110,8 +110,8 @@ def test_a_body_that_hangs_on_an_edge_is_refused() -> None:
 
 
 def test_a_body_on_thin_legs_is_stiffened_until_it_sinks_by_two_percent() -> None:
-    """The centre of mass sinks by ``MAX_SAG`` H, by a linear dense solve with a clamped base; a column, which sags
-    less, is not stiffened (docs/concepts/cage.md).
+    """The centre of mass sinks by ``MAX_SAG`` H in a dense linear solve with a clamped base; a column, which sags less,
+    is not stiffened (docs/concepts/cage.md).
     """
     for mesh, stiffened in ((coarse_stool(), True), (box_mesh((2, 2, 4), (0.8, 0.8, 2.0)), False)):
         made = make_body(mesh, FLOOR, sag=0.05, device="cpu")

@@ -54,7 +54,7 @@ def test_repeated_work_runs_while_its_flag_is_set(device: str, monkeypatch: pyte
 
     def work() -> None:
         runs.append(len(runs))
-        # With temporary memory.
+        # The captured work allocates temporary memory.
         sums.add_(torch.stack([torch.ones_like(upload.device[0]), upload.device[0]]))
         going.copy_(sums[:1] < upload.device[1])
 

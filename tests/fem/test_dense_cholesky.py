@@ -121,13 +121,13 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
         assert dense.add_low_rank(across, rates) == thin.add_low_rank(across, rates) == definite
         if definite:
             assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
-        # What is refused changes nothing.
+        # A rejected term changes nothing.
         assert not dense.add_low_rank(across, np.full(8, -1e3)) and not thin.add_low_rank(across, np.full(8, -1e3))
         assert dense.update(entries) == thin.update(entries) == definite
         if definite:
             assert not dense.add_low_rank(across, np.full(8, -1e3)) and not thin.add_low_rank(across, np.full(8, -1e3))
             assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
-        # As much along every axis as makes the sum definite.
+        # Equal stiffness along every axis, large enough that the sum is definite.
         assert (
             dense.add_low_rank(np.eye(60), np.full(60, 40.0))
             and thin.add_low_rank(np.eye(60), np.full(60, 40.0))
@@ -184,7 +184,7 @@ def test_a_cpu_gets_sparse_factors() -> None:
 
 @pytest.mark.cuda
 def test_factors_leave_what_warp_holds_for_its_stream() -> None:
-    """Temporary memory of sorts, which would be freed during a capture."""
+    """Temporary memory of Warp's sorts on the stream must not be freed, in particular not during a capture."""
     upper = band(150)
     factors, count = DenseCholesky(upper, device="cuda:0"), 1000
     for seed in range(3):

@@ -82,7 +82,7 @@ def test_projected_hessian_clamps_each_element(device: str) -> None:
     indefinite = 0
     maps = [np.diag(rng.uniform(0.3, 1.6, 3)) + 0.3 * rng.standard_normal((3, 3)) for _ in range(20)]
     for i, k in ((0, 1), (1, 2), (2, 0)):
-        # Sheared in one plane alone; blown up, most along all axes but one.
+        # Shear in a single plane; expansion, strongest along all axes but one.
         sheared, blown = np.diag([0.5, 0.7, 0.6]), np.diag([3.0, 2.6, 2.8])
         sheared[i, k], blown[k, k] = 0.4, 1.1
         maps += [sheared, blown, blown + 0.1 * rng.standard_normal((3, 3))]
@@ -92,7 +92,7 @@ def test_projected_hessian_clamps_each_element(device: str) -> None:
             continue
         true = full(assembly, assembly.hessian_entries(x))
         projected = full(assembly, assembly.hessian_entries(x, projected=True))
-        # The projection is taken in deformation-gradient space: pull both back there.
+        # The projection is done in deformation-gradient space: transform both Hessians to it.
         pull = np.kron(np.linalg.pinv(weights), np.eye(3))
         values, vectors = np.linalg.eigh(pull.T @ true @ pull)
         indefinite += values.min() < -1e-6 * values.max()
@@ -102,14 +102,14 @@ def test_projected_hessian_clamps_each_element(device: str) -> None:
 
 
 def assembly_gram(corners: np.ndarray) -> np.ndarray:
-    """4x4 matrix whose Cholesky factor maps corner values to gradients (3 rows) and their mean (1 row)."""
+    """Return the 4x4 matrix whose Cholesky factor maps corner values to gradients (3 rows) and their mean (1 row)."""
     inverse = np.linalg.inv((corners[1:] - corners[0]).T)
     gradients = np.vstack([-inverse.sum(0), inverse])
     return gradients @ gradients.T + np.full((4, 4), 1.0 / 16.0)
 
 
 def test_rigid_motion_costs_nothing(bent: Bent) -> None:
-    """No energy, force or damping from rotation; internal forces carry no net force or torque."""
+    """A rotation causes no energy, force or damping; internal forces have no net force or torque."""
     assembly, x, damping = bent
     nodes = assembly.mesh.nodes
     motion = Rotation.from_rotvec([1.0, 2.0, -0.5]).as_matrix().T
@@ -127,7 +127,7 @@ def test_rigid_motion_costs_nothing(bent: Bent) -> None:
 
 
 def test_uniaxial_stretch_closed_form(device: str) -> None:
-    """Eq. (5) for diag(a, b, c): Psi = mu/2 (a^2+b^2+c^2-3) - mu ln J + lambda/2 ln^2 J, times the volume."""
+    """Eq. (5) for F = diag(a, b, c): Psi = mu/2 (a^2+b^2+c^2-3) - mu ln J + lambda/2 ln^2 J, times the volume."""
     mesh = block_mesh()
     assembly = ElasticAssembly(mesh, MATERIAL, device=device)
     stretch = np.array([1.2, 0.9, 0.8])

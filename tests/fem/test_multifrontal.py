@@ -14,7 +14,7 @@ from tests.support.sparse_patterns import PATTERNS, upper_of
 
 
 def random_matrix(count: int, shift: float) -> sparse.csc_matrix:
-    """Symmetric, ``shift`` added to its diagonal."""
+    """Return a random symmetric matrix with ``shift`` added to its diagonal."""
     random = np.random.default_rng(3)
     half = sparse.csc_matrix(np.where(random.random((count, count)) < 0.1, random.standard_normal((count, count)), 0.0))
     return sparse.csc_matrix(half + half.T + shift * sparse.eye(count))
@@ -22,7 +22,8 @@ def random_matrix(count: int, shift: float) -> sparse.csc_matrix:
 
 @pytest.mark.parametrize("shift", [12.0, 0.7])
 def test_one_and_many_right_sides(shift: float) -> None:
-    """Definite and indefinite: A x = b to rounding, and as many negative pivots as negative eigenvalues."""
+    """For definite and indefinite matrices, A x = b to rounding, and there are as many negative pivots as negative
+    eigenvalues."""
     matrix = random_matrix(60, shift)
     dense, upper = matrix.toarray(), upper_of(matrix)
     negative = int((np.linalg.eigvalsh(dense) < 0.0).sum())
@@ -34,9 +35,9 @@ def test_one_and_many_right_sides(shift: float) -> None:
     assert np.abs(dense @ factors.solve(right) - right).max() < 1e-9
     assert np.abs(dense @ factors.solve(right[:, 0]) - right[:, 0]).max() < 1e-9
     assert factors.solve(right[:, :0]).shape == (60, 0)
-    # Where nothing is added, it is as definite as it was.
+    # An empty term does not change definiteness.
     assert factors.add_low_rank(np.zeros((60, 0)), np.zeros(0)) == (negative == 0)
-    # Another matrix of the same pattern.
+    # A matrix with the same pattern.
     assert factors.update(2.0 * upper.data) == (negative == 0)
     assert np.abs(2.0 * dense @ factors.solve(right) - right).max() < 1e-9
 
@@ -52,8 +53,8 @@ def test_what_cannot_be_factored_is_told() -> None:
 
 @pytest.mark.parametrize("name", PATTERNS)
 def test_every_pattern_and_number_of_right_sides(name: str) -> None:
-    """To rounding, for any memory order; the bits of a solution do not depend on the number of right-hand sides, except
-    for a single one."""
+    """The solution is exact to rounding for any memory order; its bits do not depend on the number of right-hand sides,
+    except for a single one."""
     matrix = PATTERNS[name]
     factors, count = MultifrontalLdl(upper_of(matrix)), len(matrix.indptr) - 1
     assert factors.update(upper_of(matrix).data) and factors.negative_pivots == 0
@@ -77,8 +78,8 @@ def strained(factors: LinearSolver, upper: sparse.csc_matrix, vectors: np.ndarra
 
 @pytest.mark.parametrize("name", PATTERNS)
 def test_the_strain_of_many_moves(name: str) -> None:
-    """X^T H X and X^T g of X = 0.3 V - 0.7 S^-1 diag(w) V minus the reference in its last column, H another
-    matrix of the same pattern."""
+    """X^T H X and X^T g are those of X = 0.3 V - 0.7 S^-1 diag(w) V, minus the reference in the last column of X, for
+    another matrix H with the same pattern."""
     matrix = PATTERNS[name]
     factors = MultifrontalLdl(upper_of(matrix))
     factors.update(upper_of(matrix).data)
@@ -138,7 +139,7 @@ def test_the_same_bits_on_any_number_of_cores(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_factors_that_share_an_analysis_keep_to_their_own_matrices() -> None:
-    """Two solvers with one analysis give the bits of solvers with their own."""
+    """Two solvers that share an analysis give the same bits as solvers with their own."""
     upper = upper_of(random_matrix(60, 12.0))
     analysis, right = SymbolicFactorization.of(upper), np.random.default_rng(5).standard_normal((60, 3))
     shared = [MultifrontalLdl(upper, analysis) for _ in range(2)]
@@ -151,11 +152,11 @@ def test_factors_that_share_an_analysis_keep_to_their_own_matrices() -> None:
 
 
 def test_a_pivot_next_to_nothing_has_no_factors() -> None:
-    """In the middle of a block and at its start; an indefinite matrix has factors."""
+    """The pivot is in the middle or at the start of a block; an indefinite matrix has factors."""
     matrix = PATTERNS["full, of fifty"].toarray()
     whole = upper_of(sparse.csc_matrix(matrix))
     factors = MultifrontalLdl(whole)
-    # The matrix whose Schur complement at the last of k rows, in the order of elimination, is `share` times the
+    # Build a matrix whose Schur complement at the last of k rows, in the order of elimination, is `share` times the
     # diagonal entry.
     place = np.argsort(factors.permutation)
     for k in (1, 17, 50):

@@ -72,7 +72,7 @@ def test_they_are_those_of_one_at_a_time(count: int | None, dt: float | None) ->
 
 
 def test_shapes_whose_axes_are_not_told_apart() -> None:
-    """At rest, stretched along one axis, and scaled uniformly: equal principal stretches, with no rotation to find."""
+    """At rest, stretched along one axis, and scaled uniformly: principal stretches are equal and determine no axes."""
     mesh = block_mesh()
     one, four = both(mesh)
     for shape in (np.ones(3), np.array([1.0, 1.0, 1.3]), 0.8 * np.ones(3)):

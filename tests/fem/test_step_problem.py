@@ -1,5 +1,5 @@
-"""The step's equation (Eq. 4, 6): it is the derivative of an energy, its tangent is its derivative, both momenta are
-conserved; free fall, spin, drag, and a column that sags.
+"""The equation of a step (Eq. 4, 6): its residual is the derivative of an energy, its tangent is the derivative of the
+residual, both momenta are conserved; free fall, spin, drag, and a column that sags.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def test_the_tangent_inverts_the_derivative(body: SoftBody, tension: MuscleEnerg
         along = tangent.solve(impulse).reshape(v.shape)
         h = 1e-4 / np.abs(along).max()
         change = (problem.residual(v + h * along, pull) - problem.residual(v - h * along, pull)) / (2 * h)
-        # What Woodbury leaves out are muscles of less than a thousandth of the largest stiffness.
+        # The Woodbury term leaves out muscles with less than a thousandth of the largest stiffness.
         assert np.abs(change.ravel() - impulse).max() < (2e-3 if muscles else 1e-6) * np.abs(impulse).max()
 
 
@@ -98,7 +98,7 @@ def test_every_column_has_the_momenta_of_its_impulse(body: SoftBody, tension: Mu
 def test_an_indefinite_stiffness_is_projected_and_keeps_the_momenta(
     body: SoftBody, tension: MuscleEnergy, muscles: bool
 ) -> None:
-    """Squashed to 40 % in a long step the true S has negative pivots, also with muscles; its definite approximation
+    """Compressed to 40 % in a long step, the true S has negative pivots, also with muscles; its definite approximation
     conserves the momenta, too."""
     squashed = BodyState(body.mesh.nodes * [1.1, 1.1, 0.4], np.zeros_like(body.mesh.nodes))
     problem, factors = StepProblem(body, squashed, 1.0), MultifrontalLdl(body.assembly.upper_pattern)
@@ -113,8 +113,8 @@ def test_an_indefinite_stiffness_is_projected_and_keeps_the_momenta(
 
 @pytest.mark.parametrize("inverting", [False, True])
 def test_a_squash_and_an_inverting_start_are_solved(body: SoftBody, inverting: bool) -> None:
-    """A body squashed to 55 %, at rest or so fast that its velocities would invert elements, ends the step with the
-    equation balanced and J > 0.
+    """For a body compressed to 55 %, at rest or so fast that its velocities would invert elements, the step ends with a
+    balanced equation and J > 0.
     """
     squashed = body.mesh.nodes * [1.1, 1.1, 0.55]
     fast = -2.0 * squashed / DT * [0, 0, 1]
@@ -126,7 +126,7 @@ def test_a_squash_and_an_inverting_start_are_solved(body: SoftBody, inverting: b
 
 
 def test_a_step_says_when_it_does_not_converge(body: SoftBody) -> None:
-    """A residual that no float can reach."""
+    """No floating-point residual reaches the tolerance."""
     _, result = passive_body(body, state=bent_state(body), tolerance=1e-25).advance(DT)
     assert not result.converged
     assert 1e-25 < result.residual < 1e-9
@@ -149,8 +149,8 @@ def fall(
 
 @pytest.mark.parametrize("muscles", [False, True])
 def test_free_fall_follows_the_discrete_parabola(body: SoftBody, tension: MuscleEnergy, muscles: bool) -> None:
-    """Eq. (4): in flight the centre of mass is x0 + n dt v0 + g dt^2 n (n + 1) / 2, to 1e-6 H,
-    however the body deforms; L stays to rounding, where implicit Euler alone loses spin.
+    """Eq. (4): in flight the centre of mass is x0 + n dt v0 + g dt^2 n (n + 1) / 2, to 1e-6 H, for any deformation; L
+    is conserved to rounding, where implicit Euler alone loses spin.
     """
     start = spinning_state(body) if muscles else bent_state(body)
     states, given_back = fall(body, start, DT, 30, tension if muscles else None)
@@ -162,7 +162,7 @@ def test_free_fall_follows_the_discrete_parabola(body: SoftBody, tension: Muscle
     spins = np.array([body.angular_momentum(s.positions, s.velocities) for s in states])
     assert np.abs(spins - spins[0]).max() < 1e-10 * np.abs(spins[0]).max()
     assert given_back > 1e-3
-    # The body does deform meanwhile, or the test would say nothing.
+    # The body must deform, or the test would show nothing.
     assert np.ptp([body.assembly.energy(s.positions) for s in states]) > 1e-3
 
 
@@ -181,11 +181,11 @@ def test_free_fall_converges_at_rate_one(body: SoftBody) -> None:
 
 @pytest.mark.parametrize("damping_ratio", [0.0, 0.05])
 def test_spin_survives_a_free_half_turn(damping_ratio: float) -> None:
-    """A free half turn in 24 steps keeps L to rounding and turns by 180 degrees within 3; 10 % of the spin is what
-    implicit Euler alone would lose.
+    """A free half turn in 24 steps conserves L to rounding and rotates by 180 degrees within 3; implicit Euler alone
+    would lose 10 % of the spin.
 
-    With and without damping, as Eq. (6) does not damp rotations. The body is stiff, since a soft one expands under the
-    spin and so rotates more slowly.
+    With and without damping, because Eq. (6) does not damp rotations. The body is stiff, since a soft one expands under
+    the spin and therefore rotates more slowly.
     """
     body = make_body(block_mesh(), FLOOR, sag=1e-3, damping_ratio=damping_ratio, device="cpu")
     steps = 24
@@ -201,8 +201,8 @@ def test_spin_survives_a_free_half_turn(damping_ratio: float) -> None:
 
 
 def test_damping_resists_deformation_but_no_rigid_motion(body: SoftBody) -> None:
-    """Eq. (6): no damping force after any rigid motion of a deformed body, however large;
-    other motions lose the power -v.f >= 0.
+    """Eq. (6): no rigid motion of a deformed body causes a damping force, however large; other motions lose the power
+    -v.f >= 0.
     """
     problem = StepProblem(body, bent_state(body), DT)
     assembly, start = body.assembly, problem.state.positions
@@ -222,8 +222,8 @@ def test_damping_resists_deformation_but_no_rigid_motion(body: SoftBody) -> None
 
 
 def test_drag_slows_free_flight_exponentially(body: SoftBody) -> None:
-    """Eq. (6): with drag alpha v_com goes to (v_com + g dt) / (1 + alpha dt) each implicit step, and so does L without
-    gravity's part.
+    """Eq. (6): in each implicit step, drag alpha changes v_com to (v_com + g dt) / (1 + alpha dt), and L likewise
+    without the gravity term.
     """
     alpha, start = 2.0, spinning_state(body)
     states, _ = fall(body, start, DT, 3, drag=alpha)

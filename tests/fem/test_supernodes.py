@@ -25,7 +25,7 @@ def test_blocks_hold_the_factor(name: str) -> None:
         own = np.arange(blocks.first[s], blocks.first[s] + blocks.widths[s])
         assert np.array_equal(front[: len(own)], own) and (np.diff(front) > 0).all()
         held[np.ix_(front, own)] = True
-        # The rows below are in the parent, which comes later.
+        # The rows below are in the parent, which is later in the order.
         below, parent = front[len(own) :], blocks.parents[s]
         assert (parent < 0) == (len(below) == 0)
         if parent >= 0:
@@ -46,5 +46,5 @@ def test_blocks_of_a_mesh_are_wide_and_nearly_full() -> None:
     factor = np.linalg.cholesky(matrix.toarray()[np.ix_(order, order)])
     held = (blocks.widths * (blocks.heights - 0.5 * (blocks.widths - 1.0))).sum()
     assert held < 1.35 * np.count_nonzero(np.abs(factor) > 1e-14)
-    # The given order would have 1.5 times as many entries.
+    # The original order would have 1.5 times as many entries.
     assert held < np.count_nonzero(np.abs(np.linalg.cholesky(matrix.toarray())) > 1e-14) / 1.5

@@ -1,4 +1,4 @@
-"""Velocities of a turn are cross products."""
+"""Velocities of a rotation are cross products."""
 
 import numpy as np
 

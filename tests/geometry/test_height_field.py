@@ -17,12 +17,12 @@ AXES = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
 
 
 def tilted(field: HeightField) -> HeightField:
-    """The same ground turned and moved."""
+    """Return the same ground, rotated and translated."""
     return HeightField(field.axes @ AXES.T, AXES @ field.origin + [0.3, -2.0, 0.7], field.spacing, field.coefficients)
 
 
 def scattered(field: HeightField, count: int = 300) -> np.ndarray:
-    """(count, 3) points within and beyond its grid."""
+    """Return (count, 3) points within and outside the grid."""
     random = np.random.default_rng(0)
     rows, columns = field.coefficients.shape
     flat = random.uniform(-3.0, 3.0 + max(rows, columns), (count, 2)) * field.spacing
@@ -30,7 +30,7 @@ def scattered(field: HeightField, count: int = 300) -> np.ndarray:
 
 
 def test_it_goes_through_its_nodes_and_follows_waves() -> None:
-    """A sine of 16 spacings is met to 0.02 % of its height at the nodes and 0.5 % between them."""
+    """A sine of 16 spacings is reproduced to 0.02 % of its height at the nodes and to 0.5 % between them."""
     field = wavy_ground(1.0, spacing=LENGTH / 16)
     nodes = field.nodes()[3:-3, 3:-3]
     assert np.abs(nodes[..., 2] - wave(nodes[..., :2], 1.0)).max() < 2e-4
@@ -39,7 +39,7 @@ def test_it_goes_through_its_nodes_and_follows_waves() -> None:
 
 
 def test_normals_are_the_gradient_of_the_gap() -> None:
-    """By central differences, on the ground; above it, to first order in the height."""
+    """By central differences, exact on the ground and to first order in the height above it."""
     field = tilted(wavy_ground(0.05))
     points = scattered(field)
     on = points - field.heights(points)[:, None] * field.normal
@@ -58,7 +58,7 @@ def test_normals_are_the_gradient_of_the_gap() -> None:
 
 
 def test_frames_turn_without_a_jump() -> None:
-    """Along a line of 4,000 points, over many cells and beyond the grid: neighbours' frames differ by little."""
+    """Along a line of 4,000 points across many cells and beyond the grid, the frames of neighbours differ by little."""
     field = tilted(wavy_ground(0.05, reach=1.0))
     line = field.origin + np.linspace(-0.3, 2.5, 4000)[:, None] * (field.axes[0] + 0.7 * field.axes[1])
     assert np.abs(np.diff(field.frames(line), axis=0)).max() < 5e-3
@@ -93,7 +93,7 @@ def test_levelled_and_raised_are_inverse() -> None:
 
 
 def test_top_is_where_a_plumb_line_meets_it() -> None:
-    """On a slope, too."""
+    """On level and on sloping ground."""
     field = tilted(wavy_ground())
     up = Rotation.from_rotvec(np.radians(20.0) * field.axes[0]).apply(field.normal)
     point = field.origin + 2.1 * field.axes[0] + 1.7 * field.axes[1] + 0.4 * field.normal
@@ -102,7 +102,7 @@ def test_top_is_where_a_plumb_line_meets_it() -> None:
 
 
 def test_coarser_ground_keeps_what_is_wide() -> None:
-    """Waves of 16 new spacings keep 97 % of their height, those of two a third or less; none is moved."""
+    """Waves of 16 new spacings keep 97 % of their height, those of two a third or less; no wave is displaced."""
     field = wavy_ground(0.03, spacing=0.02)
     coarse = field.coarser(0.05)
     assert coarse.spacing == 0.05 and len(coarse.coefficients) < 0.5 * len(field.coefficients)

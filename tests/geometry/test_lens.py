@@ -1,4 +1,4 @@
-"""Lenses: against OpenCV's, and photos made through them."""
+"""Lenses: against OpenCV's, and photos taken through them."""
 
 from __future__ import annotations
 
@@ -67,7 +67,8 @@ def test_a_lens_that_bends_nothing_is_none() -> None:
 
 
 def photographed(picture: np.ndarray, pinhole: Camera, taken: Camera, lens: Lens) -> np.ndarray:
-    """Photo by ``taken`` through ``lens`` of the scene that ``picture`` shows to ``pinhole`` at the same place."""
+    """Return the photo that camera ``taken`` takes through ``lens`` of the scene whose image by ``pinhole`` is
+    ``picture``; both are at the same place."""
     columns, rows = np.meshgrid(np.arange(taken.width) + 0.5, np.arange(taken.height) + 0.5)
     wanted = np.stack([(columns - taken.cx) / taken.fx, (rows - taken.cy) / taken.fy], axis=-1)
     rays = wanted.copy()
@@ -87,14 +88,14 @@ def photographed(picture: np.ndarray, pinhole: Camera, taken: Camera, lens: Lens
     ],
 )
 def test_a_photo_through_a_lens_is_straightened(model: str, numbers: dict[str, float]) -> None:
-    """A render bent by the lens and straightened is the render; unstraightened it is not."""
+    """A render that is distorted and undistorted again equals the render; without undistortion it does not."""
     lens = Lens.named(model, numbers)
     assert lens is not None
     size = 192
     camera = Camera.look_at(
         np.array([0.0, 1.2, 2.2]), np.array([0.0, 0.5, 0.0]), np.array([0.0, 1.0, 0.0]), width=size, height=size
     )
-    # Seen finer and wider than the photo, so that bending it loses little.
+    # The image is finer and wider than the photo, so that distorting it loses little.
     fine = replace(
         camera, width=4 * size, height=4 * size, fx=2 * camera.fx, fy=2 * camera.fy, cx=2 * size, cy=2 * size
     )
@@ -113,7 +114,7 @@ def test_a_photo_through_a_lens_is_straightened(model: str, numbers: dict[str, f
 
 
 def test_pixels_without_a_source_are_known_and_clicks_find_their_way() -> None:
-    """A pincushion's pinhole photo has corners that the lens did not see; a barrel's has none."""
+    """A pincushion lens leaves the corners of the pinhole image unknown; a barrel lens leaves none."""
     camera = Camera(60, 40, 50.0, 50.0, 30.0, 20.0, np.eye(3), np.zeros(3))
     wide = Undistortion.of(camera, Lens(radial=(0.3, 0.0, 0.0, 0.0)))
     assert not wide.known[[0, 0, -1, -1], [0, -1, 0, -1]].any()
@@ -127,7 +128,7 @@ def test_pixels_without_a_source_are_known_and_clicks_find_their_way() -> None:
 
 
 def test_a_polynomial_that_folds_back_shows_nothing_twice() -> None:
-    """Beyond r = 1 / sqrt(1.5) the radius r - 0.5 r^3 falls again: what lies there is not known."""
+    """Beyond r = 1 / sqrt(1.5) the distorted radius r - 0.5 r^3 decreases: pixels there are unknown."""
     lens = Lens(radial=(-0.5, 0.0, 0.0, 0.0))
     assert lens.valid_radius(3.0) == pytest.approx(1 / np.sqrt(1.5), abs=0.01)
     camera = Camera(200, 200, 50.0, 50.0, 100.0, 100.0, np.eye(3), np.zeros(3))

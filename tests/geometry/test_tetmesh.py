@@ -13,7 +13,7 @@ from tests.support.meshes import box_mesh
 
 
 def test_surface_and_edges_are_those_of_its_tetrahedra_and_found_once() -> None:
-    """The surface is closed, holds the volume, and may not be written to, since all who ask share it."""
+    """The surface is closed, encloses the volume, and is read-only, since all callers share the cached array."""
     mesh = box_mesh((2, 2, 3), (0.5, 0.5, 1.0))
     faces = mesh.boundary_faces()
     a, b, c = mesh.nodes[faces].transpose(1, 0, 2)

@@ -1,4 +1,4 @@
-"""New floor: where it lies, what it looks like, and what is refused. Eq. (18) gives its depth."""
+"""New floor: its position and looks, and the errors. Eq. (18) gives its depth."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def look(azimuth: float, elevation: float, *, size: int = 160) -> Camera:
 
 
 def holed(truth: GaussianCloud, hole: Hole) -> GaussianCloud:
-    """Without its floor in the hole, with a dark blob there."""
+    """Return the floor without its Gaussians in the hole, with a dark blob there."""
     kept = truth.subset(~hole.window.sample(hole.mask, truth.means.numpy()))
     blob = GaussianCloud.from_numpy(
         on_plane(0.1, 0.05)[None] + 0.03 * PLANE.normal,
@@ -55,13 +55,13 @@ def holed(truth: GaussianCloud, hole: Hole) -> GaussianCloud:
 
 @pytest.fixture(scope="module")
 def done() -> tuple[GaussianCloud, InpaintResult]:
-    """A glossy floor, filled."""
+    """A glossy floor, before its hole is made and after it is filled."""
     truth, hole = floor(gloss=0.1), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     return truth, inpaint(holed(truth, hole), hole, options=InpaintOptions(steps=30))
 
 
 def test_filled_floor_looks_like_the_truth(done: tuple[GaussianCloud, InpaintResult]) -> None:
-    """From the side, in the hole: 28 dB, no blob, nothing to be seen through."""
+    """From the side, the PSNR in the hole is 28 dB; the blob is gone, and the new floor is opaque."""
     truth, result = done
     for azimuth, elevation in ((0.3, 0.6), (2.5, 1.0)):
         camera = look(azimuth, elevation)
@@ -73,8 +73,8 @@ def test_filled_floor_looks_like_the_truth(done: tuple[GaussianCloud, InpaintRes
 
 
 def test_depth_is_the_planes(done: tuple[GaussianCloud, InpaintResult]) -> None:
-    """Eq. (18): the rendered depth of the new Gaussians is the plane's to half a spacing (a splat has one depth,
-    and those in front cover those behind)."""
+    """Eq. (18): the rendered depth of the new Gaussians is the plane's to half a spacing (a splat has one depth, and
+    splats in front hide those behind)."""
     _, result = done
     camera = look(1.0, 0.7)
     image = render_gaussians(result.cloud.subset(result.is_new), camera)
@@ -96,7 +96,7 @@ def test_new_gaussians_are_flat_dense_and_lie_on_the_plane(done: tuple[GaussianC
 
 
 def test_gloss_of_the_surround_without_its_colour(done: tuple[GaussianCloud, InpaintResult]) -> None:
-    """The highlight is the floor's; the mean colour from all around is what was painted."""
+    """The highlight is that of the floor; the mean colour over all directions is the painted one."""
     truth, result = done
     new = result.cloud.subset(result.is_new)
     assert new.sh.numpy()[:, 1:] == pytest.approx(
@@ -110,7 +110,7 @@ def test_gloss_of_the_surround_without_its_colour(done: tuple[GaussianCloud, Inp
 
 @pytest.mark.slow
 def test_training_comes_nearer_to_what_was_painted() -> None:
-    """Face-on, the picture's error falls; places and directions stay."""
+    """Seen face-on, the error of the image decreases; means and rotations stay the same."""
     truth, hole = floor(), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     damaged = holed(truth, hole)
 
@@ -127,7 +127,7 @@ def test_training_comes_nearer_to_what_was_painted() -> None:
 
 
 def test_floor_beside_the_plane_is_met_without_a_step() -> None:
-    """A floor 0.02 above the fitted plane: the new one is there, too."""
+    """For a floor 0.02 above the fitted plane, the new floor is at that height too."""
     truth, hole = floor(height=0.02), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     result = inpaint(holed(truth, hole), hole, inpainter=OpenCvInpainter(), options=InpaintOptions(steps=0))
     heights = PLANE.heights(result.cloud.means.numpy()[result.is_new])
@@ -136,7 +136,7 @@ def test_floor_beside_the_plane_is_met_without_a_step() -> None:
 
 
 def test_soap_film_and_rim_heights() -> None:
-    """Harmonic polynomials are reproduced; a tilted floor with a crack in it gives the tilted floor."""
+    """Harmonic polynomials are reproduced; for a tilted floor with a crack, the crack is ignored."""
     rows, columns = (values - 20.0 for values in np.indices((41, 41)).astype(float))
     hole = np.hypot(rows, columns) < 12
     saddle = rows**2 - columns**2 + 3.0 * columns
@@ -148,7 +148,7 @@ def test_soap_film_and_rim_heights() -> None:
 
 
 def test_window_camera_and_rectified_picture() -> None:
-    """Texels are where the camera puts them, colours are the pattern's, heights the floor's."""
+    """Texels are where the camera projects them, colours are those of the pattern, heights those of the floor."""
     window = PlaneWindow(PLANE, on_plane(0.2, -0.1), 0.01, 60, 80)
     pixels = np.array([[0.5, 0.5], [79.5, 10.5], [33.0, 59.0]])
     points = window.points(pixels)
@@ -162,7 +162,7 @@ def test_window_camera_and_rectified_picture() -> None:
     first, second = PLANE.tangents()
     places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1)) + PLANE.offset * PLANE.normal
     wanted = pattern(places @ first, places @ second).reshape(60, 80, 3)
-    # The gloss adds the same to every texel.
+    # The gloss adds the same colour to every texel.
     off = image.colour - wanted
     assert np.std(off - off.mean(axis=(0, 1))) < 0.045
     assert image.height[5:-5, 5:-5] == pytest.approx(0.01, abs=2e-3)
@@ -170,7 +170,8 @@ def test_window_camera_and_rectified_picture() -> None:
 
 
 def test_threads_at_two_heights_keep_their_contrast() -> None:
-    """Looks from the side see bright threads before dark ones, each elsewhere: their mean alone has 0.11 of 0.23."""
+    """Oblique views see bright threads in front of dark ones, in each view at another place: the mean of the views
+    alone has a contrast of 0.11 instead of 0.23."""
     window = PlaneWindow(PLANE, on_plane(0.0, 0.0), 0.01, 80, 80)
     columns, rows = np.meshgrid(*[np.arange(-20.0, 100.0, 0.5) + 0.25] * 2)
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
@@ -188,7 +189,7 @@ def test_threads_at_two_heights_keep_their_contrast() -> None:
 
 
 def test_footprints_and_what_no_view_sees() -> None:
-    """A pawn's base is a disc, a stool stands on four feet; masks of a disc on the plane give the disc back."""
+    """The base of a pawn is a disc, and a stool stands on four feet; masks of a disc on the plane yield the disc."""
     pawn, stool = scene("pawn"), scene("stool")
     assert footprint(pawn.object, pawn.plane).area == pytest.approx(np.pi * 0.3**2, rel=0.1)
     feet = footprint(stool.object, stool.plane)
@@ -202,7 +203,7 @@ def test_footprints_and_what_no_view_sees() -> None:
         v, u = np.mgrid[:160, :160] + 0.5
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
         points = camera.centre + depth[..., None] * (rays @ camera.rotation)
-        # Each sees something more in the way, at different places.
+        # In each view another object hides the floor, at different places.
         mask = hole.window.sample(hole.mask, points.reshape(-1, 3)).reshape(160, 160)
         mask[60:70, 20:32] = True
         views.append(MaskedView(camera, mask))
@@ -219,7 +220,7 @@ def test_footprints_and_what_no_view_sees() -> None:
 
 
 def test_what_hangs_over_the_hole_stays() -> None:
-    """A shelf at the height of the hole's width is no floor; haze at the foot goes."""
+    """A shelf as high above the floor as the hole is wide does not belong to the floor; haze at the foot is removed."""
     truth, hole = floor(spacing=0.04), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     shelf = floor(spacing=0.04, half=0.4, height=2.0 * RADIUS)
     background = concatenate(holed(truth, hole), shelf)
@@ -273,7 +274,7 @@ def test_bad_options_and_objects() -> None:
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """From files to a filled capture and a picture; the gap is closed."""
+    """From files to a filled capture and an image; no gap remains."""
     truth, hole = floor(spacing=0.04), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     write_ply(tmp_path / "background.ply", holed(truth, hole))
     write_planes(tmp_path / "plane.json", [PlaneRecord(PLANE)])

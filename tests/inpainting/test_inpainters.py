@@ -18,7 +18,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 
 class MeanOfTheKnown(torch.nn.Module):
-    """Paints the hole in the mean colour of the rest: the interface of LaMa in two lines."""
+    """Paints the hole in the mean colour of the rest: a minimal network with the interface of LaMa."""
 
     def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         mean = (image * (1 - mask)).sum(dim=(2, 3), keepdim=True) / (1 - mask).sum(dim=(2, 3), keepdim=True)
@@ -26,7 +26,8 @@ class MeanOfTheKnown(torch.nn.Module):
 
 
 def holed() -> tuple[np.ndarray, np.ndarray]:
-    """37 x 45 pixels, so that padding is needed, red left and blue right, with a hole on the border."""
+    """Return an image of 37 x 45 pixels, which needs padding, red on the left and blue on the right, with a hole at its
+    border."""
     image = np.zeros((37, 45, 3), np.float32)
     image[:, :22, 0], image[:, 22:, 2] = 0.8, 0.6
     hole = np.zeros((37, 45), bool)
@@ -102,7 +103,8 @@ def test_bad_networks(tmp_path: Path) -> None:
 
 
 def grey_paint(*, external: str | None = None, gain: float = 1.0) -> bytes:
-    """A network that paints the hole in 0.25, 0.5, 0.75 times ``gain``, its colour in a file of its own if asked."""
+    """Return a network that paints the hole in 0.25, 0.5, 0.75 times ``gain``; with ``external`` its colour is in a
+    separate file."""
     names = ("batch", "height", "width")
     return onnx.model(
         [
@@ -132,7 +134,7 @@ def test_an_onnx_network_fills_the_hole(gain: float, tmp_path: Path) -> None:
 
 
 def test_onnx_numbers_in_other_files_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """OpenCV itself would open them, relative to the working folder."""
+    """OpenCV itself would open such files, relative to the working folder."""
     (tmp_path / "secret").write_bytes(np.array([9, 9, 9], np.float32).tobytes())
     (tmp_path / "grey.onnx").write_bytes(grey_paint(external="secret"))
     monkeypatch.chdir(tmp_path)
@@ -158,7 +160,7 @@ def test_a_torchscript_file_is_not_loaded_unless_trusted(tmp_path: Path, monkeyp
     loaded: list[object] = []
     monkeypatch.setattr(torch.jit, "load", loaded.append)
     path = traced(MeanOfTheKnown(), tmp_path / "mean.pt")
-    # Whatever its name: content that is no ONNX never reaches torch.
+    # The content decides, not the name: content that is not ONNX never reaches torch.
     disguised = path.with_suffix(".net")
     disguised.write_bytes(path.read_bytes())
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""Stains that an object's shadow and foot leave on the floor."""
+"""Stains that the shadow and the foot of an object leave on the floor."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ HOLE = AWAY < 30
 
 
 def weave() -> np.ndarray:
-    """A cloth of fine threads."""
+    """Return a cloth of fine threads."""
     threads = 0.5 + 0.1 * np.sin(ROWS) * np.sin(COLUMNS)
     return np.stack([threads, 0.8 * threads, threads], axis=-1)
 
@@ -46,14 +46,14 @@ def test_a_pattern_is_no_stain(width: int):
 
 
 def test_the_darkest_squares_of_a_checked_cloth_are_no_stain():
-    """A quarter of it is dark, and a robust deviation knows nothing of that."""
+    """A quarter of the cloth is dark, which a robust estimate of the deviation does not reflect."""
     stripes = [(axis // 24) % 2 for axis in (ROWS, COLUMNS)]
     cloth = (1.0 - 0.3 * stripes[0] * stripes[1])[..., None] * weave()
     assert not stain_around(HOLE, ~HOLE, cloth).any()
 
 
 def test_a_seam_that_goes_on_is_no_stain():
-    """Between planks, from the hole outwards."""
+    """A seam between planks that begins at the hole."""
     wide = np.indices((360, 360))
     hole = np.hypot(*(wide - 180)) < 50
     seam = (np.abs(wide[1] - 180) < 8) & (np.abs(wide[0] - 180) < 140)
@@ -79,7 +79,7 @@ def test_no_floor_has_no_stain():
 
 
 def test_a_faint_shadow_beside_the_hole_shades_the_floor_and_a_seam_does_not():
-    """It is no stain, but nothing that is in it may be copied."""
+    """The shadow is no stain, but texels in it must not be copied."""
     shadow = (np.abs(ROWS - SIDE / 2) < 20) & (COLUMNS > SIDE / 2) & (COLUMNS < SIDE / 2 + 50)
     seam = np.abs(ROWS - 60) < 4
     floor = np.where(shadow[..., None], 0.84, 1.0) * np.where(seam[..., None], 0.7, 1.0) * weave()

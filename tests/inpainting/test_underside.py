@@ -1,4 +1,5 @@
-"""The underside of what stood sunk into its ground: closed from the rim, in the rim's colours, and only where open."""
+"""The underside of an object that was sunk into its ground: closed from the rim, in the rim's colours, only where it is
+open."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ SIZE = 1.7
 
 @pytest.mark.parametrize("degree", [0, 2])
 def test_a_ball_sunk_into_folds_is_closed(degree: int) -> None:
-    """A fifth of its radius deep: all of what is new lies within the rim, between its heights, and covers it."""
+    """The ball is sunk by a fifth of its radius: all new Gaussians lie within the rim, between its heights, and cover
+    it."""
     ground = wavy_ground(0.03, spacing=0.04)
     whole = ball(-0.2 * RADIUS)
     thing = whole.subset(ground.heights(whole.means.numpy()) > 0.005)
@@ -47,7 +49,7 @@ def test_a_ball_sunk_into_folds_is_closed(degree: int) -> None:
 def test_an_underside_too_small_for_a_gaussian_stays_open(
     sides: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No unseen texel at all, and no whole block of unseen texels: there is nothing to add, and no error."""
+    """There is no unseen texel at all, or no whole block of unseen texels: nothing is added, and there is no error."""
     hole, known = np.zeros((2, 16, 16), bool)
     known[:] = True
     for number, side in enumerate(sides):

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all."""
+"""Files appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_a_finished_file_replaces_the_old_one(tmp_path: Path) -> None:
         assert target.read_text() == "old"
     assert target.read_text() == "new"
     assert os.listdir(tmp_path) == ["a.json"]
-    # As readable for others as any new file is: mkstemp's files are not.
+    # The file must be as readable for others as any new file; files of mkstemp are not.
     (tmp_path / "plain").write_text("")
     assert target.stat().st_mode == (tmp_path / "plain").stat().st_mode
 
@@ -73,7 +73,7 @@ def test_places_that_cannot_be_written(tmp_path: Path) -> None:
 
 
 def test_a_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The system's refusal is played: root may write anywhere."""
+    """The refusal of the system is simulated, because root may write anywhere."""
 
     def refused(*_: object, **__: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
@@ -96,7 +96,7 @@ def old(path: Path) -> Path:
 
 
 def test_what_a_killed_process_leaves_is_swept(tmp_path: Path) -> None:
-    """Only names of our own, and none that a living process is writing."""
+    """Only files with names of this package are removed, and none that a running process is writing."""
     left = old(tmp_path / ".egs-0123456789abcdef.ply")
     other, young = old(tmp_path / ".egs-notes"), tmp_path / ".egs-0123456789abcdee.ply"
     young.write_text("just begun")

@@ -1,4 +1,4 @@
-"""Captures from hand-made bytes: what the public descriptions say, value by value."""
+"""Captures from hand-made bytes: decoded values equal those of the public format descriptions."""
 
 from __future__ import annotations
 
@@ -20,14 +20,16 @@ from tests.support.captures import assert_same_bits, make_cloud, spz_of_streams
 
 @pytest.mark.parametrize("version", [1, 2, 3])
 def test_spz_by_hand(version: int, tmp_path: Path) -> None:
-    """One Gaussian at (1.5, -2, 0.25) with rotation (w, x, y, z) = (0.8, 0, -0.6, 0), SH of degree 1."""
+    """The file has one Gaussian at (1.5, -2, 0.25) with rotation (w, x, y, z) = (0.8, 0, -0.6, 0) and SH of degree
+    1."""
     position = struct.pack("<3e", 1.5, -2.0, 0.25)
     if version > 1:
         position = b"".join(struct.pack("<i", int(v * 4096))[:3] for v in (1.5, -2.0, 0.25))
     if version < 3:
         rotation = bytes([128, round((-0.6 + 1) * 127.5), 128])
     else:
-        # Components x, y, z, w; w is the largest (index 3); a sign bit and nine bits of |c| sqrt(2) for each other one.
+        # Components x, y, z, w. The largest, w (index 3), is omitted; each other has a sign bit and nine bits of |c|
+        # sqrt(2).
         rotation = struct.pack("<I", 3 << 30 | 0 << 20 | (512 | round(0.6 * 2**0.5 * 511)) << 10 | 0)
     body = struct.pack("<IIIBBBB", 0x5053474E, version, 1, 1, 12, version == 3, 0) + position
     body += bytes([51]) + bytes([255, 128, 0]) + bytes([160, 96, 0]) + rotation
@@ -84,7 +86,7 @@ def _one_spz(tmp_path: Path) -> bytes:
 
 @pytest.mark.parametrize(("axes", "up"), [(4, (0, 1, 0)), (6, (0, -1, 0)), (12, (0, 0, 1)), (9, (0, 0, -1))])
 def test_spz_of_streams_says_which_way_is_up(axes: int, up: tuple[int, int, int], tmp_path: Path) -> None:
-    """RUB, RDF, RFU, LFD, behind a record of another kind."""
+    """RUB, RDF, RFU and LFD, after a record of another kind."""
     records = struct.pack("<IIfff", 0xADBE0002, 12, 0.0, 1.0, 2.0) + struct.pack("<III", 0xADBE0003, 4, axes)
     (tmp_path / "4.spz").write_bytes(spz_of_streams(_one_spz(tmp_path), 1, 0, records))
     np.testing.assert_array_equal(read_capture(tmp_path / "4.spz", device="cpu").up, up)
@@ -125,7 +127,7 @@ def test_splat_by_hand(tmp_path: Path) -> None:
 
 
 def test_compressed_ply_by_hand(tmp_path: Path) -> None:
-    """The oldest layout, without bounds of colour; extremes and middles of each packed field."""
+    """The oldest layout, without colour bounds; extreme and middle values of each packed field."""
     names = ["min_x", "min_y", "min_z", "max_x", "max_y", "max_z"]
     names += ["min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z"]
     header = "ply\r\nformat binary_little_endian 1.0\r\nelement chunk 1\r\n"
@@ -133,7 +135,7 @@ def test_compressed_ply_by_hand(tmp_path: Path) -> None:
     header += "".join(f"property uint packed_{name}\r\n" for name in ("position", "rotation", "scale", "color"))
     chunk = struct.pack("<12f", -1.0, -1.0, -1.0, 1.0, 3.0, 5.0, -8.0, -8.0, -8.0, -2.0, -2.0, -2.0)
     position = 0 << 21 | 1023 << 11 | 2047
-    # x is the largest (index 1); w, y, z follow in order.
+    # The largest, x (index 1), is omitted; w, y, z follow in order.
     rotation = 1 << 30 | round((0.6 / 2**0.5 + 0.5) * 1023) << 20 | round(0.5 * 1023) << 10 | round(0.5 * 1023)
     scale = 2047 << 21 | 0 << 11 | 2047
     colour = 255 << 24 | 0 << 16 | 102 << 8 | 51
@@ -148,7 +150,7 @@ def test_compressed_ply_by_hand(tmp_path: Path) -> None:
 
 
 def ply_text(cloud: GaussianCloud, *, kind: str, order: str, number: str) -> bytes:
-    """The same Gaussians in an unusual but lawful .ply: shuffled properties, extra elements, other number types."""
+    """Return the Gaussians as an unusual but valid .ply: shuffled properties, extra elements, other number types."""
     rest = 3 * ((cloud.sh_degree + 1) ** 2 - 1)
     columns = {f"f_rest_{i}": cloud.sh.numpy()[:, 1 + i % (rest // 3), i // (rest // 3)] for i in range(rest)}
     for i in range(3):

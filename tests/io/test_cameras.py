@@ -23,7 +23,7 @@ from tests.support.properties import examples
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel coordinates (n, 2) and z-depth (n,) of world points (n, 3)."""
+    """Return pixel coordinates (n, 2) and z-depth (n,) of world points (n, 3)."""
     seen = points @ camera.rotation.T + camera.translation
     pixels = seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     return pixels, seen[:, 2]
@@ -38,7 +38,7 @@ def inside(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def drawn(shape: tuple[int, int], pixels: np.ndarray, radius: int) -> np.ndarray:
-    """Mask with a square dot at each pixel coordinate."""
+    """Return a mask with a square dot at each pixel coordinate."""
     out = np.zeros(shape, bool)
     columns, rows = np.floor(pixels).astype(int).T
     for across in range(-radius, radius + 1):
@@ -52,7 +52,7 @@ def drawn(shape: tuple[int, int], pixels: np.ndarray, radius: int) -> np.ndarray
 
 @pytest.mark.data
 def test_plush_dog_gaussians_land_on_the_dog(data_dir: Path) -> None:
-    """COLMAP text: the capture's Gaussians cover the brown fur of each photo, and little of what is not the dog."""
+    """COLMAP text: the capture's Gaussians cover the brown fur in each photo, and little else."""
     posed = read_cameras(data_dir / "posed/plush_dog")
     assert len(posed) == 84
     cloud = read_capture(data_dir / "objects/plush_dog.ply", device="cpu").cloud
@@ -67,7 +67,7 @@ def test_plush_dog_gaussians_land_on_the_dog(data_dir: Path) -> None:
         covered = drawn(fur.shape, pixels, 5)
         assert (covered & fur).sum() > 0.98 * fur.sum()
         assert covered.mean() < 0.3
-        # The measure sees a wrong pose: the dog moved by a fifth of its height.
+        # The measure detects a wrong pose: the dog is shifted by a fifth of its height.
         moved = drawn(fur.shape, project(view.camera, points + np.array([0.0, 0.06, 0.0]))[0], 5)
         assert (moved & fur).sum() < 0.9 * fur.sum()
 
@@ -187,7 +187,7 @@ def test_colmap_models_without_distortion(tmp_path: Path) -> None:
 
 
 def test_lenses_of_colmap_and_nerfstudio(tmp_path: Path) -> None:
-    """The pinhole of the straightened photo keeps size and focal length; what bends it stands beside."""
+    """The undistorted pinhole photo keeps size and focal length; the distortion is stored separately."""
     colmap_text(tmp_path, camera="3 RADIAL 640 480 500 320 240 0.01 0.02")
     (view, _) = read_cameras(tmp_path)
     assert (view.camera.fx, view.camera.fy, view.camera.cx) == (500.0, 500.0, 320.0)
@@ -205,7 +205,7 @@ def test_lenses_of_colmap_and_nerfstudio(tmp_path: Path) -> None:
 
 
 def test_triangulated_points(tmp_path: Path) -> None:
-    """COLMAP's as text and binary, and nerfstudio's .ply."""
+    """COLMAP's points as text and as binary, and nerfstudio's .ply."""
     colmap_text(tmp_path)
     assert read_points(tmp_path) is None
     (tmp_path / "points3D.txt").write_text("# comment\n5 1.0 2.0 3.0 255 0 51 0.5 7 0 8 1\n")
@@ -305,7 +305,7 @@ def test_transforms_without_a_size(tmp_path: Path) -> None:
     assert message(path) == ": it has no w and h, and none of its photos can be read; add w and h, or the photos"
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n no")
     assert message(path) == ": it has no w and h, and none of its photos can be read; add w and h, or the photos"
-    # The first that can be read tells for all.
+    # The first photo that can be read determines the size of all.
     path.write_text(json.dumps({"camera_angle_x": 0.7, "frames": [frame, frame | {"file_path": "b"}]}))
     Image.new("RGB", (12, 8)).save(tmp_path / "b.png")
     assert [(view.camera.width, view.camera.height) for view in read_cameras(path)] == [(12, 8)] * 2

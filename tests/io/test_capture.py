@@ -25,7 +25,8 @@ from tests.support.captures import ARRAYS, assert_same_bits, make_cloud
 
 
 def angles_degrees(first: GaussianCloud, second: GaussianCloud) -> np.ndarray:
-    """Angle of each rotation from one cloud to the other; by the sine, which is exact for small ones."""
+    """Return the angle of each rotation from one cloud to the other, computed by the sine, which is exact for small
+    angles."""
     p, q = first.rotations.numpy().astype(float), second.rotations.numpy().astype(float)
     p *= np.sign(np.einsum("ni,ni->n", p, q))[:, None]
     return np.degrees(4.0 * np.arcsin(np.linalg.norm(p - q, axis=1) / 2.0))
@@ -49,7 +50,7 @@ FILES = {
 @pytest.mark.data
 @pytest.mark.parametrize("name", FILES)
 def test_real_captures_read(name: str, data_dir: Path) -> None:
-    """Counts and degrees are those of the data's README; sizes and colours are those of a thing one can look at."""
+    """Counts and degrees are those of the README of the data; sizes and colours are plausible for a visible object."""
     capture = read_capture(data_dir / name, device="cpu")
     cloud = capture.cloud
     assert (capture.format, cloud.count, cloud.sh_degree, capture.infinite_opacities) == FILES[name]
@@ -128,7 +129,7 @@ def test_real_captures_survive_ply(name: str, data_dir: Path, tmp_path: Path) ->
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["scenes/narcissus.sog", "scenes/playbot"])
 def test_real_sog_survives_being_written_again(name: str, data_dir: Path, tmp_path: Path) -> None:
-    """A capture with at most 256 different scales and colours loses nothing but rotation grid."""
+    """A capture with at most 256 different scales and colours loses only the rounding of its rotations."""
     cloud = read_capture(data_dir / name, device="cpu").cloud
     write_sog(tmp_path / "a.sog", cloud, keep_order=True)
     again = read_capture(tmp_path / "a.sog", device="cpu").cloud
@@ -147,7 +148,7 @@ WRITERS: dict[str, Callable[..., None]] = {
     "a.splat": write_splat,
     "a.sog": lambda path, cloud: write_sog(path, cloud, keep_order=True),
 }
-# Largest error of means, log scales, rotations in degrees, colour of band 0, higher SH. From each grid's half step.
+# Largest error of means, log scales, rotations in degrees, colour of band 0, and higher SH: half a step of each grid.
 TOLERANCES = {
     "a.compressed.ply": (0.5 * 4.0 / 1023.0, 0.5 * 7.0 / 1023.0, 0.25, 0.5 * 1.8 / 255.0, 1.0 / 64.0),
     "a2.spz": (2.0**-13, 1.0 / 32.0, 12.0, 0.5 / 255.0 / 0.15, 0.0625),
@@ -173,7 +174,7 @@ def test_lossy_round_trip(name: str, degree: int, tmp_path: Path) -> None:
     assert np.abs(read.sh.numpy()[:, 0] - cloud.sh.numpy()[:, 0]).max() <= colour * 1.01
     if read.sh_degree:
         assert np.abs(read.sh.numpy()[:, 1:] - cloud.sh.numpy()[:, 1:]).max() <= rest * 1.01
-    # What lies on the grid already stays on it.
+    # A second round trip changes nothing, because all values are on the grid.
     WRITERS[name](tmp_path / f"again.{name}", read)
     again = read_capture(tmp_path / f"again.{name}", device="cpu").cloud
     np.testing.assert_allclose(again.opacity_logits.numpy(), read.opacity_logits.numpy(), atol=1e-6)
@@ -193,7 +194,7 @@ def test_sorted_in_space_holds_the_same_gaussians(write: Callable[..., None], tm
 
 
 def test_sog_with_more_sh_sets_than_the_palette_holds(tmp_path: Path) -> None:
-    """70,000 Gaussians of 300 kinds share 65,536 places: nearly every one keeps its own coefficients."""
+    """70,000 Gaussians of 300 kinds share 65,536 palette entries: nearly all keep their own coefficients."""
     rng = np.random.default_rng(0)
     kinds = rng.uniform(-0.5, 0.5, (300, 4, 3))
     base = make_cloud(70_000)
@@ -219,7 +220,7 @@ def test_sequence_names(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("first", [b"{", b"PK", b"\x1f\x8b"])
 def test_a_splat_may_begin_with_any_coordinate(tmp_path: Path, first: bytes) -> None:
-    """It has no magic number: in one of 256 the first byte is that of JSON."""
+    """The format has no magic number: in one of 256 files the first byte is that of JSON."""
     write_splat(tmp_path / "a.splat", pawn(gaussian_count=50, device="cpu").cloud)
     data = (tmp_path / "a.splat").read_bytes()
     (tmp_path / "a.splat").write_bytes(first + data[len(first) :])

@@ -1,4 +1,4 @@
-"""Bad captures: one clear line, whatever the bytes."""
+"""Bad captures: one clear line for any bytes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PLY_HEADER = b"ply\nformat binary_little_endian 1.0\n"
 
 
 def ply_with(name: str, value: float, row: int) -> bytes:
-    """The good .ply with one number replaced."""
+    """Return the valid .ply with one number replaced."""
     data = bytearray(good_bytes("a.ply"))
     start = data.index(b"end_header\n") + 11
     names = [line.split()[2].decode() for line in data[:start].splitlines() if line.startswith(b"property")]
@@ -169,7 +169,7 @@ def test_bad_spz(tmp_path: Path) -> None:
     )
     assert message(written(path, gzip.compress(body[:12] + b"\x09" + body[13:]))).startswith(".spz with SH degree 9")
     assert message(written(path, b"NGSP\x04\0\0\0")).startswith("truncated: .spz header of 8 bytes, expected 16")
-    # Four thousand million Gaussians in 300 bytes: refused before any memory is taken.
+    # Four thousand million Gaussians in 300 bytes: refused before memory is allocated.
     many = gzip.compress(body[:8] + b"\xff\xff\xff\xff" + body[12:])
     assert message(written(path, many)) == (
         f"it declares 4294967295 Gaussians in {len(many)} bytes; copy or export it again"
@@ -187,7 +187,7 @@ def test_spz_cannot_hold_what_is_too_far_out(tmp_path: Path) -> None:
         write_spz(tmp_path / "a.spz", far)
     with pytest.raises(UserError, match=r"\.spz version 5 cannot be written; choose 2, 3 or 4"):
         write_spz(tmp_path / "a.spz", far, version=5)
-    # Fewer fractional bits make room.
+    # With fewer fractional bits the range is larger.
     wide = small_cloud().scaled(1e5)
     write_spz(tmp_path / "a.spz", wide)
     read = read_capture(tmp_path / "a.spz", device="cpu").cloud
@@ -227,7 +227,7 @@ def assert_capture_or_one_line(name: str, data: bytes) -> None:
 @pytest.mark.parametrize("name", WRITERS)
 def test_any_truncation_and_any_flipped_bytes(name: str, data: st.DataObject) -> None:
     good = bytearray(good_bytes(name))
-    # Half of the flips go to the header, where they do most.
+    # Half of the flips are in the header, where they have the largest effect.
     header = good.find(b"end_header") if name.endswith(".ply") else len(good)
     for _ in range(data.draw(st.integers(0, 4))):
         place = data.draw(st.integers(0, header - 1) | st.integers(0, len(good) - 1))
@@ -240,7 +240,7 @@ def test_any_truncation_and_any_flipped_bytes(name: str, data: st.DataObject) ->
 @settings(max_examples=examples(200))
 @given(st.data())
 def test_any_flipped_bytes_inside_gzip(data: st.DataObject) -> None:
-    """Behind the checksum, where flips of the compressed file do not reach."""
+    """The bytes are flipped before compression: flips of the compressed file only violate its checksum."""
     body = bytearray(gzip.decompress(good_bytes("a.spz")))
     for _ in range(data.draw(st.integers(1, 4))):
         body[data.draw(st.integers(0, len(body) - 1))] = data.draw(st.integers(0, 255))

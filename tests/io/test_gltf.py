@@ -1,4 +1,4 @@
-"""glTF with splats: what our writer writes is read back, and what the standard allows besides."""
+"""glTF with splats: round trips, and variants that the standard allows."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_small_numbers_and_strides(tmp_path: Path) -> None:
 
 
 def test_a_turned_node_says_where_up_is(tmp_path: Path) -> None:
-    """A mesh with z up under a node that turns it to y up, as exporters write it."""
+    """A mesh with z up, under a node that rotates it to y up, as exporters write it."""
     write_glb(tmp_path / "a.glb", make_cloud(20))
     tree, binary = _parts(tmp_path / "a.glb")
     tree["nodes"] = [{"mesh": 0}, {"children": [0], "rotation": [-(0.5**0.5), 0, 0, 0.5**0.5], "scale": [2, 2, 2]}]

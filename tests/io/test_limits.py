@@ -54,7 +54,7 @@ def large_png(path: Path, size: tuple[int, int] = HUGE) -> Path:
 
 
 def test_pictures_larger_than_the_gaussians_need(tmp_path: Path) -> None:
-    """A .sog of 1.6 kB whose pictures hold 177 megapixels each."""
+    """A .sog file of 1.6 kB whose images have 177 megapixels each."""
     data = io.BytesIO()
     Image.new("RGBA", (8192, 4096)).save(data, "WEBP", lossless=True)
     files = members()
@@ -96,7 +96,7 @@ def test_a_small_spz_of_many_gaussians(tmp_path: Path) -> None:
 
 
 def test_positions_without_a_whole_part(tmp_path: Path) -> None:
-    """255 fractional bits put every mean into one point."""
+    """255 fractional bits map every mean to the same point."""
     body = bytearray(gzip.decompress(good_bytes("a.spz")))
     body[13] = 255
     assert message(written(tmp_path / "a.spz", gzip.compress(bytes(body)))) == (
@@ -171,7 +171,7 @@ def test_cameras_of_no_photo(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["../secret.png", "/secret.png", "a/../../secret.png"])
 def test_photos_outside_of_the_folder_are_not_looked_for(name: str, tmp_path: Path) -> None:
-    """The result does not depend on the existence of such a file."""
+    """The result does not depend on the existence of such a photo."""
     folder = tmp_path / "poses"
     folder.mkdir()
     Image.new("RGB", (4, 4)).save(tmp_path / "secret.png")
@@ -230,7 +230,7 @@ def test_holes_that_are_none(change: dict, tmp_path: Path) -> None:
 
 
 def test_a_text_ply_takes_little_more_than_its_numbers(tmp_path: Path) -> None:
-    """Two million short lines, in a file that is no capture."""
+    """The file has two million short lines and is not a capture."""
     header = b"ply\nformat ascii 1.0\nelement other 2000000\nproperty float x\nelement vertex 1\n"
     names = ["x", "y", "z", "opacity", *(f"rot_{i}" for i in range(4)), *(f"scale_{i}" for i in range(3))]
     names += [f"f_dc_{i}" for i in range(3)]
@@ -242,7 +242,8 @@ def test_a_text_ply_takes_little_more_than_its_numbers(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", [ending for ending, _ in WRITERS.values()])
 def test_a_valid_capture_takes_four_times_its_file_and_six_times_what_it_becomes(tmp_path: Path, ending: str) -> None:
-    """Packed formats are unpacked in double precision. The object is 14 numbers a Gaussian, in single precision."""
+    """The limit is four times the size of the file plus six times the size of the cloud, 14 single-precision numbers
+    per Gaussian. Packed formats are decoded in double precision."""
     count = 200_000
     random = np.random.default_rng(0)
     cloud = GaussianCloud.from_numpy(

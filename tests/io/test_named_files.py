@@ -1,4 +1,4 @@
-"""Files that a user names: nothing is mixed, nothing of an earlier run is lost."""
+"""Files with names given by the user: files of different runs are not mixed, and no earlier file is lost."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_run_that_fails_before_its_first_file_leaves_the_earlier_one(tmp_path:
 
 
 def test_two_runs_at_once(tmp_path: Path) -> None:
-    """One name at a time; another name in the same folder is free."""
+    """Only the name in use is locked, not another name in the same folder."""
     with named_files(tmp_path / "a.ply"):
         assert error_of_second_process(named_files, tmp_path / "a.ply") == (
             f"{tmp_path / 'a.ply'}: another run is writing this file; wait for it, or choose another name"
@@ -63,7 +63,8 @@ def test_places_are_checked_before_the_work_and_not_made(tmp_path: Path) -> None
 
 
 def test_what_a_run_that_was_killed_just_now_has_left_is_gone_at_the_end(tmp_path: Path) -> None:
-    """However young: who goes on with a training at once finds its half-written files, and may end as soon."""
+    """Remnants of any age are removed: a training that is resumed at once finds recent half-written files, and may end
+    soon after."""
     left = tmp_path / ".egs-0123456789abcdef.npz"
     left.write_text("half")
     write(tmp_path / "a.ply", text="1")

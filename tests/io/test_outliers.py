@@ -1,4 +1,4 @@
-"""One bad Gaussian does not spoil a capture: it is left out, and told."""
+"""A bad Gaussian does not spoil a capture: it is left out, and reported."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CHANGED = ("means", "log_scales", "opacity_logits", "rotations")
 
 
 def spoiled(path: Path, rows: slice | list[int], *, sh: float = 0.0, **values: float) -> Path:
-    """``GOOD`` on disk with values of some rows replaced."""
+    """Write ``GOOD`` with the values of some rows replaced."""
     arrays = {
         name: getattr(GOOD, name).numpy().copy() for name in ("means", "log_scales", "opacity_logits", "rotations")
     }
@@ -30,7 +30,7 @@ def spoiled(path: Path, rows: slice | list[int], *, sh: float = 0.0, **values: f
 
 
 def unchecked(arrays: dict[str, np.ndarray]) -> GaussianCloud:
-    """With numbers that ``GaussianCloud.from_numpy`` refuses."""
+    """Return a cloud with values that ``GaussianCloud.from_numpy`` refuses."""
     kinds = {name: getattr(GOOD, name).dtype for name in arrays}
     return GaussianCloud(**{name: wp.array(value, dtype=kinds[name], device="cpu") for name, value in arrays.items()})
 
@@ -83,7 +83,7 @@ def test_values_that_single_precision_cannot_use_are_told(tmp_path: Path) -> Non
 
 
 def test_a_wide_capture_keeps_its_sky(tmp_path: Path) -> None:
-    """Skies lie some hundred sizes out, and their Gaussians are as large as the scene."""
+    """Skies are some hundred sizes away, and their Gaussians are as large as the scene."""
     path = spoiled(tmp_path / "a.ply", [1, 2], means=800.0, log_scales=3.0)
     capture = read_capture(path, device="cpu")
     assert capture.cloud.count == 50 and capture.notes == ()
@@ -105,7 +105,7 @@ def test_bounds_do_not_hang_on_the_order_or_the_unit(tmp_path: Path) -> None:
 
 
 def read_all(path: Path) -> GaussianCloud:
-    """Outliers among them."""
+    """Return all Gaussians of the file, including outliers."""
     from egs_warp.io.ply import decode_ply, read_header
 
     data = path.read_bytes()

@@ -1,4 +1,4 @@
-"""Photos as files are: turned by a tag, reduced, cut short, with masks drawn either way up."""
+"""Photo files: rotated by an EXIF tag, resized, truncated, with masks in either orientation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egs_warp.geometry.lens import Lens
 from egs_warp.io.cameras import PosedImage
 from egs_warp.io.photos import apply_orientation, decoded, orientation, read_photo
 
-# No two corners alike, smooth enough for JPEG.
+# All corners are different, and the image is smooth enough for JPEG.
 ROWS, COLUMNS = np.mgrid[:40, :60]
 PICTURE = np.stack([4 * COLUMNS, 6 * ROWS, 255 - 2 * COLUMNS - 3 * ROWS], axis=-1).astype(np.uint8)
 
@@ -84,7 +84,7 @@ def test_masks_of_turned_photos_fit_either_way(drawn_upright: bool, tmp_path: Pa
 
 
 def test_what_the_lens_did_not_see_stays_unknown_when_reduced(tmp_path: Path) -> None:
-    """Black beyond the lens's field must not darken the pixels beside it."""
+    """Black outside the field of the lens must not darken neighbouring pixels."""
     white = np.full((80, 120, 3), 255, np.uint8)
     path = saved(tmp_path / "a.png", white)
     posed = PosedImage("a.png", camera(120, 80), path, Lens(radial=(0.2, 0.0, 0.0, 0.0)))
@@ -96,7 +96,7 @@ def test_what_the_lens_did_not_see_stays_unknown_when_reduced(tmp_path: Path) ->
 
 
 def test_a_png_that_claims_more_than_it_holds(tmp_path: Path) -> None:
-    """Found by Atheris: OpenCV took 1.8 GiB for a file of 135 bytes."""
+    """Found by Atheris: OpenCV allocated 1.8 GiB for a file of 135 bytes."""
     data = bytearray(cv2.imencode(".png", np.zeros((16, 24, 3), np.uint8))[1].tobytes())
     place = data.index(b"IDAT") - 4
     data[place : place + 4] = b"nanN"

@@ -1,4 +1,4 @@
-"""``plane.json``: what is known of planes comes back, what is not goes along, what is damaged is named."""
+"""``plane.json``: known keys are read, unknown keys are passed on, and damaged values are reported by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A folder belongs to one run: nothing is mixed, nothing of an earlier run is lost."""
+"""A folder belongs to one run: files of different runs are not mixed, and no earlier file is lost."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_the_manifest_comes_last_and_holds_checksums(tmp_path: Path) -> None:
 
 
 def test_what_a_run_begins_with_is_there_before_its_first_file(tmp_path: Path) -> None:
-    """Once, after an earlier run is moved aside; a run without files has none of it."""
+    """Initial files are written once, after an earlier run is moved aside; a run without files has no initial files."""
     finished(tmp_path, flags="1")
     begun: list[list[str]] = []
     with run_folder(tmp_path, overwrite=True) as run:
@@ -72,7 +72,7 @@ def test_an_earlier_run_is_refused_or_moved_aside_whole(tmp_path: Path) -> None:
 
 
 def test_a_run_that_writes_nothing_leaves_the_earlier_one(tmp_path: Path) -> None:
-    """Bad input shows after the folder is locked, before the first file."""
+    """Bad input is found after the folder is locked and before the first file."""
     finished(tmp_path, a="1")
     with pytest.raises(UserError, match="flat"), run_folder(tmp_path, overwrite=True):
         raise UserError("object: it is flat")
@@ -115,7 +115,7 @@ def test_two_runs_at_once(tmp_path: Path) -> None:
 
 
 def test_a_broken_manifest_stands_for_a_run(tmp_path: Path) -> None:
-    """Names that lead out of the folder are not followed."""
+    """Names that point outside the folder are not followed."""
     outside = tmp_path / "secret.txt"
     outside.write_text("secret")
     folder = tmp_path / "out"
@@ -146,7 +146,8 @@ def test_places_are_checked_before_the_work_and_not_made(tmp_path: Path) -> None
 
 
 def test_what_a_killed_run_left_is_gone_when_the_next_has_finished(tmp_path: Path) -> None:
-    """At any age: an ffmpeg that has outlived its run may write its last bytes after the next run has started."""
+    """Remnants of any age are removed: an ffmpeg process that outlives its run may write after the next run has
+    started."""
     left = tmp_path / f".egs-{'0' * 16}.mp4"
     with run_folder(tmp_path) as run:
         run.file("a.txt").write_text("one")
@@ -158,7 +159,7 @@ def test_what_a_killed_run_left_is_gone_when_the_next_has_finished(tmp_path: Pat
 
 
 def test_a_run_that_was_killed_before_its_first_file_is_none(tmp_path: Path) -> None:
-    """Its manifest tells of files, none of which is there."""
+    """Its manifest lists files, but none of them exists."""
     with run_folder(tmp_path) as run:
         run.file("a.txt")
     assert manifest(tmp_path)["files"] == {"a.txt": None}
@@ -177,7 +178,7 @@ def test_a_run_that_was_killed_before_its_first_file_is_none(tmp_path: Path) -> 
 
 
 def test_what_a_run_left_that_was_killed_as_it_ended(tmp_path: Path) -> None:
-    """Between its last manifest and its end: nothing is taken from one that still runs."""
+    """The run is killed between its last manifest and its end; files of a running run are not touched."""
     with run_folder(tmp_path) as run:
         run.file("a.txt").write_text("one")
         run.finish()
@@ -191,7 +192,7 @@ def test_what_a_run_left_that_was_killed_as_it_ended(tmp_path: Path) -> None:
 
 
 def test_a_run_that_goes_on(tmp_path: Path) -> None:
-    """Its files are its own, what it began with is not written again, and folders are gone when it has finished."""
+    """It keeps its files, does not write its initial files again, and removes its folders when it finishes."""
     with pytest.raises(UserError, match="no run has written here"), run_folder(tmp_path, resume=True):
         raise AssertionError("must not come here")
     with run_folder(tmp_path) as run:

@@ -1,4 +1,4 @@
-"""SOG, zipped, unbundled and streamed: its variants, and its mistakes in one line each."""
+"""SOG, zipped, as a folder and streamed: its variants, and a one-line error for each mistake."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_sog_version_1_by_hand(tmp_path: Path) -> None:
         "shN": {"mins": -1.0, "maxs": 1.0, "files": ["c.webp", "l.webp"]},
     }
     (folder / "meta.json").write_text(json.dumps(meta))
-    # A folder that holds only the capture's folder will do as well.
+    # A folder that contains only the capture's folder is accepted, too.
     for place in (folder, tmp_path):
         capture = read_capture(place, device="cpu")
         cloud = capture.cloud
@@ -79,7 +79,7 @@ def unzip(sog: Path, folder: Path) -> dict:
 
 
 def test_sog_code_book_without_first_entry(tmp_path: Path) -> None:
-    """An early writer left codebook[0] null; it lies one mean step below the second."""
+    """An early writer left codebook[0] null; its value is one mean step below the second entry."""
     cloud = make_cloud(600)
     write_sog(tmp_path / "a.sog", cloud, keep_order=True)
     meta = unzip(tmp_path / "a.sog", tmp_path / "a")

@@ -1,4 +1,4 @@
-"""Pictures and videos on disk: what is read back is what was written, and nothing half-written is left."""
+"""Images and videos: reading returns what was written, and no half-written file is left."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ def test_an_ffmpeg_that_does_not_start_leaves_nothing(tmp_path: Path, monkeypatc
 
 
 def test_what_ffmpeg_says_of_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are the reason in the message, and the error behind it decides the exit status; other messages of ffmpeg are
-    quoted unchanged."""
+    """A full disk is the reason in the message, and the cause of the error decides the exit status; other messages of
+    ffmpeg are quoted unchanged."""
     for said, number in (("[out#0] Error: No space left on device", errno.ENOSPC), ("Unknown encoder", None)):
         program = tmp_path / "ffmpeg"
         program.write_text(f"#!/bin/sh\ncat > /dev/null\necho '{said}' >&2\nexit 1\n")
@@ -110,7 +110,7 @@ def test_contact_sheet_places_frames_and_writes_labels() -> None:
 
 
 def test_a_sheet_holds_frames_of_different_sizes() -> None:
-    """Portrait and landscape side by side: each in the middle of its cell, white around it."""
+    """Portrait and landscape side by side: each image is centred in its cell, on white."""
     wide, tall = np.full((20, 40, 3), 7, np.uint8), np.full((60, 30, 3), 9, np.uint8)
     sheet = contact_sheet([wide, tall], 2, ["", ""])
     assert sheet.shape == (60, 80, 3)
@@ -120,7 +120,7 @@ def test_a_sheet_holds_frames_of_different_sizes() -> None:
 
 @pytest.mark.parametrize("name", ["2026-11-21T12:30", "-dash", "pipe:1", "concat:a|b", "%03d"])
 def test_a_folder_may_have_any_name(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """ffmpeg would read some of them as an address, an option or a pattern."""
+    """ffmpeg would read some names as an address, an option or a pattern."""
     monkeypatch.chdir(tmp_path)
     Path(name).mkdir()
     with VideoWriter(Path(name) / "v.mp4", 16, 16) as video:

@@ -1,5 +1,5 @@
-"""The optimum to rounding, from good and bad guesses of the rows that hold it, against the conditions of Karush, Kuhn
-and Tucker.
+"""The active-set solver finds the optimum to rounding, from good and bad guesses of the active rows; checked against
+the Karush-Kuhn-Tucker conditions.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ from egs_warp.locomotion.active_set import WhitenedQp, solve_from_guess
 
 
 def random_program(seed: int) -> tuple[np.ndarray, ...]:
-    """P, q, A and bounds that some point satisfies; more rows than can hold at once, every fifth one twice."""
+    """Return P, q, A and bounds that some point satisfies; there are more rows than can be active at once, and every
+    fifth one is repeated."""
     random = np.random.default_rng(seed)
     count = int(random.integers(3, 25))
     root = random.normal(size=(count, count))
@@ -26,7 +27,8 @@ def random_program(seed: int) -> tuple[np.ndarray, ...]:
 
 @pytest.mark.parametrize("guess", ["none", "broken", "random"])
 def test_the_conditions_of_the_optimum_hold(guess: str) -> None:
-    """P x + q + A^T y = 0, bounds met, multipliers of the sign of the bound that pushes and zero elsewhere."""
+    """P x + q + A^T y = 0, x is within the bounds, multipliers have the sign of the active bound and are zero
+    elsewhere."""
     for seed in range(60):
         P, q, A, lower, upper = random_program(seed)
         reduced = WhitenedQp.of(P, q, A)
@@ -49,7 +51,7 @@ def test_the_conditions_of_the_optimum_hold(guess: str) -> None:
 
 
 def test_bounds_that_no_point_satisfies_are_told_apart() -> None:
-    """Two rows that exclude each other, by a tenth, among others."""
+    """Among others, two rows exclude each other by a tenth."""
     for seed in range(20):
         P, q, A, lower, upper = random_program(seed)
         row = len(q) + 1
@@ -63,11 +65,12 @@ def test_bounds_that_no_point_satisfies_are_told_apart() -> None:
 
 
 def test_a_sliver_between_two_bounds_has_an_optimum() -> None:
-    """A row and its double that leave a millionth between them, with a point within: it is found, and lies there."""
+    """A row and its duplicate, whose bounds leave an interval of a millionth that contains a feasible point: the
+    optimum is found in it."""
     for seed in range(20):
         P, q, A, lower, upper = random_program(seed)
         row = len(q) + int(np.flatnonzero(np.isfinite(lower[len(q) :]))[0])
-        inside = 0.5 * (lower[row] + upper[row])  # where the point that satisfies all of them is
+        inside = 0.5 * (lower[row] + upper[row])  # where the feasible point is
         A, upper = np.vstack([A, A[row]]), np.r_[upper, np.inf]
         upper[row], lower = inside + 1e-6, np.r_[lower, inside]
         reduced = WhitenedQp.of(P, q, A)
@@ -80,7 +83,7 @@ def test_a_sliver_between_two_bounds_has_an_optimum() -> None:
 
 
 def test_bounds_are_met_where_the_objective_has_nowhere_to_fall_to() -> None:
-    """q = 0: whatever they cost, by a search that joins row after row, too."""
+    """For q = 0 bounds are met at any cost, also by a search that adds one row after another."""
     for seed in range(60):
         P, q, A, lower, upper = random_program(seed)
         reduced = WhitenedQp.of(P, 0.0 * q, A)
@@ -91,7 +94,7 @@ def test_bounds_are_met_where_the_objective_has_nowhere_to_fall_to() -> None:
 
 
 def test_a_minimum_within_its_bounds_is_the_optimum() -> None:
-    """Nothing holds it, whatever was guessed."""
+    """No row is active, for any guess."""
     P, q, A, _, _ = random_program(3)
     reduced = WhitenedQp.of(P, q, A)
     at = A @ np.linalg.solve(P, -q)
@@ -102,8 +105,8 @@ def test_a_minimum_within_its_bounds_is_the_optimum() -> None:
 
 @pytest.mark.parametrize(("times", "feasible"), [(0.99, True), (1.01, False)])
 def test_what_costs_a_million_times_the_gain_counts_as_no_point(times: float, feasible: bool) -> None:
-    """x_1 >= s and x_k >= x_(k-1): the nearest point to 0 is (s, ..., s), which costs n s^2 / 2, here a million by
-    ``times``; a search finds it row after row."""
+    """x_1 >= s and x_k >= x_(k-1): the point nearest to 0 is (s, ..., s) with a cost of n s^2 / 2, here ``times`` a
+    million; the search adds one row after another."""
     count = 6
     side = np.sqrt(2e6 * times / count)
     A = np.eye(count) - np.eye(count, k=-1)
@@ -125,7 +128,7 @@ def test_a_hessian_that_holds_no_number_has_no_optimum() -> None:
 
 
 def test_what_was_sought_before_changes_nothing() -> None:
-    """Memory is used again, by programs with more rows and with fewer: the same bits."""
+    """The memory is reused by programs with more rows and with fewer; the bits are the same."""
     programs = [random_program(seed) for seed in (4, 5, 6)]
 
     def found(P: np.ndarray, q: np.ndarray, A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:
@@ -138,7 +141,7 @@ def test_what_was_sought_before_changes_nothing() -> None:
 
     for P, q, A, lower, upper in programs:
         expected = found(P, q, A, lower, upper)
-        # Of as many unknowns: more rows, fewer, and rows that all hold.
+        # Programs with as many unknowns: with more rows, with fewer, and with equalities only.
         found(P, -q, np.vstack([A, -A]), np.r_[lower, -upper], np.r_[upper, -lower])
         found(P, 3.0 * q, A[: len(q) + 2], lower[: len(q) + 2], upper[: len(q) + 2])
         for got, value in zip(found(P, q, A, lower, upper), expected, strict=True):
@@ -146,7 +149,7 @@ def test_what_was_sought_before_changes_nothing() -> None:
 
 
 def test_rows_in_coordinates_in_which_distances_are_costs() -> None:
-    """z = 0 is the minimum, half its square the cost beside it, and each row's unit and length are those by z."""
+    """z = 0 is the minimum, the cost increases from there by half of |z|^2, and rows have unit length in z."""
     for seed in range(20):
         P, q, A, _, _ = random_program(seed)
         rows = WhitenedQp.of(P, q, A)

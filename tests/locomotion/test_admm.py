@@ -1,4 +1,4 @@
-"""OSQP's splitting as kernels, against OSQP itself and the conditions of the optimum."""
+"""OSQP's operator splitting as kernels, against OSQP itself and the optimality conditions."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def by_kernels(
 
 
 def test_programs_of_many_sizes_end_side_by_side_where_osqp_does(device: str) -> None:
-    """To full accuracy: |x - x'| at most 1e-6 of the largest |x|, multipliers and status alike."""
+    """At full accuracy, |x - x'| is at most 1e-6 of the largest |x|, and multipliers and status are equal."""
     made = [random_program(seed) for seed in range(40)]
     programs, lowers, uppers = zip(*made, strict=True)
     together = AdmmPrograms(programs, device=device)
@@ -56,7 +56,8 @@ def test_programs_of_many_sizes_end_side_by_side_where_osqp_does(device: str) ->
 
 
 def test_iterations_are_those_of_osqp(device: str) -> None:
-    """Not only where they end: after one, after some, after rho has changed, the same point to rounding."""
+    """The iterates are equal to rounding not only at the end, but also after one iteration, after several, and after a
+    change of rho."""
     for seed in range(8):
         program, lower, upper = random_program(seed)
         for count in (1, 30, 130):
@@ -69,8 +70,8 @@ def test_iterations_are_those_of_osqp(device: str) -> None:
 
 
 def test_a_solved_program_is_where_the_next_begins(device: str) -> None:
-    """After a small change of the bounds a fraction of the iterations is enough; also with a given x and the previous
-    multipliers, as OSQP does it."""
+    """After a small change of the bounds a fraction of the iterations is enough; the same holds for a given x with the
+    previous multipliers, as in OSQP."""
     program, lower, upper = random_program(4)
     both: list[OperatorSplitting] = [
         OsqpSplitting(program.P, program.q, accuracy=1e-8),
@@ -108,8 +109,8 @@ def test_bounds_that_no_point_satisfies_are_told_apart_and_forgotten(device: str
 
 
 def test_a_certificate_is_taken_as_osqp_takes_it(device: str) -> None:
-    """Rows that nearly repeat each other, whose multipliers grow together for long: a contradiction to OSQP where
-    their bounds cross, by however little, and no other."""
+    """Two rows are nearly parallel, so that their multipliers grow together for many iterations. They are a
+    contradiction for OSQP exactly if their bounds cross, by however little."""
     for crossed, ending in ((-5e-5, AdmmStatus.SOLVED), (5e-5, AdmmStatus.INFEASIBLE)):
         program = DenseQp(np.eye(2), np.array([0.0, 100.0]), np.array([[1.0, 0.0], [1.0, 3e-5]]))
         bounds = np.array([-np.inf, 1.0 + crossed]), np.array([1.0, np.inf])
@@ -119,7 +120,7 @@ def test_a_certificate_is_taken_as_osqp_takes_it(device: str) -> None:
 
 
 def test_endings_are_those_of_osqp(device: str) -> None:
-    """Residuals within the accuracy, within ten times that at the last iteration, and further off."""
+    """Residuals are within the accuracy, within ten times the accuracy at the last iteration, and larger."""
     endings = []
     for seed in range(12):
         program, lower, upper = random_program(seed)

@@ -1,4 +1,4 @@
-"""Each bound of the audit, kept and broken on purpose."""
+"""Each bound of the audit, met and deliberately violated."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_ballistic_flight_passes(flight: Trajectory) -> None:
 
 
 def test_each_violation_is_seen(flight: Trajectory) -> None:
-    """A known error in each quantity comes back as the number its definition says."""
+    """A known error in each quantity gives the value that its definition predicts."""
     weight = flight.node_mass.sum() * 9.81
     kicked = flight.velocities.copy()
     kicked[7:] += [0.0, 0.01, 0.0]
@@ -54,7 +54,7 @@ def test_each_violation_is_seen(flight: Trajectory) -> None:
     )
     result = audit(pushed)
     assert result.cone_violation == pytest.approx(0.2)
-    # The four nodes come down with the block, in the air.
+    # The four nodes descend with the block, in the air.
     end = flight.positions[4, :4, 2].mean()
     assert result.complementarity_gap == pytest.approx(end)
     assert result.momentum_residual == pytest.approx(np.sqrt(2.0))
@@ -74,7 +74,7 @@ def test_a_run_that_slides_passes() -> None:
 
 
 def test_a_push_that_is_left_out_elsewhere_or_late_is_seen() -> None:
-    """A blow on one side and a wind; the same momentum on all nodes alike turns nothing."""
+    """A blow on one side and wind; if all nodes get the same velocity instead, only the angular momentum is wrong."""
     struck = slide(struck=True).trajectory()
     held = audit(struck)
     assert held.momentum_residual < 1e-8 and held.angular_momentum_residual < 1e-8 and held.energy_residual < 1e-9
@@ -92,7 +92,7 @@ def test_a_push_that_is_left_out_elsewhere_or_late_is_seen() -> None:
 
 
 def sliding(t: Trajectory) -> np.ndarray:
-    """The contacts whose friction does most work."""
+    """Return the contacts whose friction does most work."""
     way = np.diff(t.positions, axis=0)[t.contact_step[:, None], t.contact_nodes]
     moved = np.einsum("cw,cwi->ci", t.contact_weights, way)
     level = t.contact_force * [1.0, 1.0, 0.0]
@@ -100,7 +100,7 @@ def sliding(t: Trajectory) -> np.ndarray:
 
 
 def test_friction_that_pushes_is_seen() -> None:
-    """Turned about, at a right angle, and half as much as there is: all within the cone."""
+    """Friction is reversed, rotated by a right angle, or halved, which stays within the cone."""
     t = slide().trajectory()
     for turn in (np.diag([-1.0, -1.0, 1.0]), np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.diag([0.5, 0.5, 1.0])):
         forces = t.contact_force.copy()
@@ -110,7 +110,7 @@ def test_friction_that_pushes_is_seen() -> None:
 
 
 def test_a_contact_that_pulls_over_a_gap_is_seen() -> None:
-    """All contacts lifted off their plane by 1 mm."""
+    """All contacts are lifted off their plane by 1 mm."""
     t = slide().trajectory()
     normal = (t.contact_force * t.contact_normal).sum(axis=1)
     lifted = replace(t, planes=t.planes - [0.0, 0.0, 0.0, -1e-3])
@@ -119,18 +119,18 @@ def test_a_contact_that_pulls_over_a_gap_is_seen() -> None:
 
 
 def test_contact_velocities_that_were_not_solved_for_are_seen() -> None:
-    """1 mm/s across, in one step."""
+    """An error of 1 mm/s across, in one step."""
     t = slide().trajectory()
     velocities = t.velocities.copy()
     velocities[t.contact_step[0] + 1] += [0.0, 1e-3, 0.0]
     assert audit(replace(t, velocities=velocities)).contact_velocity == pytest.approx(1e-3 / np.sqrt(9.81), rel=1e-6)
-    # A point that bears nothing may move as it likes.
+    # A point without load may move freely.
     forces = np.where((t.contact_step == t.contact_step[0])[:, None], 0.0, t.contact_force)
     assert audit(replace(t, velocities=velocities, contact_force=forces)).contact_velocity < 1e-12
 
 
 def test_lost_momenta_are_seen_where_contact_and_drag_act() -> None:
-    """Contact forces 1 % too large; drag of twice as much; a spin of 0.01 rad/s that nothing turned."""
+    """Contact forces are 1 % too large; drag is twice as large; a spin of 0.01 rad/s is added without a torque."""
     t = slide().trajectory()
     assert audit(replace(t, contact_force=1.01 * t.contact_force)).momentum_residual > 1e-3
     assert audit(replace(t, drag=2.0 * t.drag)).momentum_residual > 1e-3
@@ -141,7 +141,8 @@ def test_lost_momenta_are_seen_where_contact_and_drag_act() -> None:
 
 
 def test_uneven_ground_is_that_of_the_height_field(flight: Trajectory) -> None:
-    """The audit's own heights and normals, by SciPy's splines, at points of waves: those of the field to 1e-6."""
+    """The audit's own heights and normals, by SciPy's splines, are those of the height field to 1e-6, at points on
+    waves."""
     field = wavy_ground(0.05)
     t = replace(
         flight,

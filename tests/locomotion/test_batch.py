@@ -1,4 +1,4 @@
-"""Many worlds side by side: each goes as it does alone, and as it does beside others."""
+"""Many worlds in one batch: each gives the results of a single world, whatever the other worlds do."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ FRICTIONS = (0.8, 0.3, 1.2)
 STRENGTHS = (1.0, 0.9, 0.5)
 """Factor on the recorded activations in each world."""
 FIRST, STEPS = 29, 30
-"""Steps of the recorded jump: the body leaves the ground in its 34th and is back in its 56th."""
+"""First step and number of steps of the recorded jump: the body leaves the ground in its 34th step and is back in its
+56th."""
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +61,7 @@ def runs_alone(
 
 
 def runs_together(stepper: BatchStepper, starts: list[BodyState], activations: np.ndarray, dt: float) -> list:
-    """The same side by side."""
+    """Return the reports of the same runs in one batch."""
     runs: list[list[list[StepReport]]] = [[] for _ in starts]
     state = stepper.start(starts)
     for given in activations:
@@ -75,7 +76,7 @@ def runs_together(stepper: BatchStepper, starts: list[BodyState], activations: n
 
 
 def check(creature: Creature, one: StepReport, other: StepReport) -> None:
-    """The same step, to 1e-9 of the body's units."""
+    """Assert that both reports are of the same step, to 1e-9 in the units of the body."""
     body = creature.body
     assert (one.dt, one.converged, one.newton_iterations) == (other.dt, other.converged, other.newton_iterations)
     assert np.array_equal(one.contacts.points, other.contacts.points)
@@ -91,13 +92,13 @@ def check(creature: Creature, one: StepReport, other: StepReport) -> None:
         (one.added_spin, other.added_spin, 1.0 / body.time_unit),
     ):
         np.testing.assert_allclose(mine, its, rtol=0, atol=1e-9 * unit)
-    # Redundant points share a load in more than one way.
+    # Redundant points can share a load in several ways.
     nodal = [report.contacts.nodal_forces(report.forces) for report in (one, other)]
     np.testing.assert_allclose(*nodal, rtol=0, atol=1e-6 * body.weight)
 
 
 def test_each_goes_as_it_does_alone(creature: Creature, jump: Trajectory) -> None:
-    """30 steps of a jump, off the ground and back, on three grounds with three strengths."""
+    """30 steps of a jump, from the ground and back to it, on three grounds with three strengths."""
     dt, _ = solver_steps(creature.body)
     starts = [BodyState(jump.positions[FIRST], jump.velocities[FIRST])] * 3
     activations = np.stack([strength * jump.activations[FIRST:][:STEPS] for strength in STRENGTHS], axis=1)
@@ -108,7 +109,7 @@ def test_each_goes_as_it_does_alone(creature: Creature, jump: Trajectory) -> Non
         for one, other in zip(run, its, strict=True):
             check(creature, one[0], other[0])
     pressed = [[bool((done[0].forces[:, 0] > 0.0).any()) for done in run] for run in made]
-    # It stood, flew, and stood again; grounds differ.
+    # The body stood, flew, and stood again; the grounds differ.
     assert all(run[0] for run in pressed) and not all(pressed[0]) and pressed[0][-1]
     apart = np.abs(made[0][-1][0].state.positions - made[1][-1][0].state.positions).max()
     assert apart > 1e-4 * creature.body.height
@@ -119,7 +120,7 @@ def parts(creature: Creature) -> tuple[SoftBody, MuscleSet, ContactGeometry]:
 
 
 def on_its_rim(geometry: ContactGeometry, count: int = 12) -> ContactGeometry:
-    """With no contact points but ``count`` of the base, the outermost all around."""
+    """Return the geometry with only ``count`` contact points of the base, the outermost in all directions."""
     corners = geometry.mesh.nodes[geometry.mesh.tets[geometry.tet_from_point]]
     places = np.einsum("pw,pwi->pi", geometry.weights, corners)
     heights = geometry.ground_heights(places)
@@ -131,8 +132,8 @@ def on_its_rim(geometry: ContactGeometry, count: int = 12) -> ContactGeometry:
 
 
 def rough(creature: Creature) -> tuple[list[BodyState], np.ndarray, float]:
-    """Starts, activations (2, 3, M) and the step of two worlds that fall on their ground with all muscles at odds, in
-    steps too long for that, and one between them that stands."""
+    """Return start states, activations (2, 3, M) and step size of three worlds: the first and the last fall on the
+    ground with opposing muscles and too long steps, the middle one stands."""
     body, down = creature.body, creature.body.gravity / np.linalg.norm(creature.body.gravity)
     dt = 4.0 * solver_steps(body)[0]
     starts = [
@@ -145,7 +146,7 @@ def rough(creature: Creature) -> tuple[list[BodyState], np.ndarray, float]:
 
 
 def test_a_world_goes_on_with_what_its_last_step_has_handed_on(creature: Creature, jump: Trajectory) -> None:
-    """Its contacts and their forces, of two worlds that differ in them; the step after is as alone."""
+    """Contacts and forces of two different worlds are passed to the next step, which equals that of a single world."""
     dt, _ = solver_steps(creature.body)
     begun = [BodyState(jump.positions[step], jump.velocities[step]) for step in (FIRST, FIRST + 1)]
     steppers, memories, states, expected = [], [], [], []
@@ -222,7 +223,7 @@ def test_small_chunks_change_nothing(creature: Creature) -> None:
 
 
 def test_a_world_that_cannot_be_solved_is_told_and_leaves(creature: Creature) -> None:
-    """And the others go on."""
+    """The other worlds continue."""
     dt, _ = solver_steps(creature.body)
     broken = replace(creature.start, velocities=np.full_like(creature.start.velocities, np.nan))
     stepper = BatchStepper(*parts(creature), FRICTIONS)
@@ -237,7 +238,7 @@ def test_a_world_that_cannot_be_solved_is_told_and_leaves(creature: Creature) ->
 
 @pytest.mark.slow
 def test_a_world_that_never_converges_is_lost(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a tolerance of zero not even the smallest part of the step converges."""
+    """With a tolerance of zero, not even the smallest part of the step converges."""
     monkeypatch.setattr("egs_warp.contact.coupled_step.CoupledSolver.tolerance", 0.0)
     dt, _ = solver_steps(creature.body)
     stepper = BatchStepper(*parts(creature), FRICTIONS)

@@ -1,4 +1,4 @@
-"""Branch and bound against trying every contact state."""
+"""Branch and bound against an exhaustive search over contact states."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from tests.support.contact_programs import optimum_of_each, small_problem
 
 @pytest.mark.parametrize(("contacts", "directions", "seeds"), [(1, 4, 120), (1, 8, 3), (2, 4, 3), (2, 8, 3), (3, 4, 3)])
 def test_the_optimum_is_that_of_brute_force(contacts: int, directions: int, seeds: int) -> None:
-    """Eq. (9), Eq. (13): same objective as the best of all states, each of which is that once where there are many
-    problems of one contact; complementary; and far fewer QPs than states.
+    """Eq. (9), Eq. (13): the objective is that of the best state, the solution is complementary, and far fewer QPs than
+    states are solved. Over many problems of one contact, each state is the best one at least once.
     """
     best_states = set()
     for seed in range(seeds):
@@ -34,7 +34,7 @@ def test_the_optimum_is_that_of_brute_force(contacts: int, directions: int, seed
 
 
 def test_starts_change_nothing_but_the_effort() -> None:
-    """A good start prunes; a bad one is forgotten."""
+    """A good start prunes; a bad one is discarded."""
     program = small_problem(5, contacts=3).program
     plain = exact_states(program)
     assert plain is not None
@@ -46,7 +46,7 @@ def test_starts_change_nothing_but_the_effort() -> None:
 
 
 def test_a_limit_is_not_called_a_proof() -> None:
-    """Cut short, the search says how far the optimum may still be."""
+    """If the search reaches its limit, it reports a lower bound on the optimum."""
     program = small_problem(5, contacts=3).program
     whole = exact_states(program)
     assert whole is not None
@@ -58,7 +58,7 @@ def test_a_limit_is_not_called_a_proof() -> None:
 
 @pytest.mark.slow
 def test_a_search_that_is_cut_short_never_promises_too_much() -> None:
-    """Wherever it ends its bound is below the optimum, and the longer it goes on the nearer it is."""
+    """At any limit, the bound is below the optimum; it does not decrease as the limit grows."""
     for seed in range(5, 9):
         program = small_problem(seed, contacts=3).program
         whole = exact_states(program)
@@ -73,7 +73,7 @@ def test_a_search_that_is_cut_short_never_promises_too_much() -> None:
 
 @pytest.mark.parametrize("objective", [0.0, 0.3, -4.0, 1e3])
 def test_what_a_proof_may_leave_open(objective: float) -> None:
-    """A millionth of the objective, or of one where that is more."""
+    """The gap is at most a millionth of the objective plus one."""
     for share, proved in ((0.9e-6, True), (1.1e-6, False)):
         bound = objective - share * (1.0 + abs(objective))
         assert ExactResult(np.zeros(1), np.zeros(1, int), objective, bound, 1).proved == proved

@@ -1,6 +1,5 @@
-"""Contact states as bounds (Eq. 9, 12, 13):
-each state's rows, and moves between states against brute force over all of them.
-"""
+"""Contact states as bounds (Eq. 9, 12, 13): each state's rows, and moves between states against an exhaustive
+search."""
 
 from __future__ import annotations
 
@@ -31,8 +30,8 @@ def obeys(program: ContactProgram, y: np.ndarray, states: np.ndarray) -> bool:
 
 
 def test_rows_are_the_terms_of_the_lcp() -> None:
-    """Eq. (9), Eq. (13): rows A y + offset are y, c = u_n + shift, D^T u + E lambda and mu f_n - E^T f_t,
-    one by one.
+    """Eq. (9), Eq. (13): the rows A y + offset are y, c = u_n + shift, D^T u + E lambda and mu f_n - E^T f_t, in this
+    order.
     """
     problem = small_problem(0, contacts=3, directions=6)
     program, layout = problem.program, problem.program.layout
@@ -53,8 +52,8 @@ def test_rows_are_the_terms_of_the_lcp() -> None:
 
 
 def test_every_state_satisfies_the_complementarity_conditions() -> None:
-    """Eq. (9), Eq. (13): whatever the states, a feasible point has 0 <= x, 0 <= w, x.w = 0,
-    and moves as its states say.
+    """Eq. (9), Eq. (13): for any states, a feasible point has 0 <= x, 0 <= w, x.w = 0, and the contact velocities that
+    its states prescribe.
     """
     feasible = between = 0
     for seed in range(8):
@@ -83,7 +82,8 @@ def test_every_state_satisfies_the_complementarity_conditions() -> None:
 
 
 def test_states_from_prediction() -> None:
-    """Eq. (12): no force separates, friction below its cap sticks, else the contact slides along the nearest -D_k."""
+    """Eq. (12): a contact without force separates, one with friction within the cone sticks, any other slides along the
+    nearest -D_k."""
     normal = np.array([0.0, 1.0, 1.0, 1.0, 1.0])
     tangential = np.array([[0, 0], [0.3, 0.2], [-0.8, 0], [0, 0.8], [0.8, 0.0]])
     slip = np.array([[1.0, 0], [0.1, 0.1], [2.0, 0.3], [0.1, -3.0], [-1.0, 0.9]])
@@ -93,7 +93,8 @@ def test_states_from_prediction() -> None:
 
 
 def test_states_of_pairs_are_states_the_point_obeys() -> None:
-    """Eq. (9): the states read from a complementary point have that point among their own, whatever states made it."""
+    """Eq. (9): a complementary point is feasible under the states that are read from it, whichever states it was solved
+    with."""
     read = same = 0
     for seed in range(8):
         program = small_problem(seed).program
@@ -106,12 +107,11 @@ def test_states_of_pairs_are_states_the_point_obeys() -> None:
 
 
 def test_moves_are_feasible_and_almost_always_better() -> None:
-    """The optimum of any states obeys the states of each proposed move, and of all together; most moves are
-    better.
+    """The optimum of any states is feasible under the states of each proposed move, and of all moves together; most
+    moves improve the objective.
 
-    A move that one multiplier proposes without regard to the contact's other rows is often not feasible at all.
-
-    See docs/concepts/locomotion.md.
+    A move that follows one multiplier and ignores the contact's other rows is often infeasible. See
+    docs/concepts/locomotion.md.
     """
     proposed = solved = better = plain = plain_lost = 0
     for seed in range(12):
@@ -142,8 +142,8 @@ def test_moves_are_feasible_and_almost_always_better() -> None:
 
 
 def test_moves_name_the_contact_that_helps() -> None:
-    """A closed contact that holds the body down opens, and an open one that could help closes to sliding
-    (docs/concepts/locomotion.md#moves)."""
+    """A closed contact that holds the body down opens, and an open contact that would improve the objective closes and
+    slides (docs/concepts/locomotion.md#moves)."""
     layout = ContactLayout(0, 1, 4)
     zeros, lam = np.zeros(6), slice(5, 6)
 
@@ -157,7 +157,7 @@ def test_moves_name_the_contact_that_helps() -> None:
     along = np.array([0.0, -1.0, 0.1, 1.0, -0.1, 0.0])
     assert moves(SEPARATE, zeros, along, f_n=0.2) == [(0.2, 0, 0)]
     assert moves(SEPARATE, zeros, zeros, f_n=0.2) == [(0.2, 0, STATIC)]
-    assert moves(SEPARATE, zeros, along + np.eye(6)[0], f_n=0.2) == []  # it has speed to spare
+    assert moves(SEPARATE, zeros, along + np.eye(6)[0], f_n=0.2) == []  # it is faster than necessary
     loaded = np.eye(6)[0]
     assert moves(2, loaded, zeros, f_3=0.3) == [(0.3, 0, STATIC), (0.3, 0, 4 + 2)]
     assert moves(2, loaded, zeros, cone=0.4) == [(0.4, 0, STATIC)]
@@ -169,7 +169,7 @@ def test_moves_name_the_contact_that_helps() -> None:
 
 
 def test_plain_moves_go_where_a_multiplier_s_row_is_free() -> None:
-    """Moves of contacts whose free side is zero, and of no others, each by its own multiplier."""
+    """Contacts whose free side is zero move, and no others, each according to its own multiplier."""
     layout = ContactLayout(0, 1, 4)
     zeros, one = np.zeros(6), np.eye(6)
 

@@ -25,7 +25,8 @@ CONTACTS = 3
 
 
 def random_program(seed: int) -> CoulombProgram:
-    """Two activations and three contacts of a random stiff body, costs of a few squares of velocities."""
+    """Return a program of a random stiff body with two activations and three contacts; its cost is the sum of a few
+    squared velocities."""
     rng = np.random.default_rng(seed)
     to_velocity = rng.standard_normal((12, 2 + 3 * CONTACTS))
     half = rng.standard_normal((12, 12))
@@ -44,7 +45,7 @@ def random_program(seed: int) -> CoulombProgram:
 
 
 def under(program: CoulombProgram, activations: np.ndarray) -> np.ndarray:
-    """x of ``activations`` (2,) and the forces of exact contact."""
+    """Return x of ``activations`` (2,), with the forces of exact contact."""
     free = program.offset + program.rows[:, :2] @ activations
     forces, residual = coulomb_forces(
         program.rows[:, 2:], free, np.zeros(CONTACTS), FRICTION, np.zeros((CONTACTS, 3)), tolerance=1e-12
@@ -72,7 +73,8 @@ def larger_program(seed: int, activations: int, contacts: int) -> CoulombProgram
 
 @pytest.mark.parametrize(("activations", "contacts"), [(1, 0), (2, 1), (5, 3), (8, 4), (13, 9), (92, 21)])
 def test_a_piece_is_what_its_modes_say(activations: int, contacts: int) -> None:
-    """Forces from one linear system, the cost of activations alone, and the rows where it ends, all written out."""
+    """The forces from one linear system, the cost over activations alone, and the rows that bound the region are
+    written out."""
     program = larger_program(contacts, activations, contacts)
     rng = np.random.default_rng(activations)
     angle = rng.uniform(0.0, 2.0 * np.pi, contacts)
@@ -92,7 +94,7 @@ def test_a_piece_is_what_its_modes_say(activations: int, contacts: int) -> None:
                     assert not forces[i].any()
                     ends[4].append(speeds[i, 0])
                     continue
-                # Next to nothing for each force: what makes the operator regular.
+                # Almost zero relative to the forces: the regularisation of the operator.
                 assert abs(speeds[i, 0]) < scale
                 if kind[i] == STICK:
                     assert np.abs(speeds[i]).max() < scale
@@ -118,9 +120,10 @@ def test_a_piece_is_what_its_modes_say(activations: int, contacts: int) -> None:
 
 @pytest.mark.parametrize("solver", list(QpSolver))
 def test_the_search_ends_where_no_activations_near_by_do_better(solver: QpSolver) -> None:
-    """Against exact contact for activations all round the end, and far better than the start.
+    """The result is compared with exact contact for activations around it, and is far better than the start.
 
-    Contacts that slide are taken to go on the way they went; where such large activations turn them, some is left.
+    Sliding contacts are assumed to keep their direction; where such large activations change it, some improvement is
+    left.
     """
     if solver is QpSolver.DAQP:
         pytest.importorskip("daqp")
@@ -169,7 +172,7 @@ def test_what_costs_much_is_searched_from_elsewhere_too() -> None:
 
 
 def test_within_a_piece_the_plan_is_what_contact_answers() -> None:
-    """Forces and objective of a piece's optimum are those of exact contact, up to the sliding directions that turn."""
+    """Forces and objective of a region's optimum are those of exact contact if no contact slides."""
     kinds = set()
     for seed in range(12):
         program = random_program(seed)
@@ -185,7 +188,7 @@ def test_within_a_piece_the_plan_is_what_contact_answers() -> None:
 
 
 def test_a_piece_holds_its_start() -> None:
-    """The piece of a point's own modes gives that point's forces back, sliding contacts included."""
+    """The region of a point's own modes gives the forces of that point, sliding contacts included."""
     for seed in range(12):
         program = random_program(seed)
         start, modes = started(program)
@@ -198,7 +201,8 @@ def test_a_piece_holds_its_start() -> None:
 
 
 def test_friction_stays_against_the_slip() -> None:
-    """Were it left where it was while a foot slides elsewhere, the search would find a push that no ground gives."""
+    """If friction kept its direction while a foot slides elsewhere, the search would find a force that no ground can
+    exert."""
     angles = []
     for seed in range(40):
         program = random_program(seed)
@@ -208,7 +212,7 @@ def test_friction_stays_against_the_slip() -> None:
         forces = x[2:].reshape(-1, 3)
         slip = (program.rows @ x + program.offset).reshape(-1, 3)[:, 1:]
         pull, speed = np.linalg.norm(forces[:, 1:], axis=1), np.linalg.norm(slip, axis=1)
-        slides = (speed > 0.1) & (forces[:, 0] > 0.05)  # what the start broke of the bounds is less
+        slides = (speed > 0.1) & (forces[:, 0] > 0.05)  # bound violations of the start are smaller
         cosine = -(forces[slides, 1:] * slip[slides]).sum(axis=1) / (pull * speed)[slides]
         angles += np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).tolist()
     assert len(angles) > 20

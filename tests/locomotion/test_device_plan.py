@@ -1,4 +1,4 @@
-"""Plans of the device planner equal those of prediction and plan one after the other, on every device."""
+"""Plans of the device planner equal those of prediction and planning on the host, on every device."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ def stepper(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def asks(creature: Creature, speed: float) -> list[AnyObjective]:
-    """To rise at ``speed`` m/s in the pose that it has, without turning, and to carry less with some nodes."""
+    """Return objectives: rise at ``speed`` m/s in the current pose, do not rotate, and reduce the load on some
+    nodes."""
     body = creature.body
     lifted = np.argsort(creature.start.positions @ body.gravity)[-9::3]
     up = -body.gravity / np.linalg.norm(body.gravity)
@@ -84,7 +85,8 @@ def planner_of(stepper: LocomotionStepper) -> DevicePlanner:
 def is_the_host_s(
     stepper: LocomotionStepper, start: StepInputs, memory: WarmStart, objectives: Sequence[AnyObjective]
 ) -> bool:
-    """The plan and its response; False if it is left to the host."""
+    """Assert that the plan and its linearisation equal those of the host; return False if planning is left to the
+    host."""
     found = planner_of(stepper).plan(start, objectives)
     if found is None:
         return False
@@ -106,7 +108,8 @@ def is_the_host_s(
 
 
 def test_plans_are_those_of_one_look_after_the_other(creature: Creature, stepper: LocomotionStepper) -> None:
-    """Step after step from rest, and off the ground: what a GPU has recorded the first time it plays the second."""
+    """Step after step from rest, and in flight: a GPU records a graph in the first plan and replays it in the
+    second."""
     state, memory, at_once = creature.start, stepper.initial_memory(), 0
     objectives = asks(creature, 0.1)
     for number in range(6):
@@ -162,8 +165,8 @@ def test_the_solve_goes_on_from_the_plan_s_end(
 
 @pytest.mark.parametrize("last", [False, True])
 def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: LocomotionStepper, last: bool) -> None:
-    """About the end of the ``last`` Newton step, where the device is, or about where that began. What it has left
-    behind is the host's to plan."""
+    """Replanning from the end of the ``last`` Newton step, which is the current iterate on the device, or from its
+    start. From any other point it is left to the host."""
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     start = begun(stepper, on_its_edge(stepper), memory)
     found = planner_of(stepper).plan(start, objectives)
@@ -310,7 +313,7 @@ def test_a_step_that_goes_amiss_is_planned_again_on_the_device(
 def test_the_same_body_on_other_ground_shares_what_it_works_with(
     creature: Creature, stepper: LocomotionStepper
 ) -> None:
-    """Steps by turns on two frictions are those of each alone."""
+    """Alternating steps on grounds with two friction coefficients equal the steps on each ground alone."""
     slippery = stepper.with_friction(0.1)
     assert slippery._device_planner is stepper._device_planner and slippery.linearizer is stepper.linearizer
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
@@ -333,7 +336,8 @@ def test_the_same_body_on_other_ground_shares_what_it_works_with(
 def test_a_step_is_begun_when_the_one_before_has_ended(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Once. If other work runs in between, it is started again and has the same end."""
+    """The next step starts when the previous one has ended. If other work runs in between, it is started again and has
+    the same result."""
     counted: list[StepInputs] = []
     begin = DevicePlanner.start
     monkeypatch.setattr(DevicePlanner, "start", lambda self, start: counted.append(start) or begin(self, start))

@@ -1,4 +1,4 @@
-"""The search over pieces as one launch: what the host's does, on every device."""
+"""The search over mode regions in one launch equals that of the host, on every device."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def body_program(seed: int, activations: int, contacts: int, *, bias: float = 0.
 
 
 def entered(program: CoulombProgram) -> tuple[np.ndarray, ContactModes]:
-    """Without activations: a point, and how each contact moves there."""
+    """Return x without activations and the contact modes there."""
     m, n = program.activation_count, program.contact_count
     forces, _ = coulomb_forces(program.rows[:, m:], program.offset, np.zeros(n), FRICTION, np.zeros((n, 3)))
     return np.concatenate([np.zeros(m), forces.ravel()]), ContactModes.of(forces, FRICTION)
@@ -71,7 +71,7 @@ def both(program: CoulombProgram, device: str, limit: int = 12) -> tuple[ModeSea
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("activations", "contacts"), [(1, 0), (2, 1), (5, 3), (9, 8), (23, 11)])
 def test_one_launch_finds_what_the_host_finds(activations: int, contacts: int, device: str) -> None:
-    """Through the same pieces to the same point, whatever moves at the start and on the way."""
+    """The search passes through the same regions to the same point, for sticking and sliding contacts."""
     alike = several = slid = 0
     for seed in range(12):
         program = body_program(seed, activations, contacts, bias=0.5 * (seed % 3))
@@ -83,7 +83,7 @@ def test_one_launch_finds_what_the_host_finds(activations: int, contacts: int, d
         assert there.objective == pytest.approx(program.objective(there.x), rel=1e-9, abs=1e-9)
         same = there.qp_count == here.qp_count and np.allclose(there.x, here.x, rtol=1e-6, atol=1e-6)
         alike += same
-        # Where two ways lead on, as rounding has it.
+        # At a tie, rounding decides between two regions.
         assert same or there.objective <= here.objective + 0.1 * abs(here.objective)
         several += here.qp_count > 1
     assert alike >= 10
@@ -100,7 +100,7 @@ def test_a_limit_is_kept_and_what_was_best_by_then_is_told(device: str) -> None:
     for limit in range(1, whole.qp_count + 1):
         there, here = both(program, device, limit)
         assert there is not None and there.qp_count == here.qp_count == limit
-        # Rows may be broken by so little.
+        # Rows may be violated by this amount.
         assert there.objective == pytest.approx(here.objective, abs=1e-7 * program.constant)
         assert there.objective <= last
         last = there.objective
@@ -108,8 +108,8 @@ def test_a_limit_is_kept_and_what_was_best_by_then_is_told(device: str) -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_what_slides_is_let_go_where_it_cannot_be_held(device: str) -> None:
-    """Two points of one place that are to hold at different speeds have no forces that hold both within their bounds;
-    sliding they have."""
+    """Two points at one place that must stick at different speeds have no forces within their bounds; sliding points
+    have."""
     counts = set()
     for seed in range(30):
         program = body_program(seed, 3, 4, bias=1.0)
@@ -147,12 +147,12 @@ def test_the_default_strategy_goes_by_it_and_by_the_host_where_it_is_led_astray(
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("own", [-1.0, 0.0])
 def test_contacts_without_a_pivot_are_left_to_the_host(own: float, device: str) -> None:
-    """No row is exchanged for another: a contact whose own force does nothing against its speed ends the launch. One
-    whose force does the opposite, as friction on the way of others has it, does not."""
+    """Rows are not pivoted: a contact whose own force has no effect on its velocity ends the launch; one whose force
+    has the opposite effect, as with friction coupled to other contacts, does not."""
     program = body_program(2, 3, 2, bias=1.0)
     speeds = program.rows[:, 3:]
     speeds[3, :] = 0.0
-    # What is added to the diagonal is taken off again.
+    # Cancels what is added to the diagonal.
     speeds[3, 3] = own or -mode_region.DELASSUS_REGULARIZATION * np.abs(np.delete(np.diag(speeds), 3)).sum() / 6.0
     start = np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
     modes = ContactModes(np.full(2, STICK), np.tile([1.0, 0.0], (2, 1)))
@@ -193,7 +193,7 @@ def test_one_launch_finds_the_optimum_without_complementarity(activations: int, 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 16, 31, 50, 130])
 def test_a_block_does_the_algebra(count: int, device: str) -> None:
-    """Products, roots of inverses, elimination, lists, lengths: as NumPy has them, for sizes around those of blocks."""
+    """Products, roots of inverses, elimination, lists and lengths equal NumPy's, for sizes around those of blocks."""
     rng, right = np.random.default_rng(count), 5
     matrix = rng.standard_normal((count, count + right)) + 3.0 * np.eye(count, count + right) * np.sqrt(count)
     half = rng.standard_normal((count, count))
@@ -250,7 +250,7 @@ def test_bounds_give_way_by_as_much_as_on_the_host() -> None:
 
 
 def filled(made: Any, device: str, **shapes: Any) -> Any:
-    """The struct ``made`` with zeros of these shapes, or with the numbers of arrays."""
+    """Fill the struct ``made`` with zeros of these shapes, or with the values of arrays."""
     for name, given in shapes.items():
         kind = int if name in ("side", "active", "cancelled", "base_rows") else real
         array = given if isinstance(given, np.ndarray) else np.zeros(given)
@@ -261,7 +261,7 @@ def filled(made: Any, device: str, **shapes: Any) -> Any:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("seed", range(6))
 def test_a_block_iterates_as_osqp_does_and_ends_at_the_optimum(seed: int, device: str) -> None:
-    """min 1/2 z^T z over rows of length 1: the same rows are guessed, from wherever it begins."""
+    """For min 1/2 z^T z over rows of unit length, the same rows are guessed from any start."""
     rng, n, m = np.random.default_rng(seed), 12, 60
     units = rng.standard_normal((m, n))
     units /= np.linalg.norm(units, axis=1, keepdims=True)
@@ -305,7 +305,7 @@ def test_a_block_iterates_as_osqp_does_and_ends_at_the_optimum(seed: int, device
         device=device,
         block_dim=mode_search.BLOCK,
     )
-    # A row that is at its bound to rounding is on either side of it.
+    # A row at its bound to rounding may be counted on either side.
     sure = np.minimum(np.abs(at - lower + pushes), np.abs(upper - at - pushes)) > 1e-9
     np.testing.assert_array_equal(guessed.numpy()[sure], expected[sure])
     assert sure.sum() > m - 3 and np.count_nonzero(expected) > 2

@@ -1,4 +1,4 @@
-"""The ledger closes, and no longer where any of its terms, or of the file's numbers, is wrong."""
+"""The energy balance closes, and does not close if any of its terms or of the file's values is wrong."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_every_step_closes(books: EnergyBalance) -> None:
 
 
 def test_each_flow_counts(books: EnergyBalance) -> None:
-    """A tenth more of any of them is beyond the bound; those that the slide does not have are nothing."""
+    """A change of any flow by 10 % violates the bound; flows that the slide does not have are zero."""
     for flow in FLOWS:
         values = getattr(books, flow)
         if flow in IDLE:
@@ -55,18 +55,18 @@ def test_each_flow_counts(books: EnergyBalance) -> None:
 
 @dataclass(frozen=True)
 class PartlyInside(StepProblem):
-    """Gives back a share of the spin within the step."""
+    """Adds a fraction ``share`` of the lost spin within the step."""
 
     share: float = 0.0
 
     def momentum_correction(self, internal_gradient: np.ndarray) -> np.ndarray:
-        """(3,) rad/s."""
+        """Return the part (3,) of the momentum correction within the step, rad/s."""
         return self.share * super().momentum_correction(internal_gradient)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.6])
 def test_spin_that_is_added_after_a_step_counts(trajectory: Trajectory, share: float) -> None:
-    """A block that spins in the air and is given the rest of what implicit Euler eats when its step is done."""
+    """A block spins in the air; the rest of the spin that implicit Euler loses is added at the end of its step."""
     body, positions = slide().stepper.body, trajectory.positions[0]
     state = BodyState(positions, np.cross([3.0, -2.0, 5.0], positions - body.centre_of_mass(positions)))
     problem = PartlyInside(body, state, DT, trajectory.drag, share)
@@ -105,7 +105,7 @@ def one_step(
 
 @pytest.mark.parametrize("height", [0.65, 0.5, 0.32])
 def test_muscles_that_lose_their_tension_count(trajectory: Trajectory, height: float) -> None:
-    """A block pressed flat, so that segments pass 0.7 or 0.3 of their rest length, or begin between them."""
+    """A block is compressed so that segments pass 0.7 or 0.3 of their rest length, or begin between these."""
     stepper = slide().stepper
     body, muscles = stepper.body, stepper.muscles
     positions = body.mesh.nodes * [1.0, 1.0, height] + [0.0, 0.0, 1.0]
@@ -127,7 +127,8 @@ def test_muscles_that_lose_their_tension_count(trajectory: Trajectory, height: f
 
 
 def test_the_work_of_a_push_is_the_kinetic_energy_that_it_gives(trajectory: Trajectory, books: EnergyBalance) -> None:
-    """m |v0 + k|^2 / 2 - m |v0|^2 / 2 over the nodes, of a blow on one side and a wind at once."""
+    """The work is the sum of m |v0 + k|^2 / 2 - m |v0|^2 / 2 over the nodes, for a blow on one side and wind at
+    once."""
     assert trajectory.kick_step.tolist() == list(range(8, 24)) and (books.pushes[:8] == 0.0).all()
     mass, before = trajectory.node_mass, trajectory.velocities[8]
     after = before + trajectory.kick_velocity[0]
@@ -136,7 +137,7 @@ def test_the_work_of_a_push_is_the_kinetic_energy_that_it_gives(trajectory: Traj
 
 
 def test_the_sums_of_a_run_close_and_have_its_peaks(books: EnergyBalance) -> None:
-    """Over m g H: what is gained is what all flows bring; the peaks are those of a state, found by looking at each."""
+    """In units of m g H, the change of energy is the sum of all flows; peaks are the maxima over all states."""
     sums = EnergyTotals.of(books)
     assert sums.unit_joules == books.energy_unit and set(sums.flows) == set(FLOWS)
     assert sums.change == pytest.approx(sum(sums.flows.values()), abs=1e-8)
@@ -172,13 +173,13 @@ def test_each_stored_energy_counts(books: EnergyBalance) -> None:
     ],
 )
 def test_the_file_s_numbers_are_those_of_the_run(trajectory: Trajectory, number: str) -> None:
-    """Each 1 % too large."""
+    """Each value is increased by 1 %."""
     wrong = replace(trajectory, **{number: 1.01 * getattr(trajectory, number)})
     assert worst(energy_balance(wrong)) > CLOSES
 
 
 def test_velocities_that_belong_to_no_step_are_seen(trajectory: Trajectory) -> None:
-    """A swelling of 0.1 / s, which has no momentum, is no spin that was added."""
+    """An expansion at 0.1 / s, which has no momentum, is not mistaken for added spin."""
     velocities = trajectory.velocities.copy()
     middle = trajectory.positions[10] - trajectory.node_mass @ trajectory.positions[10] / trajectory.node_mass.sum()
     velocities[10] += 0.1 * middle
@@ -186,15 +187,15 @@ def test_velocities_that_belong_to_no_step_are_seen(trajectory: Trajectory) -> N
 
 
 def test_signs_are_those_of_physics(books: EnergyBalance) -> None:
-    """Damping, drag, friction and what implicit Euler takes of the inertia never give energy, but for what the contact
-    solver leaves."""
+    """Damping, drag, friction and the inertia loss of implicit Euler never add energy, except for the residual of the
+    contact solver."""
     for flow in ("damping", "drag", "friction", "contact", "lost_inertia"):
         assert (getattr(books, flow) <= 1e-8 * books.energy_unit).all(), flow
     assert (books.push_out >= 0.0).all() and (books.muscle_work >= books.muscles - 1e-12 * books.energy_unit).all()
 
 
 def test_stored_energies_are_those_of_the_body(trajectory: Trajectory, books: EnergyBalance) -> None:
-    """Against the solver's own sum, which the ledger never sees."""
+    """The stored energies equal the solver's own sum, which the energy balance does not use."""
     body = slide().stepper.body
     theirs = [body.mechanical_energy(x, v) for x, v in zip(trajectory.positions, trajectory.velocities, strict=True)]
     assert books.stored == pytest.approx(theirs, rel=1e-10)
@@ -202,8 +203,8 @@ def test_stored_energies_are_those_of_the_body(trajectory: Trajectory, books: En
 
 @pytest.mark.parametrize("crushed", [0.5, 0.02, 1e-4])
 def test_what_a_step_loses_holds_for_crushed_elements(crushed: float) -> None:
-    """Psi(F0) - Psi(F1) + P(F1) : (F1 - F0) with energy and stress of one element written out (Eq. 5), also where the
-    straight way between the two would invert it."""
+    """Psi(F0) - Psi(F1) + P(F1) : (F1 - F0), with energy and stress of one element written out (Eq. 5), also if the
+    straight path between the two states would invert it."""
     mu, lam = 3.0, 7.0
     element = module._Elements(np.zeros((1, 4), int), np.eye(3)[None], np.ones(1), mu, lam, 0.0)
     turn = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -223,7 +224,7 @@ def test_what_a_step_loses_holds_for_crushed_elements(crushed: float) -> None:
 
 
 def test_it_shares_no_code_with_the_solver() -> None:
-    """It imports NumPy, SciPy and the record it reads; that record imports nothing of bodies, muscles or contact."""
+    """It imports NumPy, SciPy and the trajectory that it reads, which imports nothing of bodies, muscles or contact."""
     for path in (Path(module.__file__), Path(module.__file__).with_name("audit.py")):
         assert imported(path) <= {"numpy", "scipy", "egs_warp.locomotion.trajectory", "egs_warp.locomotion.ledger"}
     rooms = {name.split(".")[1] for name in imported(Path(module.__file__).with_name("trajectory.py")) if "." in name}
@@ -231,7 +232,7 @@ def test_it_shares_no_code_with_the_solver() -> None:
 
 
 def imported(path: Path) -> set[str]:
-    """Modules beside the standard library's."""
+    """Return the imported modules that are not in the standard library."""
     nodes = ast.walk(ast.parse(path.read_text()))
     names = {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
     nodes = ast.walk(ast.parse(path.read_text()))
@@ -240,7 +241,8 @@ def imported(path: Path) -> set[str]:
 
 
 def test_what_a_shortened_muscle_has_pulled_is_the_integral_of_its_share() -> None:
-    """By the midpoint rule over lengths from nothing to 1.2 of that at rest: the ledger has a formula of its own."""
+    """The energy balance has its own formula; it equals the midpoint rule over lengths from zero to 1.2 rest
+    lengths."""
     count, rest = 4800, 0.5
     lengths = 1.2 * rest * np.arange(count + 1) / count
     middles = 0.5 * (lengths[1:] + lengths[:-1]) / rest

@@ -19,7 +19,8 @@ def contact_lcp(seed: int, contacts: int, freedoms: int) -> tuple[np.ndarray, np
 
 @pytest.mark.parametrize(("contacts", "freedoms"), [(1, 8), (3, 12), (5, 6), (8, 6), (32, 6), (32, 100)])
 def test_contact_problems_are_solved(contacts: int, freedoms: int) -> None:
-    """Eq. (9): 0 <= z, 0 <= w and z.w = 0 to rounding, also where more contacts press than the body has freedoms."""
+    """Eq. (9): 0 <= z, 0 <= w and z.w = 0 to rounding, also for more loaded contacts than the body has degrees of
+    freedom."""
     for seed in range(6):
         matrix, q = contact_lcp(seed, contacts, freedoms)
         z = lemke(matrix, q)
@@ -37,7 +38,7 @@ def test_closed_forms() -> None:
 
 
 def test_ties_end() -> None:
-    """Equal rows and a q of zeros and equal entries are all ties; the lexicographic rule ends all the same."""
+    """Equal rows and a q of zeros or equal entries are ties; the lexicographic rule terminates nevertheless."""
     matrix = np.ones((6, 6)) + np.kron(np.eye(3), np.ones((2, 2)))
     z = lemke(matrix, np.array([-1.0, -1.0, -1.0, -1.0, 0.0, 0.0]))
     assert z is not None

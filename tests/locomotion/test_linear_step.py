@@ -23,7 +23,7 @@ def creature() -> Creature:
 
 
 def about_a_fall(stepper: LocomotionStepper, creature: Creature, seed: int = 0) -> tuple[PredictedStep, LinearStep]:
-    """A prospect of a body that falls and trembles on seven contacts, and the step about it."""
+    """Return the prediction for a body that falls and vibrates on seven contacts, and the linear step about it."""
     nodes, random = creature.start.positions, np.random.default_rng(seed)
     state = BodyState(nodes, np.array([0.1, 0.0, -0.3]) + 0.02 * random.standard_normal(nodes.shape))
     problem = StepProblem(stepper.body, state, 0.01, 0.1)
@@ -38,7 +38,8 @@ def about_a_fall(stepper: LocomotionStepper, creature: Creature, seed: int = 0) 
 
 
 def test_its_end_is_the_newton_step_s(creature: Creature) -> None:
-    """Activations and contact forces push the nodes, and the tangent says how these move (Eq. 7, 8)."""
+    """Activations and contact forces act on the nodes, and the tangent gives the change of the velocities (Eq. 7,
+    8)."""
     stepper = creature.stepper
     prospect, linear = about_a_fall(stepper, creature)
     problem, contacts = prospect.linearization.tangent.problem, prospect.linearization.contacts
@@ -79,7 +80,7 @@ def test_squares_are_what_is_missed(creature: Creature) -> None:
 
 
 def test_a_device_has_the_host_s_step(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """About one prospect after the other, for what a GPU has recorded the first time it plays the second."""
+    """For one prediction after another: a GPU records a graph in the first step and replays it in the second."""
     pytest.importorskip("torch")
     expected = [about_a_fall(creature.stepper, creature, seed)[1] for seed in range(3)]
     stepper = on_device(creature, device, monkeypatch)

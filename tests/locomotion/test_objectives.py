@@ -1,4 +1,4 @@
-"""Objectives: their rows against differences of the quantity they name."""
+"""Objectives: their rows against finite differences of the quantities that they are named after."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def rate_of(quantity: Callable[[np.ndarray], Any], state: BodyState, velocities:
 
 
 def test_centre_of_mass_rows_are_the_rate_of_the_centre_of_mass() -> None:
-    """Rows v = d(com)/dt by a difference of positions moved along v."""
+    """The rows are v = d(com)/dt, by a difference of positions along v."""
     rng = np.random.default_rng(0)
     x, v, h = BODY.mesh.nodes, rng.standard_normal(BODY.mesh.nodes.shape), 1e-3
     objective = centre_of_mass_velocity(BODY, np.array([1.0, 2.0, 3.0]), 0.7)
@@ -65,7 +65,7 @@ def test_centre_of_mass_rows_are_the_rate_of_the_centre_of_mass() -> None:
 
 
 def test_node_rows_measure_the_mass_weighted_distance_from_the_target() -> None:
-    """|rows v - target|^2 = sum m_i |v_i - target_i|^2 / m, its gradient by differences."""
+    """|rows v - target|^2 = sum m_i |v_i - target_i|^2 / m, and its gradient by differences."""
     rng = np.random.default_rng(1)
     v, target, along = rng.standard_normal((3, *BODY.mesh.nodes.shape))
     objective = node_velocities(BODY, target, 1.0)
@@ -102,7 +102,7 @@ def test_straining_rows_see_uniform_strain_alone_and_all_of_it() -> None:
     strained = affine - np.cross(spin, arms)
     assert square(affine + rigid) == pytest.approx((mass * strained**2).sum(), rel=1e-10)
     assert np.allclose(objective.target, objective.rows @ target.ravel())
-    # A motion across all affine ones, in the mean over the mass, is not seen.
+    # A motion orthogonal to all affine ones, weighted by mass, does not count.
     modes = np.eye(9).reshape(9, 3, 3)
     spanned = np.stack([(arms @ mode).ravel() for mode in modes] + [np.tile(a, len(arms)) for a in np.eye(3)], axis=1)
     weight = np.repeat(mass.ravel(), 3)
@@ -111,7 +111,7 @@ def test_straining_rows_see_uniform_strain_alone_and_all_of_it() -> None:
 
 
 def place(part: BodyPart, frame: Coordinates, positions: np.ndarray) -> np.ndarray:
-    """Centre of a part as an objective tells it."""
+    """Return the centre of a part, computed as the objectives do."""
     origin = BODY.centre_of_mass(positions) if frame.relative else 0.0
     return frame.axes @ (part.centre(positions) - origin)
 
@@ -139,8 +139,8 @@ def test_part_rows_are_the_rate_of_the_parts_place(part: BodyPart, frame: Coordi
 @by_part
 @by_frame
 def test_momentum_rows_measure_the_angular_momentum_in_metres_a_second(part: BodyPart, frame: Coordinates) -> None:
-    """Sum of m (x - c) x (v - v_c) over the part, about its own centre or that of the body;
-    a rigid turn gives inertia x omega.
+    """Sum of m (x - c) x (v - v_c) over the part, about its own centre or that of the body, scaled to m/s; a rigid
+    rotation gives inertia x omega.
     """
     state = shaken_state()
     v = np.random.default_rng(5).standard_normal(state.positions.shape)
@@ -158,7 +158,7 @@ def test_momentum_rows_measure_the_angular_momentum_in_metres_a_second(part: Bod
 
 @by_part
 def test_turning_rows_are_the_rate_of_the_best_fit_rotation_of_a_rigid_part(part: BodyPart) -> None:
-    """A rigid velocity field has the angular velocity with which Kabsch's rotation of the part changes."""
+    """In a rigid velocity field, the rows give the angular velocity of the part's rotation by Kabsch's method."""
     state = shaken_state()
     turn = np.array([0.4, -0.2, 0.7])
     rigid = np.cross(turn, state.positions) + [1.0, 2.0, 3.0]
@@ -173,8 +173,8 @@ def test_turning_rows_are_the_rate_of_the_best_fit_rotation_of_a_rigid_part(part
 
 
 def test_area_rows_are_the_rate_of_the_area_of_the_base() -> None:
-    """dA/dt of the hull of the base seen along a tilted up, by differences;
-    the target closes the gap at the asked rate.
+    """dA/dt of the convex hull of the base, projected along a tilted up direction, by differences; the target closes
+    the gap at the requested rate.
     """
     part, state, up = BodyPart.base(BODY, HEIGHTS), shaken_state(), TURNED[2]
     v = np.random.default_rng(6).standard_normal(state.positions.shape)
@@ -191,8 +191,7 @@ def test_area_rows_are_the_rate_of_the_area_of_the_base() -> None:
 
 
 def test_what_is_held_costs_the_squared_slip_of_each_contact_by_its_load() -> None:
-    """On a slope, so that along the ground is not along an axis; what leaves the ground along its normal costs
-    nothing."""
+    """The contact plane is sloped, so that slip is not along an axis; motion along the normal costs nothing."""
     floor = Plane(np.array([0.1, -0.2, 1.0]) / np.sqrt(1.05), 0.3)
     nodes = BODY.mesh.nodes
     embedding = embed_points(BODY.mesh, nodes[nodes[:, 2] == 0.0], device="cpu")

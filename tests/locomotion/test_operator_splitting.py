@@ -1,4 +1,5 @@
-"""Operator splitting's few iterations among squares: on a solver that is kept, as on a new one, as kernels."""
+"""A few iterations of operator splitting for unit-length rows: a reused solver, a new solver and kernels give the same
+iterates."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ SIZES = (3, 8, 9, 30)
 
 
 def program(seed: int, rows: int, unknowns: int = 12) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of length 1, bounds that the minimum breaks and another point does not, and a start."""
+    """Return rows of length 1, bounds that the minimum violates but another point satisfies, and a start."""
     rng = np.random.default_rng(seed)
     units = rng.standard_normal((rows, unknowns))
     units /= np.linalg.norm(units, axis=1)[:, None]
@@ -28,7 +29,7 @@ def program(seed: int, rows: int, unknowns: int = 12) -> tuple[np.ndarray, np.nd
 
 
 def by_osqp(units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, ...]:
-    """OSQP as its users call it."""
+    """Return the result of OSQP through its public interface."""
     solver = osqp.OSQP(algebra="builtin")
     given = {"P": sparse.identity(len(start), format="csc"), "q": np.zeros(len(start)), "A": sparse.csc_matrix(units)}
     solver.setup(

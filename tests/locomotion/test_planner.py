@@ -1,4 +1,4 @@
-"""Cost of activations and of the work of their muscles, computed by hand, and its effect (Eq. 13)."""
+"""The cost of activations and of muscle work, computed by hand, and its effect (Eq. 13)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.stances import DT
 
 
 def asked(stepper: LocomotionStepper, step: int) -> list[AnyObjective]:
-    """Down for five steps, then up ever faster, upright."""
+    """Return objectives: down for five steps, then up at increasing speed, upright."""
     up = -0.3 if step < 5 else min(0.3 * (step - 4), 0.9)
     return [
         centre_of_mass_velocity(stepper.body, np.array([0.0, 0.0, up]), 600.0),
@@ -39,14 +39,15 @@ def thrust(steps: int) -> tuple[LocomotionStepper, list[BodyState], list[StepRep
 
 
 def works(stepper: LocomotionStepper, start: np.ndarray, end: np.ndarray, tensions: np.ndarray) -> np.ndarray:
-    """(M,) m g H that segments with ``tensions`` (M,) newtons give from node positions ``start`` to ``end`` (N, 3)."""
+    """Return the work (M,), m g H, of segments with ``tensions`` (M,) newtons from node positions ``start`` to ``end``
+    (N, 3)."""
     ends = [stepper.muscles.difference_rows @ positions for positions in (start, end)]
     before, after = (np.linalg.norm(each, axis=1) for each in ends)
     return tensions * (before - after) / (stepper.body.weight * stepper.body.height)
 
 
 def test_activations_cost_the_squares_of_what_their_muscles_give_or_take(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside it nothing changes: not the slope, not the cost of no activation, not that of contact forces."""
+    """Nothing else changes: neither the gradient, nor the cost without activation, nor the cost of contact forces."""
     stepper, states, reports = thrust(7)
     muscles, start = stepper.muscles, states[-1]
     memory = WarmStart.from_report(reports[-1])
@@ -72,7 +73,7 @@ def test_activations_cost_the_squares_of_what_their_muscles_give_or_take(monkeyp
 
 
 def test_a_thrust_works_less(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And goes as fast: fewer muscles are stretched while they pull."""
+    """At the same speed, fewer muscles are stretched while they pull."""
 
     def worked(steps: int = 8) -> tuple[float, float]:
         stepper, states, reports = thrust(steps)

@@ -1,4 +1,5 @@
-"""A run is on disk while it goes: what a killed one leaves can be read, and a whole one is the same either way."""
+"""A run is written to disk while it proceeds: parts of a killed run can be read, and a complete run gives the same
+trajectory either way."""
 
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ def test_parts_on_disk_are_what_memory_would_hold(tmp_path: Path, monkeypatch: p
     for report in run.reports[6:16]:
         on_disk.add([report])
         in_memory.add([report])
-    # Here the run is killed.
+    # The run is killed here.
     assert sorted(path.name for path in (tmp_path / "parts").iterdir()) == [
         "start.npz",
         "steps-000000.npz",
@@ -82,7 +83,7 @@ def test_all_that_acts_on_the_body_is_written_down() -> None:
 
 
 def test_each_contact_names_its_plane_among_parallel_ones() -> None:
-    """A block whose one half is lifted over a step: treads have one normal, risers another."""
+    """One half of a block is lifted over a step: treads have one normal, risers another."""
     run = slide()
     body, flat = run.stepper.body, run.stepper.geometry
     step = (Plane(np.array([0.0, 0.0, 1.0]), -0.2), Plane(np.array([-1.0, 0.0, 0.0]), 0.05))

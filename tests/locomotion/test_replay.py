@@ -1,4 +1,4 @@
-"""A run that was cut off goes on to the bits of one that never was; what does not fit it is refused in one line."""
+"""An interrupted run continues to the bits of an uninterrupted one; incompatible inputs give a one-line error."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from tests.support.slides import slide
 from tests.support.stances import FORWARD
 
 FRAMES, CUT = 36, 28
-"""The block is in its thrust where the run is cut off."""
+"""Number of frames, and the step at which the run is interrupted, during the thrust of the block."""
 
 
 class KilledError(Exception):
-    """The run ends here."""
+    """Ends the run."""
 
 
 def block() -> CoarseCreature:
@@ -64,7 +64,7 @@ BODIES = {"jump": block, "walk 0.1": walker}
 
 @pytest.fixture(scope="module")
 def cut_off_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the parts of a jump that was cut off."""
+    """Return the parts of an interrupted jump."""
     parts = tmp_path_factory.mktemp("cut") / "parts"
     with pytest.raises(KilledError):
         run(block(), killed_at=CUT, parts=lambda: parts)
@@ -73,12 +73,12 @@ def cut_off_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def cut_off(cut_off_once: Path, tmp_path: Path) -> Path:
-    """The same, for one test alone."""
+    """Return a copy of the parts, for one test."""
     return shutil.copytree(cut_off_once, tmp_path / "parts")
 
 
 def same_steps(one: tuple[StepReport, ...], other: tuple[StepReport, ...]) -> bool:
-    """All but the milliseconds."""
+    """Assert that all arrays are equal except for the timings."""
 
     def bits(value: Any) -> Any:
         if isinstance(value, dict):
@@ -92,7 +92,7 @@ def same_steps(one: tuple[StepReport, ...], other: tuple[StepReport, ...]) -> bo
 def test_a_run_goes_on_to_the_same_bits(
     script: str, cut_off: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Only steps that were not recorded are solved, by a new body."""
+    """A new body solves only the steps that were not recorded."""
     body, folder = BODIES[script], cut_off
     whole = uninterrupted() if script == "jump" else run(body(), script)
     if script != "jump":
@@ -115,7 +115,7 @@ def test_a_run_goes_on_to_the_same_bits(
     assert (resumed.frames == whole.frames).all()
     for name in whole.trajectory.__dataclass_fields__:
         assert np.array_equal(getattr(resumed.trajectory, name), getattr(whole.trajectory, name)), name
-    # One that was cut off after its last step, too.
+    # A run that was interrupted after its last step, too.
     solved.clear()
     again = run(body(), script, parts=lambda: folder, resume=folder)
     assert same_steps(again.reports, whole.reports) and solved == []
@@ -123,7 +123,7 @@ def test_a_run_goes_on_to_the_same_bits(
 
 @pytest.mark.slow
 def test_a_run_goes_on_from_any_of_its_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cut off after each step: nothing lasts from one step to the next but what is written down."""
+    """The run is interrupted after each step: all state that persists between steps is recorded."""
     monkeypatch.setattr("egs_warp.locomotion.recorder._MIN_STEPS_PER_PART", 1)
     whole = run(block(), parts=lambda: tmp_path / "whole")
     parts = sorted(path.name for path in (tmp_path / "whole").iterdir())
@@ -138,7 +138,7 @@ def test_a_run_goes_on_from_any_of_its_steps(tmp_path: Path, monkeypatch: pytest
 
 
 def test_parts_of_divided_steps_are_put_together_again(tmp_path: Path) -> None:
-    """Steps that were divided because they did not converge: their parts have one digest."""
+    """Steps were divided because they did not converge; the parts of a step have the same digest."""
     slid = slide()
     recorder = slid.recorder(folder=lambda: tmp_path)
     reports = slid.reports
@@ -177,7 +177,7 @@ def test_a_damaged_part_is_told_and_can_be_left_out(cut_off: Path) -> None:
 
 
 def test_a_run_that_is_pushed_goes_on_and_another_push_is_refused(tmp_path: Path) -> None:
-    """The push comes before the cut; the objectives of its step are the same without it."""
+    """The push is before the interruption; without it, the objectives of its step are the same."""
     made = block()
 
     def pushed(size: float) -> Any:
@@ -199,7 +199,7 @@ def test_a_run_that_is_pushed_goes_on_and_another_push_is_refused(tmp_path: Path
 
 
 def test_a_disk_that_is_full_at_a_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One line; what was written before stays, and the run goes on from it."""
+    """There is a one-line error; earlier parts stay, and the run continues from them."""
     replace = os.replace
     for number in (0, 2):
         parts, calls = tmp_path / str(number), iter(range(100))

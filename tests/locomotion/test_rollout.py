@@ -1,4 +1,4 @@
-"""A step that cannot be solved ends a simulation with what there is."""
+"""A step that cannot be solved ends a simulation, and earlier steps are kept."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_what_was_solved_before_is_kept(
 
 
 def test_a_step_in_parts_hands_on_its_last(made: CoarseCreature, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second step begins where the second part of the first has ended, with what that did."""
+    """The second step begins at the end of the second part of the first step, with its contacts and activations."""
     advance, given, parts = LocomotionStepper.advance, [], []
 
     def halved(stepper: LocomotionStepper, state: BodyState, memory: WarmStart, *rest: Any) -> Any:
@@ -94,7 +94,7 @@ def test_what_has_finished_rests_before_it_ends(made: CoarseCreature, before: li
 
 @pytest.mark.slow
 def test_steps_that_have_no_solution(made: CoarseCreature) -> None:
-    """Found in the first step, before anything is done: no number, too fast and too far for double precision."""
+    """Steps without a solution are found at the start: NaN, and values too large for double precision."""
     still, positions = np.zeros_like(made.start.velocities), made.start.positions
     for start in (
         BodyState(positions, still * np.nan),
@@ -109,8 +109,8 @@ def test_steps_that_have_no_solution(made: CoarseCreature) -> None:
 def test_a_body_that_stands_still_is_settled_in_few_steps(
     made: CoarseCreature, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It ends where another long step would move it by less than 2e-4 of its height, its weight carried, before the
-    last of twelve.
+    """The search ends where another long step would move the body by less than 2e-4 of its height, with its weight
+    carried, before the last of twelve steps.
     """
     steps, passive = [], LocomotionStepper.passive_step
     monkeypatch.setattr(LocomotionStepper, "passive_step", lambda *given: steps.append(1) or passive(*given))
@@ -122,8 +122,8 @@ def test_a_body_that_stands_still_is_settled_in_few_steps(
 
 
 def test_a_body_over_nothing_is_not_followed_down(made: CoarseCreature) -> None:
-    """From rest, each step of sqrt(H / g) / 4 begun without velocity lets it fall by g dt^2 = H / 16: after two of them
-    its centre has gone more than 0.1 H, and it is returned."""
+    """Each step of sqrt(H / g) / 4 starts without velocity and lets it fall by g dt^2 = H / 16: after two steps its
+    centre has moved by more than 0.1 H, and the body is returned."""
     body, geometry = made.stepper.body, made.stepper.geometry
     (floor,) = geometry.planes
     below = replace(geometry, planes=(replace(floor, offset=floor.offset + 100.0),))
@@ -133,7 +133,7 @@ def test_a_body_over_nothing_is_not_followed_down(made: CoarseCreature) -> None:
 
 
 def test_no_frames_are_nothing_done(made: CoarseCreature) -> None:
-    """As where there are activations for less than a frame: the start alone, at no step that could not be solved."""
+    """As with activations for less than a frame: the start is the only state, and no step failed."""
     sequence = MotionSequence(made.place, motion("jump").parts(made.place.body.height))
     done = roll_out(made.stepper, made.stepper.geometry, made.start, sequence, frames=0)
     assert not done.stopped and done.reports == () and done.frames.tolist() == [0]

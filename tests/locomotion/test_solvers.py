@@ -1,4 +1,4 @@
-"""The QP adapters: optimality, bounds-only updates against fresh set-ups, and honest status."""
+"""The QP adapters: optimality, updates of bounds against new solvers, and correct status."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def random_program(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @SOLVERS
 def test_closed_form(solver: QpSolver, accuracy: float) -> None:
-    """min (x-2)^2 + (y+1)^2 with x <= 1, y free:
-    (1, -1), and the multiplier is positive where the upper bound pushes.
+    """min (x-2)^2 + (y+1)^2 with x <= 1, y free: the optimum is (1, -1), and the multiplier of the active upper bound
+    is positive.
     """
     program = quadratic_program(2 * np.eye(2), np.array([-4.0, 2.0]), np.eye(2), solver=solver)
     solution = program.solve(np.array([-np.inf, -np.inf]), np.array([1.0, np.inf]))
@@ -46,11 +46,11 @@ def test_closed_form(solver: QpSolver, accuracy: float) -> None:
 
 @SOLVERS
 def test_bounds_only_updates_give_the_optimum_of_a_fresh_set_up(solver: QpSolver, accuracy: float) -> None:
-    """Eq. (13): rows switch between free, one-sided and held, as contact states do;
-    KKT holds and x is that of a fresh solver.
+    """Eq. (13): rows change between free, one-sided and equality, as contact states do; the KKT conditions hold, and x
+    is that of a new solver.
     """
     P, q, A = random_program(0)
-    for rows in (A, np.vstack([np.eye(20), A[:10]])):  # plain bounds first, as the contact program has them
+    for rows in (A, np.vstack([np.eye(20), A[:10]])):  # plain bounds first, as in the contact program
         rng = np.random.default_rng(1)
         program = quadratic_program(P, q, rows, solver=solver)
         for _ in range(12):
@@ -67,7 +67,8 @@ def test_bounds_only_updates_give_the_optimum_of_a_fresh_set_up(solver: QpSolver
 
 
 def test_a_program_beside_one_that_is_solved_needs_no_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same optimum as OSQP leads to, without OSQP, and no point where there is none."""
+    """From the active set of a solved program, the optimum is that of OSQP, without OSQP iterations; an infeasible
+    program has no solution."""
     for seed in range(12):
         P, q, A = random_program(seed)
         lower, upper = np.full(30, -0.1), np.full(30, 0.2)
@@ -84,7 +85,7 @@ def test_a_program_beside_one_that_is_solved_needs_no_iterations(monkeypatch: py
 
 
 def test_each_splitting_is_that_of_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Operator splitting as kernels needs no OSQP; what is called osqp does."""
+    """Operator splitting as kernels does not need OSQP; the solver named osqp does."""
     P, q, A = random_program(0)
     lower, upper = np.r_[0.0, np.full(29, -0.1)], np.r_[0.0, np.full(29, 0.2)]
     expected = quadratic_program(P, q, A, solver="osqp").solve(lower, upper)
@@ -96,7 +97,7 @@ def test_each_splitting_is_that_of_its_name(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 class Doubting:
-    """A splitting whose iterations end with a loose certificate, as OSQP leaves them."""
+    """A splitting that ends with a loose infeasibility certificate, like OSQP."""
 
     def warm_start(
         self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None
@@ -108,7 +109,7 @@ class Doubting:
 
 
 def test_what_iterations_leave_in_doubt_is_no_guess(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The search for the optimum then begins with the rows that the minimum without bounds breaks."""
+    """The search for the optimum then starts with the rows that the unconstrained minimum violates."""
     P, q, A = random_program(5)
     lower, upper = np.full(30, -0.1), np.full(30, 0.2)
     guesses = []
@@ -128,7 +129,7 @@ def test_what_iterations_leave_in_doubt_is_no_guess(monkeypatch: pytest.MonkeyPa
 
 @SOLVERS
 def test_infeasible_bounds_are_reported_and_the_next_solve_recovers(solver: QpSolver, accuracy: float) -> None:
-    """OSQP returns garbage in x when infeasible: it must not come back, nor spoil the next warm start."""
+    """OSQP returns garbage in x when infeasible: it must neither be returned nor spoil the next warm start."""
     P, q, A = random_program(2)
     A = np.vstack([A, A[0]])
     program = quadratic_program(P, q, A, solver=solver)
@@ -145,7 +146,7 @@ def test_infeasible_bounds_are_reported_and_the_next_solve_recovers(solver: QpSo
 
 @SOLVERS
 def test_rows_that_repeat_each_other_may_all_be_held(solver: QpSolver, accuracy: float) -> None:
-    """A static contact holds n_d rows of rank two; held rows that agree are no contradiction."""
+    """A static contact has n_d equality rows of rank two; equality rows that agree are no contradiction."""
     P, q, A = random_program(4)
     A = np.vstack([A[:4], A[:4], A[0] + A[1]])
     solution = quadratic_program(P, q, A, solver=solver).solve(np.zeros(9), np.zeros(9))
@@ -154,12 +155,12 @@ def test_rows_that_repeat_each_other_may_all_be_held(solver: QpSolver, accuracy:
 
 
 def test_an_iteration_limit_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the limit the point may be read if it nearly obeys its bounds;
-    one that does not has a false, low objective.
+    """At the limit the point is usable if it nearly satisfies the bounds; a point that does not has a wrong, low
+    objective.
     """
     P, q, A = random_program(0)
     program = quadratic_program(P, q, A, accuracy=1e-30)
-    # A row that is held is left to OSQP alone.
+    # With an equality row, the program is left to OSQP alone.
     near = program.solve(np.zeros(30), np.r_[0.0, np.full(29, np.inf)])
     assert near.status is QpStatus.ITERATION_LIMIT and near.usable
     assert near.status.value == "the iteration limit was reached near the bounds; the last point is used"
@@ -169,7 +170,7 @@ def test_an_iteration_limit_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_program_whose_bounds_are_all_slack(capfd: pytest.CaptureFixture[str]) -> None:
-    """As in flight: the free minimum to rounding, and no word from the solver."""
+    """As in flight: the unconstrained minimum to rounding, without output of the solver."""
     P, q, A = random_program(1)
     solution = quadratic_program(P, q, A).solve(np.full(30, -1e3), np.full(30, 1e3))
     assert solution.status is QpStatus.SOLVED and np.abs(P @ solution.x + q).max() < 1e-9
@@ -177,7 +178,7 @@ def test_a_program_whose_bounds_are_all_slack(capfd: pytest.CaptureFixture[str])
 
 
 def test_same_solves_give_the_same_bits() -> None:
-    """No step of a solver may depend on the clock."""
+    """Iterations of a solver must not depend on the clock."""
     P, q, A = random_program(3)
     for solver in QpSolver:
         runs = []
@@ -189,7 +190,7 @@ def test_same_solves_give_the_same_bits() -> None:
 
 
 def test_daqp_is_optional(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The engine does not need DAQP; without the package, selecting it gives an error that says what to do."""
+    """The engine does not need DAQP; selecting it without the package gives an error with the remedy."""
     real = builtins.__import__
 
     def without(name: str, *rest: Any, **options: Any) -> ModuleType:
@@ -206,7 +207,7 @@ def test_daqp_is_optional(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_ctrl_c_while_osqp_runs_is_not_lost() -> None:
-    """It keeps the signal to itself and says that it was interrupted."""
+    """OSQP catches the signal and reports that it was interrupted."""
     random = np.random.default_rng(3)
     A = random.normal(size=(400, 200))
     program = quadratic_program(np.eye(200), 10.0 * random.normal(size=200), A, solver="osqp", accuracy=1e-15)
@@ -215,5 +216,5 @@ def test_ctrl_c_while_osqp_runs_is_not_lost() -> None:
     with pytest.raises(KeyboardInterrupt):
         timer.start()
         while time.monotonic() - began < 30.0:
-            # A row that is held leaves it to OSQP alone.
+            # With an equality row, the program is left to OSQP alone.
             program.solve(np.r_[0.0, np.full(399, -1e-3)], np.r_[0.0, np.full(399, 1e-3)])

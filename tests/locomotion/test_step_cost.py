@@ -1,4 +1,4 @@
-"""The cost of a step against what it says of positions and velocities, by differences (Eq. 13)."""
+"""The cost of a step, against finite differences over positions and velocities (Eq. 13)."""
 
 from __future__ import annotations
 
@@ -60,7 +60,8 @@ def test_objectives_are_weighted_squares_of_what_is_missed() -> None:
 
 
 def moved_on(problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, time: float, x: np.ndarray) -> np.ndarray:
-    """(N, 3) where the body is after ``time`` s: the step's way, and from there as one implicit step would go on."""
+    """Return the positions (N, 3) of the body ``time`` s after the step, if it continued as one implicit step from
+    there."""
     end = problem.end_positions(foreseen.reshape(-1, 3))
     entries = BODY.assembly.hessian_entries(
         end, BODY.assembly.damping(problem.state.positions, time), factor=time**2, projected=True
@@ -73,7 +74,7 @@ def moved_on(problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, tim
 
 
 def test_effort_is_the_energy_ahead_and_convex() -> None:
-    """Value, slope and curvature about the predicted end, by differences of the energy."""
+    """Value, gradient and curvature about the predicted end, by differences of the energy."""
     problem, linear, foreseen = example()
     horizon = 0.16
     time = horizon * np.sqrt(BODY.height / 9.81)
@@ -103,8 +104,8 @@ def test_effort_is_the_energy_ahead_and_convex() -> None:
 
 
 def test_what_lets_go_is_foreseen_slack_not_strained_the_other_way() -> None:
-    """A stretched body whose end velocity takes it to its rest shape within the step: carried on at that speed it would
-    be strained by twice as much."""
+    """A stretched body reaches its rest shape within the step at its end velocity; at the same speed afterwards it
+    would be strained by twice as much."""
     nodes = BODY.mesh.nodes
     stretch = 0.02 * (nodes - nodes.mean(axis=0)) * [0.0, 0.0, 1.0]
     problem = StepProblem(BODY, BodyState(nodes + stretch, np.zeros_like(nodes)), DT)

@@ -1,5 +1,5 @@
-"""The stepper (Eq. 4, 9, 12, 13): every step audited by hand, bit-identical runs, a body that follows its objectives,
-subdivision of a step that fails."""
+"""The stepper (Eq. 4, 9, 12, 13): each step audited by hand, deterministic runs, a body that follows its objectives,
+subdivision of a failed step."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def muscular_block(
 
 
 def hop(body: SoftBody, step: int) -> list[AnyObjective]:
-    """Down for six steps, then up and forwards, kept upright."""
+    """Return objectives of a hop: down for six steps, then up and forwards, upright."""
     velocity = np.array([0.0, 0.0, -0.4]) if step < 6 else np.array([0.1, 0.0, 0.25 * (step - 5)])
     pose = np.tile(velocity, (len(body.mesh.nodes), 1))
     return [
@@ -86,8 +86,8 @@ def run_hop(stepper: LocomotionStepper, steps: int) -> tuple[list[BodyState], li
 
 
 def test_audit_of_a_hop(device: str) -> None:
-    """Eq. (4), Eq. (9), Eq. (12), Eq. (13):
-    momentum 1e-5, angular 1e-4, cone 1e-4, complementarity 1e-4, penetration 0.01.
+    """Eq. (4), Eq. (9), Eq. (12), Eq. (13): linear momentum to 1e-5, angular momentum to 1e-4, cone to 1e-4,
+    complementarity to 1e-4, penetration to 0.01.
     """
     stepper = muscular_block(device)
     body = stepper.body
@@ -96,7 +96,7 @@ def test_audit_of_a_hop(device: str) -> None:
     assert len(states) == len(reports) + 1
     for before, report in zip(states[:-1], reports, strict=True):
         after, dt = report.state, report.dt
-        # By hand: world forces at world points.
+        # By hand: forces in world axes at points in world coordinates.
         points = np.einsum("nw,nwi->ni", report.contacts.weights, before.positions[report.contacts.nodes])
         forces = np.einsum("na,nai->ni", report.forces, report.contacts.axes)
         gain = (body.node_mass[:, None] * (after.velocities - before.velocities)).sum(0) / dt
@@ -118,16 +118,17 @@ def test_audit_of_a_hop(device: str) -> None:
         assert report.converged and body.assembly.determinants(after.positions).min() > 0.0
         assert np.all(np.abs(report.activations) <= stepper.muscles.bounds * (1 + 1e-12))
         assert 0 < report.qp_count <= stepper.settings.qp_limit
-        # Velocities are those that moved it.
+        # Velocities are consistent with the displacements.
         assert np.abs(after.positions - before.positions - dt * after.velocities).max() < 1e-12 * height
-    # The muscles did something: the body went down, then up faster than the floor's mere push-out could.
+    # The muscles are active: the body went down, then up faster than the push-out of the floor alone could move it.
     speeds = [body.centre_of_mass(s.velocities)[2] for s in states]
     assert min(speeds) < -0.2 and max(speeds) > 0.8
     assert max(np.abs(r.activations / stepper.muscles.bounds).max() for r in reports) > 0.05
 
 
 def test_what_a_program_foresees_is_in_its_units() -> None:
-    """Contact speeds in sqrt(g H), forces in body weights, activations in their bounds, as the prospect has them."""
+    """Contact velocities are in sqrt(g H), forces in body weights, and activations within their bounds, as in the
+    prediction."""
     stepper = muscular_block()
     body = stepper.body
     states, reports = run_hop(stepper, 3)
@@ -144,7 +145,8 @@ def test_what_a_program_foresees_is_in_its_units() -> None:
 
 
 def test_a_body_bobs_as_asked() -> None:
-    """Half a period of 2 % of the height: speed of the centre of mass to 5 % of its peak, load without reversals."""
+    """Half a period with an amplitude of 2 % of the height: the velocity of the centre of mass is within 5 % of its
+    peak, and the load does not reverse."""
     creature = coarse_creature(block_mesh(), forward=np.array([1.0, 0.0, 0.0]))
     stepper, body, state = creature.stepper, creature.stepper.body, creature.start
     memory, loads, misses = stepper.initial_memory(), [], []
@@ -171,8 +173,8 @@ def test_a_body_bobs_as_asked() -> None:
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
 def test_a_gpu_s_factors_make_the_same_hop(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """30 steps in closed loop (10 on a CPU, where dense factors take their time), each with its own activations, with
-    a GPU's kernels on a GPU: within 1e-8 H of sparse factors. On four feet: of more, rounding chooses which press.
+    """30 steps in closed loop (10 on a CPU, where dense factors are slow), each with its own activations: within 1e-8 H
+    of sparse factors. The body stands on four feet; with more, rounding decides which points carry the load.
     """
     steps, corners = 10 if device == "cpu" else 30, GRID[[0, 4, 20, 24]]
     dense_factors = pytest.importorskip("egs_warp.fem.dense_cholesky")
@@ -184,7 +186,7 @@ def test_a_gpu_s_factors_make_the_same_hop(device: str, monkeypatch: pytest.Monk
         return made[-1]
 
     monkeypatch.setattr("egs_warp.locomotion.stepper.linear_solver_on", dense)
-    # A GPU's kernels on a CPU, too.
+    # The kernels for GPUs also run on a CPU.
     monkeypatch.setattr("egs_warp.fem.elasticity.SimdElasticity", WarpElasticity)
     got, reports = run_hop(muscular_block(device, feet=corners), steps)
     assert len(made) == 2 and len(got) == len(expected) and max(len(one.forces) for one in reports) > 3
@@ -193,7 +195,7 @@ def test_a_gpu_s_factors_make_the_same_hop(device: str, monkeypatch: pytest.Monk
 
 
 def test_two_runs_are_bit_identical() -> None:
-    """Same device, same input: positions, velocities, forces and activations agree to the last bit."""
+    """On the same device, equal inputs give bitwise equal positions, velocities, forces and activations."""
     runs = [run_hop(muscular_block(), 10) for _ in range(2)]
     for (states, reports), (others, twins) in [runs]:
         for a, b in zip(states, others, strict=True):
@@ -228,8 +230,8 @@ def test_degenerate_contact_sets_never_lose_a_frame(feet: np.ndarray, solver: Qp
 
 @pytest.mark.parametrize("strategy", [strategy for strategy in Strategy if strategy is not Strategy.EXACT])
 def test_every_strategy_drives_the_stepper(strategy: Strategy) -> None:
-    """Eq. (12), Eq. (13): the same steps with another search;
-    all static takes one QP, two where that has no solution.
+    """Eq. (12), Eq. (13): the same steps with another search; the all-static strategy takes one QP, or two if that has
+    no solution.
     """
     settings = LocomotionSettings(strategy=strategy, qp_limit=6, qp_solver=QpSolver.DAQP)
     _, reports = run_hop(muscular_block(settings=settings), 6)
@@ -240,7 +242,7 @@ def test_every_strategy_drives_the_stepper(strategy: Strategy) -> None:
 
 
 class LateStepper(LocomotionStepper):
-    """Says of every step longer than ``longest`` that it did not converge."""
+    """Reports that every step longer than ``longest`` did not converge."""
 
     longest = 0.0
 
@@ -260,8 +262,8 @@ class LateStepper(LocomotionStepper):
 
 @pytest.mark.parametrize(("longest", "parts"), [(1.0, 1), (0.6, 2), (0.3, 4), (0.01, 16)])
 def test_a_step_that_does_not_converge_is_subdivided(longest: float, parts: int) -> None:
-    """Halved until it converges, four times over at most; the parts make up the step, under the activations that were
-    planned for the whole of it, and the last failure stays reported."""
+    """The step is halved until it converges, at most four times; the parts add up to the step, use the activations
+    planned for the whole step, and the last failure stays in the reports."""
     made = muscular_block()
     stepper = LateStepper(made.body, made.muscles, made.geometry, device="cpu")
     stepper.longest = longest * DT
@@ -304,7 +306,7 @@ def test_halves_are_made_under_the_activations_that_serve_better(planned_well: b
 
 
 def test_flight_needs_no_qp_contacts_and_keeps_the_parabola() -> None:
-    """Eq. (4): in the air there is no contact and muscles move the centre of mass by nothing."""
+    """Eq. (4): in the air there is no contact, and muscles do not move the centre of mass."""
     stepper = muscular_block()
     body = stepper.body
     state = BodyState(body.mesh.nodes + [0, 0, 1.0], np.tile([0.5, 0.0, 1.0], (len(body.mesh.nodes), 1)))

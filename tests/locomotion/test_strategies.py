@@ -55,7 +55,7 @@ def is_complementary(program: ContactProgram, y: np.ndarray, tolerance: float) -
 def test_relaxed_against_brute_force(solver: QpSolver) -> None:
     """Eq. (13): within 2 % of brute force in 78 % of 60 problems, never below it, in at most 5 QPs on average.
 
-    These are harder than a body's: the optimum without complementarity says nothing about the true one in most of them.
+    These problems are harder than those of a body: in most of them the relaxed optimum is no hint at the true one.
     """
     near, counts = 0, []
     for seed in range(60):
@@ -72,9 +72,7 @@ def test_relaxed_against_brute_force(solver: QpSolver) -> None:
 
 
 def test_order_of_the_strategies() -> None:
-    """Over many problems: exact <= relaxed <= qpcc <= static in the mean,
-    and relaxed takes far fewer QPs than exact.
-    """
+    """On average over many problems, exact <= relaxed <= qpcc <= static, and relaxed takes far fewer QPs than exact."""
     means, counts = {}, {}
     problems = [small_problem(seed, contacts=3).program for seed in range(30)]
     for strategy in PAIRED:
@@ -86,8 +84,8 @@ def test_order_of_the_strategies() -> None:
 
 
 def test_the_limit_is_kept_and_more_qps_are_never_worse() -> None:
-    """One more QP never raises the objective;
-    at the limit, thrice that where the best is in doubt, the best so far is returned.
+    """One more QP never increases the objective. The limit is tripled if the best result is uncertain; at the limit the
+    best result so far is returned.
     """
     for seed in range(8):
         program = small_problem(seed, contacts=3).program
@@ -99,13 +97,13 @@ def test_the_limit_is_kept_and_more_qps_are_never_worse() -> None:
 
 
 def test_a_search_in_doubt_may_take_thrice_the_limit() -> None:
-    """As the docs say: some of many problems take all of it, none takes more."""
+    """As documented: some of many problems take all of it, none takes more."""
     counts = [search(small_problem(seed, contacts=3).program, Strategy.RELAXED, limit=2).qp_count for seed in range(20)]
     assert max(counts) == 6 and min(counts) <= 3
 
 
 def test_contact_under_given_activations_obeys_every_pair() -> None:
-    """Eq. (9): for any activations there are forces, found to rounding."""
+    """Eq. (9): for any activations there are contact forces, found to rounding."""
     for seed in range(10):
         program = small_problem(seed, contacts=4).program
         activations = np.random.default_rng(seed).uniform(-1, 1, 3)
@@ -127,7 +125,8 @@ def degenerate_frames() -> dict[str, np.ndarray]:
     frames = {}
     for name, places in points.items():
         arms = np.column_stack([places, np.full(len(places), -0.5)])
-        # Normal first: velocity of each point along z, x, y for a body's (v_z, v_x, v_y, w_x, w_y, w_z).
+        # Rows with the normal first: velocity of each point along z, x, y for the body's (v_z, v_x, v_y, w_x, w_y,
+        # w_z).
         linear = np.tile(np.eye(3), (len(arms), 1))
         turn = np.concatenate([np.cross(np.eye(3), arm).T[[2, 0, 1]] for arm in arms])
         frames[name] = np.hstack([linear, turn])
@@ -137,8 +136,8 @@ def degenerate_frames() -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("name", list(degenerate_frames()))
 @pytest.mark.parametrize("solver", [QpSolver.OSQP, QpSolver.DAQP, pytest.param(QpSolver.ADMM, marks=pytest.mark.slow)])
 def test_degenerate_contact_sets_never_lose_a_frame(name: str, solver: QpSolver) -> None:
-    """Every contact in one line, duplicates, one point, 40 points on a rigid base:
-    a finite answer that obeys every pair.
+    """Contacts in one line, duplicates, one point, 40 points on a rigid base: the result is finite and obeys every
+    pair.
     """
     frame = degenerate_frames()[name]
     for seed in range(4):
@@ -150,8 +149,8 @@ def test_degenerate_contact_sets_never_lose_a_frame(name: str, solver: QpSolver)
 
 
 def test_states_that_contradict_each_other_are_replaced() -> None:
-    """Points of one rigid place whose gaps differ cannot all be static:
-    the search starts from what contact would do.
+    """Points at one rigid place with different gaps cannot all be static: the search starts from the solution of the
+    contact problem instead.
     """
     frame = degenerate_frames()["same"]
     problem = small_problem(1, contacts=6, frame=frame)
@@ -165,9 +164,9 @@ def test_states_that_contradict_each_other_are_replaced() -> None:
 
 
 def test_every_strategy_solves_the_same_program() -> None:
-    """Eq. (9), Eq. (13): each gives activations in their bounds, forces in the cone, the objective of its point, and
-    in the mean no more than where it begins; in a few QPs ``modes`` comes nearer than the strategies that change one
-    contact at a time from the predicted states.
+    """Eq. (9), Eq. (13): each strategy gives activations within their bounds, forces within the cone, the correct
+    objective, and on average no more than the start; in a few QPs ``modes`` comes nearer to the optimum than the
+    strategies that change one contact at a time from the predicted states.
     """
     reached: dict[Strategy, list[float]] = {strategy: [] for strategy in Strategy}
     for seed in range(24):
@@ -182,7 +181,8 @@ def test_every_strategy_solves_the_same_program() -> None:
             assert found.x is not None and found.qp_count > 0
             forces = found.x[3:].reshape(-1, 3)
             slack = FRICTION * forces[:, 0] - np.linalg.norm(forces[:, 1:], axis=1)
-            # The pieces hold the cone by a pyramid around their start, which may break a face by 0.02 and its load too.
+            # The mode regions replace the cone by a pyramid around the start, which may violate a facet by 0.02, and
+            # the objective likewise.
             broken = 0.03 if strategy is Strategy.MODES else 1e-5
             assert np.abs(found.x[:3]).max() <= 1.0 + 1e-6 and slack.min() > -broken
             assert found.objective == pytest.approx(pieces.objective(found.x), rel=1e-4, abs=1e-4)
@@ -210,8 +210,8 @@ def test_strategies_and_solvers_are_chosen_by_name() -> None:
 
 
 def test_strategies_begin_where_they_say() -> None:
-    """``paper`` starts from the predicted states, and only improves on them; ``static`` from all static, whatever the
-    prediction."""
+    """``paper`` starts from the predicted states and only improves on them; ``static`` starts with all contacts static,
+    for any prediction."""
     tried = 0
     for seed in range(40):
         program, foreseen = small_problem(seed).program, (0, 1)
@@ -228,8 +228,8 @@ def test_strategies_begin_where_they_say() -> None:
 
 @pytest.mark.parametrize("bound", [None, 1.0, 0.5])
 def test_pieces_are_searched_again_only_in_doubt(bound: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the result is within 1.2 times the lower bound, or the bound is not known, there is one QP more; otherwise a
-    second search."""
+    """If the result is within 1.2 times the lower bound, or the bound is not known, there is one more QP; otherwise
+    there is a second search."""
     pieces = small_problem(3, contacts=3, directions=8, freedoms=14).pieces
     forces = np.zeros((3, 3))
     foreseen = PredictedContact(np.zeros(3), forces, forces)

@@ -16,7 +16,7 @@ def _threads() -> set[int]:
 
 
 def test_a_step_has_one_blas_thread_and_gives_the_others_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever the program that steps it has set."""
+    """For any number of threads set by the calling program."""
     pawn, seen = coarse_pawn(), []
     step = LocomotionStepper.step
 

@@ -1,4 +1,4 @@
-"""Measures of trajectories made by hand, and their way through a file."""
+"""Measures of hand-made trajectories, and their round trip through a file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def test_ballistic_flight_is_measured(flight: Trajectory) -> None:
 
 
 def test_a_part_of_a_trajectory_is_measured_alone(flight: Trajectory) -> None:
-    """From the third state to the tenth, in the air all along, is as a trajectory that begins and ends there."""
+    """From the third to the tenth state, all in the air, the measures are those of a trajectory that begins and ends
+    there."""
     cut = replace(
         flight,
         **{name: getattr(flight, name)[3:11] for name in ("time", "positions", "velocities", "min_gap")},
@@ -43,7 +44,7 @@ def test_a_part_of_a_trajectory_is_measured_alone(flight: Trajectory) -> None:
 
 
 def test_what_was_reached_does_not_hang_on_where_up_is(flight: Trajectory) -> None:
-    """The whole world turned: the same way, height, heading, tilt and time in the air."""
+    """The whole world is rotated: distance, height, heading, tilt and time in the air stay the same."""
     expected = measure(flight)
     for vector in ([0.5 * np.pi, 0.0, 0.0], [0.0, 0.5 * np.pi, 0.0], [0.4, -1.1, 0.7]):
         turn = Rotation.from_rotvec(vector).as_matrix()

@@ -1,4 +1,4 @@
-"""A trajectory from a file is drawn only where its arrays fit each other."""
+"""A trajectory file is read only if its arrays are consistent."""
 
 from __future__ import annotations
 

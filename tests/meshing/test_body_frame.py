@@ -1,4 +1,4 @@
-"""Cage and frame come from the body itself: the order, unit, place and axes of the file leave no trace."""
+"""Cage and frame depend only on the body, not on the order, unit, position and axes of the file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def body_cage(lying: Lying) -> tuple[BodyFrame, Cage]:
-    """Cage in the body's own frame, about one unit tall."""
+    """Return a cage in the body's own frame, about one unit tall."""
     near, anchor = centred(lying.cloud)
     frame = find_body_frame(near, lying.plane.moved(-anchor))
     return frame.moved(anchor), cage_of_body(body_gaussians(near, frame))
@@ -34,7 +34,7 @@ def body_cage(lying: Lying) -> tuple[BodyFrame, Cage]:
 
 @pytest.fixture(scope="module", params=["pawn", pytest.param("stool", marks=pytest.mark.slow)])
 def thing(request: pytest.FixtureRequest) -> Lying:
-    """A round body and one with a front, coarse."""
+    """Return a round body or one with a front, coarse."""
     made = {"pawn": pawn, "stool": stool}[request.param](gaussian_count=3000)
     return Lying(made.cloud, made.plane).on_grid()
 
@@ -73,7 +73,7 @@ def test_same_bits_however_the_file_lies(thing: Lying, its_cage: Cage, other: Ca
     ids=["both", "x0.37", "turned"],
 )
 def test_same_cage_in_any_unit_and_turned(thing: Lying, its_cage: Cage, other: Callable[[Lying], Lying]) -> None:
-    """The same tetrahedra, and nodes within 1e-5 of the height, the effect of rounding; before, 3e-2."""
+    """The tetrahedra are the same, and the nodes are equal within 1e-5 of the height, the effect of rounding."""
     _, cage = body_cage(other(thing))
     assert np.array_equal(cage.mesh.tets, its_cage.mesh.tets)
     assert np.abs(cage.mesh.nodes - its_cage.mesh.nodes).max() < 1e-5 * its_cage.height(GROUND)
@@ -105,7 +105,7 @@ def test_base_plane_goes_along(thing: Lying) -> None:
     st.lists(st.floats(-100.0, 100.0), min_size=3, max_size=3),
 )
 def test_frame_turns_moves_and_grows_with_the_body(seed: int, scale: float, angle: float, shift: list[float]) -> None:
-    """Random points: their coordinates in the frame do not change."""
+    """The coordinates of random points in the frame do not change."""
     random = np.random.default_rng(seed)
     points = random.normal(size=(200, 3)) * random.uniform(0.3, 1.0, 3)
     weights = random.uniform(0.1, 1.0, 200)
@@ -115,13 +115,13 @@ def test_frame_turns_moves_and_grows_with_the_body(seed: int, scale: float, angl
     plane = GROUND.scaled(scale).moved(np.array(shift))
     other = scale * points @ turn.T + shift
     seen = upright_frame(other, weights, plane).points(other)
-    # Among moments that are nearly alike rounding may choose; of 200 random points none are so near.
+    # Rounding may choose among nearly equal moments; none of 200 random points are so close.
     assert np.abs(seen - frame.points(points)).max() < 1e-6 * np.abs(seen).max()
 
 
 @pytest.mark.parametrize("sides", [3, 4, 5])
 def test_round_bodies_face_along_what_they_have_most_of(sides: int) -> None:
-    """A regular star has no long side: x goes through one of its tips, or between two, and turns with it."""
+    """A regular star has no long side: x passes through one of its tips, or between two, and rotates with it."""
     random = np.random.default_rng(sides)
     azimuth = 2.0 * np.pi * np.repeat(np.arange(sides), 50) / sides + np.tile(random.normal(0.0, 0.1, 50), sides)
     radius = np.tile(random.uniform(0.2, 1.0, 50), sides)
@@ -148,7 +148,7 @@ def test_a_star_is_faced_through_a_tip(sides: int, turned: float) -> None:
 
 
 def test_corners_do_not_outweigh_a_long_side() -> None:
-    """The largest moment of a rectangle's four corners is the fourth, at its diagonals."""
+    """The largest fourth moment of a rectangle's four corners is along its diagonals."""
     corners = np.array([[x, y, 0.3] for x in (-0.5, 0.5) for y in (-0.6, 0.6)])
     frame = upright_frame(corners, np.ones(4), GROUND)
     assert np.abs(frame.axes[0]) == pytest.approx(np.array([0.0, 1.0, 0.0]), abs=1e-9)
@@ -156,7 +156,7 @@ def test_corners_do_not_outweigh_a_long_side() -> None:
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_a_long_body_is_faced_along_its_length_the_way_its_tail_points(way: float) -> None:
-    """Denser towards its other end: the third moments about its middle are those of the tail."""
+    """The body is denser towards its other end: the third moments about its centre are those of the tail."""
     along = way * np.linspace(0.0, 1.0, 201) ** 1.5
     aside = np.resize([0.05, -0.05], 201)
     points = np.column_stack([0.6 * along - 0.8 * aside, 0.8 * along + 0.6 * aside, np.full(201, 0.3)])
@@ -165,7 +165,7 @@ def test_a_long_body_is_faced_along_its_length_the_way_its_tail_points(way: floa
 
 
 def test_the_origin_is_under_the_middle_and_the_unit_the_median_distance() -> None:
-    """Points all over a sphere, above a plane that is not level."""
+    """Points on a sphere, above a plane that is not level."""
     random = np.random.default_rng(0)
     half = random.normal(size=(500, 3))
     points = 2.0 * np.concatenate([half, -half]) / np.linalg.norm(np.concatenate([half, half]), axis=1)[:, None]
@@ -203,7 +203,8 @@ def test_there_and_back() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0))])
 def test_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
-    """Shuffled and in a unit of a power of two the same bits; turned and in any unit the same tetrahedra."""
+    """Shuffled or in a unit of a power of two, the bits are the same; rotated and in any unit, the tetrahedra are the
+    same."""
     cloud = read_capture(data_dir / "objects" / name).cloud
     lying = Lying(cloud, find_base_plane(cloud, np.array(up, float)))
     _, cage = body_cage(lying)

@@ -80,17 +80,17 @@ def _made(gaussian_count: int, device: str) -> tuple[BuiltInObject, Cage]:
 
 
 def _pawn_cage(gaussian_count: int, device: str | None = None) -> tuple[BuiltInObject, Cage]:
-    """A pawn and its cage, made once for all tests that look at it."""
+    """Return a pawn and its cage, made once for all tests."""
     return _made(gaussian_count, device or str(wp.get_device()))
 
 
 def test_pawn_cage(device: str) -> None:
-    """The built-in pawn: all promises, on every device."""
+    """The cage of the built-in pawn satisfies all guarantees, on every device."""
     thing, cage = _pawn_cage(22000, device)
     _check(cage, thing.plane)
     assert cage.method is CageMethod.VOXEL
     assert cage.height(thing.plane) == pytest.approx(1.0, abs=0.04)
-    # The base, 0.29 in radius, rests on a disc of that size: bottom faces cover its area within the dilation.
+    # The base, 0.29 in radius, rests on a disc of that size: bottom faces cover its area to within the dilation.
     floor = [f for f in cage.mesh.boundary_faces() if np.all(cage.mesh.nodes[f, 2] < 1e-9)]
     corners = cage.mesh.nodes[np.array(floor)][:, :, :2]
     sides = corners[:, 1:] - corners[:, :1]
@@ -99,7 +99,7 @@ def test_pawn_cage(device: str) -> None:
 
 
 def test_same_bits_in_another_process() -> None:
-    """Two processes build the same pawn and the same cage, bit by bit."""
+    """Two processes build bitwise equal pawns and cages."""
     program = (
         "import hashlib; from egs_warp.assets import pawn; from egs_warp.meshing.cage import build_cage; p = pawn();"
         "m = build_cage(p.cloud, p.plane).mesh;"
@@ -114,7 +114,7 @@ def test_same_bits_in_another_process() -> None:
     ("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0)), ("robot.spz", (0, 1, 0))]
 )
 def test_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
-    """Every real object gets a cage that keeps all promises."""
+    """Every real object gets a cage that satisfies all guarantees."""
     cloud = read_capture(data_dir / "objects" / name).cloud
     plane = find_base_plane(cloud, np.array(up, float))
     cage = build_cage(cloud, plane)
@@ -134,7 +134,7 @@ def test_scale_free(scale: float) -> None:
 
 
 def test_thin_legs_survive() -> None:
-    """Four legs of 1/20 of the height reach the floor and hang together with the seat."""
+    """Four legs of 1/20 of the height reach the floor and are connected to the seat."""
     legs = [
         _box_surface((x - 0.025, y - 0.025, 0.0), (x + 0.025, y + 0.025, 0.8), 1500, seed)
         for seed, (x, y) in enumerate([(-0.3, -0.3), (0.3, -0.3), (-0.3, 0.3), (0.3, 0.3)])
@@ -150,7 +150,7 @@ def test_thin_legs_survive() -> None:
 
 
 def test_floaters_and_strays_make_no_elements() -> None:
-    """Far floaters, a faint giant and fuzz below the floor leave the cage as it is without them."""
+    """Far floaters, a faint giant Gaussian and fuzz below the floor do not change the cage."""
     body = _box_surface((-0.2, -0.2, 0.0), (0.2, 0.2, 1.0), 8000)
     random = np.random.default_rng(1)
     floaters = random.uniform(-4.0, 4.0, (150, 3)) * [1, 1, 0.5] + [0.0, 0.0, 4.0]
@@ -170,7 +170,7 @@ def test_floaters_and_strays_make_no_elements() -> None:
 
 @pytest.mark.slow
 def test_open_and_pierced_surface_is_filled() -> None:
-    """A shell without a bottom and with a hole in its side still is a solid."""
+    """A shell without a bottom and with a hole in its side is still a solid."""
     shell = _box_surface((-0.3, -0.3, 0.0), (0.3, 0.3, 1.0), 12000)
     closed = build_cage(_cloud(shell, 0.01), _FLOOR)
     shell = shell[(shell[:, 2] > 0.01) & ~((shell[:, 0] > 0.29) & (np.abs(shell[:, 2] - 0.5) < 0.06))]
@@ -187,14 +187,14 @@ def test_open_and_pierced_surface_is_filled() -> None:
     ],
 )
 def test_degenerate_objects(points: np.ndarray, message: str) -> None:
-    """A sheet, a point, and an object below its plane are refused in one line."""
+    """A sheet, a point, and an object below its plane are refused with a one-line error."""
     with pytest.raises(UserError, match=message) as caught:
         build_cage(_cloud(points, 0.001), _FLOOR)
     assert "\n" not in str(caught.value)
 
 
 def test_target_nodes() -> None:
-    """More nodes are given when asked; nonsense is refused."""
+    """A larger target gives more nodes; invalid targets are refused."""
     thing, _ = _pawn_cage(6000)
     cage = build_cage(thing.cloud, thing.plane, target_nodes=1200)
     assert len(cage.mesh.nodes) == pytest.approx(1200, rel=0.15)
@@ -203,8 +203,8 @@ def test_target_nodes() -> None:
 
 
 def test_tetwild(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """fTetWild itself, not the lattice it falls back to, keeps the same promises, fills the same solid and leaves no
-    file behind.
+    """fTetWild itself, not the lattice fallback, satisfies the same guarantees, fills the same solid and leaves no file
+    behind.
     """
     monkeypatch.chdir(tmp_path)
     thing, lattice = _pawn_cage(6000)
@@ -217,7 +217,7 @@ def test_tetwild(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_where_tetwild_fails_the_lattice_stands_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The cage says who made it."""
+    """The cage reports which mesher made it."""
     monkeypatch.setattr("egs_warp.meshing.cage.tetwild", lambda *_: None)
     thing, lattice = _pawn_cage(6000)
     cage = build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD)
@@ -231,9 +231,9 @@ def test_where_tetwild_fails_the_lattice_stands_in(monkeypatch: pytest.MonkeyPat
 @example(38649, 0.10291887719719599)
 @given(st.integers(0, 10**6), st.floats(0.08, 0.16))
 def test_stuffing_quality(seed: int, cell: float) -> None:
-    """Any smooth solid: closed surface, flat floor, volume of the level set, no angle below the 9.26 degrees that
-    ``test_stuffing_bound`` finds; at the floor, where halves of lattice tetrahedra lie, none below 7 (of 6,400 solids
-    one had less than 9.9).
+    """For any smooth solid: a closed surface, a flat floor, the volume of the level set, no angle below the 9.26
+    degrees of ``test_stuffing_bound``; at the floor, where lattice tetrahedra are halved, no angle below 7 degrees (one
+    of 6,400 solids had less than 9.9).
     """
     random = np.random.default_rng(seed)
     axes, centre = random.uniform(0.3, 0.5, 3), np.array([0.0, 0.0, 0.31]) + random.uniform(-0.05, 0.05, 3)

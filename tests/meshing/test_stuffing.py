@@ -11,12 +11,11 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.meshing import stuffing
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, -0.5, 0.5], [0.5, 0.5, 0.5]])
-"""Corners of a lattice tetrahedron in units of the cube side: two points of a long edge, then two of the opposite
-one."""
+"""Corners of a lattice tetrahedron in units of the cube side: two ends of a long edge, then two of the opposite one."""
 STEPS = np.array([*(np.array(d) - 0.5 for d in product((0, 1), repeat=3)), *np.eye(3), *-np.eye(3)])
 """From a lattice point to its 14 neighbours: 8 short edges, 6 long ones."""
 INSIDE, OUTSIDE = -2, -1
-"""State of a corner that stays where it is; other states are numbers of ``STEPS`` along which it was moved."""
+"""State of a corner that was not moved; other states are indices into ``STEPS``, along which the corner was moved."""
 PAIRS = stuffing._CORNER_PAIRS
 IS_LONG = np.isin(np.arange(6), [0, 5])
 
@@ -47,10 +46,10 @@ def least_angle(states: np.ndarray, moved: np.ndarray, cuts: np.ndarray, order: 
     """Return the least dihedral angle, degrees, of the tetrahedra that fill lattice tetrahedra in these states.
 
     Args:
-        states: (n, 4) of the corners.
-        moved: (4,) share of the longest move.
-        cuts: (6,) where edges are cut, from 0, as near as can be to the first end, to 1.
-        order: of the corners, which decides between diagonals of equal rank.
+        states: (n, 4) states of the corners.
+        moved: (4,) fraction of the longest move.
+        cuts: (6,) position of the cut on each edge, from 0, closest to the first end, to 1.
+        order: order of the corners, which decides between diagonals of equal rank.
     """
     limits = np.where(np.arange(14) < 8, stuffing._SNAP_SHORT, stuffing._SNAP_LONG)
     signs = np.select([states == INSIDE, states == OUTSIDE], [1, -1], 0)[:, order]

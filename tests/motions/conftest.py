@@ -1,4 +1,4 @@
-"""The block that the motions are tried on, posed by hand, or simulated once for all tests."""
+"""The block for the tests of the motions: posed by hand, or simulated once for all tests."""
 
 from __future__ import annotations
 
@@ -17,5 +17,5 @@ def place() -> Stance:
 
 @pytest.fixture(scope="session")
 def coarse_run() -> Run:
-    """A block that hops onto a square half a metre ahead and then twists by 45 degrees."""
+    """A run of a block that hops onto a square half a metre ahead and then twists by 45 degrees."""
     return coarse_block_run("hop 0.5 0.25, twist 45")

@@ -40,7 +40,7 @@ class Crawled:
 
 
 def crawled(route: Route) -> Crawled:
-    """Crawl until the body rests."""
+    """Simulate a crawl until the body rests."""
     made = worm()
     crawl = Crawl(made.place, route)
     state, memory, reports = made.start, made.stepper.initial_memory(), []
@@ -66,7 +66,7 @@ def test_what_lies_along_the_ground_crawls() -> None:
 
 
 def test_a_stride_strains_it_by_no_more_than_it_may() -> None:
-    """At the steepest point of the wave; and every section ends at the target of the body."""
+    """The limit is reached at the steepest point of the wave; every section ends at the target of the body."""
     crawl = Crawl(worm().place, straight_route(5.0))
     crawl._to = np.array([crawl.step_limits.length, 0.0, 0.0])
     along_it, most = crawl._standing[:, 0], 0.0
@@ -82,7 +82,8 @@ def test_a_stride_strains_it_by_no_more_than_it_may() -> None:
 
 
 def test_what_is_carried_is_unloaded_from_the_front_on() -> None:
-    """A quarter into a round the front is carried and the back stands, at three quarters the other way round."""
+    """After a quarter of a cycle the front is lifted and the back stands, after three quarters it is the other way
+    round."""
     made = worm()
     crawl = Crawl(made.place, straight_route(1.0))
     crawl.objectives(made.start, None, DT)

@@ -29,8 +29,8 @@ def danced() -> Run:
 
 
 def flights(trajectory: Trajectory, least: float) -> list[tuple[float, float]]:
-    """Return the flights of at least ``least`` seconds: end of the last step on the ground and of the first one on it
-    again."""
+    """Return the flights of at least ``least`` seconds: the end of the last step on the ground and of the first step on
+    the ground again."""
     load = np.bincount(
         trajectory.contact_step,
         np.einsum("ci,ci->c", trajectory.contact_force, trajectory.contact_normal),
@@ -43,12 +43,12 @@ def flights(trajectory: Trajectory, least: float) -> list[tuple[float, float]]:
 
 
 def check_that_it_keeps_time(dance: Dance, trajectory: Trajectory) -> None:
-    """Every flight of the trajectory begins and ends within 40 ms of its target time, and none is left out."""
+    """Assert that every flight begins and ends within 40 ms of its target time, and that none is left out."""
     reached = dance.outcome_record(trajectory, 0, -1)
     asked = np.array([event.asked for event in reached.events]).reshape(-1, 2)
     found = np.array(flights(trajectory, level_flight(0.5 * MIN_HEIGHT, 1.0, 9.81)))
     assert len(found) == len(asked) > 1
-    # A motion receives whole steps, also if one was repeated with smaller steps.
+    # A motion receives complete steps, also if a step was repeated with smaller ones.
     step = trajectory.dt.max()
     found = step * np.column_stack([np.floor(found[:, 0] / step + 1e-6), np.ceil(found[:, 1] / step - 1e-6)])
     np.testing.assert_allclose([event.reached for event in reached.events], found.ravel(), atol=1e-9)
@@ -84,7 +84,7 @@ def test_its_equations_hold_in_every_step(danced: Run) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("beats", ["dance 90 1 14", "dance 120 0.6 14", "dance 50 1 5"])
 def test_the_pawn_keeps_time_through_the_whole_figure(beats: str) -> None:
-    """Jumps, hops ahead and back, twists; at 50 beats a minute it leaves the ground half-way to a beat."""
+    """Jumps, hops ahead and back, and twists; at 50 beats a minute it takes off half-way between beats."""
     done = simulate(coarse_pawn(), motion(beats))
     dance = done.sequence.done[0].motion
     assert isinstance(dance, Dance) and done.fallen is None
@@ -118,7 +118,7 @@ def test_a_jump_spans_two_beats() -> None:
 
 
 def test_easier_jumps_are_preferred_to_hasty_ones() -> None:
-    """With beats a sixth of a second apart, it uses every third."""
+    """With beats a sixth of a second apart, the dance uses every third one."""
     found = span_of(tuple(np.arange(1, 20) / 6.0))
     assert found is not None and found.flight == pytest.approx(0.5)
 

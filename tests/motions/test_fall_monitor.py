@@ -33,7 +33,7 @@ def made() -> CoarseCreature:
 
 
 class Stands:
-    """Motion with objectives that never rests."""
+    """A motion that has objectives and never rests."""
 
     is_at_rest = False
 
@@ -51,8 +51,7 @@ def watched(made: CoarseCreature, begin: Any = Stands) -> FallMonitor:
 def seen(
     made: CoarseCreature, watch: FallMonitor, *, degrees: float, load: float, seconds: float, on: str = "base"
 ) -> None:
-    """Pass a body rotated by an angle to the monitor; the ground supports it with ``load`` of its weight at its base or
-    top."""
+    """Feed the monitor a body rotated by an angle, with ``load`` of its weight on its base or its top."""
     body, start = made.place.body, made.start
     turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
     state = BodyState(start.positions @ turn.T, start.velocities)
@@ -112,7 +111,7 @@ def test_keys_may_tip_the_body(made: CoarseCreature) -> None:
 
 
 def test_a_body_on_its_side_has_fallen() -> None:
-    """With the whole stepper and weak muscles: they relax, and the run ends a little later."""
+    """A run of the stepper with weak muscles: they relax, and the run ends shortly after."""
     made = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD, strength=0.2)
     turn = Rotation.from_euler("x", 90.0, degrees=True).as_matrix()
     positions = made.start.positions @ turn.T

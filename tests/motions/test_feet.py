@@ -1,4 +1,4 @@
-"""Feet of simple bodies, and what a trajectory says of them."""
+"""Feet of simple bodies, and their slip, swings and landings in a trajectory."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FEET = find_feet(STOOL, STOOL.nodes[:, 2], 0.8)
 
 
 def test_a_stool_has_four_feet_with_their_legs() -> None:
-    """Each foot is one corner of the ground; its leg reaches up to the seat and moves with it less and less."""
+    """Each foot is one corner of the base; its leg extends up to the seat, with weights that decrease upwards."""
     corners = {tuple(np.sign(STOOL.nodes[foot.sole, :2].mean(axis=0)).astype(int)) for foot in FEET}
     assert corners == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
     for foot in FEET:
@@ -33,7 +33,7 @@ def test_a_stool_has_four_feet_with_their_legs() -> None:
 
 
 def test_feet_are_named_around_the_body() -> None:
-    """Anticlockwise from above, so that every other one is opposite."""
+    """The numbering is counterclockwise seen from above, so that every other foot is opposite."""
     order = order_counterclockwise(np.array([STOOL.nodes[foot.sole, :2].mean(axis=0) for foot in FEET]))
     centres = [STOOL.nodes[FEET[index].sole, :2].mean(axis=0) for index in order]
     turns = [np.cross([*a, 0.0], [*b, 0.0])[2] for a, b in zip(centres, [*centres[1:], centres[0]], strict=True)]
@@ -47,7 +47,7 @@ def test_other_bodies_have_other_numbers_of_feet(mesh: TetMesh, height: float, c
 
 
 def test_a_base_has_a_left_and_a_right_side() -> None:
-    """Apart from each other by what is near the middle; what goes with them falls off sideways and up."""
+    """The sides are separated by a gap in the middle; the weights of the body above decrease sideways and upwards."""
     mesh = block_mesh(5, 5, 5)
     heights, sole = mesh.nodes[:, 2], np.flatnonzero(mesh.nodes[:, 2] == 0.0)
     left, right = split_base(mesh.nodes[:, :2], heights, sole, 1.0)
@@ -60,8 +60,8 @@ def test_a_base_has_a_left_and_a_right_side() -> None:
 
 
 def made_trajectory() -> Trajectory:
-    """Six steps of a stool of 100 kg: foot 0 slides 1 mm a step under load for three, swings 50 mm in one,
-    and stands still for two.
+    """Return six steps of a stool of 100 kg: foot 0 slides by 1 mm per step under load for three steps, swings by 50 mm
+    in one, and stands still for two.
     """
     strides = np.array([0.0, 0.001, 0.001, 0.001, 0.05, 0.0, 0.0]).cumsum()
     leg = FEET[0].leg[:, None] > 0
@@ -84,7 +84,8 @@ def made_trajectory() -> Trajectory:
 
 
 def test_slip_is_the_way_of_loaded_contacts_and_swings_do_not_count() -> None:
-    """3 mm over three steps; the sole's shift counts from where the foot came to stand, so 2 mm; one landing."""
+    """3 mm over three steps; the shift of the sole is counted from where the foot was placed, so it is 2 mm; one
+    landing."""
     assert foot_of_node(FEET)[FEET[0].sole[0]] == 0
     fell = footfalls(made_trajectory(), FEET, stride=0.1)
     assert (fell.slip, fell.sole_shift) == (pytest.approx(0.03), pytest.approx(0.02))

@@ -27,7 +27,7 @@ def place() -> Stance:
 
 
 def stood(mesh: TetMesh) -> Stance:
-    """A body of ``mesh`` at rest; forward is +y."""
+    """Return the stance of a body of ``mesh`` at rest; forward is +y."""
     body = make_body(mesh, FLOOR, device="cpu")
     ground = GroundFrame.on_plane(FLOOR, np.array([0.0, 1.0, 0.0]), body.centre_of_mass(mesh.nodes))
     return Stance(body, ground, mesh.nodes, mesh.nodes[mesh.nodes[:, 2] < 1e-9], DT)
@@ -39,7 +39,7 @@ def key(time: float, part: str, quantity: Quantity, value: tuple[float, float, f
 
 @pytest.mark.parametrize("part", ["body", "base", "head", "foot"])
 def test_each_quantity_is_measured_in_its_unit_along_forward_left_up(place: Stance, part: str) -> None:
-    """A rigid motion: forward is +y, left is -x; lengths over H, spin over m H^2."""
+    """A rigid motion with forward +y and left -x; lengths are in H, angular momentum in units of m H^2."""
     body, height = place.body, place.body.height
     follow = Follow(place, [key(1.0, part, Quantity.POSITION, (0.1, 0.0, 0.0))])
     turn = Rotation.from_rotvec(np.radians(30.0) * np.array([0.0, 0.0, 1.0]))
@@ -77,7 +77,7 @@ def test_a_position_key_asks_for_the_speed_of_its_curve(place: Stance) -> None:
 
 
 def test_each_key_has_its_own_weight(place: Stance) -> None:
-    """The weight of the first key, 1, holds until that key; the weight of the second, 9, from then on."""
+    """The weight 1 of the first key applies until that key; the weight 9 of the second one from then on."""
     value = (0.1, 0.0, 0.0)
     keys = [Key(time, "head", Quantity.POSITION, value, weight) for time, weight in ((6 * DT, 1.0), (12 * DT, 9.0))]
     follow, found = Follow(place, keys), []
@@ -102,7 +102,8 @@ def test_keys_of_the_whole_body_replace_its_own_balance_or_spin(place: Stance) -
 
 
 def test_feet_are_numbered_anticlockwise_from_straight_ahead() -> None:
-    """Forward is +y and left -x: of a stool front left, back left, back right, front right; of a figure left, right."""
+    """Forward is +y and left is -x. For a stool the order is front left, back left, back right, front right; for a
+    figure left, right."""
     for mesh, corners in (
         (stool(), [(-1, 1), (-1, -1), (1, -1), (1, 1)]),
         (figure(), [(-1, 0), (1, 0)]),
@@ -122,7 +123,7 @@ def test_feet_are_numbered_anticlockwise_from_straight_ahead() -> None:
 
 
 def test_a_part_that_the_body_does_not_have_is_refused_with_those_that_it_has(place: Stance) -> None:
-    """The one foot of a block is its base."""
+    """The only foot of a block is its base."""
     parts = Follow(place, [key(0.5, "foot", Quantity.POSITION, (0.0, 0.0, 0.1))]).parts
     assert np.array_equal(parts["foot"].nodes, parts["base"].nodes)
     with pytest.raises(UserError) as error:
@@ -152,14 +153,14 @@ def test_missed_keys_are_told_and_reached_ones_are_not(place: Stance) -> None:
 
 
 def drifting(place: Stance, speed: float, time: float) -> BodyState:
-    """The body standing at its place with ``speed`` forward, in sqrt(g H)."""
+    """Return the state of the standing body with a forward ``speed`` in sqrt(g H)."""
     velocity = speed * np.sqrt(9.81 * place.body.height) * place.ground.axes[0]
     return BodyState(place.standing, np.tile(velocity, (len(place.standing), 1)), time)
 
 
 def test_a_trajectory_rests_once_the_body_is_slow_and_at_last_in_any_case(place: Stance) -> None:
-    """Slow from some time on, it rests 0.3 sqrt(H / g) later;
-    never slow, 9 sqrt(H / g) after the last key, which is noted.
+    """If the body becomes slow, the motion rests 0.3 sqrt(H / g) later; if it never does, the motion rests 9 sqrt(H /
+    g) after the last key and reports it.
     """
     unit = np.sqrt(place.body.height / 9.81)
     for slow_from, rest in ((0.0, 0.5 + 0.3 * unit), (1.2, 1.2 + 0.3 * unit), (np.inf, 0.5 + 9.0 * unit)):
@@ -185,7 +186,7 @@ def test_places_are_held_after_their_last_key_and_speeds_are_not(place: Stance) 
 
 
 def spun(place: Stance, degrees: float, time: float) -> BodyState:
-    """The block turned about up where it stands."""
+    """Return the state of the block, rotated about up where it stands."""
     centre = place.body.centre_of_mass(place.standing)
     turn = Rotation.from_rotvec([0.0, 0.0, degrees], degrees=True)
     return BodyState(centre + turn.apply(place.standing - centre), 0 * place.standing, time)
@@ -194,7 +195,8 @@ def spun(place: Stance, degrees: float, time: float) -> BodyState:
 @pytest.mark.parametrize("part", ["body", "head"])
 @pytest.mark.parametrize("asked", [170.0, 180.0, 270.0, 360.0, -360.0])
 def test_a_turn_is_reached_the_way_round_that_was_asked(place: Stance, part: str, asked: float) -> None:
-    """A body that turns completely has no error; 10 degrees less has 10, and no turn has all of it."""
+    """A complete turn has no error; one that lacks 10 degrees has an error of 10 degrees, and no turn has the error of
+    the whole angle."""
     for share, miss in ((1.0, 0.0), (1.0 - 10.0 / abs(asked), 10.0), (0.0, abs(asked))):
         follow = Follow(place, [key(1.0, part, Quantity.ORIENTATION, (0.0, 0.0, asked))])
         for time in np.linspace(0.0, 1.0, 61):

@@ -10,14 +10,14 @@ from egs_warp.motions.free_turn import integrate_rotation, spin_for_rotation
 
 
 def leaning(inertia: list[float], lean: float) -> np.ndarray:
-    """(3, 3) with these moments about axes that lean by ``lean`` radians."""
+    """Return an inertia (3, 3) with these principal moments, about axes tilted by ``lean`` radians."""
     axes = Rotation.from_rotvec([lean, 0.3 * lean, 0.0]).as_matrix()
     return axes @ np.diag(inertia) @ axes.T
 
 
 @pytest.mark.parametrize("seconds", [0.2, 1.0, 2.0])
 def test_the_axis_of_a_symmetric_top_goes_round_its_angular_momentum(seconds: float) -> None:
-    """At the rate |L| / I across (Landau and Lifshitz, Mechanics, 33)."""
+    """The rate is |L| / I with the moment I about a transverse axis (Landau and Lifshitz, Mechanics, section 33)."""
     axis = np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
     along, across = 0.5, 1.2
     inertia = across * np.eye(3) + (along - across) * np.outer(axis, axis)
@@ -35,7 +35,7 @@ def test_about_a_principal_axis_a_body_does_not_wobble() -> None:
 
 @pytest.mark.parametrize("turn", [0.4, -1.6, 4.0])
 def test_a_body_off_its_axes_comes_to_the_turn_that_is_asked(turn: float) -> None:
-    """A spin about up alone would leave it tilted by degrees; the result of the root search ends upright."""
+    """A spin about up alone would leave the body tilted by degrees; the spin found by root search ends upright."""
     inertia, upright, asked = leaning([0.5, 0.8, 0.3], 0.25), np.array([0.05, -0.08, 0.02]), np.array([0.0, 0.0, turn])
     goal = Rotation.from_rotvec(asked) * Rotation.from_rotvec(upright)
 

@@ -1,4 +1,4 @@
-"""Gait: which feet swing when, how far the body is by then, and the swing of a foot."""
+"""Gait: the order in which feet swing, the progress of the body, and the swing of a foot."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ GAIT = Gait.create(4, 4, 0.03, LEGGED_TIMING, time_unit=0.32)
 
 @given(st.integers(2, 9))
 def test_every_foot_swings_once_in_a_round_and_none_beside_its_neighbour(count: int) -> None:
-    """With more than three feet, several swing together, the diagonals of four. Some foot always stands."""
+    """With more than three feet, several swing together, with four those on a diagonal. At least one foot always
+    stands."""
     groups = feet_in_turn(count)
     assert sorted(foot for group in groups for foot in group) == list(range(count))
     assert all(0 < len(group) < count for group in groups)
@@ -27,7 +28,7 @@ def test_every_foot_swings_once_in_a_round_and_none_beside_its_neighbour(count: 
 
 @given(st.integers(2, 7), st.integers(1, 12))
 def test_footprints_follow_each_other_and_close(feet: int, paces: int) -> None:
-    """Each swing comes one pace ahead of the last, and at the end all feet are at the last place."""
+    """Each swing ends one step ahead of the previous one, and at the end all feet have made all steps."""
     gait = Gait.create(feet, paces, 0.03, LEGGED_TIMING, time_unit=0.3)
     at = np.zeros(feet)
     for swing in range(gait.swings):
@@ -39,8 +40,8 @@ def test_footprints_follow_each_other_and_close(feet: int, paces: int) -> None:
 
 @given(st.integers(2, 7))
 def test_the_body_is_as_far_as_its_feet(feet: int) -> None:
-    """Far from both ends: in the middle of a swing as far as the groups of feet are in the mean of before and after;
-    and evenly."""
+    """Far from both ends, the progress in the middle of a swing is the mean over the groups of feet, averaged over
+    before and after; it is uniform."""
     gait = Gait.create(feet, 40, 0.03, LEGGED_TIMING, time_unit=0.3)
     swing, rounds = 20, len(gait.groups)
     before = np.mean([gait.target_step(swing - 1 - k) for k in range(rounds)])
@@ -52,8 +53,8 @@ def test_the_body_is_as_far_as_its_feet(feet: int) -> None:
 
 
 def test_a_swinging_foot_leaves_and_lands_at_rest() -> None:
-    """Height and way by differences at both ends;
-    it is highest inside, goes forward only, and is up before it goes far.
+    """Height and progress are checked by differences at both ends. The foot only moves forward, and is lifted before it
+    moves far.
     """
     near = 1e-4
     for end in (0.0, 1.0):
@@ -70,8 +71,8 @@ def test_a_swinging_foot_leaves_and_lands_at_rest() -> None:
 
 
 def test_a_foot_is_steered_bit_by_bit_and_goes_ahead_only_when_it_is_up() -> None:
-    """Steering is zero at the start of a swing and full before the foot moves far; it moves between the two given
-    times."""
+    """The steering weight is zero at the start of a swing and full before the foot moves far; the foot moves between
+    the two given times."""
     steered = [GAIT.steering_progress(s) for s in (0.0, 0.1, 0.2, 0.3, 1.0)]
     assert steered[0] == 0.0 and steered[3:] == [1.0, 1.0] and np.all(np.diff(steered[:4]) > 0.0)
     assert GAIT.transfer_progress(GAIT.transfer_start_time / GAIT.swing_time) == 0.0

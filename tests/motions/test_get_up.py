@@ -39,7 +39,7 @@ def lying(degrees: float, axis: np.ndarray = LEFT) -> BodyState:
 
 @pytest.mark.parametrize(("degrees", "axis"), [(90.0, LEFT), (-60.0, LEFT), (170.0, FORWARD)])
 def test_it_knows_how_it_lies(degrees: float, axis: np.ndarray) -> None:
-    """The angle to upright and the horizontal axis of the rotation that undoes it."""
+    """The angle to upright, and the horizontal axis of the rotation back."""
     angle, about = GetUp(block().place)._tilt(lying(degrees, axis).positions)
     assert np.degrees(angle) == pytest.approx(abs(degrees), abs=1e-6)
     assert about == pytest.approx(-np.sign(degrees) * axis, abs=1e-6)
@@ -48,12 +48,12 @@ def test_it_knows_how_it_lies(degrees: float, axis: np.ndarray) -> None:
 
 @pytest.mark.parametrize("degrees", [30.0, 60.0, 90.0, 120.0])
 def test_the_top_is_over_the_edges_that_it_rolls_over(degrees: float) -> None:
-    """The centre of mass of a block is highest above an edge: half of its diagonal, whichever edge it meets."""
+    """The centre of mass of a block is highest above an edge: half of its diagonal, for any edge."""
     get_up, state = GetUp(block().place), lying(degrees)
     arms = state.positions - get_up.body.centre_of_mass(state.positions)
     top = get_up._top(arms, -LEFT, np.radians(degrees))
     edges = [np.hypot(*(np.ptp(block().place.standing, axis=0)[[0, 2]])) / 2.0]
-    # Beyond its diagonal it rolls over an edge that is still to come; within it only comes down.
+    # Beyond its diagonal, it still has to roll over an edge; within it, it only descends.
     start = float(get_up.body.centre_of_mass(state.positions)[2] - state.positions[:, 2].min())
     steepest = np.degrees(np.arctan2(0.5, 1.0))
     assert top == pytest.approx(edges[0] if degrees > steepest else start, rel=0.03)
@@ -113,7 +113,7 @@ def test_a_ball_lies_any_way_up() -> None:
 
 
 def test_it_gives_up_after_its_tries() -> None:
-    """With a body that never moves from its side."""
+    """The body lies on its side and never moves."""
     get_up, state = GetUp(block().place), lying(90.0)
     for step in range(6000):
         get_up.objectives(replace(state, time=step * DT), None, DT)
@@ -125,7 +125,7 @@ def test_it_gives_up_after_its_tries() -> None:
 
 @cache
 def risen(degrees: float, sideways: bool) -> tuple[FallMonitor, list[StepReport], BodyState, BodyState]:
-    """Laid on its side while it was to stand for a second, and then to stand for another."""
+    """Simulate a body that lies on its side during two motions of standing, the first of which lasts a second."""
     made, start = block(), lying(degrees, FORWARD if sideways else LEFT)
     parts = [
         MotionTask("stand", {}, lambda place: StandFor(place, 1.0)),
@@ -133,7 +133,7 @@ def risen(degrees: float, sideways: bool) -> tuple[FallMonitor, list[StepReport]
     ]
     watch = FallMonitor(MotionSequence(made.place, parts), made.place, gets_up=True)
     state, memory, reports = start, made.stepper.initial_memory(), []
-    # Time for all of its tries.
+    # Enough steps for all attempts.
     for _ in range(1800):
         wishes = watch.objectives(state, reports[-1] if reports else None, DT)
         state, memory, fresh = made.stepper.advance(state, memory, wishes, DT)
@@ -146,7 +146,7 @@ def risen(degrees: float, sideways: bool) -> tuple[FallMonitor, list[StepReport]
 @pytest.mark.slow
 @pytest.mark.parametrize(("degrees", "sideways"), [(90.0, False), (80.0, False), (90.0, True)])
 def test_a_block_gets_up_and_goes_on(degrees: float, sideways: bool) -> None:
-    """The motion that fell is over; the next one starts from the new stance."""
+    """The motion that fell is finished; the next one starts from the new stance."""
     watch, _, _, end = risen(degrees, sideways)
     assert watch.fallen is None and watch.is_finished
     assert [entry.name for entry in watch.sequence.done] == ["stand", "get up", "stand"]
@@ -161,7 +161,7 @@ def test_a_block_gets_up_and_goes_on(degrees: float, sideways: bool) -> None:
 
 @pytest.mark.slow
 def test_it_gets_up_calmly() -> None:
-    """An attempt takes some m g H of muscle work (14 at most of those measured); three throws took eighty."""
+    """An attempt takes some m g H of muscle work (at most 14 of those measured)."""
     watch, _, _, _ = risen(90.0, False)
     _, entry, last = watch.sequence.done
     assert isinstance(entry.motion, GetUp)

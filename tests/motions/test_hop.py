@@ -1,4 +1,4 @@
-"""Hops on a block that is posed by hand: they aim at squares."""
+"""Hops of a block that is posed by hand: they aim at squares."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.support.stances import DT, FLOOR, FORWARD, moved
 
 
 def test_hops_aim_at_squares_from_where_the_feet_are(place: Stance) -> None:
-    """A hop that fell short and went aside is made up by the next; a square on a step is jumped up to."""
+    """A hop that is too short and to the side is compensated by the next one; a square on a step gets a higher jump."""
     height = place.body.height
     row = HopTargets(0.7, 0.2, 3, {"distance": 0.7})
     begin = [part.begin for part in row.parts()]

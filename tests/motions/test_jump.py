@@ -1,4 +1,4 @@
-"""Jumps on a block that is posed by hand: the lean, and the frame of the landing."""
+"""Jumps of a block that is posed by hand: the lean, and the frame of the landing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.stances import DT, block_place, moved
 
 
 def test_a_landing_frame_holds_the_landed_body(place: Stance) -> None:
-    """From take-off on, a body that stands turned at the target has the coordinates of the start."""
+    """From take-off on, a body that stands at the target, rotated, has the local coordinates of the start."""
     target = JumpTarget(0.5, 0.3, 0.1)
     jump = Jump(place, target, facing=TurnHeading(place, 0.8))
     start = place.ground.local(place.standing)
@@ -55,8 +55,8 @@ def test_soles_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, soles: int
 
 
 def test_a_landing_that_may_fail_is_balanced_in_full() -> None:
-    """Weights are low while the capture point is near the middle of the feet and full once it is at their edge; nearly
-    zero in the first step, in which the ground stops the fall."""
+    """Weights are low while the capture point is near the centre of the feet and full once it is at their edge; they
+    are almost zero in the first step, in which the ground stops the fall."""
     place = block_place()
     weights = []
     for time, speed in ((1.0, 0.0), (1.0, 2.0), (0.0, 2.0)):
@@ -70,7 +70,7 @@ def test_a_landing_that_may_fail_is_balanced_in_full() -> None:
 
 
 def test_what_has_taken_off_takes_up_its_pose_gently() -> None:
-    """Nearly zero in the first step in the air, full weight 0.6 sqrt(H / g) later."""
+    """The weight is almost zero in the first step in the air and full 0.6 sqrt(H / g) later."""
     place = block_place()
     jump = Jump(place, JumpTarget(0.5, 0.3))
     jump.phase = JumpPhase.THRUST
@@ -86,8 +86,8 @@ def test_what_has_taken_off_takes_up_its_pose_gently() -> None:
 
 @pytest.mark.parametrize(("com_speed", "flat"), [(1.0, True), (-1.0, False)])
 def test_what_comes_up_to_its_feet_turns_until_they_are_flat(com_speed: float, flat: bool) -> None:
-    """Sheared back over a flat sole, its mean rotation is back by half of the shear. While it moves towards its feet,
-    no rotation is requested, because its sole would point up; while it falls back from them, it turns upright."""
+    """A body sheared backwards over a flat sole has a mean rotation of half the shear. While it moves towards its feet,
+    no rotation is requested, because its sole would tilt up; while it falls back from them, it rotates upright."""
     place = block_place()
     height = place.standing[:, 2:] - place.standing[:, 2].min()
     sheared = place.standing + 0.1 * height / height.max() * [-1.0, 0.0, 0.0]

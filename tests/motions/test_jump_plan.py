@@ -1,4 +1,4 @@
-"""The plan of a jump against flight, thrust and pendulum stepped through by hand."""
+"""The plan of a jump, against flight, thrust and pendulum integrated step by step."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ GRAVITY, STEP = 9.81, 1 / 60
 )
 @pytest.mark.parametrize("height", [1.0, 1.7])
 def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTarget, height: float) -> None:
-    """Thrust and flight in implicit Euler steps, each at the speed of its end, and the landing as a linear inverted
+    """Thrust and flight are implicit Euler steps, each with its end velocity; the landing is a linear inverted
     pendulum.
     """
     com_height, ahead = 0.45 * height, 0.2 * height
@@ -30,8 +30,9 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
         lean=LEAN_FRACTION * target.distance,
     )
 
-    # Thrust: from rest at the bottom of the crouch, a push that grows and then stays, to take-off stretched by the
-    # extension; with pushes p over the way s it gains speed_up^2 / 2 = mean of p over s x way.
+    # Thrust: from rest at the bottom of the crouch, an acceleration that first grows and is then constant, up to
+    # take-off, where the body is stretched by the extension. With acceleration p over the displacement s it reaches
+    # speed_up^2 / 2 = mean of p over s, times the displacement.
     times = np.linspace(0.0, plan.thrust_time, 4001)
     moves = [plan.thrust(np.zeros(3), time) for time in times]
     up, speeds = np.array([place[2] for place, _ in moves]), np.array([speed[2] for _, speed in moves])
@@ -48,7 +49,7 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
     push = plan.speed_up**2 / (2.0 * way)
     least, deepest = plan.extension + 0.02 * height, 0.26 * com_height
     assert 0.0 < plan.extension < target.height and plan.crouch_depth > 0.0
-    # At 2.8 g; harder where the crouch is as deep as the body can, less hard where it is as shallow as a thrust needs.
+    # At 2.8 g; higher if the crouch is as deep as the body allows, lower if it is as shallow as a thrust needs.
     if plan.crouch_depth > deepest - 1e-9:
         assert plan.crouch_depth == pytest.approx(deepest) and push > 2.8 * GRAVITY
     elif way < least + 1e-9:
@@ -56,7 +57,7 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
     else:
         assert push == pytest.approx(2.8 * GRAVITY, rel=1e-6)
 
-    # Flight: up to the asked height, down to where the stretched body stands on what it lands on.
+    # Flight: up to the requested height, then down to where the stretched body stands on its landing surface.
     z, speed, apex, time = plan.extension, plan.speed_up, 0.0, 0.0
     while speed > 0.0 or z > plan.extension + target.rise:
         speed -= GRAVITY * STEP
@@ -65,17 +66,18 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
     assert apex == pytest.approx(target.height, abs=GRAVITY * STEP**2)
     assert time == pytest.approx(plan.flight_time, abs=1.5 * STEP)
 
-    # Way: the lean, half the speed while thrusting, all of it in flight; the rest is what the feet are put down ahead
-    # of the body. What the crouch has left of speed ahead is not counted: the plan's own path is a little longer.
+    # Distance: the lean, half the forward speed during the thrust and all of it in flight; the rest is the distance by
+    # which the feet are placed ahead of the body. The forward speed from the crouch is neglected: the planned path is
+    # slightly longer.
     way = plan.lean + plan.speed_forward * (0.5 * plan.thrust_time + plan.flight_time)
     assert way + plan.landing_lag == pytest.approx(target.distance, rel=1e-9)
     assert plan.lean == pytest.approx(LEAN_FRACTION * target.distance)
     path = moves[-1][0][0] + plan.speed_forward * plan.flight_time + plan.landing_lag
     assert target.distance - 1e-9 <= path <= 1.05 * target.distance
 
-    # Landing: one push through the centre of mass stops the fall and takes off speed ahead; over the feet that push,
-    # as a linear inverted pendulum, the body comes to a stop. In a jump ahead they push from 0.3 of the way to their
-    # front, in a short one from less, which saves the body that much of its way.
+    # Landing: an impulse through the centre of mass stops the fall and reduces the forward speed; over the centre of
+    # pressure the body comes to rest as a linear inverted pendulum. In a forward jump the centre of pressure is at 0.3
+    # of the distance to the front of the feet, in a short jump nearer, which reduces the distance to travel.
     fall = np.sqrt(2.0 * GRAVITY * (target.height - plan.extension - target.rise))
     fall_rate = np.sqrt(GRAVITY / com_height)
     capture_time = 1.0 / (fall_rate + fall / com_height)
@@ -98,8 +100,8 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
 @pytest.mark.parametrize("landing_time", [0.02, 0.11, 0.3])
 @pytest.mark.parametrize("fall", [0.5, 2.0])
 def test_feet_stop_a_body_whose_fall_takes_a_while(landing_time: float, fall: float) -> None:
-    """A pendulum under the load that stops the fall evenly, then under its weight: at rest over its feet; the feet are
-    further ahead than where the fall stops at once.
+    """A pendulum under the load that stops the fall at a constant rate, then under its weight, comes to rest over its
+    feet. The feet are further ahead than for a fall that stops at once.
     """
     com_height, speed = 0.5, 1.3
     lever = speed * stopping_time(com_height, fall, GRAVITY, landing_time)
@@ -117,8 +119,8 @@ def test_feet_stop_a_body_whose_fall_takes_a_while(landing_time: float, fall: fl
 
 @pytest.mark.parametrize("distance", [0.6, 0.75, 0.8, 1.2])
 def test_a_thrust_lasts_until_friction_has_given_the_speed_ahead(distance: float) -> None:
-    """At most friction times what presses, weight and what the body gains upward; a crouch is deeper for that by 0.02 H
-    at most, and what friction gives anyway is left as it is.
+    """The friction impulse is at most mu times the normal impulse of weight and upward acceleration. The crouch is
+    deeper by at most 0.02 H for that; if friction is sufficient anyway, it is unchanged.
     """
     lean = 0.05
 
@@ -143,7 +145,7 @@ def test_a_thrust_lasts_until_friction_has_given_the_speed_ahead(distance: float
     if distance == 0.6:
         assert plan == easy and spare(plan) > 0.0
     elif distance == 0.75:
-        # Computed with the speed of a thrust of zero duration, it is a little longer than necessary.
+        # It is computed with the speed of a thrust of zero duration, and is slightly longer than necessary.
         assert 0.0 < deeper < 0.02 and 0.0 < spare(easy) < spare(plan) < 0.3
     elif distance == 0.8:
         assert deeper == pytest.approx(0.02) and spare(easy) < 0.0 < spare(plan)
@@ -179,7 +181,7 @@ def test_a_given_lean_is_kept() -> None:
 
 @pytest.mark.parametrize("step", [1 / 30, 1 / 60, 1 / 90])
 def test_a_crouch_goes_over_into_its_thrust_in_whole_steps(step: float) -> None:
-    """Otherwise the target of its last step would be shorter than a whole step: a jolt against the motion."""
+    """Otherwise the target of its last step would be for less than a whole step: a jolt against the motion."""
     plan = plan_jump(
         JumpTarget(0.5, 0.2), height=1.0, com_height=0.45, support_ahead=0.2, gravity=GRAVITY, step=step, lean=0.1
     )

@@ -1,4 +1,4 @@
-"""Key frames: JSON and CSV read alike, every malformed entry named in one line, and the curve through them."""
+"""Key frames: the same from JSON and CSV, a one-line error for every malformed entry, and the curve through them."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ BODIES = {
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("tilt", [0.0, 1.0, -1.0])
 def test_bodies_stand_on_what_they_have(name: str, tilt: float) -> None:
-    """Level, and on a plane that is found a degree off."""
+    """The support is found on the true plane and on one that is off by a degree."""
     mesh, count, base = BODIES[name]
     normal = Rotation.from_euler("y", tilt, degrees=True).as_matrix()[:, 2]
     heights = mesh.nodes @ normal
@@ -77,14 +77,14 @@ def test_bodies_stand_on_what_they_have(name: str, tilt: float) -> None:
 
 
 def short_legged(p: np.ndarray) -> np.ndarray:
-    """Four legs, of which the one at +x, +y ends 0.05 over the ground."""
+    """True inside a table whose leg at +x, +y ends 0.05 above the ground."""
     legs = np.abs(np.abs(p[:, :2]) - 0.35).max(axis=1) < 0.1
     ends = np.where((p[:, :2] > 0.0).all(axis=1), 0.05, 0.0)
     return (legs & (p[:, 2] > ends)) | (p[:, 2] > 0.7)
 
 
 def test_a_table_with_one_short_leg_has_four_feet() -> None:
-    """It says which is short, and by how much; its sole is its own lowest nodes."""
+    """The short foot and its height above the ground are reported; its sole consists of its own lowest nodes."""
     mesh = mesh_of(short_legged)
     feet = find_feet(mesh, mesh.nodes[:, 2], 1.0)
     assert len(feet) == 4
@@ -95,19 +95,19 @@ def test_a_table_with_one_short_leg_has_four_feet() -> None:
 
 
 def test_what_hangs_is_no_foot() -> None:
-    """A fifth leg that ends a quarter of the height above the ground."""
+    """A fifth leg ends a quarter of the height above the ground."""
     mesh = mesh_of(lambda p: short_legged(p) | ((np.abs(p[:, :2]).max(axis=1) < 0.1) & (p[:, 2] > 0.25)))
     assert feet_of(mesh) == (4, SupportKind.FEET)
 
 
 def melted(thickness: float) -> TetMesh:
-    """Four legs on a slab."""
+    """Return four legs that are joined by a slab at their base."""
     four = legged(4, turn=0.25 * np.pi)
     return mesh_of(lambda p: four(p) | ((np.abs(p[:, :2]).max(axis=1) < 0.4) & (p[:, 2] < thickness)))
 
 
 def test_legs_that_melt_together_at_the_base_are_told_apart() -> None:
-    """Each sole is a quarter of the slab, and each foot knows that it is joined."""
+    """Each sole is a quarter of the slab, and each foot is marked as joined."""
     mesh = melted(0.05)
     feet = find_feet(mesh, mesh.nodes[:, 2], 1.0)
     assert len(feet) == 4 and all(foot.is_joined for foot in feet)
@@ -125,8 +125,8 @@ def test_legs_on_a_thick_slab_stand_on_one_base() -> None:
 
 @pytest.mark.parametrize(("length", "count"), [(1.4, 2), (0.8, 4)])
 def test_legs_on_runners_stand_on_these(length: float, count: int) -> None:
-    """As armchairs do; what joins legs as near as those of a chair may be a flaw of its capture. In the mesh, and in
-    the solid that it was made from."""
+    """Armchairs have such runners; a connection of legs as close as those of a chair may be a flaw of the capture. Both
+    the mesh and the solid that it was made from are tested."""
 
     def sledge(p: np.ndarray) -> np.ndarray:
         posts = (np.abs(np.abs(p[:, 0]) - 0.5 * length + 0.1) < 0.1) & (np.abs(np.abs(p[:, 1]) - 0.4) < 0.1)
@@ -143,7 +143,7 @@ def test_legs_on_runners_stand_on_these(length: float, count: int) -> None:
 
 
 def test_a_tail_held_up_from_the_base_carries_nothing() -> None:
-    """Beside a trunk on the same slab."""
+    """It rises from the same slab as the trunk."""
     mesh = mesh_of(
         lambda p: (
             (p[:, 2] < 0.1)
@@ -155,7 +155,8 @@ def test_a_tail_held_up_from_the_base_carries_nothing() -> None:
 
 
 def test_gaps_finer_than_the_cage_are_seen_in_the_solid() -> None:
-    """Two legs 0.06 apart, in a cage that has no gap: the capture's lattice has it, and its feet are joined."""
+    """Two legs are 0.06 apart in a cage without a gap: the lattice of the capture resolves the gap, and the feet are
+    joined."""
     spacing = 1.0 / 64.0
     places = np.stack(np.meshgrid(*[np.arange(n) for n in (49, 33, 65)], indexing="ij"), axis=-1)
     points = spacing * (places - [24, 16, 0])
@@ -172,7 +173,7 @@ def test_gaps_finer_than_the_cage_are_seen_in_the_solid() -> None:
 
 
 def test_feet_are_numbered_anticlockwise_from_straight_ahead() -> None:
-    """A foot ten degrees to the right of straight ahead is the first, one twenty degrees to the right the last."""
+    """A foot ten degrees to the right of straight ahead is the first, one twenty degrees to the right is the last."""
 
     def at(*degrees: float) -> np.ndarray:
         return np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], axis=1)

@@ -1,4 +1,4 @@
-"""The inverted pendulum: its plan against the equation of motion, solved by a library."""
+"""The plan of the inverted pendulum, against its equation of motion solved by SciPy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ RATE = 4.4
 
 
 def test_a_plan_is_a_motion_of_the_pendulum_that_ends_over_its_pressure() -> None:
-    """c'' = w^2 (c - p), begun with the planned divergent part, keeps to the plan and does not run away; p jumps."""
+    """c'' = w^2 (c - p), starting with the planned divergent component, follows the plan and does not diverge, although
+    p jumps."""
     step = 0.05
     pressure = np.array([[0.1, 0.0]] * 8 + [[0.0, 0.2]] * 6 + [[0.3, 0.1]] * 30)
     plan = PendulumPlan.from_pressure(pressure, step, RATE)
@@ -39,7 +40,7 @@ def test_a_plan_is_told_between_its_steps_and_stays_at_its_end() -> None:
 
 
 def test_what_is_off_grows_unless_it_is_pushed_against() -> None:
-    """Against x' = w (x - p): off by x, pressed off by p for a time t."""
+    """The error solves x' = w (x - p) for a time t, with an offset p of the centre of pressure."""
     off, push, time = np.array([0.01, -0.02]), np.array([0.03, 0.01]), 0.4
     solved = solve_ivp(lambda _, x: RATE * (x - push), (0.0, time), off, rtol=1e-11, atol=1e-13).y[:, -1]
     assert drift(off, push, float(np.exp(RATE * time))) == pytest.approx(solved, abs=1e-8)
@@ -47,7 +48,7 @@ def test_what_is_off_grows_unless_it_is_pushed_against() -> None:
 
 @given(st.integers(0, 1000))
 def test_nearest_point_of_a_hull_is_the_best_convex_combination(seed: int) -> None:
-    """Against a slow twin: the closest weighted mean of the points."""
+    """The closest weighted mean of the points, found by SciPy."""
     rng = np.random.default_rng(seed)
     points, place = rng.standard_normal((8, 2)), 2.0 * rng.standard_normal(2)
     found = nearest_in_hull(points, place)
@@ -63,7 +64,7 @@ def test_nearest_point_of_a_hull_is_the_best_convex_combination(seed: int) -> No
 
 
 def test_nearest_point_of_a_line() -> None:
-    """Between its ends, or one of them."""
+    """The nearest point is between the ends, or one of them."""
     points = np.array([[0.0, 0.0], [1.0, 1.0], [0.5, 0.5]])
     for place, nearest in (([1.0, 0.0], [0.5, 0.5]), ([3.0, 1.0], [1.0, 1.0]), ([-1.0, 0.0], [0.0, 0.0])):
         assert nearest_in_hull(points, np.array(place)) == pytest.approx(nearest)

@@ -1,4 +1,4 @@
-"""Pushes: impulses and gusts in momenta, energy balance and audit; a standing body keeps its feet, or falls."""
+"""Pushes: impulses and gusts in momenta, energy balance and audit; a standing body keeps its balance, or falls."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def made() -> CoarseCreature:
 
 
 def stood(made: CoarseCreature, pushes: str, frames: int = 40, **given: Path) -> tuple[RolloutResult, str | None]:
-    """A block that stands, and the description of its fall, if it fell."""
+    """Simulate a block that stands; return the result, and the description of its fall, if it fell."""
     place = made.place
     watch = FallMonitor(MotionSequence(place, motion("stand 0.5").parts(place.body.height)), place)
     simulation = roll_out(
@@ -69,8 +69,8 @@ def test_steps_share_out_all_of_a_push(push: Push, dt: float) -> None:
 
 
 def test_a_push_has_its_momentum_and_its_arm(made: CoarseCreature) -> None:
-    """m sqrt(g H) is that of the whole body at its unit of speed; what hits it high turns it, what takes all of it
-    does not."""
+    """The unit m sqrt(g H) is the whole body at its unit of speed; a push at the top rotates the body, a push of all
+    nodes does not."""
     place, body = made.place, made.place.body
     for height in (None, 0.9, 0.1):
         kick = PushKicks(place, [Push(0.0, 0.3 * LEFT, height)])(0.0, DT)
@@ -85,7 +85,7 @@ def test_a_push_has_its_momentum_and_its_arm(made: CoarseCreature) -> None:
 
 
 def test_what_is_hit_is_around_the_height(made: CoarseCreature) -> None:
-    """Within a quarter of a body height; where a coarse cage has no node so near, what is nearest to it."""
+    """Nodes within a quarter of a body height are pushed; if a coarse cage has none there, the nearest ones are."""
     heights = made.place.ground.local(made.place.standing)[:, 2] / made.place.body.height
     for height in (0.0, 0.5, 1.0):
         sizes = np.linalg.norm(kick_of(made.place, 0.1 * LEFT, height), axis=1)
@@ -99,7 +99,8 @@ def test_what_is_hit_is_around_the_height(made: CoarseCreature) -> None:
 
 
 def test_the_books_hold_what_was_given(pushed: Trajectory) -> None:
-    """Both momenta and the energy of every step, as without pushes; not with one left out or a hundredth stronger."""
+    """Both momenta and the energy of every step balance as without pushes; they do not if one push is missing or 1 %
+    stronger."""
     assert len(pushed.kick_step) == 1 + 6
     held = audit(pushed)
     assert held.energy_residual < 1e-8
@@ -112,7 +113,8 @@ def test_the_books_hold_what_was_given(pushed: Trajectory) -> None:
 
 
 def test_who_is_pushed_goes_along_and_keeps_its_feet(made: CoarseCreature, pushed: Trajectory) -> None:
-    """A tenth of a second after the first push its centre of mass is to the left, in the end upright and calm."""
+    """A tenth of a second after the first push its centre of mass has moved to the left; in the end the body is upright
+    and at rest."""
     place = made.place
     com = np.array([place.body.centre_of_mass(place.ground.local(x)) for x in pushed.positions])
     after = int(np.searchsorted(pushed.time, 0.2))
@@ -124,7 +126,8 @@ def test_who_is_pushed_goes_along_and_keeps_its_feet(made: CoarseCreature, pushe
 
 
 def test_a_hard_push_throws_it_over(made: CoarseCreature) -> None:
-    """Its energy is several times what lifts its centre over its edge, so that no balancing keeps it up."""
+    """Its energy is several times what lifts the centre of mass over the edge, so that no controller can keep
+    balance."""
     simulation, fallen = stood(made, "0.05 1 left 0.9", frames=90)
     assert fallen is not None and fallen.startswith("tilted by")
     assert audit(simulation.trajectory).energy_residual < 1e-6
@@ -137,7 +140,7 @@ def test_a_hard_push_throws_it_over(made: CoarseCreature) -> None:
 
 
 def test_a_pushed_run_goes_on_to_the_same_bits(pushed: Trajectory, tmp_path: Path) -> None:
-    """It was cut off within the gust."""
+    """The run is interrupted during the gust."""
     parts = tmp_path / "parts"
     stood(block(), "0.1 0.06 left 0.8, 0.2-0.3 0.05 back", frames=15, parts=parts)
     whole, _ = stood(block(), "0.1 0.06 left 0.8, 0.2-0.3 0.05 back")

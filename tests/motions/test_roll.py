@@ -1,4 +1,4 @@
-"""Roll: a ball reaches its target without slipping, and continues from whichever side it lies on."""
+"""Roll: a ball reaches its target without slipping, and continues from any orientation."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Rolled:
 
 @cache
 def rolled() -> Rolled:
-    """Past a point ahead and to the left."""
+    """Simulate a roll past a point ahead and to the left."""
     made = ball()
     sequence = MotionSequence(
         made.place, [MotionTask("walk to", {}, lambda place: move_along(place, path_route(WAY), 0.1))]
@@ -77,7 +77,7 @@ def test_a_ball_is_told_from_what_stands() -> None:
 
 
 def test_a_ball_that_has_turned_over_is_still_one() -> None:
-    """The kind of support follows from its shape as it lies, not from the side on which it once stood."""
+    """The kind of support follows from the current shape, not from the side on which the ball stood before."""
     made = ball()
     turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     com = made.place.body.centre_of_mass(made.place.standing)
@@ -109,7 +109,7 @@ def test_a_step_in_its_way_is_refused() -> None:
 
 @pytest.mark.slow
 def test_a_ball_rolls_to_its_point_without_slipping() -> None:
-    """Within 0.03, with an angle of distance over radius, and without counting as a fall."""
+    """It ends within 0.03 of the target, has rotated by distance over radius, and does not count as fallen."""
     done = rolled()
     local = done.roll.ground.local(done.end.positions)
     com = done.roll.body.centre_of_mass(local)

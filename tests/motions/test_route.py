@@ -1,4 +1,4 @@
-"""Routes: where they end, and that no pace is longer than the body can make it."""
+"""Routes: their end points, and limits on the length and turn of each step."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def test_turns_on_the_spot_in_even_paces(angle: float) -> None:
 
 @given(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
 def test_a_point_is_reached_however_it_lies(ahead: float, left: float) -> None:
-    """It ends there, goes the way it is turned but for the last pace, and no pace is longer or turns more than one may;
-    what turns leaves less for the way."""
+    """The route ends at the point, moves in the direction of the heading except in the last step, and no step exceeds
+    the limits of length and turn, which share one budget."""
     places = path_route(np.array([[ahead, left]]))(PACE)
     assert places[-1, :2] == pytest.approx([ahead, left], abs=1e-8)
     steps = np.diff(places, axis=0)
@@ -46,7 +46,7 @@ def test_a_point_is_reached_however_it_lies(ahead: float, left: float) -> None:
 
 
 def test_a_path_is_followed_past_its_points() -> None:
-    """Within a pace of each; the way is hardly longer than the path."""
+    """The route passes within a step of each point and is hardly longer than the path."""
     points = np.array([[0.5, 0.0], [0.9, 0.3], [0.9, 0.8]])
     places = path_route(points)(PACE)
     for point in points:

@@ -1,4 +1,4 @@
-"""Whole motions reach their targets within every bound of the audit; of a coarse block, and of the pawn (slow)."""
+"""Complete motions reach their targets within every bound of the audit, on a coarse block and on the pawn (slow)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_every_step_of_a_coarse_run_is_audited(coarse_run: Run) -> None:
 
 
 def test_a_coarse_block_hops_onto_its_square_and_twists_there(coarse_run: Run) -> None:
-    """Measured: the hop misses by 1 % of its distance, the twist by 2 degrees."""
+    """As measured, the hop misses its target by 1 % of its distance and the twist by 2 degrees."""
     trajectory, sequence = coarse_run.trajectory, coarse_run.sequence
     spans = sequence.spans(trajectory.time)
     hop, twist = (measure(trajectory, first=first, last=last) for first, last in spans)
@@ -65,7 +65,7 @@ def test_a_coarse_run_ends_at_rest_with_all_motions_done(coarse_run: Run) -> Non
 
 
 def test_a_coarse_block_jumps_on_waves() -> None:
-    """It begins and lands on folds 1.5 % of its height high either way; the audit recomputes the ground."""
+    """It starts and lands on waves with an amplitude of 1.5 % of its height; the audit recomputes the ground."""
     field = wavy_ground(0.015)
     base = np.stack(np.meshgrid(*[np.linspace(-0.25, 0.25, 11)] * 2, [0.0]), axis=-1)
     run = coarse_block_run("jump 0.4 0.2", field.moved(np.array([0.0, 0.0, -float(field.ground_height(base).max())])))
@@ -79,7 +79,7 @@ def test_a_coarse_block_jumps_on_waves() -> None:
 
 
 def run(script: str, **ground: Any) -> tuple[MotionSequence, list[MotionOutcome], np.ndarray]:
-    """Simulate ``script``; returns the sequence, what each motion reached, and the nodes at its end.
+    """Simulate ``script``; return the sequence, the outcome of each motion, and the nodes at its end.
 
     Asserts the audit.
     """
@@ -125,7 +125,7 @@ def test_hops_land_on_their_squares(script: str, ground: dict) -> None:
 
 @pytest.mark.slow
 def test_the_head_follows_its_key_and_the_body_comes_to_rest(tmp_path: Path) -> None:
-    """The key is at 0.05; measured on two cores, its error is 0.0002. A body that only stands misses it by 0.05."""
+    """The key is at 0.05; the measured error is 0.0002. A body that only stands misses it by 0.05."""
     file = tmp_path / "keys.csv"
     file.write_text("time,part,quantity,x,y,z\n0.5,head,position,0.05,0,0\n")
     sequence, (reached,), (end,) = run(f"trajectory {file}")

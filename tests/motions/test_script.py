@@ -1,4 +1,4 @@
-"""Scripts: one line of motions, or a JSON file; every mistake named in one line."""
+"""Scripts: one line of motions, or a JSON file; a one-line error for every mistake."""
 
 from __future__ import annotations
 
@@ -69,7 +69,8 @@ def test_speeds_come_from_a_file_or_from_commands(place: Stance, tmp_path: Path)
 
 
 def test_ways_are_asked_for_in_words(tmp_path: Path) -> None:
-    """A comma between two numbers does not end a motion; a path is a file; backwards is a negative distance."""
+    """A comma between two numbers does not end a motion; a path is read from a file; a negative distance is
+    backwards."""
     to, back, turned, along = motion("walk to 1.5,-0.5, walk -1 speed=1.2,turn -90, walk along a.csv 0.05").requests
     assert (to.name, to.asked["ahead"], to.asked["left"], to.asked["speed"]) == ("walk to", 1.5, -0.5, 1.0)
     assert motion("walk to 1 2").requests[0].asked["left"] == motion("walk to 1, 2").requests[0].asked["left"] == 2.0

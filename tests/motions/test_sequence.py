@@ -1,4 +1,4 @@
-"""Motions in a row on a block that is posed by hand: geometry and bookkeeping without a simulation."""
+"""Sequences of motions of a block that is posed by hand: geometry and records without a simulation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from tests.support.stances import DT, moved
 
 @pytest.mark.parametrize("angle", [0.0, 0.7, -2.5, np.pi])
 def test_a_place_follows_the_feet(place: Stance, angle: float) -> None:
-    """Turned and moved, to another level too, the stance is the body's own again and forward turns with it."""
+    """After a rotation and a translation, also to another level, the stance has the same shape, and forward rotates
+    with it."""
     shift = np.array([0.4, -1.2, 0.25])
     now = place.moved_to(moved(place, angle, shift))
     assert np.abs(now.standing - moved(place, angle, shift)).max() < 1e-12
@@ -45,7 +46,8 @@ def test_facing_turns_the_way_and_not_the_body(place: Stance) -> None:
 
 @pytest.mark.parametrize(("slope", "rise", "height"), [(0.1, 0.05, 0.2), (-0.1, -0.05, 0.2), (0.4, 0.2, 0.3)])
 def test_a_jump_is_to_land_on_what_is_ahead(place: Stance, slope: float, rise: float, height: float) -> None:
-    """Half a metre up or down a slope; over what is high by half of the asked 0.2 at least."""
+    """Half a metre up or down a slope; the apex clears the higher landing surface by at least half of the requested
+    0.2."""
     normal = np.array([-slope, 0.0, 1.0]) / np.hypot(1.0, slope)
     target = replace(place, solids=(Solid((Plane(normal, 0.0),)),)).landing(JumpTarget(0.5, 0.2))
     assert (target.distance, target.rise, target.height) == pytest.approx((0.5, rise, height))
@@ -53,7 +55,7 @@ def test_a_jump_is_to_land_on_what_is_ahead(place: Stance, slope: float, rise: f
 
 
 def test_a_jump_is_level_before_a_wall_and_over_an_edge(place: Stance) -> None:
-    """And under what is overhead."""
+    """In each case the requested target is unchanged."""
     ground, asked = Solid((Plane(np.array([0.0, 0.0, 1.0]), 0.0),)), JumpTarget(0.5, 0.2)
     block = (Plane(np.array([0.0, 0.0, 1.0]), -2.5), Plane(np.array([-1.0, 0.0, 0.0]), 0.3))
     lintel = Solid((*block, Plane(np.array([0.0, 0.0, -1.0]), 2.0)))

@@ -1,4 +1,4 @@
-"""Balance controller: ends of a step that do not tip the body, against an exhaustive search."""
+"""Balance controller: target velocities that do not tip the body, against an exhaustive search."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ GRAVITY, EDGE, DT = 9.81, 0.2, 1 / 60
 def stood(
     place: Stance, friction: float, moved: tuple[float, float, float]
 ) -> tuple[BalanceController, BodyState, Measurement]:
-    """The body with all above its soles ``moved``, at rest."""
+    """Return the controller, the state and the measurement of a body at rest whose nodes above the soles are displaced
+    by ``moved``."""
     pose = BalanceController(place.body, place.ground, place.standing, place.contact_points, friction)
     positions = place.standing + np.array(moved) * (place.standing[:, 2:] > 1e-9)
     state = BodyState(positions, np.zeros_like(positions))
@@ -23,7 +24,7 @@ def stood(
 
 
 def swing(place: Stance, state: BodyState, seen: Measurement, spin: np.ndarray) -> np.ndarray:
-    """Return the velocity (2,) in m/s that a ``spin`` (3,) adds in the angular momentum about the feet."""
+    """Return the velocity (2,), m/s, that corresponds to the angular momentum of a ``spin`` (3,) about the feet."""
     momentum = place.ground.axes @ place.body.inertia(state.positions) @ spin / (place.body.mass * seen.com[2])
     return np.array([momentum[1], -momentum[0]])
 
@@ -34,8 +35,9 @@ def swing(place: Stance, state: BodyState, seen: Measurement, spin: np.ndarray) 
 def test_the_nearest_end_of_a_step_that_does_not_tip(
     place: Stance, wanted: tuple[float, float], turning: tuple[float, float, float], up: float
 ) -> None:
-    """About the point where the ground pushes, within the footprint, m h (v + swing) changes by its distance from the
-    centre of mass times the load; of all ends that do, the one whose velocity and spin miss least."""
+    """The change of m h (v + swing) is the load times the distance of the centre of pressure from the centre of mass,
+    and the centre of pressure is within the footprint. Of all such targets, the controller picks the one with the least
+    error of velocity and spin."""
     pose, state, seen = stood(place, 1e3, (0.05, -0.03, 0.1))
     asked, spin = np.array([*wanted, up]), np.array(turning)
     velocity, turned = pose.balance_targets(seen, asked, spin, DT)
@@ -51,7 +53,7 @@ def test_the_nearest_end_of_a_step_that_does_not_tip(
     axis = place.ground.axes[2]
     inertia = place.body.inertia(state.positions)
     assert axis @ inertia @ turned == pytest.approx(axis @ inertia @ spin, abs=1e-9)
-    # By search, one axis after the other: v and swing with the radius of gyration.
+    # By search along each axis separately: v and swing, with the radius of gyration.
     gyration = 0.5 * np.trace(inertia) / (place.body.mass * height**2)
     line = np.linspace(-1.0, 1.0, 2001)
     for k in (0, 1):
@@ -89,8 +91,8 @@ def test_no_more_is_asked_than_friction_gives(place: Stance, up: float) -> None:
 
 @pytest.mark.parametrize("way", [(1.0, 0.0), (-1.0, 0.0), (0.6, -0.8)])
 def test_on_a_slope_friction_gives_less_uphill(way: tuple[float, float]) -> None:
-    """The limited request is on the cone about the ground's normal: uphill that is weight x tan(friction angle -
-    slope), by hand."""
+    """The limited request is on the cone about the ground's normal: uphill it is weight x tan(friction angle - slope),
+    computed by hand."""
     friction, slope = 0.3, np.radians(8.0)
     rising = np.array([-np.sin(slope), 0.0, np.cos(slope)])
     push, weight = np.array([*way, 0.0]), np.array([0.0, 0.0, 2.0])
@@ -117,8 +119,8 @@ def test_what_friction_denies_the_speed_the_spin_takes(place: Stance, spin: tupl
 
 
 def test_a_body_that_turns_forward_is_caught_further_ahead(place: Stance) -> None:
-    """The capture point follows from the angular momentum about the feet: at rest over its position, the acceleration
-    is zero, and spin counts as the velocity with the same momentum."""
+    """The capture point follows from the angular momentum about the feet: for a body at rest, the acceleration over its
+    position is zero, and spin counts as the velocity with the same momentum."""
     pose, state, seen = stood(place, 1.0, (0.0, 0.0, 0.0))
     np.testing.assert_allclose(pose.capture_acceleration(seen, seen.com[:2]), 0.0, atol=1e-12)
     ahead = BodyState(state.positions, np.broadcast_to(0.1 * place.ground.axes[0], state.positions.shape))
@@ -135,7 +137,7 @@ def test_a_body_that_turns_forward_is_caught_further_ahead(place: Stance) -> Non
 def test_balance_is_urgent_by_how_near_the_capture_point_is_to_the_edge(
     place: Stance, ahead: float, urgency: float
 ) -> None:
-    """Over a base of 0.2 metres either way, by the speed alone."""
+    """The base extends by 0.2 metres in both directions; only the speed varies."""
     pose = BalanceController(place.body, place.ground, place.standing, place.contact_points, place.friction)
     height = place.body.centre_of_mass(place.standing)[2]
     speed = np.array([ahead * np.sqrt(GRAVITY / height), 0.0, 0.0])
@@ -144,8 +146,8 @@ def test_balance_is_urgent_by_how_near_the_capture_point_is_to_the_edge(
 
 
 def test_a_body_that_leans_turns_as_far_as_strains_it_least(place: Stance) -> None:
-    """The static bend under a pull along the ground, its sole taken out of a dense system: the pose is the affine map
-    nearest to it by mass, found by least squares."""
+    """The static bend under a horizontal load is solved densely with the sole clamped: the pose is the nearest affine
+    map by mass, by least squares."""
     pose, _, seen = stood(place, 0.8, (0.0, 0.0, 0.0))
     body, assembly = place.body, place.body.assembly
     upper = assembly.matrix(assembly.hessian_entries(place.standing, projected=True)).toarray()

@@ -1,4 +1,4 @@
-"""Styles: each number does to a jump of a coarse block what it says, and one of 1 nothing at all."""
+"""Styles: each factor changes a jump of a coarse block as documented, and a factor of 1 changes nothing."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.support.stances import FORWARD
 
 @dataclass(frozen=True)
 class Jumped:
-    """Heights of the centre of mass and times; metres, seconds."""
+    """Heights of the centre of mass, metres, and times, seconds."""
 
     depth: float
     """Depth of the crouch."""
@@ -34,15 +34,15 @@ class Jumped:
     """End of the crouch."""
     take_off: float
     apex: float
-    """Above where it stood."""
+    """Rise above the standing height."""
     dip: float
-    """Below where it stood, after touch-down."""
+    """Descent below the standing height after touch-down."""
     heights: tuple[float, ...]
 
 
 @cache
 def jumped(style: str | None) -> Jumped:
-    """A block jumps by 0.2 on the spot, as ``style`` says; checked by the audit."""
+    """Simulate a jump of a block by 0.2 on the spot in this ``style``, and check the audit."""
     made = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
     place = made.place if style is None else replace(made.place, style=read_style(style))
     sequence = MotionSequence(place, motion("jump 0 0.2").parts(place.body.height))
@@ -68,7 +68,7 @@ def test_the_usual_style_changes_no_bit() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["anticipation", "timing"])
 def test_anticipation_and_timing_lengthen_a_crouch(name: str) -> None:
-    """By exactly their factors, to the step; the requested height is still reached."""
+    """The duration changes by the factor, to the step; the requested height is still reached."""
     short, usual, long = jumped(f"{name}=0.7"), jumped(None), jumped(f"{name}=1.4")
     crouches = np.array([short.lowest, usual.lowest, long.lowest]) - 0.1  # it settles first
     np.testing.assert_allclose(crouches / crouches[1], [0.7, 1.0, 1.4], atol=0.06)
@@ -84,7 +84,7 @@ def test_anticipation_deepens_a_crouch() -> None:
 
 @pytest.mark.slow
 def test_timing_makes_a_thrust_soft() -> None:
-    """The mean acceleration is divided by it: a thrust to the same upward speed takes longer by the factor."""
+    """The mean acceleration is divided by the factor: a thrust to the same upward speed takes longer by it."""
     usual, *others = (planned(Style(timing=timing)) for timing in (1.0, 0.7, 1.4))
     np.testing.assert_allclose([other.thrust_time / usual.thrust_time for other in others], [0.7, 1.4], rtol=1e-6)
     assert others[0].speed_up == others[1].speed_up == usual.speed_up
@@ -99,7 +99,7 @@ def test_squash_lets_a_landing_give_way() -> None:
 
 
 def planned(style: Style) -> JumpPlan:
-    """A jump so high that its stroke is neither the least nor the deepest, in very short steps."""
+    """Plan a jump so high that its stroke is at neither limit, in very short steps."""
     return plan_jump(
         JumpTarget(0.0, 0.3),
         height=1.0,
@@ -121,7 +121,7 @@ def test_a_dance_knows_how_long_the_crouches_of_its_style_are(place: Stance) -> 
 
 
 def test_a_jump_of_a_script_may_have_a_style_of_its_own(place: Stance, tmp_path: Path) -> None:
-    """It goes before the style of the run, which the others have."""
+    """It takes precedence over the style of the run, which the other jumps have."""
     (tmp_path / "s.json").write_text(
         '[{"motion": "jump", "repeat": 2, "style": "squash=2"}, {"motion": "jump"},'
         ' {"motion": "jump", "style": "light"}]'

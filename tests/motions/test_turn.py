@@ -17,13 +17,14 @@ from tests.support.stances import DT, moved
 
 
 def land(jump: Jump, state: BodyState) -> None:
-    """Put a jump where it has landed and come to rest but for the last step."""
+    """Put a jump into the state after its landing, one step before it rests."""
     jump.phase, jump._entered = JumpPhase.LAND, -100.0
     jump.controller = jump._landing
 
 
 def test_a_turn_that_falls_short_is_made_up_where_it_began(place: Stance) -> None:
-    """25 degrees short and 0.1 aside: the next jump turns by the rest and goes back; 5 degrees short is let be."""
+    """After a jump that is 25 degrees short and 0.1 to the side, the next jump turns by the rest and returns; 5 degrees
+    are tolerated."""
     turn = Turn(place, JumpTarget(0.0, 0.2), np.radians(60.0))
     short = moved(place, np.radians(35.0), np.array([0.1, 0.0, 0.0]))
     state = BodyState(short, 0 * short, 10.0)
@@ -43,7 +44,7 @@ def test_a_turn_that_falls_short_is_made_up_where_it_began(place: Stance) -> Non
 
 
 def test_a_slippery_floor_takes_more_jumps(place: Stance) -> None:
-    """The largest turn is proportional to friction; a turn beyond it is shared out evenly."""
+    """The largest turn per jump is proportional to friction; a larger turn is divided evenly."""
     target = JumpTarget(0.0, 0.2)
     rough, smooth = (Turn(replace(place, friction=mu), target, np.pi) for mu in (0.8, 0.2))
     assert smooth.max_turn_per_jump == pytest.approx(rough.max_turn_per_jump / 4.0)
@@ -59,11 +60,11 @@ def test_a_slippery_floor_takes_more_jumps(place: Stance) -> None:
 
 @pytest.mark.parametrize("points", ["disc", "rim"])
 def test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground(place: Stance, points: str) -> None:
-    """Largest turn of a disc (docs/concepts/motions.md).
+    """The largest turn of a disc (docs/concepts/motions.md).
 
-    A disc pressed down by N resists twisting by 2/3 mu N R; its impulse during the thrust turns the flying body. Of
-    Coulomb's cone, a pyramid of four edges gives 1 / (|cos| + |sin|) in each direction. The body is off the ground for
-    nine tenths of the planned time, within a twentieth.
+    A disc pressed down by N resists rotation with 2/3 mu N R; the impulse during the thrust rotates the flying body.
+    The pyramid with four facets that replaces Coulomb's cone gives 1 / (|cos| + |sin|) of it in each direction. The
+    body is off the ground for nine tenths of the planned time, within a twentieth.
     """
     radius, mu = 0.15, 0.5
     angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)

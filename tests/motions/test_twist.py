@@ -34,9 +34,9 @@ def test_a_twist_asks_friction_for_the_spin_that_is_left(turn: float) -> None:
     """In the last step of the thrust, the target is the spin that completes the remaining turn of the standing body in
     flight, whatever its present shape, with a reserve.
 
-    The target falls in proportion to the completed turn. It is zero a few degrees before the end, by which the feet
-    slide on. The heading is counted beyond half turns. The body's masses are symmetric: the target against its tilt has
-    no momentum about up.
+    The target decreases in proportion to the completed turn. It is zero a few degrees before the end, the angle by
+    which the feet slide after landing. The heading is counted beyond half turns. The masses of the body are symmetric,
+    so the target against its tilt has no momentum about up.
     """
     place = block_place(box_mesh((2, 2, 4), (0.4, 0.4, 1.0)))
     jump = twist(place, JumpTarget(0.0, 0.2), turn)
@@ -61,8 +61,8 @@ def test_a_twist_asks_friction_for_the_spin_that_is_left(turn: float) -> None:
 
 
 def test_a_twist_gathers_its_spin_as_the_speed_up_is_gathered(place: Stance) -> None:
-    """The friction follows the load: for a body at rest, the target is the fraction of the whole spin that a step is of
-    the thrust; for one that rises at half the speed, twice that."""
+    """The friction follows the load: for a body at rest, the target is the whole spin times the ratio of the step to
+    the thrust; for a body that rises at half the speed, twice that."""
     shares = []
     for risen in (0.0, 0.5):
         jump = twist(place, JumpTarget(0.0, 0.2), 1.0)
@@ -80,8 +80,8 @@ def test_a_twist_gathers_its_spin_as_the_speed_up_is_gathered(place: Stance) -> 
 
 def test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn(place: Stance) -> None:
     """Angular momentum L is conserved: the inertia I (arms in or out) that turns by the remaining angle in the
-    remaining time is L t / angle. The target shape is approached at one rate; at the spin that fits the standing shape,
-    the target is zero."""
+    remaining time is L t / angle. The target shape is approached at a constant rate; at the spin that fits the standing
+    shape, the target is zero."""
     turn, speed = 1.5, 2.5
     left = turn - LANDING_SLIDE_ANGLE
     time = 2.0 * speed / 9.81
@@ -100,11 +100,11 @@ def test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn(
         assert jump.phase is JumpPhase.FLIGHT
         shape = objectives[2]
         assert isinstance(shape, Objective)
-        # Its rows are orthonormal in the mean over the mass: the velocities with just these strains.
+        # Its rows are orthonormal in the mass-weighted mean: they are the velocities of these strains alone.
         shares = np.repeat(place.body.node_mass / place.body.mass, 3)
         assert np.allclose((shape.rows / shares) @ shape.rows.T, np.eye(6), atol=1e-12)
         wanted = (shape.rows.T @ shape.target / shares).reshape(-1, 3)
-        # Along the diagonal: how these strains turn the body does not count.
+        # Along the diagonal, so that a rotation by these strains does not count.
         apart = (wanted[corners[1], :2] - wanted[corners[0], :2]).mean()
         if width == 1.0:
             assert abs(apart) < 1e-9

@@ -1,5 +1,5 @@
-"""Velocity profiles: from rest to rest along a path, no faster than allowed, slower at corners; speeds are derivatives
-of positions."""
+"""Velocity profiles: from rest to rest along a path, within the speed limit, slower at corners; velocities are
+derivatives of positions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_right_angle_is_taken_from_rest_and_a_straight_way_at_full_speed() -> 
     assert table.speeds[corner] == pytest.approx(0.0, abs=1e-9)
     straight = VelocityProfile.from_path(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]), speed=SPEED, acceleration=PUSH)
     assert straight.speeds[np.argmin(abs(straight.points[:, 0] - 1.0))] == pytest.approx(SPEED)
-    # Of a trapezoid: way over speed, and speed over push to gather and lose it.
+    # Trapezoidal profile: distance over speed, plus speed over acceleration to start and stop.
     assert straight.seconds == pytest.approx(2.0 / SPEED + SPEED / PUSH, rel=0.03)
 
 

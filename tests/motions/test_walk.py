@@ -1,4 +1,4 @@
-"""Walks of coarse bodies on four feet, on two and on one base: their plan, and every step of them audited."""
+"""Walks of coarse bodies on four feet, on two feet and on one base: their plan, and every step of them audited."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Walked:
 
 
 def walked(creature: CoarseCreature, route: Route, pace_length: float, *, speed: float = 1.0) -> Walked:
-    """Walk until the body rests, at most 300 steps."""
+    """Simulate a walk until the body rests, at most 300 solver steps."""
     stepper, state = creature.stepper, creature.start
     walk = Walk(creature.place, route, pace_length, speed=speed)
     reports: list[StepReport] = []
@@ -89,15 +89,15 @@ def check_audit(done: Walked) -> None:
 
 
 def strong(mesh: TetMesh, up: np.ndarray = UP) -> CoarseCreature:
-    """As stiff and strong as captures are."""
+    """Return a creature with the stiffness and strength of captures."""
     return coarse_creature(mesh, forward=AHEAD, up=up, sag=DEFAULT_SAG)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("slope", [0.0, 5.0])
 def test_a_coarse_stool_takes_a_step(slope: float) -> None:
-    """One step, up a slope too, and the closing one: each foot lands once, none slips 2 % of the stride, the distance
-    is met, the audit holds."""
+    """One step, level and up a slope, and the closing step: each foot lands once, none slips by 2 % of the stride, the
+    distance is reached, and the audit holds."""
     tilt = np.radians(slope)
     done = walked(strong(coarse_stool(), np.array([np.sin(tilt), 0.0, np.cos(tilt)])), straight_route(0.06), 0.06)
     reached = measure(done.trajectory)
@@ -111,7 +111,7 @@ def test_a_coarse_stool_takes_a_step(slope: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("route", [straight_route(0.12), turn_route(np.radians(20.0))], ids=["ahead", "turn"])
 def test_a_body_on_two_legs_keeps_its_balance(route: Route) -> None:
-    """Two paces ahead, and on the spot: it comes to its place, upright."""
+    """It makes two steps ahead, or turns on the spot, and reaches its target upright."""
     done = walked(strong(biped()), route, 0.06)
     assert isinstance(done.walk._posture, LeggedPosture) and len(done.walk.feet) == 2
     reached, place = measure(done.trajectory), done.walk.planar_poses[-1]
@@ -123,7 +123,7 @@ def test_a_body_on_two_legs_keeps_its_balance(route: Route) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("route", [straight_route(0.04), pytest.param(turn_route(0.2), marks=pytest.mark.slow)])
 def test_a_block_waddles(route: Route) -> None:
-    """It lifts one side of its base, turns about the other, and so on: it comes to its place, upright."""
+    """It alternately lifts one side of its base and turns about the other, and reaches its target upright."""
     done = walked(strong(block_mesh()), route, 0.04)
     body, reached, place = done.creature.place.body, measure(done.trajectory), done.walk.planar_poses[-1]
     assert reached.distance * body.height == pytest.approx(place[0], abs=0.2 * 0.04)
@@ -135,7 +135,8 @@ def test_a_block_waddles(route: Route) -> None:
 @pytest.mark.slow
 @pytest.mark.data
 def test_a_base_does_not_run_ahead_of_what_is_above_it(data_dir: Path) -> None:
-    """The monkey's base, which is long, falls no more behind its feet with each pace: it comes to its place."""
+    """The base of the monkey is long; the body does not lag further behind its feet with each step, and reaches its
+    target."""
     cloud = read_capture(data_dir / "objects" / "monkey.ply").cloud
     plane = find_base_plane(cloud, up=np.array([0.0, 1.0, 0.0]))
     done = simulate(make_creature(cloud, plane=plane), motion("walk 0.4"), get_up=False)
@@ -180,7 +181,7 @@ def test_the_plan_tells_what_the_legs_can_do() -> None:
 
 
 def test_feet_go_to_where_they_belong_when_the_body_turns() -> None:
-    """Compared with rotating the whole standing body to each planar pose of the route, about its initial centre of
+    """They equal those of the whole standing body, rotated to each planar pose of the route about its initial centre of
     mass."""
     place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, path_route(np.array([[0.2, 0.3]])), 0.1)
@@ -195,7 +196,7 @@ def test_feet_go_to_where_they_belong_when_the_body_turns() -> None:
 
 @pytest.mark.parametrize("mesh", [stool, figure, biped, block_mesh])
 def test_it_is_planned_to_press_where_its_feet_are(mesh: Callable[[], TetMesh]) -> None:
-    """The centre of pressure of the first swing lies under the feet that stand then; all of the plan is bounded."""
+    """The centre of pressure of the first swing lies under the feet that stand during it; the whole plan is bounded."""
     place = coarse_creature(mesh(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, straight_route(0.3), 0.06)
     walk._advance_phase(place.ground.local(place.standing), None, 0.0)

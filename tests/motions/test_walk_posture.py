@@ -25,7 +25,7 @@ from tests.support.stances import block_place
 
 
 def carried(place: Stance) -> tuple[np.ndarray, tuple[Foot, ...], WalkPosture, np.ndarray]:
-    """Standing nodes, feet, carriage and the places of the feet."""
+    """Return the standing nodes, the feet, the posture and the sole poses."""
     feet, kind = select_posture(place)
     standing = place.ground.local(place.standing)
     soles = np.array([standing[foot.sole].mean(axis=0) for foot in feet])
@@ -39,7 +39,7 @@ def test_a_body_stands_as_it_stood(place: Stance) -> None:
 
 
 def test_legs_go_with_their_feet() -> None:
-    """The soles are at their targets, each moved rigidly, and so is the centre of mass; the body turns."""
+    """Each sole is at its target and is moved rigidly, and the centre of mass is at its target; the body rotates."""
     place = block_place(coarse_stool())
     standing, feet, carriage, soles = carried(place)
     assert isinstance(carriage, LeggedPosture) and len(feet) == 4
@@ -58,8 +58,8 @@ def test_legs_go_with_their_feet() -> None:
 
 
 def test_a_base_turns_and_tips_with_its_sides() -> None:
-    """Moving one side forward rotates the body about the other, lifting it tips the body; the middles of the sides are
-    near their targets, and the centre of mass is at its target."""
+    """Moving one side forward rotates the body about the other side, lifting it tips the body; the centres of the sides
+    are near their targets, and the centre of mass is at its target."""
     place = block_place()
     standing, feet, carriage, soles = carried(place)
     assert isinstance(carriage, RockingPosture) and len(feet) == 2
@@ -95,7 +95,7 @@ def test_a_base_turns_and_tips_with_its_sides() -> None:
 
 
 def test_what_lies_or_rolls_has_no_feet_to_walk_on() -> None:
-    """A long bar on the ground; a body of short joined feet takes these for the sides of a base."""
+    """A long bar on the ground has none; a body with short joined feet uses these as the sides of a base."""
     place = block_place()
     lying = replace(place, standing=place.standing[:, [2, 0, 1]] * [4.0, 0.3, 0.3])
     feet, _ = select_posture(replace(place, standing=place.standing))
@@ -106,7 +106,7 @@ def test_what_lies_or_rolls_has_no_feet_to_walk_on() -> None:
 
 
 def on_blocks(count: int, tall: float) -> TetMesh:
-    """A slab on ``count`` square blocks, 0.4 wide and ``tall`` high, two of them side by side in front."""
+    """Return a slab on ``count`` square blocks, 0.4 wide and ``tall`` high, two of them side by side in front."""
     places = [(0.4, -0.4), (0.4, 0.4), *([(-0.4, 0.0)] if count == 3 else [(-0.4, -0.4), (-0.4, 0.4)])]
 
     def keep(c: np.ndarray) -> np.ndarray:
@@ -118,5 +118,5 @@ def on_blocks(count: int, tall: float) -> TetMesh:
 
 @pytest.mark.parametrize(("count", "tall", "swings"), [(3, 0.3, False), (3, 0.6, True), (4, 0.3, True)])
 def test_on_few_feet_a_stump_is_no_leg(count: int, tall: float, swings: bool) -> None:
-    """Wider than it is long it does not reach where a fall is caught; on four or more feet the others stand."""
+    """A leg wider than long cannot reach the point where a fall is caught; with four or more feet, the others stand."""
     assert (select_posture(block_place(on_blocks(count, tall)))[1] is LeggedPosture) is swings

@@ -49,7 +49,7 @@ def test_every_kind_is_made_as_written(tmp_path: Path) -> None:
 
 
 def test_stiffness_strain_units_groups_and_partners(tmp_path: Path) -> None:
-    """Lengths are in capture units; a given stiffness is used unchanged; mirrored fibres are partners."""
+    """Lengths are in capture units; a given stiffness is used as it is; mirrored fibres are partners."""
     doubled = {**FREE, "points": (2.0 * np.array(FREE["points"])).tolist(), "mirror": True, "group": "sides"}
     content = {
         "max_strain": 0.2,
@@ -128,7 +128,7 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_picture_shows_each_kind_in_its_colour(tmp_path: Path) -> None:
-    """Three views side by side; a kind's colour appears when, and only when, the body has fibres of that kind."""
+    """Three views are side by side; the colour of a kind appears exactly if the body has fibres of that kind."""
     red, green = np.array([60, 60, 210]), np.array([60, 160, 60])
 
     def seen(image: np.ndarray, colour: np.ndarray) -> int:

@@ -34,7 +34,7 @@ def random_muscles(rng: np.random.Generator) -> MuscleSet:
 @settings(max_examples=examples(15))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_columns_make_no_net_force_or_torque(seed: int) -> None:
-    """Eq. (7): whatever the pose, every column's nodal forces sum to nothing and turn nothing."""
+    """Eq. (7): in any pose, the nodal forces of every column have no sum and no torque."""
     rng = np.random.default_rng(seed)
     muscles = random_muscles(rng)
     positions = COLUMN.nodes + rng.normal(0.0, 0.05, COLUMN.nodes.shape) + rng.normal(0.0, 1.0, 3)
@@ -46,7 +46,8 @@ def test_columns_make_no_net_force_or_torque(seed: int) -> None:
 
 
 def test_columns_are_equation_7() -> None:
-    """Eq. (7): column j is k_j (B_i^T u - B_k^T u), u from end i to end k; a segment without length pulls nothing."""
+    """Eq. (7): column j is k_j (B_i^T u - B_k^T u), with u from end i to end k; a segment of zero length exerts no
+    force."""
     rng = np.random.default_rng(1)
     muscles = random_muscles(rng)
     positions = COLUMN.nodes + rng.normal(0.0, 0.05, COLUMN.nodes.shape)
@@ -75,7 +76,7 @@ def test_positive_activation_contracts() -> None:
 
 
 def test_bounds_and_strength() -> None:
-    """|a_j| <= s_max L_j and k_j = F_max / (s_max L_j): at its bound a segment pulls with its fibre's strength."""
+    """|a_j| <= s_max L_j and k_j = F_max / (s_max L_j): at its bound a segment has the strength of its fibre."""
     fibre = Fibre("spine", FibreKind.LONGITUDINAL, np.array([[0.0, 0.0, 0.2], [0.0, 0.0, 0.5], [0.0, 0.0, 0.9]]), 7.0)
     muscles = attach_fibres(COLUMN, [fibre], max_strain=0.25)
     np.testing.assert_allclose(muscles.rest_lengths, [0.3, 0.4], rtol=0.03)
@@ -85,7 +86,7 @@ def test_bounds_and_strength() -> None:
 
 
 def test_attachments_spread_and_keep_their_centroid() -> None:
-    """Rows are non-negative, sum to 1, hold no node above 40 %; centroids lie within a tenth of an edge."""
+    """Rows are non-negative, sum to 1, and have no weight above 40 %; centroids are within a tenth of an edge."""
     points = np.random.default_rng(3).uniform([-0.15, -0.15, 0.05], [0.15, 0.15, 0.95], (50, 3))
     rows = attachment_rows(COLUMN, points)
     assert rows.min() >= 0.0
@@ -95,7 +96,7 @@ def test_attachments_spread_and_keep_their_centroid() -> None:
 
 
 def test_attachments_do_not_cross_gaps() -> None:
-    """Two legs side by side: a point in one leg never pulls a node of the other, though it is within reach."""
+    """A point in one of two adjacent legs never has weights on nodes of the other, even within reach."""
     bar = box_mesh((9, 2, 9), (0.9, 0.2, 0.9))
     centres = bar.nodes[bar.tets].mean(axis=1)
     arch = bar.tets[(centres[:, 2] > 0.6) | (np.abs(centres[:, 0]) > 0.05)]
@@ -134,7 +135,8 @@ def linear_response(body: SoftBody, muscles: MuscleSet, segments: np.ndarray) ->
 
 
 def free_response(body: SoftBody, muscles: MuscleSet, segments: np.ndarray, share: float) -> np.ndarray:
-    """(N, 3) the same of a body that only six freedoms of three corners keep from drifting, contracted by ``share``."""
+    """Return the displacement (N, 3) of a free body contracted by ``share``; six degrees of freedom at three corners
+    are fixed against drift."""
     low, ahead, aside = (
         int(np.argmin(np.linalg.norm(COLUMN.nodes - corner, axis=1)))
         for corner in ([-0.2, -0.2, 0.0], [0.2, -0.2, 0.0], [-0.2, 0.2, 0.0])
@@ -149,8 +151,8 @@ def free_response(body: SoftBody, muscles: MuscleSet, segments: np.ndarray, shar
 def static_response(
     body: SoftBody, muscles: MuscleSet, segments: np.ndarray, share: float, held: np.ndarray
 ) -> np.ndarray:
-    """(N, 3) linear displacement under a contraction by ``share``, where the freedoms ``held`` (N, 3) or (N, 1) do not
-    move.
+    """Return the linear displacement (N, 3) under a contraction by ``share``, with the degrees of freedom ``held`` (N,
+    3) or (N, 1) fixed.
     """
     upper = body.assembly.matrix(body.assembly.hessian_entries(COLUMN.nodes))
     stiffness = (upper + sparse.triu(upper, 1).T).tocsc()
@@ -164,7 +166,7 @@ def static_response(
 
 
 def twist(moved: np.ndarray) -> float:
-    """Mean rotation of the upper half about the vertical axis, radians."""
+    """Return the mean rotation of the upper half about the vertical axis, rad."""
     top = COLUMN.nodes[:, 2] > 0.5
     x, u = COLUMN.nodes[top], moved[top]
     return float((x[:, 0] * u[:, 1] - x[:, 1] * u[:, 0]).sum() / (x[:, :2] ** 2).sum())
@@ -181,7 +183,7 @@ def lean(moved: np.ndarray) -> np.ndarray:
 
 
 def test_longitudinal_fibres_shorten_and_on_one_side_bend(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7): all of them lower the top without leaning; those on +x alone lean it towards +x.
+    """Eq. (7): all of them together lower the top without leaning; those on +x alone lean it towards +x.
 
     See docs/concepts/muscles.md.
     """
@@ -198,11 +200,11 @@ def test_longitudinal_fibres_shorten_and_on_one_side_bend(column_body: SoftBody,
 
 
 def test_radial_fibres_lengthen_by_poissons_ratio(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7), docs/concepts/muscles.md: a free body that radial fibres thin grows by nu sum(T L) / (E V), exactly, and
-    clamped its top rises.
+    """Eq. (7), docs/concepts/muscles.md: a free body that is compressed by its radial fibres grows by exactly nu sum(T
+    L) / (E V); with a clamped base its top rises.
 
-    Forces in equilibrium have the mean stress sum(f x^T) / V, which is -T L along each segment of length L that pulls
-    with T; the mean axial strain is -nu / E times the two lateral stresses.
+    Forces in equilibrium have the mean stress sum(f x^T) / V, which is -T L along each segment of length L and tension
+    T; the mean axial strain is -nu / E times the two lateral stresses.
     """
     radial = column_muscles.segments_of_kind(FibreKind.RADIAL)
     share = 0.002
@@ -211,7 +213,7 @@ def test_radial_fibres_lengthen_by_poissons_ratio(column_body: SoftBody, column_
     volumes = COLUMN.volumes()
     gradients = np.linalg.solve(corners[:, 1:] - corners[:, :1], shift[:, 1:] - shift[:, :1])
     axial = float(volumes @ gradients[:, 2, 2]) / volumes.sum()
-    # What the fibre file promises: at the bound of its activation, a strain of 30 %, a segment pulls with its strength.
+    # At the bound of the activation, a strain of 30 %, a segment has its documented strength.
     lengths = column_muscles.lengths(COLUMN.nodes)[radial]
     pull = share / 0.3 * column_muscles.max_forces[radial]
     material = column_body.assembly.material
@@ -223,8 +225,8 @@ def test_radial_fibres_lengthen_by_poissons_ratio(column_body: SoftBody, column_
 
 
 def test_radial_fibres_are_diameters_spread_over_length_and_directions(column_muscles: MuscleSet) -> None:
-    """Level, through the axis, from 0.7 of the way to one side to as far on the other; as many each way on each
-    level.
+    """Fibres are level, pass through the axis, and extend to 0.7 of the half-width on both sides; their directions are
+    evenly spread on each level.
     """
     ends = column_muscles.end_points(COLUMN.nodes)[
         column_muscles.segments[column_muscles.segments_of_kind(FibreKind.RADIAL)]
@@ -237,15 +239,15 @@ def test_radial_fibres_are_diameters_spread_over_length_and_directions(column_mu
     np.testing.assert_allclose(0.5 * np.linalg.norm(across, axis=1), 0.7 * reach, rtol=0.1)
     levels = np.unique(np.round(middles[:, 2], 1))
     assert len(levels) >= 3 and np.ptp(levels) > 0.5
-    # The squares of the directions' sines and cosines are alike: no way across is pulled more than another.
+    # The second moments of the directions are isotropic: all horizontal directions are contracted equally.
     second = np.einsum("ni,nj->ij", directions, directions) / len(directions)
     np.testing.assert_allclose(second, 0.5 * np.eye(2), atol=0.02)
 
 
 def test_oblique_fibres_twist_by_their_hand_and_hoops_do_not(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7): right- and left-handed helices twist opposite ways; hoops and radial fibres hardly at all.
+    """Eq. (7): right- and left-handed helices twist in opposite directions; hoops and radial fibres hardly at all.
 
-    A right-handed helix that contracts unwinds: seen from above its upper end turns clockwise (negative).
+    A right-handed helix that contracts unwinds: seen from above, its upper end rotates clockwise (negative).
 
     See docs/concepts/muscles.md.
     """
@@ -261,8 +263,8 @@ def test_oblique_fibres_twist_by_their_hand_and_hoops_do_not(column_body: SoftBo
 
 
 def test_hoops_make_no_axial_torque_between_halves(column_muscles: MuscleSet) -> None:
-    """A planar hoop's forces turn neither half of the body about the axis,
-    whatever its activations (erratum, docs/concepts/muscles.md).
+    """The forces of a planar hoop rotate neither half of the body about the axis, for any activation (erratum,
+    docs/concepts/muscles.md).
     """
     columns = activation_jacobian(column_muscles, COLUMN.nodes).toarray().reshape(-1, 3, column_muscles.segment_count)
     x = COLUMN.nodes
@@ -274,7 +276,8 @@ def test_hoops_make_no_axial_torque_between_halves(column_muscles: MuscleSet) ->
 
 
 def test_automatic_muscles_of_a_column(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Every kind is there, mirrored, reaches the ground all round, within budget; the same call gives the same bits."""
+    """Every kind exists, is mirrored and reaches the ground all around, within the budget; two calls give the same
+    bits."""
     muscles = column_muscles
     assert set(muscles.fibre_kinds) == set(FibreKind) - {FibreKind.USER}
     assert 60 <= muscles.segment_count <= 112

@@ -66,7 +66,7 @@ def test_small_bumps_are_no_branches() -> None:
 
 
 def test_the_skeleton_follows_its_up_axis_and_its_bits_repeat() -> None:
-    """The same figure lying in other axes has the same skeleton; two calls agree to the bit."""
+    """The same figure in other axes has the same skeleton; two calls agree bitwise."""
     mesh = figure()
     turned = TetMesh(np.ascontiguousarray(mesh.nodes[:, [1, 2, 0]]), mesh.tets)
     first, second = skeleton(mesh, UP), skeleton(mesh, UP)
@@ -79,7 +79,7 @@ def test_the_skeleton_follows_its_up_axis_and_its_bits_repeat() -> None:
 
 @pytest.mark.parametrize(("make", "branch_count"), [(column, 1), (stool, 4), (figure, 5)])
 def test_every_branch_gets_every_kind_of_fibre(make: Callable[[], TetMesh], branch_count: int) -> None:
-    """Four or more longitudinal fibres and all other kinds on each branch, within the budget of segments.
+    """Each branch has at least four longitudinal fibres and fibres of all other kinds, within the budget of segments.
 
     See docs/concepts/muscles.md.
     """
@@ -96,8 +96,8 @@ def test_every_branch_gets_every_kind_of_fibre(make: Callable[[], TetMesh], bran
 
 
 def test_legs_bend_both_ways_at_once() -> None:
-    """Each leg of a four-legged body has three segments or more on each of four sides,
-    and muscles that do not crumple it.
+    """Each leg of a four-legged body has at least three segments on each of four sides, and muscles that do not crush
+    it.
     """
     mesh = stool()
     muscles = automatic_muscles(mesh, UP, body_weight=100.0, height=0.8, young_modulus=1e4)

@@ -1,4 +1,4 @@
-"""Muscles as an energy: derivatives, Eq. (7), a step under them, and the slender column that a dead load buckles."""
+"""Muscle energy: derivatives, Eq. (7), a step under tension, and the slender column that a dead load buckles."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def dense(tension: MuscleEnergy, x: np.ndarray) -> np.ndarray:
 
 
 def test_segments_of_a_rod_that_is_pressed_are_shorter() -> None:
-    """By a tenth of their rest lengths, after any translation and rotation."""
+    """The rod is compressed by a tenth of its length, under any translation and rotation."""
     muscles, turned = tendon(3), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     pressed = (ROD.nodes * [1.0, 1.0, 0.9]) @ turned.T + [1.0, 2.0, 3.0]
     np.testing.assert_allclose(shortening(muscles, ROD.nodes, pressed), 0.1 * muscles.rest_lengths, rtol=1e-9)
@@ -58,8 +58,8 @@ def test_segments_of_a_rod_that_is_pressed_are_shorter() -> None:
 
 @pytest.mark.parametrize("shortened", [1.0, 0.55, 0.2], ids=["long", "short", "slack"])
 def test_force_and_stiffness_are_derivatives_of_the_energy(shortened: float) -> None:
-    """Central differences; the factors lack but the slackest segments. Below 0.7 of the rest length the tension falls,
-    below 0.3 there is none.
+    """Central differences; the low-rank factors leave out only the slackest segments. Below 0.7 of the rest length the
+    tension decreases, below 0.3 it is zero.
     """
     rng = np.random.default_rng(0)
     tension = scattered(rng)
@@ -80,11 +80,11 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(shortened: float) -> 
 
 @pytest.mark.parametrize("shortened", [1.0, 0.55, 0.2, 0.0], ids=["long", "short", "slack", "in a point"])
 def test_the_kernel_adds_the_force_to_that_of_the_elements(rod: SoftBody, shortened: float) -> None:
-    """Eq. (7): to rounding that of ``gradient``, of one set of muscles after another."""
+    """Eq. (7): the sum is that of ``gradient`` to rounding, for one set of muscles after another."""
     rng = np.random.default_rng(3)
     x = ROD.nodes + rng.normal(0.0, 0.002, ROD.nodes.shape)
     for tension in (scattered(rng), MuscleEnergy.of(tendon(5), rng.normal(size=5)), scattered(rng)):
-        # As if the segments were that much shorter than at rest.
+        # The segments have the lengths of shorter ones at rest.
         held = MuscleEnergy(tension.rows, tension.tensions, tension.rest_lengths / max(shortened, 1e-9))
         forces = rod.assembly.gradient(x, None, held) - rod.assembly.gradient(x)
         expected = held.gradient(x)
@@ -94,8 +94,8 @@ def test_the_kernel_adds_the_force_to_that_of_the_elements(rod: SoftBody, shorte
 
 
 def test_full_tension_has_the_energy_of_its_length() -> None:
-    """V = sum T L but for a constant where no segment is shorter than 0.7 of its rest length, so the force is
-    Eq. (7)'s; between 0.3 and 0.7 it does half the work of a full tension, and none below.
+    """V = sum T L plus a constant if no segment is shorter than 0.7 of its rest length, so the force is that of Eq.
+    (7). Between 0.3 and 0.7 the work is half of that of a full tension, and below it is zero.
     """
     muscles = tendon(5)
     activations = np.linspace(0.1, 0.3, 5) * muscles.bounds
@@ -112,7 +112,7 @@ def test_full_tension_has_the_energy_of_its_length() -> None:
 
 
 def test_force_is_equation_7_and_makes_no_net_force_or_torque() -> None:
-    """Eq. (7): A(p) a at any pose."""
+    """Eq. (7): the force is A(p) a in any pose."""
     rng = np.random.default_rng(1)
     muscles = tendon(5)
     activations = rng.uniform(-1.0, 1.0, 5) * muscles.bounds
@@ -125,7 +125,7 @@ def test_force_is_equation_7_and_makes_no_net_force_or_torque() -> None:
 
 
 def test_a_step_balances_momentum_under_tension(rod: SoftBody) -> None:
-    """Eq. (4): the muscles add none, neither linear nor angular, while they deform the rod."""
+    """Eq. (4): the muscles add neither linear nor angular momentum while they deform the rod."""
     rng = np.random.default_rng(2)
     x = ROD.nodes + rng.normal(0.0, 0.002, ROD.nodes.shape)
     state, tension = BodyState(x, rng.normal(0.0, 0.3, x.shape)), scattered(rng)
@@ -150,7 +150,8 @@ def equilibrium(
     gradient: Callable[[np.ndarray], np.ndarray],
     hessian: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """(N, 3) least ``energy`` near ``start`` (N, 3) by the ``free`` (N,) nodes, a trust region's."""
+    """Return the minimum (N, 3) of ``energy`` near ``start`` (N, 3) over the ``free`` (N,) nodes, by a trust-region
+    method."""
     moving = np.repeat(free, 3)
 
     def whole(y: np.ndarray) -> np.ndarray:
@@ -171,7 +172,8 @@ def equilibrium(
 
 
 def press(rod: SoftBody, load: float, *, follows: bool) -> np.ndarray:
-    """(N, 3) the rod on its held foot, nudged sideways, under its tendon's pull of ``load`` newtons."""
+    """Return the shape (N, 3) of the rod with a clamped base and a small sideways perturbation, under the tension
+    ``load``, N, of its tendon."""
     assembly, muscles = rod.assembly, tendon(6)
     tension = MuscleEnergy(muscles.difference_rows, np.full(6, load), muscles.rest_lengths)
     x = ROD.nodes + 0.01 * ROD.nodes[:, 2:] ** 2 * [1.0, 0.0, 0.0]
@@ -204,8 +206,8 @@ def press(rod: SoftBody, load: float, *, follows: bool) -> np.ndarray:
 
 @pytest.mark.slow
 def test_a_tendon_holds_the_rod_straight_that_its_dead_load_buckles(rod: SoftBody) -> None:
-    """A tendon inside a rod cannot buckle it (its thrust bends with the rod);
-    with its direction frozen over a step it does.
+    """A tendon inside a rod cannot buckle it, because its thrust bends with the rod; with its direction frozen over a
+    step it does.
     """
     second_moment, length = 0.08**4 / 12, 0.9
     euler = np.pi**2 * rod.young_modulus * second_moment / (4 * length**2)
@@ -219,7 +221,8 @@ def test_a_tendon_holds_the_rod_straight_that_its_dead_load_buckles(rod: SoftBod
 def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
     rod: SoftBody, share: float, dt: float
 ) -> None:
-    """A free rod pressed by its tendon with ``share`` of Euler's load, below and above it; against dense matrices."""
+    """A free rod compressed by its tendon with ``share`` of Euler's load, below and above it, against dense
+    matrices."""
     euler = np.pi**2 * rod.young_modulus * 0.08**4 / 12 / 0.9**2
     tension = MuscleEnergy(tendon(6).difference_rows, np.full(6, share * euler), tendon(6).rest_lengths)
     still = np.zeros_like(ROD.nodes)
@@ -239,7 +242,7 @@ def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
     right = np.random.default_rng(3).standard_normal((whole.shape[0], 4))
     tangent = problem.tangent(MultifrontalLdl(rod.assembly.upper_pattern), still, tension)
     found = tangent.solve(right)
-    # Except for the rigid rotation that conserves the angular momentum.
+    # Apart from the rigid rotation that conserves the angular momentum.
     turned = problem.momenta.T
     missing = right - whole @ found
     missing = missing - turned @ np.linalg.lstsq(turned, missing, rcond=None)[0]
@@ -248,8 +251,8 @@ def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
 
 
 def test_impulses_of_groups_are_the_columns_of_their_muscles() -> None:
-    """Eq. (7) at the bounds, times the step size, for a body so bent that some segments lose force; with one muscle per
-    group, and with several."""
+    """Eq. (7) at the bounds, times the step size, for a body bent until some segments lose tension; with one
+    muscle per group, and with several."""
     creature = coarse_pawn()
     muscles, rest = creature.muscles, creature.body.mesh.nodes
     bent = rest * [1.0, 1.0, 0.6] + 0.01 * np.random.default_rng(0).standard_normal(rest.shape)

@@ -1,4 +1,4 @@
-"""Failures of the machine during a run: the simulation is retained, and no file is partial or of another run."""
+"""Failures of the machine during a run: the simulation is kept, and no file is partial or from another run."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def thing() -> BuiltInObject:
 
 @pytest.fixture(scope="module")
 def performance() -> SimulatedRun:
-    """Two pictures of a coarse pawn."""
+    """A simulated run of a coarse pawn with two frames."""
     creature = make_creature(thing().cloud, plane=thing().plane, options=CreatureOptions(friction=0.6, nodes=120))
     return simulate(creature, motion("jump"), frames=2)
 
 
 @pytest.fixture
 def run(performance: SimulatedRun, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Report]:
-    """``animate`` without the seconds before its first file."""
+    """``animate`` without the simulation."""
     monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", lambda *_, **__: performance.creature)
     monkeypatch.setattr("egs_warp.pipelines.animate.simulate", lambda *_, **__: performance)
 
@@ -113,7 +113,7 @@ def test_a_run_that_is_cut_off_leaves_its_steps(
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_film_from_straight_above_or_below(performance: SimulatedRun, side: float) -> None:
-    """The way the body faces is up in the picture."""
+    """The facing direction of the body is up in the picture."""
     up = thing().plane.normal
     camera = performance.camera(64, side * up)
     np.testing.assert_allclose(camera.rotation[2], [0.0, 0.0, -side], atol=1e-9)
@@ -121,7 +121,7 @@ def test_a_film_from_straight_above_or_below(performance: SimulatedRun, side: fl
 
 
 def test_of_several_sides_a_film_is_taken_from_the_one_nearest_to_the_usual(performance: SimulatedRun) -> None:
-    """The usual one shows the face and the way."""
+    """The default view shows the face and the path."""
     first, second = thing().plane.tangents()
     around = 2.0 * np.pi * (np.arange(7)[:, None] + 0.3) / 7
     ways = np.cos(around) * first + np.sin(around) * second + 0.5 * thing().plane.normal
@@ -144,8 +144,9 @@ def test_no_ffmpeg_is_told_before_anything_is_done(
 def test_a_disk_that_is_full_at_any_file(
     run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each opening and each renaming fails once in turn: one line, no temporary file, and what is there is not called
-    finished. The next run, of every fourth, moves it aside. Forty plots would take most of a minute to draw.
+    """Each opening and each renaming of a file fails once in turn: there is a one-line error, no temporary file, and
+    the run does not count as finished. In every fourth case, the next run moves it aside. Plotting is replaced, because
+    forty plots would take most of a minute.
     """
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"plots"))
     failures = 0
@@ -166,7 +167,7 @@ def test_a_disk_that_is_full_at_any_file(
         if number % 4 == 0:
             run(folder, overwrite=True)
             assert finished(folder) and set(FILES) <= set(os.listdir(folder))
-    # Seven files, the manifest before each of them and at the end, each opened and renamed.
+    # Seven files, with the manifest written before each of them and at the end; each is opened and renamed.
     assert failures == number == 30
 
 

@@ -1,4 +1,4 @@
-"""The one file of a run, read by the example that needs numpy alone, is what the deformer makes."""
+"""The single-file bundle of a run, read by the example that needs only NumPy, agrees with the deformer."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def run(run_folder: Path) -> FinishedRun:
 
 
 def test_the_reader_agrees_with_the_deformer(run: FinishedRun, tmp_path: Path) -> None:
-    """With nodes pushed about at random, so that many splats lie across tetrahedra that differ."""
+    """Nodes are displaced at random, so that many splats extend across tetrahedra with different deformation."""
     rng = np.random.default_rng(2)
     t = run.trajectory
     t.positions[run.steps[9]] += 0.02 * rng.normal(size=t.rest_positions.shape)

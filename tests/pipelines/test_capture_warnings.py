@@ -1,4 +1,4 @@
-"""Bodies that are not what the user may think."""
+"""Warnings about bodies that the user may not expect."""
 
 from __future__ import annotations
 

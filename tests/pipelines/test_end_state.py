@@ -1,4 +1,4 @@
-"""The end state of a run is in its report, summary and exit status; all files exist in each state."""
+"""The end state of a run is in its report, summary and exit status; all files are written for each state."""
 
 from __future__ import annotations
 

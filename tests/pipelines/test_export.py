@@ -1,4 +1,4 @@
-"""A run as files of other tools, read back by other readers where there are any."""
+"""Export of a run to files of other tools, checked by independent readers where available."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def run(run_folder: Path) -> FinishedRun:
 
 
 def _in_capture(run: FinishedRun, frame: int) -> np.ndarray:
-    """(n, 3) means of the creature in the capture's frame, by the formula of docs/guide/report.md."""
+    """Return the means (n, 3) of the creature in the frame of the capture, by the formula of docs/guide/report.md."""
     t = run.trajectory
     means = run.deformer().deform(t.positions[run.steps[frame]]).cloud.means.numpy().astype(np.float64)
     return t.body_origin + (means / t.metres_per_unit) @ t.body_axes
@@ -43,7 +43,7 @@ def test_splat_files_lie_in_the_frame_of_the_capture(run: FinishedRun, tmp_path:
     means = read_capture(path).cloud.means.numpy()
     expected = _in_capture(run, 12)
     assert len(means) == len(expected)
-    # Some writers put Gaussians into another order.
+    # Some writers reorder the Gaussians.
     distance, _ = KDTree(means).query(expected)
     assert distance.max() < tolerance
 
@@ -55,7 +55,7 @@ def test_a_sequence_is_numbered_at_sixty_hertz(run: FinishedRun, tmp_path: Path,
     assert names == [f"frame{k:04d}.compressed.ply" for k in (0, 4, 8, 12)]
     assert "frame0000.compressed.ply to frame0012.compressed.ply" in capsys.readouterr().out
     assert read_capture(tmp_path / "out" / names[0]).cloud.count == run.creature.splats.count
-    # The same again is written over; others would be shown in turns with these.
+    # The same files may be overwritten; other frames would be mixed with them.
     (tmp_path / "out" / "frames.compressed.ply").write_text("not one of them")
     assert main(flags) == 0
     capsys.readouterr()
@@ -69,7 +69,7 @@ def test_a_sequence_is_numbered_at_sixty_hertz(run: FinishedRun, tmp_path: Path,
 
 
 def _glb(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
-    """After the words of the glTF 2.0 standard."""
+    """Read a .glb file according to the glTF 2.0 standard."""
     data = path.read_bytes()
     magic, version, length, size, kind = np.frombuffer(data, "<u4", 5)
     assert (magic, version, length, kind) == (0x46546C67, 2, len(data), 0x4E4F534A) and size % 4 == 0
@@ -183,7 +183,7 @@ def test_frames_are_not_put_among_the_files_of_a_run(
 
 
 def test_nvidias_rule_for_splats_finds_nothing(run: FinishedRun, tmp_path: Path):
-    """VG.035 of the Omniverse asset requirements."""
+    """Rule VG.035 of the Omniverse asset requirements."""
     validator = pytest.importorskip("omni.asset_validator")
     path = tmp_path / "run.usdc"
     export_usd(run, path, every=6, quiet=True)

@@ -17,13 +17,13 @@ from egs_warp.pipelines.facing_direction import Front, mean_view
 from tests.support.frames import Lying
 
 DOWN = np.array([0.0, -1.0, 0.0])
-"""The way that the built-in figures face."""
+"""Facing direction of the built-in figures."""
 
 
 def front_of(
     standing: PlacedCage, front: np.ndarray | None = None, seen_from: np.ndarray | None = None
 ) -> tuple[Front, np.ndarray]:
-    """The front, and its direction in the capture."""
+    """Return the facing direction and its vector in the capture."""
     found = choose_front(standing, front, seen_from=seen_from)
     return found, standing.frame.axes.T @ found.direction
 
@@ -41,7 +41,7 @@ def thing(request: pytest.FixtureRequest) -> BuiltInObject:
 
 @pytest.fixture(scope="module")
 def standing(thing: BuiltInObject) -> PlacedCage:
-    """As its file lies."""
+    """The cage in the original orientation of the file."""
     return place_cage(thing.cloud, plane=thing.plane, nodes=200)
 
 
@@ -49,7 +49,7 @@ def standing(thing: BuiltInObject) -> PlacedCage:
 def test_a_bear_looks_where_its_face_is_and_a_stool_away_from_its_back(
     thing: BuiltInObject, standing: PlacedCage, turn: list[float] | None
 ) -> None:
-    """However the file lies; the line tells the direction in the file, and why."""
+    """In any orientation of the file; the message gives the direction in the file, and the reason."""
     way = DOWN
     if turn is not None:
         axes = Rotation.from_rotvec(turn).as_matrix()
@@ -64,7 +64,7 @@ def test_a_bear_looks_where_its_face_is_and_a_stool_away_from_its_back(
 
 
 def plain_box(width: float, depth: float) -> Lying:
-    """A grey box, alike on all sides."""
+    """Return a grey box with equal sides."""
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.5, 0.5, (6000, 3))
     face_of = rng.integers(0, 3, len(points))
@@ -84,7 +84,7 @@ def plain_box(width: float, depth: float) -> Lying:
 
 @pytest.mark.slow
 def test_what_was_photographed_from_one_side_shows_its_front_there() -> None:
-    """A box that says nothing itself."""
+    """A box without features has no front of its own."""
     box = plain_box(0.9, 0.5)
     standing = place_cage(box.cloud, plane=box.plane, nodes=200)
     for side in (1.0, -1.0):

@@ -1,4 +1,4 @@
-"""A warning reports a body that ends outside the captured ground."""
+"""A body that ends outside the captured ground causes a warning."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ TABLE = lying(np.concatenate([level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.03), level(
 
 
 def box(x: float, lift: float = 0.0) -> np.ndarray:
-    """(n, 3) nodes of a box of one unit that stands about ``x``."""
+    """Return the nodes (n, 3) of a box of one unit that stands at ``x``."""
     corners = np.stack(np.meshgrid(*[np.linspace(-0.2, 0.2, 5)] * 2, np.linspace(0.0, 1.0, 6)), axis=-1)
     return corners.reshape(-1, 3) + [x, 0.0, lift]
 
 
 @pytest.mark.parametrize(("x", "share"), [(0.0, 1.0), (0.99, 0.6), (1.6, 0.0)])
 def test_how_much_of_it_stands_on_ground(x: float, share: float) -> None:
-    """On the table, over its edge (three of five columns of nodes), and beyond it, over a floor far below."""
+    """On the table, over its edge (three of five columns of nodes are on it), and beyond it, over a floor far below."""
     assert share_over_ground(box(x), TABLE, FLAT, 1.0) == pytest.approx(share)
 
 
@@ -36,7 +36,7 @@ def test_what_is_told() -> None:
     )
     (line,) = ground_coverage_warning(box(1.6), TABLE, FLAT, 1.0)
     assert line.startswith("it ends beyond the edge of the captured ground, in the air; choose a shorter distance")
-    # In the air at the end, or without a scene, nothing is said; a scene without ground is all edge.
+    # A body in the air at the end, or without a scene, causes no warning; a scene without ground does.
     assert (
         ground_coverage_warning(box(1.6, 0.3), TABLE, FLAT, 1.0)
         == ground_coverage_warning(box(1.6), None, FLAT, 1.0)
@@ -47,7 +47,7 @@ def test_what_is_told() -> None:
 
 
 def test_ground_that_is_not_flat_is_where_it_is() -> None:
-    """A slope, on which both body and splats stand higher to the right."""
+    """On a slope, both body and splats are higher to the right."""
     heights = np.tile(0.2 * np.linspace(-2.0, 2.0, 41), (41, 1))
     field = HeightField.through(np.eye(3), np.array([-2.0, -2.0, 0.0]), 0.1, heights)
     points = level((-2.0, -1.0), (1.0, 1.0), 0.0, 0.03)

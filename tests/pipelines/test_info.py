@@ -1,4 +1,4 @@
-"""Text and picture of ``egs-warp info``."""
+"""Text and image of ``egs-warp info``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def chair() -> BodyInfo:
 
 
 def test_a_chair_is_told_by_what_can_be_measured(chair: BodyInfo) -> None:
-    """Front right and left, back right and left, in the order of the numbers; lengths in body heights."""
+    """Feet in the order of their numbers: front right and left, back right and left; lengths in body heights."""
     assert chair.base is SupportKind.FEET and len(chair.feet) == 4
     soles = chair.soles() / chair.body.height
     assert np.sign(soles[:, :2]).astype(int).tolist() == [[1, 1], [-1, 1], [-1, -1], [1, -1]]
@@ -72,7 +72,7 @@ def test_the_picture_has_every_foot_in_its_colour(chair: BodyInfo, tmp_path: Pat
 
 
 def snake() -> GaussianCloud:
-    """A bar of ten times its height."""
+    """A bar whose length is ten times its height."""
     rng = np.random.default_rng(0)
     points = rng.uniform(size=(5000, 3)) * [1.0, 0.1, 0.1] - [0.5, 0.05, 0.0]
     count = len(points)

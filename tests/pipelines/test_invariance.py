@@ -1,5 +1,5 @@
-"""A creature is the same however its file lies: muscles, contact, first steps bit for bit; a jump and its pictures
-within bands, in any unit and turned.
+"""A creature does not depend on the frame of its file: muscles, contacts and first steps are bitwise equal; a jump and
+its images are equal within tolerances, in any unit and orientation.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ WHERE_IT_LIES = {"body_axes", "body_origin", "metres_per_unit"}
 
 
 def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, RolloutResult]:
-    """The first ``frames`` pictures of a jump, or all of it; the plane is given, or found from up alone."""
+    """Simulate a jump, or its first ``frames`` frames; the plane is given, or found from up alone."""
     if by_up:
         creature = make_creature(lying.cloud, up=lying.up)
     else:
@@ -41,7 +41,8 @@ def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tup
 
 
 def pictures(creature: Creature, positions: np.ndarray) -> np.ndarray:
-    """(4, H, W, 3) of the creature carried to node ``positions``, from cameras that its own frame holds."""
+    """Return images (4, H, W, 3) of the creature deformed to node ``positions``, by cameras that are fixed in its own
+    frame."""
     carried = deform(creature.cloud, embed_gaussians(creature.cloud, creature.cage.mesh), positions).cloud
     cameras = ring_cameras(GROUND, np.array([0.0, 0.0, 0.5]), 0.8, count=4, size=96)
     return np.stack([render_gaussians(carried, camera).colour.numpy() for camera in cameras])
@@ -65,7 +66,7 @@ def first_steps(thing: Lying) -> tuple[Creature, RolloutResult]:
 
 @pytest.fixture(scope="module")
 def elsewhere(thing: Lying) -> tuple[Lying, Creature, RolloutResult]:
-    """The same, moved, turned and in another unit, with its plane."""
+    """The same capture and jump, translated, rotated and in another unit, with the plane given."""
     lying = thing.moved((3.0, 1.0, -2.0)).turned().scaled(0.37)
     return lying, *jump(lying, frames=3)
 
@@ -122,7 +123,7 @@ def test_same_pictures_from_up_alone(
 
 
 def test_trajectory_leads_back_to_the_capture(elsewhere: tuple[Lying, Creature, RolloutResult]) -> None:
-    """The nodes at the start stand where the Gaussians are, on the capture's plane."""
+    """The nodes at the start are at the Gaussians, on the plane of the capture."""
     turned, _, simulation = elsewhere
     trajectory = simulation.trajectory
     nodes, means = trajectory.in_capture(trajectory.rest_positions), turned.cloud.means.numpy()
@@ -134,8 +135,8 @@ def test_trajectory_leads_back_to_the_capture(elsewhere: tuple[Lying, Creature, 
 
 
 LIMIT = 0.01
-"""Tolerance of distance and height. All of these cases give the same bits as the first; a single one of some 10,000
-contact points that is rounded differently may change the jump by up to 2 %.
+"""Tolerance of distance and height. All these cases give the bits of the first; a single contact point of some 10,000
+that is rounded differently may change the jump by up to 2 %.
 """
 CHANGES: dict[str, Callable[[Lying], Lying]] = {
     "x0.37": lambda thing: thing.scaled(0.37),
@@ -168,16 +169,16 @@ def test_jump_is_the_same_however_the_file_lies(thing: Lying, name: str) -> None
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0))])
 def test_jump_of_real_captures_is_the_same(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
-    """Turned and in another unit, with nothing but up."""
+    """The captures are rotated and in another unit, with only up given."""
     cloud = read_capture(data_dir / "objects" / name).cloud
     lying = Lying(cloud, find_base_plane(cloud, np.array(up, float)))
     assert_same_jump(lying, lying.turned().scaled(0.37), by_up=True)
 
 
 def test_front_is_where_the_face_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The figurine looks along -y of its file; its camera stands before it, however the file lies.
+    """The figurine faces along -y of its file and its camera is in front of it, in any orientation of the file.
 
-    Its front does not hang on how its weight bends it, so it is not settled.
+    The front does not depend on the sag under its weight, so the settling is skipped.
     """
     monkeypatch.setattr("egs_warp.pipelines.creature.settle", at_rest)
     made = figurine(gaussian_count=6000)

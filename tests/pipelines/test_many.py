@@ -1,4 +1,4 @@
-"""Many runs of one creature: each has the bits of its run alone."""
+"""Many runs of one creature: each has the bits of a single run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import coarse_pawn
 
 FRAMES, FEW = 31, 11
-"""30 steps after the first picture, and 10 where nothing new comes later."""
+"""Numbers of frames: 30 steps after the first frame, and 10 where nothing new happens later."""
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def creature() -> Creature:
 
 @pytest.fixture(scope="module")
 def jobs(creature: Creature) -> list[Job]:
-    """Target, ground, style, push, activations; and two that cannot be done."""
+    """Jobs with their own target, friction, style, push or activations, and two invalid ones."""
     count = creature.muscles.segment_count
     held = 0.1 * np.sin(np.arange(10.0)[:, None] + np.arange(count)) * creature.muscles.bounds
     return [
@@ -85,7 +85,7 @@ def test_each_has_the_bits_of_its_run_alone(
         assert len(outcome.trajectory.dt) >= (30 if number in (0, 2) else 10)
         assert same(outcome.trajectory, performance.trajectory), number
         assert np.array_equal(outcome.frames, performance.simulation.frames)
-    # They differ from one another.
+    # The trajectories differ from one another.
     ends = np.array([outcomes[number].trajectory.positions[10] for number in alone])
     apart = np.abs(ends[:, None] - ends[None]).max(axis=(2, 3)) + np.eye(len(ends))
     assert apart.min() > 1e-6 * creature.body.height
@@ -119,8 +119,8 @@ def test_progress_ends_where_all_is_done(told: list[tuple[int, int]], outcomes: 
 
 @pytest.mark.slow
 def test_side_by_side_each_is_as_alone(creature: Creature, tmp_path: Path) -> None:
-    """Jobs of two lengths of step, on three grounds, one longer than the others, beside one that goes to a worker and
-    two that cannot be done: trajectories to 1e-9 body heights, all in the order of the jobs."""
+    """Jobs of two step sizes, on three grounds, one longer than the others, beside one that runs in a worker and two
+    invalid ones: trajectories agree to 1e-9 body heights, in the order of the jobs."""
     count = creature.muscles.segment_count
     held = 0.3 * np.sin(np.arange(6.0)[:, None] + np.arange(count)) * creature.muscles.bounds
     asked = motion("stand 1")
@@ -201,7 +201,7 @@ def test_over_ray_it_has_the_same_bits(creature: Creature, monkeypatch: pytest.M
 
 
 def test_trajectories_may_lie_in_a_folder(creature: Creature, tmp_path: Path) -> None:
-    """The callback receives each result with its number."""
+    """The callback receives the number of each result."""
     ended: dict[int, JobResult] = {}
     jobs = [Job(motion("stand 1"), frames=count) for count in (4, 3)]
     made = simulate_many(
@@ -232,7 +232,8 @@ def test_other_ground_is_that_of_a_creature_made_on_it(creature: Creature) -> No
 
 
 def test_activations_of_a_run_bring_it_about_again(creature: Creature) -> None:
-    """10 recorded steps are nearly reproduced: with prescribed activations, contact points are selected differently."""
+    """10 recorded steps are reproduced approximately: with prescribed activations, contact points are selected
+    differently."""
     first = simulate(creature, motion("jump"), frames=11)
     assert all(report.dt == first.simulation.reports[0].dt for report in first.simulation.reports)
     again = simulate(creature, motion("jump"), activations=first.trajectory.activations)

@@ -1,4 +1,4 @@
-"""The plots of a run hold what the run did."""
+"""The plots of a run show its quantities."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses of photos, by pycolmap."""
+"""Camera poses of photos by pycolmap."""
 
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
 def test_a_folder_belongs_to_one_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Remnants of a killed run are removed; an earlier run is rejected or backed up; unfinished files are temporary."""
+    """Remnants of a killed run are removed; an earlier run is refused or moved aside; unfinished files have temporary
+    names."""
     photos, out = photos_of_noise(tmp_path / "photos"), tmp_path / "out"
     left = out / ".egs-pose-left"
     left.mkdir(parents=True)
@@ -88,7 +89,7 @@ def test_a_folder_belongs_to_one_run(
 def test_a_model_that_does_not_fit_on_the_disk_is_told(
     room: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """COLMAP does not report it."""
+    """COLMAP does not report an incomplete write of its model on a full disk."""
     reconstruct_by(monkeypatch, partial(model, capacity=room))
     out = tmp_path / "out"
     assert main(["pose", str(photos_of_noise(tmp_path / "photos")), "--out", str(out)]) == 1
@@ -99,7 +100,7 @@ def test_a_model_that_does_not_fit_on_the_disk_is_told(
 def test_what_colmap_cannot_do_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An example is a database on a full disk."""
+    """The example is a database on a full disk."""
 
     def fails(*_: object, **__: object) -> None:
         raise RuntimeError("No registered database factory succeeded.\nmore")
@@ -117,7 +118,8 @@ def test_what_colmap_cannot_do_is_one_line(
 def test_photos_of_a_room_get_the_poses_that_they_had(
     data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Twelve neighbours of the bonsai, one of them turned by its tag: all are posed, as far apart as before."""
+    """Twelve adjacent photos of the bonsai, one of them rotated by an EXIF tag: all get poses, with the known relative
+    distances."""
     pytest.importorskip("pycolmap")
     photos = tmp_path / "photos"
     photos.mkdir()

@@ -1,4 +1,4 @@
-"""``animate SCENE --object``: invalid arguments are reported first, no file is lost, and a film is written."""
+"""``animate SCENE --object``: invalid arguments are reported first, no file is lost, and a video is written."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def prepared() -> PreparedScene:
-    """The ball taken off its floor, whose hole is left."""
+    """The ball separated from its floor, whose hole is left open."""
     options = SceneOptions(clearing=StraddlingPolicy.SPLIT, inpaint=False)
     return prepare_scene(ball_on_floor()[0], ObjectSpec(point=np.array([0.0, -0.5, 0.5])), options=options)
 
@@ -92,7 +92,7 @@ def test_what_only_a_scene_takes_needs_the_object(
 
 
 def _noting(told: dict[str, Any]) -> Callable[..., None]:
-    """Stands for a function: ends the command, and keeps the arguments that it was given by name."""
+    """Return a substitute for a function that ends the command and stores the keyword arguments that it received."""
 
     def note(*_: object, **named: Any) -> None:
         told.update(named)
@@ -126,8 +126,8 @@ def test_the_parts_of_earlier_steps_are_animated(
 
 @pytest.mark.slow
 def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Measured, told, written beside the plane, read again and handed to the animation; ``--flat`` keeps to the plane;
-    and the object settles on it where it stood.
+    """The ground is measured, reported, written beside the plane, read again and passed to the animation; ``--flat``
+    keeps the plane; the object settles on it where it stood.
     """
     cloud, truth = on_folds(0.04, length=0.9)
     click = ObjectSpec(point=np.array([0.0, 0.0, 0.5]))
@@ -136,7 +136,7 @@ def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monke
     ground = prepared.ground
     assert ground is not None and any(note.startswith("the ground is not flat") for note in prepared.notes)
     heights = ground.heights(prepared.object.means.numpy())
-    # None of it is cut off at the plane.
+    # The object is not cut off at the plane.
     assert heights.min() > -0.01 and prepared.object.count > 0.95 * truth.sum()
     prepared.write(tmp_path)
     for flag in ((), ("--flat",)):
@@ -149,13 +149,14 @@ def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monke
         else:
             nodes = ground.nodes().reshape(-1, 3)
             assert np.abs(told["options"].creature.ground.heights(nodes)).max() < 1e-3
-    # Stiff: its own sag, 0.033 of its height on a coarse cage where 0.05 is requested, would hide a fall of 0.017.
+    # The body is stiff: its own sag, 0.033 of its height on a coarse cage where 0.05 is requested, would hide a drop of
+    # 0.017.
     creature = make_creature(prepared.object, options=CreatureOptions(ground=ground, sag=0.01, nodes=120))
     body, start = creature.body, creature.start.positions
     assert creature.geometry.field is not None
-    # It touches the ground where it was captured, and sinks by 0.015; where the ground is not raised to it, it hangs
-    # 0.017 above and sinks by 0.027. A ball on the slope of a fold rolls: on the folds themselves its middle goes 0.075
-    # aside.
+    # It touches the ground where it was captured, and sinks by 0.015. If the ground were not raised to it, it would
+    # hang 0.017 above and sink by 0.027. A ball on the slope of a fold rolls: on the folds themselves its centre moves
+    # by 0.075 to the side.
     assert abs(creature.stepper.detector.gaps(body.mesh.nodes)[0].min()) < 0.005 * body.height
     assert abs((body.centre_of_mass(start) - body.centre_of_mass(body.mesh.nodes))[2]) < 0.02 * body.height
     assert creature.stepper.detector.gaps(start)[0].min() > -0.01 * body.height
@@ -165,7 +166,7 @@ def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monke
 def test_one_command_from_a_scene_to_a_film(
     scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As without PyTorch, whose training takes a minute."""
+    """The test runs as if PyTorch were missing, because training takes a minute."""
     monkeypatch.setattr("egs_warp.pipelines.prepare_scene.has_torch", lambda: False)
     scene, out = str(scene_file), tmp_path / "out"
     flags = ["--object", "0,-0.5,0.5", "--frames", "2", "--size", "64", "--out", str(out)]
@@ -179,7 +180,7 @@ def test_one_command_from_a_scene_to_a_film(
     ball = read_capture(out / "object.ply").cloud.means.numpy()
     assert not ((rest[:, 2] > 0.05) & (np.linalg.norm(rest - [0.0, 0.0, 0.5], axis=1) < 0.55)).any()
     assert (np.linalg.norm(ball - [0.0, 0.0, 0.5], axis=1) < 0.55).sum() > 1400
-    # There is floor where it stood.
+    # The floor continues where the ball stood.
     assert ((np.abs(rest[:, 2]) < 0.05) & (np.linalg.norm(rest[:, :2], axis=1) < 0.1)).sum() > 20
 
 
@@ -226,7 +227,8 @@ def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
 
 @pytest.mark.slow
 def test_what_hangs_above_the_ground_leaves_no_hole(tmp_path: Path) -> None:
-    """A ball a fifth of its size above the floor comes down; nothing is painted, ``plane.json`` tells of no hole."""
+    """A ball at a fifth of its size above the floor is set down; no floor is painted, and ``plane.json`` has no
+    hole."""
     cloud, truth = ball_on_floor(lift=0.33)
     spec = ObjectSpec(point=np.array([0.0, -0.5, 0.83]))
     scene = prepare_scene(cloud, spec, options=SceneOptions(clearing=StraddlingPolicy.SPLIT))

@@ -1,4 +1,4 @@
-"""Bars whose time left is meant to be believed."""
+"""Progress bars with a realistic remaining time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from egs_warp.segmentation.clearance import StraddlingPolicy
 
 
 def drawn(options: SceneOptions, monkeypatch: pytest.MonkeyPatch, told: list[tuple[float, str, float]]) -> list[str]:
-    """Return the screen line after each of ``told``: seconds since the start, stage, fraction of it."""
+    """Return the displayed line after each of ``told``: seconds since the start, stage, completed fraction."""
     clock = [1000.0]
     monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
     file, lines = io.StringIO(), []
@@ -27,7 +27,7 @@ def drawn(options: SceneOptions, monkeypatch: pytest.MonkeyPatch, told: list[tup
 
 
 def test_a_scene_tells_its_stages_and_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the middle of its longest stage half of the time is over, to a few percent."""
+    """In the middle of the longest stage, half of the time has passed, to a few percent."""
     told = [(0.0, "plane", 0.0), (12.0, "ground", 0.0), (27.0, "segment", 0.0), (50.0, "segment", 0.5)]
     assert drawn(SceneOptions(clearing=StraddlingPolicy.FINETUNE), monkeypatch, told) == [
         "scene: plane, 00:00<?",
@@ -38,14 +38,14 @@ def test_a_scene_tells_its_stages_and_what_is_left(monkeypatch: pytest.MonkeyPat
 
 
 def test_what_is_not_done_is_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without ground, training and floor there is little behind the plane."""
+    """Without ground, training and floor, little remains after the plane."""
     options = SceneOptions(clearing=StraddlingPolicy.SPLIT, flat=True, inpaint=False)
     lines = drawn(options, monkeypatch, [(0.0, "plane", 0.0), (12.0, "segment", 0.0)])
     assert lines[1] == "scene: segment, 00:12<00:02"
 
 
 def test_stages_tell_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the share of the time that is over when each begins."""
+    """Each stage has a typical fraction of the time before it."""
     clock = [1000.0]
     monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
     for bar, name, told in (

@@ -1,4 +1,4 @@
-"""The film of a finished run again: the same one, and others."""
+"""Videos of a finished run: the same one again, and others."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_without_flags_it_is_the_film_bit_for_bit(run_folder: Path, tmp_path: Pa
 def test_files_of_a_run_are_not_written_over(
     line: str, run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its film and its steps stay, and their checksums with them."""
+    """Its video and its steps stay, and so do their checksums."""
     write_ply(tmp_path / "a.ply", pawn(gaussian_count=50).cloud)
     with owned(tmp_path / "other", command="segment") as other:
         write_ply(other.file("object.ply"), pawn(gaussian_count=60).cloud)
@@ -155,7 +155,7 @@ def test_depth_is_in_millimetres_and_alpha_is_the_creatures(run: FinishedRun, tm
 
 @pytest.mark.parametrize("ending", [".mov", ".webm"])
 def test_videos_keep_alpha(ending: str, run: FinishedRun, tmp_path: Path) -> None:
-    """Decoded again by ffmpeg; VP9's alpha by the library that made it."""
+    """Videos are decoded by ffmpeg; VP9 with alpha by its own library."""
     import subprocess
 
     from egs_warp.io.video import ffmpeg_program

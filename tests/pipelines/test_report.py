@@ -12,7 +12,7 @@ from egs_warp.pipelines.report import StageTime, stage_times, versions
 
 
 def test_a_frame_without_a_stage_spends_no_time_in_it() -> None:
-    """Three frames of two, one and one steps, of which only the last replans."""
+    """Three frames consist of two, one and one steps, of which only the last replans."""
     spent = [{"predict": 3.0}, {"predict": 5.0}, {"predict": 1.0}, {"predict": 6.0, "replan": 9.0}]
     steps = [cast(StepReport, SimpleNamespace(milliseconds=stages)) for stages in spent]
     timing = stage_times(steps, np.array([0, 2, 3, 4]), {"render": [2.0, 4.0], "split": []})
@@ -20,6 +20,6 @@ def test_a_frame_without_a_stage_spends_no_time_in_it() -> None:
 
 
 def test_a_package_without_metadata_loses_no_report() -> None:
-    """One that is missing, or copied without its ``dist-info``."""
+    """The package is missing, or was copied without its ``dist-info``."""
     told = versions(("numpy", "egs-warp-is-no-such-package"))
     assert told["numpy"] == np.__version__ and told["egs-warp-is-no-such-package"] == "no metadata"

@@ -21,7 +21,7 @@ CAMERAS = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 1.0, count=4, elevation
 
 @pytest.fixture(scope="module")
 def found() -> tuple[GaussianCloud, LocatedPlane]:
-    """A ball on a floor, by a point."""
+    """A ball on a floor, located by a point."""
     cloud = concatenate(round_ones(shell(), 0.03), lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05)))
     return cloud, locate_plane(cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5])), plane=FLOOR)
 
@@ -45,7 +45,7 @@ def test_an_object_at_the_edge_of_pictures(found: tuple[GaussianCloud, LocatedPl
 
 
 def test_an_object_without_its_foot(found: tuple[GaussianCloud, LocatedPlane]) -> None:
-    """A ball of one unit that begins at 0.17: a tenth of its size, the diagonal of its box."""
+    """The lowest part of a ball of one unit is missing up to 0.17: a tenth of its size, the diagonal of its box."""
     cloud, located = found
     kept = located.segmentation.object_mask & (cloud.means.numpy()[:, 2] > 0.17)
     (line,) = segmentation_warnings(cloud, changed(located, kept), cloud.subset(kept), CAMERAS)
@@ -53,7 +53,7 @@ def test_an_object_without_its_foot(found: tuple[GaussianCloud, LocatedPlane]) -
 
 
 def test_a_floor_that_came_along(found: tuple[GaussianCloud, LocatedPlane]) -> None:
-    """All of the floor that lies on one side: half of it, within the object's size."""
+    """The part of the floor on one side was segmented with the object: half of the floor within the object's size."""
     cloud, located = found
     means = cloud.means.numpy()
     kept = located.segmentation.object_mask | ((np.arange(cloud.count) >= 1500) & (means[:, 0] > 0.0))

@@ -1,4 +1,4 @@
-"""From where a film is taken: from before the face, unless something stands there that hides it."""
+"""View direction of a video: from the front of the face, unless something blocks the view."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ USUAL = np.array(FILMED_FROM[:2]) / np.hypot(*FILMED_FROM[:2])
 
 
 def side(scene: GaussianCloud) -> np.ndarray:
-    """(2,) along the ground, for a body of one unit that faces x."""
+    """Return the horizontal view direction (2,) for a body of one unit that faces x."""
     ground = SimpleNamespace(local=lambda points: points)
     body = SimpleNamespace(height=1.0)
     stub: Any = SimpleNamespace(creature=SimpleNamespace(body=body), place=SimpleNamespace(ground=ground))
@@ -27,7 +27,7 @@ def side(scene: GaussianCloud) -> np.ndarray:
 
 
 def wall(way: np.ndarray, away: float) -> GaussianCloud:
-    """A screen of two by one and a half units that stands across ``way`` (2,)."""
+    """Return a screen of two by one and a half units, orthogonal to ``way`` (2,)."""
     along = np.array([-way[1], way[0]])
     grid = level((-1.0, 0.0), (1.0, 1.5), 0.0, 0.05)
     points = np.column_stack([away * way + grid[:, :1] * along, grid[:, 1]])

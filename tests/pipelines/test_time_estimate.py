@@ -11,11 +11,11 @@ from egs_warp.pipelines.simulated_run import simulate
 from tests.support.live_sessions import coarse_pawn
 
 NEAR = 20
-"""Number of last frames, in which the estimate is not tested."""
+"""Number of frames at the end for which the estimate is not tested."""
 
 
 def _told(text: str, frames: int | None = None) -> np.ndarray:
-    """(n, 2) frames done and expected, after each."""
+    """Return the number of done and expected frames (n, 2) after each frame."""
     told: list[tuple[int, int]] = []
     simulate(coarse_pawn(), motion(text), frames=frames, progress=lambda done, expected: told.append((done, expected)))
     assert [done for done, _ in told] == list(range(1, len(told) + 1))
@@ -25,18 +25,18 @@ def _told(text: str, frames: int | None = None) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("text", ["jump", "hop x2 0.4 0.2", "twist 60", "twist 180", "walk 0.2", "jump 0 0.1, turn 30"])
 def test_what_is_left_is_told_within_a_factor_of_two(text: str) -> None:
-    """The last frames are excluded; a twist decides in the air if it needs another jump."""
+    """The last frames are excluded; a twist decides in the air whether it needs another jump."""
     done, expected = _told(text).T
     count = len(done)
     far = done < count - NEAR
     ratio = (expected - done)[far] / (count - done)[far]
     assert ratio.min() >= 0.5 and ratio.max() <= 2.0
-    # The frames that are shown at rest are counted down.
+    # The final frames at rest are counted down.
     assert (expected[-REST_FRAMES:] == count).all()
-    # The teeth: where the motion is cut off tells less.
+    # The maximum number of frames would be a worse estimate.
     assert motion(text).frames() > 1.2 * count
 
 
 def test_asked_frames_are_all_there_are() -> None:
-    """The first one is the body at rest."""
+    """The first frame is the body at rest."""
     np.testing.assert_array_equal(_told("jump", frames=4)[:, 1], 3)

@@ -1,4 +1,4 @@
-"""Photos with poses become a capture: ``egs_warp.pipelines.train_capture`` and ``egs-warp train``."""
+"""Captures from photos with poses: ``egs_warp.pipelines.train_capture`` and ``egs-warp train``."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 
 
 def test_photos_that_cannot_be_used_are_named_and_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One is missing, one cut short, one of another shape; the rest makes the capture."""
+    """One photo is missing, one truncated, one has another shape; the others are trained."""
     posed = posed_folder(tmp_path / "posed")
     (posed / "r_5.png").unlink()
     (posed / "r_3.png").write_bytes((posed / "r_3.png").read_bytes()[:60])
@@ -112,7 +112,8 @@ def test_without_any_photo_an_earlier_result_stays(tmp_path: Path, capsys: pytes
 
 
 def test_portrait_and_landscape_through_a_lens(tmp_path: Path) -> None:
-    """Two cameras, one stored on its side with EXIF's tag, both through a lens: trained, judged, on one sheet."""
+    """Two cameras, both with lens distortion, one with images rotated by an EXIF tag: training, scores, and one contact
+    sheet."""
     posed = posed_folder(tmp_path / "posed", size=48)
     tree = json.loads((posed / "transforms.json").read_text())
     for number, frame in enumerate(tree["frames"]):
@@ -120,7 +121,7 @@ def test_portrait_and_landscape_through_a_lens(tmp_path: Path) -> None:
         assert pixels is not None
         frame.update(k1=-0.02)
         if number % 2:
-            # The left and right margin off: a portrait, lying on its side.
+            # Crop the left and right margins: a portrait, stored rotated.
             upright = np.ascontiguousarray(pixels[:, 8:-8, ::-1])
             exif = Image.Exif()
             exif[0x0112] = 6
@@ -136,7 +137,7 @@ def test_portrait_and_landscape_through_a_lens(tmp_path: Path) -> None:
 
 
 def test_a_photo_with_a_wrong_pose_is_found_and_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One of sixteen photos shows the ball from elsewhere than its pose says."""
+    """One of sixteen photos was taken from another pose than its own."""
     posed = posed_folder(tmp_path / "posed", count=16)
     tree = json.loads((posed / "transforms.json").read_text())
     wrong = tree["frames"][5]
@@ -150,7 +151,8 @@ def test_a_photo_with_a_wrong_pose_is_found_and_named(tmp_path: Path, capsys: py
 
 
 def test_reduced_photos_keep_their_colours_and_field_of_view(tmp_path: Path) -> None:
-    """Halved, a photo's mean stays and its camera sees as far to each side; transparent pixels do not bleed."""
+    """A photo of half the size has the same mean, and its camera the same field of view; transparent pixels do not
+    bleed."""
     posed = posed_folder(tmp_path / "posed", alpha=True)
     full, half = read_views(posed).views[3], read_views(posed, max_side=16).views[3]
     assert full.alpha is not None and half.alpha is not None
@@ -161,7 +163,7 @@ def test_reduced_photos_keep_their_colours_and_field_of_view(tmp_path: Path) -> 
 
 
 def test_masks_beside_the_photos_cut_the_object_out(tmp_path: Path) -> None:
-    """COLMAP's ``masks/PHOTO.png``: what the mask leaves out is background, whatever the photo shows there."""
+    """COLMAP's ``masks/PHOTO.png``: pixels outside the mask are background, whatever the photo shows there."""
     posed = posed_folder(tmp_path / "set" / "images")
     masks = tmp_path / "set" / "masks"
     masks.mkdir()
@@ -193,7 +195,7 @@ def test_the_middle_is_where_the_cameras_look() -> None:
 
 
 def test_the_first_cloud_fills_the_silhouettes_and_nothing_else() -> None:
-    """Masks of a small sphere: all points are inside of nine masks in ten, and spread over the whole of it."""
+    """Masks of a small sphere: all points are inside nine of ten masks, and are spread over the whole sphere."""
     centre, radius = np.array([0.1, -0.05, 0.0]), 0.2
     views = []
     for camera in ring(12, 64):
@@ -216,7 +218,7 @@ def test_the_first_cloud_fills_the_silhouettes_and_nothing_else() -> None:
     distance = np.linalg.norm(means - centre, axis=1)
     assert 0.6 * radius < np.median(distance) < radius
     assert np.abs(means.mean(axis=0) - centre).max() < 0.2 * radius
-    # Each Gaussian has about the room that 500 of them leave one another.
+    # The size of each Gaussian is about the spacing of 500 points in the sphere.
     spacing = (4 / 3 * np.pi * radius**3 / 500) ** (1 / 3)
     assert 0.3 * spacing < np.exp(cloud.log_scales.numpy()).mean() < 1.2 * spacing
     np.testing.assert_allclose(cloud.sh.numpy()[:, 0] * 0.28209479 + 0.5, np.tile([0.8, 0.3, 0.1], (500, 1)), atol=1e-5)
@@ -234,7 +236,7 @@ def test_cameras_that_see_nothing_in_common_are_refused() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "least"), [("bonsai", 17.0), ("mouse", 22.0)])
 def test_photos_of_a_room_become_a_capture(name: str, least: float, data_dir: Path) -> None:
-    """A room through a lens that bends a little, and a desk in portrait and landscape: small, but right."""
+    """A room with slight lens distortion, and a desk in portrait and landscape; both at reduced size."""
     result = train(data_dir / "posed" / name, iterations=300, max_gaussians=5000, max_side=90, device="cpu")
     held_out = result.mean_score(held_out=True)
     assert held_out is not None and held_out.psnr > least

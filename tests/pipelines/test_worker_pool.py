@@ -1,4 +1,4 @@
-"""Tasks over processes, and over Ray where it is installed: lost tasks are run again, finished ones are not."""
+"""Tasks on processes, and on Ray if it is installed: lost tasks are run again, finished ones are not."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ AT_LAST = "its worker was lost 3 times, finally: it ended by signal 9"
 
 @pytest.fixture(scope="module")
 def ray_here() -> Any:
-    """One Ray on loopback, without a dashboard, for all tests here that find one."""
+    """A local Ray instance without a dashboard, shared by all tests of this file."""
     ray = pytest.importorskip("ray")
     ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
     yield ray
@@ -58,13 +58,13 @@ def test_each_task_ends_once_and_an_error_is_its_own(workers: int | str) -> None
     assert errors[:3] == [None] * 3 and errors[6:] == [None] * 2
     assert errors[3] == "task 3: give another" and errors[5] == "ZeroDivisionError: five lines"
     assert errors[4] is not None and errors[4].startswith("what it returns cannot be sent: ")
-    # Ray is only looked at from time to time.
+    # Ray is polled only from time to time.
     if workers == 2:
         assert sorted(told) == [(number, number, 2 * number) for number in given]
 
 
 def test_a_killed_workers_task_is_run_again_and_those_that_ended_are_not(workers: int | str, tmp_path: Path) -> None:
-    """Task 1 kills its worker once, 3 twice, 4 at each attempt: no other task is run twice or lost."""
+    """Task 1 kills its worker once, task 3 twice, task 4 in each attempt: no other task is repeated or lost."""
     work = tasks.Dying(tmp_path, {1: 1, 3: 2, 4: 99})
     ended = in_order(list(map_tasks(work, range(7), workers=workers)))
     assert [one.attempts for one in ended] == [1, 2, 1, 3, 3, 1, 1]
@@ -107,7 +107,8 @@ def test_ray_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch) -> N
 def started(body: str, *arguments: str) -> subprocess.Popen[str]:
     code = f"import sys; sys.path.insert(0, {str(ROOT)!r})\n" + textwrap.dedent(body)
     command = [sys.executable, "-c", code, *arguments]
-    # A group of its own: the test's Ctrl-C is for it alone, as a terminal's is for all of a group.
+    # A process group of its own, so that the test's Ctrl-C reaches only this program, as a terminal's reaches a whole
+    # group.
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
@@ -120,7 +121,7 @@ def until(true: Callable[[], bool], seconds: float = 60.0) -> None:
 
 def lives(process: int) -> bool:
     try:
-        # A zombie has ended, and only its parent has not read its status.
+        # A zombie has ended; only its parent has not read its status yet.
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
@@ -139,8 +140,8 @@ SLEEPERS = """
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("crew", ["2", pytest.param("ray", marks=[NO_RAY, pytest.mark.slow])])
 def test_no_worker_outlives_the_program(number: signal.Signals, crew: str, tmp_path: Path) -> None:
-    """Ctrl-C, which a terminal sends to the whole group, ends in one line; nothing is left even where the program had
-    no time to say anything."""
+    """Ctrl-C, which a terminal sends to the whole group, gives one line; no worker is left even if the program is
+    killed."""
     program = started(SLEEPERS, str(tmp_path), crew)
     try:
         until(lambda: len(list(tmp_path.iterdir())) == 2)
@@ -173,7 +174,7 @@ def test_what_a_script_defines_is_found(tmp_path: Path) -> None:
             """
         )
     )
-    # Unbuffered, as some machines have it, nothing could be lost.
+    # With unbuffered output, which some machines set, nothing could be lost.
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": ""}
     run = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environment, timeout=120)
     assert run.stdout == "[1, 8, 27]\n" and run.stderr.count("heard") == 3, run.stderr

@@ -75,7 +75,7 @@ def test_the_shadow_falls_where_the_floor_is_seen() -> None:
     behind = plain_colour(ground, (1.0, 1.0, 1.0))
     lifted = behind.shadow_opacity(placed(body, body.means.numpy() + [0.0, 0.0, 0.4])).numpy()
     assert 0.0 < lifted.max() < behind.shadow_opacity(body).numpy().max() <= 0.5
-    # A wall in front of the floor takes no shadow.
+    # A wall in front of the floor gets no shadow.
     wall = placed(floor, floor.means.numpy()[:, [0, 2, 1]] + [0.0, -1.2, 1.0])
     plain, shaded = (over_scene(wall, body, shadow=shadow) for shadow in (False, True))
     np.testing.assert_allclose(shaded, plain, atol=0.02)

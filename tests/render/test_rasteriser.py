@@ -114,7 +114,7 @@ def test_tiny_scales_show_as_the_low_pass(device: str) -> None:
     camera = camera_of(64, 64)
     image = render_gaussians(cloud_of(values, device), camera)
     assert_same(image, render_twin(values, camera))
-    # The cut at 1/255 takes away less than 1/255 of the whole; sampling on the pixel grid adds less than 3 %.
+    # The cutoff at 1/255 removes less than 1/255 of the total; sampling on the pixel grid adds less than 3 %.
     assert image.alpha.numpy().sum() == pytest.approx(2 * np.pi * 0.3, rel=0.05)
 
 
@@ -146,7 +146,7 @@ def test_median_depth_and_normal(device: str) -> None:
     twin = render_twin(values, camera)
     assert image.normal is not None and image.median_depth is not None
     assert np.abs(image.normal.numpy() - twin["normal"]).mean() < 1e-5
-    # A rounding in the transmittance can move the median to the next splat in a few pixels.
+    # A rounding error of the transmittance can move the median to the next splat in a few pixels.
     assert (np.abs(image.median_depth.numpy() - twin["median_depth"]) > 1e-4).mean() < 2e-3
     assert (image.median_depth.numpy() > 0).mean() > 0.2
 
@@ -195,7 +195,7 @@ def test_several_cameras_and_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.cuda
 def test_a_full_gpu_refuses_and_works_again() -> None:
-    """240 million pairs need 8 GB where 600 MB are free."""
+    """240 million pairs need 8 GB, but 600 MB are free."""
     torch = pytest.importorskip("torch")
     values = random_scene(200_000, coefficients=1, log_scale=3.0)
     values["opacity_logits"][:] = 2.0
@@ -326,7 +326,7 @@ def test_sorted_lists_equal_counted_ones(spread: float, monkeypatch: pytest.Monk
     tiles = 13 * 10
     counted = [_lists_by_counting(projected, view, tiles, threads) for threads in (1, 2, 3)]
     pairs = projected.slot_count
-    # With no guess, with one that is large enough, and with one that is too small.
+    # Without a guess of the capacity, with one that is large enough, and with one that is too small.
     monkeypatch.setattr("egs_warp.render.tiles._expected", {"cpu": pairs})
     guessed = _lists_by_sorting(projected, view, tiles, guess=True)
     assert lists_fit(guessed, projected) and len(guessed.gaussian_from_intersection) > pairs

@@ -1,4 +1,4 @@
-"""The base plane and the guess of up."""
+"""The base plane and the estimate of up."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_the_length_of_up_does_not_matter() -> None:
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "up"), _OBJECTS)
 def test_planes_of_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
-    """Little mass below, yet visible support within 1.5 % of the height."""
+    """Few Gaussians are below the plane, and there is visible support within 1.5 % of the height."""
     cloud = read_capture(data_dir / "objects" / name).cloud
     plane = find_base_plane(cloud, np.array(up, float))
     heights, opacities = plane.heights(cloud.means.numpy()), cloud.opacities()
@@ -80,7 +80,7 @@ def test_planes_of_real_captures(data_dir: Path, name: str, up: tuple[int, int, 
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "up"), _OBJECTS)
 def test_up_of_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
-    """The guess is right for every real object and says why."""
+    """The estimate is right for every real object, and its reason is given."""
     guessed, reason = guess_up(read_capture(data_dir / "objects" / name).cloud, None)
     assert np.array_equal(guessed, up)
     assert "support polygon" in reason and "score" in reason
@@ -102,7 +102,7 @@ def test_up_of_a_turned_pawn(axis: int, sign: float) -> None:
 
 
 def test_up_of_the_format_wins() -> None:
-    """A format that defines up is believed."""
+    """The up direction of a format that defines one is used."""
     up, reason = guess_up(pawn(gaussian_count=500).cloud, np.array([0.0, -1.0, 0.0]))
     assert np.array_equal(up, [0.0, -1.0, 0.0])
     assert reason == "the file format defines it"
@@ -123,7 +123,7 @@ def test_no_height() -> None:
 
 
 def test_a_bevel_above_the_sole_is_not_the_support() -> None:
-    """The lower of two levels of the underside is found, though more columns end at the other."""
+    """The lower of two levels of the underside is found, although more columns end at the higher one."""
     random = np.random.default_rng(0)
     bottoms = np.concatenate([random.normal(0.0, 0.001, 60), random.normal(0.08, 0.001, 100)])
     heights = np.concatenate([bottoms, random.uniform(0.1, 1.0, 2000)])
@@ -136,8 +136,8 @@ def test_a_bevel_above_the_sole_is_not_the_support() -> None:
 
 @pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
 def test_the_support_is_what_ends_within_its_band(size: float) -> None:
-    """Columns that end the denser the nearer to the floor, and as many above: the plane has 15 % of those below it that
-    end within 1.5 % of the height of the densest level, whatever the unit.
+    """Columns are denser towards the floor, with as many far above. The plane is the 15 % quantile of the bottoms
+    within 1.5 % of the height of the densest level, in any unit.
     """
     bottoms = np.concatenate([0.04 * np.linspace(-1.0, 1.0, 401) ** 3, np.linspace(0.05, 0.14, 401)])
     within = bottoms[np.abs(bottoms) <= 0.015]
@@ -150,7 +150,7 @@ def test_the_support_is_what_ends_within_its_band(size: float) -> None:
 
 
 def test_the_reason_for_up_is_what_was_weighed() -> None:
-    """Scores of the best axis and of the next, and whether they are far apart: a pawn has one base, a cube six."""
+    """The scores of the best axis and of the next, and whether they differ clearly: a pawn has one base, a cube six."""
     cube = np.random.default_rng(0).uniform(-0.5, 0.5, (4000, 3))
     cube[np.arange(4000), np.arange(4000) % 3] = np.sign(cube[np.arange(4000), np.arange(4000) % 3]) * 0.5
     block = GaussianCloud.from_numpy(
@@ -190,7 +190,7 @@ def opaque(means: np.ndarray, opacities: np.ndarray | float = 0.98) -> GaussianC
 
 
 def test_the_columns_are_those_of_the_footprint() -> None:
-    """A block of 2 x 1 has 64 columns by 32, all of them with a bottom, and its middle in the middle of them."""
+    """A block of 2 x 1 has 64 by 32 columns, all with a bottom, and its centre is in the middle of them."""
     x, y, z = np.meshgrid(np.linspace(0.0, 2.0, 160), np.linspace(0.0, 1.0, 80), [0.0, 0.5], indexing="ij")
     block = opaque(np.column_stack([x.ravel(), y.ravel(), z.ravel()]) + [3.0, -2.0, 1.0])
     seen = _underside(block, np.array([0.0, 0.0, 1.0]))
@@ -203,7 +203,8 @@ def test_the_columns_are_those_of_the_footprint() -> None:
 
 
 def test_strays_aside_of_a_narrow_foot_widen_no_support() -> None:
-    """A mushroom: the foot's disc is a ninth of the cap's, with strays at the level of the sole far off or not."""
+    """A mushroom whose foot has a ninth of the area of its cap, with and without distant strays at the level of the
+    sole."""
     random = np.random.default_rng(0)
 
     def disc(radius: float, height: float, count: int) -> np.ndarray:
@@ -220,7 +221,7 @@ def test_strays_aside_of_a_narrow_foot_widen_no_support() -> None:
 
 
 def test_what_shows_nothing_low_is_not_supported() -> None:
-    """An opaque block above a haze that is as heavy: no visible Gaussian is low."""
+    """An opaque block above haze of equal mass: no visible Gaussian is low."""
     random = np.random.default_rng(0)
     haze, block = random.uniform(0.0, 1.0, (2, 8000, 3))
     block[:, 2] = 0.8 + 0.2 * block[:, 2]
@@ -230,7 +231,7 @@ def test_what_shows_nothing_low_is_not_supported() -> None:
 
 
 def test_up_of_a_huge_capture_is_told_by_few_of_its_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An even choice of a table says what all of it says, whatever the order of the file."""
+    """An even subset of a table gives the result of all Gaussians, in any order of the file."""
     random = np.random.default_rng(0)
     top = random.uniform([-1.0, -1.0, 1.0], [1.0, 1.0, 1.05], (6000, 3))
     leg = random.uniform([-0.1, -0.1, 0.0], [0.1, 0.1, 1.0], (3000, 3))

@@ -52,7 +52,8 @@ def covariances(cloud: GaussianCloud) -> np.ndarray:
 
 
 def test_reach_is_that_of_the_six_tips_or_of_the_whole_ellipsoid(device: str) -> None:
-    """Eq. (20): the farthest axis tip; the ellipsoid reaches farther, by at most sqrt 3."""
+    """Eq. (20): the reach is the farthest axis tip; that of the whole ellipsoid is larger, by at most a factor of sqrt
+    3."""
     cloud = cloud_near(PLANE, device)
     turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
     arms = turns * np.exp(cloud.log_scales.numpy())[:, None, :]
@@ -67,7 +68,7 @@ def test_reach_is_that_of_the_six_tips_or_of_the_whole_ellipsoid(device: str) ->
 
 
 def test_half_above_has_the_moments_of_the_cut_normal_distribution(device: str) -> None:
-    """Against scipy's truncated normal along N; the spread across N follows from the regression on it."""
+    """Against SciPy's truncated normal distribution along N; the distribution across N follows by regression on it."""
     cloud = cloud_near(PLANE, device)
     chosen = np.arange(cloud.count) % 3 != 0
     half = half_space(cloud, PLANE, chosen)
@@ -83,7 +84,7 @@ def test_half_above_has_the_moments_of_the_cut_normal_distribution(device: str) 
         expected = sigma0[k] - hazard * (hazard - t) * np.outer(along, along)
         np.testing.assert_allclose(sigma1[k], expected, atol=3e-5 * np.trace(sigma0[k]) + 1e-9)
         assert PLANE.heights(means1[k]) > 0.0
-        # Seen along the plane, its mass is the share above, unless its peak would be higher than before.
+        # Seen along the plane, its mass is the fraction above the plane, unless its peak would exceed the original one.
         mass = half.opacities()[k] * np.sqrt(n @ sigma1[k] @ n)
         share = min(norm.sf(t), np.sqrt(n @ sigma1[k] @ n) / spread)
         assert mass == pytest.approx(cloud.opacities()[k] * spread * share, rel=1e-3)
@@ -101,7 +102,8 @@ def test_far_above_the_plane_the_half_is_the_whole(device: str) -> None:
 
 
 def test_far_below_the_plane_the_half_lies_on_it(device: str) -> None:
-    """The mean of a normal distribution beyond t deviations is less than 1 / t deviations beyond them (Gordon 1941)."""
+    """The mean of a normal distribution beyond t standard deviations is less than 1 / t standard deviations farther out
+    (Gordon 1941)."""
     cloud = cloud_near(PLANE, device)
     means, spread = (
         cloud.means.numpy(),
@@ -122,8 +124,9 @@ def test_far_below_the_plane_the_half_lies_on_it(device: str) -> None:
 
 
 def test_what_straddles_is_split_in_three_across_the_plane(device: str) -> None:
-    """Along the axis that reaches farthest across; the three have mean and covariance of the one, and none hides more
-    than it. What is clear of the plane stays as it is, what comes to lie below it is left out.
+    """The split is along the axis that reaches farthest through the plane; the three children have the mean and
+    covariance of the parent, and none is more opaque. A Gaussian clear of the plane is unchanged, and a child below it
+    is left out.
     """
     first, second = PLANE.tangents()
     turn = Rotation.from_matrix(np.stack([second, PLANE.normal, first], axis=1)).as_quat()[[3, 0, 1, 2]]
@@ -137,7 +140,7 @@ def test_what_straddles_is_split_in_three_across_the_plane(device: str) -> None:
         np.zeros((3, 1, 3)),
         device=device,
     )
-    # Both reach across by three tenths.
+    # Both reach through the plane by 0.3.
     assert _subdivided(cloud, PLANE, ExtentMeasure.ELLIPSOID, 0.31) is cloud
     split = _subdivided(cloud, PLANE, ExtentMeasure.ELLIPSOID, 0.29)
     np.testing.assert_allclose(PLANE.heights(split.means.numpy()), [0.5, 0.05, 0.15, 0.25, 0.05, 0.15], atol=1e-5)
@@ -152,7 +155,7 @@ def test_what_straddles_is_split_in_three_across_the_plane(device: str) -> None:
 
 
 def test_cameras_about_the_foot_look_at_it_from_low_down() -> None:
-    """A column of radius 0.3, away from the origin: its foot is in the middle of each picture and fills most of it."""
+    """A column of radius 0.3, away from the origin: its foot is in the centre of each image and fills most of it."""
     turns, levels = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False), np.linspace(0.0, 1.0, 40))
     angle, height = turns.ravel(), levels.ravel()
     means = np.column_stack([5.0 + 0.3 * np.cos(angle), -3.0 + 0.3 * np.sin(angle), height])
@@ -174,7 +177,7 @@ def test_cameras_about_the_foot_look_at_it_from_low_down() -> None:
 
 @pytest.mark.parametrize("above", [True, False])
 def test_a_camera_under_the_plane_says_nothing_of_what_it_sees_through_it(above: bool) -> None:
-    """From above, all pixels of a ball over the floor count; from below, only those that show nothing."""
+    """From above, all pixels of a ball over the floor count; from below, only empty pixels."""
     pytest.importorskip("torch")
     ball = round_ones(shell() + [0.0, 0.0, 0.2], 0.04)
     eye = np.array([2.0, 0.0, 2.0 if above else -2.0])
@@ -257,7 +260,8 @@ def test_loss_is_the_sum_over_straddling_gaussians() -> None:
 
 
 def test_finetuning_clears_the_plane_and_keeps_the_looks() -> None:
-    """Eq. (20), (21): a small ball on its plane; what crossed it is clear of it afterwards, and the picture stays."""
+    """Eq. (20), (21): a small ball on its plane; Gaussians that crossed the plane are clear of it afterwards, and the
+    image stays the same."""
     pytest.importorskip("torch")
     from egs_warp.geometry.camera import Camera
     from egs_warp.render import render_gaussians

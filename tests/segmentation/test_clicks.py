@@ -1,4 +1,4 @@
-"""Clicks: what each hits, what they add, and where the cut goes between what is meant and what is not."""
+"""Clicks: the Gaussians that they hit, the parts that they add, and the cut between object and background."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.support.scenes import FLOOR, ball_on_floor, lying, round_ones, shell
 
 
 def test_a_click_hits_the_surface_and_not_what_shines_through() -> None:
-    """A ball of thin skin before a wall: the nearer side is hit, at its depth."""
+    """A hollow ball in front of a wall: the nearer side is hit, at its depth."""
     skin = shell(400)
     wall = np.stack(np.meshgrid(np.linspace(-2, 2, 60), [3.0], np.linspace(-1, 3, 60)), axis=-1).reshape(-1, 3)
     cloud = round_ones(np.concatenate([skin, wall]), 0.04)
@@ -37,7 +37,8 @@ def test_a_click_hits_the_surface_and_not_what_shines_through() -> None:
 
 
 def test_haze_before_what_is_clicked_on_is_not_hit() -> None:
-    """A Gaussian just above the surface with a fiftieth of its opacity is not hit; one of the same opacity is."""
+    """A Gaussian just in front of the surface is not hit if its opacity is a fiftieth of the surface's, and is hit if
+    it is equal."""
     skin = round_ones(shell(400), 0.04)
     for opacity, hit in ((-4.0, False), (3.0, True)):
         logits = np.append(skin.opacity_logits.numpy(), np.float32(opacity))
@@ -50,7 +51,7 @@ def test_haze_before_what_is_clicked_on_is_not_hit() -> None:
 @pytest.mark.parametrize("axis", [0, 2])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_click_is_a_disc_about_its_pixel(axis: int, sign: float) -> None:
-    """At the edge of a sheet, whichever side it lies on, more than half of the disc shows it; three pixels off the edge
+    """At the edge of a sheet on any side, more than half of the disc shows the sheet; three pixels outside the edge,
     less than half.
     """
     eye, up = np.array([0.0, -5.0, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -64,8 +65,8 @@ def test_a_click_is_a_disc_about_its_pixel(axis: int, sign: float) -> None:
 
 
 def test_a_click_hits_what_lies_a_little_before_and_behind() -> None:
-    """Among five discs in a row along the ray, the hits are the one that gives most of the light, and those within 3 %
-    of the distance on both sides of it."""
+    """Five discs lie in a row along the ray. The hits are the one that contributes most of the light, and those within
+    3 % of its distance."""
     camera = front()
     steps, opacities = np.array([4.5, 4.9, 5.0, 5.1, 5.6]), np.array([0.12, 0.12, 0.6, 0.6, 0.9])
     means = camera.centre + steps[:, None] * camera.rotation[2]
@@ -77,7 +78,7 @@ def test_a_click_hits_what_lies_a_little_before_and_behind() -> None:
 
 
 def test_a_click_that_just_misses_means_the_nearest_part() -> None:
-    """Within a tenth of the object's size; one further off means none, one that hits what it hits most of."""
+    """The part must be within a tenth of the object's size. A click with hits selects the part with most of them."""
     parts = np.repeat([0, 1, 2], [1500, 1500, 100])
     places = [shell() - [0.7, 0.0, 0.0], shell() + [0.7, 0.0, 0.0], 0.1 * shell(100) + [0.0, 0.9, 0.0]]
     scene, indices = SceneAbovePlane.of(round_ones(np.concatenate(places), 0.02), FLOOR), np.arange(3100)
@@ -93,7 +94,8 @@ def test_a_click_that_just_misses_means_the_nearest_part() -> None:
 
 @pytest.mark.parametrize("opacity, through", [(0.2, True), (0.9, False)])
 def test_veils_between_camera_and_object_are_looked_through(opacity: float, through: bool) -> None:
-    """Three in a row, each a third as wide as they are far away: faint ones hide nothing, dense ones are what shows."""
+    """Three flat Gaussians in a row, each a third as wide as it is distant: faint ones hide nothing, opaque ones are
+    hit."""
     skin = round_ones(shell(400), 0.04)
     means = np.concatenate([skin.means.numpy(), [[0.0, y, 0.5] for y in (-1.2, -1.0, -0.8)]])
     scales = np.concatenate([skin.log_scales.numpy(), np.log([[0.8, 0.002, 0.8]] * 3)])
@@ -106,14 +108,14 @@ def test_veils_between_camera_and_object_are_looked_through(opacity: float, thro
 
 @pytest.mark.parametrize("tones", [(-1.0, 1.0), (0.0, 0.0)])
 def test_a_click_beside_cuts_off_what_touches(tones: tuple[float, float]) -> None:
-    """One click takes both of two touching balls; a second one removes the other, for all colours."""
+    """One click selects both of two touching balls; a second, negative one removes the other ball, for all colours."""
     cloud = balls(tones)
     mine = click(cloud, (-0.5, -0.5, 0.5))
     both = segment(cloud, FLOOR, ObjectSpec.of_clicks([mine]))
     clear = cloud.means.numpy()[:3000, 2] > 0.06
     assert both.object_mask[:3000][clear].all()
     other = click(cloud, (0.5, -0.5, 0.5), inside=False)
-    # Where they touch, within a twentieth, two balls of one colour cannot be separated.
+    # Near the point of contact, within 0.05, two balls of one colour cannot be separated.
     clear &= np.abs(cloud.means.numpy()[:3000, 0]) > 0.05
     for clicks in ([mine, other], [other, mine]):
         found = segment(cloud, FLOOR, ObjectSpec.of_clicks(clicks))
@@ -143,7 +145,7 @@ def test_a_click_on_the_floor_takes_nothing_away() -> None:
 
 
 def test_leaves_that_hang_in_the_air_go_along_and_what_stands_beside_does_not() -> None:
-    """A blossom that is off its twig by less than two cells hangs on the ball; one as near on the floor is its own."""
+    """A blossom less than two cells off belongs to the ball; one as near on the floor does not."""
     random = np.random.default_rng(3)
     leaf = random.uniform(-0.06, 0.06, (60, 3))
     gap = 0.045
@@ -156,8 +158,8 @@ def test_leaves_that_hang_in_the_air_go_along_and_what_stands_beside_does_not() 
 
 
 def test_what_hangs_in_the_air_is_held_by_what_is_near() -> None:
-    """Within two of the 64 cells across the object; further off it is on its own, as is what reaches the floor, however
-    near.
+    """A detached part belongs to the object within two of the 64 cells across it, but not if it is farther away or
+    reaches the floor.
     """
     thing, leaf = shell(800), np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]])
     size = 1.7
@@ -172,8 +174,8 @@ def test_what_hangs_in_the_air_is_held_by_what_is_near() -> None:
     ("count", "post", "goes_along"), [(200, None, True), (30, None, False), (200, 1.15, False), (200, 1.6, True)]
 )
 def test_a_hand_that_hangs_apart_is_held_by_the_nearest(count: int, post: float | None, goes_along: bool) -> None:
-    """A fifth of the ball away it is the ball's, unless it is a stray, or a post stands less than twice as far from
-    it.
+    """A hand at a fifth of the ball's size belongs to it, unless it has few Gaussians, or a post is less than twice as
+    far away.
     """
     random = np.random.default_rng(5)
     skin = random.normal(size=(count, 3))
@@ -192,7 +194,7 @@ def test_a_hand_that_hangs_apart_is_held_by_the_nearest(count: int, post: float 
 
 
 def test_the_plane_lies_below_the_lowest_click() -> None:
-    """A ball on a slab on a floor: with a click on the slab's side, too, both stand on the floor."""
+    """A ball on a slab on a floor: with a second click on the side of the slab, both stand on the floor."""
     across, up_to = np.meshgrid(np.linspace(-0.9, 0.9, 46), np.linspace(0.0, 0.4, 11))
     side = np.column_stack([np.full(across.size, 0.9), across.ravel(), up_to.ravel()])
     slab = [level((-0.9, -0.9), (0.9, 0.9), 0.4, 0.04), *(side * [sign, 1, 1] for sign in (-1, 1))]
@@ -235,8 +237,8 @@ def test_clicks_as_the_user_writes_them(tmp_path: Path) -> None:
 
 
 def test_a_click_on_a_shadow_takes_no_leg_along() -> None:
-    """A tongue of the floor, a twentieth high, hangs together with the ball's foot: a click on its tip takes its outer
-    half away and leaves the ball as it is, though the ball's own click is as far from its foot.
+    """A tongue of floor, 0.05 high, is connected to the ball's foot: a click on its tip removes its outer half and
+    keeps the ball, although the positive click is as far from the foot.
     """
     across, out = np.meshgrid(np.linspace(-0.12, 0.12, 9), np.linspace(-0.72, -0.2, 19))
     tongue = [np.column_stack([across.ravel(), out.ravel(), np.full(across.size, z)]) for z in (0.03, 0.05)]
@@ -253,8 +255,8 @@ def test_a_click_on_a_shadow_takes_no_leg_along() -> None:
 
 
 def test_a_click_on_a_shadow_at_the_foot_of_a_thin_leg_leaves_the_leg() -> None:
-    """The leg is much nearer to the shadow than to the click on what it bears, and of one colour with it; but it is
-    more than twice as high.
+    """The leg is much nearer to the shadow than to the positive click above it, and has the same colour, but it is more
+    than twice as high.
     """
     angle, height = np.meshgrid(np.linspace(0.0, 6.1, 14), np.linspace(0.02, 0.7, 28))
     leg = np.column_stack([0.08 * np.cos(angle.ravel()), 0.08 * np.sin(angle.ravel()), height.ravel()])

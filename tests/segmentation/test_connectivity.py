@@ -12,7 +12,8 @@ from tests.support.scenes import FLOOR
 
 
 def test_parts_and_insides() -> None:
-    """Two clusters are two parts unless a long Gaussian reaches from one to the other; a shell encloses its inside."""
+    """Two clusters are two parts unless a long Gaussian reaches from one to the other; a shell encloses its
+    interior."""
     random = np.random.default_rng(0)
     clusters = np.concatenate([random.normal(scale=0.03, size=(50, 3)) + [x, 0.0, 1.0] for x in (-0.4, 0.4)])
     means = np.concatenate([clusters, [[0.0, 0.0, 1.0]]])
@@ -31,7 +32,7 @@ def test_parts_and_insides() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_long_gaussian_reaches_its_ends(seed: int) -> None:
-    """From a cluster to another 3.9 cells away, however it is turned; one that is longer reaches four cells."""
+    """A Gaussian of any orientation connects clusters 3.9 cells apart; a longer one reaches four cells."""
     random = np.random.default_rng(seed)
     turn = Rotation.from_quat(random.normal(size=4))
     way = turn.as_matrix()[:, seed]

@@ -1,4 +1,4 @@
-"""The cut of a graph of Gaussians is the least of all; ways along it are the shortest."""
+"""The cut of a graph of Gaussians has the lowest cost; paths along the graph are the shortest."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from egs_warp.segmentation.graph_cut import SplatGraph
 
 
 def cost(graph: SplatGraph, inside: np.ndarray, leaning: np.ndarray, smoothness: float) -> float:
-    """Sum the terms of the cost."""
+    """Return the cost of the labels ``inside``."""
     unlike = inside[graph.first] != inside[graph.second]
     own = np.where(inside, np.maximum(-leaning, 0.0), np.maximum(leaning, 0.0)).sum()
     return float(own + smoothness * graph.strength[unlike].sum())
@@ -19,7 +19,7 @@ def cost(graph: SplatGraph, inside: np.ndarray, leaning: np.ndarray, smoothness:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_no_labels_cost_less(seed: int) -> None:
-    """All 2^9 labels of nine Gaussians that keep to what is held and dropped."""
+    """All 2^9 labels of nine Gaussians that respect the fixed ones."""
     random = np.random.default_rng(seed)
     graph = SplatGraph.linking(random.normal(size=(9, 3)), random.uniform(size=(9, 3)))
     leaning = random.normal(scale=2.0, size=9)
@@ -31,7 +31,7 @@ def test_no_labels_cost_less(seed: int) -> None:
         for labels in product((False, True), repeat=9)
         if labels[0] and not labels[8]
     )
-    # Whole thousandths are cut.
+    # Costs are rounded to thousandths.
     assert cost(graph, found, np.where(held | dropped, 0.0, leaning), 1.5) == pytest.approx(least, abs=0.05)
 
 
@@ -49,7 +49,7 @@ def test_a_chain_is_cut_at_its_widest_gap_and_at_its_change_of_colour() -> None:
 
 
 def test_ways_go_along_the_links() -> None:
-    """The path follows three sides of a square, not the gap; there is none between two distant squares."""
+    """The path follows three sides of a square, not the gap; two distant squares are not connected."""
     side = np.linspace(0.0, 1.0, 41)
     legs = [
         np.column_stack([side * 0, side]),
@@ -60,7 +60,7 @@ def test_ways_go_along_the_links() -> None:
     points = np.concatenate([points, points + [50.0, 0.0, 0.0]])
     graph = SplatGraph.linking(points, np.full((len(points), 3), 0.5))
     ways = graph.distances(np.array([0]))
-    # The other end of the open square: three sides in steps of a fortieth, its median link being two or three of them.
+    # The other end of the open square: three sides with steps of 1/40, whose median link is two or three steps long.
     assert ways[82] / ways[20] == pytest.approx(6.0, rel=0.05)
     assert np.isinf(ways[123:]).all()
 

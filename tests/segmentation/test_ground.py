@@ -1,4 +1,5 @@
-"""Ground that is not flat: measured on a cloth whose folds are known, and left alone where it is flat or unsure."""
+"""Ground that is not flat: measured on a cloth with known folds, and replaced by the plane where it is flat or
+uncertain."""
 
 from __future__ import annotations
 
@@ -42,14 +43,14 @@ def located(folds: tuple[GaussianCloud, np.ndarray]) -> LocatedPlane:
 
 
 def test_the_plane_of_folds_is_level(located: LocatedPlane) -> None:
-    """Within 2 degrees and 2 % of the ball's height: it is only the start."""
+    """Within 2 degrees and 2 % of the ball's height; the plane is only the start."""
     assert located.plane.normal @ UP > np.cos(np.radians(2.0))
     assert abs(float(located.plane.heights(np.zeros(3)))) < 0.02
 
 
 def test_heights_are_those_of_the_cloth(located: LocatedPlane, folds: tuple[GaussianCloud, np.ndarray]) -> None:
-    """Beside the ball, on folds of 4 % of its height either way: 0.13 % of it in the mean, 0.6 % in 99 of 100 places,
-    of both signs: heights of splats are not changed by which hides which.
+    """Around the ball, on folds with an amplitude of 4 % of its height: the error is 0.13 % on average and 0.6 % in 99
+    of 100 points, with both signs, so occlusion of splats causes no bias.
     """
     ground = located.ground
     assert ground is not None
@@ -69,7 +70,8 @@ def test_what_is_told(located: LocatedPlane) -> None:
 
 
 def test_the_object_goes_down_to_the_ground(located: LocatedPlane, folds: tuple[GaussianCloud, np.ndarray]) -> None:
-    """The ball stands within a fold: it is found whole, down to its lowest Gaussian, with little of the cloth."""
+    """The ball stands within a fold: it is segmented completely, down to its lowest Gaussian, with little of the
+    cloth."""
     _, truth = folds
     found = located.segmentation.object_mask
     assert found[truth].mean() > 0.99
@@ -78,13 +80,13 @@ def test_the_object_goes_down_to_the_ground(located: LocatedPlane, folds: tuple[
 
 @pytest.fixture(scope="module")
 def flat() -> tuple[GaussianCloud, np.ndarray]:
-    """The ball on a cloth that is all but flat."""
+    """The ball on a cloth that is almost flat."""
     return on_folds(0.002)
 
 
 @pytest.fixture(scope="module")
 def on_flat(flat: tuple[GaussianCloud, np.ndarray]) -> tuple[LocatedPlane, LocatedPlane, MeasuredGround]:
-    """The plane, what becomes of it on its ground, and what was measured for that."""
+    """The plane before and after the measurement of its ground, and the measurement."""
     cloud, _ = flat
     located = LocatedPlane(LEVEL, None, np.array([0.0, 0.0, 0.5]), 1.7, segment(cloud, LEVEL, BALL), ())
     seen: list[MeasuredGround] = []
@@ -111,7 +113,8 @@ def test_flat_ground_stays_a_plane(on_flat: tuple[LocatedPlane, LocatedPlane, Me
 def test_roughness_that_views_do_not_agree_on_is_no_ground(
     flat: tuple[GaussianCloud, np.ndarray], on_flat: tuple[LocatedPlane, LocatedPlane, MeasuredGround]
 ) -> None:
-    """A tenth of the height, seen by views that differ by a twentieth; and what no view shows."""
+    """A roughness of a tenth of the height counts as flat if views differ by a twentieth; so does ground that no view
+    shows."""
     (cloud, truth), (_, _, measured) = flat, on_flat
     assert measured.is_flat(1.0)
     assert replace(measured, roughness=0.1, noise=0.05).is_flat(1.0)
@@ -126,7 +129,7 @@ def test_roughness_that_views_do_not_agree_on_is_no_ground(
     [("koala.ply", (0.1, -0.7, 0.15)), ("fox.ply", (0.0, 0.0, 2.0)), ("narcissus.sog", (0.0, -0.8, 0.0))],
 )
 def test_real_grounds_that_are_flat_stay_planes(data_dir: Path, file: str, click: tuple) -> None:
-    """Gravel and a plinth, and glossy paper that mirrors the koala: its splats lie 2.4 % of its height off the plane,
+    """Gravel, a plinth, and glossy paper that mirrors the koala: its splats are off the plane by 2.4 % of its height,
     but views of them differ by 1.1 %.
     """
     cloud, spec = read_capture(data_dir / "scenes" / file).cloud, ObjectSpec(point=np.array(click))
@@ -136,7 +139,8 @@ def test_real_grounds_that_are_flat_stay_planes(data_dir: Path, file: str, click
 
 
 def test_ground_reaches_up_to_what_stands_on_it() -> None:
-    """Level ground with a hill that the object hides: it is raised to the object there, and nowhere that is seen."""
+    """Level ground with a hill that the object hides: it is raised to the object there, and nowhere where it is
+    visible."""
     heights = np.zeros((41, 61))
     known = np.ones((41, 61), bool)
     known[12:29, 12:29] = False
@@ -145,20 +149,20 @@ def test_ground_reaches_up_to_what_stands_on_it() -> None:
     thing = ball(0.04)
     beside = sheet(np.array([[0.0, 1.5, -0.1]]), np.array([[0.0, 0.0, 1.0]]), 0.035, (0.8, 0.3, 0.2))
     size = np.sqrt(3.0)
-    # Something that hangs down beside the field is not what stands on it.
+    # An object beside the field that hangs lower does not stand on it.
     raised = measured.touched_by(concatenate(thing, beside), size)
     means = thing.means.numpy().astype(np.float64)
     assert field.heights(means).min() > 0.035 and abs(raised.heights(means).min()) < 0.002
     lifted = raised.nodes()[..., 2]
     assert np.abs(lifted[known]).max() < 1e-9 and lifted.max() == pytest.approx(field.heights(means).min())
-    # What hovers is not stood on.
+    # A hovering object does not stand on the ground.
     assert measured.touched_by(ball(0.2), size) is field
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.01])
 def test_what_the_object_hid_is_not_taken_for_ground(scale: float) -> None:
-    """A floor with a hole under a ball, and another floor far below: through the hole one sees the lower one. So it is
-    in metres and in whatever else.
+    """A floor with a hole under a ball, and another floor far below that is visible through the hole; in metres and in
+    another unit.
     """
     up = np.array([[0.0, 0.0, 1.0]])
     top = level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.04)
@@ -176,7 +180,7 @@ def test_what_the_object_hid_is_not_taken_for_ground(scale: float) -> None:
 
 
 def test_specks_of_ground_are_left_out() -> None:
-    """A patch counts from a twentieth of the widest on: one of 2 of 40 nodes, not one of 1."""
+    """A patch needs at least a twentieth of the nodes of the largest one: of 40 nodes, 2 are enough and 1 is not."""
     ground = np.zeros((12, 12), bool)
     ground[:4, :10] = ground[6, :2] = ground[9, 9] = True
     kept = ground.copy()
@@ -186,7 +190,7 @@ def test_specks_of_ground_are_left_out() -> None:
 
 @pytest.mark.parametrize("count", [5, 12])
 def test_medians_of_what_is_nearest_to_each_node(count: int) -> None:
-    """For odd and even numbers of points; points off the grid are ignored, and empty nodes are NaN."""
+    """For even and odd numbers of points; points outside the grid are ignored, and nodes without points are NaN."""
     random = np.random.default_rng(0)
     spacing, origin = 0.25, np.array([0.3, -0.2, 0.1])
     axes = np.linalg.qr(random.standard_normal((3, 3)))[0]

@@ -1,4 +1,4 @@
-"""Labels from masks: the closed form is the least error of all labels, and neighbours settle what votes leave open."""
+"""Labels from masks: the closed form has the least error of all labels, and neighbours decide where votes do not."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from tests.support.scenes import FLOOR, lying, round_ones
 
 
 def test_the_closed_form_paints_the_masks_with_the_least_error() -> None:
-    """Over all 2^8 labels: the sum over pixels of |mask - what the labelled Gaussians paint|, which is linear in the
-    labels where weights in a pixel sum to at most one: weight outside where a label is 1, inside where it is 0.
+    """Over all 2^8 labels: the sum over pixels of |mask - rendered labels| is linear in the labels, since weights in a
+    pixel sum to at most one: it is the weight outside where a label is 1, and inside where it is 0.
     """
     random = np.random.default_rng(0)
     inside, outside = random.uniform(0.0, 5.0, (2, 8))
@@ -47,7 +47,7 @@ def test_a_bias_makes_the_object_leaner_or_fuller() -> None:
 
 @pytest.mark.slow
 def test_rough_masks_of_three_views_find_a_stool_with_its_legs() -> None:
-    """Masks whose edges are three pixels off, up and down: the cut is right where votes alone are not."""
+    """The outlines of the masks are off by up to three pixels: the graph cut is right where votes alone are not."""
     made = scene("stool")
     cloud, truth = made.whole()
     cameras = ring_cameras(made.plane, np.array([0.0, 0.0, 0.5]), 0.9, count=3, size=256)
@@ -68,13 +68,13 @@ def test_rough_masks_of_three_views_find_a_stool_with_its_legs() -> None:
     assert overlap((wanted | unknown)[nodes]) < 0.9
     assert overlap(smoothed_labels(cloud, votes, nodes, views=3)) > 0.97
     found = segment(cloud, made.plane, ObjectSpec(masks=tuple(masks)))
-    # 0.9999; 0.9985 where the labels are those of the votes alone, and parts that hang together make up for the rest.
+    # 0.9999; with the labels of the votes alone, 0.9985, because connected parts compensate.
     assert overlap((found.object_mask | found.floater_mask)[nodes]) > 0.999
 
 
 def test_a_vote_is_surer_by_the_root_of_its_pixels() -> None:
-    """One of two neighbours alike is out for sure, the other in by less than their link costs: both are out. Nine times
-    the pixels weigh three times as much.
+    """One of two similar neighbours is certainly outside, the other is inside by less than the cost of their link:
+    both become outside. Nine times the pixels have three times the weight.
     """
     pair = round_ones(np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]]), 0.02)
     pixels, share = 9.0 * module._SURE, np.array([0.5 + 0.35 * module._SMOOTHNESS / 3.0, 0.0])
@@ -86,8 +86,8 @@ def test_a_vote_is_surer_by_the_root_of_its_pixels() -> None:
 
 @pytest.mark.parametrize(("pixels", "kept_out"), [(66.0, True), (4.0, False)])
 def test_what_many_pixels_say_no_neighbour_overrules(pixels: float, kept_out: bool) -> None:
-    """One of a sheet of the object's, of which 62 % shows outside of the masks: in 66 pixels that is so, in four it may
-    be the masks' edge.
+    """One Gaussian in a sheet of the object is 62 % outside the masks: with 66 pixels the vote counts, with four
+    it may be due to the edge of the masks.
     """
     cloud = lying(level((-0.3, -0.3), (0.3, 0.3), 0.5, 0.03))
     inside, outside = np.full(cloud.count, 20.0), np.zeros(cloud.count)
@@ -99,7 +99,7 @@ def test_what_many_pixels_say_no_neighbour_overrules(pixels: float, kept_out: bo
 
 
 def test_masks_mean_every_piece_and_clicks_correct_them() -> None:
-    """Two balls apart, both masked: both are the object; a click takes one away again."""
+    """Two separate balls are masked and both become the object; a negative click removes one."""
     cloud = balls((0.0, 0.0), between=1.6)
     pair = np.arange(cloud.count) < 3000
     cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 1.5, count=3, size=128)

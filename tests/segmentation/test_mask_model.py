@@ -1,4 +1,4 @@
-"""Networks that make masks: what they are given, what is taken from them, and files that are none."""
+"""Networks that make masks: their inputs and outputs, and invalid files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def written(path: Path, data: bytes) -> Path:
 
 
 def halves() -> np.ndarray:
-    """60 x 90 pixels, red to the left of column 30 and blue beyond it."""
+    """Return an image of 60 x 90 pixels, red to the left of column 30 and blue to the right."""
     picture = np.zeros((60, 90, 3), np.float32)
     picture[:, :30, 0], picture[:, 30:, 2] = 0.8, 0.6
     return picture
@@ -42,7 +42,7 @@ def halves() -> np.ndarray:
 
 @pytest.mark.parametrize(("u", "red"), [(10.5, True), (70.5, False)])
 def test_a_click_becomes_the_mask_of_its_colour(program: str, tmp_path: Path, u: float, red: bool) -> None:
-    """At the picture's size, to the pixel at the edge; the black beyond the picture is no part of it."""
+    """The mask has the size of the image and is exact at the edge; the black padding does not belong to it."""
     model = OnnxClickModel.read(written(tmp_path / "alike.onnx", alike()))
     assert model.names == NAMES
     mask = model.mask(halves(), np.array([[u, 40.5], [45.0, 5.0]]), np.array([True, False]))
@@ -52,7 +52,7 @@ def test_a_click_becomes_the_mask_of_its_colour(program: str, tmp_path: Path, u:
 
 
 def answering(*outputs: np.ndarray) -> tuple[OnnxClickModel, list[Inputs]]:
-    """A model whose network answers so, and what it was given."""
+    """Return a model whose network returns these outputs, and a list that collects its inputs."""
     given: list[Inputs] = []
 
     def compute(inputs: Inputs) -> list[np.ndarray]:
@@ -123,7 +123,7 @@ def test_a_network_that_fails_is_told_in_one_line() -> None:
 
 
 def test_what_stands_out_is_stretched_to_all_of_its_range() -> None:
-    """As the network was trained: its least answer is nothing, its largest all."""
+    """As in the training of the network: the smallest output is background, the largest is object."""
     answer = np.full((1, 1, 320, 320), 0.1, np.float32)
     answer[..., :160, :] = 0.4
     given: list[Inputs] = []
@@ -136,7 +136,7 @@ def test_what_stands_out_is_stretched_to_all_of_its_range() -> None:
     assert mask[:29].all() and not mask[31:].any()
     values = given[0]["input.1"]
     assert values.shape == (1, 3, 320, 320) and values.dtype == np.float32
-    # Red of 0.8 is the brightest, and counts as 1.
+    # Red of 0.8 is the maximum of the image and is scaled to 1.
     np.testing.assert_allclose(
         values[0, :, 10, 10], (np.array([1.0, 0.0, 0.0]) - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225], rtol=1e-5
     )
@@ -151,7 +151,7 @@ def test_where_nothing_that_proposes_is_installed(monkeypatch: pytest.MonkeyPatc
 
 
 def test_the_reader_comes_before_any_program(program: str, tmp_path: Path) -> None:
-    """Numbers in other files are refused."""
+    """Tensors in external files are refused."""
     data = onnx.model(
         [onnx.node("Mul", ["image", "much"], ["out"])],
         [onnx.tensor("much", [1], [2.0], external="../secret")],

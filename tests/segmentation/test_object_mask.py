@@ -1,4 +1,5 @@
-"""The object among a scene's Gaussians, from masks, a box, a point or a click; clear errors for what cannot be it."""
+"""The object among the Gaussians of a scene, from masks, a box, a point or a click; clear errors for invalid
+selections."""
 
 from __future__ import annotations
 
@@ -31,7 +32,7 @@ def check(cloud: GaussianCloud, truth: np.ndarray, spec: ObjectSpec) -> None:
     found = segment(cloud, FLOOR, spec)
     heights = FLOOR.heights(cloud.means.numpy())
     clear = heights > 0.05
-    # A few of the floor's Gaussians at the point of contact cannot be separated.
+    # Some floor Gaussians at the point of contact cannot be separated.
     assert (found.object_mask & ~truth & (np.abs(heights) > 0.01)).sum() == 0
     assert (found.object_mask & ~truth).sum() <= 4
     assert (truth & clear & ~found.object_mask).sum() == 0
@@ -42,8 +43,8 @@ def check(cloud: GaussianCloud, truth: np.ndarray, spec: ObjectSpec) -> None:
 
 
 def test_shreds_of_the_floor_do_not_go_along() -> None:
-    """Wide floor-coloured Gaussians at the foot of a dark ball belong to neither;
-    a dark one as wide stays the ball's.
+    """Wide Gaussians of the floor's colour at the foot of a dark ball belong neither to the ball nor to the background;
+    a dark one of the same size belongs to the ball.
     """
     cloud, truth = ball_on_floor()
     random = np.random.default_rng(5)
@@ -64,7 +65,7 @@ def test_shreds_of_the_floor_do_not_go_along() -> None:
 
 
 def test_an_object_that_segmentation_leaves_empty_is_an_error_of_that_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whichever step removes the last Gaussian: floor remnants, haze or clicks."""
+    """For every step that may remove the last Gaussian: floor remnants, haze or clicks."""
     cloud, _ = ball_on_floor()
     spec = ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
     with monkeypatch.context() as patch:
@@ -84,7 +85,8 @@ def test_an_object_that_segmentation_leaves_empty_is_an_error_of_that_stage(monk
 
 
 def test_fine_specks_in_the_floor_s_colour_are_no_shreds_of_it() -> None:
-    """Thrice as wide as others at the foot, but less than a hundredth of the object; those of a thirtieth are."""
+    """Specks three times as wide as others at the foot, but less than a hundredth of the object, are kept; wider ones
+    of a thirtieth are not."""
     thing, floor = shell(), level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.05)
     angles = np.linspace(0.0, 5.0, 6)
     specks = np.column_stack([0.3 * np.cos(angles), 0.3 * np.sin(angles), np.full(6, 0.09)])
@@ -205,7 +207,7 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     "name", ["pawn", *(pytest.param(name, marks=pytest.mark.slow) for name in ("stool", "figurine"))]
 )
 def test_built_in_scenes_come_apart(name: str) -> None:
-    """Compared with the known object: all of it above the foot is found, and nothing of the room except unseen
+    """Compared with the true object, everything above the foot is found, and nothing of the room except unseen
     Gaussians."""
     made = scene(name)
     cloud, truth = made.whole()
@@ -230,7 +232,7 @@ def test_built_in_scenes_come_apart(name: str) -> None:
 def test_real_captures_from_one_click(
     data_dir: Path, file: str, click: tuple, normal: tuple, heights: tuple[float, float]
 ) -> None:
-    """The plane that the data's own page gives, which was fitted to the Gaussians, not to rendered depth."""
+    """The plane is that of the data's own page, which was fitted to the Gaussians, not to rendered depth."""
     cloud = read_capture(data_dir / "scenes" / file).cloud
     located = locate_plane(cloud, ObjectSpec(point=np.array(click)))
     unit = np.array(normal) / np.linalg.norm(normal)
@@ -242,22 +244,22 @@ def test_real_captures_from_one_click(
 
 @pytest.mark.parametrize("width", [120.0, 400.0])
 def test_a_click_finds_what_is_small_in_a_large_room(width: float) -> None:
-    """A ball of one unit between walls that are far apart: guesses of its size are halved until it is found."""
+    """A ball of one unit between distant walls: the guess of its size is halved until it is found."""
     cloud, truth = ball_on_floor()
     whole = concatenate(cloud, walls(width, cloud.sh.shape[1]))
     check(whole, np.arange(whole.count) < truth.sum(), ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
 
 
 def walls(width: float, bands: int) -> GaussianCloud:
-    """Two, so far apart and as long."""
+    """Return two walls at a distance of ``width``, and of that length."""
     line = np.linspace(-0.5 * width, 0.5 * width, 60)
     sides = [np.column_stack([np.full(60, x), line, np.full(60, z)]) for x in (line[0], line[-1]) for z in (0.5, 1.5)]
     return round_ones(np.concatenate(sides), 0.135, bands)
 
 
 def test_a_click_finds_what_is_flat_in_a_room() -> None:
-    """A lens a tenth as high as it is wide, between walls 11 apart: the first guess of its size, half of the room's,
-    overlooks it, and half of that is about right.
+    """A lens with a height of a tenth of its width, between walls 11 apart: with the first guess of its size, half of
+    the room's, it is not found, with half of that it is.
     """
     lens = round_ones(shell() * [1.0, 1.0, 0.1], 0.02)
     whole = concatenate(concatenate(lens, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05))), walls(11.3, 1))
@@ -293,7 +295,8 @@ def test_the_unit_of_length_changes_nothing() -> None:
 
 
 def test_what_hangs_beside_is_a_floater_only_where_it_is_small() -> None:
-    """Beside a ball, a single Gaussian goes with neither ball nor background; another ball as near is background."""
+    """A single Gaussian beside a ball belongs neither to the ball nor to the background; another ball as near is
+    background."""
     mine = shell()
     other = mine + [1.13, 0.0, 0.0]
     floater = np.array([[0.0, -0.62, 0.5]])
@@ -309,7 +312,7 @@ def test_what_hangs_beside_is_a_floater_only_where_it_is_small() -> None:
 
 
 def test_loose_matter_behind_a_hole_is_the_bodys() -> None:
-    """A hollow ball with a round hole in its side, a tenth of its size across: what is loose inside goes along."""
+    """A hollow ball with a round hole in its side, a tenth of its size wide: loose Gaussians inside belong to it."""
     skin = shell(3000)
     away = np.linalg.norm(skin - [0.5, 0.0, 0.5], axis=1)
     skin = skin[away > 0.085]
@@ -322,7 +325,7 @@ def test_loose_matter_behind_a_hole_is_the_bodys() -> None:
 
 
 def test_the_floor_closes_a_bell_from_below() -> None:
-    """A dome that stands on its rim, open below: what is loose under it goes along."""
+    """A dome that stands on its rim, open below: loose Gaussians inside belong to it."""
     skin = shell(3000)
     dome = skin[skin[:, 2] > 0.5] - [0.0, 0.0, 0.5]
     inside = np.random.default_rng(0).normal(0.0, 0.03, (30, 3)) + [0.0, 0.0, 0.25]
@@ -334,8 +337,8 @@ def test_the_floor_closes_a_bell_from_below() -> None:
 
 
 def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
-    """Three standard deviations of the floor that is near; not of a higher one far away, nor of what lies under the
-    object.
+    """The limit is three standard deviations of the floor nearby; neither a higher floor far away nor Gaussians under
+    the object count.
     """
     random = np.random.default_rng(0)
     thing = shell() * [1.0, 1.0, 0.2] + [2.0, -1.0, 0.0]
@@ -351,7 +354,7 @@ def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
 
 
 def test_hardly_any_floor_says_nothing_of_its_roughness() -> None:
-    """Nineteen of its Gaussians beside the object; twenty do."""
+    """Nineteen Gaussians of floor beside the object are too few, twenty are enough."""
     for count, rough in ((19, False), (20, True)):
         place = np.linspace(0.7, 1.2, count)
         floor = np.column_stack([place, np.zeros(count), np.full(count, 0.01)])
@@ -363,7 +366,8 @@ def test_hardly_any_floor_says_nothing_of_its_roughness() -> None:
 
 
 def test_what_hovers_over_the_only_floor_is_taken_and_said() -> None:
-    """A ball a fifth of its size, the diagonal of its box, above it; twice as high it is refused."""
+    """A ball above the floor by a fifth of its size, the diagonal of its box, is accepted; at twice the height it is
+    refused."""
     cloud, truth = ball_on_floor(lift=0.35)
     located = locate_plane(cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.85])), up=FLOOR.normal)
     assert located.segmentation.object_mask[truth].mean() > 0.99

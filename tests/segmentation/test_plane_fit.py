@@ -22,7 +22,7 @@ def camera_over(plane: Plane, azimuth: float, *, elevation: float = 0.6, width: 
 
 
 def spoiled_view(plane: Plane, azimuth: float, seed: int) -> PlaneView:
-    """30 % of the depths are wrong, all have 1 % noise."""
+    """Return a view with 1 % noise in all depths, of which 30 % are wrong."""
     random = np.random.default_rng(seed)
     camera = camera_over(plane, azimuth)
     depth = plane_depth(plane, camera)
@@ -37,7 +37,7 @@ def angle(a: Plane, b: Plane) -> float:
 
 
 def test_plane_measures_height_towards_the_objects_side() -> None:
-    """Eq. (1): N.x + d is the distance to the plane, positive where N points, in any units."""
+    """Eq. (1): N.x + d is the signed distance to the plane, positive on the side to which N points, in any unit."""
     plane = Plane.from_coefficients(0.0, 0.0, -2.0, 3.0)
     np.testing.assert_allclose(plane.normal, [0.0, 0.0, -1.0])
     np.testing.assert_allclose(plane.heights(np.array([[5.0, 1.0, 1.5], [0.0, 0.0, 0.5]])), [0.0, 1.0])
@@ -47,7 +47,8 @@ def test_plane_measures_height_towards_the_objects_side() -> None:
 
 
 def test_depth_puts_every_pixel_on_the_plane() -> None:
-    """Eq. (18): walking D_p along the ray ends on the plane; the ray's z-depth is 1, and the sky has none."""
+    """Eq. (18): the point at D_p along each pixel's ray is on the plane; rays have a z-depth of 1, and sky pixels have
+    no depth."""
     camera = camera_over(TRUTH, 0.3, elevation=0.1)
     depth, rays = plane_depth(TRUTH, camera), camera_rays(camera)
     np.testing.assert_allclose(rays @ camera.rotation[2], 1.0, atol=1e-12)
@@ -60,7 +61,8 @@ def test_depth_puts_every_pixel_on_the_plane() -> None:
 @pytest.mark.parametrize("azimuth", [0.0, 1.0, 2.5])
 @pytest.mark.parametrize("paper_start", [False, True])
 def test_one_view_with_outliers_and_noise(azimuth: float, paper_start: bool) -> None:
-    """Eq. (18), (19): 0.1 degree and 0.1 % of the extent, also from the paper's start (look direction, d = 0)."""
+    """Eq. (18), (19): the error is at most 0.1 degree and 0.1 % of the extent, also from the paper's start (look
+    direction, d = 0)."""
     view = spoiled_view(TRUTH, azimuth, seed=3)
     start = Plane(view.camera.rotation[2], 0.0) if paper_start else None
     fit = fit_plane([view], start=start)
@@ -82,9 +84,8 @@ def test_exact_depth_gives_the_exact_plane() -> None:
 
 
 def test_weights_of_one_over_the_residual_leave_outliers_out() -> None:
-    """Weighted so, least squares have the least sum of absolute residuals: exact depth of which a fifth is wrong, all
-    to one side, gives the exact plane.
-    """
+    """Weights of 1 / |residual| turn least squares into least absolute residuals: exact depths of which a fifth are
+    wrong, all to one side, give the exact plane."""
     camera = camera_over(TRUTH, 0.7)
     depth = plane_depth(TRUTH, camera)
     mask = (depth > 0.0) & (depth < 12.0)
@@ -114,7 +115,7 @@ def test_what_cannot_be_fitted_is_said() -> None:
     noise = np.random.default_rng(0).uniform(0.5, 20.0, depth.shape)
     with pytest.raises(UserError, match=r"plane: none in sight: the best one leaves depth errors of [3-9]\d %"):
         fit_plane([PlaneView(camera, noise, np.ones_like(depth, bool))])
-    # A few wide splats that lie in one plane to the bit, and haze all about: no error of theirs, and nothing else fits.
+    # A few wide splats exactly on one plane, and haze everywhere else: their residual is zero, and no other plane fits.
     random = np.random.default_rng(0)
     steps = depth * np.where(random.uniform(size=depth.shape) < 0.35, 1.0, random.uniform(0.7, 1.3, depth.shape))
     with pytest.raises(UserError, match=r"the best one explains only 3\d % of what is in the masks"):
@@ -122,7 +123,7 @@ def test_what_cannot_be_fitted_is_said() -> None:
 
 
 def test_the_loss_of_outliers_has_its_derivatives() -> None:
-    """Tukey's biweight: value, first and second derivative by z, inside and beyond where it is flat; finite
+    """Tukey's biweight: value, first and second derivative with respect to z, inside the cutoff and beyond, by finite
     differences.
     """
     z, step = np.array([0.05, 0.3, 0.6, 0.9, 1.2, 5.0]), 1e-5

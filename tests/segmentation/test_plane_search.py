@@ -1,4 +1,5 @@
-"""Search for unmarked planes: widest first, from Gaussians parallel to them, in one patch, where they are visible."""
+"""Search for unmarked planes: widest first, from Gaussians parallel to them, as a single patch, where they are
+visible."""
 
 from __future__ import annotations
 
@@ -45,8 +46,8 @@ def test_several_planes_widest_first() -> None:
 
 
 def test_what_lies_along_a_plane() -> None:
-    """Discs, whichever of their axes is the thin one and however it is turned, within 25 degrees of the plane but not
-    beyond 40; neither needles nor balls.
+    """Discs of any thin axis and orientation count within 25 degrees of the plane but not beyond 40; needles and balls
+    do not count.
     """
     count = 200
     turns = Rotation.from_quat(np.random.default_rng(0).normal(size=(count, 4)))
@@ -69,7 +70,7 @@ def test_what_lies_along_a_plane() -> None:
 
 
 def test_a_plane_is_one_patch_or_none() -> None:
-    """A sheet is; three that lie apart at one level are not, even where another sheet above spans them."""
+    """A sheet is one patch; three separate sheets at one level are not, even if another sheet above spans them."""
     one = level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.03)
     apart = np.concatenate([one[:, :3] + [3.0 * k, 0.0, 0.0] for k in range(3)])
     above = level((-1.0, -1.0), (7.0, 1.0), 0.4, 0.03)
@@ -108,7 +109,7 @@ def test_what_lets_half_of_the_light_through_is_no_plane_to_see() -> None:
 
 @pytest.mark.parametrize(("given", "taken"), [(8, 8), (9, 5), (20, 7)])
 def test_of_many_cameras_at_most_eight_look(given: int, taken: int) -> None:
-    """Evenly picked; those below the plane do not count."""
+    """They are picked evenly; cameras below the plane are not used."""
     floor = lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05))
     above = ring_cameras(FLOOR, np.zeros(3), 1.0, count=given, elevations=(40.0,), size=32)
     below = Camera.look_at(np.array([0.0, 1.0, -2.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]), width=32, height=32)
@@ -119,7 +120,8 @@ def test_of_many_cameras_at_most_eight_look(given: int, taken: int) -> None:
 
 
 def test_a_plane_is_refined_alike_in_any_unit_of_length() -> None:
-    """The floor scatters by a hundredth of what is looked at, and a step of a twentieth on one side is none of it."""
+    """The floor has a scatter of 0.01 in a region of size 1, and a step of 0.05 on one side that does not belong to
+    it."""
     points = level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.03)
     points[:, 2] = np.random.default_rng(1).normal(0.0, 0.01, len(points)) + 0.05 * (points[:, 0] > 0.6)
     fits = []

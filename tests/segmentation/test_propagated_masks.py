@@ -1,4 +1,4 @@
-"""Masks from clicks, carried from view to view; what stands out, and the view in which something else does."""
+"""Masks from clicks, propagated from view to view, and the detection of masks of other objects."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def pixel_of(camera: Camera, point: tuple[float, float, float]) -> tuple[float, 
 
 @pytest.mark.slow
 def test_one_click_is_marked_in_every_view_and_cuts_what_touches(cameras: list[Camera]) -> None:
-    """Among two touching balls, the clicked one is found completely; without a network, the click finds both."""
+    """The clicked one of two touching balls is found completely; without a network, the click selects both."""
     cloud = balls(TONES)
     camera = next(one for one in cameras if one.centre[1] < -1.0 and abs(one.centre[0]) < 1.5)
     click = click_at(cloud, camera, *pixel_of(camera, (-0.5, -0.45, 0.6)))
@@ -89,7 +89,7 @@ def test_a_view_that_marks_something_else_is_left_out(cameras: list[Camera]) -> 
 
 @pytest.mark.parametrize(("times", "fits"), [(2.9, True), (3.1, False)])
 def test_a_mask_thrice_as_large_is_of_something_else(cameras: list[Camera], times: float, fits: bool) -> None:
-    """The network marks the region of the first mask about its middle, enlarged by this factor."""
+    """The network marks the region of the first mask about its centre, enlarged by a factor."""
     cloud = balls(TONES)
     (first,) = masks_from_selection(cloud, np.arange(cloud.count) < 1500, cameras[:1])
     places = np.indices(first.mask.shape).transpose(1, 2, 0)
@@ -111,7 +111,7 @@ def test_clicks_beside_go_along_where_they_are_in_sight(cameras: list[Camera]) -
     masks_of_clicks(cloud, [on, off], cameras, model, count=4)
     points, inside = model.asked[0]
     assert inside.tolist() == [True, False] and len(points) == 2
-    # From other sides it is out of sight.
+    # In other views it is hidden.
     assert any(not inside.all() for _, inside in model.asked[1:])
     below = [np.array([-0.5, 0.0, 0.5]), off.point]
     np.testing.assert_allclose(_in_sight(cloud, below, cameras[0]), [pixel_of(cameras[0], tuple(off.point))], atol=1e-9)
@@ -134,7 +134,7 @@ def test_what_nothing_can_be_made_of_is_told(cameras: list[Camera]) -> None:
 
 
 def test_places_to_point_at() -> None:
-    """The innermost one first; none twice; a thread is none."""
+    """The innermost pixel of each region, largest region first; none twice, and none in a thin line."""
     mask = np.zeros((60, 100), bool)
     mask[5:46, 5:46], mask[10:31, 60:81], mask[50, 10:90] = True, True, True
     places = _innermost(mask, 3)
@@ -181,7 +181,7 @@ def test_what_stands_out_of_most_views_is_taken(cameras: list[Camera]) -> None:
 def test_a_mask_model_at_the_command_line(
     tmp_path: Path, cameras: list[Camera], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One click and a network's file: the ball that was clicked on; without the click, one line."""
+    """One click and the file of a network select the ball; without a click, there is a one-line error."""
     write_ply(tmp_path / "scene.ply", balls(TONES))
     write_cameras(tmp_path / "cameras.json", cameras, [f"photo{k}.png" for k in range(len(cameras))])
     (tmp_path / "alike.onnx").write_bytes(alike(threshold=0.02))

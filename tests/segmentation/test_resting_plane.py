@@ -1,4 +1,4 @@
-"""The plane under an object on haze: by its own lowest parts."""
+"""The plane under an object on haze, found from its own lowest parts."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ BOX = np.array([1.0, 0.6, 0.5])
 
 
 def leaning(degrees: float) -> np.ndarray:
-    """(3,) up, turned about y."""
+    """Return up (3,), rotated about y."""
     angle = np.radians(degrees)
     return np.array([np.sin(angle), 0.0, np.cos(angle)])
 
 
 def skin_of_box(count: int = 3000) -> np.ndarray:
-    """(n, 3) on all sides of a box whose underside is in the floor, about its middle."""
+    """Return points (n, 3) on all sides of a box centred at the origin, with its underside on the floor."""
     random = np.random.default_rng(2)
     points = random.uniform(-0.5, 0.5, (count, 3))
     side = random.integers(0, 3, count)
@@ -41,7 +41,7 @@ def skin_of_box(count: int = 3000) -> np.ndarray:
 
 
 def box_on_haze(degrees: float) -> GaussianCloud:
-    """The box, and a sheet that leans so, through its foot."""
+    """Return the box, and a tilted sheet of haze through its foot."""
     normal = leaning(degrees)
     haze = level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.1)
     haze[:, 2] = 0.05 - haze[:, 0] * normal[0] / normal[2]
@@ -56,7 +56,7 @@ def degrees_between(one: np.ndarray, other: np.ndarray) -> float:
 
 @pytest.mark.parametrize("off", [0.0, 3.0, 8.0])
 def test_a_box_rests_on_its_underside(off: float) -> None:
-    """Whatever plane cuts through it, up may be off by ``off`` degrees, and some strays lie below."""
+    """The initial plane may cut through the box, up may be off by ``off`` degrees, and some strays are below."""
     skin = skin_of_box()
     strays = np.random.default_rng(0).uniform(-0.4, 0.4, (8, 3)) * [1.0, 1.0, 0.2] - [0.0, 0.0, 0.1]
     cloud = round_ones(np.concatenate([skin, strays]), 0.008)
@@ -69,7 +69,7 @@ def test_a_box_rests_on_its_underside(off: float) -> None:
 
 @pytest.mark.parametrize("off", [-9.0, -5.0, 5.0])
 def test_the_direction_is_found_more_finely_than_by_the_first_search(off: float) -> None:
-    """The search tries directions 1.4 degrees apart."""
+    """The first search tries directions 1.4 degrees apart."""
     cloud = round_ones(skin_of_box(), 0.008)
     found = resting_plane(cloud, np.ones(cloud.count, bool), FLOOR, leaning(off), degrees=10.0, size=1.3)
     assert degrees_between(found.normal, UP) < 0.15
@@ -77,7 +77,7 @@ def test_the_direction_is_found_more_finely_than_by_the_first_search(off: float)
 
 @pytest.mark.parametrize("mirror", [(-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
 def test_what_is_mirrored_rests_on_the_mirrored_plane(mirror: tuple[float, float, float]) -> None:
-    """No side is preferred, whatever the shape."""
+    """No side is preferred, for any shape."""
     for seed in range(8):
         points = np.random.default_rng(seed).normal(size=(600, 3)) * [0.3, 0.2, 0.1] + [0.0, 0.0, 0.5]
         found, other = (
@@ -89,7 +89,7 @@ def test_what_is_mirrored_rests_on_the_mirrored_plane(mirror: tuple[float, float
 
 
 def test_a_mirror_image_in_a_glossy_table_carries_nothing() -> None:
-    """A box that stands on feet 0.3 high, and as many Gaussians half its size below them."""
+    """A box stands on feet 0.3 high, with as many Gaussians 0.6 below them, as in a reflection."""
     skin = skin_of_box() + [0.0, 0.0, 0.3]
     feet = np.concatenate([skin_of_box(300) * [0.1, 0.1, 0.6] + [x, y, 0.0] for x in (-0.4, 0.4) for y in (-0.2, 0.2)])
     image = skin_of_box() * [1.0, 1.0, -1.0] - [0.0, 0.0, 0.6]
@@ -119,7 +119,7 @@ def found_on(cloud: GaussianCloud) -> LocatedPlane:
 
 
 def test_where_what_is_seen_is_not_level_the_plane_is_laid_under_the_object() -> None:
-    """By 8 degrees it is haze; by 3 it is a table."""
+    """A surface tilted by 8 degrees is haze; one tilted by 3 degrees is a table."""
     laid, seen = found_on(box_on_haze(8.0)), found_on(box_on_haze(3.0))
     assert not laid.in_sight and laid.fit is None and seen.in_sight
     assert "laid under the object's lowest parts" in laid.notes[-1]
@@ -130,7 +130,7 @@ def test_where_what_is_seen_is_not_level_the_plane_is_laid_under_the_object() ->
 
 
 def test_shreds_about_a_foot_on_haze_are_dropped_and_haze_stays() -> None:
-    """Near it and low; not what lies apart, and nothing where a table is in sight."""
+    """Remnants near the foot and low are dropped, distant ones are not, and none if a table is visible."""
     at = np.array([[0.54, 0.1, 0.04], [0.52, -0.1, 0.03], [1.6, 0.9, 0.0]])
     shreds = round_ones(at, 0.01)
     for degrees, dropped in ((8.0, [True, True, False]), (3.0, [False, False, False])):
@@ -145,7 +145,7 @@ def test_shreds_about_a_foot_on_haze_are_dropped_and_haze_stays() -> None:
 
 
 def test_haze_is_not_filled() -> None:
-    """A floor where none was seen would be a patch in the air."""
+    """A floor that was not visible would be painted in the air."""
     cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.25]), 0.9, count=8, elevations=(20.0, 50.0), size=200)
     spec = ObjectSpec(point=np.array([0.0, 0.0, 0.45]))
     scene = prepare_scene(
@@ -156,7 +156,7 @@ def test_haze_is_not_filled() -> None:
 
 
 def test_haze_within_an_object_is_dropped_with_it() -> None:
-    """It is not taken along, and left behind it would be a ghost of the object."""
+    """It does not belong to the object, and in the background it would look like a ghost of the object."""
     cloud, truth = ball_on_floor()
     where = np.array([[0.0, 0.1, 0.6], [0.1, 0.0, 0.4]])
     haze = round_ones(where, 0.2)
@@ -167,7 +167,7 @@ def test_haze_within_an_object_is_dropped_with_it() -> None:
 
 
 def test_haze_at_an_object_in_its_colour_is_dropped_with_it() -> None:
-    """Haze of another colour, or farther away, belongs to the room."""
+    """Haze of another colour, or farther away, belongs to the background."""
     cloud, _ = ball_on_floor()
     where = np.array([[0.55, 0.0, 0.5], [0.0, 0.55, 0.5], [0.75, 0.0, 0.5]])
     haze = round_ones(where, 0.2)

@@ -1,4 +1,4 @@
-"""Visible surfaces of a picture: from heights, a floor is at its place; from depths, it seems higher."""
+"""Visible surfaces of an image: positions by heights are on the floor; positions by depths are biased upwards."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SPACING = 0.03
 
 @pytest.fixture(scope="module")
 def seen() -> SeenSurface:
-    """A floor, looked at from 30 degrees above it."""
+    """A floor, viewed from 30 degrees above it."""
     eye = np.array([0.0, -2.2, 1.3])
     camera = Camera.look_at(
         eye, np.zeros(3), np.array([0.0, 0.0, 1.0]), width=120, height=120, vertical_fov_degrees=30.0
@@ -32,13 +32,13 @@ def test_heights_are_right_where_depths_are_too_high(seen: SeenSurface) -> None:
     points = seen.points(FLOOR, seen.opaque)
     assert len(points) == seen.opaque.sum()
     assert np.abs(points[:, 2]).max() < 1e-6
-    # Each is on its own pixel's ray.
+    # Each point is on the ray of its own pixel.
     along = (points - seen.camera.centre) @ seen.camera.rotation[2]
     np.testing.assert_allclose(points, seen.camera.centre + along[:, None] * rays[seen.opaque], atol=1e-9)
 
 
 def test_a_rough_plane_will_do(seen: SeenSurface) -> None:
-    """Tilted by two degrees, a splat's width counts by their sine."""
+    """For a plane tilted by two degrees, the error is the width of a splat times the sine of the tilt."""
     tilt = np.radians(2.0)
     rough = Plane(np.array([0.0, np.sin(tilt), np.cos(tilt)]), 0.02)
     points = seen.points(rough, seen.opaque)
@@ -46,7 +46,7 @@ def test_a_rough_plane_will_do(seen: SeenSurface) -> None:
 
 
 def test_what_shows_nothing_or_does_not_come_down_has_no_place(seen: SeenSurface) -> None:
-    """A look at the horizon and above; a plane above the camera."""
+    """Empty pixels, rays at or above the horizon, and a plane above the camera."""
     up = Camera.look_at(
         np.array([0.0, -1.0, 0.5]), np.array([0.0, 1.0, 0.9]), np.array([0.0, 0.0, 1.0]), width=64, height=64
     )

@@ -1,4 +1,4 @@
-"""The plane under an object in a room: the table top that it stands on, not the floor, which is wider."""
+"""The plane under an object in a room is the table top that it stands on, not the floor, which is wider."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ def candidates(room: GaussianCloud) -> list[Plane]:
     ],
 )
 def test_a_click_on_a_ball_finds_the_table_top(room: GaussianCloud, click: tuple[float, float, float]) -> None:
-    """Within 1 degree and 0.5 % of the ball's height, and the ball is the object; the floor is far wider."""
+    """The plane is within 1 degree and 0.5 % of the ball's height, and the ball is the object; the floor is much
+    wider."""
     located = locate_plane(room, ObjectSpec(point=np.array(click)), up=UP)
     assert located.plane.normal @ UP > np.cos(np.radians(1.0))
     assert abs(float(located.plane.heights(np.zeros(3)))) < 5e-3
@@ -95,12 +96,12 @@ def test_dust_far_away_changes_no_candidate(room: GaussianCloud, candidates: lis
 
 
 def on_surface(points: np.ndarray, spacing: float, cover: float) -> float:
-    """``surface_around`` a ball of one unit that touches z = 0 at (-3, 2), on flat Gaussians at ``points`` (n, 3), from
-    its foot, of a grid of ``spacing``, whose opacity adds up to ``cover`` of the area.
+    """Return ``surface_around`` a ball of one unit that touches z = 0 at (-3, 2), for flat Gaussians at ``points`` (n,
+    3) relative to its foot, on a grid of ``spacing``; their opacities cover ``cover`` of the area.
     """
     thing, foot = ball(), np.array([-3.0, 2.0, 0.0])
     flat = sheet(points, np.tile(UP, (len(points), 1)), spacing, (0.5, 0.5, 0.5))
-    # A Gaussian's opacity adds up to 2 pi s1 s2 times its peak.
+    # The integral of a Gaussian's opacity is 2 pi s1 s2 times its peak.
     full = 2.0 * np.pi * flat.opacities()[0] * np.exp(2.0 * float(flat.log_scales.numpy()[0, 0])) / spacing**2
     whole = concatenate(
         thing, sheet(points, np.tile(UP, (len(points), 1)), spacing * np.sqrt(cover / full), (0.5, 0.5, 0.5))
@@ -118,15 +119,15 @@ def on_surface(points: np.ndarray, spacing: float, cover: float) -> float:
 
 
 def test_the_surface_goes_on_as_far_as_it_lies() -> None:
-    """Half of the surroundings on a table whose edge runs under the ball's middle, wherever the ball stands; all of
-    them where Gaussians cover enough, none where they cover less, and next to none where they begin a cell beyond.
+    """It is half on a table whose edge runs under the ball's centre; one if Gaussians cover enough of the area and zero
+    if less; and nearly zero if they begin a cell farther out.
     """
     spacing, enough = 0.02, module._COVERED
     half, whole = (level((left, -1.0), (1.0, 1.0), 0.0, spacing) for left in (0.0, -1.0))
-    # Blurred, the edge stays where it is in the level of half the cover.
+    # After the blur, the edge is at the level of half the cover.
     assert on_surface(half, spacing, 2.0 * enough) == pytest.approx(0.5, abs=0.03)
     assert on_surface(whole, spacing, 1.2 * enough) > 0.95
     assert on_surface(whole, spacing, 0.8 * enough) < 0.05
-    # The ball's foot is a circle of radius 0.35; the cell at its outline does not count, nor one beyond the apron.
+    # The ball's foot is a circle of radius 0.35; neither the cell at its outline nor one outside the apron counts.
     reach = 0.35 + (1 + module._APRON + 1) * module._CELL * np.sqrt(3.0)
     assert on_surface(whole[np.linalg.norm(whole[:, :2], axis=1) > reach], spacing, 2.0) < 0.2

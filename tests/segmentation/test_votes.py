@@ -1,4 +1,4 @@
-"""Votes by blending weight against a slow, obvious twin; masks of the wrong size."""
+"""Votes by blending weight against a slow, obvious reference; masks of the wrong size."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def camera() -> Camera:
 
 
 def test_votes_are_the_weights_that_paint_each_gaussian(device: str) -> None:
-    """Painting one Gaussian white and all others black shows its blending weight, pixel by pixel."""
+    """A render of one white Gaussian among black ones shows its blending weight in each pixel."""
     cloud, view = random_cloud(device), camera()
     mask = np.zeros((view.height, view.width), bool)
     mask[10:25, 20:45] = True
@@ -45,7 +45,7 @@ def test_votes_are_the_weights_that_paint_each_gaussian(device: str) -> None:
             device=device,
         )
         weight = render_gaussians(painted, view, background=(0.0, 0.0, 0.0)).colour.numpy()[..., 0].astype(np.float64)
-        # The second view swaps in and out.
+        # The second view exchanges inside and outside.
         assert votes.inside[chosen] == pytest.approx(weight.sum(), rel=1e-4, abs=1e-4)
         assert votes.outside[chosen] == pytest.approx(weight.sum(), rel=1e-4, abs=1e-4)
     one = blending_votes(cloud, [MaskedView(view, mask)])
@@ -55,7 +55,7 @@ def test_votes_are_the_weights_that_paint_each_gaussian(device: str) -> None:
 
 
 def test_a_hidden_gaussian_is_hardly_seen(device: str) -> None:
-    """Two equal Gaussians one behind the other: the front one shows whole, the one behind hardly at all."""
+    """Two equal Gaussians one behind the other: the front one is fully visible, the other one hardly at all."""
     cloud = GaussianCloud.from_numpy(
         np.array([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.7, 0.0, 0.0]]),
         np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)),
@@ -77,7 +77,7 @@ def test_a_mask_of_another_size_is_refused() -> None:
 
 
 def test_what_no_pixel_could_show_has_no_weight() -> None:
-    """Behind the camera and far aside: nothing, whatever stands in the way; a first one of a single tile counts."""
+    """Gaussians behind the camera or far to the side have none, whatever hides them; one in a single tile counts."""
     means = np.array([[0.0, 0.0, 0.0], [0.0, -9.0, 0.0], [40.0, 0.0, 0.0]])
     cloud = GaussianCloud.from_numpy(
         means, np.tile([1.0, 0, 0, 0], (3, 1)), np.full((3, 3), -4.0), np.full(3, 2.0), np.zeros((3, 1, 3))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Mutation:
-    """One wrong formula."""
+    """A deliberately wrong formula."""
 
     what: str
     """Name of the formula, with its equation in the paper as "Eq. (n)" if it has one."""

@@ -1,4 +1,4 @@
-"""Training that was cut off goes on to the bits of one that was not."""
+"""An interrupted training continues to the bits of an uninterrupted one."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ OPTIONS = FinetuneOptions(
     seed=3,
 )
 CUTS = (17, 104, 209)
-"""Before and after Gaussians are moved and added, and once a view is left out."""
+"""Steps before and after Gaussians are moved and added, and after a view is excluded."""
 
 
 @pytest.fixture(autouse=True)
 def one_thread(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("egs_warp.training.checkpoint.SECONDS", 0.0)
     monkeypatch.setattr("egs_warp.training.checkpoint._SHARE", 1e9)
-    # One view in ten is left out early, whichever it is.
+    # One view in ten is excluded early, whichever it is.
     monkeypatch.setattr("egs_warp.training.outlier_views._TIMES_MEDIAN", 1.0)
     monkeypatch.setattr("egs_warp.training.outlier_views._SPREADS", 0.1)
     threads = torch.get_num_threads()
@@ -50,7 +50,7 @@ def one_thread(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture(scope="module")
 def views() -> list[TrainingView]:
-    """Ten of a ball."""
+    """Ten views of a ball."""
     return render_views(GaussianCloud.from_numpy(**ball(60), device="cpu"), ring(10, 24))
 
 

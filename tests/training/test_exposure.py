@@ -1,4 +1,4 @@
-"""Exposures that differ are found, and views that never fit; growth ends when it gains nothing."""
+"""Different exposures are estimated, views that never fit are excluded, and growth ends when it has no benefit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from egs_warp.training.relocation import Population, _growth_factor  # noqa: E40
 
 @pytest.mark.slow
 def test_gains_and_shifts_of_the_views_are_found_and_their_mean_is_none() -> None:
-    """Six views of one ball under gains from 0.7 to 1.2 and a warm or cold tint: what remains between two is theirs."""
+    """Six views of one ball with gains from 0.7 to 1.2 and a warm or cold tint: the estimated differences between views
+    are those of the gains."""
     random = np.random.default_rng(0)
     cloud = GaussianCloud.from_numpy(**ball(), device="cpu")
     gains = np.linspace(0.7, 1.2, 6)[:, None] * (1 + 0.1 * random.uniform(-1, 1, (6, 3)))
@@ -32,7 +33,7 @@ def test_gains_and_shifts_of_the_views_are_found_and_their_mean_is_none() -> Non
     result = finetune(cloud, views, options=options)
     assert result.tones is not None
     np.testing.assert_allclose(result.tones.mean(axis=0), np.eye(3, 4), atol=1e-5)
-    # Of what each view does to a grey.
+    # Compare the effect of each tone on grey.
     found = result.tones[:, :, :3].sum(axis=2)
     expected = gains / gains.mean(axis=0)
     assert np.abs(found - expected).max() < 0.16
@@ -57,7 +58,7 @@ def test_what_lies_far_above_the_others_is_a_misfit() -> None:
     assert not is_outlier(losses).any()
     losses[7] = 0.15
     assert np.flatnonzero(is_outlier(losses)).tolist() == [7]
-    # Few photos, or photos of which some are simply harder, tell nothing.
+    # A few photos, or a gradual increase of the loss, are not enough to call a photo an outlier.
     assert not is_outlier(losses[5:11]).any()
     assert not is_outlier(np.geomspace(0.02, 0.1, 40)).any()
 
@@ -76,7 +77,8 @@ def test_growth_ends_when_the_pictures_gain_nothing_and_goes_to_a_cap_that_was_a
 
 
 def test_pull_and_jitter_are_what_they_say() -> None:
-    """The pull is the derivative of the mean opacity and scale; the jitter of a faint Gaussian is Sigma times noise."""
+    """The regularisation is the derivative of the mean opacity and scale; the jitter of a faint Gaussian is Sigma times
+    noise."""
     count = 4000
     values = {
         "means": torch.zeros(count, 3),
@@ -109,7 +111,7 @@ def test_pull_and_jitter_are_what_they_say() -> None:
     )
     sigma = turn @ np.diag([0.09, 0.01, 0.0004]) @ turn.T
     gate = 1 / (1 + np.exp(100 * (1 / (1 + np.exp(9.0)) - 0.005)))
-    # 5e5 times the rate of the means, which is 1e-4 times the extent; covariances over the extent squared.
+    # 5e5 times the rate of the means, which is 1e-4 times the extent; covariances relative to the extent squared.
     size = 5e5 * 2e-4 / 4.0 * gate
     moved = tensors["means"].detach().numpy().astype(float)
     np.testing.assert_allclose(np.cov(moved.T), size**2 * sigma @ sigma, atol=0.08 * (size * 0.09) ** 2)
@@ -117,7 +119,7 @@ def test_pull_and_jitter_are_what_they_say() -> None:
 
 def test_the_number_grows_gently_where_there_is_time() -> None:
     def turns(count: int, cap: int, steps: int) -> tuple[float, float]:
-        """Step at which the cap is reached, and the largest factor."""
+        """Return the step at which the cap is reached, and the largest growth factor."""
         largest = 1.0
         for step in range(99, steps, 100):
             pace = _growth_factor(cap / count, step, steps)

@@ -1,4 +1,4 @@
-"""The training loop: it finds what it is shown, keeps what it must, and repeats to the bit."""
+"""The training loop: it recovers a known cloud, keeps fixed values, and is deterministic."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_only_the_trainable_change_and_scales_stay_above_their_floor() -> None:
 
 
 def test_an_extra_loss_and_pixel_weights_count() -> None:
-    """With no pixel that counts, only the extra loss moves the means: down to the plane y = 0."""
+    """Without counting pixels, only the extra loss moves the means: towards the plane y = 0."""
     cloud = GaussianCloud.from_numpy(**ball(40), device="cpu")
     camera = ring(1)[0]
     blank = np.zeros((camera.height, camera.width), dtype=np.float32)
@@ -95,7 +95,7 @@ def test_an_extra_loss_and_pixel_weights_count() -> None:
 
 @pytest.mark.parametrize("copies", [1, 2, 5])
 def test_relocated_copies_together_look_as_the_one_did(copies: int) -> None:
-    """n Gaussians on one spot have the peak and the mass across a line of the one that they share."""
+    """n copies at one place together have the peak and the integral along a line of the original Gaussian."""
     opacity, scale = 0.8, 0.3
     tensors = {
         "means": torch.zeros(1, 3),
@@ -117,8 +117,8 @@ def test_relocated_copies_together_look_as_the_one_did(copies: int) -> None:
 
 
 def test_ssim_equals_scikit_images() -> None:
-    """Pixel by pixel the published index: a window of sigma 1.5 and zeros beyond the rim, which scikit-image is given
-    as pixels.
+    """Pixel by pixel, the published index with a window of sigma 1.5 and zeros outside the image, which are given to
+    scikit-image as pixels.
     """
     from skimage.metrics import structural_similarity
 
@@ -162,7 +162,8 @@ def test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared() -> None:
     shape = axes @ np.diag(scales**2) @ axes.T
     for moved, opacity in zip(tensors["means"].numpy().astype(float).reshape(3, count, 3), opacities, strict=True):
         size = 5e5 * rate / (1 + np.exp(100 * (opacity - 0.005)))
-        # In the shape's own units each deviate has variance 1: sampled, to 1 / sqrt(count / 2), and four times that.
+        # In the units of the shape each deviate has variance 1: the tolerance is four times the sampling error, 1 /
+        # sqrt(count / 2).
         unit = moved @ np.linalg.inv(size * shape)
         np.testing.assert_allclose(unit.T @ unit / count, np.eye(3), atol=4 * np.sqrt(2 / count))
 

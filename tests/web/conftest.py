@@ -1,4 +1,4 @@
-"""The browser that the page's tests share, and a session for each."""
+"""The browser shared by the tests of the page, and a session for each test."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.support.live_sessions import coarse_pawn, session_of
 
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
-    """One browser for all of them: Playwright runs but once in a process."""
+    """One browser for all tests: Playwright can run only once in a process."""
     with started() as browser:
         yield browser
 

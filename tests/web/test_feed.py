@@ -29,7 +29,7 @@ def _socket(server: PageServer, token: str | None = None) -> ClientConnection:
 
 
 def _news(socket: ClientConnection, **wanted: Any) -> dict[str, Any]:
-    """The first news that hold what is ``wanted``."""
+    """Return the first message that contains ``wanted``."""
     end = time.monotonic() + 60.0
     while time.monotonic() < end:
         message = socket.recv(timeout=30)
@@ -41,7 +41,7 @@ def _news(socket: ClientConnection, **wanted: Any) -> dict[str, Any]:
 
 
 def _error(socket: ClientConnection) -> str:
-    """The first complaint."""
+    """Return the first error message."""
     while True:
         news = _news(socket)
         if "error" in news:

@@ -36,13 +36,13 @@ def test_a_pushed_body_comes_back_over_its_feet(tmp_path: Path):
     played.step(36)
     feet_moved = played.session.steering.place.moved_to(played.session.state.positions).ground.origin
     over = body.centre_of_mass(played.session.state.positions)[:2] - feet_moved[:2]
-    # Measured: 0.011 and 1.5 degrees; 0.024 and 3.3 a sixth of a second after it is let go.
+    # Measured: 0.011 and 1.5 degrees; 0.024 and 3.3 degrees a sixth of a second after the release.
     assert np.linalg.norm(over) < 0.015 * body.height
     assert tilt_degrees(initial_stance(played.session.creature), played.session.state.positions) < 2.0
 
 
 def test_one_that_is_thrown_over_lies_relaxed_and_stands_up_when_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """At once, where a pawn on its side would else get up again."""
+    """Then it gets up at once; otherwise a pawn on its side would get up by itself."""
     monkeypatch.setattr(steering, "_FALL_TIME", 0.0)
     played = SteppedSession(coarse_pawn(), tmp_path)
     session = played.session

@@ -1,4 +1,4 @@
-"""The page of a live creature in a real Chromium: what it shows, its controls, its connection."""
+"""The page of a live creature in a real Chromium: its view, its controls, its connection."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_what_is_shown_goes_evenly_and_never_back(chromium: Any, session: Sessio
             })"""
         )
         assert len(shown) > 20 and np.diff(shown).min() >= 0.0 and shown[-1] > shown[0]
-        # A frame of the solver is shown in more than one picture where the solver is slower than the screen.
+        # If the solver is slower than the screen, a frame of the solver is shown in several images.
         assert np.diff(shown).max() < 0.1
         assert "stand" in page.text_content(".pace") or "jump" in page.text_content(".pace")
 
@@ -84,7 +84,7 @@ def test_pause_step_sliders_and_script(chromium: Any, session: Session):
 
 @in_browser
 def test_a_style_is_chosen_by_name_or_by_number(chromium: Any, session: Session):
-    """The page shows what the session says, and the next jump is of that style."""
+    """The page shows the style of the session, and the next jump has it."""
     with watched(chromium, session) as page:
         pressed = "[...document.querySelectorAll('.choice [aria-pressed=true]')].map((one) => one.textContent).join()"
         wait_until(page, "egs.live.state?.style.squash === 1")

@@ -73,7 +73,7 @@ def test_busy_ends_whatever_goes_wrong():
 def test_a_session_that_is_held_wakes_when_asked_and_ends_when_stopped():
     post, turns = _watched(), []
     post.send_state({"doing": "stand"})
-    # Not held, nothing told or something asked: no waiting.
+    # Not suspended, or with a pending request: it does not block.
     assert post.wait_for_work(lambda: False, lambda: None)
     thread = threading.Thread(target=lambda: turns.append(post.wait_for_work(lambda: True, lambda: None)))
     thread.start()

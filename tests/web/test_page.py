@@ -1,4 +1,4 @@
-"""The page in a real Chromium, which draws in software where there is no GPU."""
+"""The page in a real Chromium, which renders in software if there is no GPU."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def file(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def _picture(page: Any, stage: int = 0) -> np.ndarray:
-    """(H, W, 3) 0 to 1: the canvas of a stage, its splats sorted."""
+    """Return the canvas of a view as (H, W, 3) in 0 to 1, with its splats sorted."""
     text = page.evaluate(
         """async (k) => {
             const viewer = window.egs.viewers[k];
@@ -58,7 +58,7 @@ def _picture(page: Any, stage: int = 0) -> np.ndarray:
 
 
 def _own_picture(recording: Recording, page: Any, frame: int) -> np.ndarray:
-    """The same frame through the page's own camera, by our renderer."""
+    """Return the same frame, rendered by this package with the camera of the page."""
     seen = page.evaluate(
         """() => {
             const { camera, controls, canvas } = window.egs.viewers[0];
@@ -96,7 +96,7 @@ def test_canvas_is_like_our_own_picture_of_the_same_frame_and_camera(
 
 
 def test_motion_is_seen(chromium: Any, file: str, recording: Recording):
-    """The teeth of the comparison: another frame, and splats that stay, are far off."""
+    """Another frame, and splats that do not move, differ clearly."""
     page, _ = opened(chromium, file)
     page.evaluate("egs.setLayer('ground', false); egs.player.seek(12)")
     assert _psnr_on_body(_own_picture(recording, page, 0), _picture(page)) < 35.0
@@ -126,7 +126,7 @@ def test_play_advances_and_loops(chromium: Any, file: str):
 
 
 def test_a_slow_machine_waits_for_its_splats_to_be_sorted(chromium: Any, file: str):
-    """An old order would draw the ground over a body that has moved."""
+    """With an old order, the ground would be drawn over a body that has moved."""
     page, _ = opened(chromium, file)
     page.evaluate("Object.defineProperty(egs.viewers[0], 'sorting', { get: () => window.held })")
     page.evaluate("() => { window.held = true; egs.player.playing = true; egs.frameTime = 0.001; }")
@@ -163,13 +163,13 @@ def test_a_foot_is_bright_while_the_ground_bears_it(chromium: Any, file: str):
                 "for (const frame of egs.viewers[0].source.frames)"
                 " Object.defineProperty(frame, 'contacts', { value: new Float32Array(0) })"
             )
-        # The first state has no step before it, and so no forces.
+        # The first state has no previous step, and so no forces.
         page.evaluate("egs.player.seek(0); egs.player.seek(4)")
         picture = _picture(page)
         shown = np.abs(picture - np.array(_BACKGROUND)).max(axis=-1) > 0.05
         assert shown.mean() > 2e-3
         green[carried] = float((picture[..., 1] - picture[..., 2])[shown].mean())
-    # Mint is green, the grey bluish.
+    # Mint is green, the grey is bluish.
     assert green[True] > 0.01 and green[False] < -0.01
     assert complaints == []
     page.close()
@@ -256,7 +256,7 @@ def test_a_server_that_is_gone_is_told(chromium: Any, recording: Recording):
 
 
 def test_a_browser_without_webgl2_is_told(file: str):
-    # Playwright runs but once in a process.
+    # Playwright can run only once in a process.
     script = f"""
 from playwright.sync_api import sync_playwright
 with sync_playwright() as started:
@@ -272,7 +272,7 @@ with sync_playwright() as started:
 
 @pytest.fixture(scope="module")
 def on_a_floor(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The page of the same run over a grey floor of flat Gaussians, which lies behind it as ``background.ply``."""
+    """The page of the same run over a grey floor of flat Gaussians, stored with the run as ``background.ply``."""
     folder = tmp_path_factory.mktemp("floor") / "run"
     shutil.copytree(run_folder, folder)
     t = Recording.read(folder).trajectory
@@ -297,7 +297,7 @@ def test_a_scene_behind_lies_on_the_ground_and_takes_the_shadow(chromium: Any, o
     assert not page.evaluate("document.getElementById('layer-ground').checked")
     page.evaluate("egs.viewers[0].preset('top'); egs.setLayer('splats', false)")
     picture = _picture(page)
-    # Grey where light is let through, darker under the creature, nowhere outside of the floor's range.
+    # Grey where light passes through, darker under the creature, nothing outside the range of the floor.
     middle = picture[picture.shape[0] // 2, picture.shape[1] // 2]
     assert 0.2 < middle.mean() < 0.35
     assert abs(np.median(picture[180:300, 10:40]) - 0.5) < 0.03

@@ -27,7 +27,7 @@ needs_page = pytest.mark.skipif(not PAGE.is_file(), reason="the page is not buil
 
 
 def _read(data: bytes) -> tuple[dict, dict[str, np.ndarray], list[dict]]:
-    """A reader after the words of docs/guide/view.md alone."""
+    """Read packets as docs/guide/view.md describes them."""
     assert data[:8] == b"EGSPAGE1"
     length = int(np.frombuffer(data, "<u4", 1, 8)[0])
     facts = json.loads(data[12 : 12 + length])
@@ -73,7 +73,7 @@ def test_what_is_written_is_read_back_by_the_documented_layout(run_folder: Path)
         np.testing.assert_allclose(force, t.contact_force[t.contact_step == step - 1].sum(axis=0), atol=1e-3)
         assert len(frame["curves"]) == len(CURVES)
     np.testing.assert_array_equal(arrays["splats_means"], recording.creature.splats.means.numpy())
-    # The plan of a jump is known from its first frame on; its one foot is what stands on the ground.
+    # The plan of a jump is known from the first frame; its only foot is the sole on the ground.
     plan, centre = arrays["plan"], t.node_mass @ t.positions[0] / t.node_mass.sum()
     assert plan.shape == (13, 3)
     np.testing.assert_allclose(plan[0], centre, atol=1e-3 * t.height)
@@ -94,7 +94,7 @@ def test_a_frame_is_as_small_as_documented(run_folder: Path):
 
 
 def test_the_creature_file_draws_what_the_film_drew(run_folder: Path):
-    """The embedding is computed again from the splats of the file and the rest cage of the trajectory."""
+    """The embedding is recomputed from the splats of the file and the rest cage of the trajectory."""
     recording = Recording.read(run_folder)
     t, made = recording.trajectory, recording.creature
     deformer = Deformer(made.splats, embed_gaussians(made.splats, TetMesh(t.rest_positions, t.tets)))
@@ -113,7 +113,7 @@ def test_curves_are_those_of_the_audit(run_folder: Path):
     assert values[:, names.index("residual")].max() <= audit["momentum_residual"] + 1e-12
     assert -values[:, names.index("gap")].min() <= audit["penetration"] * (1 + 1e-9)
     assert values[:, names.index("friction")].max() <= 1.0 + 1e-6
-    # It stands, and begins to crouch: none of them is nothing.
+    # The body stands and begins to crouch: none of the curves is zero.
     assert -values[:, names.index("gap")].min() == pytest.approx(audit["penetration"])
     assert values[:, names.index("friction")].max() > 0.2
     assert values[0, names.index("force")] == pytest.approx(1.0, abs=0.2)
@@ -151,7 +151,7 @@ def test_a_scene_behind_it_travels_too(run_folder: Path, tmp_path: Path):
 
 
 def _shorten(path: Path, *names: str, end: int) -> None:
-    """These arrays of a file up to row ``end``: each is whole, the file is not."""
+    """Shorten these arrays of a file to row ``end``: each array is valid, but the file is inconsistent."""
     with np.load(path) as file:
         arrays = dict(file)
     arrays |= {name: arrays[name][:end] for name in names}

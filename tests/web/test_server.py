@@ -1,4 +1,4 @@
-"""The server of the page: for this machine and this page alone."""
+"""The server of the page: accessible only to this machine and this page."""
 
 from __future__ import annotations
 
@@ -75,7 +75,8 @@ def test_nothing_else_is_served(server: PageServer, path: str):
 def test_what_lies_in_the_folder_of_the_run_is_not_served_nor_where_a_link_in_it_leads(
     run_folder: Path, tmp_path: Path
 ):
-    """The page gets what is made of a run: no path of it names a file."""
+    """Neither files in the folder nor targets of links in it: the page receives data made from the run, and no path
+    names a file."""
     folder, secret = tmp_path / "run", tmp_path / "secret.txt"
     shutil.copytree(run_folder, folder)
     secret.write_text("nobody's business")

@@ -1,4 +1,4 @@
-"""A creature that lives: its thread, and what it does with messages."""
+"""A live session: its thread, and its reaction to messages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.support.live_sessions import SteppedSession, coarse_pawn, session_of
 
 
 def _wait(session: Session, woken: threading.Event, seen: list, done: Callable[[], bool]) -> None:
-    """Gathers news until ``done``."""
+    """Collect messages until ``done`` holds."""
     end = time.monotonic() + 60.0
     while not done():
         assert time.monotonic() < end, [one for one in seen if not isinstance(one, Frame)]
@@ -66,7 +66,8 @@ def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
 
 
 def _held(session: Session) -> float:
-    """Seconds of its state, once the step that was under way is done: a busy core takes its time over one."""
+    """Return the seconds for which its state stays the same, once the current step is done, which takes time on a busy
+    core."""
     for _ in range(30):
         before = session.state.time
         time.sleep(1.0)
@@ -106,7 +107,7 @@ def test_it_is_no_faster_than_the_clock(tmp_path: Path, monkeypatch: pytest.Monk
         began = time.monotonic()
         session.subscribe(woken.set)
         _wait(session, woken, seen, lambda: len([one for one in seen if isinstance(one, Frame)]) > 32)
-        # It may catch up what two steps were late.
+        # It may catch up on two late steps.
         assert time.monotonic() - began > 27 / 60.0
     finally:
         session.stop()
@@ -202,7 +203,7 @@ def test_a_push_strikes_it_in_the_next_step_and_its_take_passes_the_audit(tmp_pa
     played.request("record", on=True)
     played.step()
     gained = body.centre_of_mass(session.state.velocities) / body.speed_unit
-    # The ground has had a step to take some of it, by friction; the books of the take say how much.
+    # The ground has had a step to reduce the momentum by friction; the take records the whole push.
     assert 0.2 < gained[0] / 0.05 <= 1.0 and 0.2 < gained[1] / -0.1 <= 1.0
     played.step(4)
     spin = body.angular_momentum(session.state.positions, session.state.velocities)

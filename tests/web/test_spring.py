@@ -1,4 +1,4 @@
-"""A pull: its force, and what a step makes of it."""
+"""A pull: its force, and its effect in a step."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_force_is_that_of_a_spring_up_to_its_strongest():
     rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
     spring.target = np.zeros(3)
     held = -spring.force(rest) / np.linalg.norm(spring.force(rest))
-    # Its own middle is found from the pulls along the axes.
+    # The position of the grip is determined from pulls along the axes.
     away = np.array([0.1, 0.0, 0.0])
     spring.target = held + away
     before = spring.force(rest)

@@ -17,7 +17,7 @@ from tests.support.chromium import wait_until
 from tests.support.live_pages import KEEP_SENT, in_browser, watched
 
 _FAR = "Math.hypot(...egs.viewers[0].centreOfMass.toArray().map((x, k) => x - {}[k])) > 0.01"
-"""The centre of mass is no longer there."""
+"""JavaScript that returns true when the centre of mass has moved away from a point."""
 _AWAY = """() => {
     const { camera } = egs.viewers[0], way = camera.getWorldDirection(camera.position.clone());
     return [way.x, way.y].map((part) => part / Math.hypot(way.x, way.y));
@@ -90,7 +90,7 @@ def test_a_click_on_the_ground_sends_it_there(chromium: Any, session: Session):
         goal = np.array(page.evaluate("egs.live.state?.goal"))
         start = np.array(page.evaluate("egs.viewers[0].centreOfMass.toArray()"))[:2]
         assert np.linalg.norm(goal - start) > 0.25
-        # Some hundred steps of a walk, beside a page that is drawn on the same cores.
+        # About a hundred steps of a walk, while the page is rendered on the same cores.
         wait_until(page, "egs.live.state?.goal === null", seconds=600.0)
         assert not [line for line in page.evaluate("egs.live.messages") if line.startswith("go")]
         place = session.steering.place
@@ -117,7 +117,7 @@ def test_a_drag_pulls_at_it(chromium: Any, session: Session):
         wait_until(page, _FAR.format(before))
         page.mouse.up()
         wait_until(page, "!egs.live.state?.pulled")
-        # The camera has gone along with it, and was not turned.
+        # The camera has followed the body without rotating.
         moved = np.subtract(page.evaluate("egs.viewers[0].camera.position.toArray()"), camera)
         assert np.linalg.norm(moved) < 0.5
 
@@ -130,7 +130,7 @@ def test_a_key_a_button_and_a_click_push_it_away_from_the_eye(chromium: Any, ses
         wait_until(page, "egs.live.state?.recording")
         away, before = np.array(page.evaluate(_AWAY)), np.array(page.evaluate("egs.viewers[0].centreOfMass.toArray()"))
         page.keyboard.down("b")
-        page.keyboard.down("b")  # as a key that is held repeats itself
+        page.keyboard.down("b")  # as repeated by a key that is held down
         page.keyboard.up("b")
         page.click("[title='Push it away from you (b)']")
         wait_until(page, _FAR.format(before.tolist()))

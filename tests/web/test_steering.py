@@ -39,7 +39,7 @@ def test_what_is_asked_meanwhile_takes_the_place_of_what_was_to_come(tmp_path: P
 
 
 def test_it_is_driven_until_something_else_is_asked(tmp_path: Path):
-    """A command waits for the motion that goes on; the next command, or motion, takes its place."""
+    """A command is queued behind the current motion; the next command, or motion, replaces it."""
     played = SteppedSession(coarse_pawn(), tmp_path)
     steering = played.session.steering
     played.request("drive", forward=0.1)
@@ -115,7 +115,7 @@ def test_a_journey_turns_first_and_then_jumps_straight_at_its_goal():
     assert straight is not None and straight.request.name == "jump"
     assert straight.request.asked["distance"] == pytest.approx(0.5, abs=1e-3)
     assert leg(0.9 * ARRIVAL_DISTANCE * left) is None
-    # So near, it does not turn.
+    # It does not turn towards a point so near.
     near = leg(0.2 * left)
     assert near is not None and near.request.name == "jump"
 
@@ -129,7 +129,7 @@ def test_a_journey_that_comes_no_nearer_is_given_up():
 
 
 def test_a_body_with_feet_walks_there():
-    """To where it lies, ahead and aside as it is, at most a leg's length at once."""
+    """It walks towards the point, ahead and sideways, by at most the length of a leg at once."""
     place = coarse_creature(
         stool(), forward=np.array([0.9, 0.3, 0.0]), sag=0.01, strength=20.0, settle_first=False
     ).place

@@ -1,4 +1,4 @@
-"""Pushes are of one step, a pull lasts until it is released; both add up."""
+"""A push acts in one step, a pull until it is released; both add up."""
 
 from __future__ import annotations
 
