@@ -128,7 +128,7 @@ def test_names_that_are_too_long_are_one_line(line: str, tmp_path: Path, capsys:
     assert "no such file" in error and error.count("\n") == 1
 
 
-def test_flat_object_leaves_an_earlier_result_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_flat_object_does_not_overwrite_an_earlier_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)
     flat = np.column_stack([rng.uniform(-1, 1, (500, 2)), np.zeros(500)])
     cloud = GaussianCloud.from_numpy(
@@ -145,7 +145,7 @@ def test_flat_object_leaves_an_earlier_result_alone(tmp_path: Path, capsys: pyte
     assert [path.name for path in out.iterdir()] == ["jump.mp4"]
 
 
-def test_own_muscles_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_own_muscles_are_plotted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The plot shows the fibres of the file; a fibre outside the body is refused by name."""
     thing = pawn()
     write_ply(tmp_path / "pawn.ply", thing.cloud)
@@ -168,7 +168,7 @@ def test_a_plot_needs_the_name_of_a_picture(tmp_path: Path, name: str, capsys: p
     assert f"{name}: not the name of a picture; let it end in one of .png, .jpg" in error and error.count("\n") == 1
 
 
-def test_a_plot_goes_where_there_is_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_plot_needs_an_existing_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The error is reported before the capture is read."""
     assert main(["muscles", str(tmp_path / "nothing.ply"), "--plot", str(tmp_path / "gone" / "a.png")]) == 2
     assert f"a.png: its folder does not exist; create {tmp_path / 'gone'} first" in capsys.readouterr().err
@@ -214,7 +214,7 @@ def test_axes_and_planes_are_read() -> None:
 
 
 @pytest.mark.parametrize(("given", "taken"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "4"}, "4")])
-def test_small_matrices_take_one_thread_unless_told(given: dict[str, str], taken: str) -> None:
+def test_blas_uses_one_thread_by_default(given: dict[str, str], taken: str) -> None:
     """The variable is set before NumPy, which reads it, is loaded."""
     script = """
 import atexit, os, sys

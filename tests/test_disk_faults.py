@@ -151,7 +151,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
         if name != "animate"
     ],
 )
-def test_each_opening_and_renaming_fails_once(
+def test_each_file_operation_fails_once(
     line: str,
     reason: int,
     status: int,

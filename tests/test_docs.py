@@ -36,13 +36,13 @@ def test_cited_pages_exist() -> None:
     assert not [pair for pair in sorted(cited) if not (ROOT / pair[1]).is_file() and "NAME" not in pair[1]]
 
 
-def test_no_page_that_is_not_in_the_tree_is_cited() -> None:
+def test_no_missing_page_is_cited() -> None:
     """No text refers to the first design document, whose content is in docs/concepts."""
     elsewhere = re.compile(r"\bDESIGN\b(?! of the first days)")
     assert not [str(path) for path in TEXTS if elsewhere.search(path.read_text())]
 
 
-def test_pictures_are_small_and_all_made_by_the_script() -> None:
+def test_images_are_small_and_made_by_the_script() -> None:
     made = [path for path in (DOCS / "assets").iterdir() if path.suffix in (".webp", ".mp4")]
     assert {path.name for path in made} == set(PICTURES)
     assert (DOCS / "assets" / "hop.mp4").stat().st_size <= 1e6
@@ -75,7 +75,7 @@ def test_the_gallery_opens_the_pages_that_the_script_makes_and_has_no_dead_link(
     assert len(shown.splitlines()) == len(text.splitlines()) - len(linked) + 1
 
 
-def test_every_page_of_concepts_says_where_its_code_is() -> None:
+def test_every_page_of_concepts_names_its_code() -> None:
     for page in (DOCS / "concepts").glob("*.md"):
         for room in re.findall(r"`(egs_warp/[\w/]+?)/?`", page.read_text()):
             assert (ROOT / room).exists() or (ROOT / f"{room}.py").exists(), f"{page.name}: no {room}"

@@ -114,7 +114,7 @@ PLACE = re.compile(r"`(egs_warp/[\w/]+\.py):([\w.]+)`")
 TEST = re.compile(r"`(tests/[\w/]+\.py)::(\w+)`")
 
 
-def test_the_reader_of_mentions_reads_lists_and_ranges() -> None:
+def test_mentioned_reads_lists_and_ranges() -> None:
     assert mentioned("(Eq. 4, 6) and Eq. (9), Eq. 14-16; Tan 2012") == {4, 6, 9, 14, 15, 16}
     assert mentioned("Eq. (14) to (16): x. Eq. (2), (3): y, 5") == {2, 3, 14, 15, 16}
     assert mentioned("no equation") == set()
@@ -162,7 +162,7 @@ def test_every_cited_test_asserts_and_calls_the_code_of_its_row() -> None:
             assert called, f"{file}::{name} calls none of {places}, so it is no test of Eq. ({number})"
 
 
-def test_the_reader_of_calls_sees_through_helpers_and_knows_a_mention_from_a_call(tmp_path: Path) -> None:
+def test_calls_are_followed_through_helpers_and_mentions_do_not_count(tmp_path: Path) -> None:
     file = tmp_path / "test_it.py"
     file.write_text(
         "from egs_warp.segmentation.plane_fit import fit_plane\n"

@@ -37,7 +37,7 @@ def test_a_program_ends_with_one_line(capsys: pytest.CaptureFixture[str]) -> Non
     assert end.value.code == 2 and capsys.readouterr().err == "jump.py: --size 0: give a number of pixels\n"
 
 
-def test_only_the_commands_speak_of_flags() -> None:
+def test_only_commands_mention_flags() -> None:
     """No string of the library contains ``--flag``, except docstrings."""
     for path in sorted(PACKAGE.rglob("*.py")):
         if path.is_relative_to(PACKAGE / "commands") or path.name == "cli.py":

@@ -90,7 +90,7 @@ def test_signals_unwind(number: signal.Signals, status: int, line: str, tmp_path
     assert os.listdir(tmp_path) == []
 
 
-def test_an_interrupt_that_a_destructor_swallows_comes_again() -> None:
+def test_an_interrupt_swallowed_by_a_destructor_still_ends_the_program() -> None:
     body = """
         class Thing:
             def __del__(self):
@@ -149,26 +149,26 @@ def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
         ("egs-warp doctor >/dev/full", 1),
     ],
 )
-def test_output_that_goes_nowhere_changes_no_status(command: str, status: int) -> None:
+def test_closed_outputs_do_not_change_the_status(command: str, status: int) -> None:
     """A command whose result is its output is the exception."""
     ended, _, said = told_by(command)
     assert ended == status and "Traceback" not in said and said.count("\n") <= 1
 
 
-def test_files_are_not_opened_in_the_place_of_closed_streams() -> None:
+def test_files_do_not_get_the_numbers_of_closed_streams() -> None:
     """Otherwise libraries would print into these files."""
     code = "from egs_warp.commands.exit_handling import one_line_errors\nwith one_line_errors('prog'):\n"
     code += " import os, tempfile\n with tempfile.TemporaryFile() as file: os._exit(file.fileno())"
     assert told_by(f'{sys.executable} -c "$(cat <<"END"\n{code}\nEND\n)" <&- >&- 2>&-')[0] > 2
 
 
-def test_letters_that_a_terminal_does_not_know(tmp_path: Path) -> None:
+def test_characters_outside_the_terminal_encoding(tmp_path: Path) -> None:
     """The name of a folder is printed after everything is written."""
     status, said, error = told_by(f"egs-warp samples '{tmp_path}/é'", encoding="ascii")
     assert status == 0 and "\\xe9" in said and error == ""
 
 
-def test_the_command_is_quick_to_refuse() -> None:
+def test_wrong_flags_are_reported_quickly() -> None:
     """No heavy package is imported for a wrong flag or the version."""
     code = "import sys\nfrom egs_warp.cli import main\ntry:\n main(sys.argv[1:])\nexcept SystemExit as end:\n"
     code += " print(end.code, *sorted({'warp', 'numpy', 'scipy', 'torch', 'cv2'} & set(sys.modules)))"
@@ -196,7 +196,7 @@ def test_a_machine_without_a_gpu_is_not_warned() -> None:
     assert done.stderr == "egs-warp: none.ply: no such file or folder; check the path\n"
 
 
-def test_ctrl_c_that_a_library_makes_an_error_of_its_own_of_is_still_one() -> None:
+def test_ctrl_c_converted_by_a_library_is_recognised() -> None:
     """SciPy's HiGHS raises "ImportError: initialization failed" if it is interrupted while it is imported."""
     body = """
         try:
@@ -208,7 +208,7 @@ def test_ctrl_c_that_a_library_makes_an_error_of_its_own_of_is_still_one() -> No
     assert ended(body) == (130, "prog: stopped; finished files are whole, unfinished ones are gone\n")
 
 
-def test_what_fails_after_a_ctrl_c_that_was_meant_keeps_its_line() -> None:
+def test_an_error_after_a_handled_ctrl_c_is_reported() -> None:
     """For example, a take cannot be saved when the live page is ended by Ctrl-C."""
     body = """
         from egs_warp.errors import UserError

@@ -104,7 +104,7 @@ def test_gradients_are_finite(changed: dict[str, tuple[int, float]]) -> None:
 
 
 @tried
-def test_a_cage_carries_it_and_all_others_as_if_it_were_not_there(changed: dict[str, tuple[int, float]]) -> None:
+def test_a_cage_deforms_it_and_leaves_all_others_unchanged(changed: dict[str, tuple[int, float]]) -> None:
     """Eq. (14) to (17): moved, bent, inverted and flattened cages; splits where they bend."""
     cloud, usual = cloud_of(odd(changed)), cloud_of(ordinary())
     others = np.arange(COUNT) != ODD
@@ -124,7 +124,7 @@ def test_a_cage_carries_it_and_all_others_as_if_it_were_not_there(changed: dict[
 
 @settings(max_examples=examples(15), phases=[Phase.generate])
 @given(changed=changes())
-def test_training_stays_finite_or_says_why(changed: dict[str, tuple[int, float]]) -> None:
+def test_training_stays_finite_or_reports_the_reason(changed: dict[str, tuple[int, float]]) -> None:
     views = render_views(cloud_of(ordinary()), [CAMERA])
     try:
         result = finetune(cloud_of(odd(changed)), views, options=FinetuneOptions(iterations=3))

@@ -32,7 +32,7 @@ def readme_lines() -> str:
     return block
 
 
-def test_the_face_is_what_the_docs_teach() -> None:
+def test_the_public_names_are_documented() -> None:
     rows = re.findall(r"^\| (`.*?) \|", (ROOT / "docs" / "reference" / "face.md").read_text(), re.MULTILINE)
     taught = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
     assert sorted(taught) == sorted(egs.__all__) == dir(egs)
@@ -48,7 +48,7 @@ def classes_of(annotation: object) -> list[set[str]]:
     return [set(re.findall(r"\w+", text)) & PACKAGE_CLASSES for text in alternatives if text.strip() != "None"]
 
 
-def test_whatever_a_public_function_takes_can_be_given_by_the_face() -> None:
+def test_arguments_of_public_functions_are_public() -> None:
     """Each parameter has an alternative that consists of public classes, or of records that a public function returns;
     so do the constructors of classes that no function returns."""
     public: dict[str, Any] = {name: getattr(egs, name) for name in egs.__all__}
@@ -67,7 +67,7 @@ def test_whatever_a_public_function_takes_can_be_given_by_the_face() -> None:
     assert checked > 40
 
 
-def test_type_checkers_see_the_same_names_in_the_same_places() -> None:
+def test_type_checkers_see_the_same_names_in_the_same_modules() -> None:
     (block,) = [node for node in ast.parse(FACE.read_text()).body if isinstance(node, ast.If)]
     seen = {alias.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}
     assert seen == egs._MODULE_OF
@@ -82,7 +82,7 @@ def test_importing_the_face_imports_nothing_else() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, capture_output=True)
 
 
-def test_the_examples_import_the_package_by_its_face_alone() -> None:
+def test_the_examples_import_only_the_public_names() -> None:
     for path in sorted((ROOT / "examples").glob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom):

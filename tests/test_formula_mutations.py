@@ -41,7 +41,7 @@ def test_every_equation_of_the_paper_is_spoiled_once() -> None:
 
 
 @by_formula
-def test_the_formula_stands_where_it_is_spoiled(mutation: Mutation) -> None:
+def test_each_formula_occurs_once(mutation: Mutation) -> None:
     """Otherwise another formula would be changed; the test that must fail exists."""
     found = (ROOT / mutation.file).read_text().count(mutation.right)
     assert found == 1, f"{mutation.file} has {found} times: {mutation.right}; rewrite the mutation with the formula"
@@ -51,7 +51,7 @@ def test_the_formula_stands_where_it_is_spoiled(mutation: Mutation) -> None:
 
 @pytest.mark.slow
 @by_formula
-def test_a_wrong_formula_is_noticed(copy: Path, mutation: Mutation) -> None:
+def test_a_wrong_formula_is_detected(copy: Path, mutation: Mutation) -> None:
     """The test fails by an assertion, not because the mutated program cannot run."""
     place = copy / mutation.file
     right = place.read_text()

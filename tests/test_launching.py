@@ -67,7 +67,7 @@ def test_every_row_runs_once(device: str, threads: int, heavy: bool, count: int)
     np.testing.assert_allclose(result.numpy().reshape(-1, 3), expected(values, 2.0, (1, 2, 3), None), atol=1e-5)
 
 
-def test_a_launch_made_again_takes_its_new_arguments(device: str) -> None:
+def test_a_cached_launch_takes_its_new_arguments(device: str) -> None:
     """Sizes, arrays, empty arrays, numbers and vectors all change between launches, in two threads at once."""
     target = wp.get_device(device)
 
@@ -118,7 +118,7 @@ def test_arrays_in_one_piece_of_memory_do_not_touch_and_keep_it(device: str) -> 
     assert len(others) == 50 and (one.numpy() == 2).all()
 
 
-def test_arrays_that_nobody_holds_are_given_again(device: str) -> None:
+def test_released_arrays_are_reused(device: str) -> None:
     wanted = [(11, wp.vec3), (4, wp.float32)]
     first = empty_pooled(device, *wanted)
     places = [piece.ptr for piece in first]
@@ -133,16 +133,14 @@ def test_arrays_that_nobody_holds_are_given_again(device: str) -> None:
     assert second[0].ptr != third[0].ptr
 
 
-def test_sizes_with_room_are_few_and_not_much_larger() -> None:
+def test_capacities_are_few_and_not_much_larger() -> None:
     sizes = [grow_capacity(count) for count in range(1, 100_000)]
     assert all(count <= size <= max(1.25 * count, count + 1) for count, size in enumerate(sizes, 1))
     assert len(set(sizes)) < 100
 
 
 @pytest.mark.parametrize(("told", "most"), [("1", 1), ("0", 1), ("100000", None), ("", None), ("two", None)])
-def test_the_environment_may_ask_for_fewer_threads(
-    told: str, most: int | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_environment_may_limit_the_threads(told: str, most: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """At most the available number, and at least one."""
     monkeypatch.delenv(THREADS, raising=False)
     there = available_threads()
@@ -153,7 +151,7 @@ def test_the_environment_may_ask_for_fewer_threads(
 @pytest.mark.parametrize(
     ("cores", "told", "used"), [(4, "", 3), (2, "", 1), (1, "", 1), (4, "4", 4), (4, "2", 2), (4, "9", 4)]
 )
-def test_a_core_is_left_to_others(cores: int, told: str, used: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_core_is_reserved(cores: int, told: str, used: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """One core is reserved within the block, if there are several and the environment sets no number; nested blocks
     reserve more."""
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(cores)), raising=False)
@@ -169,14 +167,14 @@ def test_a_core_is_left_to_others(cores: int, told: str, used: int, monkeypatch:
 
 
 @pytest.mark.parametrize("told", ["1", ""])
-def test_beside_on_one_thread_is_one_after_the_other(told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_concurrent_tasks_on_one_thread_run_in_sequence(told: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(THREADS, told)
     used = run_concurrently(threading.get_ident, lambda: (threading.get_ident(), 7))
     assert used[0] == threading.get_ident() and used[1][1] == 7
     assert told == "" or used[1][0] == used[0]
 
 
-def test_what_goes_on_beside_an_error_has_ended_when_that_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_waits_for_the_concurrent_task(monkeypatch: pytest.MonkeyPatch) -> None:
     """When the error is raised, the data of both tasks can be reused."""
     monkeypatch.setenv(THREADS, "2")
     begun, ended = threading.Event(), threading.Event()
@@ -195,7 +193,7 @@ def test_what_goes_on_beside_an_error_has_ended_when_that_is_told(monkeypatch: p
     assert ended.is_set()
 
 
-def test_each_thread_keeps_its_own() -> None:
+def test_each_thread_has_its_own_cache() -> None:
     """The cache keeps the most recent results by their arguments; another thread has its own."""
     make = thread_local_cache(2)(lambda *given: [*given])
     first = make(1, 2)
@@ -208,7 +206,7 @@ def test_each_thread_keeps_its_own() -> None:
     assert others == [own] and others[0] is not own and make(1, 2) is own
 
 
-def test_mirrors_bring_and_fetch_what_lies_there_now(device: str) -> None:
+def test_mirrors_transfer_the_current_values(device: str) -> None:
     """Cases: unchanged values, NaN, and device values that have changed since the last read-back."""
     arrays = [wp.zeros(3, dtype=wp.float64, device=device) for _ in range(2)]
     one, other = mirrors = [PinnedMirror(array) for array in arrays]

@@ -56,7 +56,7 @@ def test_changes_are_other_programs_within_a_family(room: Path) -> None:
     )
 
 
-def test_a_sample_stays_where_another_line_changes(room: Path) -> None:
+def test_a_sample_does_not_depend_on_other_lines(room: Path) -> None:
     few = mutants.sample("contact", 4, 1)
     assert few == mutants.sample("contact", 100, 1)[:4] != mutants.sample("contact", 4, 2)
     room.write_text(SOURCE + "\n\ndef another(a: float) -> float:\n    return a * 2.0\n")
@@ -83,7 +83,7 @@ def test_the_nearest_test_comes_first() -> None:
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_run_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Results are written one by one; survivors are tested again on request."""
     tried: list[str] = []
 
@@ -116,7 +116,7 @@ def _differs(copy: mutation.Copy, path: Path) -> bool:
 
 
 @pytest.mark.parametrize("survivor", SURVIVORS, ids=lambda survivor: survivor.before)
-def test_survivors_stand_in_the_code(survivor: Survivor) -> None:
+def test_survivors_refer_to_existing_lines(survivor: Survivor) -> None:
     """When a line is rewritten, its survivors must be removed."""
     lines = [line.strip() for line in (mutants.ROOT / "egs_warp" / survivor.file).read_text().splitlines()]
     assert survivor.before in lines and len(survivor.reason) > 20

@@ -81,7 +81,7 @@ def spin_work(problem: StepProblem, result: CoupledResult) -> float:
     return float(given @ momenta.sum(axis=0))
 
 
-def test_a_spin_that_nothing_bears_yet_gives_energy_once() -> None:
+def test_restored_spin_adds_energy_only_at_the_start() -> None:
     """A soft block that spins as fast as in these tests, but is not stretched yet, stretches in its first step. The
     spin that is restored may add more energy than that takes: less than its work, and within three steps it is gone."""
     shape = Shape((3, 2, 4), (0.294, 0.392, 0.333), 1.16, sag=0.05, poisson_ratio=0.137, damping_ratio=0.05, seed=3657)
@@ -132,7 +132,7 @@ def test_contact_gives_no_energy_and_both_momenta_are_its_impulse(count: int) ->
 
 
 @at_length
-def test_a_mirror_a_turn_and_another_place_change_nothing(count: int) -> None:
+def test_reflection_rotation_and_translation_change_nothing(count: int) -> None:
     """Eq. (4), (8), (9): the mirrored body with a mirrored throw has the mirrored motion; a body that is rotated about
     the vertical and translated has the same motion.
     """
@@ -159,7 +159,7 @@ def test_a_mirror_a_turn_and_another_place_change_nothing(count: int) -> None:
 
 
 @at_length
-def test_more_friction_never_slips_more(count: int) -> None:
+def test_more_friction_never_slides_farther(count: int) -> None:
     """Eq. (9): a flat block that is pushed uphill, downhill or across a slope slides less far with more friction; on
     level ground the distance is proportional to 1 / mu.
     """
@@ -254,7 +254,7 @@ def test_no_element_is_inverted_in_2000_frames_of_random_activations(mesh: TetMe
 
 @pytest.mark.cuda
 @at_length
-def test_cpu_and_cuda_move_a_body_alike(count: int) -> None:
+def test_cpu_and_cuda_give_the_same_motion(count: int) -> None:
     """Eq. (4), (8), (9): 15 steps of a thrown body with elements and gaps on either device agree to 1e-9 H, for any
     muscle forces.
     """

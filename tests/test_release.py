@@ -36,13 +36,13 @@ def reports() -> list[dict[str, Any]]:
     return [{"install": here}, {"install": [own, scipy, entry("numpy", "2.4.6", "c" * 64, [])]}]
 
 
-def test_requirements_hold_every_package_with_its_hashes() -> None:
+def test_requirements_list_every_package_with_its_hashes() -> None:
     expected = f"numpy==2.4.6 \\\n    --hash=sha256:{'a' * 64} \\\n    --hash=sha256:{'c' * 64}\n"
     expected += f"scipy==1.17.1 \\\n    --hash=sha256:{'b' * 64}\n"
     assert RELEASE["requirements_of"](reports()) == expected
 
 
-def test_the_bill_names_every_part_and_who_needs_it(wheel: Path) -> None:
+def test_the_bill_of_materials_lists_every_component_and_its_dependents(wheel: Path) -> None:
     lock = json.loads((ROOT / "egs_warp" / "web" / "client" / "package-lock.json").read_text())
     bill = RELEASE["bill_of"](wheel, reports(), lock)
     assert (bill["bomFormat"], bill["specVersion"], bill["version"]) == ("CycloneDX", "1.6", 1)

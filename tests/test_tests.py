@@ -38,7 +38,7 @@ def test_no_test_file_imports_another() -> None:
         assert not others, f"{path.relative_to(TESTS)} imports {sorted(others)}; put what is shared into tests/support"
 
 
-def test_each_test_file_is_named_after_a_module_of_its_room() -> None:
+def test_each_test_file_is_named_after_a_module_of_its_package() -> None:
     for path in FILES:
         place = path.relative_to(TESTS)
         if len(place.parts) == 1 or place.as_posix() in ACROSS:

@@ -24,7 +24,7 @@ while time.monotonic() < began + 60.0:
 """
 
 
-def test_each_work_is_done_once() -> None:
+def test_each_task_is_done_once() -> None:
     """By a worker or by the caller, with more tasks than threads; the number of threads stays within its limit."""
     many, done = WorkerThreads(2), []
     before = threading.active_count()
@@ -36,7 +36,7 @@ def test_each_work_is_done_once() -> None:
     assert threading.active_count() == before
 
 
-def test_work_goes_on_beside() -> None:
+def test_tasks_run_concurrently() -> None:
     """Each of two tasks waits for the other, which neither could do in sequence."""
     first, second = threading.Event(), threading.Event()
 
@@ -68,7 +68,7 @@ def test_a_helper_that_is_busy_is_not_waited_for() -> None:
     one.end()
 
 
-def test_what_was_settled_never_begins() -> None:
+def test_a_cancelled_task_never_runs() -> None:
     done: list[int] = []
     task = Task(lambda: done.append(1))
     task.wait()

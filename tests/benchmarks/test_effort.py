@@ -30,7 +30,7 @@ def test_lift_off_is_where_the_longest_flight_begins(effort: ModuleType, loads: 
     assert effort.before_lift_off(np.array(loads, float)) == steps
 
 
-def test_the_load_is_what_the_ground_gives(effort: ModuleType) -> None:
+def test_load_is_the_ground_force(effort: ModuleType) -> None:
     """Load, gravity and drag together account for the change of upward momentum in every step."""
     trajectory = slide().trajectory()
     t, mass = trajectory, trajectory.node_mass

@@ -17,7 +17,7 @@ def figure7(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return module_of("figure7")
 
 
-def test_scores_of_a_known_picture(figure7: ModuleType) -> None:
+def test_scores_of_a_known_image(figure7: ModuleType) -> None:
     """Measure a known image.
 
     Upper half 0.5 with target 0.6: 20 dB; 0.1 in the lower half: a residual of a fifth of the upper half, and the
@@ -40,7 +40,7 @@ def rows(ours: tuple[float, float], split: tuple[float, float]) -> list[dict[str
     return [{"scene": "koala.ply", "method": way, "psnr": dB, "residual": left} for way, (dB, left) in figures.items()]
 
 
-def test_the_aim_asks_for_little_below_the_plane_first_and_for_looks_then(figure7: ModuleType) -> None:
+def test_the_target_is_clearance_first_and_appearance_second(figure7: ModuleType) -> None:
     assert figure7.judge(rows((39.0, 0.001), (42.0, 0.012)), [])[0] == {"figure7_best": True}
     assert figure7.judge(rows((39.0, 0.001), (42.0, 0.0019)), [])[0] == {"figure7_best": False}
     assert figure7.judge(rows((39.0, 0.003), (42.0, 0.012)), [])[0] == {"figure7_best": False}

@@ -27,7 +27,7 @@ def noise(size: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(size=(size, size, 3))
 
 
-def test_detail_is_one_for_other_texture_of_the_same_kind_and_small_for_a_blur(measures: ModuleType) -> None:
+def test_detail_is_one_for_independent_noise_and_small_after_a_blur(measures: ModuleType) -> None:
     """The gradient energy of white noise does not depend on the draw; pixels outside the mask do not count."""
     truth, mask = noise(96, 0), disc(96, 36)
     assert measures.gradient_energy(noise(96, 1), truth, mask) == pytest.approx(1.0, abs=0.05)
@@ -36,7 +36,7 @@ def test_detail_is_one_for_other_texture_of_the_same_kind_and_small_for_a_blur(m
     assert measures.gradient_energy(np.where(mask[..., None], truth, 0.0), truth, mask) == 1.0
 
 
-def test_psnr_likes_the_blur_that_likeness_in_the_large_does_not_see(measures: ModuleType) -> None:
+def test_psnr_prefers_the_blurred_image_and_coarse_psnr_does_not(measures: ModuleType) -> None:
     """Compare independent noise and its mean before and after a blur.
 
     Independent noise has twice the squared error of its mean, 3.01 dB; a blur removes that difference only where images
@@ -51,7 +51,7 @@ def test_psnr_likes_the_blur_that_likeness_in_the_large_does_not_see(measures: M
     assert measures.coarse_psnr(outside, truth, mask) == measures.coarse_psnr(other, truth, mask)
 
 
-def test_the_true_floor_moved_finds_its_period_and_no_more(measures: ModuleType) -> None:
+def test_shifted_true_floor_finds_its_period_and_no_more(measures: ModuleType) -> None:
     """Score shifted floors of stripes and of noise.
 
     A floor of stripes fits itself at whole periods; noise scores the 7.8 dB of two independent draws (squared error

@@ -34,7 +34,7 @@ def test_exponents_are_those_of_the_records(frame: ModuleType) -> None:
     assert frame.exponents([one for one in records() if one["nodes"] == 250]) == {}
 
 
-def test_steps_are_told_by_their_contacts(frame: ModuleType) -> None:
+def test_steps_are_grouped_by_their_contacts(frame: ModuleType) -> None:
     rows = frame.by_contacts([one for one in records() if one["nodes"] == 541])
     assert [(row["contacts"], row["steps"]) for row in rows] == [("all", 5), ("1-8", 2), ("9-16", 1), ("17-32", 1)]
     assert rows[0]["worst"] == pytest.approx(max(one["total"] for one in records() if one["nodes"] == 541))

@@ -43,7 +43,7 @@ def test_there_are_benchmarks() -> None:
     assert len(SCRIPTS) == 33
 
 
-def test_what_a_benchmark_leaves(harness: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_benchmark_outputs(harness: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Print a table with its header, and write JSON of the agreed form and an image."""
     files = {"json": tmp_path / "figures.json", "plot": tmp_path / "picture.png"}
     asked = ["--quick", "--seed", "3", "--json", str(files["json"]), "--plot", str(files["plot"])]

@@ -22,7 +22,7 @@ def row(nodes: int, rate: float, apart: float | None = 1e-12, steps: int = 30) -
     return {"nodes": nodes, "rate": rate, "apart": apart, "steps": steps}
 
 
-def test_the_rate_that_is_asked_is_that_of_both_cages_on_a_gpu(many_worlds: ModuleType) -> None:
+def test_the_target_rate_is_for_both_cages_on_a_gpu(many_worlds: ModuleType) -> None:
     rows = [row(253, 1900.0), row(253, 2100.0), row(541, 650.0)]
     assert many_worlds.summary(rows, "cuda:0") == {"aims": {"many_2000": True, "many_alike": True}, "why_null": {}}
     slow = many_worlds.summary([*rows[:2], row(541, 590.0)], "cuda:0")
@@ -41,7 +41,7 @@ def test_all_that_were_run_alone_for_long_enough_must_be_alike(many_worlds: Modu
 
 
 @pytest.mark.slow
-def test_a_row_tells_the_rate_where_the_time_goes_and_how_far_apart(many_worlds: ModuleType) -> None:
+def test_a_row_has_rate_stage_times_and_deviation(many_worlds: ModuleType) -> None:
     creature = coarse_pawn()
     jump = many_worlds.recorded(creature, 2)
     assert jump.shape == (2, creature.muscles.segment_count)
@@ -51,7 +51,7 @@ def test_a_row_tells_the_rate_where_the_time_goes_and_how_far_apart(many_worlds:
     assert found["apart"] < 1e-12
 
 
-def test_matrices_are_factored_in_every_way(many_worlds: ModuleType) -> None:
+def test_matrices_are_factored_with_every_panel(many_worlds: ModuleType) -> None:
     rows = many_worlds.matrices(40, 2, torch.device("cpu"))
     assert [row["panel"] for row in rows] == [None, *many_worlds.PANELS]
     assert min(row["factor"] for row in rows) > 0.0 and all(row["solve_96"] > 0.0 for row in rows[1:])

@@ -38,7 +38,7 @@ def paper(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
     return module
 
 
-def test_every_script_of_the_paper_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_script_of_the_paper_exists(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     module = module_of("paper")
     assert {stage.name for stage in module.STAGES} >= {"table1", "table2", "table3", "figure7", "figure8", "inpaint"}
@@ -46,7 +46,7 @@ def test_every_script_of_the_paper_is_there(monkeypatch: pytest.MonkeyPatch) -> 
         assert (module.ROOT / stage.script).is_file()
 
 
-def test_stages_run_with_what_was_asked_and_their_aims_are_gathered(
+def test_stages_run_with_their_flags_and_their_targets_are_collected(
     paper: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
@@ -62,7 +62,7 @@ def test_stages_run_with_what_was_asked_and_their_aims_are_gathered(
     assert "| `one.fast` | not judged | no GPU |" in (out / "paper.md").read_text()
 
 
-def test_a_stage_that_fails_is_told_and_the_others_run(
+def test_a_stage_that_fails_is_reported_and_the_others_run(
     paper: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert paper.main(["--out", str(tmp_path), "--device", "cpu"]) == 0

@@ -36,7 +36,7 @@ PICTURES = {
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_flip_is_that_of_its_authors(perceptual: ModuleType, name: str) -> None:
+def test_flip_equals_the_reference_implementation(perceptual: ModuleType, name: str) -> None:
     """The tolerance is 5e-5 because the reference is in single precision."""
     target, picture, theirs = PICTURES[name]
     assert perceptual.flip_error(torch.tensor(picture), torch.tensor(target)) == pytest.approx(theirs, abs=5e-5)

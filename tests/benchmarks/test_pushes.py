@@ -32,7 +32,7 @@ def test_halving_finds_the_largest_push(script: Any, monkeypatch: pytest.MonkeyP
     assert not pushes.aims([{"largest": size, "tried": [*tried, {"broken": "audit"}]}])["audit"]
 
 
-def test_a_body_that_is_pushed_is_judged_by_its_soles(script: Any) -> None:
+def test_a_pushed_body_is_judged_by_its_soles(script: Any) -> None:
     """The aim requires at least 14 bodies, all of which withstand the push."""
     gaits: ModuleType = script("gaits")
     assert gaits._push_failure({"tilt_degrees": 2.0, "sole_shift": 0.02}) is None

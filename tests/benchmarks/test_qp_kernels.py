@@ -27,7 +27,7 @@ def programs(benchmark: ModuleType) -> list[Any]:
 
 
 @pytest.mark.slow
-def test_recorded_programs_end_as_osqp_ends_on_them(benchmark: ModuleType, programs: list[Any], device: str) -> None:
+def test_recorded_programs_end_as_in_osqp(benchmark: ModuleType, programs: list[Any], device: str) -> None:
     """Both solvers end with the same status and |x - x'| at most 1e-6 of the largest |x|.
 
     This holds by iterations alone, after 50 iterations, and solved as in the engine.
@@ -46,7 +46,7 @@ def test_recorded_programs_end_as_osqp_ends_on_them(benchmark: ModuleType, progr
         assert not row["unlike"] and row["worst"] <= 1e-6
 
 
-def test_what_is_not_unique_is_compared_by_its_value(benchmark: ModuleType) -> None:
+def test_non_unique_solutions_are_compared_by_their_values(benchmark: ModuleType) -> None:
     """Compare optima of min (x1 + x2 - 1)^2, which form a line; the rows of A distinguish points."""
     P, q = 2.0 * np.ones((2, 2)), np.full(2, -2.0)
     bounds = np.array([0.0]), np.array([np.inf])

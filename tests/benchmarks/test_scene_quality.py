@@ -42,7 +42,7 @@ def front() -> Camera:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_scene_has_eight_outlines_and_markings_beside_them(name: str, annotated: ModuleType) -> None:
+def test_every_scene_has_eight_outlines_and_marked_points(name: str, annotated: ModuleType) -> None:
     tree = json.loads((annotated.FOLDER / f"{name}.json").read_text())
     assert len(tree["views"]) == 8 and len({view["name"] for view in tree["views"]}) == 8
     assert name in annotated.NAMES
@@ -61,7 +61,7 @@ def test_outlines_within_outlines_are_holes(annotated: ModuleType) -> None:
     assert mask[2, 2] and not mask[7, 7] and not mask[18, 18]
 
 
-def test_overlap_counts_what_is_missing_and_too_much(annotated: ModuleType, clicking: ModuleType) -> None:
+def test_overlap_counts_missing_and_excess_pixels(annotated: ModuleType, clicking: ModuleType) -> None:
     """Compare a ball with its own outline, and with one that is shifted by its radius."""
     ball = round_ones(shell(), 0.03)
     cloud = concatenate(ball, lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.05)))
@@ -78,7 +78,7 @@ def test_overlap_counts_what_is_missing_and_too_much(annotated: ModuleType, clic
     assert more.sum() == (own & ~shifted).sum() and 0 < missing.sum() <= (shifted & ~own).sum()
 
 
-def test_clicks_go_to_the_innermost_place(clicking: ModuleType) -> None:
+def test_prompts_are_at_the_innermost_pixel(clicking: ModuleType) -> None:
     mask = np.zeros((60, 80), bool)
     mask[10:31, 20:61] = True
     depth, (u, v) = clicking.innermost(mask)
@@ -98,7 +98,7 @@ def test_a_marked_plane_and_how_far_it_is_from_another(annotated: ModuleType, gr
     assert degrees == pytest.approx(np.degrees(0.02), rel=1e-6) and offset == pytest.approx(0.025)
 
 
-def test_ground_is_judged_by_what_is_known_of_it(ground: ModuleType) -> None:
+def test_ground_is_judged_by_its_known_errors(ground: ModuleType) -> None:
     known = {"how": "ground", "degrees": 0.9, "offset": 0.004}
     real = {"how": "ground", "degrees": 3.0, "offset": 0.01, "markings_degrees": 1.6, "markings_offset": 0.006}
     assert ground.judged_ground([known, real, {"how": "masks", "iou": 0.1}])

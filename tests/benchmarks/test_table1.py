@@ -33,7 +33,7 @@ def glossy_vase(scenes: ModuleType) -> Any:
     return replace(module_of("painted_meshes").vase(), glossy=True)
 
 
-def test_a_turned_object_looks_as_from_a_turned_camera(scenes: ModuleType, glossy_vase: Any) -> None:
+def test_a_rotated_object_looks_as_from_a_rotated_camera(scenes: ModuleType, glossy_vase: Any) -> None:
     """Rotating the body by R looks like a camera rotated by R^T, because lamps rotate with the body.
 
     Edges and borders of the pattern may fall into the next sample.
@@ -51,7 +51,7 @@ def test_a_turned_object_looks_as_from_a_turned_camera(scenes: ModuleType, gloss
     assert np.abs(matt - still[0]).mean() > 0.02
 
 
-def test_faces_turn_with_their_normals(scenes: ModuleType, glossy_vase: Any) -> None:
+def test_face_rotations_map_normals(scenes: ModuleType, glossy_vase: Any) -> None:
     """Each face has a proper rotation, which maps its normal at rest to its normal in the bend."""
     vertices = scenes.bend(glossy_vase.vertices)
     turns = scenes.face_rotations(glossy_vase, vertices)
@@ -64,7 +64,7 @@ def test_faces_turn_with_their_normals(scenes: ModuleType, glossy_vase: Any) -> 
     np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.tile(np.eye(3), (len(turns), 1, 1)), atol=1e-12)
 
 
-def test_the_surface_of_a_capture_lies_on_the_object(scenes: ModuleType, glossy_vase: Any) -> None:
+def test_the_surface_of_a_capture_is_on_the_object(scenes: ModuleType, glossy_vase: Any) -> None:
     """With 4000 splats of 0.6 % on a vase, the surface is within 2.5 % of the height and has no slivers."""
     surface = module_of("capture_surface").capture_surface(scenes.surface_cloud(glossy_vase, 4000, device="cpu"))
     distance, _ = KDTree(scenes.surface_points(glossy_vase, 60_000, 1)).query(
@@ -108,7 +108,7 @@ def test_aims_follow_from_the_rows(table1: ModuleType) -> None:
     assert [name for name, met in aims.items() if not met] == ["margin_over_vrgs", "paper_margins_held_out"]
 
 
-def test_what_was_not_measured_is_null_with_a_reason(table1: ModuleType) -> None:
+def test_missing_measurements_are_null_with_a_reason(table1: ModuleType) -> None:
     some = [row for row in rows(table1, {"ours": 2.0}) if row["object"] not in ("plant", "stool")]
     aims, why = table1.judge(some, quick=False)
     assert set(aims.values()) == {None} and set(why) == set(aims)
@@ -118,7 +118,7 @@ def test_what_was_not_measured_is_null_with_a_reason(table1: ModuleType) -> None
     assert set(why) == {"margin_over_vrgs", "paper_margins_held_out"} == {n for n, v in aims.items() if v is None}
 
 
-def test_the_coarsest_setting_near_to_the_best_is_taken(table1: ModuleType) -> None:
+def test_coarsest_setting_near_the_best_is_selected(table1: ModuleType) -> None:
     """The selected setting is the coarsest within ``PSNR_TOLERANCE`` of the best mean over objects and motions."""
     names = list(table1.SETTINGS)
 

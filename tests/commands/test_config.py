@@ -45,7 +45,7 @@ def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.Ca
 
 
 @pytest.mark.usefixtures("coarse")
-def test_a_run_that_is_interrupted_has_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_run_has_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The file exists as soon as a simulation step is made; bad input found before that leaves no file."""
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=4000).cloud)
     flags = ["animate", str(tmp_path / "pawn.ply"), "--up", "z", "--friction", "0.7", "--qp", "daqp"]
@@ -74,7 +74,7 @@ def _given(arguments: list[str]) -> dict:
     return vars(parser.parse_args(["animate", *with_config(arguments, commands["animate"]), "--out", "x"]))
 
 
-def test_files_are_relative_to_the_file_and_flags_go_before_it(tmp_path: Path) -> None:
+def test_files_are_relative_to_the_file_and_flags_take_precedence(tmp_path: Path) -> None:
     (tmp_path / "here").mkdir()
     for name in ("a.ply", "steps.json", "bow.csv", "fixed"):
         (tmp_path / "here" / name).write_text("")
@@ -93,7 +93,7 @@ def test_files_are_relative_to_the_file_and_flags_go_before_it(tmp_path: Path) -
     assert (other["capture"], other["friction"]) == ("other.ply", 0.7)
 
 
-def test_what_is_written_is_what_was_given(tmp_path: Path) -> None:
+def test_written_values_are_the_given_ones(tmp_path: Path) -> None:
     parser, commands = cli._parsers()
     flags = ["a.ply", "--up=-y", "--motion", "hop x3, twist 180", "--view-from=-1,0,.5", "--frames", "9", "--no-shadow"]
     chosen = parser.parse_args(["animate", *flags, "--out", "x"])
@@ -104,7 +104,7 @@ def test_what_is_written_is_what_was_given(tmp_path: Path) -> None:
     assert vars(again) | {"config": None} == vars(chosen)
 
 
-def test_clicks_are_a_list_and_those_given_beside_the_file_go_alone(tmp_path: Path) -> None:
+def test_clicks_are_a_list_and_clicks_of_the_command_line_replace_those_of_the_file(tmp_path: Path) -> None:
     parser, commands = cli._parsers()
     clicks = ["--object", "+1,2@a.jpg", "--object=-3,4@b.jpg"]
     chosen = parser.parse_args(["animate", "a.ply", *clicks, "--out", "x"])
@@ -153,7 +153,7 @@ def test_bad_files_are_one_line(text: str, said: str, tmp_path: Path, capsys: py
 
 
 @pytest.mark.parametrize("way", ["lists", "merged"])
-def test_a_few_lines_that_stand_for_billions(way: str, tmp_path: Path) -> None:
+def test_short_files_that_expand_to_billions_of_values(way: str, tmp_path: Path) -> None:
     """Nine levels of nested aliases, quoted in an error message, or keys merged as often: expanded, neither fits into
     memory."""
     inner = {"lists": "[z, z]", "merged": "{up: z}"}[way]

@@ -33,7 +33,7 @@ def test_a_capture_becomes_another(kind: str, tmp_path: Path, capsys: pytest.Cap
         assert read.format == f".spz version {4 if kind == 'spz4' else 3}"
 
 
-def test_what_is_said_is_what_was_done(tmp_path: Path) -> None:
+def test_reported_losses_are_the_actual_ones(tmp_path: Path) -> None:
     """The changes are known, and the Gaussians are in a shuffled order."""
     cloud = make_cloud(500, 1)
     rng = np.random.default_rng(0)
@@ -97,7 +97,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert (tmp_path / "a.ply").read_bytes() == before
 
 
-def test_what_the_reader_left_out_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_omissions_of_the_reader_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_spz(tmp_path / "a.spz", make_cloud(50))
     assert main(["convert", str(tmp_path / "a.spz"), str(tmp_path / "b.ply")]) == 0
     assert re.search("the up direction is lost", capsys.readouterr().out)

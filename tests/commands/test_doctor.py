@@ -23,7 +23,7 @@ def test_it_names_device_versions_memory_and_cache(capsys: pytest.CaptureFixture
     assert str(wp.config.kernel_cache_dir) in said and ffmpeg_program() in said and "mp4" in said
 
 
-def test_without_ffmpeg_it_says_so_and_ends_with_1(
+def test_a_missing_ffmpeg_is_reported_with_status_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def none() -> str:

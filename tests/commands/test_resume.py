@@ -101,7 +101,7 @@ def ended_by(arguments: Sequence[str], number: int, ready: Path, after: float) -
 
 
 @pytest.mark.slow
-def test_a_run_that_is_killed_again_and_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_that_is_killed_repeatedly(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The run is killed by SIGKILL and by Ctrl-C before its first part, between parts and in the video. Runs that need
     not be killed execute in this process."""
     folder, whole, out = made(tmp_path), tmp_path / "whole", tmp_path / "out"
@@ -151,7 +151,7 @@ def test_random_moments(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.slow
-def test_each_opening_and_renaming_of_what_goes_on_fails_once(
+def test_each_file_operation_of_a_resumed_run_fails_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Resume a run that was interrupted during the video: an error is one line and leaves nothing half-written.
@@ -184,7 +184,7 @@ def interrupted(*_: object, **__: object) -> None:
     raise KeyboardInterrupt
 
 
-def test_what_cannot_go_on_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_runs_that_cannot_be_resumed_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def told(folder: Path) -> str:
         assert cli.main(["resume", str(folder)]) == 2
         return capsys.readouterr().err

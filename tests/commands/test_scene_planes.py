@@ -14,7 +14,7 @@ from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.scenes import FLOOR
 
 
-def test_further_planes_are_level_patches_in_colours_of_their_own() -> None:
+def test_further_planes_are_level_patches_in_their_own_colours() -> None:
     """Beside the floor of a bedroom, only the stool's board and cushion are level; slices of walls and legs are not
     planes."""
     made = scene("stool")

@@ -34,7 +34,7 @@ def bits(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix != ".json"}
 
 
-def test_ctrl_c_tells_how_to_go_on(
+def test_ctrl_c_prints_how_to_continue(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("egs_warp.training.checkpoint.SECONDS", 0.0)
@@ -62,7 +62,7 @@ def test_ctrl_c_tells_how_to_go_on(
     assert capsys.readouterr().out == f"{out}: this training has finished\n"
 
 
-def test_an_earlier_training_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_earlier_training_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The report and the sheet, which no flag names, are protected, too."""
     posed, out = posed_folder(tmp_path / "posed"), tmp_path / "a.ply"
     (tmp_path / "a.sheet.png").write_bytes(b"sheet")

@@ -49,7 +49,7 @@ def alone(creature: Creature, chosen: list[np.ndarray], positions: np.ndarray) -
     return [one.contact_set(each, place) for each, place in zip(chosen, positions, strict=True)]
 
 
-def test_points_are_chosen_step_by_step_as_for_one(
+def test_selection_equals_that_of_one_world_in_every_step(
     creature: Creature, points: ContactSelector, detector: BatchDetector, positions: np.ndarray
 ) -> None:
     """In three steps, points are added, retained because of their load, removed, and joined by deeper ones."""
@@ -119,7 +119,7 @@ def test_frames_speeds_and_pushes_are_those_of_one(
         assert np.array_equal(contacts.faces[world, :count].numpy(), one.faces)
 
 
-def test_forces_go_along_with_their_points(detector: BatchDetector, positions: np.ndarray) -> None:
+def test_forces_follow_their_points(detector: BatchDetector, positions: np.ndarray) -> None:
     gaps, faces = detector.gaps(torch.from_numpy(positions))
     now = detector.contacts(gaps < 0.003, gaps, faces)
     then = detector.contacts(gaps < 0.004, gaps, faces)

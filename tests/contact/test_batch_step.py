@@ -104,7 +104,7 @@ def solved_together(
 
 
 @pytest.mark.parametrize("few", [False, True])
-def test_ends_are_those_of_each_alone(
+def test_results_equal_those_of_each_world_alone(
     creature: Creature, states: list[BodyState], activations: np.ndarray, few: bool
 ) -> None:
     """From the points that touch in free motion, or from a third of them so that many are added during the solve: the
@@ -132,7 +132,7 @@ def test_ends_are_those_of_each_alone(
 
 
 @pytest.mark.slow
-def test_steps_that_hardly_converge_go_the_way_of_each_alone(creature: Creature) -> None:
+def test_barely_converging_steps_equal_those_of_each_world_alone(creature: Creature) -> None:
     """Bodies are crushed, thrown at the ground, and torn by opposing muscles, with time steps four times too long. Step
     lengths and tangents are chosen as for a single world, so even unconverged results are equal at the iteration limit.
     """
@@ -157,7 +157,7 @@ def test_steps_that_hardly_converge_go_the_way_of_each_alone(creature: Creature)
     assert made.converged.any() and not made.converged.all()
 
 
-def test_a_world_that_no_tangent_helps_gives_up_at_once(creature: Creature) -> None:
+def test_a_world_without_a_usable_tangent_stops_at_once(creature: Creature) -> None:
     """Worlds with NaN activations, on the ground and in the air, stop in their second iteration, after one new tangent;
     the others continue."""
     nodes = creature.start.positions
@@ -171,7 +171,7 @@ def test_a_world_that_no_tangent_helps_gives_up_at_once(creature: Creature) -> N
     assert made.iterations[[1, 3]].tolist() == [2, 2]
 
 
-def test_shifts_let_nothing_deeper_and_bring_out_what_is_too_deep(creature: Creature, states: list[BodyState]) -> None:
+def test_normal_bias_equals_that_of_one_world(creature: Creature, states: list[BodyState]) -> None:
     """The push-out speeds are equal up to the cap; capacity without a contact has no bias."""
     one, dt = creature.stepper.solver, 0.01
     points = ContactSelector(

@@ -68,7 +68,7 @@ def test_sweeps_equal_their_twin(friction: float, sweeps: int) -> None:
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.4, 1.5])
-def test_the_answer_obeys_where_tangents_differ(friction: float) -> None:
+def test_solutions_obey_coulombs_law_for_different_tangents(friction: float) -> None:
     """Eq. (8), (9): complementarity, the cone, and friction opposite to the slip hold to 1e-9 from any start."""
     for seed in range(6):
         delassus, free, shift, start = problem(seed)
@@ -85,7 +85,7 @@ def test_the_answer_obeys_where_tangents_differ(friction: float) -> None:
         np.testing.assert_allclose(along[sliding], -(pull * slip)[sliding], atol=1e-7)
 
 
-def test_forces_of_what_is_no_number_are_those_of_the_start() -> None:
+def test_nan_problems_return_the_initial_forces() -> None:
     """The residual of a failed solve is infinite."""
     delassus, free, shift, start = problem(0)
     free[4] = np.nan
@@ -93,7 +93,7 @@ def test_forces_of_what_is_no_number_are_those_of_the_start() -> None:
     assert size == np.inf and np.array_equal(forces[:, 0], start[:, 0])
 
 
-def test_problems_side_by_side_have_the_bits_of_each_alone() -> None:
+def test_batched_problems_have_the_bits_of_single_ones() -> None:
     """The result does not depend on the capacity, nor on the contents of the padding."""
     counts, room, frictions = [5, 3, 0], 7, np.array([0.4, 1.5, 0.8])
     random = np.random.default_rng(3)
@@ -114,7 +114,7 @@ def test_problems_side_by_side_have_the_bits_of_each_alone() -> None:
         assert np.array_equal(forces[world, count:].numpy(), starts[world, count:])
 
 
-def test_problems_that_take_all_iterations_have_the_same_bits_side_by_side() -> None:
+def test_batched_problems_at_the_iteration_limit_have_the_bits_of_single_ones() -> None:
     """20 sticking points with 30 degrees of freedom: some problems are not solved within the iteration limit, in a
     batch as alone."""
     count, friction, problems = 20, 1.5, []
@@ -134,7 +134,7 @@ def test_problems_that_take_all_iterations_have_the_same_bits_side_by_side() -> 
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
-def test_a_block_of_threads_finds_the_forces_of_one(friction: float) -> None:
+def test_a_thread_block_finds_the_forces_of_a_single_thread(friction: float) -> None:
     """Full and partial groups; numbers of unknowns up to the capacity of one pass and above it."""
     counts, room = [1, 4, 5, 6, 11, 33, 40, 45, 64, 65, 70], 70
     random = np.random.default_rng(1)
@@ -154,7 +154,7 @@ def test_a_block_of_threads_finds_the_forces_of_one(friction: float) -> None:
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
-def test_a_block_of_threads_finds_the_forces_of_many_contacts_that_press(friction: float) -> None:
+def test_a_thread_block_finds_the_forces_of_many_loaded_contacts(friction: float) -> None:
     """Numbers of unknowns above the capacity of one pass: full and partial passes and tiles, more unknowns than all
     passes hold, and more contacts than one block sweeps."""
     counts, room = [41, 42, 43, 50, 53, 62, 64, 65, 80, 85, 86, 100, 130], 130
@@ -194,7 +194,7 @@ def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:
         assert size < 1e-10 and np.abs(forces).sum() < 1e3
 
 
-def test_what_was_solved_before_changes_nothing() -> None:
+def test_earlier_problems_do_not_change_the_result() -> None:
     """Memory is reused: the bits are the same after a problem with NaN, and after one that used all attempts."""
     delassus, free, shift, start = problem(1)
     expected, missed = coulomb_forces(delassus, free, shift, 0.4, start)
@@ -205,7 +205,7 @@ def test_what_was_solved_before_changes_nothing() -> None:
         assert np.array_equal(got, expected) and again == missed
 
 
-def test_forces_of_more_points_than_nodes_are_found_where_contacts_give_way(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_points_than_nodes_are_solved_by_continuation(monkeypatch: pytest.MonkeyPatch) -> None:
     """First step of a jump on 32 points of a coarse foot, from muscles at rest to those of the whole step. From the
     present forces the kernel alone does not converge; continuation from compliant contacts does, also for many
     worlds.

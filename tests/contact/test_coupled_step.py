@@ -78,7 +78,7 @@ def assert_obeys(standing: PassiveBody, before: BodyState, problem: StepProblem,
 
 
 @pytest.mark.parametrize("push", [0.0, 0.5])
-def test_a_block_comes_to_rest_and_every_step_obeys(push: float) -> None:
+def test_a_block_comes_to_rest_and_every_step_obeys_coulombs_law(push: float) -> None:
     """Eq. (4), Eq. (9): the block is dropped by 2 % of its height, with and without a sideways push."""
     falling = block(lift=0.02)
     body = falling.body
@@ -96,7 +96,7 @@ def test_a_block_comes_to_rest_and_every_step_obeys(push: float) -> None:
         assert np.abs(falling.state.velocities).max() < 5e-3 * scale
 
 
-def test_an_oblique_spinning_impact_obeys() -> None:
+def test_an_oblique_spinning_impact_obeys_coulombs_law() -> None:
     """Eq. (4), Eq. (9): contact, friction and both momenta for a body that translates and spins."""
     thrown = block(0.8, lift=0.03)
     body, x = thrown.body, thrown.state.positions
@@ -202,7 +202,7 @@ def test_a_sliding_block_stops_and_stays() -> None:
 
 
 @pytest.mark.parametrize("depth", [0.006, 0.02, 0.3])
-def test_a_sunk_body_comes_out_gently_to_the_tolerance(depth: float) -> None:
+def test_a_penetrating_body_is_pushed_out_to_the_tolerance(depth: float) -> None:
     """Eq. (8): points deeper than the tolerance rise by a fifth of the excess per step, up to the speed cap; other
     points stay at their depth."""
     sunk = block(sag=0.002, lift=-depth)
@@ -233,7 +233,7 @@ def on_one_corner(falling: PassiveBody) -> tuple[StepProblem, CoupledResult]:
     return problem, solver.solve(response, None, velocities=problem.rigid_guess, forces=np.zeros((1, 3)))
 
 
-def test_points_that_would_sink_join_the_set() -> None:
+def test_points_that_would_penetrate_join_the_set() -> None:
     """A step that starts with one corner in its contact set ends with every point above the tolerance."""
     falling = block()
     solver = falling.solver
@@ -255,7 +255,7 @@ def test_points_join_before_the_step_without_them_has_converged(monkeypatch: pyt
     np.testing.assert_allclose(soon.velocities, late.velocities, atol=1e-7 * falling.body.speed_unit)
 
 
-def test_a_tangent_that_leads_nowhere_is_made_anew() -> None:
+def test_a_tangent_that_yields_no_descent_is_replaced() -> None:
     """The tangent of a body with no stiffness and a billionth of the mass inverts elements at any step length. The
     result is that of the body's own tangent, which is computed once."""
     standing = block()
@@ -274,7 +274,7 @@ def test_a_tangent_that_leads_nowhere_is_made_anew() -> None:
     np.testing.assert_allclose(ends[1].velocities, ends[0].velocities, atol=1e-6 * body.speed_unit)
 
 
-def test_a_response_is_the_linear_answer_of_the_step() -> None:
+def test_a_linearization_predicts_the_step() -> None:
     """Eq. (8): columns of known points are reused, and forces change the velocities as the tangent predicts for their
     impulse."""
     standing = block()
@@ -292,7 +292,7 @@ def test_a_response_is_the_linear_answer_of_the_step() -> None:
     np.testing.assert_array_equal(again.delassus, response.delassus)
 
 
-def test_foreseen_forces_press_and_rub_no_more_than_they_may() -> None:
+def test_predicted_forces_obey_coulombs_law() -> None:
     """In place of the paper's penalties (Eq. 10, 11), stage 1 has exact contact: normal forces are not negative, forces
     are within Coulomb's cone, and friction is opposite to the slip, for any free velocities."""
     standing = block()
@@ -323,7 +323,7 @@ def test_foreseen_forces_press_and_rub_no_more_than_they_may() -> None:
     assert kinds == {"free", "slides", "sticks"}
 
 
-def test_a_step_that_nothing_joins_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_without_new_points_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The gaps at the end of the step are evaluated twice: when the activation threshold is passed, and at the end."""
     resting = block(sag=0.01, damping_ratio=0.5)
     for _ in range(5):
@@ -335,7 +335,7 @@ def test_a_step_that_nothing_joins_is_solved_once(monkeypatch: pytest.MonkeyPatc
     assert result.converged and result.contacts.count > 4 and len(looks) == 4
 
 
-def test_forces_that_miss_coulombs_law_end_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forces_that_violate_coulombs_law_end_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """The equation of motion alone is not enough. Where the forces violate Coulomb's law, another tangent is tried;
     then the solve fails, so that the caller takes two half steps."""
     resting, answered = block(sag=0.01, damping_ratio=0.5), responses.coulomb_forces

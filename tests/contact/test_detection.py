@@ -37,7 +37,7 @@ def seven_points(cloud: GaussianCloud, gamma: float = 3.0) -> np.ndarray:
     return np.array(rows, dtype=np.float64)
 
 
-def test_hull_points_hold_the_lowest_of_all_points(device: str) -> None:
+def test_hull_points_include_the_lowest_of_all_points(device: str) -> None:
     """Eq. (3), Eq. (8): over 50 deformations of the cage, the minimum gap of the hull points is that of all 7 n
     points."""
     mesh = block_mesh()
@@ -128,7 +128,7 @@ def flat_base(noise: float) -> GaussianCloud:
     return GaussianCloud.from_numpy(*values, np.zeros((count, 1, 3)), device="cpu")
 
 
-def test_points_on_a_grid_do_not_hang_on_the_last_bits_of_a_file() -> None:
+def test_grid_points_do_not_depend_on_the_last_bits_of_a_file() -> None:
     """Points on the grid are not below the floor and are sorted by position. Under rounding errors of single precision,
     fewer than 0.3 % of them change, and none that touches the floor, although half of the means and arms there lie
     below it. Without a grid, most points change."""
@@ -150,7 +150,7 @@ def test_points_on_a_grid_do_not_hang_on_the_last_bits_of_a_file() -> None:
     assert len(loose[0] & loose[1]) < 0.5 * len(loose[0])
 
 
-def test_what_lies_in_an_edge_or_a_face_of_the_hull_is_no_vertex() -> None:
+def test_points_within_an_edge_or_face_of_the_hull_are_no_vertices() -> None:
     """Only the corners of a cubic grid are hull vertices, in any order of its points."""
     line = np.arange(5.0)
     cube = np.stack(np.meshgrid(line, line, line), axis=-1).reshape(-1, 3)
@@ -324,7 +324,7 @@ def test_coulomb_forces_of_forty_points_under_a_rigid_base(regularisation: float
         assert force[:, 0].sum() > 0.5 * mass * -twist[2]
 
 
-def test_gaps_are_those_of_the_place_asked_for(device: str) -> None:
+def test_gaps_are_those_of_the_requested_positions(device: str) -> None:
     """More configurations than the cache holds, in any order, some changed in place. The cached result is read-only."""
     mesh = block_mesh()
     geometry = contact_geometry(surface_cloud(mesh, 50, lowest=0.05), mesh, (FLOOR,), device=device)

@@ -51,7 +51,7 @@ def assert_alike(one: NewtonIterate, other: NewtonIterate) -> None:
 
 
 @pytest.mark.parametrize("points", [np.array([0, 7, 13, 24]), np.zeros(0, int), np.arange(11)])
-def test_iterates_go_the_host_s_way(
+def test_iterates_equal_those_of_the_host(
     creature: Creature, points: np.ndarray, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Initial iterate, full and partial trial steps, further trials, and a new tangent with the muscles' stiffness.
@@ -88,7 +88,7 @@ def test_iterates_go_the_host_s_way(
         )
 
 
-def test_what_inverts_an_element_is_no_number(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_inverted_element_gives_nan(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The previous iterate remains usable."""
     stepper = on_device(creature, device, monkeypatch)
     respond, (problem, *_) = stepper.linearizer, problems(stepper, creature)
@@ -106,7 +106,7 @@ def test_what_inverts_an_element_is_no_number(creature: Creature, device: str, m
     )
 
 
-def test_what_was_no_number_is_left_behind(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nan_of_an_earlier_step_is_ignored(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A step does not depend on NaN that an earlier one left, from a matrix without factors or from a diverged
     iterate."""
     stepper = on_device(creature, device, monkeypatch)
@@ -140,9 +140,7 @@ def test_what_was_no_number_is_left_behind(creature: Creature, device: str, monk
         )
 
 
-def test_what_is_at_hand_no_more_is_told_again(
-    creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_evicted_data_are_uploaded_again(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The workspace holds two iterates; an evicted one is uploaded again and gives the same step. It holds one
     linearisation; an older one raises instead of using data of another.
     """
@@ -177,7 +175,7 @@ def test_what_is_at_hand_no_more_is_told_again(
         old.iterate_at(None, problem.rigid_guess, forces)
 
 
-def test_a_step_has_the_same_contacts_whatever_was_looked_ahead_for(
+def test_contacts_do_not_depend_on_the_prefetch(
     creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The prefetch is for the same step, or for one with another state, step size or set of points."""
@@ -202,7 +200,7 @@ def test_a_step_has_the_same_contacts_whatever_was_looked_ahead_for(
     assert len(seen) == 3
 
 
-def test_a_tangent_whose_sum_fails_is_the_host_s(
+def test_a_tangent_whose_sum_is_indefinite_equals_the_host_s(
     creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The muscles' stiffness is not definite by itself: the whole matrix is factored, and the iterate stays the

@@ -48,7 +48,7 @@ def assert_alike(there: ContactSet, here: ContactSet) -> None:
 
 
 @pytest.mark.parametrize("kind", ["flat", "corner", "waves"])
-def test_the_points_of_a_step_are_the_host_s(kind: str, device: str) -> None:
+def test_selected_points_equal_those_of_the_host(kind: str, device: str) -> None:
     """A body approaches the ground, leans, slides to the wall and leaves. Each selection starts from the previous
     points, some of which are loaded. Penetrating points are counted unless they are in contact."""
     geometry = ground(kind)

@@ -59,7 +59,7 @@ def test_a_newton_step_solves_the_linear_equation(creature: Creature) -> None:
     assert missing.residual_norm == pytest.approx(push, rel=1e-6)
 
 
-def test_another_tangent_changes_the_newton_step_alone(creature: Creature) -> None:
+def test_a_new_tangent_changes_only_the_newton_step(creature: Creature) -> None:
     """The new tangent is that of the iterate, with the muscles' stiffness."""
     problem, tension, random = falling(creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(5), problem.state.positions)
@@ -95,7 +95,7 @@ def test_a_wider_response_is_that_of_all_its_contacts(creature: Creature) -> Non
     np.testing.assert_allclose(wide.delassus, whole.delassus, rtol=0, atol=1e-13 * np.abs(whole.delassus).max())
 
 
-def test_a_step_ahead_is_newton_s_with_forces_as_they_are(creature: Creature) -> None:
+def test_the_prefetched_step_is_a_newton_step_with_fixed_forces(creature: Creature) -> None:
     """The result is None if the step would invert an element."""
     problem, tension, random = falling(creature)
     respond = HostContactLinearizer()
@@ -117,7 +117,7 @@ def test_a_step_ahead_is_newton_s_with_forces_as_they_are(creature: Creature) ->
 
 
 @pytest.mark.parametrize("pulled", [True, False])
-def test_kernels_say_what_arrays_say(creature: Creature, pulled: bool) -> None:
+def test_kernels_equal_numpy(creature: Creature, pulled: bool) -> None:
     """Residual norms, contact velocities, and full and partial Newton steps, also with the muscles' stiffness in the
     tangent."""
     problem, tension, random = falling(creature)

@@ -104,7 +104,7 @@ def plain(*sizes: float) -> list[tuple[float, float, float]]:
         (FIRST.after_failed_step(), plain(0.4, 0.1), 1),
     ],
 )
-def test_a_loop_takes_the_steps_that_need_no_look(
+def test_a_loop_takes_the_steps_that_do_not_need_the_host(
     course: ConvergenceState, steps: list[tuple[float, float, float]], taken: int, device: str
 ) -> None:
     found = in_a_loop(course, None, steps, device)
@@ -112,7 +112,7 @@ def test_a_loop_takes_the_steps_that_need_no_look(
     np.testing.assert_allclose(found, [size for size, _, _ in steps[:taken]], rtol=1e-15)
 
 
-def test_a_loop_goes_the_host_s_way(device: str) -> None:
+def test_the_device_loop_takes_the_steps_of_the_host(device: str) -> None:
     """Residuals decrease and increase at random; the loop starts in the middle of a round."""
     random, lengths = np.random.default_rng(0), set()
     for _ in range(100):
@@ -132,5 +132,5 @@ def test_a_loop_goes_the_host_s_way(device: str) -> None:
     assert len(lengths) > 5
 
 
-def test_what_is_not_as_usual_is_not_gone_on_from(device: str) -> None:
+def test_a_search_does_not_continue_from_failures(device: str) -> None:
     assert len(in_a_loop(FIRST, None, plain(0.1), device, usual=0)) == 0

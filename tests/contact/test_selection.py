@@ -45,7 +45,7 @@ def test_few_points_one_a_cell(geometry: ContactGeometry) -> None:
         assert gaps[point] == gaps[points.cell_from_point == cell].min()
 
 
-def test_what_presses_stays_and_the_rest_follows_the_lowest(geometry: ContactGeometry) -> None:
+def test_loaded_points_stay_and_others_follow_the_lowest(geometry: ContactGeometry) -> None:
     points = ContactSelector(geometry, activation_distance=NEAR, hysteresis=1e-3)
     first = points.select(np.zeros(0, int), np.zeros(0, bool), gaps_of(geometry))
     tilted = gaps_of(geometry, 0.02)
@@ -58,7 +58,7 @@ def test_what_presses_stays_and_the_rest_follows_the_lowest(geometry: ContactGeo
     assert len(lifted) == 0
 
 
-def test_forces_go_with_their_points_and_the_deep_join(geometry: ContactGeometry) -> None:
+def test_forces_follow_their_points_and_deep_points_are_added(geometry: ContactGeometry) -> None:
     points = ContactSelector(geometry, activation_distance=NEAR, hysteresis=1e-3)
     before, forces = np.array([7, 3, 11]), np.arange(9.0).reshape(3, 3)
     matched = points.transfer_forces(np.array([3, 5, 7]), before, forces)
@@ -68,7 +68,7 @@ def test_forces_go_with_their_points_and_the_deep_join(geometry: ContactGeometry
     assert len(deep) and (gaps[deep] < -0.005).all() and int(np.argmin(gaps)) not in deep
 
 
-def test_cells_are_as_few_wherever_the_ground_is() -> None:
+def test_the_number_of_cells_does_not_depend_on_the_ground_height() -> None:
     """A wide body that starts above the ground has the same cells under it as where it stands."""
     mesh = block_mesh(7, 7, 3, (1.2, 1.2, 0.4))
     side = np.linspace(-0.6, 0.6, 30)
@@ -85,7 +85,7 @@ def test_cells_are_as_few_wherever_the_ground_is() -> None:
     assert np.array_equal(points[0].cell_from_point, points[1].cell_from_point)
 
 
-def test_rounding_chooses_neither_cells_nor_points(geometry: ContactGeometry) -> None:
+def test_rounding_changes_neither_cells_nor_points(geometry: ContactGeometry) -> None:
     """The last bits of weights and gaps differ between machines. Of points with equal gaps, the one closest to the
     centre of its cell is selected."""
     random = np.random.default_rng(0)

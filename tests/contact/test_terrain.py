@@ -49,7 +49,7 @@ def test_tops_of_a_step_a_ramp_a_wall_and_a_box() -> None:
     assert stair.scaled(2.0).distance_along(2.0 * at, UP) == pytest.approx(0.2)
 
 
-def test_the_top_of_what_hangs_over() -> None:
+def test_the_top_of_an_overhang() -> None:
     """A solid below a level face at z = 1 and below a face z = 2 x: a vertical line through the part with x < 0.5
     leaves it at z = 1; beyond, it misses the solid."""
     wedge = Solid((Plane.from_coefficients(0.0, 0.0, 1.0, -1.0), Plane.from_coefficients(2.0, 0.0, -1.0, 0.0)))
@@ -89,7 +89,7 @@ def test_mistakes_of_a_terrain_file(tmp_path: Path, text: str, message: str) -> 
     assert str(error.value).startswith(str(path)) and message in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_slope_that_nothing_stands_on_is_refused() -> None:
+def test_a_ground_steeper_than_45_degrees_is_refused() -> None:
     thing = pawn(device="cpu")
     with pytest.raises(UserError) as error:
         make_creature(thing.cloud, plane=thing.plane, options=CreatureOptions(gravity_up=np.array([1.0, 0.0, 0.5])))
@@ -99,7 +99,7 @@ def test_a_slope_that_nothing_stands_on_is_refused() -> None:
     )
 
 
-def test_a_solid_that_holds_the_body_is_named(tmp_path: Path) -> None:
+def test_a_solid_that_contains_the_body_is_named(tmp_path: Path) -> None:
     """The second floor's normal points down into the body."""
     thing = pawn(device="cpu")
     path = tmp_path / "t.json"
@@ -138,7 +138,7 @@ def test_the_kernel_equals_its_twin(device: str) -> None:
     assert np.allclose(contacts.axes[~on_ground, 0], [-1.0, 0.0, 0.0])
 
 
-def test_contact_velocities_are_the_gaps_change(device: str) -> None:
+def test_contact_velocities_are_the_rate_of_the_gap(device: str) -> None:
     """For points on the ground: after a small displacement the gap is, to second order, what the frame's normal row
     predicts."""
     mesh = block_mesh()
@@ -157,7 +157,7 @@ def test_contact_velocities_are_the_gaps_change(device: str) -> None:
         assert np.abs(contacts.end_gaps(dt, v) - moved).max() < 10.0 * dt**2
 
 
-def test_arms_end_on_the_ground_at_rest_and_bumps_between_them_are_seen() -> None:
+def test_arms_end_on_the_ground_and_bumps_between_them_are_detected() -> None:
     """Eq. (3): no point begins inside the ground. More points remain than on flat ground, and above bumps as wide as
     two cage edges no Gaussian mean is deeper than the deepest point."""
     mesh = block_mesh()

@@ -64,7 +64,7 @@ def test_only_splitting_follows_a_bend() -> None:
     assert off_circle(DeformationMethod.BIDIRECTIONAL) < 0.6 * whole
 
 
-def test_gaussians_bound_to_a_surface_within_the_cage_follow_it_and_not_the_cages_faces(device: str) -> None:
+def test_gaussians_bound_to_a_surface_follow_it_and_not_the_cage(device: str) -> None:
     """SuGaR: under a shear of the cage, Gaussians on a level sheet get the sheet's own in-plane map and normal, and no
     change of thickness."""
     mesh = box()

@@ -49,7 +49,7 @@ def colours(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_a_turned_cage_turns_shape_and_colour_exactly(device: str, degree: int) -> None:
+def test_a_rotated_cage_rotates_shape_and_colour_exactly(device: str, degree: int) -> None:
     """Eq. (14), (15): under a rotation the covariance rotates, and every band of colour is unchanged for a viewer that
     rotates with it."""
     mesh, cloud = box(), random_cloud(300, degree=degree, device=device)
@@ -65,7 +65,7 @@ def test_a_turned_cage_turns_shape_and_colour_exactly(device: str, degree: int) 
     np.testing.assert_allclose(turned, seen, atol=2e-5)
 
 
-def test_colour_turns_exactly_where_euler_angles_are_arbitrary(device: str) -> None:
+def test_colour_rotates_exactly_where_euler_angles_are_arbitrary(device: str) -> None:
     """Eq. (15): rotations about z alone, by 180 degrees about horizontal axes, the identity, and nearly each of
     them."""
     half = [np.pi * np.array([np.cos(a), np.sin(a), 0.0]) for a in (0.0, 0.5 * np.pi, 1.1)]
@@ -94,7 +94,7 @@ def test_colour_turns_exactly_where_euler_angles_are_arbitrary(device: str) -> N
         np.testing.assert_allclose(colours(turned, turns.apply(views)), colours(sh, views), atol=1e-5)
 
 
-def test_turning_the_object_is_turning_the_camera(device: str) -> None:
+def test_rotating_the_object_is_rotating_the_camera(device: str) -> None:
     """Eq. (15): the image of the rotated object equals that of the object from the inversely rotated camera, to 1e-4 in
     linear colour, with bands 1 to 3 at full strength."""
     mesh, cloud = box(), random_cloud(300, degree=3, device=device)
@@ -112,7 +112,7 @@ def test_turning_the_object_is_turning_the_camera(device: str) -> None:
     assert difference.max() < 4e-3 * np.abs(pictures[0]).max()
 
 
-def test_an_affine_cage_carries_flat_splats_exactly(device: str) -> None:
+def test_an_affine_cage_deforms_flat_splats_exactly(device: str) -> None:
     """Eq. (14), (15): Sigma' = F Sigma F^T to float32, for scales from e^-16 to a quarter of the body; det R = +1, and
     axes match the deformed ones in order and sign."""
     mesh, rng = box((5, 5, 5)), np.random.default_rng(3)
@@ -162,7 +162,7 @@ def by_arms(cloud: GaussianCloud, embedding: GaussianEmbedding, positions: np.nd
     return 0.5 * (plus + minus).transpose(0, 2, 1) @ matrices(cloud).transpose(0, 2, 1)
 
 
-def test_arms_go_where_their_ends_go(device: str) -> None:
+def test_arms_follow_their_ends(device: str) -> None:
     """Eq. (14): (F+ + F-)/2 from the deformed ends, in float64, gives the deformed covariance, for ends in the same
     tetrahedron, in the next one and farther, where the cage is bent and perturbed."""
     mesh, cloud = box((4, 4, 4)), random_cloud(400, degree=0, scale=0.15, device=device)
@@ -181,7 +181,7 @@ def test_arms_go_where_their_ends_go(device: str) -> None:
     assert error[exact].max() < 2e-4
 
 
-def test_colour_turns_with_the_mean_of_the_arms(device: str) -> None:
+def test_colour_rotates_with_the_mean_of_the_arms(device: str) -> None:
     """Eq. (15): a Gaussian that reaches into other tetrahedra rotates by the polar rotation of (F+ + F-)/2 (SciPy's),
     which differs from that of the tetrahedron of its mean."""
     mesh, cloud = box((4, 4, 4)), random_cloud(400, degree=0, scale=0.15, device=device)
@@ -227,7 +227,7 @@ def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
 
 @pytest.mark.parametrize("along", [0, 1, 2])
 @pytest.mark.parametrize("quarters", [0, 1])
-def test_a_bend_about_any_axis_of_a_needle_is_read(device: str, along: int, quarters: int) -> None:
+def test_a_bend_about_any_axis_of_a_needle_is_measured(device: str, along: int, quarters: int) -> None:
     """Eq. (16): 40 degrees for each choice of the long axis and of the axis of bending."""
     mesh, radius = box((24, 2, 2), (4.0, 0.4, 0.4)), 1.2 / np.radians(40.0)
     # Axis ``along`` lies in x, the one after it in y, or in z after a quarter turn about x.
@@ -252,7 +252,7 @@ def test_a_bend_about_any_axis_of_a_needle_is_read(device: str, along: int, quar
     flatten=st.sampled_from([1.0, 1e-3, 0.0, -1.0]),
     reach=st.sampled_from([0.0, 0.5, 30.0]),
 )
-def test_no_spike_and_no_nan_whatever_the_cage_does(seed: int, noise: float, flatten: float, reach: float) -> None:
+def test_no_spike_and_no_nan_for_any_cage(seed: int, noise: float, flatten: float, reach: float) -> None:
     """Eq. (14): for inverted and flattened tetrahedra, far ends, means far outside and scales from e^-16 to a quarter
     of the body, results are finite with proper rotations, and no Gaussian is stretched more than the material around it
     allows."""
@@ -294,7 +294,7 @@ def test_no_spike_and_no_nan_whatever_the_cage_does(seed: int, noise: float, fla
     np.testing.assert_allclose(result.cloud.log_scales.numpy()[far], cloud.log_scales.numpy()[far], atol=1e-3)
 
 
-def test_the_mean_goes_where_the_mass_goes(device: str) -> None:
+def test_the_mean_is_the_mean_of_the_deformed_mass(device: str) -> None:
     """Eq. (14) and second order: the deformed mean of a long Gaussian is the mean of its deformed mass, estimated by
     sampling."""
     mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
@@ -346,7 +346,7 @@ def test_a_wrong_number_of_nodes_is_refused() -> None:
         deform(cloud, embed_gaussians(cloud, mesh), np.zeros((7, 3)))
 
 
-def test_far_outside_nothing_bends_or_stretches(device: str) -> None:
+def test_far_gaussians_neither_bend_nor_stretch(device: str) -> None:
     """Eq. (14), (16): a Gaussian far from the cage moves rigidly with the nearest tetrahedron."""
     mesh = box()
     cloud = random_cloud(50, degree=0, device=device)
@@ -385,7 +385,7 @@ def turns_of(count: int, seed: int) -> np.ndarray:
     return Rotation.from_quat(np.random.default_rng(seed).normal(size=(count, 4))).as_matrix()
 
 
-def test_the_rotation_of_a_map_that_flattens_is_that_of_its_plane(device: str) -> None:
+def test_the_rotation_of_a_singular_map_is_that_of_its_svd(device: str) -> None:
     """Eq. (15): for F with a singular value that is zero, or nearly, the rotation is that of SciPy's SVD with det = +1,
     in any order of the other two."""
     stretches = [(1.0, 0.4, 0.0), (1.0, 0.0, 0.4), (0.4, 1.0, 0.0), (0.0, 0.4, 1.0), (0.4, 0.0, 1.0), (0.0, 1.0, 0.4)]
@@ -402,7 +402,7 @@ def test_the_rotation_of_a_map_that_flattens_is_that_of_its_plane(device: str) -
         np.testing.assert_allclose(found.numpy(), left @ right, atol=2e-5)
 
 
-def test_of_a_map_onto_a_line_the_rotation_takes_that_line_along(device: str) -> None:
+def test_the_rotation_of_a_rank_one_map_maps_its_line(device: str) -> None:
     """F = s u v^T, along each axis and obliquely: the rotation is proper, and R v = u."""
     slanted = np.random.default_rng(5).normal(size=(6, 2, 3))
     lines = np.concatenate([[(a, b) for a in np.eye(3) for b in np.eye(3)], slanted])
@@ -432,7 +432,7 @@ def test_axes_keep_their_order(device: str) -> None:
     assert set(found) == set(itertools.permutations(range(3)))
 
 
-def test_axes_keep_the_side_that_they_were_carried_to(device: str) -> None:
+def test_axes_keep_their_signs(device: str) -> None:
     """The signs are the closest to the reference of the four choices with det = +1."""
     count, random = 200, np.random.default_rng(9)
     frames = turns_of(count, 3)

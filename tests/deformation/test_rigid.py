@@ -13,7 +13,7 @@ from tests.support.deformation_scenes import covariances
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_shapes_turn_and_grow_with_the_frame(degree: int) -> None:
+def test_shapes_rotate_and_scale_with_the_frame(degree: int) -> None:
     """C -> s^2 A C A^T and m -> s A (m - o), with the frame's axes A; the same colour is seen from the same side."""
     random = np.random.default_rng(3)
     count = 40

@@ -107,7 +107,7 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
     assert cloud.count < capped.cloud.count <= 1.5 * cloud.count
 
 
-def test_where_not_all_can_be_split_the_worst_are() -> None:
+def test_a_count_limit_splits_those_with_the_largest_fit_error() -> None:
     """With a limit on the count, the Gaussians with the largest fit error are split, all of which would be split
     without a limit too."""
     mesh, cloud = box((24, 2, 2), (4.0, 0.4, 0.4)), bar_cloud()
@@ -125,7 +125,7 @@ def test_where_not_all_can_be_split_the_worst_are() -> None:
     assert misfits[some].min() >= np.sort(misfits[everyone])[-8]
 
 
-def test_what_was_split_three_times_is_left() -> None:
+def test_gaussians_at_the_depth_limit_are_not_split() -> None:
     """A Gaussian at the depth limit is not split, however bent; others are split once more, and their depth
     increases."""
     mesh, cloud = box((24, 2, 2), (4.0, 0.4, 0.4)), bar_cloud()
@@ -149,7 +149,7 @@ def test_an_affine_motion_splits_nothing() -> None:
     assert result.cloud is cloud and result.embedding is embedding
 
 
-def test_nothing_pops_in_an_animation_that_splits() -> None:
+def test_an_animation_with_splits_has_no_pops() -> None:
     """Eq. (17): over a growing bend, frames of the cloud split for the motion change as smoothly as those of the
     unsplit one; the same measure detects a cloud that is split in the middle."""
     mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
@@ -183,7 +183,7 @@ def test_nothing_pops_in_an_animation_that_splits() -> None:
 
 
 @pytest.mark.data
-def test_a_split_at_rest_cannot_be_seen(data_dir: Path) -> None:
+def test_a_split_at_rest_is_invisible(data_dir: Path) -> None:
     """Eq. (17): the PSNR of split against unsplit at rest is at least 45 dB on a real capture that was split for a
     bend."""
     cloud = read_capture(data_dir / "objects" / "plush_dog.ply", device="cpu").cloud
@@ -206,7 +206,7 @@ def test_a_split_at_rest_cannot_be_seen(data_dir: Path) -> None:
         assert -10.0 * np.log10(np.mean((pictures[0] - pictures[1]) ** 2)) >= 45.0
 
 
-def test_children_are_as_opaque_as_the_rules_say() -> None:
+def test_child_opacities_follow_the_split_rules() -> None:
     """Eq. (17): the paper's two children share the mass, each with sigma^2 = 1 - 2 / pi and a peak of at most 0.99. Of
     the three children of the measured rule, none is more opaque than the parent, the middle one is the most opaque, and
     all opacities increase with the parent's."""

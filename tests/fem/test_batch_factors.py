@@ -23,7 +23,7 @@ def matrices() -> np.ndarray:
 
 @pytest.mark.parametrize("panel", [8, 53, 96])
 @pytest.mark.parametrize("chunk_bytes", [1, 2**31])
-def test_solutions_are_those_of_numpy(matrices: np.ndarray, panel: int, chunk_bytes: int) -> None:
+def test_solutions_equal_those_of_numpy(matrices: np.ndarray, panel: int, chunk_bytes: int) -> None:
     """In all slots, in some of them, and after some slots were overwritten."""
     right = np.random.default_rng(1).normal(size=(COUNT, SIZE, 3))
     factors = BatchCholesky(COUNT, SIZE, torch.device("cpu"), panel=panel, chunk_bytes=chunk_bytes)

@@ -74,7 +74,7 @@ def same(beside: torch.Tensor, alone: list[np.ndarray], *, rel: float = 1e-12) -
         np.testing.assert_allclose(one.reshape(other.shape), other, rtol=0, atol=rel * np.abs(other).max() + 1e-300)
 
 
-def test_what_a_step_starts_from(body: SoftBody, beside: BatchProblem, alone: list[StepProblem]) -> None:
+def test_initial_values_of_a_step(body: SoftBody, beside: BatchProblem, alone: list[StepProblem]) -> None:
     assert beside.residual_scale == pytest.approx(alone[0].residual_scale) and beside.inertia_ratio == pytest.approx(
         1.0 + DT * DRAG
     )
@@ -176,9 +176,7 @@ def given_size(body: SoftBody) -> int:
     return 3 * len(body.mesh.nodes)
 
 
-def test_an_indefinite_world_is_projected_and_one_without_numbers_has_no_factors(
-    body: SoftBody, muscles: MuscleSet
-) -> None:
+def test_an_indefinite_world_is_projected_and_one_with_nan_has_no_factors(body: SoftBody, muscles: MuscleSet) -> None:
     """The first world is compressed to 40 % in a long step, the second has NaN velocities, the third is at rest."""
     rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
     squashed = BodyState(body.mesh.nodes * [1.1, 1.1, 0.4], rest.velocities)

@@ -45,7 +45,7 @@ def test_worlds_are_written_back_in_place() -> None:
     assert record.places.tolist() == [[-1.0, -1.0], [20.0, 30.0], [-1.0, -1.0], [60.0, 70.0]]
 
 
-def test_copies_of_a_map_lie_one_behind_the_other() -> None:
+def test_copies_of_an_index_map_are_concatenated() -> None:
     """Negative entries are unchanged."""
     assert repeat_offsets(np.array([[0, 2], [-1, 1]]), 3, 5, CPU).tolist() == [
         [0, 2],

@@ -67,7 +67,7 @@ def test_momenta_of_a_rigid_motion(body: SoftBody) -> None:
     assert body.mechanical_energy(x, v) == pytest.approx(kinetic + potential, rel=1e-9)
 
 
-def test_best_fit_rotation_recovers_a_turn(body: SoftBody) -> None:
+def test_best_fit_rotation_recovers_a_rotation(body: SoftBody) -> None:
     """Exact for a rotated stretch along the principal axes; a proper rotation even for a mirrored body."""
     turn = Rotation.from_rotvec([0.4, -1.9, 0.8]).as_matrix()
     centred = body.mesh.nodes - body.centre_of_mass(body.mesh.nodes)
@@ -95,7 +95,7 @@ def test_the_smallest_and_the_largest_body_are_bodies() -> None:
         assert make_body(mesh, FLOOR, device="cpu").height == height
 
 
-def test_a_body_that_hangs_on_an_edge_is_refused() -> None:
+def test_a_body_hinged_at_an_edge_is_refused() -> None:
     """Two boxes that share only an edge form a hinge: the upper one rotates freely, so there is no first mode."""
     box = box_mesh((1, 1, 1), (1.0, 1.0, 1.0))
     low = box.nodes.min(axis=0)

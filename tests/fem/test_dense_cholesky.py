@@ -139,7 +139,7 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [1, 70])
-def test_directions_are_added_without_another_factor(count: int, device: str) -> None:
+def test_low_rank_terms_need_no_new_factorization(count: int, device: str) -> None:
     """Positive, then negative terms; if the sum is indefinite, there are no factors until the next matrix."""
     upper, random = pattern(60), np.random.default_rng(5)
     factors, right = DenseCholesky(upper, device=device), random.normal(size=(60, 4))
@@ -163,7 +163,7 @@ def test_directions_are_added_without_another_factor(count: int, device: str) ->
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_what_is_not_finite_has_no_factors(device: str) -> None:
+def test_non_finite_matrices_have_no_factors(device: str) -> None:
     upper = pattern(20)
     factors = DenseCholesky(upper, device=device)
     for value in (np.nan, np.inf):
@@ -183,7 +183,7 @@ def test_a_cpu_gets_sparse_factors() -> None:
 
 
 @pytest.mark.cuda
-def test_factors_leave_what_warp_holds_for_its_stream() -> None:
+def test_factors_keep_temporary_memory_of_warp() -> None:
     """Temporary memory of Warp's sorts on the stream must not be freed, in particular not during a capture."""
     upper = band(150)
     factors, count = DenseCholesky(upper, device="cuda:0"), 1000

@@ -34,7 +34,7 @@ def test_nothing_joins_two_slabs(count: int, seed: int) -> None:
     assert max(map(len, slabs.parts)) + len(slabs.separator) < 0.3 * count + 12
 
 
-def test_what_no_cut_divides_is_whole() -> None:
+def test_a_dense_matrix_is_not_divided() -> None:
     for joined in (np.ones((30, 30), bool), np.ones((1, 1), bool)):
         slabs = Dissection.of(upper_of(joined))
         assert (
@@ -42,7 +42,7 @@ def test_what_no_cut_divides_is_whole() -> None:
         )
 
 
-def test_bodies_that_do_not_meet_have_slabs_too() -> None:
+def test_disconnected_bodies_have_slabs_too() -> None:
     """All vertices that are not connected to the first one form one level."""
     joined = sparse.block_diag([band(60, 2, 0), band(20, 2, 1)]).toarray().astype(bool)
     slabs = Dissection.of(upper_of(joined))

@@ -42,7 +42,7 @@ def test_one_and_many_right_sides(shift: float) -> None:
     assert np.abs(2.0 * dense @ factors.solve(right) - right).max() < 1e-9
 
 
-def test_what_cannot_be_factored_is_told() -> None:
+def test_singular_matrices_are_reported() -> None:
     upper = upper_of(random_matrix(60, 12.0))
     factors = MultifrontalLdl(upper)
     assert not factors.update(np.full(upper.nnz, np.nan)) and not factors.is_ready
@@ -77,7 +77,7 @@ def strained(factors: LinearSolver, upper: sparse.csc_matrix, vectors: np.ndarra
 
 
 @pytest.mark.parametrize("name", PATTERNS)
-def test_the_strain_of_many_moves(name: str) -> None:
+def test_effort_quadratic_equals_dense_algebra(name: str) -> None:
     """X^T H X and X^T g are those of X = 0.3 V - 0.7 S^-1 diag(w) V, minus the reference in the last column of X, for
     another matrix H with the same pattern."""
     matrix = PATTERNS[name]
@@ -97,7 +97,7 @@ def test_the_strain_of_many_moves(name: str) -> None:
 
 
 @pytest.mark.parametrize("added", [False, True])
-def test_what_solutions_keep(added: bool) -> None:
+def test_solutions_conserve_the_angular_momentum(added: bool) -> None:
     """The scaled angular momentum of a solution equals that of its right-hand side, also with a low-rank term."""
     matrix = PATTERNS["grid of nodes"]
     count, random = len(matrix.indptr) - 1, np.random.default_rng(8)
@@ -116,7 +116,7 @@ def test_what_solutions_keep(added: bool) -> None:
         assert np.abs(found - plain).max() > 1e-6
 
 
-def test_where_nothing_is_given_nothing_comes_of_it() -> None:
+def test_sparse_right_hand_sides() -> None:
     """Columns with few nonzero entries, for which some blocks are skipped."""
     matrix = PATTERNS["grid of nodes"]
     count = len(matrix.indptr) - 1
@@ -138,7 +138,7 @@ def test_the_same_bits_on_any_number_of_cores(monkeypatch: pytest.MonkeyPatch) -
         np.testing.assert_array_equal(one, other)
 
 
-def test_factors_that_share_an_analysis_keep_to_their_own_matrices() -> None:
+def test_solvers_with_a_shared_analysis_have_their_own_factors() -> None:
     """Two solvers that share an analysis give the same bits as solvers with their own."""
     upper = upper_of(random_matrix(60, 12.0))
     analysis, right = SymbolicFactorization.of(upper), np.random.default_rng(5).standard_normal((60, 3))
@@ -151,7 +151,7 @@ def test_factors_that_share_an_analysis_keep_to_their_own_matrices() -> None:
         assert np.array_equal(factors.solve(right), alone.solve(right))
 
 
-def test_a_pivot_next_to_nothing_has_no_factors() -> None:
+def test_a_negligible_pivot_has_no_factors() -> None:
     """The pivot is in the middle or at the start of a block; an indefinite matrix has factors."""
     matrix = PATTERNS["full, of fifty"].toarray()
     whole = upper_of(sparse.csc_matrix(matrix))
@@ -176,7 +176,7 @@ def test_a_pivot_next_to_nothing_has_no_factors() -> None:
 
 
 @pytest.mark.parametrize("size", [2, 7, 60])
-def test_an_inverse_comes_with_the_count_of_positive_eigenvalues(size: int) -> None:
+def test_an_inverse_has_the_count_of_positive_eigenvalues(size: int) -> None:
     """For any symmetric matrix, also with a zero diagonal and 2 x 2 pivots; the upper triangle is not read."""
     random = np.random.default_rng(size)
     for diagonal in (0.0, 1.0, 10.0, -10.0):

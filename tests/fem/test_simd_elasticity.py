@@ -43,7 +43,7 @@ def strings(mesh: TetMesh) -> MuscleEnergy:
 
 @pytest.mark.parametrize("count", [1, 4, 7, 40, None])
 @pytest.mark.parametrize("dt", [None, 1 / 60])
-def test_they_are_those_of_one_at_a_time(count: int | None, dt: float | None) -> None:
+def test_groups_of_four_equal_single_elements(count: int | None, dt: float | None) -> None:
     """Eq. (5): energy, determinants, gradients with muscles and without, both Hessians."""
     mesh = block_mesh() if count is None else part(count)
     one, four = both(mesh)
@@ -71,7 +71,7 @@ def test_they_are_those_of_one_at_a_time(count: int | None, dt: float | None) ->
     np.testing.assert_allclose(pulled, tension.gradient(end), atol=1e-9)
 
 
-def test_shapes_whose_axes_are_not_told_apart() -> None:
+def test_shapes_with_equal_principal_stretches() -> None:
     """At rest, stretched along one axis, and scaled uniformly: principal stretches are equal and determine no axes."""
     mesh = block_mesh()
     one, four = both(mesh)

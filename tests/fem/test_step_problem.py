@@ -39,7 +39,7 @@ def tension(body: SoftBody) -> MuscleEnergy:
 
 
 @pytest.mark.parametrize("muscles", [False, True])
-def test_the_residual_is_the_derivative_of_an_energy_but_for_a_turn(device: str, muscles: bool) -> None:
+def test_the_residual_is_the_derivative_of_an_energy_up_to_a_rotation(device: str, muscles: bool) -> None:
     """Eq. (4), Eq. (6): central differences of Phi(v), with drag and Rayleigh damping; the difference is M times
     the rigid rotation of the momentum correction, to rounding.
     """
@@ -112,7 +112,7 @@ def test_an_indefinite_stiffness_is_projected_and_keeps_the_momenta(
 
 
 @pytest.mark.parametrize("inverting", [False, True])
-def test_a_squash_and_an_inverting_start_are_solved(body: SoftBody, inverting: bool) -> None:
+def test_a_compressed_body_and_an_inverting_start_are_solved(body: SoftBody, inverting: bool) -> None:
     """For a body compressed to 55 %, at rest or so fast that its velocities would invert elements, the step ends with a
     balanced equation and J > 0.
     """
@@ -125,7 +125,7 @@ def test_a_squash_and_an_inverting_start_are_solved(body: SoftBody, inverting: b
     assert np.linalg.norm(problem.residual(result.velocities, None)) <= 1e-8 * problem.residual_scale
 
 
-def test_a_step_says_when_it_does_not_converge(body: SoftBody) -> None:
+def test_a_step_reports_that_it_does_not_converge(body: SoftBody) -> None:
     """No floating-point residual reaches the tolerance."""
     _, result = passive_body(body, state=bent_state(body), tolerance=1e-25).advance(DT)
     assert not result.converged

@@ -11,7 +11,7 @@ from tests.support.sparse_patterns import PATTERNS, upper_of
 
 
 @pytest.mark.parametrize("name", PATTERNS)
-def test_blocks_hold_the_factor(name: str) -> None:
+def test_blocks_contain_the_factor(name: str) -> None:
     """Every nonzero entry of L lies in a block, and the blocks partition the columns."""
     matrix = PATTERNS[name]
     blocks, count = Supernodes.of(upper_of(matrix)), len(matrix.indptr) - 1

@@ -5,7 +5,7 @@ import numpy as np
 from egs_warp.geometry.frames import cross_matrices
 
 
-def test_turning_is_the_cross_product_with_each_axis() -> None:
+def test_rotation_velocity_is_the_cross_product_with_each_axis() -> None:
     """v = w x r for any angular velocity."""
     random = np.random.default_rng(0)
     arms, spin = random.normal(size=(7, 3)), random.normal(size=3)

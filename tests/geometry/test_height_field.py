@@ -29,7 +29,7 @@ def scattered(field: HeightField, count: int = 300) -> np.ndarray:
     return field.origin + flat @ field.axes[:2] + random.uniform(-0.2, 0.2, (count, 1)) * field.axes[2]
 
 
-def test_it_goes_through_its_nodes_and_follows_waves() -> None:
+def test_ground_interpolates_its_nodes_and_follows_waves() -> None:
     """A sine of 16 spacings is reproduced to 0.02 % of its height at the nodes and to 0.5 % between them."""
     field = wavy_ground(1.0, spacing=LENGTH / 16)
     nodes = field.nodes()[3:-3, 3:-3]
@@ -57,7 +57,7 @@ def test_normals_are_the_gradient_of_the_gap() -> None:
     assert np.linalg.det(frames) == pytest.approx(1.0)
 
 
-def test_frames_turn_without_a_jump() -> None:
+def test_frames_rotate_continuously() -> None:
     """Along a line of 4,000 points across many cells and beyond the grid, the frames of neighbours differ by little."""
     field = tilted(wavy_ground(0.05, reach=1.0))
     line = field.origin + np.linspace(-0.3, 2.5, 4000)[:, None] * (field.axes[0] + 0.7 * field.axes[1])
@@ -92,7 +92,7 @@ def test_levelled_and_raised_are_inverse() -> None:
     assert field.unflatten(level) == pytest.approx(points, abs=1e-12)
 
 
-def test_top_is_where_a_plumb_line_meets_it() -> None:
+def test_top_is_where_a_vertical_line_meets_the_ground() -> None:
     """On level and on sloping ground."""
     field = tilted(wavy_ground())
     up = Rotation.from_rotvec(np.radians(20.0) * field.axes[0]).apply(field.normal)
@@ -101,7 +101,7 @@ def test_top_is_where_a_plumb_line_meets_it() -> None:
     assert way < 0.0 and field.heights(point + way * up) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_coarser_ground_keeps_what_is_wide() -> None:
+def test_coarser_ground_keeps_long_waves() -> None:
     """Waves of 16 new spacings keep 97 % of their height, those of two a third or less; no wave is displaced."""
     field = wavy_ground(0.03, spacing=0.02)
     coarse = field.coarser(0.05)

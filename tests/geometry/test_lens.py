@@ -87,7 +87,7 @@ def photographed(picture: np.ndarray, pinhole: Camera, taken: Camera, lens: Lens
         ("OPENCV_FISHEYE", {"k1": 0.05, "k2": -0.02, "k3": 0.0, "k4": 0.0}),
     ],
 )
-def test_a_photo_through_a_lens_is_straightened(model: str, numbers: dict[str, float]) -> None:
+def test_a_photo_through_a_lens_is_undistorted(model: str, numbers: dict[str, float]) -> None:
     """A render that is distorted and undistorted again equals the render; without undistortion it does not."""
     lens = Lens.named(model, numbers)
     assert lens is not None
@@ -113,7 +113,7 @@ def test_a_photo_through_a_lens_is_straightened(model: str, numbers: dict[str, f
     assert not back[~way.known].any()
 
 
-def test_pixels_without_a_source_are_known_and_clicks_find_their_way() -> None:
+def test_pixels_outside_the_lens_are_unknown_and_clicks_are_mapped() -> None:
     """A pincushion lens leaves the corners of the pinhole image unknown; a barrel lens leaves none."""
     camera = Camera(60, 40, 50.0, 50.0, 30.0, 20.0, np.eye(3), np.zeros(3))
     wide = Undistortion.of(camera, Lens(radial=(0.3, 0.0, 0.0, 0.0)))
@@ -127,7 +127,7 @@ def test_pixels_without_a_source_are_known_and_clicks_find_their_way() -> None:
     np.testing.assert_allclose(barrel.pixel(u, v), ray * 50.0 + [30.0, 20.0], atol=0.6)
 
 
-def test_a_polynomial_that_folds_back_shows_nothing_twice() -> None:
+def test_the_folded_range_of_a_polynomial_is_unknown() -> None:
     """Beyond r = 1 / sqrt(1.5) the distorted radius r - 0.5 r^3 decreases: pixels there are unknown."""
     lens = Lens(radial=(-0.5, 0.0, 0.0, 0.0))
     assert lens.valid_radius(3.0) == pytest.approx(1 / np.sqrt(1.5), abs=0.01)

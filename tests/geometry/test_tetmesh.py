@@ -12,7 +12,7 @@ from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 from tests.support.meshes import box_mesh
 
 
-def test_surface_and_edges_are_those_of_its_tetrahedra_and_found_once() -> None:
+def test_surface_and_edges_are_those_of_the_tetrahedra() -> None:
     """The surface is closed, encloses the volume, and is read-only, since all callers share the cached array."""
     mesh = box_mesh((2, 2, 3), (0.5, 0.5, 1.0))
     faces = mesh.boundary_faces()

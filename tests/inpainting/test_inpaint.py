@@ -72,7 +72,7 @@ def test_filled_floor_looks_like_the_truth(done: tuple[GaussianCloud, InpaintRes
         assert after.alpha.numpy()[hole].min() > 0.94
 
 
-def test_depth_is_the_planes(done: tuple[GaussianCloud, InpaintResult]) -> None:
+def test_depth_is_that_of_the_plane(done: tuple[GaussianCloud, InpaintResult]) -> None:
     """Eq. (18): the rendered depth of the new Gaussians is the plane's to half a spacing (a splat has one depth, and
     splats in front hide those behind)."""
     _, result = done
@@ -95,7 +95,9 @@ def test_new_gaussians_are_flat_dense_and_lie_on_the_plane(done: tuple[GaussianC
     assert new.sh_degree == 3
 
 
-def test_gloss_of_the_surround_without_its_colour(done: tuple[GaussianCloud, InpaintResult]) -> None:
+def test_new_gaussians_have_the_gloss_of_the_floor_but_their_own_colour(
+    done: tuple[GaussianCloud, InpaintResult],
+) -> None:
     """The highlight is that of the floor; the mean colour over all directions is the painted one."""
     truth, result = done
     new = result.cloud.subset(result.is_new)
@@ -109,7 +111,7 @@ def test_gloss_of_the_surround_without_its_colour(done: tuple[GaussianCloud, Inp
 
 
 @pytest.mark.slow
-def test_training_comes_nearer_to_what_was_painted() -> None:
+def test_training_reduces_the_error_to_the_painted_image() -> None:
     """Seen face-on, the error of the image decreases; means and rotations stay the same."""
     truth, hole = floor(), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     damaged = holed(truth, hole)
@@ -126,7 +128,7 @@ def test_training_comes_nearer_to_what_was_painted() -> None:
     assert np.array_equal(again.cloud.sh.numpy(), start.cloud.sh.numpy())
 
 
-def test_floor_beside_the_plane_is_met_without_a_step() -> None:
+def test_new_floor_continues_a_floor_beside_the_plane() -> None:
     """For a floor 0.02 above the fitted plane, the new floor is at that height too."""
     truth, hole = floor(height=0.02), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     result = inpaint(holed(truth, hole), hole, inpainter=OpenCvInpainter(), options=InpaintOptions(steps=0))
@@ -135,7 +137,7 @@ def test_floor_beside_the_plane_is_met_without_a_step() -> None:
     assert heights.max() < 0.022
 
 
-def test_soap_film_and_rim_heights() -> None:
+def test_laplace_fill_and_rim_heights() -> None:
     """Harmonic polynomials are reproduced; for a tilted floor with a crack, the crack is ignored."""
     rows, columns = (values - 20.0 for values in np.indices((41, 41)).astype(float))
     hole = np.hypot(rows, columns) < 12
@@ -147,7 +149,7 @@ def test_soap_film_and_rim_heights() -> None:
     assert rim_heights(image, hole, ~hole)[hole] == pytest.approx(tilted[hole], abs=0.02)
 
 
-def test_window_camera_and_rectified_picture() -> None:
+def test_window_camera_and_rectified_image() -> None:
     """Texels are where the camera projects them, colours are those of the pattern, heights those of the floor."""
     window = PlaneWindow(PLANE, on_plane(0.2, -0.1), 0.01, 60, 80)
     pixels = np.array([[0.5, 0.5], [79.5, 10.5], [33.0, 59.0]])
@@ -188,7 +190,7 @@ def test_threads_at_two_heights_keep_their_contrast() -> None:
     assert colour.mean(axis=1).std() < 0.02
 
 
-def test_footprints_and_what_no_view_sees() -> None:
+def test_footprints_and_common_occlusion() -> None:
     """The base of a pawn is a disc, and a stool stands on four feet; masks of a disc on the plane yield the disc."""
     pawn, stool = scene("pawn"), scene("stool")
     assert footprint(pawn.object, pawn.plane).area == pytest.approx(np.pi * 0.3**2, rel=0.1)
@@ -219,7 +221,7 @@ def test_footprints_and_what_no_view_sees() -> None:
         unseen(PLANE, [MaskedView(up, np.ones((160, 160), bool))])
 
 
-def test_what_hangs_over_the_hole_stays() -> None:
+def test_overhanging_objects_stay() -> None:
     """A shelf as high above the floor as the hole is wide does not belong to the floor; haze at the foot is removed."""
     truth, hole = floor(spacing=0.04), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     shelf = floor(spacing=0.04, half=0.4, height=2.0 * RADIUS)

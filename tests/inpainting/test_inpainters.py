@@ -46,7 +46,7 @@ def save_traced(module: torch.nn.Module, inputs: tuple[torch.Tensor, ...], path:
     script.save(str(path))
 
 
-def test_torchscript_is_given_padded_pictures(tmp_path: Path) -> None:
+def test_torchscript_gets_padded_images(tmp_path: Path) -> None:
     image, hole = holed()
     inpainter = inpainter_by_name(str(traced(MeanOfTheKnown(), tmp_path / "mean.pt")), trust=True)
     filled = inpainter.fill(image, hole, ~hole)
@@ -133,7 +133,7 @@ def test_an_onnx_network_fills_the_hole(gain: float, tmp_path: Path) -> None:
     assert filled[hole] == pytest.approx(np.tile([0.25, 0.5, 0.75], (hole.sum(), 1)), abs=1e-6)
 
 
-def test_onnx_numbers_in_other_files_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_onnx_external_data_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """OpenCV itself would open such files, relative to the working folder."""
     (tmp_path / "secret").write_bytes(np.array([9, 9, 9], np.float32).tobytes())
     (tmp_path / "grey.onnx").write_bytes(grey_paint(external="secret"))

@@ -39,7 +39,7 @@ def test_cut_is_the_optimum() -> None:
         assert found @ unary + ((~found[p] & found[q]) * pairwise).sum() == costs.min()
 
 
-def test_labels_point_to_what_is_known_and_looks_alike() -> None:
+def test_labels_point_to_similar_known_texels() -> None:
     """In an exactly periodic image every source is a whole number of periods away."""
     image = picture()
     hole = round_hole(128, (70, 60), 13)
@@ -65,7 +65,7 @@ def test_a_repeating_texture_is_continued(device: str) -> None:
     assert np.array_equal(filled, PatchSynthesis(device=device).fill(holed, hole, ~hole))
 
 
-def test_light_that_fades_across_the_hole_leaves_no_seam() -> None:
+def test_an_illumination_gradient_leaves_no_seam() -> None:
     """For a texture under a gradient of light, the error is below a sixtieth of the light's range, without a step at
     the rim."""
     fade = np.linspace(-0.1, 0.1, 128, dtype=np.float32)[None, :, None]
@@ -77,7 +77,7 @@ def test_light_that_fades_across_the_hole_leaves_no_seam() -> None:
     assert np.abs(filled - image)[rim].max() < 0.02
 
 
-def test_meld_takes_the_gradients_and_drops_the_step() -> None:
+def test_blending_keeps_gradients_and_removes_steps() -> None:
     """A copy that is 0.1 too bright is corrected from its rim; where sources and votes agree nothing changes."""
     image = picture().astype(np.float64)
     image[:, 64:] += 0.1
@@ -94,7 +94,7 @@ def test_meld_takes_the_gradients_and_drops_the_step() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
-def test_no_island_of_what_lies_far_from_the_hole(seed: int) -> None:
+def test_no_patch_of_a_distant_texture(seed: int) -> None:
     """A hole in an unevenly lit pale sheet on dark boards, with little of the sheet left around it, gets no dark patch;
     a crack that runs through a hole in the boards is continued."""
     random = np.random.default_rng(seed)
@@ -111,7 +111,7 @@ def test_no_island_of_what_lies_far_from_the_hole(seed: int) -> None:
     assert (filled[57:71, 109] < 0.25).all()
 
 
-def test_nothing_to_learn_from() -> None:
+def test_an_image_without_source_patches() -> None:
     """Except for a few columns, the image consists of the hole."""
     hole = np.ones((40, 40), bool)
     hole[:, :3] = False
@@ -120,7 +120,7 @@ def test_nothing_to_learn_from() -> None:
 
 
 @pytest.mark.slow
-def test_what_lies_in_the_shade_is_not_copied():
+def test_shaded_texels_are_not_copied():
     """There is shade on one side of the hole: without the shade mask the filled hole is darker."""
     rows, columns = np.indices((96, 96))
     hole = np.hypot(rows - 48, columns - 48) < 14

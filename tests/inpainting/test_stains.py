@@ -19,7 +19,7 @@ def weave() -> np.ndarray:
     return np.stack([threads, 0.8 * threads, threads], axis=-1)
 
 
-def test_a_shadow_beside_the_hole_is_found_and_nothing_else():
+def test_a_shadow_next_to_the_hole_is_the_only_stain():
     shadow = (np.abs(ROWS - SIDE / 2) < 20) & (COLUMNS > SIDE / 2) & (COLUMNS < SIDE / 2 + 55)
     found = stain_around(HOLE, ~HOLE, np.where(shadow[..., None], 0.5, 1.0) * weave())
     inner, outer = shadow & ~HOLE, (AWAY < 70) & (np.abs(ROWS - SIDE / 2) < 24) & (COLUMNS > SIDE / 2)
@@ -52,7 +52,7 @@ def test_the_darkest_squares_of_a_checked_cloth_are_no_stain():
     assert not stain_around(HOLE, ~HOLE, cloth).any()
 
 
-def test_a_seam_that_goes_on_is_no_stain():
+def test_a_seam_that_continues_is_no_stain():
     """A seam between planks that begins at the hole."""
     wide = np.indices((360, 360))
     hole = np.hypot(*(wide - 180)) < 50
@@ -68,7 +68,7 @@ def test_a_dark_place_apart_from_the_hole_stays():
     assert not stain_around(HOLE, ~HOLE, np.where(apart[..., None], 0.4, 1.0) * weave()).any()
 
 
-def test_what_is_larger_than_twice_the_hole_is_another_floor():
+def test_a_region_larger_than_twice_the_hole_is_another_floor():
     mat = AWAY < 75
     assert mat.sum() > 3.5 * HOLE.sum()
     assert not stain_around(HOLE, ~HOLE, np.where(mat[..., None], 0.5, 1.0) * weave()).any()
@@ -78,7 +78,7 @@ def test_no_floor_has_no_stain():
     assert not stain_around(HOLE, np.zeros_like(HOLE), weave()).any()
 
 
-def test_a_faint_shadow_beside_the_hole_shades_the_floor_and_a_seam_does_not():
+def test_a_faint_shadow_is_shade_and_a_seam_is_not():
     """The shadow is no stain, but texels in it must not be copied."""
     shadow = (np.abs(ROWS - SIDE / 2) < 20) & (COLUMNS > SIDE / 2) & (COLUMNS < SIDE / 2 + 50)
     seam = np.abs(ROWS - 60) < 4

@@ -62,7 +62,7 @@ def test_an_underside_too_small_for_a_gaussian_stays_open(
     assert with_underside(object_cloud, ground, SIZE) == (object_cloud, 0)
 
 
-def test_what_is_closed_already_stays_as_it_is() -> None:
+def test_a_closed_underside_is_unchanged() -> None:
     ground = wavy_ground(0.03, spacing=0.04).moved(np.array([0.0, 0.0, -0.06]))
     thing = ball()
     same, count = with_underside(thing, ground, SIZE)

@@ -12,7 +12,7 @@ import pytest
 from egs_warp.io.arrays import read_npz
 
 
-def test_what_numpy_saves_comes_back(tmp_path: Path) -> None:
+def test_arrays_saved_by_numpy_are_read(tmp_path: Path) -> None:
     saved = {"a": np.arange(6.0).reshape(2, 3), "b": np.array(["x", "yz"]), "c": np.zeros((0, 3), np.int32)}
     np.savez(tmp_path / "a.npz", schema=np.int64(2), **saved)  # pyright: ignore[reportArgumentType]
     back = read_npz(tmp_path / "a.npz")
@@ -38,7 +38,7 @@ def _member(shape: str, dtype: str, data: bytes = b"") -> bytes:
         (b"\x93NUMPY\x03\x00", "an array of format 3.0"),
     ],
 )
-def test_arrays_that_declare_what_is_not_there(member: bytes, said: str, tmp_path: Path) -> None:
+def test_arrays_that_declare_more_than_the_file_holds(member: bytes, said: str, tmp_path: Path) -> None:
     """They are refused before memory is allocated for them."""
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("a.npy", member)

@@ -83,7 +83,7 @@ def test_a_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         writable_folder(tmp_path)
 
 
-def test_writable_folder_is_made_and_left_empty(tmp_path: Path) -> None:
+def test_a_writable_folder_is_created_empty(tmp_path: Path) -> None:
     assert writable_folder(str(tmp_path / "a" / "b")) == tmp_path / "a" / "b"
     assert writable_folder(tmp_path / "a" / "b").is_dir()
     assert os.listdir(tmp_path / "a" / "b") == []
@@ -95,7 +95,7 @@ def old(path: Path) -> Path:
     return path
 
 
-def test_what_a_killed_process_leaves_is_swept(tmp_path: Path) -> None:
+def test_remnants_of_a_killed_process_are_removed(tmp_path: Path) -> None:
     """Only files with names of this package are removed, and none that a running process is writing."""
     left = old(tmp_path / ".egs-0123456789abcdef.ply")
     other, young = old(tmp_path / ".egs-notes"), tmp_path / ".egs-0123456789abcdee.ply"

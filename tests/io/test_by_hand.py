@@ -50,7 +50,7 @@ def test_spz_by_hand(version: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_spz_of_streams_holds_what_version_3_does(degree: int, tmp_path: Path) -> None:
+def test_spz_of_streams_equals_version_3(degree: int, tmp_path: Path) -> None:
     write_spz(tmp_path / "3.spz", make_cloud(900, degree))
     plain = gzip.decompress((tmp_path / "3.spz").read_bytes())
     (tmp_path / "4.spz").write_bytes(spz_of_streams(plain, 900, 3 * ((degree + 1) ** 2 - 1)))
@@ -61,7 +61,7 @@ def test_spz_of_streams_holds_what_version_3_does(degree: int, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("degree", [0, 2])
-def test_spz_of_streams_is_written_as_its_description_says(degree: int, tmp_path: Path) -> None:
+def test_spz_of_streams_is_written_as_described(degree: int, tmp_path: Path) -> None:
     """Header, table and streams of https://github.com/nianticlabs/spz, byte by byte; the blocks are those of 3."""
     write_spz(tmp_path / "3.spz", make_cloud(900, degree))
     write_spz(tmp_path / "4.spz", make_cloud(900, degree), version=4)
@@ -85,7 +85,7 @@ def _one_spz(tmp_path: Path) -> bytes:
 
 
 @pytest.mark.parametrize(("axes", "up"), [(4, (0, 1, 0)), (6, (0, -1, 0)), (12, (0, 0, 1)), (9, (0, 0, -1))])
-def test_spz_of_streams_says_which_way_is_up(axes: int, up: tuple[int, int, int], tmp_path: Path) -> None:
+def test_spz_of_streams_declares_the_up_direction(axes: int, up: tuple[int, int, int], tmp_path: Path) -> None:
     """RUB, RDF, RFU and LFD, after a record of another kind."""
     records = struct.pack("<IIfff", 0xADBE0002, 12, 0.0, 1.0, 2.0) + struct.pack("<III", 0xADBE0003, 4, axes)
     (tmp_path / "4.spz").write_bytes(spz_of_streams(_one_spz(tmp_path), 1, 0, records))

@@ -56,7 +56,7 @@ def test_content_decides_not_the_name(tmp_path: Path) -> None:
 # .ply ----------------------------------------------------------------------------------------------------------------
 
 
-def test_truncated_ply_says_how_many_bytes(tmp_path: Path) -> None:
+def test_a_truncated_ply_reports_the_missing_bytes(tmp_path: Path) -> None:
     for name, element in (("a.ply", "vertex"), ("b.ply", "sh")):
         data = good_bytes(name)
         expected = f"truncated: 7 rows of element {element} need a file of {len(data)} bytes, found {len(data) - 3}"
@@ -179,7 +179,7 @@ def test_bad_spz(tmp_path: Path) -> None:
     assert message(written(path, bytes(flipped))).startswith("corrupted gzip data (")
 
 
-def test_spz_cannot_hold_what_is_too_far_out(tmp_path: Path) -> None:
+def test_spz_refuses_distant_means(tmp_path: Path) -> None:
     far = small_cloud().scaled(1e8)
     with pytest.raises(
         UserError, match=r"a mean lies .* units from the origin, the limit of \.spz is 8388607; scale the capture down"

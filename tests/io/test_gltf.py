@@ -33,7 +33,7 @@ def _glb(tree: dict[str, Any], binary: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_what_is_written_is_read(degree: int, tmp_path: Path) -> None:
+def test_written_files_are_read_back(degree: int, tmp_path: Path) -> None:
     cloud = make_cloud(300, degree)
     write_glb(tmp_path / "a.glb", cloud)
     capture = read_capture(tmp_path / "a.glb", device="cpu")
@@ -46,7 +46,7 @@ def test_what_is_written_is_read(degree: int, tmp_path: Path) -> None:
     assert capture.notes == ()
 
 
-def test_a_gltf_with_its_buffer_inside_or_beside(tmp_path: Path) -> None:
+def test_a_gltf_with_an_embedded_or_external_buffer(tmp_path: Path) -> None:
     cloud = make_cloud(50)
     write_glb(tmp_path / "a.glb", cloud)
     tree, binary = _parts(tmp_path / "a.glb")
@@ -84,7 +84,7 @@ def test_small_numbers_and_strides(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.opacities(), cloud.opacities(), atol=0.5 / 255 + 1e-6)
 
 
-def test_a_turned_node_says_where_up_is(tmp_path: Path) -> None:
+def test_a_rotated_node_declares_the_up_direction(tmp_path: Path) -> None:
     """A mesh with z up, under a node that rotates it to y up, as exporters write it."""
     write_glb(tmp_path / "a.glb", make_cloud(20))
     tree, binary = _parts(tmp_path / "a.glb")
@@ -129,7 +129,7 @@ def _changed(tree: dict[str, Any], case: str) -> None:
         ("nonsense", "no glTF with splats (TypeError"),
     ],
 )
-def test_what_cannot_be_read_is_one_line(case: str, said: str, tmp_path: Path) -> None:
+def test_unreadable_files_are_one_line_errors(case: str, said: str, tmp_path: Path) -> None:
     write_glb(tmp_path / "a.glb", make_cloud(10))
     tree, binary = _parts(tmp_path / "a.glb")
     _changed(tree, case)

@@ -64,7 +64,7 @@ def test_pictures_larger_than_the_gaussians_need(tmp_path: Path) -> None:
     assert megabytes_of(read_on_cpu, path) < 16
 
 
-def test_more_gaussians_than_the_pictures_can_hold(tmp_path: Path) -> None:
+def test_more_gaussians_than_the_images_can_hold(tmp_path: Path) -> None:
     files = members()
     meta = json.loads(files["meta.json"])
     meta["count"] = 33_554_432
@@ -75,7 +75,7 @@ def test_more_gaussians_than_the_pictures_can_hold(tmp_path: Path) -> None:
     )
 
 
-def test_what_a_zip_does_not_name_is_not_inflated(tmp_path: Path) -> None:
+def test_unrequested_zip_members_are_not_inflated(tmp_path: Path) -> None:
     path = written(tmp_path / "a.sog", zipped(members() | {"ballast": bytes(200 << 20)}))
     assert read_capture(path, device="cpu").cloud.count == 7
     named = members()
@@ -95,7 +95,7 @@ def test_a_small_spz_of_many_gaussians(tmp_path: Path) -> None:
     assert megabytes_of(read_on_cpu, path) < 16
 
 
-def test_positions_without_a_whole_part(tmp_path: Path) -> None:
+def test_positions_without_an_integer_part(tmp_path: Path) -> None:
     """255 fractional bits map every mean to the same point."""
     body = bytearray(gzip.decompress(good_bytes("a.spz")))
     body[13] = 255
@@ -184,7 +184,7 @@ def test_photos_outside_of_the_folder_are_not_looked_for(name: str, tmp_path: Pa
         read_photo(posed)
 
 
-def test_a_pipe_does_not_wait(tmp_path: Path) -> None:
+def test_a_pipe_does_not_block(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.ply")
     assert message(tmp_path / "pipe.ply") == "not a regular file; give a file"
     with pytest.raises(UserError, match=r"pipe\.ply: not a regular file; give a file"):
@@ -229,7 +229,7 @@ def test_holes_that_are_none(change: dict, tmp_path: Path) -> None:
         read_planes(path)
 
 
-def test_a_text_ply_takes_little_more_than_its_numbers(tmp_path: Path) -> None:
+def test_a_text_ply_needs_little_more_memory_than_its_numbers(tmp_path: Path) -> None:
     """The file has two million short lines and is not a capture."""
     header = b"ply\nformat ascii 1.0\nelement other 2000000\nproperty float x\nelement vertex 1\n"
     names = ["x", "y", "z", "opacity", *(f"rot_{i}" for i in range(4)), *(f"scale_{i}" for i in range(3))]
@@ -241,7 +241,7 @@ def test_a_text_ply_takes_little_more_than_its_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", [ending for ending, _ in WRITERS.values()])
-def test_a_valid_capture_takes_four_times_its_file_and_six_times_what_it_becomes(tmp_path: Path, ending: str) -> None:
+def test_memory_to_read_a_valid_capture_is_bounded(tmp_path: Path, ending: str) -> None:
     """The limit is four times the size of the file plus six times the size of the cloud, 14 single-precision numbers
     per Gaussian. Packed formats are decoded in double precision."""
     count = 200_000

@@ -19,7 +19,7 @@ def write(*paths: Path, text: str, overwrite: bool = False) -> None:
             path.write_text(text)
 
 
-def test_what_is_there_is_refused_or_kept_aside(tmp_path: Path) -> None:
+def test_existing_files_are_refused_or_moved_aside(tmp_path: Path) -> None:
     first, second = tmp_path / "made" / "a.ply", tmp_path / "made" / "a.png"
     write(first, second, text="1")
     first.unlink()
@@ -51,7 +51,7 @@ def test_two_runs_at_once(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_places_are_checked_before_the_work_and_not_made(tmp_path: Path) -> None:
+def test_paths_are_checked_before_the_work_and_not_created(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.ply").mkdir()
     with pytest.raises(UserError, match=r"folder\.ply: is a folder; give the name of a file"):
@@ -62,7 +62,7 @@ def test_places_are_checked_before_the_work_and_not_made(tmp_path: Path) -> None
     assert sorted(os.listdir(tmp_path)) == ["file", "folder.ply"]
 
 
-def test_what_a_run_that_was_killed_just_now_has_left_is_gone_at_the_end(tmp_path: Path) -> None:
+def test_recent_remnants_of_a_killed_run_are_removed_at_the_end(tmp_path: Path) -> None:
     """Remnants of any age are removed: a training that is resumed at once finds recent half-written files, and may end
     soon after."""
     left = tmp_path / ".egs-0123456789abcdef.npz"

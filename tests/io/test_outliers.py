@@ -51,7 +51,7 @@ def unchecked(arrays: dict[str, np.ndarray]) -> GaussianCloud:
         ),
     ],
 )
-def test_outliers_are_left_out_and_told(values: dict[str, float], said: str, tmp_path: Path) -> None:
+def test_outliers_are_left_out_and_reported(values: dict[str, float], said: str, tmp_path: Path) -> None:
     capture = read_capture(spoiled(tmp_path / "a.ply", [3, 7, 11, 20], **values), device="cpu")
     rest = np.ones(50, bool)
     rest[[3, 7, 11, 20]] = False
@@ -70,7 +70,7 @@ def test_a_capture_of_outliers_is_refused(tmp_path: Path) -> None:
     assert message(path).startswith("it extends 7.23e+86 units from the origin")
 
 
-def test_values_that_single_precision_cannot_use_are_told(tmp_path: Path) -> None:
+def test_values_beyond_single_precision_are_reported(tmp_path: Path) -> None:
     path = spoiled(tmp_path / "a.ply", [5, 6], log_scales=-3e38, opacity_logits=-1e30)
     capture = read_capture(path, device="cpu")
     assert capture.notes == (
@@ -97,7 +97,7 @@ def test_few_gaussians_and_flat_captures_have_no_outliers(tmp_path: Path) -> Non
     assert read_capture(one_place, device="cpu").cloud.count == 50
 
 
-def test_bounds_do_not_hang_on_the_order_or_the_unit(tmp_path: Path) -> None:
+def test_bounds_do_not_depend_on_the_order_or_the_unit(tmp_path: Path) -> None:
     cloud = read_capture(spoiled(tmp_path / "a.ply", [3], means=1e6), device="cpu").cloud
     for factor in (1e-3, 1e3):
         write_ply(tmp_path / "b.ply", read_all(spoiled(tmp_path / "a.ply", [3], means=1e6)).scaled(factor))

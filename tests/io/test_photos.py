@@ -83,7 +83,7 @@ def test_masks_of_turned_photos_fit_either_way(drawn_upright: bool, tmp_path: Pa
     np.testing.assert_array_equal(photo.alpha, apply_orientation(mask, 6) / 255.0)
 
 
-def test_what_the_lens_did_not_see_stays_unknown_when_reduced(tmp_path: Path) -> None:
+def test_pixels_outside_the_lens_stay_unknown_when_resized(tmp_path: Path) -> None:
     """Black outside the field of the lens must not darken neighbouring pixels."""
     white = np.full((80, 120, 3), 255, np.uint8)
     path = saved(tmp_path / "a.png", white)
@@ -95,7 +95,7 @@ def test_what_the_lens_did_not_see_stays_unknown_when_reduced(tmp_path: Path) ->
         np.testing.assert_allclose(photo.colour[photo.known], 1.0, atol=1e-3)
 
 
-def test_a_png_that_claims_more_than_it_holds(tmp_path: Path) -> None:
+def test_a_png_that_declares_more_than_it_holds(tmp_path: Path) -> None:
     """Found by Atheris: OpenCV allocated 1.8 GiB for a file of 135 bytes."""
     data = bytearray(cv2.imencode(".png", np.zeros((16, 24, 3), np.uint8))[1].tobytes())
     place = data.index(b"IDAT") - 4

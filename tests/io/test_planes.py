@@ -18,7 +18,7 @@ GROUND = wavy_ground(spacing=0.5)
 HOLE = HoleOutline(np.array([1.0, 2.0, 0.25]), 0.5, (8, 6), (np.array([[1, 1], [4, 1], [4, 5]]),))
 
 
-def test_all_that_is_known_comes_back(tmp_path: Path) -> None:
+def test_known_values_are_read_back(tmp_path: Path) -> None:
     known = PlaneRecord(FLOOR, np.array([1.0, 2.0, 3.0]), 0.7, 0.01, 0.9, 120, 0.3, HOLE, GROUND, {"remark": ["a", 1]})
     write_planes(tmp_path / "plane.json", [known, PlaneRecord(FLOOR)])
     full, bare = read_planes(tmp_path / "plane.json")
@@ -30,7 +30,7 @@ def test_all_that_is_known_comes_back(tmp_path: Path) -> None:
     assert bare.to_json() == {"normal": [0.0, 0.0, 1.0], "offset": -0.25}
 
 
-def test_what_is_found_anew_takes_the_place_of_what_was_known() -> None:
+def test_new_values_replace_the_known_ones() -> None:
     before = PlaneRecord(FLOOR, noise=0.01, size=0.7, others={"remark": 1})
     now = PlaneRecord(Plane(np.array([0.0, 0.0, 1.0]), 0.0), size=0.8).merged_with(before)
     assert now.plane.offset == 0.0 and (now.noise, now.size, now.others) == (0.01, 0.8, {"remark": 1})

@@ -25,7 +25,7 @@ def manifest(folder: Path) -> dict:
     return json.loads((folder / MANIFEST).read_text())
 
 
-def test_the_manifest_comes_last_and_holds_checksums(tmp_path: Path) -> None:
+def test_the_manifest_is_written_last_with_checksums(tmp_path: Path) -> None:
     with run_folder(tmp_path / "out") as run:
         run.file("a.txt").write_text("one")
         assert manifest(run.path)["finished"] is False and manifest(run.path)["files"] == {"a.txt": None}
@@ -37,7 +37,7 @@ def test_the_manifest_comes_last_and_holds_checksums(tmp_path: Path) -> None:
     assert sorted(os.listdir(tmp_path / "out")) == ["a.txt", "b.txt", MANIFEST]
 
 
-def test_what_a_run_begins_with_is_there_before_its_first_file(tmp_path: Path) -> None:
+def test_initial_files_are_written_before_the_first_file(tmp_path: Path) -> None:
     """Initial files are written once, after an earlier run is moved aside; a run without files has no initial files."""
     finished(tmp_path, flags="1")
     begun: list[list[str]] = []
@@ -79,7 +79,7 @@ def test_a_run_that_writes_nothing_leaves_the_earlier_one(tmp_path: Path) -> Non
     assert sorted(os.listdir(tmp_path)) == ["a.txt", MANIFEST] and (tmp_path / "a.txt").read_text() == "1"
 
 
-def test_an_unfinished_run_says_so_and_is_moved_aside_too(tmp_path: Path) -> None:
+def test_an_unfinished_run_is_reported_and_moved_aside_too(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), run_folder(tmp_path) as run:
         run.file("trajectory.txt").write_text("hours")
         run.file("film.txt")
@@ -92,7 +92,7 @@ def test_an_unfinished_run_says_so_and_is_moved_aside_too(tmp_path: Path) -> Non
     assert not (tmp_path / "trajectory.txt").exists()
 
 
-def test_files_of_nobody_are_not_overwritten(tmp_path: Path) -> None:
+def test_files_without_a_run_are_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("precious")
     with (
         pytest.raises(UserError, match=r"it has a\.txt, which would be mixed with this one"),
@@ -114,7 +114,7 @@ def test_two_runs_at_once(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_a_broken_manifest_stands_for_a_run(tmp_path: Path) -> None:
+def test_a_broken_manifest_counts_as_a_run(tmp_path: Path) -> None:
     """Names that point outside the folder are not followed."""
     outside = tmp_path / "secret.txt"
     outside.write_text("secret")
@@ -130,7 +130,7 @@ def test_a_broken_manifest_stands_for_a_run(tmp_path: Path) -> None:
         (folder / "a.txt").unlink()
 
 
-def test_places_are_checked_before_the_work_and_not_made(tmp_path: Path) -> None:
+def test_paths_are_checked_before_the_work_and_not_created(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for out, said in (
         ("", "out '': give the name of a folder"),
@@ -145,7 +145,7 @@ def test_places_are_checked_before_the_work_and_not_made(tmp_path: Path) -> None
     assert os.listdir(tmp_path) == ["file"]
 
 
-def test_what_a_killed_run_left_is_gone_when_the_next_has_finished(tmp_path: Path) -> None:
+def test_remnants_of_a_killed_run_are_removed_by_the_next(tmp_path: Path) -> None:
     """Remnants of any age are removed: an ffmpeg process that outlives its run may write after the next run has
     started."""
     left = tmp_path / f".egs-{'0' * 16}.mp4"
@@ -158,7 +158,7 @@ def test_what_a_killed_run_left_is_gone_when_the_next_has_finished(tmp_path: Pat
     assert sorted(os.listdir(tmp_path)) == ["a.txt", MANIFEST]
 
 
-def test_a_run_that_was_killed_before_its_first_file_is_none(tmp_path: Path) -> None:
+def test_a_run_killed_before_its_first_file_does_not_count(tmp_path: Path) -> None:
     """Its manifest lists files, but none of them exists."""
     with run_folder(tmp_path) as run:
         run.file("a.txt")
@@ -177,7 +177,7 @@ def test_a_run_that_was_killed_before_its_first_file_is_none(tmp_path: Path) -> 
         check_run_folder(tmp_path)
 
 
-def test_what_a_run_left_that_was_killed_as_it_ended(tmp_path: Path) -> None:
+def test_remnants_of_a_run_killed_at_its_end(tmp_path: Path) -> None:
     """The run is killed between its last manifest and its end; files of a running run are not touched."""
     with run_folder(tmp_path) as run:
         run.file("a.txt").write_text("one")
@@ -191,7 +191,7 @@ def test_what_a_run_left_that_was_killed_as_it_ended(tmp_path: Path) -> None:
     assert sorted(os.listdir(tmp_path)) == ["a.txt", MANIFEST]
 
 
-def test_a_run_that_goes_on(tmp_path: Path) -> None:
+def test_a_resumed_run(tmp_path: Path) -> None:
     """It keeps its files, does not write its initial files again, and removes its folders when it finishes."""
     with pytest.raises(UserError, match="no run has written here"), run_folder(tmp_path, resume=True):
         raise AssertionError("must not come here")

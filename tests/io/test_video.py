@@ -66,7 +66,7 @@ def test_an_ffmpeg_that_does_not_start_leaves_nothing(tmp_path: Path, monkeypatc
     assert os.listdir(tmp_path) == []
 
 
-def test_what_ffmpeg_says_of_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_reported_by_ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A full disk is the reason in the message, and the cause of the error decides the exit status; other messages of
     ffmpeg are quoted unchanged."""
     for said, number in (("[out#0] Error: No space left on device", errno.ENOSPC), ("Unknown encoder", None)):

@@ -26,7 +26,7 @@ def random_program(seed: int) -> tuple[np.ndarray, ...]:
 
 
 @pytest.mark.parametrize("guess", ["none", "broken", "random"])
-def test_the_conditions_of_the_optimum_hold(guess: str) -> None:
+def test_the_kkt_conditions_hold(guess: str) -> None:
     """P x + q + A^T y = 0, x is within the bounds, multipliers have the sign of the active bound and are zero
     elsewhere."""
     for seed in range(60):
@@ -50,7 +50,7 @@ def test_the_conditions_of_the_optimum_hold(guess: str) -> None:
         assert (np.abs(at - lower) < 10.0 * slack)[y < -least].all()
 
 
-def test_bounds_that_no_point_satisfies_are_told_apart() -> None:
+def test_infeasible_bounds_are_detected() -> None:
     """Among others, two rows exclude each other by a tenth."""
     for seed in range(20):
         P, q, A, lower, upper = random_program(seed)
@@ -82,7 +82,7 @@ def test_a_sliver_between_two_bounds_has_an_optimum() -> None:
         assert -slack < (A @ found.x)[-1] - inside < 1e-6 + slack
 
 
-def test_bounds_are_met_where_the_objective_has_nowhere_to_fall_to() -> None:
+def test_bounds_are_met_without_a_linear_term() -> None:
     """For q = 0 bounds are met at any cost, also by a search that adds one row after another."""
     for seed in range(60):
         P, q, A, lower, upper = random_program(seed)
@@ -104,7 +104,7 @@ def test_a_minimum_within_its_bounds_is_the_optimum() -> None:
 
 
 @pytest.mark.parametrize(("times", "feasible"), [(0.99, True), (1.01, False)])
-def test_what_costs_a_million_times_the_gain_counts_as_no_point(times: float, feasible: bool) -> None:
+def test_infeasibility_is_declared_by_a_cost_limit(times: float, feasible: bool) -> None:
     """x_1 >= s and x_k >= x_(k-1): the point nearest to 0 is (s, ..., s) with a cost of n s^2 / 2, here ``times`` a
     million; the search adds one row after another."""
     count = 6
@@ -119,7 +119,7 @@ def test_what_costs_a_million_times_the_gain_counts_as_no_point(times: float, fe
         np.testing.assert_allclose(found.x, side, rtol=1e-6)
 
 
-def test_a_hessian_that_holds_no_number_has_no_optimum() -> None:
+def test_a_hessian_with_nan_has_no_optimum() -> None:
     """A NaN in P raises no error: the result is None and the caller continues."""
     P, q, A, lower, upper = random_program(3)
     P[1, 1] = np.nan
@@ -127,7 +127,7 @@ def test_a_hessian_that_holds_no_number_has_no_optimum() -> None:
     assert solve_from_guess(WhitenedQp.of(P, q, A), lower, upper, nothing, nothing) is None
 
 
-def test_what_was_sought_before_changes_nothing() -> None:
+def test_earlier_programs_do_not_change_the_result() -> None:
     """The memory is reused by programs with more rows and with fewer; the bits are the same."""
     programs = [random_program(seed) for seed in (4, 5, 6)]
 
@@ -148,7 +148,7 @@ def test_what_was_sought_before_changes_nothing() -> None:
             assert np.array_equal(got, value)
 
 
-def test_rows_in_coordinates_in_which_distances_are_costs() -> None:
+def test_whitened_coordinates() -> None:
     """z = 0 is the minimum, the cost increases from there by half of |z|^2, and rows have unit length in z."""
     for seed in range(20):
         P, q, A, _, _ = random_program(seed)
@@ -163,7 +163,7 @@ def test_rows_in_coordinates_in_which_distances_are_costs() -> None:
         assert np.allclose(np.linalg.norm(rows.unit_rows, axis=1), 1.0)
 
 
-def test_rows_of_two_programs_are_not_mixed_up() -> None:
+def test_two_programs_do_not_share_rows() -> None:
     """Two QPs of one size share a workspace; an indefinite Hessian raises an error."""
     (P, q, A, *_), (Q, r, _, *_) = random_program(7), random_program(7)
     first, second = WhitenedQp.of(P, q, A), WhitenedQp.of(2.0 * Q, r + 1.0, A)
@@ -177,7 +177,7 @@ def test_rows_of_two_programs_are_not_mixed_up() -> None:
         WhitenedQp.of(P - 2.0 * np.linalg.eigvalsh(P)[0] * np.eye(len(q)), q, A)
 
 
-def test_as_many_rows_as_unknowns_and_one_that_contradicts_them() -> None:
+def test_a_corner_of_nearly_dependent_rows_and_a_contradicting_row() -> None:
     """Nearly dependent rows define a corner, and a further row is violated there by a ten-thousandth: the QP is
     infeasible, and the search does not end in a numerical failure."""
     rng = np.random.default_rng(0)

@@ -38,7 +38,7 @@ def by_kernels(
     return splitting.full_run(program.A, iterations).run(lower, upper, None)
 
 
-def test_programs_of_many_sizes_end_side_by_side_where_osqp_does(device: str) -> None:
+def test_batched_programs_of_many_sizes_end_as_in_osqp(device: str) -> None:
     """At full accuracy, |x - x'| is at most 1e-6 of the largest |x|, and multipliers and status are equal."""
     made = [random_program(seed) for seed in range(40)]
     programs, lowers, uppers = zip(*made, strict=True)
@@ -69,7 +69,7 @@ def test_iterations_are_those_of_osqp(device: str) -> None:
             assert np.abs(made.multipliers - asked.multipliers).max() < 1e-8 * largest
 
 
-def test_a_solved_program_is_where_the_next_begins(device: str) -> None:
+def test_a_solved_program_warm_starts_the_next(device: str) -> None:
     """After a small change of the bounds a fraction of the iterations is enough; the same holds for a given x with the
     previous multipliers, as in OSQP."""
     program, lower, upper = random_program(4)
@@ -90,7 +90,7 @@ def test_a_solved_program_is_where_the_next_begins(device: str) -> None:
     assert ran[0] == ran[1]
 
 
-def test_bounds_that_no_point_satisfies_are_told_apart_and_forgotten(device: str) -> None:
+def test_infeasible_bounds_are_detected_and_leave_no_warm_start(device: str) -> None:
     """Two rows that exclude each other give a certificate in both solvers; the next solve starts from zero."""
     for seed in range(10):
         program, lower, upper = random_program(seed)
@@ -108,7 +108,7 @@ def test_bounds_that_no_point_satisfies_are_told_apart_and_forgotten(device: str
         assert np.abs(after.x - fresh.x).max() <= 1e-6 * max(1.0, np.abs(fresh.x).max())
 
 
-def test_a_certificate_is_taken_as_osqp_takes_it(device: str) -> None:
+def test_certificates_equal_those_of_osqp(device: str) -> None:
     """Two rows are nearly parallel, so that their multipliers grow together for many iterations. They are a
     contradiction for OSQP exactly if their bounds cross, by however little."""
     for crossed, ending in ((-5e-5, AdmmStatus.SOLVED), (5e-5, AdmmStatus.INFEASIBLE)):
@@ -119,7 +119,7 @@ def test_a_certificate_is_taken_as_osqp_takes_it(device: str) -> None:
         assert made.status is asked.status is ending
 
 
-def test_endings_are_those_of_osqp(device: str) -> None:
+def test_statuses_equal_those_of_osqp(device: str) -> None:
     """Residuals are within the accuracy, within ten times the accuracy at the last iteration, and larger."""
     endings = []
     for seed in range(12):
@@ -132,7 +132,7 @@ def test_endings_are_those_of_osqp(device: str) -> None:
     assert min(endings.count(one) for one in (AdmmStatus.SOLVED, AdmmStatus.INEXACT, AdmmStatus.LIMIT)) >= 5
 
 
-def test_what_is_no_number_is_no_solution(device: str) -> None:
+def test_nan_is_no_solution(device: str) -> None:
     program, lower, upper = random_program(0)
     q = program.q.copy()
     q[0] = np.nan

@@ -29,7 +29,7 @@ def test_ballistic_flight_passes(flight: Trajectory) -> None:
     assert result.inverted_elements == 0
 
 
-def test_each_violation_is_seen(flight: Trajectory) -> None:
+def test_each_violation_is_measured(flight: Trajectory) -> None:
     """A known error in each quantity gives the value that its definition predicts."""
     weight = flight.node_mass.sum() * 9.81
     kicked = flight.velocities.copy()
@@ -73,7 +73,7 @@ def test_a_run_that_slides_passes() -> None:
     assert result.newton_unconverged == result.inverted_elements == 0 and result.penetration < 5e-3
 
 
-def test_a_push_that_is_left_out_elsewhere_or_late_is_seen() -> None:
+def test_a_missing_misplaced_or_late_push_is_detected() -> None:
     """A blow on one side and wind; if all nodes get the same velocity instead, only the angular momentum is wrong."""
     struck = slide(struck=True).trajectory()
     held = audit(struck)
@@ -99,7 +99,7 @@ def sliding(t: Trajectory) -> np.ndarray:
     return np.argsort(np.einsum("ci,ci->c", level, moved))[:5]
 
 
-def test_friction_that_pushes_is_seen() -> None:
+def test_friction_not_opposite_to_the_slip_is_detected() -> None:
     """Friction is reversed, rotated by a right angle, or halved, which stays within the cone."""
     t = slide().trajectory()
     for turn in (np.diag([-1.0, -1.0, 1.0]), np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.diag([0.5, 0.5, 1.0])):
@@ -109,7 +109,7 @@ def test_friction_that_pushes_is_seen() -> None:
         assert wrong.friction_gap > 1e-5 and wrong.cone_violation < 1e-12
 
 
-def test_a_contact_that_pulls_over_a_gap_is_seen() -> None:
+def test_a_contact_force_across_a_gap_is_detected() -> None:
     """All contacts are lifted off their plane by 1 mm."""
     t = slide().trajectory()
     normal = (t.contact_force * t.contact_normal).sum(axis=1)
@@ -118,7 +118,7 @@ def test_a_contact_that_pulls_over_a_gap_is_seen() -> None:
     assert audit(lifted).complementarity_gap == pytest.approx(normal.max() * 1e-3 / weight, rel=0.01)
 
 
-def test_contact_velocities_that_were_not_solved_for_are_seen() -> None:
+def test_wrong_contact_velocities_are_detected() -> None:
     """An error of 1 mm/s across, in one step."""
     t = slide().trajectory()
     velocities = t.velocities.copy()
@@ -129,7 +129,7 @@ def test_contact_velocities_that_were_not_solved_for_are_seen() -> None:
     assert audit(replace(t, velocities=velocities, contact_force=forces)).contact_velocity < 1e-12
 
 
-def test_lost_momenta_are_seen_where_contact_and_drag_act() -> None:
+def test_lost_momenta_are_detected_under_contact_and_drag() -> None:
     """Contact forces are 1 % too large; drag is twice as large; a spin of 0.01 rad/s is added without a torque."""
     t = slide().trajectory()
     assert audit(replace(t, contact_force=1.01 * t.contact_force)).momentum_residual > 1e-3
@@ -140,7 +140,7 @@ def test_lost_momenta_are_seen_where_contact_and_drag_act() -> None:
     assert found.angular_momentum_residual > 1e-4 and found.momentum_residual < 1e-8
 
 
-def test_uneven_ground_is_that_of_the_height_field(flight: Trajectory) -> None:
+def test_uneven_ground_equals_the_height_field(flight: Trajectory) -> None:
     """The audit's own heights and normals, by SciPy's splines, are those of the height field to 1e-6, at points on
     waves."""
     field = wavy_ground(0.05)

@@ -97,7 +97,7 @@ def check(creature: Creature, one: StepReport, other: StepReport) -> None:
     np.testing.assert_allclose(*nodal, rtol=0, atol=1e-6 * body.weight)
 
 
-def test_each_goes_as_it_does_alone(creature: Creature, jump: Trajectory) -> None:
+def test_each_world_equals_a_single_run(creature: Creature, jump: Trajectory) -> None:
     """30 steps of a jump, from the ground and back to it, on three grounds with three strengths."""
     dt, _ = solver_steps(creature.body)
     starts = [BodyState(jump.positions[FIRST], jump.velocities[FIRST])] * 3
@@ -145,7 +145,7 @@ def rough(creature: Creature) -> tuple[list[BodyState], np.ndarray, float]:
     return [starts[0], creature.start, starts[1]], signs * creature.muscles.bounds, dt
 
 
-def test_a_world_goes_on_with_what_its_last_step_has_handed_on(creature: Creature, jump: Trajectory) -> None:
+def test_a_world_continues_from_its_last_step(creature: Creature, jump: Trajectory) -> None:
     """Contacts and forces of two different worlds are passed to the next step, which equals that of a single world."""
     dt, _ = solver_steps(creature.body)
     begun = [BodyState(jump.positions[step], jump.velocities[step]) for step in (FIRST, FIRST + 1)]
@@ -171,7 +171,7 @@ def test_a_world_goes_on_with_what_its_last_step_has_handed_on(creature: Creatur
         check(creature, report, other)
 
 
-def test_what_does_not_converge_is_done_in_halves_as_alone(creature: Creature) -> None:
+def test_unconverged_steps_are_halved_as_in_single_runs(creature: Creature) -> None:
     starts, activations, dt = rough(creature)
     expected = runs_alone(creature, starts, activations[:1], dt)
     made = runs_together(BatchStepper(*parts(creature), FRICTIONS), starts, activations[:1], dt)
@@ -184,7 +184,7 @@ def test_what_does_not_converge_is_done_in_halves_as_alone(creature: Creature) -
 
 
 @pytest.mark.slow
-def test_what_a_world_does_does_not_hang_on_its_neighbours(creature: Creature) -> None:
+def test_a_world_does_not_depend_on_the_others(creature: Creature) -> None:
     """The steps of a world do not depend on the other worlds, which stand, fall, make half steps, or fail. Equal to
     rounding: products with other numbers of worlds and contacts round differently. The body stands on its rim, because
     with 32 points on so coarse a base the Delassus operator is nearly singular and amplifies rounding a thousandfold.
@@ -222,7 +222,7 @@ def test_small_chunks_change_nothing(creature: Creature) -> None:
             check(creature, mine, its)
 
 
-def test_a_world_that_cannot_be_solved_is_told_and_leaves(creature: Creature) -> None:
+def test_a_world_that_cannot_be_solved_is_reported_and_removed(creature: Creature) -> None:
     """The other worlds continue."""
     dt, _ = solver_steps(creature.body)
     broken = replace(creature.start, velocities=np.full_like(creature.start.velocities, np.nan))
@@ -237,7 +237,7 @@ def test_a_world_that_cannot_be_solved_is_told_and_leaves(creature: Creature) ->
 
 
 @pytest.mark.slow
-def test_a_world_that_never_converges_is_lost(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_world_that_never_converges_is_reported(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a tolerance of zero, not even the smallest part of the step converges."""
     monkeypatch.setattr("egs_warp.contact.coupled_step.CoupledSolver.tolerance", 0.0)
     dt, _ = solver_steps(creature.body)

@@ -11,7 +11,7 @@ from tests.support.contact_programs import optimum_of_each, small_problem
 
 
 @pytest.mark.parametrize(("contacts", "directions", "seeds"), [(1, 4, 120), (1, 8, 3), (2, 4, 3), (2, 8, 3), (3, 4, 3)])
-def test_the_optimum_is_that_of_brute_force(contacts: int, directions: int, seeds: int) -> None:
+def test_the_optimum_equals_brute_force(contacts: int, directions: int, seeds: int) -> None:
     """Eq. (9), Eq. (13): the objective is that of the best state, the solution is complementary, and far fewer QPs than
     states are solved. Over many problems of one contact, each state is the best one at least once.
     """
@@ -33,7 +33,7 @@ def test_the_optimum_is_that_of_brute_force(contacts: int, directions: int, seed
         assert len(best_states) == 2 * directions + 2
 
 
-def test_starts_change_nothing_but_the_effort() -> None:
+def test_starts_change_only_the_number_of_qps() -> None:
     """A good start prunes; a bad one is discarded."""
     program = small_problem(5, contacts=3).program
     plain = exact_states(program)
@@ -45,7 +45,7 @@ def test_starts_change_nothing_but_the_effort() -> None:
     assert good.qp_count <= plain.qp_count + 1
 
 
-def test_a_limit_is_not_called_a_proof() -> None:
+def test_a_limited_search_is_not_a_proof() -> None:
     """If the search reaches its limit, it reports a lower bound on the optimum."""
     program = small_problem(5, contacts=3).program
     whole = exact_states(program)
@@ -57,7 +57,7 @@ def test_a_limit_is_not_called_a_proof() -> None:
 
 
 @pytest.mark.slow
-def test_a_search_that_is_cut_short_never_promises_too_much() -> None:
+def test_the_bound_of_a_limited_search_is_valid() -> None:
     """At any limit, the bound is below the optimum; it does not decrease as the limit grows."""
     for seed in range(5, 9):
         program = small_problem(seed, contacts=3).program
@@ -72,7 +72,7 @@ def test_a_search_that_is_cut_short_never_promises_too_much() -> None:
 
 
 @pytest.mark.parametrize("objective", [0.0, 0.3, -4.0, 1e3])
-def test_what_a_proof_may_leave_open(objective: float) -> None:
+def test_optimality_gap_of_a_proof(objective: float) -> None:
     """The gap is at most a millionth of the objective plus one."""
     for share, proved in ((0.9e-6, True), (1.1e-6, False)):
         bound = objective - share * (1.0 + abs(objective))

@@ -92,7 +92,7 @@ def test_states_from_prediction() -> None:
     assert states.tolist() == [SEPARATE, STATIC, 2, 1, 0]
 
 
-def test_states_of_pairs_are_states_the_point_obeys() -> None:
+def test_states_of_pairs_admit_the_point() -> None:
     """Eq. (9): a complementary point is feasible under the states that are read from it, whichever states it was solved
     with."""
     read = same = 0
@@ -141,7 +141,7 @@ def test_moves_are_feasible_and_almost_always_better() -> None:
     assert plain_lost > 0.1 * plain
 
 
-def test_moves_name_the_contact_that_helps() -> None:
+def test_moves_select_the_contact_that_improves_the_objective() -> None:
     """A closed contact that holds the body down opens, and an open contact that would improve the objective closes and
     slides (docs/concepts/locomotion.md#moves)."""
     layout = ContactLayout(0, 1, 4)
@@ -168,7 +168,7 @@ def test_moves_name_the_contact_that_helps() -> None:
     assert moves(4 + 0, sliding, zeros, w_1=0.3) == [(0.3, 0, 0)]
 
 
-def test_plain_moves_go_where_a_multiplier_s_row_is_free() -> None:
+def test_plain_moves_follow_the_multipliers_of_degenerate_contacts() -> None:
     """Contacts whose free side is zero move, and no others, each according to its own multiplier."""
     layout = ContactLayout(0, 1, 4)
     zeros, one = np.zeros(6), np.eye(6)

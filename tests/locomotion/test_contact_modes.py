@@ -72,7 +72,7 @@ def larger_program(seed: int, activations: int, contacts: int) -> CoulombProgram
 
 
 @pytest.mark.parametrize(("activations", "contacts"), [(1, 0), (2, 1), (5, 3), (8, 4), (13, 9), (92, 21)])
-def test_a_piece_is_what_its_modes_say(activations: int, contacts: int) -> None:
+def test_a_mode_region_is_defined_by_its_modes(activations: int, contacts: int) -> None:
     """The forces from one linear system, the cost over activations alone, and the rows that bound the region are
     written out."""
     program = larger_program(contacts, activations, contacts)
@@ -119,7 +119,7 @@ def test_a_piece_is_what_its_modes_say(activations: int, contacts: int) -> None:
 
 
 @pytest.mark.parametrize("solver", list(QpSolver))
-def test_the_search_ends_where_no_activations_near_by_do_better(solver: QpSolver) -> None:
+def test_the_search_ends_at_a_local_optimum(solver: QpSolver) -> None:
     """The result is compared with exact contact for activations around it, and is far better than the start.
 
     Sliding contacts are assumed to keep their direction; where such large activations change it, some improvement is
@@ -144,7 +144,7 @@ def test_the_search_ends_where_no_activations_near_by_do_better(solver: QpSolver
     assert best >= 7 and gained >= 10
 
 
-def test_what_costs_much_is_searched_from_elsewhere_too() -> None:
+def test_a_costly_result_is_searched_from_the_relaxed_optimum() -> None:
     """The relaxed optimum is a lower bound on the objective under exact contact (a grid over all activations). A search
     that restarts from it is never worse, at times much better, and its result satisfies exact contact."""
     grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 13)] * 2), axis=-1).reshape(-1, 2)
@@ -171,7 +171,7 @@ def test_what_costs_much_is_searched_from_elsewhere_too() -> None:
     assert costly >= 20 and better >= 3 and worse == 0
 
 
-def test_within_a_piece_the_plan_is_what_contact_answers() -> None:
+def test_the_optimum_of_a_region_satisfies_exact_contact() -> None:
     """Forces and objective of a region's optimum are those of exact contact if no contact slides."""
     kinds = set()
     for seed in range(12):
@@ -187,7 +187,7 @@ def test_within_a_piece_the_plan_is_what_contact_answers() -> None:
     assert kinds == {FREE, STICK, SLIDE}
 
 
-def test_a_piece_holds_its_start() -> None:
+def test_a_region_contains_its_start() -> None:
     """The region of a point's own modes gives the forces of that point, sliding contacts included."""
     for seed in range(12):
         program = random_program(seed)
@@ -200,7 +200,7 @@ def test_a_piece_holds_its_start() -> None:
         assert np.allclose(solution.x, start, atol=1e-5 * max(1.0, np.abs(start).max()))
 
 
-def test_friction_stays_against_the_slip() -> None:
+def test_friction_stays_opposite_to_the_slip() -> None:
     """If friction kept its direction while a foot slides elsewhere, the search would find a force that no ground can
     exert."""
     angles = []

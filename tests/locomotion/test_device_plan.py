@@ -107,7 +107,7 @@ def is_the_host_s(
     return True
 
 
-def test_plans_are_those_of_one_look_after_the_other(creature: Creature, stepper: LocomotionStepper) -> None:
+def test_device_plans_equal_host_plans(creature: Creature, stepper: LocomotionStepper) -> None:
     """Step after step from rest, and in flight: a GPU records a graph in the first plan and replays it in the
     second."""
     state, memory, at_once = creature.start, stepper.initial_memory(), 0
@@ -126,7 +126,7 @@ def test_plans_are_those_of_one_look_after_the_other(creature: Creature, stepper
         assert is_the_host_s(stepper, start, memory, objectives)
 
 
-def test_the_solve_goes_on_from_the_plan_s_end(
+def test_the_solve_continues_from_the_end_of_the_plan(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The solve makes no second request: its first Newton step is already in flight, and equals a requested one."""
@@ -164,7 +164,7 @@ def test_the_solve_goes_on_from_the_plan_s_end(
 
 
 @pytest.mark.parametrize("last", [False, True])
-def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: LocomotionStepper, last: bool) -> None:
+def test_a_replan_equals_that_of_the_host(creature: Creature, stepper: LocomotionStepper, last: bool) -> None:
     """Replanning from the end of the ``last`` Newton step, which is the current iterate on the device, or from its
     start. From any other point it is left to the host."""
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
@@ -192,7 +192,7 @@ def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: Locomoti
 
 @pytest.mark.parametrize("beside", [False, True])
 @pytest.mark.parametrize("what", ["costly", "kept", "better", "astray", "no bound", "second astray"])
-def test_a_search_goes_on_as_the_host_s(
+def test_a_restart_equals_that_of_the_host(
     what: str, beside: bool, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A restart, made if the first result costs much, leads to the plan of the host, and the solve starts at its end;
@@ -257,7 +257,7 @@ def test_a_search_goes_on_as_the_host_s(
 
 
 @pytest.mark.parametrize("what", ["verdicts", "sizes", "missed", "horizon", "end", "forces"])
-def test_what_is_not_as_usual_is_left_to_the_host(
+def test_failures_are_left_to_the_host(
     what: str, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A matrix that is not positive definite, an inverted element, or a Coulomb violation, in the prediction or at the
@@ -281,13 +281,13 @@ def test_what_is_not_as_usual_is_left_to_the_host(
     np.testing.assert_array_equal(end.velocities, expected.velocities)
 
 
-def test_a_body_that_is_squeezed_flat_is_left_to_the_host(creature: Creature, stepper: LocomotionStepper) -> None:
+def test_a_compressed_body_is_left_to_the_host(creature: Creature, stepper: LocomotionStepper) -> None:
     squeezed = creature.start.positions * np.array([1.0, 0.4, 1.0])
     memory = stepper.initial_memory()
     assert planner_of(stepper).plan(begun(stepper, BodyState(squeezed, 0.0 * squeezed), memory), []) is None
 
 
-def test_a_step_that_goes_amiss_is_planned_again_on_the_device(
+def test_a_failed_step_is_replanned_on_the_device(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every step is replanned, with the result of the host."""
@@ -310,9 +310,7 @@ def test_a_step_that_goes_amiss_is_planned_again_on_the_device(
     np.testing.assert_allclose(end.positions, expected.positions, rtol=0, atol=1e-8 * stepper.body.height)
 
 
-def test_the_same_body_on_other_ground_shares_what_it_works_with(
-    creature: Creature, stepper: LocomotionStepper
-) -> None:
+def test_steppers_of_one_body_share_the_workspace(creature: Creature, stepper: LocomotionStepper) -> None:
     """Alternating steps on grounds with two friction coefficients equal the steps on each ground alone."""
     slippery = stepper.with_friction(0.1)
     assert slippery._device_planner is stepper._device_planner and slippery.linearizer is stepper.linearizer
@@ -333,7 +331,7 @@ def test_the_same_body_on_other_ground_shares_what_it_works_with(
         np.testing.assert_allclose(turn, alone[place], rtol=0, atol=1e-9 * stepper.body.height)
 
 
-def test_a_step_is_begun_when_the_one_before_has_ended(
+def test_a_step_is_prefetched_once(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The next step starts when the previous one has ended. If other work runs in between, it is started again and has

@@ -70,7 +70,7 @@ def both(program: CoulombProgram, device: str, limit: int = 12) -> tuple[ModeSea
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("activations", "contacts"), [(1, 0), (2, 1), (5, 3), (9, 8), (23, 11)])
-def test_one_launch_finds_what_the_host_finds(activations: int, contacts: int, device: str) -> None:
+def test_one_launch_finds_the_result_of_the_host(activations: int, contacts: int, device: str) -> None:
     """The search passes through the same regions to the same point, for sticking and sliding contacts."""
     alike = several = slid = 0
     for seed in range(12):
@@ -92,7 +92,7 @@ def test_one_launch_finds_what_the_host_finds(activations: int, contacts: int, d
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_a_limit_is_kept_and_what_was_best_by_then_is_told(device: str) -> None:
+def test_at_the_limit_the_best_result_so_far_is_returned(device: str) -> None:
     program = body_program(3, 9, 8, bias=0.5)
     whole = both(program, device)[1]
     assert whole.qp_count > 2
@@ -107,7 +107,7 @@ def test_a_limit_is_kept_and_what_was_best_by_then_is_told(device: str) -> None:
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_what_slides_is_let_go_where_it_cannot_be_held(device: str) -> None:
+def test_infeasible_sticking_contacts_slide(device: str) -> None:
     """Two points at one place that must stick at different speeds have no forces within their bounds; sliding points
     have."""
     counts = set()
@@ -121,7 +121,7 @@ def test_what_slides_is_let_go_where_it_cannot_be_held(device: str) -> None:
     assert {0, 1} <= counts
 
 
-def test_the_default_strategy_goes_by_it_and_by_the_host_where_it_is_led_astray(
+def test_the_default_strategy_falls_back_to_the_host(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     program = body_program(1, 5, 3, bias=0.5)
@@ -167,7 +167,7 @@ def test_contacts_without_a_pivot_are_left_to_the_host(own: float, device: str) 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("activations", "contacts"), [(1, 1), (5, 3), (9, 8), (23, 11)])
-def test_one_launch_finds_the_optimum_without_complementarity(activations: int, contacts: int, device: str) -> None:
+def test_one_launch_finds_the_relaxed_optimum(activations: int, contacts: int, device: str) -> None:
     """The relaxed optimum equals that of the host, in a workspace of larger capacity; no search has a lower
     objective."""
     search = ModeSearchWorkspace(activations, contacts + 2, device)
@@ -192,7 +192,7 @@ def test_one_launch_finds_the_optimum_without_complementarity(activations: int, 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 16, 31, 50, 130])
-def test_a_block_does_the_algebra(count: int, device: str) -> None:
+def test_block_algebra(count: int, device: str) -> None:
     """Products, roots of inverses, elimination, lists and lengths equal NumPy's, for sizes around those of blocks."""
     rng, right = np.random.default_rng(count), 5
     matrix = rng.standard_normal((count, count + right)) + 3.0 * np.eye(count, count + right) * np.sqrt(count)
@@ -232,7 +232,7 @@ def test_a_block_does_the_algebra(count: int, device: str) -> None:
     np.testing.assert_allclose(across.numpy(), product.T @ long, rtol=1e-9, atol=1e-9 * count)
 
 
-def test_bounds_give_way_by_as_much_as_on_the_host() -> None:
+def test_tolerances_equal_those_of_the_host() -> None:
     """The kernels repeat these constants, because they do not import host modules."""
     device_values = (
         block_mode_region.ROW_TOLERANCE,
@@ -260,7 +260,7 @@ def filled(made: Any, device: str, **shapes: Any) -> Any:
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("seed", range(6))
-def test_a_block_iterates_as_osqp_does_and_ends_at_the_optimum(seed: int, device: str) -> None:
+def test_a_block_iterates_as_osqp_and_ends_at_the_optimum(seed: int, device: str) -> None:
     """For min 1/2 z^T z over rows of unit length, the same rows are guessed from any start."""
     rng, n, m = np.random.default_rng(seed), 12, 60
     units = rng.standard_normal((m, n))

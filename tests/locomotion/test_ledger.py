@@ -65,7 +65,7 @@ class PartlyInside(StepProblem):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.6])
-def test_spin_that_is_added_after_a_step_counts(trajectory: Trajectory, share: float) -> None:
+def test_spin_added_after_a_step_counts(trajectory: Trajectory, share: float) -> None:
     """A block spins in the air; the rest of the spin that implicit Euler loses is added at the end of its step."""
     body, positions = slide().stepper.body, trajectory.positions[0]
     state = BodyState(positions, np.cross([3.0, -2.0, 5.0], positions - body.centre_of_mass(positions)))
@@ -126,7 +126,7 @@ def test_muscles_that_lose_their_tension_count(trajectory: Trajectory, height: f
         assert worst(replace(books, **{flow: 1.1 * getattr(books, flow)})) > CLOSES, flow
 
 
-def test_the_work_of_a_push_is_the_kinetic_energy_that_it_gives(trajectory: Trajectory, books: EnergyBalance) -> None:
+def test_the_work_of_a_push_is_the_kinetic_energy_that_it_adds(trajectory: Trajectory, books: EnergyBalance) -> None:
     """The work is the sum of m |v0 + k|^2 / 2 - m |v0|^2 / 2 over the nodes, for a blow on one side and wind at
     once."""
     assert trajectory.kick_step.tolist() == list(range(8, 24)) and (books.pushes[:8] == 0.0).all()
@@ -136,7 +136,7 @@ def test_the_work_of_a_push_is_the_kinetic_energy_that_it_gives(trajectory: Traj
     assert books.pushes[8] == pytest.approx(gained, rel=1e-10)
 
 
-def test_the_sums_of_a_run_close_and_have_its_peaks(books: EnergyBalance) -> None:
+def test_totals_of_a_run_close(books: EnergyBalance) -> None:
     """In units of m g H, the change of energy is the sum of all flows; peaks are the maxima over all states."""
     sums = EnergyTotals.of(books)
     assert sums.unit_joules == books.energy_unit and set(sums.flows) == set(FLOWS)
@@ -172,13 +172,13 @@ def test_each_stored_energy_counts(books: EnergyBalance) -> None:
         "dt",
     ],
 )
-def test_the_file_s_numbers_are_those_of_the_run(trajectory: Trajectory, number: str) -> None:
+def test_an_error_in_any_stored_value_is_detected(trajectory: Trajectory, number: str) -> None:
     """Each value is increased by 1 %."""
     wrong = replace(trajectory, **{number: 1.01 * getattr(trajectory, number)})
     assert worst(energy_balance(wrong)) > CLOSES
 
 
-def test_velocities_that_belong_to_no_step_are_seen(trajectory: Trajectory) -> None:
+def test_inconsistent_velocities_are_detected(trajectory: Trajectory) -> None:
     """An expansion at 0.1 / s, which has no momentum, is not mistaken for added spin."""
     velocities = trajectory.velocities.copy()
     middle = trajectory.positions[10] - trajectory.node_mass @ trajectory.positions[10] / trajectory.node_mass.sum()
@@ -202,7 +202,7 @@ def test_stored_energies_are_those_of_the_body(trajectory: Trajectory, books: En
 
 
 @pytest.mark.parametrize("crushed", [0.5, 0.02, 1e-4])
-def test_what_a_step_loses_holds_for_crushed_elements(crushed: float) -> None:
+def test_the_loss_of_a_step_is_exact_for_crushed_elements(crushed: float) -> None:
     """Psi(F0) - Psi(F1) + P(F1) : (F1 - F0), with energy and stress of one element written out (Eq. 5), also if the
     straight path between the two states would invert it."""
     mu, lam = 3.0, 7.0
@@ -223,7 +223,7 @@ def test_what_a_step_loses_holds_for_crushed_elements(crushed: float) -> None:
         assert got[0] == pytest.approx(expected, rel=1e-9)
 
 
-def test_it_shares_no_code_with_the_solver() -> None:
+def test_the_energy_balance_shares_no_code_with_the_solver() -> None:
     """It imports NumPy, SciPy and the trajectory that it reads, which imports nothing of bodies, muscles or contact."""
     for path in (Path(module.__file__), Path(module.__file__).with_name("audit.py")):
         assert imported(path) <= {"numpy", "scipy", "egs_warp.locomotion.trajectory", "egs_warp.locomotion.ledger"}
@@ -240,7 +240,7 @@ def imported(path: Path) -> set[str]:
     return {name for name in names if name.split(".")[0] in ("numpy", "scipy", "warp", "egs_warp")}
 
 
-def test_what_a_shortened_muscle_has_pulled_is_the_integral_of_its_share() -> None:
+def test_the_work_of_a_shortened_muscle_is_an_integral() -> None:
     """The energy balance has its own formula; it equals the midpoint rule over lengths from zero to 1.2 rest
     lengths."""
     count, rest = 4800, 0.5

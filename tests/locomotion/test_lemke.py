@@ -37,7 +37,7 @@ def test_closed_forms() -> None:
     assert lemke(np.array([[-1.0]]), np.array([-1.0])) is None
 
 
-def test_ties_end() -> None:
+def test_ties_terminate() -> None:
     """Equal rows and a q of zeros or equal entries are ties; the lexicographic rule terminates nevertheless."""
     matrix = np.ones((6, 6)) + np.kron(np.eye(3), np.ones((2, 2)))
     z = lemke(matrix, np.array([-1.0, -1.0, -1.0, -1.0, 0.0, 0.0]))

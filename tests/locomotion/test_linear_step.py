@@ -37,7 +37,7 @@ def about_a_fall(stepper: LocomotionStepper, creature: Creature, seed: int = 0) 
     return prospect, linear
 
 
-def test_its_end_is_the_newton_step_s(creature: Creature) -> None:
+def test_the_end_is_that_of_the_newton_step(creature: Creature) -> None:
     """Activations and contact forces act on the nodes, and the tangent gives the change of the velocities (Eq. 7,
     8)."""
     stepper = creature.stepper
@@ -70,7 +70,7 @@ def objectives_of(count: int) -> list[Objective]:
     ]
 
 
-def test_squares_are_what_is_missed(creature: Creature) -> None:
+def test_objective_values_are_squared_errors(creature: Creature) -> None:
     _, linear = about_a_fall(creature.stepper, creature)
     asked = objectives_of(creature.start.positions.size)
     x = np.append(np.random.default_rng(4).standard_normal(linear.count), 1.0)
@@ -79,7 +79,9 @@ def test_squares_are_what_is_missed(creature: Creature) -> None:
     assert np.array_equal(linear.objective_quadratic([])(), np.zeros((len(x), len(x))))
 
 
-def test_a_device_has_the_host_s_step(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_device_step_equals_that_of_the_host(
+    creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """For one prediction after another: a GPU records a graph in the first step and replays it in the second."""
     pytest.importorskip("torch")
     expected = [about_a_fall(creature.stepper, creature, seed)[1] for seed in range(3)]

@@ -79,7 +79,7 @@ def test_node_rows_measure_the_mass_weighted_distance_from_the_target() -> None:
     assert slope == pytest.approx(gradient @ along.ravel(), rel=1e-8)
 
 
-def test_straining_rows_see_uniform_strain_alone_and_all_of_it() -> None:
+def test_strain_rows_measure_only_uniform_strain() -> None:
     """For an affine motion, the mean square of its non-rigid part; zero for a rigid motion and for one without uniform
     strain."""
     rng = np.random.default_rng(4)
@@ -118,7 +118,7 @@ def place(part: BodyPart, frame: Coordinates, positions: np.ndarray) -> np.ndarr
 
 @by_part
 @by_frame
-def test_part_rows_are_the_rate_of_the_parts_place(part: BodyPart, frame: Coordinates) -> None:
+def test_part_rows_are_the_rate_of_the_part_s_centre(part: BodyPart, frame: Coordinates) -> None:
     """Velocity, position and acceleration of a part: rows by differences; a velocity that meets the target gives the
     requested motion."""
     state, dt = shaken_state(), 0.01
@@ -138,7 +138,7 @@ def test_part_rows_are_the_rate_of_the_parts_place(part: BodyPart, frame: Coordi
 
 @by_part
 @by_frame
-def test_momentum_rows_measure_the_angular_momentum_in_metres_a_second(part: BodyPart, frame: Coordinates) -> None:
+def test_momentum_rows_measure_the_angular_momentum(part: BodyPart, frame: Coordinates) -> None:
     """Sum of m (x - c) x (v - v_c) over the part, about its own centre or that of the body, scaled to m/s; a rigid
     rotation gives inertia x omega.
     """
@@ -157,7 +157,7 @@ def test_momentum_rows_measure_the_angular_momentum_in_metres_a_second(part: Bod
 
 
 @by_part
-def test_turning_rows_are_the_rate_of_the_best_fit_rotation_of_a_rigid_part(part: BodyPart) -> None:
+def test_rotation_rows_are_the_rate_of_the_best_fit_rotation(part: BodyPart) -> None:
     """In a rigid velocity field, the rows give the angular velocity of the part's rotation by Kabsch's method."""
     state = shaken_state()
     turn = np.array([0.4, -0.2, 0.7])
@@ -190,7 +190,7 @@ def test_area_rows_are_the_rate_of_the_area_of_the_base() -> None:
     assert objective.target[0] * perimeter == pytest.approx(5.0 * (0.2 - hull(state.positions).volume))
 
 
-def test_what_is_held_costs_the_squared_slip_of_each_contact_by_its_load() -> None:
+def test_slip_costs_its_square_times_the_load() -> None:
     """The contact plane is sloped, so that slip is not along an axis; motion along the normal costs nothing."""
     floor = Plane(np.array([0.1, -0.2, 1.0]) / np.sqrt(1.05), 0.3)
     nodes = BODY.mesh.nodes

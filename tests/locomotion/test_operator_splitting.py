@@ -48,7 +48,7 @@ def by_osqp(units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.n
     return result.x, result.y
 
 
-def test_they_are_those_of_osqp_whatever_was_asked_before() -> None:
+def test_iterations_equal_those_of_osqp_on_a_reused_solver() -> None:
     """A reused solver with padding rows, after other QPs, gives the iterations of OSQP."""
     kept = OsqpWarmStart(32, 12)
     for seed in range(6):
@@ -68,7 +68,7 @@ def test_without_a_start_they_begin_at_the_minimum() -> None:
     np.testing.assert_allclose(OsqpWarmStart(8, 12).run(units, lower, upper, None).x, x, atol=1e-12)
 
 
-def test_kernels_end_where_osqp_does() -> None:
+def test_kernels_end_as_osqp_does() -> None:
     for seed in range(6):
         for rows in SIZES:
             given = program(seed, rows)

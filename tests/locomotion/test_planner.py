@@ -46,7 +46,7 @@ def works(stepper: LocomotionStepper, start: np.ndarray, end: np.ndarray, tensio
     return tensions * (before - after) / (stepper.body.weight * stepper.body.height)
 
 
-def test_activations_cost_the_squares_of_what_their_muscles_give_or_take(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_activations_cost_the_squares_of_their_muscles_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing else changes: neither the gradient, nor the cost without activation, nor the cost of contact forces."""
     stepper, states, reports = thrust(7)
     muscles, start = stepper.muscles, states[-1]
@@ -72,7 +72,7 @@ def test_activations_cost_the_squares_of_what_their_muscles_give_or_take(monkeyp
     np.testing.assert_allclose(P - without.P, np.diag(added), rtol=1e-9, atol=1e-9 * np.abs(P).max())
 
 
-def test_a_thrust_works_less(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_work_cost_reduces_the_work_of_a_thrust(monkeypatch: pytest.MonkeyPatch) -> None:
     """At the same speed, fewer muscles are stretched while they pull."""
 
     def worked(steps: int = 8) -> tuple[float, float]:

@@ -22,7 +22,7 @@ def same(a: Trajectory, b: Trajectory) -> bool:
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in a.__dataclass_fields__)
 
 
-def test_parts_on_disk_are_what_memory_would_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_on_disk_equal_the_records_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("egs_warp.locomotion.recorder._MIN_STEPS_PER_PART", 7)
     run = slide()
     on_disk, in_memory = run.recorder(folder=lambda: tmp_path / "parts"), run.recorder()
@@ -48,7 +48,9 @@ def test_parts_on_disk_are_what_memory_would_hold(tmp_path: Path, monkeypatch: p
     assert same(Trajectory.load(tmp_path / "parts"), whole)
 
 
-def test_a_part_that_is_missing_or_of_another_schema_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_part_that_is_missing_or_of_another_schema_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("egs_warp.locomotion.recorder._MIN_STEPS_PER_PART", 7)
     run = slide()
     recorder = run.recorder(folder=lambda: tmp_path)

@@ -89,7 +89,7 @@ def same_steps(one: tuple[StepReport, ...], other: tuple[StepReport, ...]) -> bo
 
 
 @pytest.mark.parametrize("script", ["jump", pytest.param("walk 0.1", marks=pytest.mark.slow)])
-def test_a_run_goes_on_to_the_same_bits(
+def test_a_run_continues_to_the_same_bits(
     script: str, cut_off: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A new body solves only the steps that were not recorded."""
@@ -122,7 +122,7 @@ def test_a_run_goes_on_to_the_same_bits(
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_from_any_of_its_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_continues_from_any_of_its_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The run is interrupted after each step: all state that persists between steps is recorded."""
     monkeypatch.setattr("egs_warp.locomotion.recorder._MIN_STEPS_PER_PART", 1)
     whole = run(block(), parts=lambda: tmp_path / "whole")
@@ -137,7 +137,7 @@ def test_a_run_goes_on_from_any_of_its_steps(tmp_path: Path, monkeypatch: pytest
         assert same_steps(resumed.reports, whole.reports), kept
 
 
-def test_parts_of_divided_steps_are_put_together_again(tmp_path: Path) -> None:
+def test_parts_of_divided_steps_are_joined(tmp_path: Path) -> None:
     """Steps were divided because they did not converge; the parts of a step have the same digest."""
     slid = slide()
     recorder = slid.recorder(folder=lambda: tmp_path)
@@ -159,7 +159,7 @@ def test_another_run_is_refused(cut_off: Path) -> None:
             run(made, script, parts=lambda: cut_off, resume=cut_off)
 
 
-def test_a_damaged_part_is_told_and_can_be_left_out(cut_off: Path) -> None:
+def test_a_damaged_part_is_reported_and_can_be_left_out(cut_off: Path) -> None:
     second = cut_off / "steps-000001.npz"
     good = second.read_bytes()
     for bad in (good[:-40], good[: len(good) // 2] + b"\x55" + good[len(good) // 2 + 1 :], b"", b"text"):
@@ -176,7 +176,7 @@ def test_a_damaged_part_is_told_and_can_be_left_out(cut_off: Path) -> None:
         run(block(), parts=lambda: cut_off, resume=cut_off)
 
 
-def test_a_run_that_is_pushed_goes_on_and_another_push_is_refused(tmp_path: Path) -> None:
+def test_a_pushed_run_continues_and_another_push_is_refused(tmp_path: Path) -> None:
     """The push is before the interruption; without it, the objectives of its step are the same."""
     made = block()
 
@@ -198,7 +198,7 @@ def test_a_run_that_is_pushed_goes_on_and_another_push_is_refused(tmp_path: Path
             run(block(), resume=parts, kicks=other)
 
 
-def test_a_disk_that_is_full_at_a_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_while_a_part_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """There is a one-line error; earlier parts stay, and the run continues from them."""
     replace = os.replace
     for number in (0, 2):
@@ -219,7 +219,7 @@ def test_a_disk_that_is_full_at_a_part(tmp_path: Path, monkeypatch: pytest.Monke
         assert same_steps(again.reports, uninterrupted().reports)
 
 
-def test_a_digest_tells_objectives_apart() -> None:
+def test_digests_distinguish_objectives() -> None:
     slid = slide()
     body, contacts = slid.stepper.body, slid.reports[-1].contacts
     still = np.zeros((len(body.node_mass), 3))

@@ -31,7 +31,7 @@ def made() -> CoarseCreature:
 
 
 @pytest.mark.parametrize("failure", [UnsolvableStepError("singular"), np.linalg.LinAlgError("singular"), None])
-def test_what_was_solved_before_is_kept(
+def test_earlier_steps_are_kept(
     made: CoarseCreature, failure: Exception | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The fourth step fails with an error, or does not converge in any of its parts."""
@@ -52,7 +52,7 @@ def test_what_was_solved_before_is_kept(
     assert np.array_equal(cut.trajectory.positions, whole.trajectory.positions[:4])
 
 
-def test_a_step_in_parts_hands_on_its_last(made: CoarseCreature, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_divided_step_passes_on_its_last_part(made: CoarseCreature, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second step begins at the end of the second part of the first step, with its contacts and activations."""
     advance, given, parts = LocomotionStepper.advance, [], []
 
@@ -76,7 +76,7 @@ def test_a_step_in_parts_hands_on_its_last(made: CoarseCreature, monkeypatch: py
 
 
 @pytest.mark.parametrize("before", [[], [True] * 5 + [False]], ids=["at once", "and goes on"])
-def test_what_has_finished_rests_before_it_ends(made: CoarseCreature, before: list[bool]) -> None:
+def test_a_finished_motion_rests_before_it_ends(made: CoarseCreature, before: list[bool]) -> None:
     """``REST_FRAMES`` frames in a row: a motion that continues in between resets the count."""
     frames = iter(before + [True] * 100)
     nothing = np.zeros((100, made.stepper.muscles.segment_count))
@@ -121,7 +121,7 @@ def test_a_body_that_stands_still_is_settled_in_few_steps(
     assert more.forces[:, 0].sum() == pytest.approx(body.weight, rel=0.01)
 
 
-def test_a_body_over_nothing_is_not_followed_down(made: CoarseCreature) -> None:
+def test_a_body_over_no_ground_is_not_followed_down(made: CoarseCreature) -> None:
     """Each step of sqrt(H / g) / 4 starts without velocity and lets it fall by g dt^2 = H / 16: after two steps its
     centre has moved by more than 0.1 H, and the body is returned."""
     body, geometry = made.stepper.body, made.stepper.geometry
@@ -132,7 +132,7 @@ def test_a_body_over_nothing_is_not_followed_down(made: CoarseCreature) -> None:
     np.testing.assert_allclose(fallen, [0.0, 0.0, -body.height / 8.0], atol=1e-6)
 
 
-def test_no_frames_are_nothing_done(made: CoarseCreature) -> None:
+def test_zero_frames(made: CoarseCreature) -> None:
     """As with activations for less than a frame: the start is the only state, and no step failed."""
     sequence = MotionSequence(made.place, motion("jump").parts(made.place.body.height))
     done = roll_out(made.stepper, made.stepper.geometry, made.start, sequence, frames=0)

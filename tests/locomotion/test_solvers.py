@@ -45,7 +45,7 @@ def test_closed_form(solver: QpSolver, accuracy: float) -> None:
 
 
 @SOLVERS
-def test_bounds_only_updates_give_the_optimum_of_a_fresh_set_up(solver: QpSolver, accuracy: float) -> None:
+def test_updated_bounds_give_the_optimum_of_a_new_solver(solver: QpSolver, accuracy: float) -> None:
     """Eq. (13): rows change between free, one-sided and equality, as contact states do; the KKT conditions hold, and x
     is that of a new solver.
     """
@@ -66,7 +66,7 @@ def test_bounds_only_updates_give_the_optimum_of_a_fresh_set_up(solver: QpSolver
             assert (rows @ warm.x - upper).max() < accuracy and (lower - rows @ warm.x).max() < accuracy
 
 
-def test_a_program_beside_one_that_is_solved_needs_no_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_similar_program_needs_no_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
     """From the active set of a solved program, the optimum is that of OSQP, without OSQP iterations; an infeasible
     program has no solution."""
     for seed in range(12):
@@ -84,7 +84,7 @@ def test_a_program_beside_one_that_is_solved_needs_no_iterations(monkeypatch: py
         assert none.status is QpStatus.INFEASIBLE
 
 
-def test_each_splitting_is_that_of_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_solver_name_selects_its_solver(monkeypatch: pytest.MonkeyPatch) -> None:
     """Operator splitting as kernels does not need OSQP; the solver named osqp does."""
     P, q, A = random_program(0)
     lower, upper = np.r_[0.0, np.full(29, -0.1)], np.r_[0.0, np.full(29, 0.2)]
@@ -108,7 +108,7 @@ class Doubting:
         raise AssertionError("nothing is left to iterate on")
 
 
-def test_what_iterations_leave_in_doubt_is_no_guess(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_uncertain_result_is_not_used_as_a_guess(monkeypatch: pytest.MonkeyPatch) -> None:
     """The search for the optimum then starts with the rows that the unconstrained minimum violates."""
     P, q, A = random_program(5)
     lower, upper = np.full(30, -0.1), np.full(30, 0.2)
@@ -145,7 +145,7 @@ def test_infeasible_bounds_are_reported_and_the_next_solve_recovers(solver: QpSo
 
 
 @SOLVERS
-def test_rows_that_repeat_each_other_may_all_be_held(solver: QpSolver, accuracy: float) -> None:
+def test_repeated_rows_may_all_be_active(solver: QpSolver, accuracy: float) -> None:
     """A static contact has n_d equality rows of rank two; equality rows that agree are no contradiction."""
     P, q, A = random_program(4)
     A = np.vstack([A[:4], A[:4], A[0] + A[1]])
@@ -154,7 +154,7 @@ def test_rows_that_repeat_each_other_may_all_be_held(solver: QpSolver, accuracy:
     assert np.abs(P @ solution.x + q + A.T @ solution.multipliers).max() < 10 * accuracy
 
 
-def test_an_iteration_limit_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_iteration_limit_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     """At the limit the point is usable if it nearly satisfies the bounds; a point that does not has a wrong, low
     objective.
     """

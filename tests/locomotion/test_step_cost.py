@@ -41,7 +41,7 @@ def value(cost: QuadraticCost, x: np.ndarray) -> float:
     return float(0.5 * x @ cost.P @ x + cost.q @ x + cost.constant)
 
 
-def test_objectives_are_weighted_squares_of_what_is_missed() -> None:
+def test_objectives_are_weighted_squared_errors() -> None:
     problem, linear, _ = example(7)
     rng = np.random.default_rng(1)
     x, target, momentum = rng.standard_normal(7), rng.standard_normal(3), rng.standard_normal(3)
@@ -73,7 +73,7 @@ def moved_on(problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, tim
     return problem.state.positions + (DT * speeds + (time - DT) * further).reshape(-1, 3)
 
 
-def test_effort_is_the_energy_ahead_and_convex() -> None:
+def test_effort_is_the_future_energy_and_convex() -> None:
     """Value, gradient and curvature about the predicted end, by differences of the energy."""
     problem, linear, foreseen = example()
     horizon = 0.16
@@ -103,7 +103,7 @@ def test_effort_is_the_energy_ahead_and_convex() -> None:
     assert value(modelled, x) == pytest.approx(energy(x), rel=1e-6)
 
 
-def test_what_lets_go_is_foreseen_slack_not_strained_the_other_way() -> None:
+def test_a_relaxing_body_is_predicted_without_reversed_strain() -> None:
     """A stretched body reaches its rest shape within the step at its end velocity; at the same speed afterwards it
     would be strained by twice as much."""
     nodes = BODY.mesh.nodes

@@ -126,7 +126,7 @@ def test_audit_of_a_hop(device: str) -> None:
     assert max(np.abs(r.activations / stepper.muscles.bounds).max() for r in reports) > 0.05
 
 
-def test_what_a_program_foresees_is_in_its_units() -> None:
+def test_predictions_of_a_program_are_in_its_units() -> None:
     """Contact velocities are in sqrt(g H), forces in body weights, and activations within their bounds, as in the
     prediction."""
     stepper = muscular_block()
@@ -144,7 +144,7 @@ def test_what_a_program_foresees_is_in_its_units() -> None:
     np.testing.assert_allclose(foreseen.activations, shares, rtol=1e-12)
 
 
-def test_a_body_bobs_as_asked() -> None:
+def test_a_body_bobs_as_requested() -> None:
     """Half a period with an amplitude of 2 % of the height: the velocity of the centre of mass is within 5 % of its
     peak, and the load does not reverse."""
     creature = coarse_creature(block_mesh(), forward=np.array([1.0, 0.0, 0.0]))
@@ -172,7 +172,7 @@ def test_a_body_bobs_as_asked() -> None:
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
-def test_a_gpu_s_factors_make_the_same_hop(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_device_factors_give_the_same_hop(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """30 steps in closed loop (10 on a CPU, where dense factors are slow), each with its own activations: within 1e-8 H
     of sparse factors. The body stands on four feet; with more, rounding decides which points carry the load.
     """
@@ -229,7 +229,7 @@ def test_degenerate_contact_sets_never_lose_a_frame(feet: np.ndarray, solver: Qp
 
 
 @pytest.mark.parametrize("strategy", [strategy for strategy in Strategy if strategy is not Strategy.EXACT])
-def test_every_strategy_drives_the_stepper(strategy: Strategy) -> None:
+def test_the_stepper_runs_with_every_strategy(strategy: Strategy) -> None:
     """Eq. (12), Eq. (13): the same steps with another search; the all-static strategy takes one QP, or two if that has
     no solution.
     """
@@ -279,7 +279,7 @@ def test_a_step_that_does_not_converge_is_subdivided(longest: float, parts: int)
 
 
 @pytest.mark.parametrize("planned_well", [True, False])
-def test_halves_are_made_under_the_activations_that_serve_better(planned_well: bool) -> None:
+def test_half_steps_use_the_better_activations(planned_well: bool) -> None:
     """The planned activations of a step that does not converge, or the previous ones if the planned ones push the wrong
     way."""
     made = muscular_block()

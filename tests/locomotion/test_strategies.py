@@ -83,7 +83,7 @@ def test_order_of_the_strategies() -> None:
     assert 5.0 * counts[Strategy.RELAXED] < counts[Strategy.EXACT]
 
 
-def test_the_limit_is_kept_and_more_qps_are_never_worse() -> None:
+def test_more_qps_are_never_worse() -> None:
     """One more QP never increases the objective. The limit is tripled if the best result is uncertain; at the limit the
     best result so far is returned.
     """
@@ -96,7 +96,7 @@ def test_the_limit_is_kept_and_more_qps_are_never_worse() -> None:
             last = found.objective
 
 
-def test_a_search_in_doubt_may_take_thrice_the_limit() -> None:
+def test_an_uncertain_search_may_triple_the_limit() -> None:
     """As documented: some of many problems take all of it, none takes more."""
     counts = [search(small_problem(seed, contacts=3).program, Strategy.RELAXED, limit=2).qp_count for seed in range(20)]
     assert max(counts) == 6 and min(counts) <= 3
@@ -135,7 +135,7 @@ def degenerate_frames() -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("name", list(degenerate_frames()))
 @pytest.mark.parametrize("solver", [QpSolver.OSQP, QpSolver.DAQP, pytest.param(QpSolver.ADMM, marks=pytest.mark.slow)])
-def test_degenerate_contact_sets_never_lose_a_frame(name: str, solver: QpSolver) -> None:
+def test_degenerate_contact_sets_have_a_solution(name: str, solver: QpSolver) -> None:
     """Contacts in one line, duplicates, one point, 40 points on a rigid base: the result is finite and obeys every
     pair.
     """
@@ -209,7 +209,7 @@ def test_strategies_and_solvers_are_chosen_by_name() -> None:
         LocomotionSettings(qp_solver="nonsense")
 
 
-def test_strategies_begin_where_they_say() -> None:
+def test_start_states_of_the_strategies() -> None:
     """``paper`` starts from the predicted states and only improves on them; ``static`` starts with all contacts static,
     for any prediction."""
     tried = 0
@@ -227,7 +227,7 @@ def test_strategies_begin_where_they_say() -> None:
 
 
 @pytest.mark.parametrize("bound", [None, 1.0, 0.5])
-def test_pieces_are_searched_again_only_in_doubt(bound: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_search_only_if_uncertain(bound: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """If the result is within 1.2 times the lower bound, or the bound is not known, there is one more QP; otherwise
     there is a second search."""
     pieces = small_problem(3, contacts=3, directions=8, freedoms=14).pieces

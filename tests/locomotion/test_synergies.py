@@ -19,7 +19,7 @@ from tests.support.meshes import block_mesh
 from tests.support.stances import FORWARD
 
 
-def test_alike_are_grouped_and_few_are_left_alone() -> None:
+def test_similar_muscles_are_grouped_and_small_sets_are_not() -> None:
     floor = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
     body = make_body(block_mesh(), floor, device="cpu")
     muscles = automatic_muscles(body.mesh, floor.normal, body_weight=body.weight, height=body.height)
@@ -44,7 +44,7 @@ def test_alike_are_grouped_and_few_are_left_alone() -> None:
     assert alone.count == count and np.array_equal(alone.group_from_muscle, np.arange(count))
 
 
-def test_muscles_are_grouped_by_what_they_do_in_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_muscles_are_grouped_by_their_effect_in_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """Effects are velocity changes in a step of sqrt(H / g) / 19: their impulse, by central differences of the equation
     of that step, is parallel to that of the muscle."""
     given = []

@@ -15,7 +15,7 @@ def _threads() -> set[int]:
     return {library["num_threads"] for library in ThreadpoolController().info() if library["user_api"] == "blas"}
 
 
-def test_a_step_has_one_blas_thread_and_gives_the_others_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_uses_one_blas_thread_and_restores_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """For any number of threads set by the calling program."""
     pawn, seen = coarse_pawn(), []
     step = LocomotionStepper.step

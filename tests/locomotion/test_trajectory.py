@@ -29,7 +29,7 @@ def test_ballistic_flight_is_measured(flight: Trajectory) -> None:
     assert reached.airborne_frames == pytest.approx(60 * (flight.time[com > 0][-1] - flight.time[1]))
 
 
-def test_a_part_of_a_trajectory_is_measured_alone(flight: Trajectory) -> None:
+def test_a_part_of_a_trajectory_is_measured_separately(flight: Trajectory) -> None:
     """From the third to the tenth state, all in the air, the measures are those of a trajectory that begins and ends
     there."""
     cut = replace(
@@ -43,7 +43,7 @@ def test_a_part_of_a_trajectory_is_measured_alone(flight: Trajectory) -> None:
     assert part.airborne_frames == pytest.approx(60.0 * 7 * DT)
 
 
-def test_what_was_reached_does_not_hang_on_where_up_is(flight: Trajectory) -> None:
+def test_measures_do_not_depend_on_the_up_axis(flight: Trajectory) -> None:
     """The whole world is rotated: distance, height, heading, tilt and time in the air stay the same."""
     expected = measure(flight)
     for vector in ([0.5 * np.pi, 0.0, 0.0], [0.0, 0.5 * np.pi, 0.0], [0.4, -1.1, 0.7]):
@@ -61,7 +61,7 @@ def test_tilt_is_the_angle_to_the_normal(flight: Trajectory) -> None:
     assert measure(replace(flight, positions=leaned)).tilt_degrees == pytest.approx(np.degrees(0.3), rel=1e-9)
 
 
-def test_saved_trajectory_comes_back_bit_for_bit(flight: Trajectory, tmp_path: Path) -> None:
+def test_a_saved_trajectory_is_read_back_bitwise(flight: Trajectory, tmp_path: Path) -> None:
     flight.save(tmp_path / "a.npz")
     flight.save(tmp_path / "b.npz")
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()

@@ -15,7 +15,7 @@ from tests.support.slides import slide
 
 
 @pytest.mark.parametrize("made", [rigid_flight, lambda: slide(struck=True).trajectory()], ids=["flight", "slide"])
-def test_what_was_simulated_is_sound(made: Any) -> None:
+def test_simulated_trajectories_are_consistent(made: Any) -> None:
     check_trajectory(made())
 
 
@@ -54,6 +54,6 @@ def _spoilt(name: str, value: float, row: int = -1) -> Any:
         (lambda t: replace(t, planned_com=np.zeros((2, 3))), "its arrays do not fit each other"),
     ],
 )
-def test_what_cannot_be_drawn_is_named(change: Any, said: str) -> None:
+def test_inconsistent_trajectories_are_reported(change: Any, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         check_trajectory(change(slide(struck=True).trajectory()))

@@ -55,7 +55,7 @@ def its_cage(thing: Lying) -> Cage:
     ],
     ids=["all three", "shuffled", "x64", "x1/8", "moved"],
 )
-def test_same_bits_however_the_file_lies(thing: Lying, its_cage: Cage, other: Callable[[Lying], Lying]) -> None:
+def test_same_bits_for_any_frame_of_the_file(thing: Lying, its_cage: Cage, other: Callable[[Lying], Lying]) -> None:
     changed = other(thing)
     assert not np.array_equal(changed.cloud.means.numpy(), thing.cloud.means.numpy())
     _, cage = body_cage(changed)
@@ -72,14 +72,14 @@ def test_same_bits_however_the_file_lies(thing: Lying, its_cage: Cage, other: Ca
     ],
     ids=["both", "x0.37", "turned"],
 )
-def test_same_cage_in_any_unit_and_turned(thing: Lying, its_cage: Cage, other: Callable[[Lying], Lying]) -> None:
+def test_same_cage_in_any_unit_and_orientation(thing: Lying, its_cage: Cage, other: Callable[[Lying], Lying]) -> None:
     """The tetrahedra are the same, and the nodes are equal within 1e-5 of the height, the effect of rounding."""
     _, cage = body_cage(other(thing))
     assert np.array_equal(cage.mesh.tets, its_cage.mesh.tets)
     assert np.abs(cage.mesh.nodes - its_cage.mesh.nodes).max() < 1e-5 * its_cage.height(GROUND)
 
 
-def test_cage_in_the_capture_goes_along(thing: Lying) -> None:
+def test_the_cage_transforms_with_the_capture(thing: Lying) -> None:
     cage, turned = build_cage(thing.cloud, thing.plane), thing.turned()
     along = build_cage(turned.cloud, turned.plane)
     turn = np.linalg.lstsq(cage.mesh.nodes, along.mesh.nodes, rcond=None)[0]
@@ -88,7 +88,7 @@ def test_cage_in_the_capture_goes_along(thing: Lying) -> None:
     assert np.abs(turned.plane.heights(along.mesh.nodes)).min() < 1e-12
 
 
-def test_base_plane_goes_along(thing: Lying) -> None:
+def test_the_base_plane_transforms_with_the_capture(thing: Lying) -> None:
     level = find_base_plane(thing.cloud, UP).offset
     assert find_base_plane(thing.shuffled().cloud, UP).offset == level
     assert find_base_plane(thing.scaled(4.0).cloud, UP).offset == 4.0 * level
@@ -104,7 +104,7 @@ def test_base_plane_goes_along(thing: Lying) -> None:
     st.floats(0.0, 2.0 * np.pi),
     st.lists(st.floats(-100.0, 100.0), min_size=3, max_size=3),
 )
-def test_frame_turns_moves_and_grows_with_the_body(seed: int, scale: float, angle: float, shift: list[float]) -> None:
+def test_the_frame_transforms_with_the_body(seed: int, scale: float, angle: float, shift: list[float]) -> None:
     """The coordinates of random points in the frame do not change."""
     random = np.random.default_rng(seed)
     points = random.normal(size=(200, 3)) * random.uniform(0.3, 1.0, 3)
@@ -120,7 +120,7 @@ def test_frame_turns_moves_and_grows_with_the_body(seed: int, scale: float, angl
 
 
 @pytest.mark.parametrize("sides", [3, 4, 5])
-def test_round_bodies_face_along_what_they_have_most_of(sides: int) -> None:
+def test_round_bodies_face_along_their_longest_directions(sides: int) -> None:
     """A regular star has no long side: x passes through one of its tips, or between two, and rotates with it."""
     random = np.random.default_rng(sides)
     azimuth = 2.0 * np.pi * np.repeat(np.arange(sides), 50) / sides + np.tile(random.normal(0.0, 0.1, 50), sides)
@@ -155,7 +155,7 @@ def test_corners_do_not_outweigh_a_long_side() -> None:
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
-def test_a_long_body_is_faced_along_its_length_the_way_its_tail_points(way: float) -> None:
+def test_a_long_body_faces_along_its_length_towards_its_tail(way: float) -> None:
     """The body is denser towards its other end: the third moments about its centre are those of the tail."""
     along = way * np.linspace(0.0, 1.0, 201) ** 1.5
     aside = np.resize([0.05, -0.05], 201)
@@ -164,7 +164,7 @@ def test_a_long_body_is_faced_along_its_length_the_way_its_tail_points(way: floa
     assert frame.axes == pytest.approx(way * np.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0, 0, way]]), abs=0.02)
 
 
-def test_the_origin_is_under_the_middle_and_the_unit_the_median_distance() -> None:
+def test_the_origin_is_under_the_centre_and_the_unit_is_the_median_distance() -> None:
     """Points on a sphere, above a plane that is not level."""
     random = np.random.default_rng(0)
     half = random.normal(size=(500, 3))
@@ -190,7 +190,7 @@ def test_strays_do_not_turn_the_frame() -> None:
         upright_frame(np.ones((5, 3)), np.ones(5), GROUND)
 
 
-def test_there_and_back() -> None:
+def test_round_trip() -> None:
     frame = BodyFrame(Rotation.from_rotvec([0.2, 0.5, -1.0]).as_matrix(), np.array([3.0, -1.0, 2.0]), 2.5)
     points = np.random.default_rng(0).normal(size=(20, 3))
     plane = Plane.from_coefficients(0.1, 0.9, -0.3, 0.7)

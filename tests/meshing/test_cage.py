@@ -216,7 +216,7 @@ def test_tetwild(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_where_tetwild_fails_the_lattice_stands_in(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_lattice_is_used_if_tetwild_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     """The cage reports which mesher made it."""
     monkeypatch.setattr("egs_warp.meshing.cage.tetwild", lambda *_: None)
     thing, lattice = _pawn_cage(6000)

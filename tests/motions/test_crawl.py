@@ -57,7 +57,7 @@ def crawled(route: Route) -> Crawled:
     return Crawled(crawl, recorder.trajectory(), reports, place)
 
 
-def test_what_lies_along_the_ground_crawls() -> None:
+def test_a_body_along_the_ground_crawls() -> None:
     place = worm().place
     assert place.base() is SupportKind.LYING
     assert isinstance(move_along(place, straight_route(1.0), 0.1), Crawl) and isinstance(
@@ -65,7 +65,7 @@ def test_what_lies_along_the_ground_crawls() -> None:
     )
 
 
-def test_a_stride_strains_it_by_no_more_than_it_may() -> None:
+def test_a_stride_strains_the_body_within_its_limit() -> None:
     """The limit is reached at the steepest point of the wave; every section ends at the target of the body."""
     crawl = Crawl(worm().place, straight_route(5.0))
     crawl._to = np.array([crawl.step_limits.length, 0.0, 0.0])
@@ -81,7 +81,7 @@ def test_a_stride_strains_it_by_no_more_than_it_may() -> None:
     assert crawl._pose(0.0) == pytest.approx(crawl._standing)
 
 
-def test_what_is_carried_is_unloaded_from_the_front_on() -> None:
+def test_lifted_sections_are_unloaded_from_the_front() -> None:
     """After a quarter of a cycle the front is lifted and the back stands, after three quarters it is the other way
     round."""
     made = worm()
@@ -102,7 +102,7 @@ def test_what_is_carried_is_unloaded_from_the_front_on() -> None:
     [(straight_route(0.5), [0.5, 0.0]), (path_route(np.array([[0.2, 0.2]])), [0.2, 0.2])],
     ids=["ahead", "aside"],
 )
-def test_a_worm_comes_where_it_is_told(route: Route, goal: list[float]) -> None:
+def test_a_worm_reaches_its_target(route: Route, goal: list[float]) -> None:
     done = crawled(route)
     assert done.place[:2] == pytest.approx(goal, abs=0.07)
     assert abs(np.degrees(done.place[2])) < 3.0 and measure(done.trajectory).tilt_degrees < 5.0

@@ -68,7 +68,7 @@ def test_a_dance_keeps_time(danced: Run) -> None:
     }
 
 
-def test_what_was_skipped_is_told(danced: Run) -> None:
+def test_skipped_beats_are_reported(danced: Run) -> None:
     dance = danced.sequence.done[0].motion
     assert isinstance(dance, Dance)
     np.testing.assert_allclose(dance.outcome_record(danced.trajectory, 0, -1).skipped, [1.7])
@@ -76,14 +76,14 @@ def test_what_was_skipped_is_told(danced: Run) -> None:
     assert any(note.startswith("4 take-offs and touch-downs, the worst ") for note in dance.notes())
 
 
-def test_its_equations_hold_in_every_step(danced: Run) -> None:
+def test_the_equations_hold_in_every_step(danced: Run) -> None:
     found = audit(danced.trajectory, newton_unconverged=sum(not report.converged for report in danced.reports))
     assert verdict(found).startswith("audit: passed")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("beats", ["dance 90 1 14", "dance 120 0.6 14", "dance 50 1 5"])
-def test_the_pawn_keeps_time_through_the_whole_figure(beats: str) -> None:
+def test_the_pawn_keeps_time_through_the_whole_dance(beats: str) -> None:
     """Jumps, hops ahead and back, and twists; at 50 beats a minute it takes off half-way between beats."""
     done = simulate(coarse_pawn(), motion(beats))
     dance = done.sequence.done[0].motion
@@ -91,14 +91,14 @@ def test_the_pawn_keeps_time_through_the_whole_figure(beats: str) -> None:
     check_that_it_keeps_time(dance, done.trajectory)
 
 
-def test_a_flight_and_its_height_are_told_from_each_other() -> None:
+def test_flight_time_and_height_are_converted() -> None:
     """T = sqrt(8 Z / g), with the rise Z above the extension of the body at take-off."""
     for height in (MIN_HEIGHT, 0.16, 0.3, MAX_HEIGHT):
         assert height_of_flight(level_flight(height, 1.0, 9.81), 1.0, 9.81) == pytest.approx(height)
     assert level_flight(0.5, 1.0, 9.81) == pytest.approx(np.sqrt(8.0 * 0.46 / 9.81))
 
 
-def test_a_jump_says_when_it_takes_off(place: Stance) -> None:
+def test_a_jump_predicts_its_take_off(place: Stance) -> None:
     """The lead and the flight follow from the plan of the jump."""
     jump = Jump(place, JumpTarget(0.0, 0.4), skips_settling=True)
     assert jump.plan.flight_time == pytest.approx(level_flight(0.4, place.body.height, 9.81))
@@ -123,12 +123,12 @@ def test_easier_jumps_are_preferred_to_hasty_ones() -> None:
     assert found is not None and found.flight == pytest.approx(0.5)
 
 
-def test_what_is_too_far_for_a_jump_is_divided() -> None:
+def test_a_distance_too_far_for_a_jump_is_divided() -> None:
     assert span_of((1.0, 2.0)) == Span(1.5, 2.0, 2)
     assert span_of((1.0, 3.0)) == Span(2.5, 3.0, 4)
 
 
-def test_what_cannot_be_reached_is_left() -> None:
+def test_unreachable_beats_are_left_out() -> None:
     assert span_of((0.1, 0.4)) is None
     assert span_of((1.0,)) is None
     assert span_of((1.0, 60.0)) is None
@@ -155,7 +155,7 @@ def test_beats_are_read_from_the_first_column(tmp_path: Path) -> None:
         ("\n".join(str(k / 10) for k in range(1001)), "1001 beats; at most 1000 are allowed"),
     ],
 )
-def test_a_bad_file_of_beats_is_told_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+def test_a_bad_file_of_beats_is_a_one_line_error(tmp_path: Path, text: str, said: str) -> None:
     file = tmp_path / "beats.csv"
     file.write_text(text)
     with pytest.raises(UserError) as error:
@@ -185,7 +185,7 @@ def test_beats_are_given_to_the_dances_of_a_script(tmp_path: Path) -> None:
         ("dance 1 2 3 4", None, "'4' is one value too many; dance takes tempo, first, beats or a file of beats"),
     ],
 )
-def test_mistakes_are_told_in_one_line(text: str, beats: str | None, said: str) -> None:
+def test_mistakes_are_one_line_errors(text: str, beats: str | None, said: str) -> None:
     with pytest.raises((UserError, ArgumentError)) as error:
         motion(text, beats=beats).frames()
     assert said in str(error.value) and "\n" not in str(error.value)

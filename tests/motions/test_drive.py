@@ -33,7 +33,7 @@ def stool() -> CoarseCreature:
 
 
 @given(_SPEED, _SPEED, _SPEED, st.floats(0.01, 3.0))
-def test_no_pace_is_longer_than_may_be(forward: float, sideways: float, turn: float, time: float) -> None:
+def test_no_step_exceeds_its_limits(forward: float, sideways: float, turn: float, time: float) -> None:
     """A command is scaled to the limits of a step, with its ratio of directions unchanged."""
     command, start = Drive(forward, sideways, turn), np.array([0.3, -0.2, 0.7])
     change = integrate_command(start, command, time, PACE, unit=0.5, height=0.8) - start
@@ -47,13 +47,13 @@ def test_no_pace_is_longer_than_may_be(forward: float, sideways: float, turn: fl
     assert [ahead, left, change[2]] == pytest.approx(share * asked, abs=1e-9)
 
 
-def test_a_base_goes_to_no_side() -> None:
+def test_a_base_does_not_step_sideways() -> None:
     change = integrate_command(np.zeros(3), Drive(0.1, 0.1, 0.0), 1.0, StepLimits(1.0, 1.0), unit=1.0, height=1.0)
     assert change == pytest.approx([0.1, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("value", [float("nan"), 2.1, -3.0])
-def test_what_is_no_speed_is_refused(value: float) -> None:
+def test_invalid_speeds_are_refused(value: float) -> None:
     with pytest.raises(ArgumentError, match=r"sideways .*: give a speed from -2 to 2"):
         Drive(sideways=value)
 
@@ -76,7 +76,7 @@ def test_a_file_of_speeds_is_read(tmp_path: Path) -> None:
         ("\n", "no commands; give lines of four numbers, time,forward,sideways,turn"),
     ],
 )
-def test_a_bad_file_is_told_in_a_line(tmp_path: Path, text: str, told: str) -> None:
+def test_a_bad_file_is_a_one_line_error(tmp_path: Path, text: str, told: str) -> None:
     file = tmp_path / "speeds.csv"
     file.write_text(text)
     with pytest.raises(UserError) as error:
@@ -84,7 +84,7 @@ def test_a_bad_file_is_told_in_a_line(tmp_path: Path, text: str, told: str) -> N
     assert told in str(error.value) and "\n" not in str(error.value)
 
 
-def test_the_way_is_made_from_the_command_of_the_moment() -> None:
+def test_the_route_follows_the_current_command() -> None:
     """Past poses stay, future ones follow the command, and a zero command closes the feet."""
     walk = DrivenWalk(stool().place, Drive(0.1))
     before = walk.planar_poses.copy()
@@ -105,7 +105,7 @@ def test_the_way_is_made_from_the_command_of_the_moment() -> None:
     )
 
 
-def test_it_goes_on_from_where_slipping_feet_have_left_it() -> None:
+def test_the_route_continues_from_slipping_feet() -> None:
     """Feet that lag by a step shift the route; also in the closing swings of three groups of feet, which come after the
     last pose."""
     place = stool().place

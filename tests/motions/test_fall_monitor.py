@@ -81,14 +81,14 @@ def test_tilt_and_what_a_body_lies_on(made: CoarseCreature) -> None:
         assert watch.fallen == said and watch.is_finished == (said is not None)
 
 
-def test_a_fallen_body_is_asked_for_nothing(made: CoarseCreature) -> None:
+def test_a_fallen_body_has_no_objectives(made: CoarseCreature) -> None:
     watch = watched(made)
     assert len(watch.objectives(made.start, None, DT)) == 1
     seen(made, watch, degrees=90.0, load=1.0, seconds=1.0)
     assert watch.objectives(made.start, None, DT) == []
 
 
-def test_a_body_that_gets_up_is_not_watched_meanwhile(made: CoarseCreature) -> None:
+def test_a_body_that_gets_up_is_not_monitored(made: CoarseCreature) -> None:
     """The motion that fell is marked, getting up replaces it, and only its failure counts as a fall."""
     sequence = MotionSequence(made.place, [MotionTask("stand", {}, cast(Any, Stands))])
     watch = FallMonitor(sequence, made.place, gets_up=True)

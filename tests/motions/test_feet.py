@@ -83,7 +83,7 @@ def made_trajectory() -> Trajectory:
     )
 
 
-def test_slip_is_the_way_of_loaded_contacts_and_swings_do_not_count() -> None:
+def test_slip_is_the_path_of_loaded_contacts_without_swings() -> None:
     """3 mm over three steps; the shift of the sole is counted from where the foot was placed, so it is 2 mm; one
     landing."""
     assert foot_of_node(FEET)[FEET[0].sole[0]] == 0

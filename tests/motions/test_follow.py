@@ -57,7 +57,7 @@ def test_each_quantity_is_measured_in_its_unit_along_forward_left_up(place: Stan
     assert np.allclose(follow._measure(part, Quantity.ANGULAR_MOMENTUM, state), [spin[1], -spin[0], spin[2]])
 
 
-def test_a_position_key_asks_for_the_speed_of_its_curve(place: Stance) -> None:
+def test_a_position_key_requests_the_speed_of_its_curve(place: Stance) -> None:
     """On the curve, the target speed of the head is that of the curve; behind it, it is higher."""
     follow = Follow(place, [key(1.0, "head", Quantity.POSITION, (0.2, 0.0, 0.0))])
     (channel,) = follow.channels
@@ -101,7 +101,7 @@ def test_keys_of_the_whole_body_replace_its_own_balance_or_spin(place: Stance) -
     assert rate[2] > 0.0 and np.abs(rate[:2]).max() < 1e-6 * rate[2]
 
 
-def test_feet_are_numbered_anticlockwise_from_straight_ahead() -> None:
+def test_feet_are_ordered_counterclockwise_from_straight_ahead() -> None:
     """Forward is +y and left is -x. For a stool the order is front left, back left, back right, front right; for a
     figure left, right."""
     for mesh, corners in (
@@ -122,7 +122,7 @@ def test_feet_are_numbered_anticlockwise_from_straight_ahead() -> None:
         assert np.allclose(lift.target[:2], 0.0) and lift.target[2] > 0.0
 
 
-def test_a_part_that_the_body_does_not_have_is_refused_with_those_that_it_has(place: Stance) -> None:
+def test_an_unknown_part_is_refused_with_the_known_ones(place: Stance) -> None:
     """The only foot of a block is its base."""
     parts = Follow(place, [key(0.5, "foot", Quantity.POSITION, (0.0, 0.0, 0.1))]).parts
     assert np.array_equal(parts["foot"].nodes, parts["base"].nodes)
@@ -133,7 +133,7 @@ def test_a_part_that_the_body_does_not_have_is_refused_with_those_that_it_has(pl
         Follow(stood(figure()), [key(0.5, "foot", Quantity.POSITION, (0.0, 0.0, 0.1))])
 
 
-def test_missed_keys_are_told_and_reached_ones_are_not(place: Stance) -> None:
+def test_missed_keys_are_reported_and_reached_ones_are_not(place: Stance) -> None:
     keys = [
         key(0.1, "head", Quantity.POSITION, (0.1, 0.0, 0.0)),
         Key(0.2, "head", Quantity.POSITION, (0.2, 0.0, 0.0), where="k.json, key 2"),
@@ -158,7 +158,7 @@ def drifting(place: Stance, speed: float, time: float) -> BodyState:
     return BodyState(place.standing, np.tile(velocity, (len(place.standing), 1)), time)
 
 
-def test_a_trajectory_rests_once_the_body_is_slow_and_at_last_in_any_case(place: Stance) -> None:
+def test_a_trajectory_ends_when_the_body_is_slow_or_after_a_limit(place: Stance) -> None:
     """If the body becomes slow, the motion rests 0.3 sqrt(H / g) later; if it never does, the motion rests 9 sqrt(H /
     g) after the last key and reports it.
     """
@@ -174,7 +174,7 @@ def test_a_trajectory_rests_once_the_body_is_slow_and_at_last_in_any_case(place:
         assert len(follow.notes()) == (slow_from == np.inf)
 
 
-def test_places_are_held_after_their_last_key_and_speeds_are_not(place: Stance) -> None:
+def test_positions_are_held_after_their_last_key_and_velocities_are_not(place: Stance) -> None:
     """After the last key of a body velocity, the balance objectives apply again; a head position stays a target."""
     keys = [key(0.1, "body", Quantity.VELOCITY, (0.3, 0.0, 0.0)), key(0.2, "head", Quantity.POSITION, (0.1, 0.0, 0.0))]
     follow = Follow(place, keys)
@@ -194,7 +194,7 @@ def spun(place: Stance, degrees: float, time: float) -> BodyState:
 
 @pytest.mark.parametrize("part", ["body", "head"])
 @pytest.mark.parametrize("asked", [170.0, 180.0, 270.0, 360.0, -360.0])
-def test_a_turn_is_reached_the_way_round_that_was_asked(place: Stance, part: str, asked: float) -> None:
+def test_a_turn_is_measured_in_the_requested_direction(place: Stance, part: str, asked: float) -> None:
     """A complete turn has no error; one that lacks 10 degrees has an error of 10 degrees, and no turn has the error of
     the whole angle."""
     for share, miss in ((1.0, 0.0), (1.0 - 10.0 / abs(asked), 10.0), (0.0, abs(asked))):
@@ -206,7 +206,7 @@ def test_a_turn_is_reached_the_way_round_that_was_asked(place: Stance, part: str
 
 
 @pytest.mark.parametrize("behind", [0.0, 20.0, 190.0])
-def test_a_turn_over_half_is_steered_the_way_round_that_was_asked(place: Stance, behind: float) -> None:
+def test_a_turn_over_half_is_steered_in_the_requested_direction(place: Stance, behind: float) -> None:
     """Late in a turn by 350 degrees, the target rate is that of the curve plus a correction of the error, however
     large."""
     follow = Follow(place, [key(2.0, "body", Quantity.ORIENTATION, (0.0, 0.0, 350.0))])

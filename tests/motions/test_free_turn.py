@@ -16,7 +16,7 @@ def leaning(inertia: list[float], lean: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seconds", [0.2, 1.0, 2.0])
-def test_the_axis_of_a_symmetric_top_goes_round_its_angular_momentum(seconds: float) -> None:
+def test_a_symmetric_top_precesses_about_its_angular_momentum(seconds: float) -> None:
     """The rate is |L| / I with the moment I about a transverse axis (Landau and Lifshitz, Mechanics, section 33)."""
     axis = np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
     along, across = 0.5, 1.2
@@ -34,7 +34,7 @@ def test_about_a_principal_axis_a_body_does_not_wobble() -> None:
 
 
 @pytest.mark.parametrize("turn", [0.4, -1.6, 4.0])
-def test_a_body_off_its_axes_comes_to_the_turn_that_is_asked(turn: float) -> None:
+def test_a_tilted_body_reaches_the_requested_rotation(turn: float) -> None:
     """A spin about up alone would leave the body tilted by degrees; the spin found by root search ends upright."""
     inertia, upright, asked = leaning([0.5, 0.8, 0.3], 0.25), np.array([0.05, -0.08, 0.02]), np.array([0.0, 0.0, turn])
     goal = Rotation.from_rotvec(asked) * Rotation.from_rotvec(upright)

@@ -14,7 +14,7 @@ GAIT = Gait.create(4, 4, 0.03, LEGGED_TIMING, time_unit=0.32)
 
 
 @given(st.integers(2, 9))
-def test_every_foot_swings_once_in_a_round_and_none_beside_its_neighbour(count: int) -> None:
+def test_every_foot_swings_once_per_cycle_and_not_with_its_neighbour(count: int) -> None:
     """With more than three feet, several swing together, with four those on a diagonal. At least one foot always
     stands."""
     groups = feet_in_turn(count)
@@ -39,7 +39,7 @@ def test_footprints_follow_each_other_and_close(feet: int, paces: int) -> None:
 
 
 @given(st.integers(2, 7))
-def test_the_body_is_as_far_as_its_feet(feet: int) -> None:
+def test_the_progress_of_the_body_is_that_of_its_feet(feet: int) -> None:
     """Far from both ends, the progress in the middle of a swing is the mean over the groups of feet, averaged over
     before and after; it is uniform."""
     gait = Gait.create(feet, 40, 0.03, LEGGED_TIMING, time_unit=0.3)
@@ -70,7 +70,7 @@ def test_a_swinging_foot_leaves_and_lands_at_rest() -> None:
     assert heights[moving].min() > 0.3 * GAIT.lift
 
 
-def test_a_foot_is_steered_bit_by_bit_and_goes_ahead_only_when_it_is_up() -> None:
+def test_a_foot_is_steered_gradually_and_moves_only_when_lifted() -> None:
     """The steering weight is zero at the start of a swing and full before the foot moves far; the foot moves between
     the two given times."""
     steered = [GAIT.steering_progress(s) for s in (0.0, 0.1, 0.2, 0.3, 1.0)]

@@ -38,7 +38,7 @@ def lying(degrees: float, axis: np.ndarray = LEFT) -> BodyState:
 
 
 @pytest.mark.parametrize(("degrees", "axis"), [(90.0, LEFT), (-60.0, LEFT), (170.0, FORWARD)])
-def test_it_knows_how_it_lies(degrees: float, axis: np.ndarray) -> None:
+def test_tilt_of_a_lying_body(degrees: float, axis: np.ndarray) -> None:
     """The angle to upright, and the horizontal axis of the rotation back."""
     angle, about = GetUp(block().place)._tilt(lying(degrees, axis).positions)
     assert np.degrees(angle) == pytest.approx(abs(degrees), abs=1e-6)
@@ -47,7 +47,7 @@ def test_it_knows_how_it_lies(degrees: float, axis: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("degrees", [30.0, 60.0, 90.0, 120.0])
-def test_the_top_is_over_the_edges_that_it_rolls_over(degrees: float) -> None:
+def test_the_highest_point_is_over_the_edge_of_the_roll(degrees: float) -> None:
     """The centre of mass of a block is highest above an edge: half of its diagonal, for any edge."""
     get_up, state = GetUp(block().place), lying(degrees)
     arms = state.positions - get_up.body.centre_of_mass(state.positions)
@@ -60,7 +60,7 @@ def test_the_top_is_over_the_edges_that_it_rolls_over(degrees: float) -> None:
     assert top >= start - 1e-9
 
 
-def test_it_turns_as_a_whole_about_the_edge_of_its_base() -> None:
+def test_the_body_rotates_about_the_edge_of_its_base() -> None:
     """The targets of the centre of mass and of the spin are one rotation about the lower edge of the base. Without
     support behind that edge, they are those of the free fall back."""
     get_up, state = GetUp(block().place), lying(90.0)
@@ -80,13 +80,13 @@ def test_it_turns_as_a_whole_about_the_edge_of_its_base() -> None:
     assert np.linalg.solve(body.inertia(state.positions), spin.target)[1] == pytest.approx(falls, rel=0.01)
 
 
-def test_each_try_pushes_otherwise() -> None:
+def test_attempts_differ() -> None:
     """No failed attempt is repeated unchanged."""
     assert len(set(_ATTEMPTS)) == len(_ATTEMPTS) >= 3
     assert all(push > 0.0 and in_hand > 0.0 for push, in_hand in _ATTEMPTS)
 
 
-def test_a_body_that_is_caught_is_held_low() -> None:
+def test_a_body_that_was_caught_stands_low() -> None:
     """The target velocity of the centre of mass is downward in a crouched stand, zero in a straight one."""
     made = block()
     for crouch, down in ((1.0, False), (0.75, True)):
@@ -106,13 +106,13 @@ def test_a_body_that_stands_is_up() -> None:
     assert get_up.is_up and get_up.is_at_rest and get_up.tries == 0 and get_up.notes() == []
 
 
-def test_a_ball_lies_any_way_up() -> None:
+def test_a_ball_cannot_fall_over() -> None:
     ball = coarse_creature(ball_mesh(), forward=FORWARD, all_round=True)
     with pytest.raises(UserError, match="get up: a ball cannot fall over; walk or jump instead"):
         GetUp(ball.place)
 
 
-def test_it_gives_up_after_its_tries() -> None:
+def test_getting_up_fails_after_all_attempts() -> None:
     """The body lies on its side and never moves."""
     get_up, state = GetUp(block().place), lying(90.0)
     for step in range(6000):
@@ -145,7 +145,7 @@ def risen(degrees: float, sideways: bool) -> tuple[FallMonitor, list[StepReport]
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("degrees", "sideways"), [(90.0, False), (80.0, False), (90.0, True)])
-def test_a_block_gets_up_and_goes_on(degrees: float, sideways: bool) -> None:
+def test_a_block_gets_up_and_continues(degrees: float, sideways: bool) -> None:
     """The motion that fell is finished; the next one starts from the new stance."""
     watch, _, _, end = risen(degrees, sideways)
     assert watch.fallen is None and watch.is_finished
@@ -160,7 +160,7 @@ def test_a_block_gets_up_and_goes_on(degrees: float, sideways: bool) -> None:
 
 
 @pytest.mark.slow
-def test_it_gets_up_calmly() -> None:
+def test_getting_up_takes_little_work() -> None:
     """An attempt takes some m g H of muscle work (at most 14 of those measured)."""
     watch, _, _, _ = risen(90.0, False)
     _, entry, last = watch.sequence.done

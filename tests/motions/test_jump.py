@@ -18,7 +18,7 @@ from tests.support.meshes import coarse_stool
 from tests.support.stances import DT, block_place, moved
 
 
-def test_a_landing_frame_holds_the_landed_body(place: Stance) -> None:
+def test_the_landing_frame_is_that_of_the_landed_body(place: Stance) -> None:
     """From take-off on, a body that stands at the target, rotated, has the local coordinates of the start."""
     target = JumpTarget(0.5, 0.3, 0.1)
     jump = Jump(place, target, facing=TurnHeading(place, 0.8))
@@ -33,9 +33,7 @@ def test_a_landing_frame_holds_the_landed_body(place: Stance) -> None:
 
 
 @pytest.mark.parametrize(("distance", "lean"), [(0.0, 0.0), (0.3, 0.045), (2.0, 0.07)])
-def test_the_weight_goes_ahead_with_the_distance_and_stays_well_behind_the_toes(
-    place: Stance, distance: float, lean: float
-) -> None:
+def test_the_lean_follows_the_distance_up_to_a_limit(place: Stance, distance: float, lean: float) -> None:
     """0.15 of the distance, at most 0.35 of the 0.2 metres to the front of the feet."""
     assert Jump(place, JumpTarget(distance, 0.3)).plan.lean == pytest.approx(lean)
 
@@ -54,7 +52,7 @@ def test_soles_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, soles: int
         assert objective.target[0] > 0.05 > abs(objective.target[1])
 
 
-def test_a_landing_that_may_fail_is_balanced_in_full() -> None:
+def test_an_unstable_landing_has_full_balance_weights() -> None:
     """Weights are low while the capture point is near the centre of the feet and full once it is at their edge; they
     are almost zero in the first step, in which the ground stops the fall."""
     place = block_place()
@@ -69,7 +67,7 @@ def test_a_landing_that_may_fail_is_balanced_in_full() -> None:
     assert 0.0 < weights[2] < 0.05 * jump.weights.spin
 
 
-def test_what_has_taken_off_takes_up_its_pose_gently() -> None:
+def test_the_pose_in_the_air_is_blended_in() -> None:
     """The weight is almost zero in the first step in the air and full 0.6 sqrt(H / g) later."""
     place = block_place()
     jump = Jump(place, JumpTarget(0.5, 0.3))
@@ -85,7 +83,7 @@ def test_what_has_taken_off_takes_up_its_pose_gently() -> None:
 
 
 @pytest.mark.parametrize(("com_speed", "flat"), [(1.0, True), (-1.0, False)])
-def test_what_comes_up_to_its_feet_turns_until_they_are_flat(com_speed: float, flat: bool) -> None:
+def test_a_body_moving_towards_its_feet_keeps_its_soles_flat(com_speed: float, flat: bool) -> None:
     """A body sheared backwards over a flat sole has a mean rotation of half the shear. While it moves towards its feet,
     no rotation is requested, because its sole would tilt up; while it falls back from them, it rotates upright."""
     place = block_place()
@@ -101,7 +99,7 @@ def test_what_comes_up_to_its_feet_turns_until_they_are_flat(com_speed: float, f
 
 
 @pytest.mark.parametrize("toes", [0.05, 0.2])
-def test_feet_come_down_so_far_ahead_that_the_body_stops_over_them(toes: float) -> None:
+def test_feet_are_placed_ahead_so_that_the_body_stops(toes: float) -> None:
     """If the target is too near to stop, the capture point is ahead of the middle of the feet by at most its fraction
     of their forward reach, however far they reach behind."""
     place = block_place()

@@ -15,7 +15,7 @@ GRAVITY, STEP = 9.81, 1 / 60
     "target", [JumpTarget(0.5, 0.3), JumpTarget(0.0, 0.4), JumpTarget(0.9, 0.35, 0.15), JumpTarget(0.5, 0.2)]
 )
 @pytest.mark.parametrize("height", [1.0, 1.7])
-def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTarget, height: float) -> None:
+def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTarget, height: float) -> None:
     """Thrust and flight are implicit Euler steps, each with its end velocity; the landing is a linear inverted
     pendulum.
     """
@@ -99,7 +99,7 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
 
 @pytest.mark.parametrize("landing_time", [0.02, 0.11, 0.3])
 @pytest.mark.parametrize("fall", [0.5, 2.0])
-def test_feet_stop_a_body_whose_fall_takes_a_while(landing_time: float, fall: float) -> None:
+def test_feet_stop_a_body_with_a_gradual_landing(landing_time: float, fall: float) -> None:
     """A pendulum under the load that stops the fall at a constant rate, then under its weight, comes to rest over its
     feet. The feet are further ahead than for a fall that stops at once.
     """
@@ -118,7 +118,7 @@ def test_feet_stop_a_body_whose_fall_takes_a_while(landing_time: float, fall: fl
 
 
 @pytest.mark.parametrize("distance", [0.6, 0.75, 0.8, 1.2])
-def test_a_thrust_lasts_until_friction_has_given_the_speed_ahead(distance: float) -> None:
+def test_a_thrust_is_long_enough_for_friction_to_give_the_speed(distance: float) -> None:
     """The friction impulse is at most mu times the normal impulse of weight and upward acceleration. The crouch is
     deeper by at most 0.02 H for that; if friction is sufficient anyway, it is unchanged.
     """
@@ -172,7 +172,7 @@ def test_a_jump_on_the_spot_needs_no_friction() -> None:
     assert plans[0] == plans[1] == plans[2]
 
 
-def test_a_given_lean_is_kept() -> None:
+def test_a_given_lean_is_used() -> None:
     plan = plan_jump(
         JumpTarget(0.5, 0.3), height=1.0, com_height=0.5, support_ahead=0.2, gravity=GRAVITY, step=STEP, lean=0.09
     )
@@ -180,7 +180,7 @@ def test_a_given_lean_is_kept() -> None:
 
 
 @pytest.mark.parametrize("step", [1 / 30, 1 / 60, 1 / 90])
-def test_a_crouch_goes_over_into_its_thrust_in_whole_steps(step: float) -> None:
+def test_a_crouch_ends_after_a_whole_number_of_steps(step: float) -> None:
     """Otherwise the target of its last step would be for less than a whole step: a jolt against the motion."""
     plan = plan_jump(
         JumpTarget(0.5, 0.2), height=1.0, com_height=0.45, support_ahead=0.2, gravity=GRAVITY, step=step, lean=0.1

@@ -21,7 +21,7 @@ def written(folder: Path, name: str, content: object) -> Path:
     return path
 
 
-def test_json_and_csv_say_the_same(tmp_path: Path) -> None:
+def test_json_and_csv_are_equivalent(tmp_path: Path) -> None:
     entries = [GOOD, {"time": 1.0, "part": "body", "quantity": "orientation", "value": [0, 0, 30], "weight": 2}]
     from_json = read_keyframes(written(tmp_path, "k.json", entries))
     from_csv = read_keyframes(
@@ -57,7 +57,7 @@ def test_feet_have_numbers(tmp_path: Path) -> None:
     assert [k.part for k in read_keyframes(path)] == ["foot 12", "foot"]
 
 
-def test_a_weight_holds_on_the_way_to_its_key(tmp_path: Path) -> None:
+def test_a_weight_applies_until_its_key(tmp_path: Path) -> None:
     entries = [{**GOOD, "time": t, "weight": w} for t, w in ((0.5, 1), (1.0, 9), (2.0, 4))]
     (channel,) = channels(read_keyframes(written(tmp_path, "k.json", entries)))
     assert [channel.weight_at(t) for t in (0.0, 0.5, 0.51, 1.0, 1.9, 2.0, 7.0)] == [1, 1, 9, 9, 4, 4, 4]

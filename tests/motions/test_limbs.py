@@ -68,7 +68,7 @@ BODIES = {
 
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("tilt", [0.0, 1.0, -1.0])
-def test_bodies_stand_on_what_they_have(name: str, tilt: float) -> None:
+def test_support_of_bodies(name: str, tilt: float) -> None:
     """The support is found on the true plane and on one that is off by a degree."""
     mesh, count, base = BODIES[name]
     normal = Rotation.from_euler("y", tilt, degrees=True).as_matrix()[:, 2]
@@ -94,7 +94,7 @@ def test_a_table_with_one_short_leg_has_four_feet() -> None:
     assert not any(foot.is_joined for foot in feet)
 
 
-def test_what_hangs_is_no_foot() -> None:
+def test_a_hanging_limb_is_no_foot() -> None:
     """A fifth leg ends a quarter of the height above the ground."""
     mesh = mesh_of(lambda p: short_legged(p) | ((np.abs(p[:, :2]).max(axis=1) < 0.1) & (p[:, 2] > 0.25)))
     assert feet_of(mesh) == (4, SupportKind.FEET)
@@ -106,7 +106,7 @@ def melted(thickness: float) -> TetMesh:
     return mesh_of(lambda p: four(p) | ((np.abs(p[:, :2]).max(axis=1) < 0.4) & (p[:, 2] < thickness)))
 
 
-def test_legs_that_melt_together_at_the_base_are_told_apart() -> None:
+def test_legs_joined_at_the_base_are_separated() -> None:
     """Each sole is a quarter of the slab, and each foot is marked as joined."""
     mesh = melted(0.05)
     feet = find_feet(mesh, mesh.nodes[:, 2], 1.0)
@@ -124,7 +124,7 @@ def test_legs_on_a_thick_slab_stand_on_one_base() -> None:
 
 
 @pytest.mark.parametrize(("length", "count"), [(1.4, 2), (0.8, 4)])
-def test_legs_on_runners_stand_on_these(length: float, count: int) -> None:
+def test_legs_on_runners_stand_on_the_runners(length: float, count: int) -> None:
     """Armchairs have such runners; a connection of legs as close as those of a chair may be a flaw of the capture. Both
     the mesh and the solid that it was made from are tested."""
 
@@ -142,7 +142,7 @@ def test_legs_on_runners_stand_on_these(length: float, count: int) -> None:
     assert find_limbs(Sections.of_solid(solid, mesh), mesh.nodes).count == count
 
 
-def test_a_tail_held_up_from_the_base_carries_nothing() -> None:
+def test_a_raised_tail_carries_nothing() -> None:
     """It rises from the same slab as the trunk."""
     mesh = mesh_of(
         lambda p: (
@@ -154,7 +154,7 @@ def test_a_tail_held_up_from_the_base_carries_nothing() -> None:
     assert feet_of(mesh) == (1, SupportKind.SINGLE_BASE)
 
 
-def test_gaps_finer_than_the_cage_are_seen_in_the_solid() -> None:
+def test_gaps_finer_than_the_cage_are_found_in_the_solid() -> None:
     """Two legs are 0.06 apart in a cage without a gap: the lattice of the capture resolves the gap, and the feet are
     joined."""
     spacing = 1.0 / 64.0
@@ -172,7 +172,7 @@ def test_gaps_finer_than_the_cage_are_seen_in_the_solid() -> None:
     assert sides[0] < -0.1 and sides[1] > 0.1
 
 
-def test_feet_are_numbered_anticlockwise_from_straight_ahead() -> None:
+def test_feet_are_ordered_counterclockwise_from_straight_ahead() -> None:
     """A foot ten degrees to the right of straight ahead is the first, one twenty degrees to the right is the last."""
 
     def at(*degrees: float) -> np.ndarray:

@@ -14,7 +14,7 @@ from egs_warp.motions.pendulum import PendulumPlan, drift, nearest_in_hull
 RATE = 4.4
 
 
-def test_a_plan_is_a_motion_of_the_pendulum_that_ends_over_its_pressure() -> None:
+def test_a_plan_solves_the_pendulum_and_ends_over_the_pressure() -> None:
     """c'' = w^2 (c - p), starting with the planned divergent component, follows the plan and does not diverge, although
     p jumps."""
     step = 0.05
@@ -31,7 +31,7 @@ def test_a_plan_is_a_motion_of_the_pendulum_that_ends_over_its_pressure() -> Non
     assert state[:2] == pytest.approx([0.3, 0.1], abs=2e-3)
 
 
-def test_a_plan_is_told_between_its_steps_and_stays_at_its_end() -> None:
+def test_a_plan_is_interpolated_and_constant_after_its_end() -> None:
     plan = PendulumPlan.from_pressure(np.array([[0.0, 0.0], [1.0, 0.0]]), 0.1, RATE)
     pressure, divergent = plan.at(0.05)
     assert pressure == pytest.approx([0.0, 0.0])
@@ -39,7 +39,7 @@ def test_a_plan_is_told_between_its_steps_and_stays_at_its_end() -> None:
     assert plan.at(9.0)[0] == pytest.approx([1.0, 0.0]) and plan.at(9.0)[1] == pytest.approx([1.0, 0.0])
 
 
-def test_what_is_off_grows_unless_it_is_pushed_against() -> None:
+def test_an_error_of_the_divergent_component_grows() -> None:
     """The error solves x' = w (x - p) for a time t, with an offset p of the centre of pressure."""
     off, push, time = np.array([0.01, -0.02]), np.array([0.03, 0.01]), 0.4
     solved = solve_ivp(lambda _, x: RATE * (x - push), (0.0, time), off, rtol=1e-11, atol=1e-13).y[:, -1]

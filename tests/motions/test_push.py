@@ -68,7 +68,7 @@ def test_steps_share_out_all_of_a_push(push: Push, dt: float) -> None:
         assert sorted(shares)[-2:] == [0.0, 1.0]
 
 
-def test_a_push_has_its_momentum_and_its_arm(made: CoarseCreature) -> None:
+def test_a_push_has_its_momentum_and_its_lever_arm(made: CoarseCreature) -> None:
     """The unit m sqrt(g H) is the whole body at its unit of speed; a push at the top rotates the body, a push of all
     nodes does not."""
     place, body = made.place, made.place.body
@@ -84,7 +84,7 @@ def test_a_push_has_its_momentum_and_its_arm(made: CoarseCreature) -> None:
     assert PushKicks(place, [Push(0.5, LEFT)])(0.0, DT) is None
 
 
-def test_what_is_hit_is_around_the_height(made: CoarseCreature) -> None:
+def test_a_push_acts_near_its_height(made: CoarseCreature) -> None:
     """Nodes within a quarter of a body height are pushed; if a coarse cage has none there, the nearest ones are."""
     heights = made.place.ground.local(made.place.standing)[:, 2] / made.place.body.height
     for height in (0.0, 0.5, 1.0):
@@ -98,7 +98,7 @@ def test_what_is_hit_is_around_the_height(made: CoarseCreature) -> None:
     assert sizes[below].min() > sizes[above].max() >= 0.0
 
 
-def test_the_books_hold_what_was_given(pushed: Trajectory) -> None:
+def test_the_balances_include_the_pushes(pushed: Trajectory) -> None:
     """Both momenta and the energy of every step balance as without pushes; they do not if one push is missing or 1 %
     stronger."""
     assert len(pushed.kick_step) == 1 + 6
@@ -112,7 +112,7 @@ def test_the_books_hold_what_was_given(pushed: Trajectory) -> None:
         assert found.momentum_residual > 1e-4 and found.angular_momentum_residual > 1e-5
 
 
-def test_who_is_pushed_goes_along_and_keeps_its_feet(made: CoarseCreature, pushed: Trajectory) -> None:
+def test_a_pushed_body_moves_with_the_push_and_keeps_its_feet(made: CoarseCreature, pushed: Trajectory) -> None:
     """A tenth of a second after the first push its centre of mass has moved to the left; in the end the body is upright
     and at rest."""
     place = made.place
@@ -125,7 +125,7 @@ def test_who_is_pushed_goes_along_and_keeps_its_feet(made: CoarseCreature, pushe
     assert np.linalg.norm(pushed.node_mass @ pushed.velocities[-1]) < 0.05 * place.body.mass * place.body.speed_unit
 
 
-def test_a_hard_push_throws_it_over(made: CoarseCreature) -> None:
+def test_a_hard_push_topples_the_body(made: CoarseCreature) -> None:
     """Its energy is several times what lifts the centre of mass over the edge, so that no controller can keep
     balance."""
     simulation, fallen = stood(made, "0.05 1 left 0.9", frames=90)
@@ -139,7 +139,7 @@ def test_a_hard_push_throws_it_over(made: CoarseCreature) -> None:
     assert reached.sole_shift == pytest.approx(shift) and reached.lean > 0.2
 
 
-def test_a_pushed_run_goes_on_to_the_same_bits(pushed: Trajectory, tmp_path: Path) -> None:
+def test_a_pushed_run_continues_to_the_same_bits(pushed: Trajectory, tmp_path: Path) -> None:
     """The run is interrupted during the gust."""
     parts = tmp_path / "parts"
     stood(block(), "0.1 0.06 left 0.8, 0.2-0.3 0.05 back", frames=15, parts=parts)
@@ -149,7 +149,7 @@ def test_a_pushed_run_goes_on_to_the_same_bits(pushed: Trajectory, tmp_path: Pat
         np.testing.assert_array_equal(getattr(again.trajectory, name), getattr(whole.trajectory, name))
 
 
-def test_what_the_run_was_over_before_is_told() -> None:
+def test_pushes_after_the_end_of_the_run_are_reported() -> None:
     pushes = read_pushes("0.5 0.1 left, 1-3 0.1 back, 2 0.1 left")
     assert [push.unapplied_note(2.0) for push in pushes] == [
         None,
@@ -204,7 +204,7 @@ def test_numbers_that_no_push_has_are_refused(numbers: dict[str, Any], said: str
         ("0.5 0.1 left 1.5", "height 1.5: give body heights from 0 to 1"),
     ],
 )
-def test_a_bad_push_is_told_in_one_line(line: str, said: str) -> None:
+def test_a_bad_push_is_a_one_line_error(line: str, said: str) -> None:
     with pytest.raises(UserError) as error:
         read_pushes(line)
     assert said in str(error.value) and "\n" not in str(error.value)

@@ -68,7 +68,7 @@ def rolled() -> Rolled:
     return Rolled(roll, recorder.trajectory(), reports, state, watch.fallen)
 
 
-def test_a_ball_is_told_from_what_stands() -> None:
+def test_a_ball_is_recognised() -> None:
     place = ball().place
     assert place.base() is SupportKind.ROUND_BASE
     assert isinstance(move_along(place, straight_route(1.0), 0.1), Roll) and isinstance(
@@ -76,7 +76,7 @@ def test_a_ball_is_told_from_what_stands() -> None:
     )
 
 
-def test_a_ball_that_has_turned_over_is_still_one() -> None:
+def test_a_ball_that_has_rolled_over_is_still_a_ball() -> None:
     """The kind of support follows from the current shape, not from the side on which the ball stood before."""
     made = ball()
     turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
@@ -99,7 +99,7 @@ def _report(made: CoarseCreature) -> StepReport:
     return reports[-1]
 
 
-def test_a_step_in_its_way_is_refused() -> None:
+def test_a_step_across_the_path_is_refused() -> None:
     place = ball().place
     wall = (step(Plane(UP, 0.0), 0.5 * FORWARD, FORWARD, 0.2),)
     blocked = Stance(place.body, place.ground, place.standing, place.contact_points, DT, wall)
@@ -108,7 +108,7 @@ def test_a_step_in_its_way_is_refused() -> None:
 
 
 @pytest.mark.slow
-def test_a_ball_rolls_to_its_point_without_slipping() -> None:
+def test_a_ball_rolls_to_its_target_without_slipping() -> None:
     """It ends within 0.03 of the target, has rotated by distance over radius, and does not count as fallen."""
     done = rolled()
     local = done.roll.ground.local(done.end.positions)

@@ -32,7 +32,7 @@ def test_turns_on_the_spot_in_even_paces(angle: float) -> None:
 
 
 @given(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
-def test_a_point_is_reached_however_it_lies(ahead: float, left: float) -> None:
+def test_a_point_is_reached_in_any_direction(ahead: float, left: float) -> None:
     """The route ends at the point, moves in the direction of the heading except in the last step, and no step exceeds
     the limits of length and turn, which share one budget."""
     places = path_route(np.array([[ahead, left]]))(PACE)
@@ -55,7 +55,7 @@ def test_a_path_is_followed_past_its_points() -> None:
     assert np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1).sum() < 1.55
 
 
-def test_a_way_of_too_many_paces_is_refused() -> None:
+def test_a_path_of_too_many_steps_is_refused() -> None:
     with pytest.raises(UserError, match="walk: the path takes more than 400 steps; choose a shorter one"):
         path_route(np.array([[9.0, 0.0]]))(StepLimits(0.01, 0.25))
 

@@ -52,7 +52,7 @@ def test_a_run_is_the_quickest_walk_by_the_longest_paces(place: Stance) -> None:
     )
 
 
-def test_what_takes_no_numbers_says_so() -> None:
+def test_motions_without_parameters_reject_numbers() -> None:
     with pytest.raises(UserError, match="'2' is one value too many; get up takes no numbers"):
         motion("get up 2")
 
@@ -68,7 +68,7 @@ def test_speeds_come_from_a_file_or_from_commands(place: Stance, tmp_path: Path)
         motion("drive")
 
 
-def test_ways_are_asked_for_in_words(tmp_path: Path) -> None:
+def test_motions_along_paths_are_parsed(tmp_path: Path) -> None:
     """A comma between two numbers does not end a motion; a path is read from a file; a negative distance is
     backwards."""
     to, back, turned, along = motion("walk to 1.5,-0.5, walk -1 speed=1.2,turn -90, walk along a.csv 0.05").requests

@@ -24,7 +24,7 @@ from tests.support.stances import DT, moved
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.7, -2.5, np.pi])
-def test_a_place_follows_the_feet(place: Stance, angle: float) -> None:
+def test_a_stance_follows_the_feet(place: Stance, angle: float) -> None:
     """After a rotation and a translation, also to another level, the stance has the same shape, and forward rotates
     with it."""
     shift = np.array([0.4, -1.2, 0.25])
@@ -38,14 +38,14 @@ def test_a_place_follows_the_feet(place: Stance, angle: float) -> None:
     assert np.ptp(feet[:, 2]) == pytest.approx(np.ptp(place.standing[:, 2]))
 
 
-def test_facing_turns_the_way_and_not_the_body(place: Stance) -> None:
+def test_facing_rotates_the_frame_and_not_the_body(place: Stance) -> None:
     other = place.with_forward(np.array([0.0, 2.0, 5.0]))
     assert np.allclose(other.ground.axes, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     assert other.standing is place.standing
 
 
 @pytest.mark.parametrize(("slope", "rise", "height"), [(0.1, 0.05, 0.2), (-0.1, -0.05, 0.2), (0.4, 0.2, 0.3)])
-def test_a_jump_is_to_land_on_what_is_ahead(place: Stance, slope: float, rise: float, height: float) -> None:
+def test_a_jump_lands_on_the_ground_ahead(place: Stance, slope: float, rise: float, height: float) -> None:
     """Half a metre up or down a slope; the apex clears the higher landing surface by at least half of the requested
     0.2."""
     normal = np.array([-slope, 0.0, 1.0]) / np.hypot(1.0, slope)
@@ -54,7 +54,7 @@ def test_a_jump_is_to_land_on_what_is_ahead(place: Stance, slope: float, rise: f
     assert place.landing(JumpTarget(0.5, 0.2)) == JumpTarget(0.5, 0.2)
 
 
-def test_a_jump_is_level_before_a_wall_and_over_an_edge(place: Stance) -> None:
+def test_a_jump_is_level_before_a_wall_over_an_edge_and_under_a_lintel(place: Stance) -> None:
     """In each case the requested target is unchanged."""
     ground, asked = Solid((Plane(np.array([0.0, 0.0, 1.0]), 0.0),)), JumpTarget(0.5, 0.2)
     block = (Plane(np.array([0.0, 0.0, 1.0]), -2.5), Plane(np.array([-1.0, 0.0, 0.0]), 0.3))
@@ -65,7 +65,7 @@ def test_a_jump_is_level_before_a_wall_and_over_an_edge(place: Stance) -> None:
 
 
 @pytest.mark.parametrize("name", ["jump", "twist"])
-def test_motions_jump_onto_what_is_ahead(place: Stance, name: str) -> None:
+def test_motions_jump_onto_the_solid_ahead(place: Stance, name: str) -> None:
     step = Solid((Plane(np.array([0.0, 0.0, 1.0]), -0.1), Plane(np.array([-1.0, 0.0, 0.0]), 0.3)))
     ground = Solid((Plane(np.array([0.0, 0.0, 1.0]), 0.0),))
     target, stepped = JumpTarget(0.5, 0.2), replace(place, solids=(ground, step))
@@ -104,7 +104,7 @@ class Waits:
         return []
 
 
-def test_motions_follow_each_other_from_where_the_body_is(place: Stance) -> None:
+def test_each_motion_starts_from_the_current_stance(place: Stance) -> None:
     sequence = MotionSequence(place, [MotionTask("a", {}, Waits), MotionTask("b", {}, Waits)])
     times = [0.0]
     for k in range(8):
@@ -119,7 +119,7 @@ def test_motions_follow_each_other_from_where_the_body_is(place: Stance) -> None
     assert sequence.spans(np.array(times)) == [(0, 3), (3, 8)]
 
 
-def test_what_the_last_frame_cut_off_is_told(place: Stance) -> None:
+def test_a_motion_cut_off_by_the_last_frame_is_reported(place: Stance) -> None:
     sequence = MotionSequence(
         place, [MotionTask("a", {}, Waits), MotionTask("b", {}, Waits), MotionTask("c", {}, Waits)]
     )

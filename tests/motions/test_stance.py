@@ -32,7 +32,7 @@ def swing(place: Stance, state: BodyState, seen: Measurement, spin: np.ndarray) 
 @pytest.mark.parametrize("wanted", [(0.005, -0.003), (0.3, 0.01), (-0.1, -0.4)])
 @pytest.mark.parametrize("turning", [(0.0, 0.0, 0.3), (0.4, -2.0, 0.0)])
 @pytest.mark.parametrize("up", [0.0, 0.1, -0.08])
-def test_the_nearest_end_of_a_step_that_does_not_tip(
+def test_balance_targets_are_the_nearest_that_do_not_tip(
     place: Stance, wanted: tuple[float, float], turning: tuple[float, float, float], up: float
 ) -> None:
     """The change of m h (v + swing) is the load times the distance of the centre of pressure from the centre of mass,
@@ -66,7 +66,7 @@ def test_the_nearest_end_of_a_step_that_does_not_tip(
         assert np.sqrt(got) >= np.sqrt(missed[stands].min()) - 5e-3
 
 
-def test_what_feet_can_give_is_asked_for_as_it_is_and_a_falling_body_may_be_pushed_either_way(place: Stance) -> None:
+def test_feasible_targets_are_unchanged_and_a_falling_body_may_move_in_both_directions(place: Stance) -> None:
     pose, _, seen = stood(place, 1e3, (0.0, 0.0, 0.0))
     asked, spin = np.array([0.01, -0.005, 0.02]), np.array([0.01, 0.02, 0.5])
     velocity, turned = pose.balance_targets(seen, asked, spin, DT)
@@ -78,7 +78,7 @@ def test_what_feet_can_give_is_asked_for_as_it_is_and_a_falling_body_may_be_push
 
 
 @pytest.mark.parametrize("up", [0.0, 0.25])
-def test_no_more_is_asked_than_friction_gives(place: Stance, up: float) -> None:
+def test_requests_are_limited_by_friction(place: Stance, up: float) -> None:
     """Coulomb: a request keeps its direction and is limited to 0.95 of the friction; a smaller one is unchanged."""
     pose, _, seen = stood(place, 0.05, (0.0, 0.0, 0.0))
     wanted = np.array([0.009, -0.012])
@@ -107,7 +107,7 @@ def test_on_a_slope_friction_gives_less_uphill(way: tuple[float, float]) -> None
 
 
 @pytest.mark.parametrize("spin", [(0.0, -2.0, 0.0), (1.5, 1.0, 0.2)])
-def test_what_friction_denies_the_speed_the_spin_takes(place: Stance, spin: tuple[float, float, float]) -> None:
+def test_spin_replaces_velocity_where_friction_is_low(place: Stance, spin: tuple[float, float, float]) -> None:
     """On slippery ground, too, the requested centre of pressure is within the footprint."""
     pose, state, seen = stood(place, 0.3, (0.05, -0.03, 0.1))
     velocity, turned = pose.balance_targets(seen, np.array([0.3, 0.01, 0.0]), np.array(spin), DT)
@@ -118,7 +118,7 @@ def test_what_friction_denies_the_speed_the_spin_takes(place: Stance, spin: tupl
     assert np.abs(pressure - middle).max() <= SUPPORT_MARGIN * EDGE + 1e-9
 
 
-def test_a_body_that_turns_forward_is_caught_further_ahead(place: Stance) -> None:
+def test_a_body_that_rotates_forward_is_caught_further_ahead(place: Stance) -> None:
     """The capture point follows from the angular momentum about the feet: for a body at rest, the acceleration over its
     position is zero, and spin counts as the velocity with the same momentum."""
     pose, state, seen = stood(place, 1.0, (0.0, 0.0, 0.0))
@@ -134,9 +134,7 @@ def test_a_body_that_turns_forward_is_caught_further_ahead(place: Stance) -> Non
 
 
 @pytest.mark.parametrize(("ahead", "urgency"), [(0.0, 0.0), (0.05, 0.25), (-0.1, 0.5), (0.3, 1.5)])
-def test_balance_is_urgent_by_how_near_the_capture_point_is_to_the_edge(
-    place: Stance, ahead: float, urgency: float
-) -> None:
+def test_the_capture_margin_is_relative_to_the_edge(place: Stance, ahead: float, urgency: float) -> None:
     """The base extends by 0.2 metres in both directions; only the speed varies."""
     pose = BalanceController(place.body, place.ground, place.standing, place.contact_points, place.friction)
     height = place.body.centre_of_mass(place.standing)[2]
@@ -145,7 +143,7 @@ def test_balance_is_urgent_by_how_near_the_capture_point_is_to_the_edge(
     assert pose.capture_margin(seen) == pytest.approx(urgency, abs=0.02)
 
 
-def test_a_body_that_leans_turns_as_far_as_strains_it_least(place: Stance) -> None:
+def test_a_leaning_body_rotates_as_in_its_static_bend(place: Stance) -> None:
     """The static bend under a horizontal load is solved densely with the sole clamped: the pose is the nearest affine
     map by mass, by least squares."""
     pose, _, seen = stood(place, 0.8, (0.0, 0.0, 0.0))

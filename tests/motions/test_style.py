@@ -112,7 +112,7 @@ def planned(style: Style) -> JumpPlan:
     )
 
 
-def test_a_dance_knows_how_long_the_crouches_of_its_style_are(place: Stance) -> None:
+def test_a_dance_uses_the_crouch_time_of_its_style(place: Stance) -> None:
     usual, quick = (Dance(replace(place, style=style), (1.0, 1.5)) for style in (Style(), Style(timing=0.5)))
     assert quick.expected_time == usual.expected_time
     with pytest.raises(UserError, match="before the first jump it takes"):
@@ -120,7 +120,7 @@ def test_a_dance_knows_how_long_the_crouches_of_its_style_are(place: Stance) -> 
     assert Dance(replace(place, style=Style(timing=0.5)), (0.35, 0.8)).plan_record().beats == 2.0
 
 
-def test_a_jump_of_a_script_may_have_a_style_of_its_own(place: Stance, tmp_path: Path) -> None:
+def test_a_jump_of_a_script_may_have_its_own_style(place: Stance, tmp_path: Path) -> None:
     """It takes precedence over the style of the run, which the other jumps have."""
     (tmp_path / "s.json").write_text(
         '[{"motion": "jump", "repeat": 2, "style": "squash=2"}, {"motion": "jump"},'
@@ -156,7 +156,7 @@ def test_presets_can_be_changed() -> None:
         ("timing=nan", "style: timing nan: give a number of times the usual from 0.5 to 2"),
     ],
 )
-def test_a_bad_style_is_told_in_one_line(text: str, said: str) -> None:
+def test_a_bad_style_is_a_one_line_error(text: str, said: str) -> None:
     with pytest.raises(UserError) as error:
         motion("jump").style(text)
     assert said in str(error.value) and "\n" not in str(error.value)

@@ -22,7 +22,7 @@ def land(jump: Jump, state: BodyState) -> None:
     jump.controller = jump._landing
 
 
-def test_a_turn_that_falls_short_is_made_up_where_it_began(place: Stance) -> None:
+def test_a_turn_that_falls_short_is_completed_at_its_start(place: Stance) -> None:
     """After a jump that is 25 degrees short and 0.1 to the side, the next jump turns by the rest and returns; 5 degrees
     are tolerated."""
     turn = Turn(place, JumpTarget(0.0, 0.2), np.radians(60.0))
@@ -59,7 +59,7 @@ def test_a_slippery_floor_takes_more_jumps(place: Stance) -> None:
 
 
 @pytest.mark.parametrize("points", ["disc", "rim"])
-def test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground(place: Stance, points: str) -> None:
+def test_the_largest_turn_is_that_of_a_disc_on_rough_ground(place: Stance, points: str) -> None:
     """The largest turn of a disc (docs/concepts/motions.md).
 
     A disc pressed down by N resists rotation with 2/3 mu N R; the impulse during the thrust rotates the flying body.

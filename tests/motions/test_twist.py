@@ -30,7 +30,7 @@ def inertia_about_up(place: Stance, positions: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.0 * np.pi])
-def test_a_twist_asks_friction_for_the_spin_that_is_left(turn: float) -> None:
+def test_a_twist_requests_the_remaining_spin_from_friction(turn: float) -> None:
     """In the last step of the thrust, the target is the spin that completes the remaining turn of the standing body in
     flight, whatever its present shape, with a reserve.
 
@@ -60,7 +60,7 @@ def test_a_twist_asks_friction_for_the_spin_that_is_left(turn: float) -> None:
     assert jump.facing.heading == pytest.approx(turn)
 
 
-def test_a_twist_gathers_its_spin_as_the_speed_up_is_gathered(place: Stance) -> None:
+def test_a_twist_spins_up_with_the_upward_speed(place: Stance) -> None:
     """The friction follows the load: for a body at rest, the target is the whole spin times the ratio of the step to
     the thrust; for a body that rises at half the speed, twice that."""
     shares = []
@@ -78,7 +78,7 @@ def test_a_twist_gathers_its_spin_as_the_speed_up_is_gathered(place: Stance) -> 
     assert shares[1] == pytest.approx(2.0 * shares[0], rel=5e-3)
 
 
-def test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn(place: Stance) -> None:
+def test_in_the_air_the_width_is_adjusted_to_the_turn(place: Stance) -> None:
     """Angular momentum L is conserved: the inertia I (arms in or out) that turns by the remaining angle in the
     remaining time is L t / angle. The target shape is approached at a constant rate; at the spin that fits the standing
     shape, the target is zero."""

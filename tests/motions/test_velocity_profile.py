@@ -38,7 +38,7 @@ def test_velocity_and_acceleration_are_the_slopes_of_place_and_velocity() -> Non
         assert (after.velocity - before.velocity) / (2.0 * step) == pytest.approx(at.acceleration, abs=1e-5)
 
 
-def test_a_right_angle_is_taken_from_rest_and_a_straight_way_at_full_speed() -> None:
+def test_a_right_angle_is_passed_at_rest_and_a_straight_path_at_full_speed() -> None:
     table = VelocityProfile.from_path(CORNER, speed=SPEED, acceleration=PUSH)
     corner = np.argmin(np.linalg.norm(table.points - CORNER[1], axis=1))
     assert table.speeds[corner] == pytest.approx(0.0, abs=1e-9)
@@ -48,6 +48,6 @@ def test_a_right_angle_is_taken_from_rest_and_a_straight_way_at_full_speed() -> 
     assert straight.seconds == pytest.approx(2.0 / SPEED + SPEED / PUSH, rel=0.03)
 
 
-def test_nothing_to_go_takes_no_time() -> None:
+def test_a_path_of_zero_length_takes_no_time() -> None:
     table = VelocityProfile.from_path(np.zeros((2, 2)), speed=SPEED, acceleration=PUSH)
     assert table.seconds == 0.0 and table.length == 0.0 and not table.at(0.5).position.any()

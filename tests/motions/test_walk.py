@@ -110,7 +110,7 @@ def test_a_coarse_stool_takes_a_step(slope: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("route", [straight_route(0.12), turn_route(np.radians(20.0))], ids=["ahead", "turn"])
-def test_a_body_on_two_legs_keeps_its_balance(route: Route) -> None:
+def test_a_biped_keeps_its_balance(route: Route) -> None:
     """It makes two steps ahead, or turns on the spot, and reaches its target upright."""
     done = walked(strong(biped()), route, 0.06)
     assert isinstance(done.walk._posture, LeggedPosture) and len(done.walk.feet) == 2
@@ -134,7 +134,7 @@ def test_a_block_waddles(route: Route) -> None:
 
 @pytest.mark.slow
 @pytest.mark.data
-def test_a_base_does_not_run_ahead_of_what_is_above_it(data_dir: Path) -> None:
+def test_a_long_base_does_not_outrun_the_body(data_dir: Path) -> None:
     """The base of the monkey is long; the body does not lag further behind its feet with each step, and reaches its
     target."""
     cloud = read_capture(data_dir / "objects" / "monkey.ply").cloud
@@ -145,7 +145,7 @@ def test_a_base_does_not_run_ahead_of_what_is_above_it(data_dir: Path) -> None:
     assert reached.distance == pytest.approx(0.4, abs=0.04)
 
 
-def test_a_pace_that_slipping_feet_have_lost_is_made_again() -> None:
+def test_a_step_lost_to_slipping_is_repeated() -> None:
     """Feet at their footholds continue; feet that lag by half a step repeat it, with one message, and the route ends at
     the same place."""
     place = coarse_creature(block_mesh(), forward=AHEAD, settle_first=False).place
@@ -162,7 +162,7 @@ def test_a_pace_that_slipping_feet_have_lost_is_made_again() -> None:
     assert np.array_equal(walk.planar_poses[2], before[1]) and "1 step" in walk.notes()[-1]
 
 
-def test_the_plan_tells_what_the_legs_can_do() -> None:
+def test_the_plan_respects_the_limits_of_the_legs() -> None:
     place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, straight_route(0.24), 0.08)
     planned = walk.plan_record()
@@ -180,7 +180,7 @@ def test_the_plan_tells_what_the_legs_can_do() -> None:
     assert turned.stride == pytest.approx(2.0 * 2.0 * np.sin(0.125) * far, rel=0.05) and turned.paces == 2.0
 
 
-def test_feet_go_to_where_they_belong_when_the_body_turns() -> None:
+def test_footholds_rotate_with_the_body() -> None:
     """They equal those of the whole standing body, rotated to each planar pose of the route about its initial centre of
     mass."""
     place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
@@ -195,7 +195,7 @@ def test_feet_go_to_where_they_belong_when_the_body_turns() -> None:
 
 
 @pytest.mark.parametrize("mesh", [stool, figure, biped, block_mesh])
-def test_it_is_planned_to_press_where_its_feet_are(mesh: Callable[[], TetMesh]) -> None:
+def test_the_planned_pressure_is_under_the_standing_feet(mesh: Callable[[], TetMesh]) -> None:
     """The centre of pressure of the first swing lies under the feet that stand during it; the whole plan is bounded."""
     place = coarse_creature(mesh(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, straight_route(0.3), 0.06)
@@ -214,7 +214,7 @@ def test_it_is_planned_to_press_where_its_feet_are(mesh: Callable[[], TetMesh]) 
     assert np.all(np.abs(plan.divergent - walk._start_com[:2]) < reach)
 
 
-def test_a_foot_that_has_turned_all_the_way_round_is_told_so() -> None:
+def test_headings_of_feet_are_unwrapped() -> None:
     """A measured heading is unwrapped to the value nearest to the planned one."""
     place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, turn_route(np.radians(420.0)), 0.08)
@@ -227,13 +227,13 @@ def test_a_foot_that_has_turned_all_the_way_round_is_told_so() -> None:
     assert walk._footprints[0, 3] == pytest.approx(np.radians(420.0))
 
 
-def test_a_base_on_ice_is_told_that_it_cannot_turn() -> None:
+def test_a_base_on_ice_cannot_turn() -> None:
     place = replace(coarse_creature(block_mesh(), forward=AHEAD, settle_first=False).place, friction=0.001)
     with pytest.raises(UserError, match=r"walk: friction 0\.001 cannot turn the body about a side of its base"):
         Walk(place, straight_route(0.2), 0.1)
 
 
-def test_what_has_no_feet_and_what_stands_in_the_way_is_told() -> None:
+def test_missing_feet_and_obstacles_are_reported() -> None:
     bar = block_mesh(12, 3, 3, (2.0, 0.3, 0.3))
     with pytest.raises(UserError, match="walk: the body has no feet, and no flat base of which it could lift a side"):
         Walk(block_place(bar), straight_route(0.2), 0.1)

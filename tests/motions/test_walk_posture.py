@@ -33,12 +33,12 @@ def carried(place: Stance) -> tuple[np.ndarray, tuple[Foot, ...], WalkPosture, n
 
 
 @pytest.mark.parametrize("place", [block_place(), block_place(coarse_stool()), block_place(figure())])
-def test_a_body_stands_as_it_stood(place: Stance) -> None:
+def test_the_initial_posture_is_the_standing_body(place: Stance) -> None:
     standing, _, carriage, soles = carried(place)
     assert carriage.pose(place.body.centre_of_mass(standing), 0.0, soles) == pytest.approx(standing, abs=1e-12)
 
 
-def test_legs_go_with_their_feet() -> None:
+def test_legs_follow_their_feet() -> None:
     """Each sole is at its target and is moved rigidly, and the centre of mass is at its target; the body rotates."""
     place = block_place(coarse_stool())
     standing, feet, carriage, soles = carried(place)
@@ -57,7 +57,7 @@ def test_legs_go_with_their_feet() -> None:
     assert angle == pytest.approx(heading, abs=0.02)
 
 
-def test_a_base_turns_and_tips_with_its_sides() -> None:
+def test_a_base_rotates_and_tips_with_its_sides() -> None:
     """Moving one side forward rotates the body about the other side, lifting it tips the body; the centres of the sides
     are near their targets, and the centre of mass is at its target."""
     place = block_place()
@@ -94,7 +94,7 @@ def test_a_base_turns_and_tips_with_its_sides() -> None:
     assert across[2] / width == pytest.approx(-0.01 / width, rel=0.1)
 
 
-def test_what_lies_or_rolls_has_no_feet_to_walk_on() -> None:
+def test_a_lying_body_has_no_feet() -> None:
     """A long bar on the ground has none; a body with short joined feet uses these as the sides of a base."""
     place = block_place()
     lying = replace(place, standing=place.standing[:, [2, 0, 1]] * [4.0, 0.3, 0.3])
@@ -117,6 +117,6 @@ def on_blocks(count: int, tall: float) -> TetMesh:
 
 
 @pytest.mark.parametrize(("count", "tall", "swings"), [(3, 0.3, False), (3, 0.6, True), (4, 0.3, True)])
-def test_on_few_feet_a_stump_is_no_leg(count: int, tall: float, swings: bool) -> None:
+def test_a_stump_is_no_leg_of_few_feet(count: int, tall: float, swings: bool) -> None:
     """A leg wider than long cannot reach the point where a fall is caught; with four or more feet, the others stand."""
     assert (select_posture(block_place(on_blocks(count, tall)))[1] is LeggedPosture) is swings

@@ -127,7 +127,7 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
         read_muscles(tmp_path / "binary.json", MESH, body_weight=1.0)
 
 
-def test_the_picture_shows_each_kind_in_its_colour(tmp_path: Path) -> None:
+def test_the_plot_shows_each_kind_in_its_colour(tmp_path: Path) -> None:
     """Three views are side by side; the colour of a kind appears exactly if the body has fibres of that kind."""
     red, green = np.array([60, 60, 210]), np.array([60, 160, 60])
 

@@ -65,7 +65,7 @@ def test_small_bumps_are_no_branches() -> None:
     assert len(skeleton(carved((0.6, 0.4, 1.2), 0.1, keep), UP).branches) == 1
 
 
-def test_the_skeleton_follows_its_up_axis_and_its_bits_repeat() -> None:
+def test_the_skeleton_rotates_with_the_up_axis_and_is_deterministic() -> None:
     """The same figure in other axes has the same skeleton; two calls agree bitwise."""
     mesh = figure()
     turned = TetMesh(np.ascontiguousarray(mesh.nodes[:, [1, 2, 0]]), mesh.tets)
@@ -95,7 +95,7 @@ def test_every_branch_gets_every_kind_of_fibre(make: Callable[[], TetMesh], bran
         assert (of_group == "longitudinal").sum() >= 4
 
 
-def test_legs_bend_both_ways_at_once() -> None:
+def test_legs_bend_in_both_directions() -> None:
     """Each leg of a four-legged body has at least three segments on each of four sides, and muscles that do not crush
     it.
     """

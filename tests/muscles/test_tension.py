@@ -48,7 +48,7 @@ def dense(tension: MuscleEnergy, x: np.ndarray) -> np.ndarray:
     return (across * rates) @ across.T
 
 
-def test_segments_of_a_rod_that_is_pressed_are_shorter() -> None:
+def test_segments_of_a_compressed_rod_are_shorter() -> None:
     """The rod is compressed by a tenth of its length, under any translation and rotation."""
     muscles, turned = tendon(3), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     pressed = (ROD.nodes * [1.0, 1.0, 0.9]) @ turned.T + [1.0, 2.0, 3.0]
@@ -205,7 +205,7 @@ def press(rod: SoftBody, load: float, *, follows: bool) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_tendon_holds_the_rod_straight_that_its_dead_load_buckles(rod: SoftBody) -> None:
+def test_a_tendon_holds_straight_the_rod_that_a_dead_load_buckles(rod: SoftBody) -> None:
     """A tendon inside a rod cannot buckle it, because its thrust bends with the rod; with its direction frozen over a
     step it does.
     """

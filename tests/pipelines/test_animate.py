@@ -60,7 +60,7 @@ def finished(folder: Path) -> bool:
     return json.loads((folder / MANIFEST).read_text())["finished"]
 
 
-def test_a_run_holds_what_was_asked_and_its_manifest(run: Callable[..., Report], tmp_path: Path) -> None:
+def test_a_run_contains_its_options_and_its_manifest(run: Callable[..., Report], tmp_path: Path) -> None:
     report = run(tmp_path)
     assert sorted(os.listdir(tmp_path)) == FILES and finished(tmp_path)
     asked = json.loads((tmp_path / "report.json").read_text())["asked"]
@@ -120,7 +120,7 @@ def test_a_film_from_straight_above_or_below(performance: SimulatedRun, side: fl
     assert performance.place.ground.axes[0] @ -camera.rotation[1] > 0.999
 
 
-def test_of_several_sides_a_film_is_taken_from_the_one_nearest_to_the_usual(performance: SimulatedRun) -> None:
+def test_of_several_views_the_nearest_to_the_default_is_filmed(performance: SimulatedRun) -> None:
     """The default view shows the face and the path."""
     first, second = thing().plane.tangents()
     around = 2.0 * np.pi * (np.arange(7)[:, None] + 0.3) / 7
@@ -131,7 +131,7 @@ def test_of_several_sides_a_film_is_taken_from_the_one_nearest_to_the_usual(perf
     np.testing.assert_allclose(performance.camera(64, ways).rotation[2], each[best], atol=1e-9)
 
 
-def test_no_ffmpeg_is_told_before_anything_is_done(
+def test_a_missing_ffmpeg_is_reported_first(
     run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/nowhere/ffmpeg")
@@ -171,7 +171,7 @@ def test_a_disk_that_is_full_at_any_file(
     assert failures == number == 30
 
 
-def test_a_verdict_names_what_is_beyond(run: Callable[..., Report], tmp_path: Path) -> None:
+def test_a_verdict_names_the_violated_limits(run: Callable[..., Report], tmp_path: Path) -> None:
     audit = run(tmp_path).audit
     said = verdict(replaced(audit, penetration=0.02, momentum_residual=float("nan")))
     assert said == "audit: FAILED: momentum_residual nan (at most 1e-05), penetration 0.02 (at most 0.01)"

@@ -47,7 +47,7 @@ def test_the_reader_agrees_with_the_deformer(run: FinishedRun, tmp_path: Path) -
         assert np.abs(turns - made).max() < 1e-3
 
 
-def test_it_needs_numpy_alone_and_fits_the_capture(
+def test_the_reader_needs_only_numpy_and_the_frame_is_the_capture_s(
     run: FinishedRun, run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "a.npz"

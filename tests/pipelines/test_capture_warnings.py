@@ -27,11 +27,11 @@ def test_an_ordinary_body_has_none() -> None:
     assert capture_warnings(cloud_at(block(400)), block_mesh(), 1.0) == ()
 
 
-def test_a_few_gaussians_are_told() -> None:
+def test_few_gaussians_cause_a_warning() -> None:
     assert capture_warnings(cloud_at(block(2)), block_mesh(), 1.0) == ("only 2 Gaussians: most of the body is guessed",)
 
 
-def test_another_object_is_told() -> None:
+def test_another_object_is_reported() -> None:
     both = cloud_at(np.concatenate([block(300), block(100, shift=2.0)]))
     (note,) = capture_warnings(both, block_mesh(), 1.0)
     assert note.startswith("25 % of the capture lies apart from the body, up to ")

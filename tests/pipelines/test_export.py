@@ -37,7 +37,7 @@ def _in_capture(run: FinishedRun, frame: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("kind", "tolerance"), [("ply", 1e-5), ("splat", 1e-5), ("spz", 1e-3), ("spz4", 1e-3), ("sog", 2e-3)]
 )
-def test_splat_files_lie_in_the_frame_of_the_capture(run: FinishedRun, tmp_path: Path, kind: str, tolerance: float):
+def test_splat_files_are_in_the_frame_of_the_capture(run: FinishedRun, tmp_path: Path, kind: str, tolerance: float):
     (path,) = export_splats(run, tmp_path, kind, frame=-1, quiet=True)
     assert path.name == f"frame0012{WRITERS[kind][0]}"
     means = read_capture(path).cloud.means.numpy()
@@ -87,7 +87,7 @@ def _glb(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
     return said, arrays
 
 
-def test_gltf_holds_the_splats_in_metres_with_y_up(run: FinishedRun, tmp_path: Path):
+def test_gltf_has_the_splats_in_metres_with_y_up(run: FinishedRun, tmp_path: Path):
     (path,) = export_splats(run, tmp_path, "glb", frame=6, quiet=True)
     said, arrays = _glb(path)
     primitive = said["meshes"][0]["primitives"][0]
@@ -182,7 +182,7 @@ def test_frames_are_not_put_among_the_files_of_a_run(
     assert sorted(run_folder.iterdir()) == before
 
 
-def test_nvidias_rule_for_splats_finds_nothing(run: FinishedRun, tmp_path: Path):
+def test_nvidias_validator_for_splats_finds_nothing(run: FinishedRun, tmp_path: Path):
     """Rule VG.035 of the Omniverse asset requirements."""
     validator = pytest.importorskip("omni.asset_validator")
     path = tmp_path / "run.usdc"
@@ -192,7 +192,7 @@ def test_nvidias_rule_for_splats_finds_nothing(run: FinishedRun, tmp_path: Path)
     assert list(engine.validate(str(path)).issues()) == []
 
 
-def test_a_scene_goes_along_into_usd(run: FinishedRun, tmp_path: Path):
+def test_a_scene_is_exported_to_usd(run: FinishedRun, tmp_path: Path):
     Usd, UsdVol = map(pytest.importorskip, ("pxr.Usd", "pxr.UsdVol"))
     with_scene = replace(run, scene=run.creature.splats)
     export_usd(with_scene, tmp_path / "run.usdc", every=12, degree=0, quiet=True)

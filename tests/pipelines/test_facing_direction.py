@@ -46,7 +46,7 @@ def standing(thing: BuiltInObject) -> PlacedCage:
 
 
 @pytest.mark.parametrize("turn", [None, [0.7, -1.1, 0.4]])
-def test_a_bear_looks_where_its_face_is_and_a_stool_away_from_its_back(
+def test_a_figurine_faces_its_face_and_a_stool_away_from_its_back(
     thing: BuiltInObject, standing: PlacedCage, turn: list[float] | None
 ) -> None:
     """In any orientation of the file; the message gives the direction in the file, and the reason."""
@@ -83,7 +83,7 @@ def plain_box(width: float, depth: float) -> Lying:
 
 
 @pytest.mark.slow
-def test_what_was_photographed_from_one_side_shows_its_front_there() -> None:
+def test_photos_from_one_side_determine_the_front() -> None:
     """A box without features has no front of its own."""
     box = plain_box(0.9, 0.5)
     standing = place_cage(box.cloud, plane=box.plane, nodes=200)
@@ -98,7 +98,7 @@ def test_what_was_photographed_from_one_side_shows_its_front_there() -> None:
         assert "was photographed from there" in str(found.reason)
 
 
-def test_cameras_all_around_say_nothing() -> None:
+def test_cameras_all_around_determine_no_front() -> None:
     angles = np.arange(12) * np.pi / 6.0
     eyes = np.stack([np.cos(angles), np.sin(angles), np.full(12, 0.4)], axis=1)
     up = np.array([0.0, 0.0, 1.0])
@@ -107,7 +107,7 @@ def test_cameras_all_around_say_nothing() -> None:
     assert mean_view([], np.zeros(3)) is None
 
 
-def test_front_is_as_given_along_the_ground(standing: PlacedCage) -> None:
+def test_a_given_front_is_projected_onto_the_ground(standing: PlacedCage) -> None:
     found, front = front_of(standing, np.array([1.0, 1.0, 3.0]))
     np.testing.assert_allclose(front, np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0), atol=1e-12)
     assert found.reason is None

@@ -23,12 +23,12 @@ def box(x: float, lift: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("x", "share"), [(0.0, 1.0), (0.99, 0.6), (1.6, 0.0)])
-def test_how_much_of_it_stands_on_ground(x: float, share: float) -> None:
+def test_fraction_of_the_feet_over_ground(x: float, share: float) -> None:
     """On the table, over its edge (three of five columns of nodes are on it), and beyond it, over a floor far below."""
     assert share_over_ground(box(x), TABLE, FLAT, 1.0) == pytest.approx(share)
 
 
-def test_what_is_told() -> None:
+def test_messages() -> None:
     assert (
         ground_coverage_warning(box(0.0), TABLE, FLAT, 1.0)
         == ground_coverage_warning(box(0.99), TABLE, FLAT, 1.0)
@@ -46,7 +46,7 @@ def test_what_is_told() -> None:
     assert len(ground_coverage_warning(box(0.0), above, FLAT, 1.0)) == 1
 
 
-def test_ground_that_is_not_flat_is_where_it_is() -> None:
+def test_coverage_on_uneven_ground() -> None:
     """On a slope, both body and splats are higher to the right."""
     heights = np.tile(0.2 * np.linspace(-2.0, 2.0, 41), (41, 1))
     field = HeightField.through(np.eye(3), np.array([-2.0, -2.0, 0.0]), 0.1, heights)

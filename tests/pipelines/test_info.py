@@ -32,7 +32,7 @@ def chair() -> BodyInfo:
     )
 
 
-def test_a_chair_is_told_by_what_can_be_measured(chair: BodyInfo) -> None:
+def test_a_chair_is_described_by_its_measurements(chair: BodyInfo) -> None:
     """Feet in the order of their numbers: front right and left, back right and left; lengths in body heights."""
     assert chair.base is SupportKind.FEET and len(chair.feet) == 4
     soles = chair.soles() / chair.body.height
@@ -50,7 +50,7 @@ def test_a_chair_is_told_by_what_can_be_measured(chair: BodyInfo) -> None:
     assert lines[-1] == "note: so"
 
 
-def test_all_motions_are_told_with_what_is_in_their_way(chair: BodyInfo) -> None:
+def test_all_motions_are_listed(chair: BodyInfo) -> None:
     assert chair.motions() == dict.fromkeys(MOTIONS)
     round_one = seen(pawn(gaussian_count=3000))
     assert len(round_one.feet) == 1 and "stands   on one base" in round_one.lines()
@@ -81,7 +81,7 @@ def snake() -> GaussianCloud:
     return GaussianCloud.from_numpy(points, turns, sizes, np.full(count, 4.0), np.zeros((count, 1, 3)), device="cpu")
 
 
-def test_what_lies_has_no_feet_and_is_drawn(tmp_path: Path) -> None:
+def test_a_lying_body_has_no_feet_and_is_drawn(tmp_path: Path) -> None:
     info = inspect_capture(snake(), up=np.array([0.0, 0.0, 1.0]), nodes=300)
     assert info.feet == () and info.base is SupportKind.LYING
     assert "stands   on its length: it crawls" in info.lines()

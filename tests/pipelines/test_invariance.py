@@ -81,7 +81,7 @@ def elsewhere(thing: Lying) -> tuple[Lying, Creature, RolloutResult]:
     ],
     ids=["all", "shuffled", "x4", "moved"],
 )
-def test_same_bits_however_the_file_lies(
+def test_same_bits_for_any_frame_of_the_file(
     thing: Lying, first_steps: tuple[Creature, RolloutResult], other: Callable[[Lying], Lying]
 ) -> None:
     creature, simulation = first_steps
@@ -116,13 +116,13 @@ def test_same_pictures_elsewhere(
 @pytest.mark.parametrize(
     "other", [lambda thing: thing.scaled(0.37), lambda thing: thing.turned()], ids=["x0.37", "turned"]
 )
-def test_same_pictures_from_up_alone(
+def test_same_images_from_up_alone(
     thing: Lying, first_steps: tuple[Creature, RolloutResult], other: Callable[[Lying], Lying]
 ) -> None:
     assert_same_pictures(first_steps, jump(other(thing), frames=3, by_up=True))
 
 
-def test_trajectory_leads_back_to_the_capture(elsewhere: tuple[Lying, Creature, RolloutResult]) -> None:
+def test_a_trajectory_maps_back_to_the_capture(elsewhere: tuple[Lying, Creature, RolloutResult]) -> None:
     """The nodes at the start are at the Gaussians, on the plane of the capture."""
     turned, _, simulation = elsewhere
     trajectory = simulation.trajectory
@@ -161,7 +161,7 @@ def assert_same_jump(lying: Lying, other: Lying, *, by_up: bool = False) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHANGES)
-def test_jump_is_the_same_however_the_file_lies(thing: Lying, name: str) -> None:
+def test_a_jump_does_not_depend_on_the_frame_of_the_file(thing: Lying, name: str) -> None:
     assert_same_jump(thing, CHANGES[name](thing))
 
 
@@ -175,7 +175,7 @@ def test_jump_of_real_captures_is_the_same(data_dir: Path, name: str, up: tuple[
     assert_same_jump(lying, lying.turned().scaled(0.37), by_up=True)
 
 
-def test_front_is_where_the_face_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_front_is_the_side_of_the_face(monkeypatch: pytest.MonkeyPatch) -> None:
     """The figurine faces along -y of its file and its camera is in front of it, in any orientation of the file.
 
     The front does not depend on the sag under its weight, so the settling is skipped.

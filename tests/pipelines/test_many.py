@@ -68,7 +68,7 @@ def same(one: Trajectory, other: Trajectory) -> bool:
     )
 
 
-def test_each_has_the_bits_of_its_run_alone(
+def test_each_result_has_the_bits_of_a_single_run(
     creature: Creature, jobs: list[Job], outcomes: tuple[JobResult, ...]
 ) -> None:
     alone = {
@@ -101,7 +101,7 @@ def test_the_error_of_one_does_not_end_the_others(outcomes: tuple[JobResult, ...
             _ = outcome.trajectory
 
 
-def test_reports_tell_how_they_ended(creature: Creature, outcomes: tuple[JobResult, ...]) -> None:
+def test_reports_have_the_end_state(creature: Creature, outcomes: tuple[JobResult, ...]) -> None:
     for outcome in outcomes[:6]:
         assert outcome.report is not None
         assert outcome.state is outcome.report.state is not State.DONE
@@ -111,14 +111,14 @@ def test_reports_tell_how_they_ended(creature: Creature, outcomes: tuple[JobResu
     assert outcomes[2].report is not None and outcomes[2].report.asked["friction"] == 0.3
 
 
-def test_progress_ends_where_all_is_done(told: list[tuple[int, int]], outcomes: tuple[JobResult, ...]) -> None:
+def test_progress_ends_at_the_total(told: list[tuple[int, int]], outcomes: tuple[JobResult, ...]) -> None:
     frames = sum(len(outcome.frames) - 1 for outcome in outcomes if outcome.report is not None)
     done = [one for one, _ in told]
     assert told[-1] == (frames, frames) and done == sorted(done) and all(one <= of for one, of in told)
 
 
 @pytest.mark.slow
-def test_side_by_side_each_is_as_alone(creature: Creature, tmp_path: Path) -> None:
+def test_worlds_of_a_batch_equal_single_runs(creature: Creature, tmp_path: Path) -> None:
     """Jobs of two step sizes, on three grounds, one longer than the others, beside one that runs in a worker and two
     invalid ones: trajectories agree to 1e-9 body heights, in the order of the jobs."""
     count = creature.muscles.segment_count
@@ -163,7 +163,7 @@ def test_side_by_side_each_is_as_alone(creature: Creature, tmp_path: Path) -> No
     assert steps == [6, 3, 4, 3, 6]
 
 
-def test_what_a_gpu_has_no_room_for_is_done_in_halves(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_too_large_for_a_gpu_is_halved(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
     """There is memory for two of four requested worlds; then for none, which each result reports in a line."""
     room, asked = 2, []
 
@@ -187,7 +187,7 @@ def test_what_a_gpu_has_no_room_for_is_done_in_halves(creature: Creature, monkey
     ] * 2
 
 
-def test_how_many_worlds_is_at_least_none(creature: Creature) -> None:
+def test_a_negative_number_of_worlds_is_refused(creature: Creature) -> None:
     with pytest.raises(ArgumentError, match=r"^worlds -1: give the number of jobs in a batch, at least 0$"):
         simulate_many(creature, [Job(motion("stand 1"))], worlds=-1)
 
@@ -200,7 +200,7 @@ def test_over_ray_it_has_the_same_bits(creature: Creature, monkeypatch: pytest.M
     assert outcome.error is None and same(outcome.trajectory, job.run(creature).trajectory)
 
 
-def test_trajectories_may_lie_in_a_folder(creature: Creature, tmp_path: Path) -> None:
+def test_trajectories_may_be_written_to_a_folder(creature: Creature, tmp_path: Path) -> None:
     """The callback receives the number of each result."""
     ended: dict[int, JobResult] = {}
     jobs = [Job(motion("stand 1"), frames=count) for count in (4, 3)]
@@ -212,7 +212,7 @@ def test_trajectories_may_lie_in_a_folder(creature: Creature, tmp_path: Path) ->
     assert [len(one.trajectory.dt) for one in made] == [3, 2]
 
 
-def test_a_creature_can_be_sent(creature: Creature) -> None:
+def test_a_creature_can_be_pickled(creature: Creature) -> None:
     """A creature that is read from its pickle moves identically and has the same splats."""
     other: Creature = pickle.loads(pickle.dumps(creature))
     asked = motion("jump")
@@ -222,7 +222,7 @@ def test_a_creature_can_be_sent(creature: Creature) -> None:
 
 
 @pytest.mark.slow
-def test_other_ground_is_that_of_a_creature_made_on_it(creature: Creature) -> None:
+def test_a_changed_ground_equals_that_of_a_new_creature(creature: Creature) -> None:
     again = coarse_pawn(friction=0.4)
     other = creature.with_friction(0.4)
     assert other.geometry.friction == other.stepper.planner.friction == 0.4
@@ -231,7 +231,7 @@ def test_other_ground_is_that_of_a_creature_made_on_it(creature: Creature) -> No
         creature.with_friction(float("nan"))
 
 
-def test_activations_of_a_run_bring_it_about_again(creature: Creature) -> None:
+def test_activations_of_a_run_reproduce_it(creature: Creature) -> None:
     """10 recorded steps are reproduced approximately: with prescribed activations, contact points are selected
     differently."""
     first = simulate(creature, motion("jump"), frames=11)

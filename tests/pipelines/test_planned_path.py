@@ -31,7 +31,7 @@ def standing(name: str, seconds: float) -> tuple[MotionSequence, Trajectory, np.
     return sequence, Trajectory(**stood), place.body.centre_of_mass(place.standing)
 
 
-def test_a_jump_s_plan_crouches_rises_as_asked_and_ends_at_touch_down() -> None:
+def test_a_jump_s_plan_crouches_rises_as_requested_and_ends_at_touch_down() -> None:
     sequence, t, start = standing("jump", 2.5)
     jump = sequence.done[0].motion
     assert isinstance(jump, Jump)
@@ -57,7 +57,7 @@ def test_hops_and_twists_have_the_plan_of_their_jump(name: str) -> None:
     assert np.nanmax(path[:, 2]) == pytest.approx(height, rel=0.15) and np.isnan(path[-1]).all()
 
 
-def test_motions_without_a_plan_of_the_centre_of_mass_tell_none() -> None:
+def test_motions_without_a_plan_have_no_planned_path() -> None:
     place = block_place()
     sequence = MotionSequence(place, [])
     sequence.done.append(

@@ -86,7 +86,7 @@ def test_a_folder_belongs_to_one_run(
 
 
 @pytest.mark.parametrize("room", [0, 50, 100])
-def test_a_model_that_does_not_fit_on_the_disk_is_told(
+def test_a_truncated_model_is_reported(
     room: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """COLMAP does not report an incomplete write of its model on a full disk."""
@@ -97,7 +97,7 @@ def test_a_model_that_does_not_fit_on_the_disk_is_told(
     assert not list(out.iterdir())
 
 
-def test_what_colmap_cannot_do_is_one_line(
+def test_failures_of_colmap_are_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The example is a database on a full disk."""
@@ -115,7 +115,7 @@ def test_what_colmap_cannot_do_is_one_line(
 
 @pytest.mark.data
 @pytest.mark.slow
-def test_photos_of_a_room_get_the_poses_that_they_had(
+def test_photos_of_a_room_get_their_known_poses(
     data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Twelve adjacent photos of the bonsai, one of them rotated by an EXIF tag: all get poses, with the known relative

@@ -53,7 +53,7 @@ def prepared() -> PreparedScene:
         (["--background", "{tmp}/no.ply"], "--background: with --object the rest of the scene is the background"),
     ],
 )
-def test_a_slip_is_told_before_the_scene_is_taken_apart(
+def test_invalid_flags_are_reported_before_the_scene_is_prepared(
     scene_file: Path,
     tmp_path: Path,
     flags: list[str],
@@ -82,7 +82,7 @@ def test_a_slip_is_told_before_the_scene_is_taken_apart(
         ["--straddling", "split"],
     ],
 )
-def test_what_only_a_scene_takes_needs_the_object(
+def test_scene_flags_need_an_object(
     scene_file: Path, tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["animate", str(scene_file), *flags, "--out", str(tmp_path / "out")]) == 2
@@ -101,9 +101,7 @@ def _noting(told: dict[str, Any]) -> Callable[..., None]:
     return note
 
 
-def test_animate_passes_on_how_the_scene_is_taken_apart(
-    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_animate_passes_on_the_scene_options(scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told: dict[str, Any] = {}
     monkeypatch.setattr("egs_warp.pipelines.prepare_scene.prepare_scene", _noting(told))
     flags = ["--object", "0,0,0.5", "--inpainter", "ns", "--straddling", "remove", "--out", str(tmp_path / "out")]
@@ -125,7 +123,7 @@ def test_the_parts_of_earlier_steps_are_animated(
 
 
 @pytest.mark.slow
-def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uneven_ground_is_passed_on_with_the_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The ground is measured, reported, written beside the plane, read again and passed to the animation; ``--flat``
     keeps the plane; the object settles on it where it stood.
     """
@@ -163,7 +161,7 @@ def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monke
 
 
 @pytest.mark.slow
-def test_one_command_from_a_scene_to_a_film(
+def test_one_command_from_a_scene_to_a_video(
     scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The test runs as if PyTorch were missing, because training takes a minute."""
@@ -202,7 +200,7 @@ def test_an_animation_that_fails_loses_none_of_the_parts(
 
 
 @pytest.mark.slow
-def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
+def test_a_scene_is_prepared_and_viewed_from_its_cameras() -> None:
     cloud, _ = ball_on_floor()
     told: list[tuple[str, float]] = []
     options = SceneOptions(clearing=StraddlingPolicy.SPLIT, inpaint=False)
@@ -226,7 +224,7 @@ def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
 
 
 @pytest.mark.slow
-def test_what_hangs_above_the_ground_leaves_no_hole(tmp_path: Path) -> None:
+def test_a_hovering_object_leaves_no_hole(tmp_path: Path) -> None:
     """A ball at a fifth of its size above the floor is set down; no floor is painted, and ``plane.json`` has no
     hole."""
     cloud, truth = ball_on_floor(lift=0.33)

@@ -26,7 +26,7 @@ def drawn(options: SceneOptions, monkeypatch: pytest.MonkeyPatch, told: list[tup
     return lines
 
 
-def test_a_scene_tells_its_stages_and_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_shows_its_stages_and_the_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """In the middle of the longest stage, half of the time has passed, to a few percent."""
     told = [(0.0, "plane", 0.0), (12.0, "ground", 0.0), (27.0, "segment", 0.0), (50.0, "segment", 0.5)]
     assert drawn(SceneOptions(clearing=StraddlingPolicy.FINETUNE), monkeypatch, told) == [
@@ -37,14 +37,14 @@ def test_a_scene_tells_its_stages_and_what_is_left(monkeypatch: pytest.MonkeyPat
     ]
 
 
-def test_what_is_not_done_is_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_skipped_stages_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without ground, training and floor, little remains after the plane."""
     options = SceneOptions(clearing=StraddlingPolicy.SPLIT, flat=True, inpaint=False)
     lines = drawn(options, monkeypatch, [(0.0, "plane", 0.0), (12.0, "segment", 0.0)])
     assert lines[1] == "scene: segment, 00:12<00:02"
 
 
-def test_stages_tell_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stages_show_the_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each stage has a typical fraction of the time before it."""
     clock = [1000.0]
     monkeypatch.setattr("tqdm.std.time", lambda: clock[0])

@@ -53,7 +53,7 @@ def test_without_flags_it_is_the_film_bit_for_bit(run_folder: Path, tmp_path: Pa
         "convert {capture} {other}/object.ply",
     ],
 )
-def test_files_of_a_run_are_not_written_over(
+def test_files_of_a_run_are_not_overwritten(
     line: str, run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its video and its steps stay, and so do their checksums."""
@@ -73,7 +73,7 @@ def test_files_of_a_run_are_not_written_over(
 
 
 @pytest.mark.parametrize("camera", ["fixed", "follow", "orbit"])
-def test_every_camera_holds_the_whole_creature(camera: str, run: FinishedRun) -> None:
+def test_every_camera_shows_the_whole_creature(camera: str, run: FinishedRun) -> None:
     shot = Shot(camera, size=(160, 90))
     steps = nearest_steps(run.trajectory.time, shot.fps)
     cameras = shot.cameras(run.creature.camera, run.trajectory, steps)
@@ -183,7 +183,7 @@ def test_videos_keep_alpha(ending: str, run: FinishedRun, tmp_path: Path) -> Non
         assert np.abs(read[inside, :3] - made[inside, :3]).mean() < 8.0
 
 
-def test_a_turntable_holds_one_frame(run: FinishedRun, tmp_path: Path) -> None:
+def test_a_turntable_shows_one_frame(run: FinishedRun, tmp_path: Path) -> None:
     assert render_run(run, tmp_path / "t", Shot(size=(32, 32), fps=2.0, colour=(1, 1, 1)), hold=-1, quiet=True) == 8
     first, half = _png(tmp_path / "t" / "frame0000.png"), _png(tmp_path / "t" / "frame0004.png")
     assert not np.array_equal(first, half)

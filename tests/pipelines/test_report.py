@@ -19,7 +19,7 @@ def test_a_frame_without_a_stage_spends_no_time_in_it() -> None:
     assert timing == {"predict": StageTime(5.0, 8.0), "replan": StageTime(3.0, 9.0), "render": StageTime(3.0, 4.0)}
 
 
-def test_a_package_without_metadata_loses_no_report() -> None:
+def test_a_package_without_metadata_is_reported() -> None:
     """The package is missing, or was copied without its ``dist-info``."""
     told = versions(("numpy", "egs-warp-is-no-such-package"))
     assert told["numpy"] == np.__version__ and told["egs-warp-is-no-such-package"] == "no metadata"

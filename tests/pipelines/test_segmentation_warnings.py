@@ -30,7 +30,7 @@ def changed(located: LocatedPlane, object_mask: np.ndarray) -> LocatedPlane:
     return replace(located, segmentation=replace(located.segmentation, object_mask=object_mask))
 
 
-def test_nothing_is_said_of_a_whole_object(found: tuple[GaussianCloud, LocatedPlane]) -> None:
+def test_a_complete_object_causes_no_warning(found: tuple[GaussianCloud, LocatedPlane]) -> None:
     cloud, located = found
     assert segmentation_warnings(cloud, located, cloud.subset(located.segmentation.object_mask), CAMERAS) == []
 
@@ -64,7 +64,7 @@ def test_a_floor_that_came_along(found: tuple[GaussianCloud, LocatedPlane]) -> N
     assert 45 <= int(line.split()[2]) <= 55
 
 
-def test_the_words_are_in_the_picture(found: tuple[GaussianCloud, LocatedPlane]) -> None:
+def test_the_warnings_are_in_the_image(found: tuple[GaussianCloud, LocatedPlane]) -> None:
     cloud, located = found
     thing = cloud.subset(located.segmentation.object_mask)
     plain, told = (segmentation_picture(cloud, thing, cloud, CAMERAS[:2], words) for words in ((), ("taken along",)))

@@ -44,7 +44,7 @@ def test_floaters_do_not_turn_the_camera_away_from_the_face() -> None:
     assert side(concatenate(FLOOR, round_ones(near, 0.02))) == pytest.approx(USUAL)
 
 
-def test_what_hides_it_does_and_what_stands_behind_the_camera_does_not() -> None:
+def test_an_occluder_turns_the_camera_and_a_wall_behind_it_does_not() -> None:
     turned = side(concatenate(FLOOR, wall(USUAL, 1.5)))
     assert -0.1 < turned @ USUAL < 0.8, "the nearest side that is clear"
     assert side(concatenate(FLOOR, wall(USUAL, 4.5))) == pytest.approx(USUAL)

@@ -24,7 +24,7 @@ def _told(text: str, frames: int | None = None) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("text", ["jump", "hop x2 0.4 0.2", "twist 60", "twist 180", "walk 0.2", "jump 0 0.1, turn 30"])
-def test_what_is_left_is_told_within_a_factor_of_two(text: str) -> None:
+def test_the_estimate_is_within_a_factor_of_two(text: str) -> None:
     """The last frames are excluded; a twist decides in the air whether it needs another jump."""
     done, expected = _told(text).T
     count = len(done)
@@ -37,6 +37,6 @@ def test_what_is_left_is_told_within_a_factor_of_two(text: str) -> None:
     assert motion(text).frames() > 1.2 * count
 
 
-def test_asked_frames_are_all_there_are() -> None:
+def test_requested_frames_are_the_estimate() -> None:
     """The first frame is the body at rest."""
     np.testing.assert_array_equal(_told("jump", frames=4)[:, 1], 3)

@@ -83,7 +83,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert not list(tmp_path.iterdir())
 
 
-def test_photos_that_cannot_be_used_are_named_and_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unusable_photos_are_named_and_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One photo is missing, one truncated, one has another shape; the others are trained."""
     posed = posed_folder(tmp_path / "posed")
     (posed / "r_5.png").unlink()
@@ -136,7 +136,7 @@ def test_portrait_and_landscape_through_a_lens(tmp_path: Path) -> None:
     assert sheet is not None and sheet.shape == (96, 96, 3)
 
 
-def test_a_photo_with_a_wrong_pose_is_found_and_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_photo_with_a_wrong_pose_is_detected_and_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One of sixteen photos was taken from another pose than its own."""
     posed = posed_folder(tmp_path / "posed", count=16)
     tree = json.loads((posed / "transforms.json").read_text())
@@ -162,7 +162,7 @@ def test_reduced_photos_keep_their_colours_and_field_of_view(tmp_path: Path) -> 
     np.testing.assert_allclose(one.reshape(16, 2, 16, 2, 3).mean(axis=(1, 3)), other, atol=1e-5)
 
 
-def test_masks_beside_the_photos_cut_the_object_out(tmp_path: Path) -> None:
+def test_masks_beside_the_photos_remove_the_background(tmp_path: Path) -> None:
     """COLMAP's ``masks/PHOTO.png``: pixels outside the mask are background, whatever the photo shows there."""
     posed = posed_folder(tmp_path / "set" / "images")
     masks = tmp_path / "set" / "masks"
@@ -188,7 +188,7 @@ def test_masks_beside_the_photos_cut_the_object_out(tmp_path: Path) -> None:
     assert "r_4.png.png: 32 x 8 pixels, but its photo has 32 x 32; make the mask" in left.reason
 
 
-def test_the_middle_is_where_the_cameras_look() -> None:
+def test_the_centre_is_where_the_cameras_point() -> None:
     shift = np.array([3.0, -2.0, 5.0])
     cameras = [replace(camera, translation=camera.translation - camera.rotation @ shift) for camera in ring(7)]
     np.testing.assert_allclose(middle_of(cameras), shift, atol=1e-9)
@@ -224,7 +224,7 @@ def test_the_first_cloud_fills_the_silhouettes_and_nothing_else() -> None:
     np.testing.assert_allclose(cloud.sh.numpy()[:, 0] * 0.28209479 + 0.5, np.tile([0.8, 0.3, 0.1], (500, 1)), atol=1e-5)
 
 
-def test_cameras_that_see_nothing_in_common_are_refused() -> None:
+def test_cameras_without_a_common_view_are_refused() -> None:
     camera = ring(1)[0]
     away = replace(camera, rotation=camera.rotation, near=1e9)
     view = TrainingView(away, np.zeros((camera.height, camera.width, 3), np.float32))

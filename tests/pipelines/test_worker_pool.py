@@ -63,7 +63,7 @@ def test_each_task_ends_once_and_an_error_is_its_own(workers: int | str) -> None
         assert sorted(told) == [(number, number, 2 * number) for number in given]
 
 
-def test_a_killed_workers_task_is_run_again_and_those_that_ended_are_not(workers: int | str, tmp_path: Path) -> None:
+def test_lost_tasks_are_run_again_and_finished_ones_are_not(workers: int | str, tmp_path: Path) -> None:
     """Task 1 kills its worker once, task 3 twice, task 4 in each attempt: no other task is repeated or lost."""
     work = tasks.Dying(tmp_path, {1: 1, 3: 2, 4: 99})
     ended = in_order(list(map_tasks(work, range(7), workers=workers)))
@@ -75,7 +75,7 @@ def test_a_killed_workers_task_is_run_again_and_those_that_ended_are_not(workers
     assert workers == "ray" or lost == AT_LAST
 
 
-def test_a_worker_has_one_thread_and_is_kept(workers: int | str) -> None:
+def test_a_worker_has_one_thread_and_is_reused(workers: int | str) -> None:
     seen = [one.value for one in map_tasks(tasks.threads, range(6), workers=workers)]
     assert all(one["available"] == 1 and set(one["blas"]) == {1} for one in seen), seen
     used = {one["process"] for one in seen}
@@ -98,7 +98,7 @@ def test_workers_that_cannot_be_had(workers: int | str, line: str) -> None:
         list(map_tasks(tasks.square, [1], workers=workers))
 
 
-def test_ray_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_ray_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match=r"^workers ray: Ray is not installed; pip install 'egs-warp\[ray\]'$"):
         list(map_tasks(tasks.square, [1], workers="ray"))
@@ -158,7 +158,7 @@ def test_no_worker_outlives_the_program(number: signal.Signals, crew: str, tmp_p
 
 
 @pytest.mark.slow
-def test_what_a_script_defines_is_found(tmp_path: Path) -> None:
+def test_functions_of_a_script_are_found_in_workers(tmp_path: Path) -> None:
     script = tmp_path / "cubes.py"
     script.write_text(
         textwrap.dedent(

@@ -15,7 +15,7 @@ from egs_warp.render.async_render import AsyncRenderer
 from egs_warp.render.rasteriser import enqueue_image, render_gaussians
 
 
-def test_what_is_taken_is_what_is_drawn_at_once(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_asynchronous_renders_equal_blocking_ones(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Results equal those of blocking renders, in order, also when the last guess was too small; without a submit there
     is no result."""
     cloud = pawn(gaussian_count=3000, device=device).cloud

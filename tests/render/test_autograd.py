@@ -182,7 +182,7 @@ def test_a_picture_without_gradients_has_the_same_bits(device: str) -> None:
         assert torch.equal(getattr(plain, name), getattr(again, name))
 
 
-def test_pictures_wait_for_their_gradients_while_others_are_made(device: str) -> None:
+def test_images_keep_the_memory_of_their_gradients(device: str) -> None:
     """Two images are rendered before either backward pass: memory that the gradients need must not be reused
     meanwhile."""
     values, camera = many_splats()
@@ -203,7 +203,7 @@ def test_pictures_wait_for_their_gradients_while_others_are_made(device: str) ->
         assert all(torch.equal(a, b) and a.abs().sum() > 0 for a, b in zip(one, other, strict=True))
 
 
-def test_tiles_left_out_show_the_background_and_give_no_gradient(device: str) -> None:
+def test_masked_tiles_show_the_background_and_have_no_gradient(device: str) -> None:
     """Gradients are those of a loss without the masked tiles; gsplat's masks have the same tiles."""
     values, camera = many_splats()
     mask = np.random.default_rng(5).random((5, 6)) < 0.5
@@ -244,7 +244,7 @@ def test_pixels_share_memory_and_bad_tensors_are_named() -> None:
         render_torch(*tensors, camera=camera, rotation=torch.eye(3))
 
 
-def test_screen_positions_get_their_gradient_where_asked_for(device: str) -> None:
+def test_screen_positions_get_a_gradient_on_request(device: str) -> None:
     """Moving every splat by one pixel moves the principal point: the sums equal the camera's gradient."""
     values, camera = clear_scene()
     tensors = [torch.tensor(values[name], dtype=torch.float32, device=device, requires_grad=True) for name in NAMES]
@@ -267,7 +267,7 @@ def test_screen_positions_get_their_gradient_where_asked_for(device: str) -> Non
 @pytest.mark.parametrize(
     "case", ["none visible", "covers all", "one pixel", "inside", "opaque", "clear", "tiny", "flat"]
 )
-def test_odd_cases_have_finite_gradients(device: str, case: str) -> None:
+def test_degenerate_scenes_have_finite_gradients(device: str, case: str) -> None:
     """Invisible scenes give exactly zero gradients; degenerate ones give no NaN or infinity, also in the antialiased
     mode, which divides by the area."""
     values, camera = clear_scene()

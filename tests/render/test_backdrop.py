@@ -62,7 +62,7 @@ def square(values: Any) -> np.ndarray:
     return values.numpy().reshape(SIDE, SIDE, -1).squeeze()
 
 
-def test_the_shadow_falls_where_the_floor_is_seen() -> None:
+def test_the_shadow_falls_on_the_visible_floor() -> None:
     """The image is darker under the body and unchanged elsewhere and on what hides the floor; higher bodies cast
     softer, paler shadows."""
     body, floor = parts()
@@ -81,7 +81,7 @@ def test_the_shadow_falls_where_the_floor_is_seen() -> None:
     np.testing.assert_allclose(shaded, plain, atol=0.02)
 
 
-def test_the_shadow_lies_on_an_uneven_floor_without_an_edge() -> None:
+def test_the_shadow_on_an_uneven_floor_has_no_edge() -> None:
     """The half of a floor that is 3 % of the reach above the fitted plane, as cloths are, receives nearly the same
     shadow. At a terrace too high for it the shadow ends, but not within one pixel."""
     body, flat = parts()
@@ -126,7 +126,7 @@ def darkness(body: GaussianCloud, plane: Plane, centre: np.ndarray, reach: float
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
-def test_it_is_what_bins_blurs_and_rays_make(tilt: float, device: str) -> None:
+def test_the_shadow_equals_the_reference(tilt: float, device: str) -> None:
     """The shadow equals the reference on level and tilted ground, for bodies of other heights and Gaussian sizes,
     visible wholly and in part."""
     plane = Plane(np.array([np.sin(tilt), 0.0, np.cos(tilt)]), 0.1)
@@ -160,7 +160,7 @@ def test_a_floor_has_lines_and_ends_in_the_sky() -> None:
     assert picture[full & (near < 0.1)].mean() < 0.8 < picture[full & (near > 1.3)].mean()
 
 
-def test_levels_are_clipped_and_halves_go_to_the_even_one() -> None:
+def test_quantisation_equals_numpy() -> None:
     """Quantisation equals NumPy's clip and rint."""
     import warp as wp
 

@@ -108,7 +108,7 @@ def test_opacity_zero_and_one(device: str) -> None:
         assert image.alpha.numpy()[22, 33] == pytest.approx(centre_alpha, abs=1e-3)
 
 
-def test_tiny_scales_show_as_the_low_pass(device: str) -> None:
+def test_tiny_scales_render_as_the_low_pass_filter(device: str) -> None:
     """A Gaussian of scale e^-10 covers the area of the 0.3 px low-pass: 2 pi 0.3 opacity square pixels of alpha."""
     values = one_splat(log_scales=[[-10.0] * 3], opacity_logits=[8.0])
     camera = camera_of(64, 64)
@@ -166,7 +166,7 @@ def test_tiles_left_out_show_the_background(device: str) -> None:
     assert (whole.alpha.numpy()[~pixels] > 0).any()
 
 
-def test_several_cameras_and_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_several_cameras_and_inconsistent_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud = cloud_of(random_scene(50))
     cameras = [camera_of(20, 30), camera_of(40, 10)]
     images = render_views(cloud, cameras, background=(0, 0, 0))
@@ -194,7 +194,7 @@ def test_several_cameras_and_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.cuda
-def test_a_full_gpu_refuses_and_works_again() -> None:
+def test_a_full_gpu_reports_an_error_and_recovers() -> None:
     """240 million pairs need 8 GB, but 600 MB are free."""
     torch = pytest.importorskip("torch")
     values = random_scene(200_000, coefficients=1, log_scale=3.0)

@@ -135,7 +135,7 @@ def test_a_bevel_above_the_sole_is_not_the_support() -> None:
 
 
 @pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
-def test_the_support_is_what_ends_within_its_band(size: float) -> None:
+def test_the_support_is_the_densest_level_of_columns(size: float) -> None:
     """Columns are denser towards the floor, with as many far above. The plane is the 15 % quantile of the bottoms
     within 1.5 % of the height of the densest level, in any unit.
     """
@@ -149,7 +149,7 @@ def test_the_support_is_what_ends_within_its_band(size: float) -> None:
     assert found == pytest.approx(size * np.quantile(within, 0.15), abs=2e-4 * size)
 
 
-def test_the_reason_for_up_is_what_was_weighed() -> None:
+def test_the_reason_for_up_gives_the_scores() -> None:
     """The scores of the best axis and of the next, and whether they differ clearly: a pawn has one base, a cube six."""
     cube = np.random.default_rng(0).uniform(-0.5, 0.5, (4000, 3))
     cube[np.arange(4000), np.arange(4000) % 3] = np.sign(cube[np.arange(4000), np.arange(4000) % 3]) * 0.5
@@ -171,7 +171,7 @@ def test_the_reason_for_up_is_what_was_weighed() -> None:
         assert reason.endswith(f"{sure} ahead of {other}, score {best:.2f} to {second:.2f}")
 
 
-def test_what_is_flat_along_an_axis_is_not_supported_there() -> None:
+def test_a_sheet_has_no_support_along_its_normal() -> None:
     sheet = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 3)) * [1.0, 1.0, 0.0]
     cloud = GaussianCloud.from_numpy(
         sheet, np.tile([1.0, 0, 0, 0], (400, 1)), np.full((400, 3), -5.0), np.full(400, 4.0), np.zeros((400, 1, 3))
@@ -189,7 +189,7 @@ def opaque(means: np.ndarray, opacities: np.ndarray | float = 0.98) -> GaussianC
     )  # fmt: skip
 
 
-def test_the_columns_are_those_of_the_footprint() -> None:
+def test_the_columns_cover_the_footprint() -> None:
     """A block of 2 x 1 has 64 by 32 columns, all with a bottom, and its centre is in the middle of them."""
     x, y, z = np.meshgrid(np.linspace(0.0, 2.0, 160), np.linspace(0.0, 1.0, 80), [0.0, 0.5], indexing="ij")
     block = opaque(np.column_stack([x.ravel(), y.ravel(), z.ravel()]) + [3.0, -2.0, 1.0])
@@ -202,7 +202,7 @@ def test_the_columns_are_those_of_the_footprint() -> None:
     np.testing.assert_allclose(np.sort(seen.centre), [15.5, 31.5], atol=0.5)
 
 
-def test_strays_aside_of_a_narrow_foot_widen_no_support() -> None:
+def test_distant_strays_do_not_widen_the_support() -> None:
     """A mushroom whose foot has a ninth of the area of its cap, with and without distant strays at the level of the
     sole."""
     random = np.random.default_rng(0)
@@ -220,7 +220,7 @@ def test_strays_aside_of_a_narrow_foot_widen_no_support() -> None:
         assert shape.polygon == pytest.approx(1.0 / 9.0, abs=0.02)
 
 
-def test_what_shows_nothing_low_is_not_supported() -> None:
+def test_haze_is_no_support() -> None:
     """An opaque block above haze of equal mass: no visible Gaussian is low."""
     random = np.random.default_rng(0)
     haze, block = random.uniform(0.0, 1.0, (2, 8000, 3))
@@ -230,7 +230,7 @@ def test_what_shows_nothing_low_is_not_supported() -> None:
     assert (shape.polygon, shape.level, shape.depth) == (0.0, 0.0, 0.0)
 
 
-def test_up_of_a_huge_capture_is_told_by_few_of_its_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_up_of_a_huge_capture_is_estimated_from_a_subset(monkeypatch: pytest.MonkeyPatch) -> None:
     """An even subset of a table gives the result of all Gaussians, in any order of the file."""
     random = np.random.default_rng(0)
     top = random.uniform([-1.0, -1.0, 1.0], [1.0, 1.0, 1.05], (6000, 3))

@@ -123,7 +123,7 @@ def test_far_below_the_plane_the_half_lies_on_it(device: str) -> None:
     assert np.isfinite(half.opacity_logits.numpy()).all() and half.opacities().max() < 1e-3
 
 
-def test_what_straddles_is_split_in_three_across_the_plane(device: str) -> None:
+def test_straddling_gaussians_are_split_in_three(device: str) -> None:
     """The split is along the axis that reaches farthest through the plane; the three children have the mean and
     covariance of the parent, and none is more opaque. A Gaussian clear of the plane is unchanged, and a child below it
     is left out.
@@ -154,7 +154,7 @@ def test_what_straddles_is_split_in_three_across_the_plane(device: str) -> None:
         assert 0.0 < opacities[child] < cloud.opacities()[parent]
 
 
-def test_cameras_about_the_foot_look_at_it_from_low_down() -> None:
+def test_foot_cameras_are_low_and_centred_on_the_foot() -> None:
     """A column of radius 0.3, away from the origin: its foot is in the centre of each image and fills most of it."""
     turns, levels = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False), np.linspace(0.0, 1.0, 40))
     angle, height = turns.ravel(), levels.ravel()
@@ -176,7 +176,7 @@ def test_cameras_about_the_foot_look_at_it_from_low_down() -> None:
 
 
 @pytest.mark.parametrize("above", [True, False])
-def test_a_camera_under_the_plane_says_nothing_of_what_it_sees_through_it(above: bool) -> None:
+def test_a_camera_below_the_plane_ignores_what_it_sees_through_it(above: bool) -> None:
     """From above, all pixels of a ball over the floor count; from below, only empty pixels."""
     pytest.importorskip("torch")
     ball = round_ones(shell() + [0.0, 0.0, 0.2], 0.04)
@@ -259,7 +259,7 @@ def test_loss_is_the_sum_over_straddling_gaussians() -> None:
         assert torch.autograd.gradcheck(value, inputs, eps=1e-7, atol=1e-4)
 
 
-def test_finetuning_clears_the_plane_and_keeps_the_looks() -> None:
+def test_finetuning_clears_the_plane_and_keeps_the_appearance() -> None:
     """Eq. (20), (21): a small ball on its plane; Gaussians that crossed the plane are clear of it afterwards, and the
     image stays the same."""
     pytest.importorskip("torch")

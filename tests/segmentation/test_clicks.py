@@ -24,7 +24,7 @@ from tests.support.grounds import level
 from tests.support.scenes import FLOOR, ball_on_floor, lying, round_ones, shell
 
 
-def test_a_click_hits_the_surface_and_not_what_shines_through() -> None:
+def test_a_click_hits_the_front_surface() -> None:
     """A hollow ball in front of a wall: the nearer side is hit, at its depth."""
     skin = shell(400)
     wall = np.stack(np.meshgrid(np.linspace(-2, 2, 60), [3.0], np.linspace(-1, 3, 60)), axis=-1).reshape(-1, 3)
@@ -36,7 +36,7 @@ def test_a_click_hits_the_surface_and_not_what_shines_through() -> None:
     assert click_at(round_ones(skin, 0.04), front(), 3.0, 3.0) is None
 
 
-def test_haze_before_what_is_clicked_on_is_not_hit() -> None:
+def test_haze_in_front_of_the_surface_is_not_hit() -> None:
     """A Gaussian just in front of the surface is not hit if its opacity is a fiftieth of the surface's, and is hit if
     it is equal."""
     skin = round_ones(shell(400), 0.04)
@@ -64,7 +64,7 @@ def test_a_click_is_a_disc_about_its_pixel(axis: int, sign: float) -> None:
         assert (click_at(cloud, camera, u, v) is not None) is hit
 
 
-def test_a_click_hits_what_lies_a_little_before_and_behind() -> None:
+def test_a_click_hits_gaussians_at_about_the_same_depth() -> None:
     """Five discs lie in a row along the ray. The hits are the one that contributes most of the light, and those within
     3 % of its distance."""
     camera = front()
@@ -77,7 +77,7 @@ def test_a_click_hits_what_lies_a_little_before_and_behind() -> None:
     assert (found.point - camera.centre) @ camera.rotation[2] == pytest.approx(5.0)
 
 
-def test_a_click_that_just_misses_means_the_nearest_part() -> None:
+def test_a_click_that_just_misses_selects_the_nearest_part() -> None:
     """The part must be within a tenth of the object's size. A click with hits selects the part with most of them."""
     parts = np.repeat([0, 1, 2], [1500, 1500, 100])
     places = [shell() - [0.7, 0.0, 0.0], shell() + [0.7, 0.0, 0.0], 0.1 * shell(100) + [0.0, 0.9, 0.0]]
@@ -93,7 +93,7 @@ def test_a_click_that_just_misses_means_the_nearest_part() -> None:
 
 
 @pytest.mark.parametrize("opacity, through", [(0.2, True), (0.9, False)])
-def test_veils_between_camera_and_object_are_looked_through(opacity: float, through: bool) -> None:
+def test_faint_gaussians_before_the_object_are_ignored(opacity: float, through: bool) -> None:
     """Three flat Gaussians in a row, each a third as wide as it is distant: faint ones hide nothing, opaque ones are
     hit."""
     skin = round_ones(shell(400), 0.04)
@@ -107,7 +107,7 @@ def test_veils_between_camera_and_object_are_looked_through(opacity: float, thro
 
 
 @pytest.mark.parametrize("tones", [(-1.0, 1.0), (0.0, 0.0)])
-def test_a_click_beside_cuts_off_what_touches(tones: tuple[float, float]) -> None:
+def test_a_negative_click_cuts_off_a_touching_ball(tones: tuple[float, float]) -> None:
     """One click selects both of two touching balls; a second, negative one removes the other ball, for all colours."""
     cloud = balls(tones)
     mine = click(cloud, (-0.5, -0.5, 0.5))
@@ -125,7 +125,7 @@ def test_a_click_beside_cuts_off_what_touches(tones: tuple[float, float]) -> Non
         assert found.size == pytest.approx(np.sqrt(3.0), rel=0.15)
 
 
-def test_a_click_adds_what_stands_apart() -> None:
+def test_a_click_adds_a_separate_part() -> None:
     cloud = balls((0.0, 0.0), between=1.6)
     first, second = click(cloud, (-0.8, -0.5, 0.5)), click(cloud, (0.8, -0.5, 0.5))
     clear = cloud.means.numpy()[:3000, 2] > 0.06
@@ -135,7 +135,7 @@ def test_a_click_adds_what_stands_apart() -> None:
     assert pair.object_mask[:3000][clear].all()
 
 
-def test_a_click_on_the_floor_takes_nothing_away() -> None:
+def test_a_negative_click_on_the_floor_removes_nothing() -> None:
     cloud, _ = ball_on_floor()
     mine, floor = click(cloud, (0.0, -0.5, 0.5)), click(cloud, (0.0, -0.9, 0.0), inside=False)
     one = segment(cloud, FLOOR, ObjectSpec.of_clicks([mine]))
@@ -144,7 +144,7 @@ def test_a_click_on_the_floor_takes_nothing_away() -> None:
     assert two.background_mask[floor.hits].all()
 
 
-def test_leaves_that_hang_in_the_air_go_along_and_what_stands_beside_does_not() -> None:
+def test_detached_parts_in_the_air_are_added_and_standing_ones_are_not() -> None:
     """A blossom less than two cells off belongs to the ball; one as near on the floor does not."""
     random = np.random.default_rng(3)
     leaf = random.uniform(-0.06, 0.06, (60, 3))
@@ -157,7 +157,7 @@ def test_leaves_that_hang_in_the_air_go_along_and_what_stands_beside_does_not() 
     assert not found.object_mask[1560:1620].any()
 
 
-def test_what_hangs_in_the_air_is_held_by_what_is_near() -> None:
+def test_detached_parts_belong_to_a_near_object() -> None:
     """A detached part belongs to the object within two of the 64 cells across it, but not if it is farther away or
     reaches the floor.
     """
@@ -173,7 +173,7 @@ def test_what_hangs_in_the_air_is_held_by_what_is_near() -> None:
 @pytest.mark.parametrize(
     ("count", "post", "goes_along"), [(200, None, True), (30, None, False), (200, 1.15, False), (200, 1.6, True)]
 )
-def test_a_hand_that_hangs_apart_is_held_by_the_nearest(count: int, post: float | None, goes_along: bool) -> None:
+def test_a_detached_hand_belongs_to_the_nearest_object(count: int, post: float | None, goes_along: bool) -> None:
     """A hand at a fifth of the ball's size belongs to it, unless it has few Gaussians, or a post is less than twice as
     far away.
     """
@@ -193,7 +193,7 @@ def test_a_hand_that_hangs_apart_is_held_by_the_nearest(count: int, post: float 
     assert not found.object_mask[1500 + count : things.count].any()
 
 
-def test_the_plane_lies_below_the_lowest_click() -> None:
+def test_the_plane_is_below_the_lowest_click() -> None:
     """A ball on a slab on a floor: with a second click on the side of the slab, both stand on the floor."""
     across, up_to = np.meshgrid(np.linspace(-0.9, 0.9, 46), np.linspace(0.0, 0.4, 11))
     side = np.column_stack([np.full(across.size, 0.9), across.ravel(), up_to.ravel()])
@@ -236,7 +236,7 @@ def test_clicks_as_the_user_writes_them(tmp_path: Path) -> None:
         read_object("+32,32@b", cloud, [])
 
 
-def test_a_click_on_a_shadow_takes_no_leg_along() -> None:
+def test_a_negative_click_on_a_shadow_keeps_the_foot() -> None:
     """A tongue of floor, 0.05 high, is connected to the ball's foot: a click on its tip removes its outer half and
     keeps the ball, although the positive click is as far from the foot.
     """
@@ -254,7 +254,7 @@ def test_a_click_on_a_shadow_takes_no_leg_along() -> None:
     assert found.object_mask[:1500][high].all()
 
 
-def test_a_click_on_a_shadow_at_the_foot_of_a_thin_leg_leaves_the_leg() -> None:
+def test_a_negative_click_on_a_shadow_keeps_a_thin_leg() -> None:
     """The leg is much nearer to the shadow than to the positive click above it, and has the same colour, but it is more
     than twice as high.
     """

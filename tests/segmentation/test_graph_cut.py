@@ -18,7 +18,7 @@ def cost(graph: SplatGraph, inside: np.ndarray, leaning: np.ndarray, smoothness:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_no_labels_cost_less(seed: int) -> None:
+def test_the_cut_has_the_lowest_cost(seed: int) -> None:
     """All 2^9 labels of nine Gaussians that respect the fixed ones."""
     random = np.random.default_rng(seed)
     graph = SplatGraph.linking(random.normal(size=(9, 3)), random.uniform(size=(9, 3)))
@@ -48,7 +48,7 @@ def test_a_chain_is_cut_at_its_widest_gap_and_at_its_change_of_colour() -> None:
     assert by_colour.sum() == 25 and by_colour[:25].all()
 
 
-def test_ways_go_along_the_links() -> None:
+def test_distances_follow_the_links() -> None:
     """The path follows three sides of a square, not the gap; two distant squares are not connected."""
     side = np.linspace(0.0, 1.0, 41)
     legs = [
@@ -65,7 +65,7 @@ def test_ways_go_along_the_links() -> None:
     assert np.isinf(ways[123:]).all()
 
 
-def test_parts_are_what_hangs_together_on_either_side() -> None:
+def test_parts_are_connected_components_on_either_side() -> None:
     line = np.column_stack([np.arange(60.0), np.zeros((60, 2))])
     graph = SplatGraph.linking(line, np.full((60, 3), 0.5))
     inside = (np.arange(60) < 20) | (np.arange(60) >= 40)

@@ -61,7 +61,7 @@ def test_heights_are_those_of_the_cloth(located: LocatedPlane, folds: tuple[Gaus
     assert abs(off.mean()) < 1e-3 and np.abs(off).mean() < 2e-3 and np.quantile(np.abs(off), 0.99) < 8e-3
 
 
-def test_what_is_told(located: LocatedPlane) -> None:
+def test_messages(located: LocatedPlane) -> None:
     assert any(
         note.startswith("the ground is not flat: it differs from its plane by")
         and note.endswith("the object stands on it as captured")
@@ -69,7 +69,7 @@ def test_what_is_told(located: LocatedPlane) -> None:
     )
 
 
-def test_the_object_goes_down_to_the_ground(located: LocatedPlane, folds: tuple[GaussianCloud, np.ndarray]) -> None:
+def test_the_object_reaches_the_ground(located: LocatedPlane, folds: tuple[GaussianCloud, np.ndarray]) -> None:
     """The ball stands within a fold: it is segmented completely, down to its lowest Gaussian, with little of the
     cloth."""
     _, truth = folds
@@ -110,7 +110,7 @@ def test_flat_ground_stays_a_plane(on_flat: tuple[LocatedPlane, LocatedPlane, Me
 
 
 @pytest.mark.slow
-def test_roughness_that_views_do_not_agree_on_is_no_ground(
+def test_inconsistent_roughness_is_no_ground(
     flat: tuple[GaussianCloud, np.ndarray], on_flat: tuple[LocatedPlane, LocatedPlane, MeasuredGround]
 ) -> None:
     """A roughness of a tenth of the height counts as flat if views differ by a twentieth; so does ground that no view
@@ -138,7 +138,7 @@ def test_real_grounds_that_are_flat_stay_planes(data_dir: Path, file: str, click
     assert any("taken as flat" in note for note in located.notes) == (file == "koala.ply")
 
 
-def test_ground_reaches_up_to_what_stands_on_it() -> None:
+def test_ground_is_raised_to_the_object() -> None:
     """Level ground with a hill that the object hides: it is raised to the object there, and nowhere where it is
     visible."""
     heights = np.zeros((41, 61))
@@ -160,7 +160,7 @@ def test_ground_reaches_up_to_what_stands_on_it() -> None:
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.01])
-def test_what_the_object_hid_is_not_taken_for_ground(scale: float) -> None:
+def test_a_lower_floor_seen_through_the_hole_is_no_ground(scale: float) -> None:
     """A floor with a hole under a ball, and another floor far below that is visible through the hole; in metres and in
     another unit.
     """
@@ -179,7 +179,7 @@ def test_what_the_object_hid_is_not_taken_for_ground(scale: float) -> None:
     assert len(seen) > 1000 and np.abs(seen[:, 2]).max() < 0.05 * scale
 
 
-def test_specks_of_ground_are_left_out() -> None:
+def test_small_patches_of_ground_are_left_out() -> None:
     """A patch needs at least a twentieth of the nodes of the largest one: of 40 nodes, 2 are enough and 1 is not."""
     ground = np.zeros((12, 12), bool)
     ground[:4, :10] = ground[6, :2] = ground[9, 9] = True

@@ -24,7 +24,7 @@ from tests.support.grounds import level
 from tests.support.scenes import FLOOR, lying, round_ones
 
 
-def test_the_closed_form_paints_the_masks_with_the_least_error() -> None:
+def test_the_closed_form_has_the_least_error() -> None:
     """Over all 2^8 labels: the sum over pixels of |mask - rendered labels| is linear in the labels, since weights in a
     pixel sum to at most one: it is the weight outside where a label is 1, and inside where it is 0.
     """
@@ -46,7 +46,7 @@ def test_a_bias_makes_the_object_leaner_or_fuller() -> None:
 
 
 @pytest.mark.slow
-def test_rough_masks_of_three_views_find_a_stool_with_its_legs() -> None:
+def test_rough_masks_of_three_views_segment_a_stool() -> None:
     """The outlines of the masks are off by up to three pixels: the graph cut is right where votes alone are not."""
     made = scene("stool")
     cloud, truth = made.whole()
@@ -72,7 +72,7 @@ def test_rough_masks_of_three_views_find_a_stool_with_its_legs() -> None:
     assert overlap((found.object_mask | found.floater_mask)[nodes]) > 0.999
 
 
-def test_a_vote_is_surer_by_the_root_of_its_pixels() -> None:
+def test_the_confidence_of_a_vote_grows_with_the_root_of_its_pixels() -> None:
     """One of two similar neighbours is certainly outside, the other is inside by less than the cost of their link:
     both become outside. Nine times the pixels have three times the weight.
     """
@@ -85,7 +85,7 @@ def test_a_vote_is_surer_by_the_root_of_its_pixels() -> None:
 
 
 @pytest.mark.parametrize(("pixels", "kept_out"), [(66.0, True), (4.0, False)])
-def test_what_many_pixels_say_no_neighbour_overrules(pixels: float, kept_out: bool) -> None:
+def test_many_pixels_overrule_the_neighbours(pixels: float, kept_out: bool) -> None:
     """One Gaussian in a sheet of the object is 62 % outside the masks: with 66 pixels the vote counts, with four
     it may be due to the edge of the masks.
     """
@@ -98,7 +98,7 @@ def test_what_many_pixels_say_no_neighbour_overrules(pixels: float, kept_out: bo
     assert labels[middle] != kept_out and labels.sum() >= cloud.count - 1
 
 
-def test_masks_mean_every_piece_and_clicks_correct_them() -> None:
+def test_masks_select_every_part_and_clicks_correct_them() -> None:
     """Two separate balls are masked and both become the object; a negative click removes one."""
     cloud = balls((0.0, 0.0), between=1.6)
     pair = np.arange(cloud.count) < 3000

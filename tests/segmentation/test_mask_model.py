@@ -62,7 +62,7 @@ def answering(*outputs: np.ndarray) -> tuple[OnnxClickModel, list[Inputs]]:
     return OnnxClickModel(OnnxNetwork(Path("model.onnx"), NAMES, compute), NAMES), given
 
 
-def test_what_it_is_given_and_that_the_best_mask_is_taken() -> None:
+def test_inputs_of_the_network_and_selection_of_the_best_mask() -> None:
     masks = np.full((1, 1, 3, 256, 256), -1.0, np.float32)
     masks[0, 0, 1, :, :128] = 1.0
     model, given = answering(masks, np.array([[[0.2, 0.9, 0.5]]], np.float32))
@@ -85,7 +85,7 @@ def test_what_it_is_given_and_that_the_best_mask_is_taken() -> None:
 @pytest.mark.parametrize(
     "wrong", [np.zeros((1, 1, 64, 64)), np.full((1, 1, 1, 8, 8), np.nan), np.zeros((1, 1, 0, 8, 8))]
 )
-def test_what_is_no_mask_is_refused(wrong: np.ndarray) -> None:
+def test_invalid_masks_are_refused(wrong: np.ndarray) -> None:
     model, _ = answering(wrong)
     with pytest.raises(UserError, match=r"model\.onnx: the network returned shape .* expected masks \(1, 1, k, h, w\)"):
         model.mask(halves(), np.array([[9.0, 6.0]]), np.array([True]))
@@ -109,7 +109,7 @@ def test_files_that_are_no_such_network(program: str, tmp_path: Path) -> None:
         )
 
 
-def test_a_network_that_fails_is_told_in_one_line() -> None:
+def test_a_network_that_fails_is_a_one_line_error() -> None:
     def compute(inputs: Inputs) -> list[np.ndarray]:
         raise RuntimeError("long\nstory\nout of shape")
 
@@ -122,7 +122,7 @@ def test_a_network_that_fails_is_told_in_one_line() -> None:
     assert "\n" not in str(error.value)
 
 
-def test_what_stands_out_is_stretched_to_all_of_its_range() -> None:
+def test_saliency_is_normalised_to_its_range() -> None:
     """As in the training of the network: the smallest output is background, the largest is object."""
     answer = np.full((1, 1, 320, 320), 0.1, np.float32)
     answer[..., :160, :] = 0.4
@@ -142,7 +142,7 @@ def test_what_stands_out_is_stretched_to_all_of_its_range() -> None:
     )
 
 
-def test_where_nothing_that_proposes_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_saliency_network_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(
         UserError, match=r"no network for proposing an object is installed; install egs-warp\[salient\], or click"
@@ -150,7 +150,7 @@ def test_where_nothing_that_proposes_is_installed(monkeypatch: pytest.MonkeyPatc
         SalientModel.installed()
 
 
-def test_the_reader_comes_before_any_program(program: str, tmp_path: Path) -> None:
+def test_onnx_files_are_checked_before_they_are_loaded(program: str, tmp_path: Path) -> None:
     """Tensors in external files are refused."""
     data = onnx.model(
         [onnx.node("Mul", ["image", "much"], ["out"])],

@@ -42,7 +42,7 @@ def check(cloud: GaussianCloud, truth: np.ndarray, spec: ObjectSpec) -> None:
     assert 1.2 < found.size < 1.8
 
 
-def test_shreds_of_the_floor_do_not_go_along() -> None:
+def test_floor_remnants_are_left_out() -> None:
     """Wide Gaussians of the floor's colour at the foot of a dark ball belong neither to the ball nor to the background;
     a dark one of the same size belongs to the ball.
     """
@@ -64,7 +64,7 @@ def test_shreds_of_the_floor_do_not_go_along() -> None:
     assert (truth & (cloud.means.numpy()[:, 2] > 0.05) & ~found.object_mask[: cloud.count]).sum() == 0
 
 
-def test_an_object_that_segmentation_leaves_empty_is_an_error_of_that_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_empty_segmentation_is_an_error_of_that_stage(monkeypatch: pytest.MonkeyPatch) -> None:
     """For every step that may remove the last Gaussian: floor remnants, haze or clicks."""
     cloud, _ = ball_on_floor()
     spec = ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
@@ -84,7 +84,7 @@ def test_an_object_that_segmentation_leaves_empty_is_an_error_of_that_stage(monk
             segment(cloud, FLOOR, spec)
 
 
-def test_fine_specks_in_the_floor_s_colour_are_no_shreds_of_it() -> None:
+def test_fine_specks_of_the_floor_s_colour_are_kept() -> None:
     """Specks three times as wide as others at the foot, but less than a hundredth of the object, are kept; wider ones
     of a thirtieth are not."""
     thing, floor = shell(), level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.05)
@@ -117,7 +117,7 @@ def test_box_and_point_find_the_same_hollow_ball_with_what_is_inside() -> None:
     check(cloud, truth, ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
 
 
-def test_what_no_mask_can_mean_is_said() -> None:
+def test_impossible_masks_are_reported() -> None:
     cloud, truth = ball_on_floor()
     camera = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.8, count=1, size=96)[0]
     mask = masks_from_selection(cloud, truth, [camera])[0].mask
@@ -206,7 +206,7 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["pawn", *(pytest.param(name, marks=pytest.mark.slow) for name in ("stool", "figurine"))]
 )
-def test_built_in_scenes_come_apart(name: str) -> None:
+def test_built_in_scenes_are_segmented(name: str) -> None:
     """Compared with the true object, everything above the foot is found, and nothing of the room except unseen
     Gaussians."""
     made = scene(name)
@@ -243,7 +243,7 @@ def test_real_captures_from_one_click(
 
 
 @pytest.mark.parametrize("width", [120.0, 400.0])
-def test_a_click_finds_what_is_small_in_a_large_room(width: float) -> None:
+def test_a_click_finds_a_small_object_in_a_large_room(width: float) -> None:
     """A ball of one unit between distant walls: the guess of its size is halved until it is found."""
     cloud, truth = ball_on_floor()
     whole = concatenate(cloud, walls(width, cloud.sh.shape[1]))
@@ -257,7 +257,7 @@ def walls(width: float, bands: int) -> GaussianCloud:
     return round_ones(np.concatenate(sides), 0.135, bands)
 
 
-def test_a_click_finds_what_is_flat_in_a_room() -> None:
+def test_a_click_finds_a_flat_object_in_a_room() -> None:
     """A lens with a height of a tenth of its width, between walls 11 apart: with the first guess of its size, half of
     the room's, it is not found, with half of that it is.
     """
@@ -294,7 +294,7 @@ def test_the_unit_of_length_changes_nothing() -> None:
     assert large.size == pytest.approx(1000.0 * small.size, rel=1e-5)
 
 
-def test_what_hangs_beside_is_a_floater_only_where_it_is_small() -> None:
+def test_only_small_detached_parts_are_floaters() -> None:
     """A single Gaussian beside a ball belongs neither to the ball nor to the background; another ball as near is
     background."""
     mine = shell()
@@ -311,7 +311,7 @@ def test_what_hangs_beside_is_a_floater_only_where_it_is_small() -> None:
     assert found.floater_mask[3000]
 
 
-def test_loose_matter_behind_a_hole_is_the_bodys() -> None:
+def test_loose_gaussians_behind_a_hole_belong_to_the_object() -> None:
     """A hollow ball with a round hole in its side, a tenth of its size wide: loose Gaussians inside belong to it."""
     skin = shell(3000)
     away = np.linalg.norm(skin - [0.5, 0.0, 0.5], axis=1)
@@ -324,7 +324,7 @@ def test_loose_matter_behind_a_hole_is_the_bodys() -> None:
     assert found.object_mask[len(skin) : len(skin) + 30].all()
 
 
-def test_the_floor_closes_a_bell_from_below() -> None:
+def test_the_floor_closes_a_dome_from_below() -> None:
     """A dome that stands on its rim, open below: loose Gaussians inside belong to it."""
     skin = shell(3000)
     dome = skin[skin[:, 2] > 0.5] - [0.0, 0.0, 0.5]
@@ -336,7 +336,7 @@ def test_the_floor_closes_a_bell_from_below() -> None:
     assert found.object_mask[len(dome) : len(dome) + 30].all()
 
 
-def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
+def test_floor_scatter_is_measured_beside_the_object() -> None:
     """The limit is three standard deviations of the floor nearby; neither a higher floor far away nor Gaussians under
     the object count.
     """
@@ -353,7 +353,7 @@ def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
     assert top == pytest.approx(0.003, rel=0.15)
 
 
-def test_hardly_any_floor_says_nothing_of_its_roughness() -> None:
+def test_floor_scatter_needs_enough_gaussians() -> None:
     """Nineteen Gaussians of floor beside the object are too few, twenty are enough."""
     for count, rough in ((19, False), (20, True)):
         place = np.linspace(0.7, 1.2, count)
@@ -365,7 +365,7 @@ def test_hardly_any_floor_says_nothing_of_its_roughness() -> None:
         assert top == pytest.approx(0.01 if rough else 0.0, abs=1e-6)
 
 
-def test_what_hovers_over_the_only_floor_is_taken_and_said() -> None:
+def test_an_object_hovering_over_the_only_floor_is_accepted_with_a_note() -> None:
     """A ball above the floor by a fifth of its size, the diagonal of its box, is accepted; at twice the height it is
     refused."""
     cloud, truth = ball_on_floor(lift=0.35)

@@ -83,7 +83,7 @@ def test_exact_depth_gives_the_exact_plane() -> None:
     assert abs(fit.plane.offset - TRUTH.offset) < 1e-6
 
 
-def test_weights_of_one_over_the_residual_leave_outliers_out() -> None:
+def test_weights_of_one_over_the_residual_reject_outliers() -> None:
     """Weights of 1 / |residual| turn least squares into least absolute residuals: exact depths of which a fifth are
     wrong, all to one side, give the exact plane."""
     camera = camera_over(TRUTH, 0.7)
@@ -103,7 +103,7 @@ def test_several_views_are_fitted_together() -> None:
     assert angle(fit_plane(views).plane, TRUTH) < np.mean(alone)
 
 
-def test_what_cannot_be_fitted_is_said() -> None:
+def test_views_that_cannot_be_fitted_are_reported() -> None:
     camera = camera_over(TRUTH, 0.0)
     depth = plane_depth(TRUTH, camera)
     with pytest.raises(UserError, match=r"mask of view 0 is \(50, 40\), its camera \(120, 90\) pixels"):

@@ -45,7 +45,7 @@ def test_several_planes_widest_first() -> None:
     assert plane_under(found, np.array([0.0, 0.0, -1.0]), tolerance=0.0) is None
 
 
-def test_what_lies_along_a_plane() -> None:
+def test_gaussians_parallel_to_a_plane() -> None:
     """Discs of any thin axis and orientation count within 25 degrees of the plane but not beyond 40; needles and balls
     do not count.
     """
@@ -69,7 +69,7 @@ def test_what_lies_along_a_plane() -> None:
     assert not found(-scales).any() and not found(np.full((count, 3), -3.0)).any()
 
 
-def test_a_plane_is_one_patch_or_none() -> None:
+def test_a_plane_is_a_single_patch() -> None:
     """A sheet is one patch; three separate sheets at one level are not, even if another sheet above spans them."""
     one = level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.03)
     apart = np.concatenate([one[:, :3] + [3.0 * k, 0.0, 0.0] for k in range(3)])
@@ -89,7 +89,7 @@ def test_further_planes_are_level_in_one_patch_and_elsewhere(scale: float) -> No
     assert [round(one.plane.offset / scale, 3) for one in found] == [0.8]
 
 
-def test_what_lets_half_of_the_light_through_is_no_plane_to_see() -> None:
+def test_faint_surfaces_are_no_visible_planes() -> None:
     """A floor that is opaque on one side of a line and faint on the other: the mask ends at the line."""
     points = level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.03)
     floor = lying(points)
@@ -108,7 +108,7 @@ def test_what_lets_half_of_the_light_through_is_no_plane_to_see() -> None:
 
 
 @pytest.mark.parametrize(("given", "taken"), [(8, 8), (9, 5), (20, 7)])
-def test_of_many_cameras_at_most_eight_look(given: int, taken: int) -> None:
+def test_at_most_eight_cameras_are_used(given: int, taken: int) -> None:
     """They are picked evenly; cameras below the plane are not used."""
     floor = lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05))
     above = ring_cameras(FLOOR, np.zeros(3), 1.0, count=given, elevations=(40.0,), size=32)
@@ -119,7 +119,7 @@ def test_of_many_cameras_at_most_eight_look(given: int, taken: int) -> None:
     assert len(set(steps.tolist())) == 1
 
 
-def test_a_plane_is_refined_alike_in_any_unit_of_length() -> None:
+def test_a_plane_is_refined_equally_in_any_unit_of_length() -> None:
     """The floor has a scatter of 0.01 in a region of size 1, and a step of 0.05 on one side that does not belong to
     it."""
     points = level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.03)

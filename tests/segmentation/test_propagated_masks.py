@@ -56,7 +56,7 @@ def pixel_of(camera: Camera, point: tuple[float, float, float]) -> tuple[float, 
 
 
 @pytest.mark.slow
-def test_one_click_is_marked_in_every_view_and_cuts_what_touches(cameras: list[Camera]) -> None:
+def test_one_click_is_marked_in_every_view_and_cuts_touching_balls(cameras: list[Camera]) -> None:
     """The clicked one of two touching balls is found completely; without a network, the click selects both."""
     cloud = balls(TONES)
     camera = next(one for one in cameras if one.centre[1] < -1.0 and abs(one.centre[0]) < 1.5)
@@ -73,7 +73,7 @@ def test_one_click_is_marked_in_every_view_and_cuts_what_touches(cameras: list[C
     assert alone.object_mask[1500:3000].mean() > 0.9
 
 
-def test_a_view_that_marks_something_else_is_left_out(cameras: list[Camera]) -> None:
+def test_a_view_that_marks_another_object_is_left_out(cameras: list[Camera]) -> None:
     cloud = balls(TONES)
     click = click_at(cloud, cameras[0], *pixel_of(cameras[0], (-0.5, 0.0, 0.9)))
     assert click is not None
@@ -88,7 +88,7 @@ def test_a_view_that_marks_something_else_is_left_out(cameras: list[Camera]) -> 
 
 
 @pytest.mark.parametrize(("times", "fits"), [(2.9, True), (3.1, False)])
-def test_a_mask_thrice_as_large_is_of_something_else(cameras: list[Camera], times: float, fits: bool) -> None:
+def test_a_mask_three_times_as_large_is_rejected(cameras: list[Camera], times: float, fits: bool) -> None:
     """The network marks the region of the first mask about its centre, enlarged by a factor."""
     cloud = balls(TONES)
     (first,) = masks_from_selection(cloud, np.arange(cloud.count) < 1500, cameras[:1])
@@ -103,7 +103,7 @@ def test_a_mask_thrice_as_large_is_of_something_else(cameras: list[Camera], time
     assert (found is not None) is fits
 
 
-def test_clicks_beside_go_along_where_they_are_in_sight(cameras: list[Camera]) -> None:
+def test_negative_clicks_are_passed_on_where_they_are_visible(cameras: list[Camera]) -> None:
     cloud = balls(TONES)
     on, off = (click_at(cloud, cameras[0], *pixel_of(cameras[0], (x, 0.0, 0.95)), inside=x < 0) for x in (-0.5, 0.5))
     assert on is not None and off is not None
@@ -117,7 +117,7 @@ def test_clicks_beside_go_along_where_they_are_in_sight(cameras: list[Camera]) -
     np.testing.assert_allclose(_in_sight(cloud, below, cameras[0]), [pixel_of(cameras[0], tuple(off.point))], atol=1e-9)
 
 
-def test_what_nothing_can_be_made_of_is_told(cameras: list[Camera]) -> None:
+def test_clicks_without_a_result_are_reported(cameras: list[Camera]) -> None:
     cloud = balls(TONES)
     beside = click_at(cloud, cameras[0], *pixel_of(cameras[0], (0.5, 0.0, 0.9)), inside=False)
     on = click_at(cloud, cameras[0], *pixel_of(cameras[0], (-0.5, 0.0, 0.9)))
@@ -133,7 +133,7 @@ def test_what_nothing_can_be_made_of_is_told(cameras: list[Camera]) -> None:
         masks_of_clicks(cloud, [on], cameras, Blind())
 
 
-def test_places_to_point_at() -> None:
+def test_prompt_points() -> None:
     """The innermost pixel of each region, largest region first; none twice, and none in a thin line."""
     mask = np.zeros((60, 100), bool)
     mask[5:46, 5:46], mask[10:31, 60:81], mask[50, 10:90] = True, True, True
@@ -152,7 +152,7 @@ def test_cameras_well_apart_in_small_steps(cameras: list[Camera]) -> None:
     assert len(_well_apart(cameras[:1], cameras, 99)) == 9
 
 
-def test_what_stands_out_of_most_views_is_taken(cameras: list[Camera]) -> None:
+def test_the_object_salient_in_most_views_is_selected(cameras: list[Camera]) -> None:
     cloud = balls(TONES)
     seen: list[np.ndarray] = []
 

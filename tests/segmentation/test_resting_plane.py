@@ -68,7 +68,7 @@ def test_a_box_rests_on_its_underside(off: float) -> None:
 
 
 @pytest.mark.parametrize("off", [-9.0, -5.0, 5.0])
-def test_the_direction_is_found_more_finely_than_by_the_first_search(off: float) -> None:
+def test_the_direction_is_finer_than_the_first_search(off: float) -> None:
     """The first search tries directions 1.4 degrees apart."""
     cloud = round_ones(skin_of_box(), 0.008)
     found = resting_plane(cloud, np.ones(cloud.count, bool), FLOOR, leaning(off), degrees=10.0, size=1.3)
@@ -76,7 +76,7 @@ def test_the_direction_is_found_more_finely_than_by_the_first_search(off: float)
 
 
 @pytest.mark.parametrize("mirror", [(-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
-def test_what_is_mirrored_rests_on_the_mirrored_plane(mirror: tuple[float, float, float]) -> None:
+def test_a_mirrored_object_rests_on_the_mirrored_plane(mirror: tuple[float, float, float]) -> None:
     """No side is preferred, for any shape."""
     for seed in range(8):
         points = np.random.default_rng(seed).normal(size=(600, 3)) * [0.3, 0.2, 0.1] + [0.0, 0.0, 0.5]
@@ -100,7 +100,7 @@ def test_a_mirror_image_in_a_glossy_table_carries_nothing() -> None:
     assert abs(float(found.heights(np.zeros(3)))) < 0.01
 
 
-def test_a_direction_beyond_what_is_allowed_is_not_taken() -> None:
+def test_the_direction_is_limited() -> None:
     cloud = round_ones(skin_of_box(), 0.008)
     found = resting_plane(cloud, np.ones(cloud.count, bool), FLOOR, leaning(8.0), degrees=5.0, size=1.3)
     assert degrees_between(found.normal, leaning(8.0)) == pytest.approx(5.0, abs=0.1)
@@ -118,7 +118,7 @@ def found_on(cloud: GaussianCloud) -> LocatedPlane:
     return with_measured_ground(cloud, locate_plane(cloud, spec, cameras=cameras), spec, cameras)
 
 
-def test_where_what_is_seen_is_not_level_the_plane_is_laid_under_the_object() -> None:
+def test_a_tilted_visible_surface_is_replaced_by_the_resting_plane() -> None:
     """A surface tilted by 8 degrees is haze; one tilted by 3 degrees is a table."""
     laid, seen = found_on(box_on_haze(8.0)), found_on(box_on_haze(3.0))
     assert not laid.in_sight and laid.fit is None and seen.in_sight
@@ -129,7 +129,7 @@ def test_where_what_is_seen_is_not_level_the_plane_is_laid_under_the_object() ->
     assert laid.ground is None
 
 
-def test_shreds_about_a_foot_on_haze_are_dropped_and_haze_stays() -> None:
+def test_low_remnants_on_haze_are_dropped_and_haze_stays() -> None:
     """Remnants near the foot and low are dropped, distant ones are not, and none if a table is visible."""
     at = np.array([[0.54, 0.1, 0.04], [0.52, -0.1, 0.03], [1.6, 0.9, 0.0]])
     shreds = round_ones(at, 0.01)
@@ -155,7 +155,7 @@ def test_haze_is_not_filled() -> None:
     assert "was not filled, as no view tells" in scene.notes[-1]
 
 
-def test_haze_within_an_object_is_dropped_with_it() -> None:
+def test_haze_within_an_object_is_dropped() -> None:
     """It does not belong to the object, and in the background it would look like a ghost of the object."""
     cloud, truth = ball_on_floor()
     where = np.array([[0.0, 0.1, 0.6], [0.1, 0.0, 0.4]])
@@ -166,7 +166,7 @@ def test_haze_within_an_object_is_dropped_with_it() -> None:
     assert found.object_mask[: cloud.count][truth].mean() > 0.95
 
 
-def test_haze_at_an_object_in_its_colour_is_dropped_with_it() -> None:
+def test_haze_at_an_object_in_its_colour_is_dropped() -> None:
     """Haze of another colour, or farther away, belongs to the background."""
     cloud, _ = ball_on_floor()
     where = np.array([[0.55, 0.0, 0.5], [0.0, 0.55, 0.5], [0.75, 0.0, 0.5]])
@@ -182,7 +182,7 @@ def test_haze_at_an_object_in_its_colour_is_dropped_with_it() -> None:
     assert not found.object_mask[-3:].any()
 
 
-def test_haze_about_an_object_is_not_taken_along() -> None:
+def test_haze_around_an_object_is_left_out() -> None:
     cloud, truth = ball_on_floor()
     random = np.random.default_rng(4)
     where = random.normal(size=(30, 3))

@@ -37,7 +37,7 @@ def test_heights_are_right_where_depths_are_too_high(seen: SeenSurface) -> None:
     np.testing.assert_allclose(points, seen.camera.centre + along[:, None] * rays[seen.opaque], atol=1e-9)
 
 
-def test_a_rough_plane_will_do(seen: SeenSurface) -> None:
+def test_a_rough_plane_is_sufficient(seen: SeenSurface) -> None:
     """For a plane tilted by two degrees, the error is the width of a splat times the sine of the tilt."""
     tilt = np.radians(2.0)
     rough = Plane(np.array([0.0, np.sin(tilt), np.cos(tilt)]), 0.02)
@@ -45,7 +45,7 @@ def test_a_rough_plane_will_do(seen: SeenSurface) -> None:
     assert np.abs(points[:, 2]).max() < 3.0 * SPACING * np.sin(tilt)
 
 
-def test_what_shows_nothing_or_does_not_come_down_has_no_place(seen: SeenSurface) -> None:
+def test_pixels_without_a_surface_have_no_depth(seen: SeenSurface) -> None:
     """Empty pixels, rays at or above the horizon, and a plane above the camera."""
     up = Camera.look_at(
         np.array([0.0, -1.0, 0.5]), np.array([0.0, 1.0, 0.9]), np.array([0.0, 0.0, 1.0]), width=64, height=64

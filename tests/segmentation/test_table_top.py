@@ -62,7 +62,7 @@ def test_a_mask_and_a_box_find_it_too(room: GaussianCloud) -> None:
         assert abs(float(located.plane.heights(np.zeros(3)))) < 5e-3
 
 
-def test_candidates_come_from_the_highest_down_and_the_surface_goes_on_around_the_ball(
+def test_candidates_are_sorted_from_the_top_and_extend_around_the_ball(
     room: GaussianCloud, candidates: list[Plane]
 ) -> None:
     heights = [-plane.offset for plane in candidates]
@@ -75,7 +75,7 @@ def test_candidates_come_from_the_highest_down_and_the_surface_goes_on_around_th
     assert surface_around(room, middle, segment(room, middle, point)) < 0.05
 
 
-def test_candidates_do_not_hang_on_the_unit_of_length(room: GaussianCloud, candidates: list[Plane]) -> None:
+def test_candidates_do_not_depend_on_the_unit_of_length(room: GaussianCloud, candidates: list[Plane]) -> None:
     scaled = planes_below(room.scaled(10.0), UP, 10.0 * MIDDLE)
     np.testing.assert_allclose(
         [plane.offset for plane in scaled], [10.0 * plane.offset for plane in candidates], atol=1e-3
@@ -118,7 +118,7 @@ def on_surface(points: np.ndarray, spacing: float, cover: float) -> float:
     return surface_around(whole, Plane(UP, 0.0), Segmentation(mine, nothing, nothing, float(np.sqrt(3.0))))
 
 
-def test_the_surface_goes_on_as_far_as_it_lies() -> None:
+def test_surface_around_measures_the_extent_of_the_surface() -> None:
     """It is half on a table whose edge runs under the ball's centre; one if Gaussians cover enough of the area and zero
     if less; and nearly zero if they begin a cell farther out.
     """

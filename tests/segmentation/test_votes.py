@@ -30,7 +30,7 @@ def camera() -> Camera:
     return Camera.look_at(np.array([0.3, -3.0, 0.8]), np.zeros(3), np.array([0.0, 0.0, 1.0]), width=56, height=40)
 
 
-def test_votes_are_the_weights_that_paint_each_gaussian(device: str) -> None:
+def test_votes_are_the_blending_weights(device: str) -> None:
     """A render of one white Gaussian among black ones shows its blending weight in each pixel."""
     cloud, view = random_cloud(device), camera()
     mask = np.zeros((view.height, view.width), bool)
@@ -54,7 +54,7 @@ def test_votes_are_the_weights_that_paint_each_gaussian(device: str) -> None:
     assert share.min() < 0.1 and share.max() > 0.9
 
 
-def test_a_hidden_gaussian_is_hardly_seen(device: str) -> None:
+def test_a_hidden_gaussian_has_little_weight(device: str) -> None:
     """Two equal Gaussians one behind the other: the front one is fully visible, the other one hardly at all."""
     cloud = GaussianCloud.from_numpy(
         np.array([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.7, 0.0, 0.0]]),
@@ -76,7 +76,7 @@ def test_a_mask_of_another_size_is_refused() -> None:
         blending_votes(random_cloud("cpu"), [view])
 
 
-def test_what_no_pixel_could_show_has_no_weight() -> None:
+def test_gaussians_outside_the_image_have_no_weight() -> None:
     """Gaussians behind the camera or far to the side have none, whatever hides them; one in a single tile counts."""
     means = np.array([[0.0, 0.0, 0.0], [0.0, -9.0, 0.0], [40.0, 0.0, 0.0]])
     cloud = GaussianCloud.from_numpy(

@@ -87,12 +87,12 @@ EQUATIONS: dict[int, Mutation] = {
                 "(self._regular, speeds, shift, friction, start)",
                 "(self._regular, speeds, shift + 0.1, friction, start)",
             ),
-            "contact/test_coupled_step.py::test_foreseen_forces_press_and_rub_no_more_than_they_may",
+            "contact/test_coupled_step.py::test_predicted_forces_obey_coulombs_law",
         ),
         (
             *(11, "Coulomb's limit", "kernels/contact/coulomb.py"),
             *("            share = radius / pull\n        newton", "            share = real(1.0)\n        newton"),
-            "contact/test_coupled_step.py::test_foreseen_forces_press_and_rub_no_more_than_they_may",
+            "contact/test_coupled_step.py::test_predicted_forces_obey_coulombs_law",
         ),
         (
             *(12, "the direction of the slip", "locomotion/complementarity.py"),
@@ -107,7 +107,7 @@ EQUATIONS: dict[int, Mutation] = {
         (
             *(14, "the mean of F+ and F-", "kernels/deformation/deformer.py"),
             *("average = 0.5 * (both.plus + both.minus)", "average = both.plus"),
-            "deformation/test_deformer.py::test_arms_go_where_their_ends_go",
+            "deformation/test_deformer.py::test_arms_follow_their_ends",
         ),
         (
             *(15, "the rotation of the colour", "kernels/deformation/deformer.py"),
@@ -115,7 +115,7 @@ EQUATIONS: dict[int, Mutation] = {
                 "result.polar_rotation = quaternion_from_rotation(turned * wp.transpose(axes))",
                 "result.polar_rotation = quaternion_from_rotation(axes * wp.transpose(turned))",
             ),
-            "deformation/test_deformer.py::test_a_turned_cage_turns_shape_and_colour_exactly",
+            "deformation/test_deformer.py::test_a_rotated_cage_rotates_shape_and_colour_exactly",
         ),
         (
             *(16, "the bend's angle", "kernels/deformation/deformer.py"),
@@ -196,7 +196,7 @@ OTHER_FORMULAS: list[Mutation] = [
         (
             *("the work of a push: the factor 1/2 of the velocity change", "locomotion/ledger.py"),
             *("t.velocities[step] + 0.5 * kick", "t.velocities[step] + kick"),
-            "locomotion/test_ledger.py::test_the_work_of_a_push_is_the_kinetic_energy_that_it_gives",
+            "locomotion/test_ledger.py::test_the_work_of_a_push_is_the_kinetic_energy_that_it_adds",
         ),
         (
             *("the loss of a push by implicit Euler", "locomotion/ledger.py"),
@@ -206,12 +206,12 @@ OTHER_FORMULAS: list[Mutation] = [
         (
             *("the torque of a push", "locomotion/audit.py"),
             *("np.cross(arms[t.kick_step], impulses)", "np.cross(t.positions[t.kick_step], impulses)"),
-            "locomotion/test_audit.py::test_a_push_that_is_left_out_elsewhere_or_late_is_seen",
+            "locomotion/test_audit.py::test_a_missing_misplaced_or_late_push_is_detected",
         ),
         (
             *("a push's change of speed", "motions/push.py"),
             *("(body.node_mass @ near) *", "near.sum() *"),
-            "motions/test_push.py::test_a_push_has_its_momentum_and_its_arm",
+            "motions/test_push.py::test_a_push_has_its_momentum_and_its_lever_arm",
         ),
         (
             *("a gust's end", "motions/push.py"),
@@ -221,7 +221,7 @@ OTHER_FORMULAS: list[Mutation] = [
         (
             *("the curve of the momentum residual: pushes", "web/recording.py"),
             *("force + kicked - t.drag", "force - t.drag"),
-            "web/test_recording.py::test_the_curve_of_the_momentum_knows_of_pushes",
+            "web/test_recording.py::test_the_momentum_curve_includes_pushes",
         ),
         (
             *("the impulse of a pull over a step", "web/spring.py"),
@@ -231,77 +231,77 @@ OTHER_FORMULAS: list[Mutation] = [
         (
             *("a jump's plan: half a step of gravity", "motions/jump_plan.py"),
             *("(2.0 * gravity * rise) + 0.5 * gravity * step", "(2.0 * gravity * rise)"),
-            "motions/test_jump_plan.py::test_a_body_that_does_as_planned_reaches_height_and_distance",
+            "motions/test_jump_plan.py::test_a_body_that_follows_the_plan_reaches_height_and_distance",
         ),
         (
             *("a jump's plan: half a step of the thrust", "motions/jump_plan.py"),
             *("stroke += 0.5 * speed_up * step", "stroke += speed_up * step"),
-            "motions/test_jump_plan.py::test_a_body_that_does_as_planned_reaches_height_and_distance",
+            "motions/test_jump_plan.py::test_a_body_that_follows_the_plan_reaches_height_and_distance",
         ),
         (
             *("a jump's plan: the time down to a landing that is higher", "motions/jump_plan.py"),
             *("max(rise - target.rise, 0.0) / gravity)", "max(rise + target.rise, 0.0) / gravity)"),
-            "motions/test_jump_plan.py::test_a_body_that_does_as_planned_reaches_height_and_distance",
+            "motions/test_jump_plan.py::test_a_body_that_follows_the_plan_reaches_height_and_distance",
         ),
         (
             *("a jump's plan: the capture point", "motions/jump_plan.py"),
             *("swaying = np.sqrt(gravity / com_height)", "swaying = np.sqrt(1.3 * gravity / com_height)"),
-            "motions/test_jump_plan.py::test_a_body_that_does_as_planned_reaches_height_and_distance",
+            "motions/test_jump_plan.py::test_a_body_that_follows_the_plan_reaches_height_and_distance",
         ),
         (
             *("a jump's plan: the load of a landing", "motions/jump_plan.py"),
             *("(gravity + fall_speed / landing_time)", "(fall_speed / landing_time)"),
-            "motions/test_jump_plan.py::test_feet_stop_a_body_whose_fall_takes_a_while",
+            "motions/test_jump_plan.py::test_feet_stop_a_body_with_a_gradual_landing",
         ),
         (
             *("balance: the centre of pressure under load", "motions/stance.py"),
             *("height / up * (level + turn) / dt", "height / gravity * (level + turn) / dt"),
-            "motions/test_stance.py::test_the_nearest_end_of_a_step_that_does_not_tip",
+            "motions/test_stance.py::test_balance_targets_are_the_nearest_that_do_not_tip",
         ),
         (
             *("balance: the friction limit under load", "motions/stance.py"),
             *("np.array([0.0, 0.0, up]), self._normal", "np.array([0.0, 0.0, gravity]), self._normal"),
-            "motions/test_stance.py::test_no_more_is_asked_than_friction_gives",
+            "motions/test_stance.py::test_requests_are_limited_by_friction",
         ),
         (
             *("balance: the margin of the footprint", "motions/stance.py"),
             *("0.5 * SUPPORT_MARGIN * (measurement.support[1]", "0.5 * (measurement.support[1]"),
-            "motions/test_stance.py::test_the_nearest_end_of_a_step_that_does_not_tip",
+            "motions/test_stance.py::test_balance_targets_are_the_nearest_that_do_not_tip",
         ),
         (
             *("the maximum rotation: the lever arm of a disc", "motions/turn.py"),
             *("2.0 / 3.0 * float(", "3.0 / 4.0 * float("),
-            "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground",
+            "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_on_rough_ground",
         ),
         (
             *("the maximum rotation: the impulse of the weight", "motions/turn.py"),
             *("(plan.speed_up + jump.gravity * plan.thrust_time)", "plan.speed_up"),
-            "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground",
+            "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_on_rough_ground",
         ),
         (
             *("the maximum rotation: the friction pyramid", "motions/turn.py"),
             *("rate = PYRAMID_FRICTION_RATIO * stance.friction", "rate = stance.friction"),
-            "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground",
+            "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_on_rough_ground",
         ),
         (
             *("twist: the angular velocity of the standing body, not of the crouched one", "motions/twist.py"),
             *("return inertia @ spin_for_rotation(", "return seen.inertia @ spin_for_rotation("),
-            "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
+            "motions/test_twist.py::test_a_twist_requests_the_remaining_spin_from_friction",
         ),
         (
             *("twist: the time of flight", "motions/twist.py"),
             *("airborne = AIRBORNE_FRACTION * flight_time", "airborne = 2.0 * AIRBORNE_FRACTION * flight_time"),
-            "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
+            "motions/test_twist.py::test_a_twist_requests_the_remaining_spin_from_friction",
         ),
         (
             *("twist: a free body conserves its angular momentum, not its angular velocity", "motions/free_turn.py"),
             *("axes @ np.linalg.solve(inertia, axes.T @ momentum)", "np.linalg.solve(inertia, momentum)"),
-            "motions/test_free_turn.py::test_the_axis_of_a_symmetric_top_goes_round_its_angular_momentum",
+            "motions/test_free_turn.py::test_a_symmetric_top_precesses_about_its_angular_momentum",
         ),
         (
             *("twist: arms as the square root of the inertia", "motions/twist.py"),
             *("width = float(np.sqrt(np.clip(", "width = float((np.clip("),
-            "motions/test_twist.py::test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn",
+            "motions/test_twist.py::test_in_the_air_the_width_is_adjusted_to_the_turn",
         ),
         (
             *("radial fibres: their tension", "muscles/tension.py"),
@@ -354,7 +354,7 @@ OTHER_FORMULAS: list[Mutation] = [
         (
             *("energy balance: the energy of the added angular velocity", "locomotion/ledger.py"),
             *("+ 0.5 * _inertia(mass, after) @ added", "+ 1.0 * _inertia(mass, after) @ added"),
-            "locomotion/test_ledger.py::test_spin_that_is_added_after_a_step_counts",
+            "locomotion/test_ledger.py::test_spin_added_after_a_step_counts",
         ),
         (
             *("audit: friction against slip", "locomotion/audit.py"),

@@ -92,7 +92,7 @@ def test_cut_off_three_times_it_has_the_same_bits(views: list[TrainingView], tmp
     assert bits(again) == bits(whole) and again.outliers == whole.outliers
 
 
-def test_what_cannot_go_on_is_told(views: list[TrainingView], tmp_path: Path) -> None:
+def test_runs_that_cannot_be_resumed_are_reported(views: list[TrainingView], tmp_path: Path) -> None:
     path = tmp_path / "training.npz"
 
     def told(views: list[TrainingView]) -> str:

@@ -19,7 +19,7 @@ from egs_warp.training.relocation import Population, _growth_factor  # noqa: E40
 
 
 @pytest.mark.slow
-def test_gains_and_shifts_of_the_views_are_found_and_their_mean_is_none() -> None:
+def test_exposures_are_recovered_up_to_their_mean() -> None:
     """Six views of one ball with gains from 0.7 to 1.2 and a warm or cold tint: the estimated differences between views
     are those of the gains."""
     random = np.random.default_rng(0)
@@ -53,7 +53,7 @@ def test_an_affine_tone_is_removed_before_judging() -> None:
     np.testing.assert_allclose(match_tone(photo, picture, known)[known], photo[known], atol=1e-5)
 
 
-def test_what_lies_far_above_the_others_is_a_misfit() -> None:
+def test_a_loss_far_above_the_others_is_an_outlier() -> None:
     losses = np.random.default_rng(2).uniform(0.02, 0.035, 40)
     assert not is_outlier(losses).any()
     losses[7] = 0.15
@@ -63,7 +63,7 @@ def test_what_lies_far_above_the_others_is_a_misfit() -> None:
     assert not is_outlier(np.geomspace(0.02, 0.1, 40)).any()
 
 
-def test_growth_ends_when_the_pictures_gain_nothing_and_goes_to_a_cap_that_was_asked_for() -> None:
+def test_growth_ends_without_benefit_and_reaches_a_requested_cap() -> None:
     gaining, idle, asked = Growth(10, None, "cpu"), Growth(10, None, "cpu"), Growth(10, 5000, "cpu")
     room = idle.cap
     for step in range(3000):
@@ -76,7 +76,7 @@ def test_growth_ends_when_the_pictures_gain_nothing_and_goes_to_a_cap_that_was_a
     assert asked.cap == 5000
 
 
-def test_pull_and_jitter_are_what_they_say() -> None:
+def test_regularization_and_jitter_equal_their_formulas() -> None:
     """The regularisation is the derivative of the mean opacity and scale; the jitter of a faint Gaussian is Sigma times
     noise."""
     count = 4000
@@ -117,7 +117,7 @@ def test_pull_and_jitter_are_what_they_say() -> None:
     np.testing.assert_allclose(np.cov(moved.T), size**2 * sigma @ sigma, atol=0.08 * (size * 0.09) ** 2)
 
 
-def test_the_number_grows_gently_where_there_is_time() -> None:
+def test_the_number_of_gaussians_grows_slowly_in_long_trainings() -> None:
     def turns(count: int, cap: int, steps: int) -> tuple[float, float]:
         """Return the step at which the cap is reached, and the largest growth factor."""
         largest = 1.0

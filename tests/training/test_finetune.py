@@ -94,7 +94,7 @@ def test_an_extra_loss_and_pixel_weights_count() -> None:
 
 
 @pytest.mark.parametrize("copies", [1, 2, 5])
-def test_relocated_copies_together_look_as_the_one_did(copies: int) -> None:
+def test_relocated_copies_look_like_the_original(copies: int) -> None:
     """n copies at one place together have the peak and the integral along a line of the original Gaussian."""
     opacity, scale = 0.8, 0.3
     tensors = {

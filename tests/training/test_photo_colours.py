@@ -17,7 +17,7 @@ from egs_warp.segmentation.clearance import StraddlingOptions, StraddlingPolicy,
 from tests.support.scenes import FLOOR, ball_on_floor
 
 
-def test_photographs_beside_the_cameras_clear_the_plane(tmp_path: Path) -> None:
+def test_photos_of_the_cameras_clear_the_plane(tmp_path: Path) -> None:
     """Eq. (21) with photos of the whole scene; a photo whose size differs from its camera's is refused."""
     pytest.importorskip("torch")
     from egs_warp.io import read_cameras
@@ -62,9 +62,7 @@ def test_photographs_beside_the_cameras_clear_the_plane(tmp_path: Path) -> None:
     assert crossing(tuned) < 0.6 * crossing(thing)
 
 
-def test_a_photo_is_reduced_in_blocks_of_whole_pixels_as_its_camera_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_photo_is_reduced_in_blocks_of_whole_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A third of 97 pixels is 32, from the first 96; an image resized from all 97 would be shifted at its edge."""
     pytest.importorskip("torch")
     from egs_warp.io import read_cameras

@@ -68,7 +68,7 @@ def test_a_socket_gets_header_frames_and_news_and_its_commands_are_done(session:
 
 
 @needs_page
-def test_a_socket_that_is_lost_is_taken_up_where_it_was(session: Session):
+def test_a_lost_socket_continues_where_it_was(session: Session):
     with living(session) as server:
         with _socket(server) as socket:
             head = socket.recv(timeout=20)
@@ -115,7 +115,7 @@ def test_strangers_and_giants_do_not_disturb_it(session: Session, capfd: pytest.
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_the_camera_sees_the_creature_with_room_around_it():
+def test_the_camera_shows_the_creature_with_a_margin():
     creature = coarse_pawn()
     camera = live_camera(creature)
     seen = creature.start.positions @ camera.rotation.T + camera.translation
@@ -137,7 +137,7 @@ def test_the_camera_sees_the_creature_with_room_around_it():
         (["--background", "missing.ply"], "missing.ply"),
     ],
 )
-def test_bad_flags_are_told_in_one_line(
+def test_bad_flags_are_one_line_errors(
     flags: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -149,7 +149,7 @@ def test_bad_flags_are_told_in_one_line(
 
 
 @needs_page
-def test_a_port_in_use_is_told_before_any_work(session: Session, capsys: pytest.CaptureFixture[str]):
+def test_a_port_in_use_is_reported_before_any_work(session: Session, capsys: pytest.CaptureFixture[str]):
     with living(session) as server:
         assert main(["live", "no-such.ply", "--port", str(server.port)]) == 2
         assert capsys.readouterr().err.startswith(f"egs-warp: --port {server.port}: cannot be used")

@@ -41,7 +41,7 @@ def test_a_pushed_body_comes_back_over_its_feet(tmp_path: Path):
     assert tilt_degrees(initial_stance(played.session.creature), played.session.state.positions) < 2.0
 
 
-def test_one_that_is_thrown_over_lies_relaxed_and_stands_up_when_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_toppled_body_stays_down_until_requested_to_get_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Then it gets up at once; otherwise a pawn on its side would get up by itself."""
     monkeypatch.setattr(steering, "_FALL_TIME", 0.0)
     played = SteppedSession(coarse_pawn(), tmp_path)

@@ -19,7 +19,7 @@ from tests.support.pages import served
 
 
 @in_browser
-def test_what_is_shown_goes_evenly_and_never_back(chromium: Any, session: Session):
+def test_displayed_time_is_steady_and_never_decreases(chromium: Any, session: Session):
     with watched(chromium, session) as page:
         page.keyboard.press(" ")
         wait_until(page, "egs.live.state?.doing === 'jump'")
@@ -40,7 +40,7 @@ def test_what_is_shown_goes_evenly_and_never_back(chromium: Any, session: Sessio
 
 
 @in_browser
-def test_a_picture_is_drawn_once_and_again_when_its_splats_are_sorted(chromium: Any, session: Session):
+def test_an_image_is_rendered_once_and_again_when_its_splats_are_sorted(chromium: Any, session: Session):
     with watched(chromium, session) as page:
         wait_until(page, "egs.live.state?.resting && !egs.viewers[0].sorting && !egs.viewers[0].dirty")
         left = page.evaluate(
@@ -83,7 +83,7 @@ def test_pause_step_sliders_and_script(chromium: Any, session: Session):
 
 
 @in_browser
-def test_a_style_is_chosen_by_name_or_by_number(chromium: Any, session: Session):
+def test_a_style_is_selected_by_name_or_by_number(chromium: Any, session: Session):
     """The page shows the style of the session, and the next jump has it."""
     with watched(chromium, session) as page:
         pressed = "[...document.querySelectorAll('.choice [aria-pressed=true]')].map((one) => one.textContent).join()"
@@ -104,7 +104,7 @@ def test_a_style_is_chosen_by_name_or_by_number(chromium: Any, session: Session)
 
 
 @in_browser
-def test_a_lost_connection_is_taken_up_and_the_session_goes_on(chromium: Any, session: Session):
+def test_a_lost_connection_is_restored_and_the_session_continues(chromium: Any, session: Session):
     feed = LiveFeed(session)
     with served(feed=feed) as server:
         page, complaints = opened(chromium, server.address)
@@ -125,7 +125,7 @@ def test_a_lost_connection_is_taken_up_and_the_session_goes_on(chromium: Any, se
 
 
 @in_browser
-def test_a_second_page_is_told_in_one_line(chromium: Any, session: Session):
+def test_a_second_page_gets_a_one_line_error(chromium: Any, session: Session):
     with living(session) as server:
         first, complaints = opened(chromium, server.address)
         second = chromium.new_page()

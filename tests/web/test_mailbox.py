@@ -25,7 +25,7 @@ def _watched() -> Mailbox:
     return post
 
 
-def test_nobody_is_sent_anything_and_who_comes_begins_with_how_it_is():
+def test_nothing_is_sent_without_a_page_and_a_new_page_starts_with_the_state():
     post, woken = Mailbox(), []
     post.send_line("lost")
     post.send_state({"doing": "jump"})
@@ -39,7 +39,7 @@ def test_nobody_is_sent_anything_and_who_comes_begins_with_how_it_is():
     assert post.take_news() == [] and woken == [True]
 
 
-def test_a_state_is_told_when_it_is_new_or_who_watches_is():
+def test_a_state_is_sent_when_it_or_its_receiver_is_new():
     post = _watched()
     for state in ({"doing": "jump"}, {"doing": "jump"}, {"doing": "stand"}):
         post.send_state(state)
@@ -49,7 +49,7 @@ def test_a_state_is_told_when_it_is_new_or_who_watches_is():
     assert post.take_news()[1:] == [{"doing": "stand"}]
 
 
-def test_of_what_waits_the_oldest_frames_go_and_no_news():
+def test_only_the_oldest_pending_frames_are_dropped():
     post = _watched()
     with patch("egs_warp.web.mailbox._MAX_QUEUED_FRAMES", 4):
         post.send_line("first")
@@ -60,7 +60,7 @@ def test_of_what_waits_the_oldest_frames_go_and_no_news():
     assert left == ["first", 4, 5, "last"]
 
 
-def test_busy_ends_whatever_goes_wrong():
+def test_busy_ends_after_an_error():
     post = _watched()
     try:
         with post.send_busy():
@@ -70,7 +70,7 @@ def test_busy_ends_whatever_goes_wrong():
     assert post.take_news() == [{"type": "busy", "on": True}, {"type": "busy", "on": False}]
 
 
-def test_a_session_that_is_held_wakes_when_asked_and_ends_when_stopped():
+def test_a_suspended_session_wakes_on_a_request_and_ends_when_stopped():
     post, turns = _watched(), []
     post.send_state({"doing": "stand"})
     # Not suspended, or with a pending request: it does not block.
@@ -86,7 +86,7 @@ def test_a_session_that_is_held_wakes_when_asked_and_ends_when_stopped():
     assert not post.wait_for_work(lambda: True, lambda: None)
 
 
-def test_time_is_waited_for_unless_something_is_asked():
+def test_the_loop_blocks_until_the_time_or_a_request():
     post = Mailbox()
     due = time.perf_counter() + 0.05
     post.wait_until(lambda: due - time.perf_counter())

@@ -110,7 +110,7 @@ def test_motions_are_those_of_scripts():
         ({"type": "record"}, "on: give true or false"),
     ],
 )
-def test_nonsense_is_told_in_one_line(message: dict[str, Any], said: str):
+def test_invalid_input_is_a_one_line_error(message: dict[str, Any], said: str):
     with pytest.raises(ValueError, match=said) as refused:
         _read(**message)
     assert "\n" not in str(refused.value)

@@ -95,7 +95,7 @@ def test_canvas_is_like_our_own_picture_of_the_same_frame_and_camera(
     page.close()
 
 
-def test_motion_is_seen(chromium: Any, file: str, recording: Recording):
+def test_the_comparison_detects_another_frame(chromium: Any, file: str, recording: Recording):
     """Another frame, and splats that do not move, differ clearly."""
     page, _ = opened(chromium, file)
     page.evaluate("egs.setLayer('ground', false); egs.player.seek(12)")
@@ -246,7 +246,7 @@ def test_two_runs_side_by_side_share_time_and_camera(chromium: Any, recording: R
         page.close()
 
 
-def test_a_server_that_is_gone_is_told(chromium: Any, recording: Recording):
+def test_a_stopped_server_is_reported(chromium: Any, recording: Recording):
     page = chromium.new_page()
     with served(recording) as server:
         page.route("**/run/0", lambda route: route.fulfill(status=404, body=""))
@@ -255,7 +255,7 @@ def test_a_server_that_is_gone_is_told(chromium: Any, recording: Recording):
     page.close()
 
 
-def test_a_browser_without_webgl2_is_told(file: str):
+def test_a_browser_without_webgl2_gets_a_message(file: str):
     # Playwright can run only once in a process.
     script = f"""
 from playwright.sync_api import sync_playwright
@@ -292,7 +292,7 @@ def on_a_floor(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> st
     return path.as_uri()
 
 
-def test_a_scene_behind_lies_on_the_ground_and_takes_the_shadow(chromium: Any, on_a_floor: str):
+def test_a_background_scene_is_on_the_ground_and_receives_the_shadow(chromium: Any, on_a_floor: str):
     page, complaints = opened(chromium, on_a_floor)
     assert not page.evaluate("document.getElementById('layer-ground').checked")
     page.evaluate("egs.viewers[0].preset('top'); egs.setLayer('splats', false)")

@@ -59,7 +59,7 @@ def _read(data: bytes) -> tuple[dict, dict[str, np.ndarray], list[dict]]:
     return facts, arrays, frames
 
 
-def test_what_is_written_is_read_back_by_the_documented_layout(run_folder: Path):
+def test_the_written_layout_is_the_documented_one(run_folder: Path):
     recording = Recording.read(run_folder)
     facts, arrays, frames = _read(recording.bytes())
     t = recording.trajectory
@@ -93,7 +93,7 @@ def test_a_frame_is_as_small_as_documented(run_folder: Path):
         assert len(frame.packet()) == expected
 
 
-def test_the_creature_file_draws_what_the_film_drew(run_folder: Path):
+def test_the_creature_file_equals_the_video(run_folder: Path):
     """The embedding is recomputed from the splats of the file and the rest cage of the trajectory."""
     recording = Recording.read(run_folder)
     t, made = recording.trajectory, recording.creature
@@ -120,13 +120,13 @@ def test_curves_are_those_of_the_audit(run_folder: Path):
     assert np.ptp(values[:, names.index("height")]) < 0.1 < values[0, names.index("height")]
 
 
-def test_the_curve_of_the_momentum_knows_of_pushes():
+def test_the_momentum_curve_includes_pushes():
     struck = slide(struck=True).trajectory()
     assert _curves(struck)[:, [name for name, _, _ in CURVES].index("residual")].max() < 1e-8
 
 
 @needs_page
-def test_an_exported_page_holds_its_runs_and_fetches_nothing(run_folder: Path, tmp_path: Path):
+def test_an_exported_page_contains_its_runs_and_fetches_nothing(run_folder: Path, tmp_path: Path):
     first, second = tmp_path / "a.html", tmp_path / "b.html"
     for path in (first, second):
         assert main(["view", str(run_folder), str(run_folder), "--export", str(path)]) == 0
@@ -175,7 +175,7 @@ _MUSCLES = ("muscle_segments", "muscle_bounds", "fibre_from_segment")
         (lambda folder: (folder / "report.json").write_text("[]"), "report.json: is no report"),
     ],
 )
-def test_a_folder_that_is_no_run_is_told_in_one_line(
+def test_a_folder_without_a_run_is_a_one_line_error(
     run_folder: Path, tmp_path: Path, spoil: Callable[[Path], object], said: str, capsys: pytest.CaptureFixture[str]
 ):
     folder = tmp_path / "run"
@@ -193,7 +193,7 @@ def test_three_runs_are_one_too_many(run_folder: Path, capsys: pytest.CaptureFix
     assert "only two runs can be shown" in capsys.readouterr().err
 
 
-def test_without_the_page_it_is_said_how_to_build_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_missing_page_build_is_reported_with_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("egs_warp.web.page.PAGE", tmp_path / "page.html")
     with pytest.raises(UserError, match=r"page.html: the page is not built; run make web in the source tree"):
         page_text()

@@ -22,7 +22,7 @@ from tests.support.disk_faults import fail_once
 from tests.support.live_sessions import SteppedSession, coarse_pawn
 
 
-def test_a_script_says_what_was_done(tmp_path: Path):
+def test_a_script_lists_the_motions(tmp_path: Path):
     asked = motion("jump 0.3 0.2, twist 90, hop")
     path = tmp_path / "script.json"
     path.write_text(script_text(asked.requests))
@@ -69,7 +69,7 @@ def test_a_take_is_a_run_like_any_other(take: tuple[SteppedSession, Path]):
 
 
 @pytest.mark.slow
-def test_its_report_is_measured_and_its_audit_holds(take: tuple[SteppedSession, Path]):
+def test_the_report_is_measured_and_the_audit_passes(take: tuple[SteppedSession, Path]):
     report = json.loads((take[1] / "report.json").read_text())
     (jump,) = report["motion"]
     assert jump["name"] == "jump" and jump["asked"] == {"distance": 0.2, "height": 0.15}
@@ -81,12 +81,12 @@ def test_its_report_is_measured_and_its_audit_holds(take: tuple[SteppedSession, 
 
 
 @pytest.mark.slow
-def test_its_script_repeats_its_motions_alone(take: tuple[SteppedSession, Path]):
+def test_the_script_repeats_only_the_motions(take: tuple[SteppedSession, Path]):
     assert motion(str(take[1] / "script.json")) == motion("jump 0.2 0.15")
 
 
 @pytest.mark.slow
-def test_a_script_of_all_that_it_did_is_told(take: tuple[SteppedSession, Path], tmp_path: Path):
+def test_the_script_of_all_motions_is_reported(take: tuple[SteppedSession, Path], tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
     played.request("script")
     assert played.news[-1] == {"type": "script", "text": "[\n\n]\n", "motions": 0}
@@ -114,7 +114,7 @@ def test_a_take_with_a_pull_passes_the_audit_and_a_second_take_is_another_folder
     assert abs(report["energy"]["flows"]["pushes"]) > 1e3 * AUDIT_LIMITS["energy_residual"]
 
 
-def test_an_empty_take_and_a_folder_that_cannot_be_written_are_told(tmp_path: Path):
+def test_an_empty_take_and_an_unwritable_folder_are_reported(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path / "file" / "takes")
     played.request("record", on=True)
     played.request("record", on=False)
@@ -135,9 +135,7 @@ def test_an_empty_take_and_a_folder_that_cannot_be_written_are_told(tmp_path: Pa
         pytest.param(errno.EPIPE, id="pipe", marks=pytest.mark.slow),
     ],
 )
-def test_each_opening_and_renaming_of_a_take_fails_once(
-    reason: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_file_operation_of_a_take_fails_once(reason: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The error is reported, no half-written or finished take is left, and the session continues."""
     for number in range(100):
         folder = tmp_path / str(number)

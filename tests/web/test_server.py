@@ -72,9 +72,7 @@ def test_nothing_else_is_served(server: PageServer, path: str):
     assert status == 404 and len(body) < 200
 
 
-def test_what_lies_in_the_folder_of_the_run_is_not_served_nor_where_a_link_in_it_leads(
-    run_folder: Path, tmp_path: Path
-):
+def test_files_of_the_run_folder_are_not_served(run_folder: Path, tmp_path: Path):
     """Neither files in the folder nor targets of links in it: the page receives data made from the run, and no path
     names a file."""
     folder, secret = tmp_path / "run", tmp_path / "secret.txt"
@@ -144,7 +142,7 @@ def test_a_socket_under_another_name_is_refused(server: PageServer):
         connect(f"ws://evil.example:{server.port}/{server.token}/live", sock=line, origin=own)
 
 
-def test_a_second_page_is_told_and_the_first_goes_on(server: PageServer):
+def test_a_second_page_gets_a_message_and_the_first_continues(server: PageServer):
     with _socket(server) as first:
         first.recv(timeout=20)
         with _socket(server) as second, pytest.raises(ConnectionClosed) as closed:
@@ -158,7 +156,7 @@ def test_a_second_page_is_told_and_the_first_goes_on(server: PageServer):
 
 
 @pytest.mark.parametrize("message", ["{", "[1]", '"x"', '{"type": "fly"}', "[" * 30000, b"\xff\xfe\x00"])
-def test_nonsense_is_answered_in_one_line_and_the_run_goes_on(server: PageServer, message: str | bytes):
+def test_invalid_messages_get_one_line_and_the_run_continues(server: PageServer, message: str | bytes):
     with _socket(server) as page:
         page.recv(timeout=20)
         page.send(message)
@@ -169,7 +167,7 @@ def test_nonsense_is_answered_in_one_line_and_the_run_goes_on(server: PageServer
 
 
 @pytest.mark.parametrize("size", [MAX_MESSAGE_BYTES + 1, 100_000_000])
-def test_a_message_that_is_too_large_closes_its_socket_alone(
+def test_a_message_that_is_too_large_closes_only_its_socket(
     server: PageServer, size: int, capfd: pytest.CaptureFixture[str]
 ):
     with _socket(server) as page:
@@ -183,7 +181,7 @@ def test_a_message_that_is_too_large_closes_its_socket_alone(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_a_port_in_use_is_told_in_one_line(server: PageServer, recording: Recording):
+def test_a_port_in_use_is_a_one_line_error(server: PageServer, recording: Recording):
     with pytest.raises(UserError, match=rf"^port {server.port}: cannot be used \(.*\); give another, or 0 for any$"):
         PageServer([recording.bytes], port=server.port)
     with pytest.raises(UserError, match=r"^port 70000: cannot be used"):

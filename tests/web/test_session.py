@@ -76,7 +76,7 @@ def _held(session: Session) -> float:
     raise AssertionError("it goes on with nobody watching")
 
 
-def test_a_pause_holds_it_and_a_step_is_one_step(tmp_path: Path):
+def test_a_pause_suspends_it_and_a_step_is_one_step(tmp_path: Path):
     session = session_of(coarse_pawn(), tmp_path)
     woken, seen = threading.Event(), []
     session.put_request(Pause(True))
@@ -113,7 +113,7 @@ def test_it_is_no_faster_than_the_clock(tmp_path: Path, monkeypatch: pytest.Monk
         session.stop()
 
 
-def test_frames_tell_what_the_solver_did(tmp_path: Path):
+def test_frames_contain_the_solver_reports(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
     played.step(3)
     frame, session = played.frames[-1], played.session
@@ -156,7 +156,7 @@ def test_friction_and_stiffness_change_under_it(tmp_path: Path):
     assert played.session.creature is made
 
 
-def test_a_changed_creature_is_that_which_would_have_been_made():
+def test_a_changed_creature_equals_a_new_one():
     made = coarse_pawn()
     same = changed_creature(made, friction=made.geometry.friction, sag=0.05, muscles_file=None)
     np.testing.assert_allclose(same.start.positions, made.start.positions, atol=1e-12)
@@ -182,7 +182,7 @@ def test_a_solver_that_fails_does_not_end_the_session(
     assert len(played.messages) == 1
 
 
-def test_a_page_that_takes_nothing_loses_the_oldest_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_page_that_does_not_read_loses_the_oldest_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("egs_warp.web.mailbox._MAX_QUEUED_FRAMES", 5)
     session = session_of(coarse_pawn(), tmp_path)
     session.subscribe(lambda: None)
@@ -193,7 +193,7 @@ def test_a_page_that_takes_nothing_loses_the_oldest_frames(tmp_path: Path, monke
 
 
 @pytest.mark.slow
-def test_a_push_strikes_it_in_the_next_step_and_its_take_passes_the_audit(tmp_path: Path):
+def test_a_push_acts_in_the_next_step_and_the_take_passes_the_audit(tmp_path: Path):
     """A push moves the centre of mass, and rotates the body if it hits the head; a body at rest does not fall."""
     played = SteppedSession(coarse_pawn(), tmp_path)
     session, body = played.session, played.session.creature.body
@@ -224,7 +224,7 @@ def test_a_push_strikes_it_in_the_next_step_and_its_take_passes_the_audit(tmp_pa
     assert report["notes"] == ["the user pulled or pushed the body; script.json does not repeat this"]
 
 
-def test_a_push_that_waits_is_dropped_where_the_creature_stands_up_anew(tmp_path: Path):
+def test_a_pending_push_is_dropped_when_the_creature_is_reset(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
     played.request("push", x=0.3, y=0.0, z=0.0)
     played.request("stand")

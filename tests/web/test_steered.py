@@ -26,7 +26,7 @@ _AWAY = """() => {
 
 
 @in_browser
-def test_a_key_makes_it_jump_and_the_take_says_so(chromium: Any, session: Session, tmp_path: Path):
+def test_a_key_starts_a_jump_that_the_take_records(chromium: Any, session: Session, tmp_path: Path):
     with watched(chromium, session) as page:
         page.keyboard.press("r")
         wait_until(page, "egs.live.state?.recording")
@@ -82,7 +82,7 @@ def test_a_gamepad_pushes_it_once_for_each_press(chromium: Any, session: Session
 
 @pytest.mark.slow
 @in_browser
-def test_a_click_on_the_ground_sends_it_there(chromium: Any, session: Session):
+def test_a_click_on_the_ground_sets_the_goal(chromium: Any, session: Session):
     with watched(chromium, session, 640, 480) as page:
         box = page.locator("canvas.view").bounding_box()
         page.mouse.click(box["x"] + 400, box["y"] + 300)

@@ -21,7 +21,7 @@ from tests.support.live_sessions import SteppedSession, coarse_pawn
 from tests.support.meshes import stool
 
 
-def test_what_is_asked_meanwhile_takes_the_place_of_what_was_to_come(tmp_path: Path):
+def test_a_new_request_replaces_the_queued_one(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
     played.request("motion", text="jump 0 0.1, hop")
     played.step()
@@ -38,7 +38,7 @@ def test_what_is_asked_meanwhile_takes_the_place_of_what_was_to_come(tmp_path: P
     assert [entry.name for entry in played.session.steering.records] == ["jump", "twist"]
 
 
-def test_it_is_driven_until_something_else_is_asked(tmp_path: Path):
+def test_a_drive_lasts_until_another_request(tmp_path: Path):
     """A command is queued behind the current motion; the next command, or motion, replaces it."""
     played = SteppedSession(coarse_pawn(), tmp_path)
     steering = played.session.steering
@@ -57,7 +57,7 @@ def test_it_is_driven_until_something_else_is_asked(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_what_was_driven_stands_once_it_is_told_to(tmp_path: Path):
+def test_a_driven_body_stands_after_a_zero_command(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
     played.request("drive", forward=0.1)
     played.step(60)
@@ -66,7 +66,7 @@ def test_what_was_driven_stands_once_it_is_told_to(tmp_path: Path):
     assert played.session.steering.doing == "stand" and played.messages == []
 
 
-def test_a_style_is_of_the_motions_that_begin_after_it(tmp_path: Path):
+def test_a_style_applies_to_later_motions(tmp_path: Path):
     """The active jump keeps its style; after standing up or a rebuild, the new style stays."""
     played = SteppedSession(coarse_pawn(), tmp_path)
     session = played.session
@@ -89,7 +89,7 @@ def test_a_style_is_of_the_motions_that_begin_after_it(tmp_path: Path):
     assert [request.style for request in session.steering.requests] == [None, Style(**PRESETS["heavy"])]
 
 
-def test_a_motion_that_the_body_cannot_do_is_told(tmp_path: Path):
+def test_a_motion_that_the_body_cannot_do_is_reported(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
     played.request("motion", text="walk to 9,9 0.01, jump")
     played.step()
@@ -98,7 +98,7 @@ def test_a_motion_that_the_body_cannot_do_is_told(tmp_path: Path):
     assert played.session.steering.records == []
 
 
-def test_a_journey_turns_first_and_then_jumps_straight_at_its_goal():
+def test_navigation_turns_first_and_then_jumps_towards_its_goal():
     creature = coarse_pawn()
     place = initial_stance(creature)
     feet = sole_shares(place.body, place.ground, place.standing) @ place.standing
@@ -120,7 +120,7 @@ def test_a_journey_turns_first_and_then_jumps_straight_at_its_goal():
     assert near is not None and near.request.name == "jump"
 
 
-def test_a_journey_that_comes_no_nearer_is_given_up():
+def test_navigation_without_progress_is_abandoned():
     place = initial_stance(coarse_pawn())
     journey = PointNavigation(np.array([3.0, 0.0]), walks=False)
     with pytest.raises(UserError, match="go: the body gets no nearer than"):
@@ -148,7 +148,7 @@ def test_a_body_with_feet_walks_there():
 
 
 @pytest.mark.slow
-def test_a_click_sends_it_there(tmp_path: Path):
+def test_a_click_sets_the_goal(tmp_path: Path):
     played = SteppedSession(coarse_pawn(), tmp_path)
     body = played.session.creature.body
     place = played.session.steering.place

@@ -12,7 +12,7 @@ from tests.support.live_sessions import coarse_pawn
 DT = 1.0 / 60.0
 
 
-def test_a_push_and_a_pull_add_up_and_the_push_is_gone():
+def test_a_push_and_a_pull_add_up_and_the_push_ends():
     creature = coarse_pawn()
     body, state, place = creature.body, creature.start, initial_stance(creature)
     node = int(np.argmax(body.mesh.nodes[:, 2]))
@@ -39,7 +39,7 @@ def test_a_push_and_a_pull_add_up_and_the_push_is_gone():
     assert hand.kick(place, state, DT) is None
 
 
-def test_a_hand_that_goes_on_keeps_its_grip_and_dropping_forgets_all():
+def test_a_moving_pull_keeps_its_grip_and_dropping_clears_all():
     creature = coarse_pawn()
     body, place = creature.body, initial_stance(creature)
     hand = UserForces()
