@@ -20,9 +20,9 @@ def test_an_argument_is_called_by_its_name_or_by_its_flag() -> None:
     error = ArgumentError("metres_per_unit", "give a positive number", value=-2.0)
     assert str(error) == "metres_per_unit -2.0: give a positive number"
     assert error.format_message(flag_of) == "--metres-per-unit -2.0: give a positive number"
-    error = ArgumentError("solids", "the body is inside number 2", check=("plane", "muscles_file"))
-    assert str(error) == "solids: the body is inside number 2; check plane and muscles_file"
-    assert error.format_message(flag_of) == "--terrain: the body is inside number 2; check --plane and --muscles"
+    error = ArgumentError("solids", "the body is inside solid 2", check=("plane", "muscles_file"))
+    assert str(error) == "solids: the body is inside solid 2; check plane and muscles_file"
+    assert error.format_message(flag_of) == "--terrain: the body is inside solid 2; check --plane and --muscles"
     assert UserError("object: it is flat", check=("up",)).format_message(flag_of) == "object: it is flat; check --up"
 
 

@@ -150,7 +150,7 @@ def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
     ],
 )
 def test_closed_outputs_do_not_change_the_status(command: str, status: int) -> None:
-    """A command whose result is its output is the exception."""
+    """Only a command whose result is its output fails then, with status 1."""
     ended, _, said = told_by(command)
     assert ended == status and "Traceback" not in said and said.count("\n") <= 1
 

@@ -195,8 +195,8 @@ def contact_geometry(
         if np.count_nonzero(above) < least:
             raise ArgumentError(
                 "solids",
-                f"the body is inside number {number}; inside is where n.x + d < 0 for every face [nx, ny, nz, d]:"
-                " turn the signs of a face, or move the solid",
+                f"the body is inside solid {number}, where n.x + d < 0 for every face [nx, ny, nz, d];"
+                " change the signs of a face, or move the solid",
             )
     opacities = cloud.opacities()
     points = [means[above]]

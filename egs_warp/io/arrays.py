@@ -48,6 +48,6 @@ def _array(data: bytes) -> np.ndarray:
     if dtype.kind not in _NUMBERS or dtype.itemsize == 0:
         raise ValueError(f"an array of {dtype}")
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data) - member.tell():
-        raise ValueError(f"an array of shape {str(shape)[:80]} has other bytes")
+        raise ValueError(f"an array of shape {str(shape)[:80]} does not match its number of bytes")
     member.seek(0)
     return np.lib.format.read_array(member, allow_pickle=False)

@@ -34,7 +34,7 @@ def is_glb(data: bytes) -> bool:
 def decode_glb(data: bytes, source: Path) -> RawCapture:
     """Decode a .glb. Raises ``UserError`` for a damaged one, or one without splats of a supported kind."""
     if len(data) < 20 or int.from_bytes(data[4:8], "little") != 2:
-        raise UserError(f"{source}: no .glb of version 2, or truncated; export it again")
+        raise UserError(f"{source}: not a .glb file of version 2, or truncated; export it again")
     chunks: dict[int, bytes] = {}
     place = 12
     while place + 8 <= len(data):
@@ -65,7 +65,7 @@ def _buffer(uri: str, source: Path) -> bytes:
         try:
             return base64.b64decode(uri.partition(",")[2], validate=True)
         except binascii.Error as error:
-            raise UserError(f"{source}: a buffer that is no base64 ({error}); export it again") from error
+            raise UserError(f"{source}: a buffer is not valid base64 ({error}); export it again") from error
     name = PurePosixPath(unquote(uri))
     if name.is_absolute() or ".." in name.parts or ":" in uri or "\0" in str(name):
         raise UserError(f"{source}: it names {uri!r}, which lies outside its folder; export it again")
@@ -80,7 +80,9 @@ def _decode(text: bytes, source: Path, read: Callable[[str | None], bytes]) -> R
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         if isinstance(error, UserError):
             raise
-        raise UserError(f"{source}: no glTF with splats ({type(error).__name__}: {error}); export it again") from error
+        raise UserError(
+            f"{source}: not a glTF file with splats ({type(error).__name__}: {error}); export it again"
+        ) from error
 
 
 @dataclass(frozen=True)

@@ -41,12 +41,14 @@ def read_trajectory(path: Path) -> Trajectory:
     except FileNotFoundError as error:
         if not path.is_dir() and (path.parent / PARTS).is_dir():
             raise UserError(
-                f"{path}: is missing, the run was cut off; egs-warp resume {path.parent} goes on"
+                f"{path}: is missing because the run was interrupted; egs-warp resume {path.parent} continues it"
                 f" (its finished steps are in {PARTS})"
             ) from error
         raise UserError(f"{path}: is missing; give the folder that egs-warp animate wrote") from error
     except READ_ERRORS as error:
-        raise UserError(f"{path}: is no trajectory ({error}); run egs-warp animate again, which writes it") from error
+        raise UserError(
+            f"{path}: is not a valid trajectory ({error}); run egs-warp animate again, which writes it"
+        ) from error
     return trajectory
 
 
@@ -73,7 +75,7 @@ class FinishedRun:
             UserError: ``folder`` has no finished run.
         """
         if not folder.is_dir():
-            raise UserError(f"{folder}: is no folder; give the one that egs-warp animate wrote")
+            raise UserError(f"{folder}: is not a folder; give the one that egs-warp animate wrote")
         trajectory = read_trajectory(folder / "trajectory.npz")
         creature = RenderData.load(folder / render_data.FILE, node_count=len(trajectory.rest_positions))
         if len(creature.muscle_bounds) != trajectory.activations.shape[1]:
@@ -81,7 +83,7 @@ class FinishedRun:
             raise UserError(f"{folder / render_data.FILE}: has other muscles than trajectory.npz; {advice}")
         report = parse_json(read_text(folder / "report.json"), folder / "report.json")
         if not isinstance(report, dict):
-            raise UserError(f"{folder / 'report.json'}: is no report; run egs-warp animate again, which writes it")
+            raise UserError(f"{folder / 'report.json'}: is not a report; run egs-warp animate again, which writes it")
         own_background = folder / "background.ply"
         file = background or (own_background if own_background.is_file() else None)
         scene = None

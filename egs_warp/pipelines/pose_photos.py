@@ -25,7 +25,7 @@ from egs_warp.io.run_folder import check_run_folder, run_folder
 
 _PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 _MAX_EXHAUSTIVE = 400
-"""Above this number, photos are matched only with their neighbours in the order of their names."""
+"""Number of photos above which they are matched only with their neighbours in the order of their names."""
 _NEIGHBOURS = 20
 """Neighbours of a photo for sequential matching."""
 _MIN_PHOTOS = 3
@@ -116,7 +116,7 @@ def pose_photos(
         except RuntimeError as error:
             # An error of its database, for example if the disk is full.
             reason = next(iter(str(error).splitlines()), "no reason given")
-            raise UserError(f"pose: COLMAP cannot go on ({reason}); is there free space in {out}?") from error
+            raise UserError(f"pose: COLMAP cannot continue ({reason}); is there free space in {out}?") from error
         _write_model(model, work / "sparse" / "0", out)
         try:
             for part in _WRITES:
@@ -144,7 +144,8 @@ def _write_model(model: Any, folder: Path, out: Path | str) -> None:
         read_points(folder)
     except UserError as error:
         raise UserError(
-            f"{out}: COLMAP's model is not whole, most likely the disk is full; free space, or choose another place"
+            f"{out}: COLMAP's model is incomplete, most likely because the disk is full; free space, or choose"
+            " another place"
         ) from OSError(errno.ENOSPC, str(error))
 
 
@@ -261,11 +262,11 @@ def _reconstructed(
     )
     if not models:
         raise UserError(
-            "pose: no photo could be posed; take more photos that overlap, of something with texture, from places apart"
+            "pose: no photo could be posed; take more overlapping photos of a textured scene, from different positions"
         )
     best = max(models.values(), key=lambda model: model.num_reg_images())
     if best.num_reg_images() < _MIN_PHOTOS:
-        raise UserError(f"pose: only {best.num_reg_images()} photos could be posed; take more photos that overlap")
+        raise UserError(f"pose: only {best.num_reg_images()} photos could be posed; take more overlapping photos")
     return best
 
 

@@ -62,7 +62,9 @@ class RayPool:
                 ray.init(ray_address, log_to_driver=False, logging_level=logging.ERROR, **options)
             except (ConnectionError, ValueError, RuntimeError, OSError) as error:
                 line = " ".join(str(error).split())
-                raise ArgumentError("workers", f"no Ray answers there ({line})", value=address) from error
+                raise ArgumentError(
+                    "workers", f"no Ray cluster answers at this address ({line})", value=address
+                ) from error
         self.size = max(1, min(max_workers, int(ray.cluster_resources().get("CPU", 1))))
         # Two concurrent calls: the task, and the one that reads its progress.
         self._actor_class = ray.remote(num_cpus=1, max_restarts=0, max_concurrency=2)(RayWorker)

@@ -118,6 +118,6 @@ def _depths(points: np.ndarray, cameras: Sequence[Camera]) -> tuple[float, float
     corners = box_corners(points.min(axis=0), points.max(axis=0))
     depths = np.concatenate([(corners - camera.centre) @ camera.rotation[2] for camera in cameras])
     if depths.max() <= 0.0:
-        raise UserError("camera: the creature is behind it all the time; turn it round")
+        raise UserError("camera: the creature is behind it in every frame; turn the camera around")
     near = max(float(depths.min()), 0.0)
     return near, max(float(depths.max()), near + 1e-6)

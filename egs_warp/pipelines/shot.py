@@ -193,7 +193,9 @@ def _through_keys(path: Path, camera: Camera, trajectory: Trajectory, steps: np.
         eye, target = row[:3], row[3:6]
         forward = target - eye
         if np.linalg.norm(np.cross(forward, [0.0, 0.0, 1.0])) < 1e-6 * max(np.linalg.norm(forward), 1e-12):
-            raise UserError(f"{path}: its camera looks straight up or down, or at its own place; move a key")
+            raise UserError(
+                f"{path}: its camera points straight up or down, or its eye and target coincide; move a key"
+            )
         fov = float(np.clip(row[6], 1.0, 150.0))
         cameras.append(
             Camera.look_at(
@@ -217,7 +219,7 @@ def _keys(path: Path) -> np.ndarray:
         raise UserError(f'{path}: give {{"keys": [{{"time": 0, "eye": [x, y, z], "target": [x, y, z]}}, ...]}}')
     rows = np.array([_key(path, number, entry) for number, entry in enumerate(entries)])
     if (np.diff(rows[:, 0]) <= 0.0).any():
-        raise UserError(f"{path}: the times of its keys do not grow; put them in order")
+        raise UserError(f"{path}: the times of its keys do not increase; sort the keys")
     return rows
 
 

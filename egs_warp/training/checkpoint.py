@@ -55,13 +55,14 @@ class Checkpoint:
             state: State = dict(read_npz(self.path))
             facts = json.loads(str(state.pop("facts")))
             if sorted(state) != facts["arrays"]:
-                raise ValueError("other arrays than were written")
+                raise ValueError("arrays are missing or added")
             state |= facts["state"]
         except (*READ_ERRORS, RecursionError) as error:
             raise UserError(f"{self.path}: the checkpoint is damaged; start the training again") from error
         if facts.get("digest") != digest:
             raise UserError(
-                f"{self.path}: it is of other photos, flags or another version of egs-warp; start the training again"
+                f"{self.path}: it belongs to other photos, flags or another version of egs-warp;"
+                " start the training again"
             )
         return state
 

@@ -107,8 +107,8 @@ def test_a_solid_that_contains_the_body_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError) as error:
         make_creature(thing.cloud, plane=thing.plane, options=CreatureOptions(solids=read_terrain(path)))
     assert str(error.value) == (
-        "solids: the body is inside number 2; inside is where n.x + d < 0 for every face [nx, ny, nz, d]:"
-        " turn the signs of a face, or move the solid"
+        "solids: the body is inside solid 2, where n.x + d < 0 for every face [nx, ny, nz, d];"
+        " change the signs of a face, or move the solid"
     )
 
 

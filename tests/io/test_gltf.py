@@ -124,9 +124,9 @@ def _changed(tree: dict[str, Any], case: str) -> None:
         ("linear", "the colour space 'lin_rec709_display'"),
         ("long", "accessor 0 extends beyond its buffer"),
         ("negative", "accessor 0 extends beyond its buffer"),
-        ("no scales", "no glTF with splats (KeyError"),
+        ("no scales", "not a glTF file with splats (KeyError"),
         ("flat", "a transform of its nodes is flat"),
-        ("nonsense", "no glTF with splats (TypeError"),
+        ("nonsense", "not a glTF file with splats (TypeError"),
     ],
 )
 def test_unreadable_files_are_one_line_errors(case: str, said: str, tmp_path: Path) -> None:

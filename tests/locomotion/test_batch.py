@@ -250,5 +250,5 @@ def test_a_world_that_never_converges_is_reported(creature: Creature, monkeypatc
 def test_ground_that_is_not_flat_is_refused(creature: Creature) -> None:
     ground = HeightField(np.eye(3), np.zeros(3), 1.0, np.zeros((3, 3)))
     geometry = replace(creature.geometry, field=ground)
-    with pytest.raises(ArgumentError, match=r"^geometry: many worlds stand on flat ground only; run these over "):
+    with pytest.raises(ArgumentError, match=r"^geometry: batched worlds need flat ground; run these jobs in "):
         BatchStepper(creature.body, creature.muscles, geometry, FRICTIONS)

@@ -104,7 +104,7 @@ def test_a_run_that_is_cut_off_leaves_its_steps(
             run(tmp_path)
     assert not finished(tmp_path) and sorted(os.listdir(tmp_path)) == [MANIFEST, PARTS]
     assert np.array_equal(read_trajectory(tmp_path / PARTS).positions, slid.trajectory().positions[:15])
-    with pytest.raises(UserError, match=r"the run was cut off; egs-warp resume .* goes on \(its finished steps are in"):
+    with pytest.raises(UserError, match=r"the run was interrupted; egs-warp resume .* continues it \(its finished"):
         read_trajectory(tmp_path / "trajectory.npz")
     run(tmp_path, overwrite=True)
     assert sorted(os.listdir(tmp_path)) == sorted([*FILES, "earlier-1"])

@@ -93,7 +93,7 @@ def test_a_truncated_model_is_reported(
     reconstruct_by(monkeypatch, partial(model, capacity=room))
     out = tmp_path / "out"
     assert main(["pose", str(photos_of_noise(tmp_path / "photos")), "--out", str(out)]) == 1
-    assert "out: COLMAP's model is not whole, most likely the disk is full; free" in capsys.readouterr().err
+    assert "out: COLMAP's model is incomplete, most likely because the disk is full" in capsys.readouterr().err
     assert not list(out.iterdir())
 
 
@@ -109,7 +109,9 @@ def test_failures_of_colmap_are_one_line(
     out = tmp_path / "out"
     assert main(["pose", str(photos_of_noise(tmp_path / "photos")), "--out", str(out)]) == 2
     said = capsys.readouterr().err.splitlines()[-1]
-    assert said.startswith("egs-warp: pose: COLMAP cannot go on (No registered database factory succeeded.); is there")
+    assert said.startswith(
+        "egs-warp: pose: COLMAP cannot continue (No registered database factory succeeded.); is there"
+    )
     assert not list(out.iterdir())
 
 

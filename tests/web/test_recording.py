@@ -164,15 +164,18 @@ _MUSCLES = ("muscle_segments", "muscle_bounds", "fibre_from_segment")
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lambda folder: shutil.rmtree(folder), "is no folder; give the one that egs-warp animate wrote"),
+        (lambda folder: shutil.rmtree(folder), "is not a folder; give the one that egs-warp animate wrote"),
         (lambda folder: (folder / "trajectory.npz").unlink(), "trajectory.npz: is missing; give the folder"),
-        (lambda folder: (folder / "trajectory.npz").write_bytes(b"PK\x03\x04 no zip"), "is no trajectory"),
+        (lambda folder: (folder / "trajectory.npz").write_bytes(b"PK\x03\x04 no zip"), "is not a valid trajectory"),
         (lambda folder: (folder / "creature.npz").unlink(), "creature.npz: is missing; run egs-warp animate again"),
         (lambda folder: np.savez(folder / "creature.npz", means=np.zeros((2, 3))), "creature.npz: cannot be read"),
         (lambda folder: _shorten(folder / "creature.npz", *_MUSCLES, end=-1), "has other muscles than trajectory.npz"),
         (lambda folder: _shorten(folder / "creature.npz", "foot_from_node", end=0), "foot_from_node has shape"),
-        (lambda folder: _shorten(folder / "trajectory.npz", "tets", end=0), "is no trajectory (its arrays do not fit"),
-        (lambda folder: (folder / "report.json").write_text("[]"), "report.json: is no report"),
+        (
+            lambda folder: _shorten(folder / "trajectory.npz", "tets", end=0),
+            "is not a valid trajectory (its arrays do not fit",
+        ),
+        (lambda folder: (folder / "report.json").write_text("[]"), "report.json: is not a report"),
     ],
 )
 def test_a_folder_without_a_run_is_a_one_line_error(
