@@ -27,7 +27,7 @@ class BuiltInObject:
 
     name: str
     cloud: GaussianCloud
-    """Scene units."""
+    """Gaussians of the object, scene units."""
     plane: Plane
     """Ground plane, scene units."""
 

@@ -25,7 +25,7 @@ class Scene:
 
     name: str
     object: GaussianCloud
-    """Scene units."""
+    """Gaussians of the object, scene units."""
     background: GaussianCloud
     """The complete environment without the object, scene units: the reference for inpainting."""
     plane: Plane

@@ -80,9 +80,9 @@ class BatchSolver:
     push_out_cap: float
     """Maximum push-out speed, m/s."""
     penetration_tolerance: float
-    """Metres."""
+    """Depth up to which a point is not pushed out, m."""
     tolerance: float
-    """Residual over dt x weight."""
+    """Residual over dt x weight at which a world has converged."""
     stages: StageTimer = no_timer
 
     def normal_bias(self, contacts: BatchContacts, dt: float) -> torch.Tensor:
@@ -373,7 +373,7 @@ class _NewtonState(BatchedRecord):
     is_near_end: torch.Tensor
     """(c,) bool, True if the last step came near enough to the end to search for points to add."""
     contacts_added: torch.Tensor
-    """(c,) bool, True if there were some."""
+    """(c,) bool, True if points were added in that search."""
 
     @classmethod
     def begin(

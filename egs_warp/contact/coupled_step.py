@@ -35,7 +35,7 @@ MAX_SINK = 0.3
 """Fraction of the penetration tolerance by which a point that is already deep may sink in a step without being added.
 """
 MAX_CREEP = 0.02
-"""The same limit for a point that would end deeper than the tolerance itself."""
+"""``MAX_SINK`` for a point that would end deeper than the penetration tolerance itself."""
 COULOMB_TOLERANCE = 1e-6
 """Violation of Coulomb's law at the end of a step, as a fraction of dt g, the speed that free fall gains in a step."""
 MAX_COULOMB_FAILURES = 3

@@ -45,7 +45,7 @@ class CoulombWorkspace:
     def upload(self, shifts: np.ndarray, friction: float) -> None:
         """Upload the normal bias ``shifts`` (n,) in m/s and the Coulomb coefficient, if they have changed."""
         parameters = np.array([friction, *shifts])
-        # They are the same for all Newton steps of a round.
+        # The parameters are the same for all Newton steps of a round.
         if not np.array_equal(parameters, self._uploaded_parameters):
             self._parameters.set(parameters)
             self._uploaded_parameters = parameters

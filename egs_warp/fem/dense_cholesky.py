@@ -76,7 +76,7 @@ class DenseCholesky:
 
     def upload_diagonal(self, diagonal: np.ndarray) -> None:
         """Set the ``diagonal`` (n,) that is added to the entries."""
-        # It is usually the same in every step.
+        # The diagonal is usually the same in every step.
         if not np.array_equal(diagonal, self._uploaded_diagonal):
             self._uploaded_diagonal = diagonal.copy()
             self._diagonal.copy_(self._to_device(diagonal))
@@ -240,8 +240,9 @@ class _InverseFactor:
             torch.from_numpy(each).to(device) for each in (permutation, order.astype(np.int64))
         )
         self.matrix, self.inverse = torch.zeros((2, count, count), dtype=torch.float64, device=device)
-        """(n, n) each: S in the order of the dissection, of which the lower triangle is read, and R."""
-        # By the number of directions that are added at once.
+        """(n, n) each: the matrix S, of which the lower triangle is read, and R, both in the order of the dissection.
+        """
+        # Workspaces by the number of directions that are added at once.
         self._small: dict[int, tuple[_TriangularInverse, _TriangularInverse]] = {}
         self._tiled = (
             TiledInverseFactor(dissection, self.matrix, self.inverse, stream) if device.type == "cuda" else None

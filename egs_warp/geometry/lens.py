@@ -23,7 +23,7 @@ class Lens:
     """Map from points (x, y) of a pinhole's plane z = 1 to their distorted position. The defaults are a pinhole."""
 
     fisheye: bool = False
-    """Polynomials are in the angle from the optical axis, not in its tangent."""
+    """True if the distortion polynomials take the angle from the optical axis, not its tangent."""
     radial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Coefficients k1 to k4 of r^2, r^4, r^6, r^8."""
     rational: tuple[float, float, float] = (0.0, 0.0, 0.0)

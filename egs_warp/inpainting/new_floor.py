@@ -20,7 +20,7 @@ _OPACITY = 0.97
 _SKIRT = 2
 """Number of spacings by which the new floor continues under the old one, so that no gap shows between them."""
 _SKIRT_DROP = 0.5
-"""Number of spacings by which it lies lower there."""
+"""Depth of the new floor below the old one where they overlap, in spacings."""
 _RIM_SMOOTHING = 3.0
 """Standard deviation, in texels, of the blur of the floor's height at the rim."""
 _OUTLIER = 2.0

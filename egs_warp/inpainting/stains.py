@@ -42,7 +42,7 @@ _FEW = 20
 _REACH = 60.0
 """Texels, half of the hole's side. A stain does not extend farther from the hole."""
 _MAX_AREA = 2.0
-"""In areas of the hole. A larger region is another part of the floor, not a stain."""
+"""Maximum area of a stain, in areas of the hole; a larger region is another part of the floor."""
 
 
 def stain_around(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:

@@ -28,7 +28,7 @@ _MESSAGES = {
     "SparseTensor": {1: "Tensor", 2: "Tensor"},
 }
 _EXTERNAL_DATA, _DATA_LOCATION = 13, 14
-"""Fields of a tensor that tell where its numbers are, if not in the file."""
+"""Fields of a tensor that give the location of its data outside the file."""
 
 
 @dataclass(frozen=True)

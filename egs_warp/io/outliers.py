@@ -22,7 +22,7 @@ MAX_SCALE_RATIO = 1e2
 MAX_SH = 1e3
 """Maximum coefficient of a colour; that of a white surface is 1.8."""
 MIN_LOG_SCALE = -100.0
-"""Below, exp gives 0 in single precision."""
+"""Log scale below which exp gives 0 in single precision."""
 MAX_LOGIT = 500.0
 """An opacity logit beyond this is treated as infinite."""
 _MAX_OUTLIER_FRACTION = 0.5

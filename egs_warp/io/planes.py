@@ -32,7 +32,7 @@ class HoleOutline:
     texels: tuple[int, int]
     """Rows and columns of the window."""
     outlines: tuple[np.ndarray, ...]
-    """Each (k, 2) int."""
+    """(k, 2) int32 each, polygons around the hole; column and row in texels."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry ``hole`` of a plane."""
@@ -79,7 +79,7 @@ class PlaneRecord:
     hole: HoleOutline | None = None
     """The region that the object has left open."""
     ground: HeightField | None = None
-    """The ground, if it is uneven."""
+    """Height field of the ground if it is uneven; None if the plane is the ground."""
     others: Mapping[str, Any] = field(default_factory=dict)
     """Further entries of the file, which are passed on unchanged."""
 

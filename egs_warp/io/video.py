@@ -1,4 +1,4 @@
-"""Pictures and videos on disk, written atomically: beside their place, then renamed."""
+"""Images and videos on disk, written atomically: to a temporary file in the same folder, which is then renamed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Every Warp kernel and device function of the package, by room; imports only warp, ``precision`` and each other.
+"""Every Warp kernel and device function, in the packages of their host code; they import only warp, ``precision`` and
+each other.
 
-In: Warp arrays. Out: Warp arrays, of whatever the paper's equations say of each Gaussian, element, point or pixel.
+Kernels read and write Warp arrays; one thread or block handles one element, point, Gaussian, pixel or QP.
 """

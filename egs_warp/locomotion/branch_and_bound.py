@@ -21,9 +21,9 @@ class _Decided(Enum):
     SEPARATE = "separate"
     STATIC = "static"
     ARC = "arc"
-    """It slides, in one of a range of directions."""
+    """The contact slides in one direction of a range."""
     SLIDE = "slide"
-    """It slides, in the given directions."""
+    """The contact slides in the given direction."""
 
 
 _LEAVES = (_Decided.SEPARATE, _Decided.STATIC, _Decided.SLIDE)

@@ -22,7 +22,7 @@ class Pivot(NamedTuple):
     """Change of a contact's state."""
 
     gain: float
-    """Size of the multiplier that proposes it."""
+    """Magnitude of the multiplier that proposes the move."""
     contact: int
     state: int
     """New state."""

@@ -41,15 +41,15 @@ class EnergyBalance:
     energy_unit: float
     """m g H."""
     kinetic_com: np.ndarray
-    """(F+1,) of the centre of mass."""
+    """(F+1,) kinetic energy of the motion of the centre of mass."""
     kinetic_rotation: np.ndarray
-    """(F+1,) of the rigid rotation with the body's angular momentum."""
+    """(F+1,) kinetic energy of the rigid rotation with the body's angular momentum."""
     kinetic_deformation: np.ndarray
-    """(F+1,) of the remaining motion."""
+    """(F+1,) kinetic energy of the remaining motion."""
     potential: np.ndarray
-    """(F+1,) in gravity, relative to the origin."""
+    """(F+1,) potential energy in gravity, relative to the origin."""
     elastic: np.ndarray
-    """(F+1,) Neo-Hookean (Eq. 5)."""
+    """(F+1,) Neo-Hookean energy (Eq. 5)."""
     muscles: np.ndarray
     """(F,) work of muscles, sum of T (L before - L after)."""
     pushes: np.ndarray
@@ -67,11 +67,12 @@ class EnergyBalance:
     lost_inertia: np.ndarray
     """(F,) kinetic energy lost by implicit Euler."""
     lost_elastic: np.ndarray
-    """(F,) lost by implicit Euler, which applies the elastic force at the end of the step throughout the step."""
+    """(F,) energy lost by implicit Euler because it applies the elastic force at the end of the step throughout the
+    step."""
     lost_muscle: np.ndarray
-    """(F,) lost in the same way by the muscles' forces."""
+    """(F,) energy lost in the same way by the muscles' forces."""
     lost_damping: np.ndarray
-    """(F,) lost in the same way by the damping's forces."""
+    """(F,) energy lost in the same way by the damping forces."""
     spin_inside: np.ndarray
     """(F,) work of the torque that is removed from the internal forces within the step, to conserve the angular
     momentum."""
@@ -225,9 +226,9 @@ class _Elements:
 
     tets: np.ndarray
     rest_inverses: np.ndarray
-    """(T, 3, 3)."""
+    """(T, 3, 3) inverses of the rest edge matrices, 1/m."""
     volumes: np.ndarray
-    """(T,)."""
+    """(T,) m^3, volumes at rest."""
     mu: float
     """Pa, Lame parameter."""
     lam: float

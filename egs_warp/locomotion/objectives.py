@@ -91,7 +91,7 @@ class LoadObjective:
     """
 
     nodes: np.ndarray
-    """(k,)."""
+    """(k,) indices of the nodes to be unloaded."""
     weight: float
 
     def slopes(self, problem: StepProblem, contacts: ContactSet, torques: np.ndarray, speed: float) -> np.ndarray:
@@ -159,9 +159,9 @@ class BodyPart:
 
     name: str
     nodes: np.ndarray
-    """(k,)."""
+    """(k,) indices of the nodes."""
     masses: np.ndarray
-    """(k,) kg."""
+    """(k,) kg, masses of the nodes."""
 
     @classmethod
     def of(cls, body: SoftBody, name: str, nodes: np.ndarray) -> BodyPart:

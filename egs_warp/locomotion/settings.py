@@ -24,7 +24,7 @@ class LocomotionSettings:
     """Maximum number of QPs in a step; all strategies but ``modes`` may use ``strategies.RESTART_BUDGET`` times as many
     while the result is far from the lower bound."""
     qp_solver: QpSolver | str | None = None
-    """None selects ``osqp``, or ``admm`` if the body is on a GPU."""
+    """QP solver; None selects ``osqp``, or ``admm`` if the body is on a GPU."""
     strategy: Strategy | str = Strategy.MODES
     directions: int = 4
     """n_d, number of edges of the friction pyramid. The strategy ``modes`` uses the exact cone instead."""

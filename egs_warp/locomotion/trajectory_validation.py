@@ -59,7 +59,7 @@ _INDICES = {
 """Arrays of integers, each below this extent."""
 _POSITIVE = ("node_mass", "height", "metres_per_unit", "ground_spacing", "dt")
 _MAY_BE_NAN = ("planned_com", "min_gap")
-"""May contain values that are not finite: no plan, no contact point."""
+"""Arrays that may contain NaN: where there is no plan or no contact point."""
 
 
 def check_trajectory(t: Trajectory) -> None:

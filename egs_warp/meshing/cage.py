@@ -29,7 +29,7 @@ _MAX_GROWTH_STEPS = 6
 _GROWTH_SAMPLE = 20000
 _REFINEMENT_PER_STEP = 0.15
 _THIN_RADIUS = 0.56
-"""In lattice cells: a rod of this radius always contains points of a body-centred cubic lattice, whose covering radius
+"""Radius in lattice cells of a rod that always contains points of a body-centred cubic lattice, whose covering radius
 is sqrt(5)/4."""
 
 _CELL_SIZES_PER_OCTAVE = 16
@@ -53,7 +53,7 @@ class Cage:
     """A tetrahedral mesh around an object, with measures of what it encloses."""
 
     mesh: TetMesh
-    """In the units and axes of the input cloud."""
+    """Tetrahedral mesh in the units and axes of the input cloud."""
     method: CageMethod
     """The mesher that was used."""
     min_dihedral_degrees: float
@@ -242,7 +242,7 @@ class _Distance:
         self.medial = (self.smooth < -0.2) & (self.smooth <= ndimage.minimum_filter(self.smooth, 3))
         """Mask of its crests, as in the middle of a thin part (there is none at corners)."""
         self.longest_side = solid.longest_side / solid.spacing
-        """In lattice spacings."""
+        """Longest side of the object, in lattice spacings."""
         self.middle = -solid.corner[:2]
         """(2,) lattice indices of the frame's origin, about which the cells are arranged."""
 

@@ -117,7 +117,7 @@ class Crawl:
         """Index of the current goal in ``planar_poses``; planar poses of the body before and after this round."""
         self._speed, self._length = speed, length
         self._round = self._duration()
-        """Seconds."""
+        """Duration of a round, s."""
         self._nearest, self._fruitless = np.inf, 0
         self._round_start: float | None = None
         self.rounds = 0

@@ -43,9 +43,9 @@ class _Landing:
 
     move: str
     forward: float = 0.0
-    """Distance from the start of the dance, in small hops."""
+    """Distance from the start of the dance in multiples of the distance of a small hop."""
     turned: float = 0.0
-    """Heading relative to the front, in small twists."""
+    """Heading relative to the front in multiples of the angle of a small twist."""
     twists: bool = False
     """True if the jump turns; other jumps land with the heading that they started with."""
 

@@ -65,8 +65,8 @@ POSE_BLEND_TIME = 0.3
 TAKE_OFF_RELEASE_TIME = 0.6
 """Time in sqrt(H / g) after take-off in which the pose of the landing is adopted."""
 URGENT_CAPTURE_MARGIN = 0.5
-"""Fraction of the distance from the middle of the feet to their edge: with its capture point beyond, a landing body is
-balanced with more than the usual weights."""
+"""Fraction of the distance from the middle of the feet to their edge; a landing body whose capture point is farther out
+is balanced with more than the usual weights."""
 SWING_WEIGHT, BASE_SWING_WEIGHT = 5.0, 1.0
 """Weights of the soles in the air, for feet on legs and for a base: the soles swing forward under a body that keeps its
 shape. From the pose alone they land 0.03 body heights short, and a body with little support in front falls over them. A

@@ -34,7 +34,7 @@ class Quantity(Enum):
     ORIENTATION = "orientation"
     """Rotation from the start as a rotation vector, degrees; its length gives the direction: 270 differs from -90."""
     ANGULAR_MOMENTUM = "angular_momentum"
-    """About the part's centre, body mass x height squared per second."""
+    """Angular momentum about the centre of the part, in body mass times squared height per second."""
 
 
 PARTS = ("body", "base", "head", "foot")

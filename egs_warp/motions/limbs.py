@@ -23,7 +23,7 @@ _SECTION_THICKNESS = 0.02
 _CUT_MARGIN = 1e-3
 """Smallest distance of cuts from nodes, in section thicknesses."""
 _NEAR_GROUND = 0.07
-"""Body heights: a limb that ends higher hangs."""
+"""Maximum height in body heights of the end of a limb that stands on the ground; a limb that ends higher hangs."""
 _MIN_LIMB_HEIGHT = 0.08
 """Smallest height in body heights over which a limb is separate from all others; a shorter one is a toe."""
 _MAX_MERGED_HEIGHT = 0.1
@@ -179,11 +179,11 @@ class _Limb:
     """Limb of a section graph; heights are levels."""
 
     own: frozenset[int]
-    """Its sections, where it is separate from all others."""
+    """Sections of the limb where it is separate from all others."""
     lowest: frozenset[int]
-    """Its sections on its lowest level."""
+    """Sections of the limb on its lowest level."""
     bottom: int
-    """Its lowest level."""
+    """Lowest level of the limb."""
     top: int
     """Level at which it joins another limb."""
     is_joined: bool

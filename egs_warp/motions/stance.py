@@ -228,7 +228,7 @@ class BalanceController:
         high = np.maximum(middle + reach, measurement.com[:2] + slack)
         both = (measurement.com[:2] - np.clip(pressure, low, high)) * up / height * dt
         # Both terms are reduced according to the weights of their objectives, speeds directly, spins with the radius of
-        # gyration. What friction denies to the first is left to the second.
+        # gyration. The part of the speed that exceeds the friction limit is assigned to the spin.
         share = 1.0 / (1.0 + 0.5 * np.trace(measurement.inertia) / (self.body.mass * height**2))
         level = within_grip(level + share * (both - level - turn))
         turn = both - level

@@ -9,7 +9,7 @@ from egs_warp.errors import ArgumentError
 from egs_warp.motions.values import Value
 
 MIN_FACTOR, MAX_FACTOR = 0.5, 2.0
-"""Smallest and largest factor; beyond, no body could make the stroke of the jump."""
+"""Smallest and largest factor; outside this range no body could make the stroke of the jump."""
 
 
 @dataclass(frozen=True)

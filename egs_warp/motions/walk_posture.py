@@ -30,8 +30,8 @@ LEGGED_TIMING, ROCKING_TIMING = GaitTiming(0.94, 0.78, 0.2, 0.6), GaitTiming(0.9
 """Gait timing at nominal speed, on legs and on a single base. A body that pivots about its sides uses most of a swing
 for it; the less time it stands on both sides, the less it leans from one to the other."""
 MAX_PIVOT, MAX_ROLL = 0.45, 0.05
-"""Largest angles in radians by which a body on one base pivots about one side, and tips to lift the other. Faster, it
-would throw itself off the side on which it stands."""
+"""Largest angles in radians by which a body on one base pivots about one side, and tips to lift the other. With larger
+angles it would throw itself off the side on which it stands."""
 COUNTER_ROTATION = 1.5
 """Counter-rotation: reduction of the rotation of a node per body height above the base, relative to the rotation of the
 base. The less of the body rotates with the base, the less friction the pivot needs."""

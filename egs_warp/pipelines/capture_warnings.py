@@ -9,7 +9,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 
 MIN_GAUSSIANS = 100
-"""With fewer, most of the body's shape is extrapolated."""
+"""Number of Gaussians below which most of the body's shape is extrapolated."""
 _DETACHED_DISTANCE = 0.15
 """Body heights from the cage, at least one cage edge: floaters that the cage excludes are nearer."""
 _MIN_DETACHED_SHARE = 0.01

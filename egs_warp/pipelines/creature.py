@@ -40,7 +40,7 @@ MIN_SAG = 0.004
 MAX_SLOPE = 45.0
 """Degrees; steeper ground is rejected."""
 _GROUND_SPACING = 0.5
-"""Mean cage edges between the nodes of uneven ground: contact points are 0.4 of an edge apart."""
+"""Spacing of the nodes of uneven ground, in mean cage edges; contact points are 0.4 of an edge apart."""
 _CAGE_BITS = 32
 """Bits to which the cage's coordinates are rounded, relative to the height."""
 _CONTACT_GRID = 2.0**-10

@@ -27,9 +27,9 @@ _SIDE, _COARSE_SIDE = 128, 64
 _ELEVATION = 0.2
 """Vertical over horizontal component of the direction from the body to the camera."""
 _FOV_DEGREES = 20.0
-"""Narrow, so that a mirrored body gives nearly a mirrored picture."""
+"""Vertical field of view, narrow so that images of a mirrored body are nearly mirrored."""
 _MAX_GAUSSIANS = 50_000
-"""Above this number, Gaussians are subsampled and widened: small details do not matter."""
+"""Number of Gaussians above which they are subsampled and widened: small details do not matter."""
 _FINE, _SMOOTH = 0.01, 0.04
 """Standard deviations of two blurs, body heights: detail is the difference between them."""
 _OFFSETS = np.arange(-6.0, 7.0, 1.5)

@@ -55,7 +55,7 @@ class LocatedPlane:
 
     plane: Plane
     fit: PlaneFit | None
-    """None if the plane was given, or placed under the object."""
+    """Fit of the plane to rendered depth; None if the plane was given, or placed under the object."""
     centre: np.ndarray
     """(3,) Centre of the object."""
     size: float

@@ -55,7 +55,7 @@ class SceneOptions:
     inpaint: bool = True
     """Fill the hole under the object in the background."""
     inpainter: Inpainter | None = None
-    """None uses patch synthesis."""
+    """Method that fills the hole; None uses patch synthesis."""
     clearing_options: StraddlingOptions = field(default_factory=StraddlingOptions)
     """Options of ``clearing``."""
 
@@ -66,7 +66,7 @@ class SceneOptions:
 
     @property
     def stages(self) -> dict[str, bool]:
-        """Names of the stages of ``prepare_scene`` in order; True if a stage includes any training that it has."""
+        """Stages of ``prepare_scene`` in their order. False marks a stage that is run without its training."""
         requested = {"plane": True, "ground": not self.flat, "segment": True, "inpaint": self.inpaint}
         whole = {"segment": self.method is StraddlingPolicy.FINETUNE, "inpaint": has_torch()}
         return {name: whole.get(name, True) for name, is_requested in requested.items() if is_requested}

@@ -13,16 +13,18 @@ _PREPARATION_STAGES = {"cage": 0, "contact": 45, "front": 55, "body and muscles"
 """Percent of the time that have passed when a stage starts: median of four captures on a CPU (pawn, plush dog, monkey,
 robot: within 15 of these)."""
 _INFO_STAGES = {"cage": 0, "front": 70, "muscles": 91}
-"""The same for ``info`` (pawn, plush dog, monkey, robot: within 13)."""
+"""Percent of the time that have passed when a stage of ``info`` starts (pawn, plush dog, monkey, robot: within 13)."""
 _CONVERSION_STAGES = {".compressed.ply": 37, ".ply": 27, ".spz": 65, ".sog": 80, ".splat": 1, ".glb": 11}
-"""The same for the start of the comparison after a capture was written (400,000 Gaussians of SH degree 3 on a CPU)."""
+"""Percent of the time that have passed when the comparison after writing a capture starts (400,000 Gaussians of SH
+degree 3 on a CPU)."""
 _SCENE_SHARES = {"plane": 12, "ground": 15, "segment": 49, "inpaint": 24}
 """Percent of the time that each stage of a scene takes: median of two built-in scenes, koala and narcissus on a CPU;
 stages start within 16 of these."""
 _UNTRAINED_SHARE = 2
-"""The same for a stage without its training."""
+"""Percent of the time that a stage takes without its training."""
 _SMOOTHING = 0.05
-"""Small, as a frame in the air takes a third of the time of one on the ground, and both alternate."""
+"""Smoothing factor of the frame rate; small, because a frame in the air takes a third of the time of one on the ground,
+and both alternate."""
 
 
 @contextmanager

@@ -82,7 +82,7 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
             positions = t.positions[step]
             cloud = with_degree(deformer.deform(positions).cloud, degree)
             if index == 0:
-                # The default value, which programs and validators read that do not specify a time.
+                # The default value, for programs and validators that do not specify a time.
                 _write_sample(splats, cloud, Usd.TimeCode.Default(), Vt)
             _write_sample(splats, cloud, code, Vt)
             _set_points(cage, positions, code, Vt)

@@ -28,7 +28,8 @@ _MAX_MASS_BELOW = 0.015
 
 _AXIS_NAMES = "xyz"
 _AXIS_BONUS = {1: 0.10, 2: 0.05, 0: 0.0}
-"""Trainers and generators use y as up most often (COLMAP: -y, glTF: +y), then z, hardly ever x."""
+"""Bonus of each axis in the score of up: trainers and generators mostly use y (COLMAP: -y, glTF: +y), then z, hardly
+ever x."""
 _CLEAR_MARGIN = 0.3
 
 

@@ -46,13 +46,14 @@ class StraddlingPolicy(enum.Enum):
     """Handling of the object's Gaussians that straddle its plane."""
 
     NONE = "none"
-    """They are left unchanged."""
+    """Leave them unchanged."""
     REMOVE = "remove"
-    """They are removed."""
+    """Remove them."""
     FINETUNE = "finetune"
-    """They shrink and move until they are clear of the plane, while renders of the object stay the same (Eq. 21)."""
+    """Train them to shrink and move until they are clear of the plane, while renders of the object stay the same (Eq.
+    21)."""
     SPLIT = "split"
-    """Each is replaced by its part above the plane."""
+    """Replace each by its part above the plane."""
 
 
 @dataclass(frozen=True)

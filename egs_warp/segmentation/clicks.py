@@ -43,7 +43,7 @@ class Click:
     hits: np.ndarray
     """(k,) int, Gaussians that paint the clicked surface."""
     inside: bool = True
-    """True for a click on the object; False for one on what does not belong to it."""
+    """True for a click on the object; False for one beside it."""
     camera: Camera | None = None
     """Camera of the clicked picture, if there is one."""
     pixel: tuple[float, float] = (0.0, 0.0)
@@ -54,9 +54,10 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
     """Return the click at pixel (``u``, ``v``), from the top left corner of ``camera``'s picture; None if nothing is
     there.
 
-    Only a window about the click is rendered. Its depth is that of the first quarter of its light: between leaves one
-    sees the wall, but means the leaves. Haze in the air, as in captures from a turntable, is ignored if there is enough
-    light without it. The hits are the Gaussians that paint the window at that depth.
+    Only a window about the click is rendered. The depth of the click is that of the first quarter of the window's
+    light, so that a click on foliage selects the leaves and not the wall visible between them. Haze in the air, as in
+    captures from a turntable, is ignored if there is enough light without it. The hits are the Gaussians that paint the
+    window at that depth.
     """
     reach = max(1, round(_RADIUS * max(camera.width, camera.height)))
     left, top, side = int(u) - reach, int(v) - reach, 2 * reach + 1

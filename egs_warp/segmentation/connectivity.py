@@ -19,7 +19,7 @@ _ARM = 1.5
 _FOURTH = 4
 """Index of the neighbour whose distance measures how sparse a capture is."""
 _MAX_GAUSSIANS = 200_000
-"""Maximum number of Gaussians, spread evenly, from which it is measured."""
+"""Maximum number of Gaussians, spread evenly, from which the sparsity is measured."""
 
 
 def connected_parts(

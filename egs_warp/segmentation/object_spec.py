@@ -36,7 +36,7 @@ class ObjectSpec:
     point: np.ndarray | None = None
     """(3,) on or in the object, scene units."""
     clicks: tuple[Click, ...] = ()
-    """Each adds what it hits, with what is connected to it, or removes it."""
+    """Clicks; each adds the Gaussians that it hits and those connected to them, or removes them."""
 
     @classmethod
     def of_clicks(cls, clicks: Sequence[Click]) -> ObjectSpec:

@@ -42,7 +42,7 @@ class PlaneFit:
     """A fitted plane and the quality of the fit."""
 
     plane: Plane
-    """Its normal points to the cameras' side."""
+    """Fitted plane; its normal points to the cameras' side."""
     noise: float
     """Standard deviation (robust) of relative depth over the pixels on the plane."""
     inlier_share: float

@@ -25,9 +25,9 @@ class SeenSurface:
 
     camera: Camera
     depth: np.ndarray
-    """(H, W) float64, z-depth of that splat's mean, scene units; 0 where there is none."""
+    """(H, W) float64, z-depth of the mean of the splat at the surface, scene units; 0 where there is none."""
     middles: np.ndarray
-    """(H, W, 3) float64, mean of that splat; undefined where there is none."""
+    """(H, W, 3) float64, mean of that splat, scene units; undefined where there is none."""
     opaque: np.ndarray
     """(H, W) bool, True where hardly any light passes."""
 

@@ -19,10 +19,10 @@ _LEVELS = 4
 _MIN_SUPPORT = 0.1
 """Minimum share of the level surface near a point; a plane with less is no table."""
 _THICKNESS = 0.02
-"""Fraction of that radius."""
+"""Thickness of a plane, as a fraction of the search radius."""
 _LEVEL_DEGREES = 5.0
 _CELL = 0.03
-"""Fraction of the object's size."""
+"""Side of a cell, as a fraction of the object's size."""
 _APRON = 3
 """Width in cells of the apron around the object's outline in which the surface must continue; the cell at the outline
 does not count."""

@@ -86,9 +86,9 @@ class FinetuneOptions:
     sh_steps: int = 0
     """Steps after which the next SH degree is trained; 0 trains all degrees from the start."""
     fit_exposure: bool = False
-    """Each view has its own exposure and white balance, optimised with the cloud."""
+    """Optimise an exposure and a white balance for each view together with the cloud."""
     exclude_outliers: bool = False
-    """Views that do not fit the others are excluded during the training."""
+    """Exclude views during the training that do not fit the others."""
     antialiased: bool = False
     seed: int = 0
     threads: int | None = None
@@ -99,17 +99,17 @@ class GaussianTensors:
     """Parameters under training, as leaf tensors with the conventions of ``GaussianCloud``."""
 
     means: torch.Tensor
-    """(n, 3)."""
+    """(n, 3) means."""
     rotations: torch.Tensor
-    """(n, 4)."""
+    """(n, 4) quaternions, w x y z."""
     log_scales: torch.Tensor
-    """(n, 3)."""
+    """(n, 3) log scales."""
     opacity_logits: torch.Tensor
-    """(n,)."""
+    """(n,) opacity logits."""
     sh_band_0: torch.Tensor
-    """(n, 1, 3)."""
+    """(n, 1, 3) SH coefficients of band 0."""
     sh_rest: torch.Tensor
-    """(n, K - 1, 3)."""
+    """(n, K - 1, 3) SH coefficients of the higher bands."""
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ class Pivots:
     panel_count: int
     """Number of pivots in the last panel."""
     parts: wp.vec4i
-    """Their columns within the panel."""
+    """Columns of these pivots within the panel."""
 
 
 @wp.func

@@ -50,7 +50,7 @@ def warp_space() -> wp.uint64:
     }
 """)
 def fetch_colour(address: wp.uint64, sh: wp.array2d[wp.vec3], row: wp.int32, count: wp.int32):
-    """Start to read the rows of the warp, asynchronously since Ampere."""
+    """Start reading the rows of the warp; asynchronous on Ampere and newer GPUs."""
     ...
 
 

@@ -57,7 +57,7 @@ class Residuals:
     dual_size: real
     gap: real
     gap_size: real
-    """In the units of the unscaled program."""
+    """Residual and magnitude of the duality gap, in the units of the unscaled program."""
     ratio: real
     """Ratio of the scaled primal to the scaled dual residual, each relative to the magnitude of its terms."""
 

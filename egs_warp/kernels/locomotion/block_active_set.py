@@ -87,7 +87,7 @@ class ActiveSet:
     root: wp.array2d[real]
     """(k, k) upper triangular U with products^-1 = U U^T."""
     inverse: wp.array2d[real]
-    """(k, k) inverse of the products, updated as rows are added and dropped."""
+    """(k, k) inverse of ``products``, updated as rows are added and dropped."""
     z: wp.array[real]
     """(n,) current point z."""
     values: wp.array[real]

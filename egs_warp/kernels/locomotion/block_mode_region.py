@@ -83,9 +83,9 @@ class Workspace:
     transition: wp.array[int]
     """(k,) contact of a row, and transition of that contact past the row."""
     first: wp.array[int]
-    """(n,) first row of each contact,"""
+    """(n,) first row of each contact."""
     next: wp.array[int]
-    """(k,) and the next row of the same contact, -1 for none."""
+    """(k,) next row of the same contact, -1 for none."""
     equations: wp.array2d[real]
     """(h, h + m + 1) linear system for the forces, with right-hand sides."""
     force_map: wp.array2d[real]
@@ -99,9 +99,9 @@ class Workspace:
     root: wp.array2d[real]
     """(m, m) upper triangular U with cost^-1 = U U^T."""
     slope: wp.array[real]
-    """(m,)."""
+    """(m,) gradient of the cost of the activations."""
     minimum: wp.array[real]
-    """(m,)."""
+    """(m,) activations of the unconstrained minimum."""
     optimum: wp.array[real]
     """(m,) optimum."""
     at_minimum: wp.array[real]
@@ -113,7 +113,7 @@ class Workspace:
     bounds: wp.array2d[real]
     """(2, m + k) lower and upper bounds before scaling."""
     values: wp.array[real]
-    """(m + 3n,)."""
+    """(m + 3n,) scratch: products of the QP's matrices with ``trial``."""
     multipliers: wp.array[real]
     """(k,) multipliers of the rows of the modes."""
     kinds: wp.array2d[int]
@@ -124,7 +124,7 @@ class Workspace:
     start: wp.array[real]
     """(m,) activations from which the region is entered."""
     trial: wp.array[real]
-    """(m + 3n,)."""
+    """(m + 3n,) activations and forces of a trial."""
 
 
 @wp.struct
