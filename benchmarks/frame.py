@@ -209,7 +209,8 @@ def old_captures(folder: Path, frames: int, *, device: str) -> list[Row]:
         mean = by_contacts(records)[0]["mean"]
         old = old_step(folder, frames, str(path), f"--up={up}")
         rows.append({"body": name, "nodes": records[0]["nodes"], "mean": mean, "old_ms": old})
-        print(f"{name}: {records[0]['nodes']} nodes, {mean:.1f} ms a step, 3848750 {old:.1f}: {old / mean:.1f} times")
+        times = f"{mean:.1f} ms a step, {old:.1f} ms at commit 3848750: {old / mean:.1f} times faster"
+        print(f"{name}: {records[0]['nodes']} nodes, {times}")
     return rows
 
 

@@ -134,7 +134,7 @@ def inpaint(
     thickness = _THICKNESS * hole.bounds()[1]
     junk = _in_hole(background, window, grown, hole.bounds()[1])
     if junk.all():
-        raise UserError("inpaint: the hole takes the whole capture; make it smaller")
+        raise UserError("inpaint: the hole covers the whole capture; make it smaller")
     retained = background.subset(~junk)
     before = rectify(retained, window, thickness=thickness)
     grown, known = _closed(grown, before.alpha)
@@ -145,7 +145,7 @@ def inpaint(
     # Stains lie on the floor; Gaussians far below it belong to a table's side.
     junk |= _in_hole(background, window, grown, hole.bounds()[1], depth=_THICKNESS)
     if junk.all():
-        raise UserError("inpaint: the hole takes the whole capture; make it smaller")
+        raise UserError("inpaint: the hole covers the whole capture; make it smaller")
     retained = background.subset(~junk)
     clock.lap("rectify")
     # Without a stain there is no shadow either, and dark floor keeps its own colour.

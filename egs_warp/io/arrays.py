@@ -46,7 +46,7 @@ def _array(data: bytes) -> np.ndarray:
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = header(member)
     if dtype.kind not in _NUMBERS or dtype.itemsize == 0:
-        raise ValueError(f"an array of {dtype}")
+        raise ValueError(f"an array of type {dtype}, not of numbers")
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data) - member.tell():
         raise ValueError(f"an array of shape {str(shape)[:80]} does not match its number of bytes")
     member.seek(0)

@@ -161,7 +161,7 @@ def _of_size(
     lowest = float(np.quantile(scene.heights[object_mask], 0.002))
     if lowest > hover * size:
         raise UserError(
-            f"object: it does not touch the plane: its lowest part is {lowest / size:.2f} of its size above this one; "
+            f"object: it does not touch the plane: its lowest part is {lowest / size:.2f} of its size above it; "
             "mark all of the object, or give its plane",
             check=("plane",),
         )

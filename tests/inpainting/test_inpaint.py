@@ -240,7 +240,7 @@ def test_overhanging_objects_stay() -> None:
         ((5.0, 5.0), 0.2, "the hole is off the floor: nothing lies on the plane around it"),
         ((1.3, 0.0), 0.35, "the hole is off the floor: only"),
         ((0.0, 0.0), 1.2, "the hole covers nearly all of the floor; make it smaller"),
-        ((0.0, 0.0), 3.0, "the hole takes the whole capture; make it smaller"),
+        ((0.0, 0.0), 3.0, "the hole covers the whole capture; make it smaller"),
         ((0.0, 0.0), -1.0, "the hole's radius -1 must be a positive number"),
         ((0.0, 0.0), np.nan, "the hole's radius nan must be a positive number"),
     ],

@@ -200,7 +200,7 @@ def test_a_turntable_shows_one_frame(run: FinishedRun, tmp_path: Path) -> None:
         (["--camera", "none.json"], "none.json: no such file"),
         (["--camera", "{tmp}/bad.json"], "bad.json: key 0 needs time, eye [x, y, z] and target [x, y, z], finite"),
         (["--camera", "{tmp}/back.json"], "back.json: the times of its keys do not increase"),
-        (["--camera", "{tmp}/up.json"], "up.json: its camera looks straight up or down"),
+        (["--camera", "{tmp}/up.json"], "up.json: its camera points straight up or down"),
         (["--camera", "{tmp}/fov.json"], "fov.json: fov of key 0 is 180; give degrees from 1 to 150"),
         (["--background", "2,0,0"], "--background 2,0,0: give three numbers r,g,b from 0 to 1"),
         (["--background", "nowhere.ply"], "nowhere.ply: no such file"),
