@@ -30,7 +30,8 @@ def overlap(cloud: GaussianCloud, object_cloud: GaussianCloud, view: DrawnView) 
     """Compare ``object_cloud``, rendered alone, with the outline of a view.
 
     Returns:
-        IoU; (H, W) bool, pixels where the object is missing; (H, W) bool, pixels where it is too much.
+        IoU; (H, W) bool, pixels of the outline that the object lacks; (H, W) bool, pixels of the object outside the
+    outline.
     """
     alone, whole = (render_gaussians(one, view.camera).alpha.numpy() > 0.5 for one in (object_cloud, cloud))
     counts = whole | alone
@@ -99,7 +100,8 @@ def clicked(
 
 
 def picture(object_cloud: GaussianCloud, view: DrawnView, missing: np.ndarray, more: np.ndarray) -> np.ndarray:
-    """(320, 320, 3) uint8: the object alone, red where it is missing, blue where it is too much."""
+    """Return the image (320, 320, 3) uint8 of the object alone, red where it is missing, blue where it extends beyond
+    the outline."""
     rendered = render_gaussians(object_cloud, view.camera, background=(0.7, 0.7, 0.7)).colour.numpy()
     picture = np.clip(rendered.astype(np.float32), 0.0, 1.0)
     picture[missing], picture[more] = (1.0, 0.1, 0.1), (0.1, 0.2, 1.0)

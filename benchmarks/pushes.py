@@ -60,7 +60,7 @@ def stood(creature: Creature, line: str) -> Row:
 
 
 def largest(creature: Creature, kind: str) -> tuple[float, list[Row]]:
-    """Return the largest size of pushes of a ``kind`` that is withstood, and all rows that were tried."""
+    """Return the strongest push of ``kind`` that the body withstands, and the rows of all pushes that were tried."""
     low, high, tried = 0, MAX_STEPS + 1, []
     while high - low > 1:
         middle = (low + high) // 2

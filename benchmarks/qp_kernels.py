@@ -77,7 +77,7 @@ class Recorded:
 
 
 class _EnoughError(Exception):
-    """Stops the recorded motion when enough programs are recorded."""
+    """Raised to stop the recorded motion when enough programs are recorded."""
 
 
 @contextmanager
@@ -199,7 +199,8 @@ def compared(
 
 
 def full(programs: Sequence[Recorded], device: str) -> list[Row]:
-    """Return a row for each motion and one for all: how often both end alike, and the distance of their solutions."""
+    """Return a row for each motion and one for all: how often both solvers end with the same status, and how far their
+    solutions differ."""
     times, osqp_results, kernel_results = compared(programs, device, accuracy=FULL_ACCURACY, limit=MAX_ITERATIONS)
     differences = [
         relative_difference(one, b.x, a.x) if a.status is b.status is AdmmStatus.SOLVED else None

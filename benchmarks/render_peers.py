@@ -78,7 +78,7 @@ Renderer = Callable[[Scene, Camera], torch.Tensor]
 
 
 def ours(scene: Scene, camera: Camera) -> torch.Tensor:
-    """Render ``scene`` of ``ours_scene``, (H, W, 3); that conversion is outside of the timed calls."""
+    """Render ``scene``, already converted to ``ours_scene``, as (H, W, 3). The conversion is not timed."""
     return render_torch(
         scene.means, scene.rotations, scene.scales, scene.opacities, scene.colours, camera, background=(0.0, 0.0, 0.0)
     ).colour
@@ -118,7 +118,7 @@ def gsplat_matrices(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def gsplat_renderer(*, packed: bool) -> Renderer:
-    """Return gsplat 1.5.3; raises ImportError if it is not installed."""
+    """Return the renderer of gsplat; raises ImportError if gsplat is not installed."""
     from gsplat.rendering import rasterization
 
     matrices_of = _once_per_camera(gsplat_matrices)

@@ -63,7 +63,8 @@ def memory_of(step: StepReport) -> WarmStart:
 
 
 def contact_errors(creature: Creature, before: StepReport, step: StepReport) -> dict[str, np.ndarray]:
-    """(3k,) m/s, errors of the linearised velocities of the k loaded contacts, by the point of the tangent."""
+    """Return (3k,) m/s, the errors of the linearised velocities of the k loaded contacts, for each point of
+    linearisation."""
     stepper, contacts, muscles = creature.stepper, step.contacts, creature.muscles
     problem = StepProblem(creature.body, before.state, step.dt)
     predicted = stepper.predict(stepper.step_inputs(problem, contacts, memory_of(before))).velocities

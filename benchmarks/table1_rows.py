@@ -69,7 +69,7 @@ MAIN = {
     "ours": TableRow(SPLIT, WHOLE),
 }
 SAME_SPLIT = {f"{name}, our split": TableRow(SPLIT, method) for name, method in BASELINES.items()}
-"""Rows next to "ours" with the same Gaussians, so the same number and the same image at rest."""
+"""Rows that deform the same Gaussians as "ours": their number and the image at rest are equal."""
 SAME_TRAINING = {
     **{f"{name}, as many": TableRow(AS_MANY, method) for name, method in BASELINES.items()},
     "ours, no split, as many": TableRow(AS_MANY, WHOLE),
@@ -274,7 +274,7 @@ def object_rows(
 
 
 def settings_rows(mesh: PaintedMesh, options: argparse.Namespace, settings: Mapping[str, Splitting]) -> list[Row]:
-    """Return rows of ours with each of ``settings``, for one object and every motion."""
+    """Return the rows of our method with each of ``settings``, for one object and every motion."""
     subject = Subject(mesh, options)
     cloud = subject.trained(options.gaussians)
     rows = []

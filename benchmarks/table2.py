@@ -8,17 +8,17 @@ directions, that is 60 variables and 50 complementarity pairs a frame. Each fram
 is the animation's own motion; every strategy gets the same programs. A second table has smaller problems of the same
 bodies, and random ones, compared with the optimum over all contact states (branch and bound).
 
-``pieces``, the engine's own, has the exact friction cone and no unknowns but activations; all others have the pyramid,
-``exact`` among them, so ``pieces`` may be better than it. ``objective`` is the program's, at the activations and forces
-that a strategy returns; ``true`` is the same objective with the contact forces of the exact cone under its activations,
-which is what a step then computes. ``paper`` is the paper's: the states of stage 1 (Eq. 12), then one contact at a
-time. ``qpcc`` starts from all-static and changes one contact at a time by its own multipliers; if all-static has no
-solution, it starts from the states that follow from the last activations. ``qpcc-our-moves`` differs from it only in
-our rules for the moves, so that rules and start can be judged separately.
+``modes``, the default of the engine, has the exact friction cone, and activations as its only unknowns. All others have
+the pyramid, also ``exact``, so ``modes`` may be better than it. ``objective`` is the program's, at the activations and
+forces that a strategy returns; ``true`` is the same objective with the contact forces of the exact cone under its
+activations, which is what a step then computes. ``paper`` is the paper's: the states of stage 1 (Eq. 12), then one
+contact at a time. ``qpcc`` starts from all-static and changes one contact at a time by its own multipliers; if
+all-static has no solution, it starts from the states that follow from the last activations. ``qpcc-our-moves`` differs
+from it only in our rules for the moves, so that rules and start can be judged separately.
 
 The ratios of ``exact`` to ``qpcc`` are also reported; they bound the possible gain. Aims, over all frames together:
-``qps_vs_qpcc`` (pieces takes at most 0.37 of qpcc's QPs) and ``objective_vs_qpcc`` (its mean objective is at most 0.64
-of qpcc's): the paper's own ratios.
+``qps_vs_qpcc`` (``modes`` takes at most 0.37 of qpcc's QPs) and ``objective_vs_qpcc`` (its mean objective is at most
+0.64 of qpcc's): the paper's own ratios.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ class Parts:
     hard: GaussianCloud
     """Gaussians with more than half of their blending weight in the masks, without regard to the plane."""
     claimed: GaussianCloud
-    """The same without detached parts: the object, and its part below the plane."""
+    """``hard`` without detached parts: the object, including its part below the plane."""
     above: GaussianCloud
     """The object above the plane."""
     located: LocatedPlane

@@ -44,7 +44,7 @@ class Watched(io.StringIO):
         self.updates: list[tuple[float, float]] = []
 
     def write(self, text: str, /) -> int:
-        """Parse the remaining time in the text of a progress bar."""
+        """Parse the remaining time from a line of the progress bar."""
         if match := re.search(r"<(?:(\d+):)?(\d+):(\d+)", text):
             hours, minutes, seconds = (float(part or 0) for part in match.groups())
             self.updates.append((time.perf_counter(), 3600.0 * hours + 60.0 * minutes + seconds))

@@ -100,7 +100,7 @@ class SogMeta:
         return names
 
     def integer(self, *keys: str) -> int:
-        """Return a count."""
+        """Return the integer of at least 0 under ``keys``."""
         value = self.entry(*keys)
         if not isinstance(value, int) or isinstance(value, bool) or value < 0:
             raise self._wrong(*keys, expected="an integer of at least 0")

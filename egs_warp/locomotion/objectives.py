@@ -128,10 +128,10 @@ def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Object
 
 
 def deformation_velocities(body: SoftBody, positions: np.ndarray, target: np.ndarray, weight: float) -> Objective:
-    """Return the objective on the homogeneous deformation rate of ``target`` velocities: motion towards a pose that
-    leaves the finer shape to elasticity, and translation and rotation to their own objectives.
+    """Return the objective that the body stretches and shears as ``target`` velocities do: motion towards a pose. Finer
+    deformations are left to elasticity, translation and rotation to their own objectives.
 
-    The six rows are orthonormal in the mean over the mass, so the weight is comparable with that of
+    The six rows are orthonormal in the mass-weighted mean, so the weight is comparable with that of
     ``node_velocities``.
 
     Args:

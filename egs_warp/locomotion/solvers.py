@@ -68,7 +68,7 @@ class QpSolution:
 
     status: QpStatus
     x: np.ndarray
-    """(n,)."""
+    """(n,) the minimiser, or the last iterate of a solve that stopped early."""
     multipliers: np.ndarray
     """(m,) positive at an active upper bound (OSQP's sign)."""
     objective: float
@@ -152,7 +152,7 @@ class SplittingProgram:
         """Solve with bounds ``lower``, ``upper`` (m,), see ``QuadraticProgram.solve``."""
         start = self._start if start is None else start
         if (upper - lower < _EQUALITY_WIDTH).any():
-            # Equality rows, as those of contact states, are redundant: they are satisfied to an accuracy, not exactly.
+            # The equality rows of contact states may be redundant, so they are satisfied to an accuracy, not exactly.
             return self._solve_by_splitting(lower, upper, start)
         rows = self._rows
         lower, upper = lower - self._padding, upper + self._padding

@@ -128,7 +128,7 @@ class Trajectory:
     body_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     """(3,) this frame's origin in the capture, in the capture's unit."""
     metres_per_unit: float = 1.0
-    """m, the capture's unit."""
+    """Length of the capture's unit, m."""
 
     def in_capture(self, points: np.ndarray) -> np.ndarray:
         """Return ``points`` (..., 3) of this frame in the capture's frame and unit."""

@@ -182,7 +182,7 @@ class Dance:
 
     @property
     def expected_time(self) -> float:
-        """Expected duration in seconds: it dances until the last beat."""
+        """Expected duration in seconds; the body dances until the last beat."""
         body = self._start_stance.body
         return self._beats[-1] + float(np.sqrt(body.height / self._gravity))
 

@@ -196,7 +196,7 @@ class _Limb:
 
 
 class _Graph:
-    """Graph of sections by level, with the sections that touch from above and below."""
+    """Graph of the sections: each is connected to those that touch it from above and below."""
 
     def __init__(self, sections: Sections) -> None:
         self.sections = sections

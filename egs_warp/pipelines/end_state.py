@@ -36,7 +36,7 @@ class State(Enum):
 
     @property
     def is_failure(self) -> bool:
-        """True if the exit status reports it."""
+        """True if the exit status reports this state as a failure."""
         return self in (State.MISSED, State.FALLEN, State.STOPPED)
 
     @classmethod

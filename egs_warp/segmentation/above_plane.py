@@ -113,8 +113,8 @@ def detached_parts(
 
 
 def _gaps(points: np.ndarray, parts: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
-    """(k,) distance of each of ``these`` (k,) bool parts of the ``points`` (m, 3) to the nearest of ``those`` (k,)
-    bool; infinite for all others, and if there are none."""
+    """(k,) distance of each of the parts ``these`` (k,) bool of the ``points`` (m, 3) to the nearest of the parts
+    ``those`` (k,) bool; infinite for all other parts, and if there are none."""
     gaps = np.full(len(these), np.inf)
     of, near = np.flatnonzero(these[parts]), np.flatnonzero(those[parts])
     if len(of) and len(near):

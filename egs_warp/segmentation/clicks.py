@@ -86,7 +86,7 @@ def _is_haze(cloud: GaussianCloud, rows: np.ndarray, depths: np.ndarray) -> np.n
 
 
 def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> np.ndarray:
-    """(m,) bool, the ``nodes`` (m,), indices, that clicks on the object (``inside``) or beside it hit."""
+    """(m,) bool, True for the indices ``nodes`` (m,) that clicks on the object (``inside``) or beside it hit."""
     hits = [click.hits for click in clicks if click.inside is inside]
     return np.isin(nodes, np.concatenate(hits)) if hits else np.zeros(len(nodes), bool)
 
@@ -94,7 +94,7 @@ def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> n
 def removed_by_clicks(
     cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], heights: np.ndarray, low: float
 ) -> np.ndarray:
-    """(m,) bool, the ``nodes`` (m,), indices of ``cloud``, that ``clicks`` remove.
+    """(m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that ``clicks`` remove.
 
     A click beside the object that is lower than ``low`` means something on the ground, such as a shadow: it removes
     nothing that is more than twice as high as it, or as half of ``low``. ``heights`` (m,) are those of the nodes over
@@ -121,7 +121,8 @@ def removed_by_clicks(
 def cut_by_clicks(
     cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], *, required: np.ndarray | None = None
 ) -> np.ndarray:
-    """(m,) bool, the ``nodes`` (m,), indices of ``cloud``, that the ``clicks`` leave; ``required`` (m,) bool stay.
+    """(m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that the ``clicks`` leave.
+    ``required`` (m,) bool are always kept.
 
     The score of each Gaussian prefers the clicks that are nearer along links between neighbours, which are longer the
     more their colours differ, and the side on which its colour is more common. The labels are the minimum cut. Nothing

@@ -18,7 +18,8 @@ _MIN_PIXELS = 30
 _TRIALS = 300
 _TUKEY = 2.0
 """Pixels farther off than this many standard deviations have zero weight. 4.685 would be more efficient without
-outliers, but an object is close to the plane at its foot: with 3.0, some of 100 scenes tilt by a degree."""
+outliers, but an object is close to the plane at its foot: with 3.0, the planes
+of some of 100 scenes are tilted by a degree."""
 _MIN_NOISE = 1e-3
 """Fraction of the depth. Points nearer than this are on the plane. If few wide splats form a floor, a plane through
 three of them has no error in half of the pixels, and the others would have zero weight."""

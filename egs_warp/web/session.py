@@ -153,7 +153,7 @@ class Session:
         self._due = time.perf_counter()
 
     def _wait_for_clock(self) -> None:
-        """Wait until the next step is due; at most two steps are caught up."""
+        """Wait until the next step is due; a session that is late catches up on two steps at most."""
         self._due = max(self._due + self._dt, time.perf_counter() - 2.0 * self._dt)
         self._mailbox.wait_until(lambda: self._due - time.perf_counter())
 

@@ -66,8 +66,8 @@ def test_a_rotated_cage_rotates_shape_and_colour_exactly(device: str, degree: in
 
 
 def test_colour_rotates_exactly_where_euler_angles_are_arbitrary(device: str) -> None:
-    """Eq. (15): rotations about z alone, by 180 degrees about horizontal axes, the identity, and nearly each of
-    them."""
+    """Eq. (15): the identity, rotations about z alone and by 180 degrees about horizontal axes, and small
+    perturbations of each."""
     half = [np.pi * np.array([np.cos(a), np.sin(a), 0.0]) for a in (0.0, 0.5 * np.pi, 1.1)]
     near = np.array([1e-9, -3e-5, 2e-4])
     vectors = np.array(
@@ -230,7 +230,7 @@ def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
 def test_a_bend_about_any_axis_of_a_needle_is_measured(device: str, along: int, quarters: int) -> None:
     """Eq. (16): 40 degrees for each choice of the long axis and of the axis of bending."""
     mesh, radius = box((24, 2, 2), (4.0, 0.4, 0.4)), 1.2 / np.radians(40.0)
-    # Axis ``along`` lies in x, the one after it in y, or in z after a quarter turn about x.
+    # Axis ``along`` of the Gaussian is parallel to x, and the next one to y, or to z after a quarter turn about x.
     frame = Rotation.from_rotvec([0.5 * np.pi * quarters, 0.0, 0.0]).as_matrix() @ np.roll(np.eye(3), along, axis=1)
     scales = np.roll([0.4, 0.02, 0.004], along)
     cloud = GaussianCloud.from_numpy(

@@ -51,7 +51,7 @@ def test_the_kkt_conditions_hold(guess: str) -> None:
 
 
 def test_infeasible_bounds_are_detected() -> None:
-    """Among others, two rows exclude each other by a tenth."""
+    """The bounds of two equal rows exclude each other by 0.1; there are other rows too."""
     for seed in range(20):
         P, q, A, lower, upper = random_program(seed)
         row = len(q) + 1

@@ -156,7 +156,7 @@ def test_corners_do_not_outweigh_a_long_side() -> None:
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_a_long_body_faces_along_its_length_towards_its_tail(way: float) -> None:
-    """The body is denser towards its other end: the third moments about its centre are those of the tail."""
+    """The body is denser at the opposite end, so the tail dominates the third moments about its centre."""
     along = way * np.linspace(0.0, 1.0, 201) ** 1.5
     aside = np.resize([0.05, -0.05], 201)
     points = np.column_stack([0.6 * along - 0.8 * aside, 0.8 * along + 0.6 * aside, np.full(201, 0.3)])

@@ -47,7 +47,8 @@ def test_other_bodies_have_other_numbers_of_feet(mesh: TetMesh, height: float, c
 
 
 def test_a_base_has_a_left_and_a_right_side() -> None:
-    """The sides are separated by a gap in the middle; the weights of the body above decrease sideways and upwards."""
+    """A gap in the middle separates the sides. The share of a foot in the body above it decreases sideways and
+    upwards."""
     mesh = block_mesh(5, 5, 5)
     heights, sole = mesh.nodes[:, 2], np.flatnonzero(mesh.nodes[:, 2] == 0.0)
     left, right = split_base(mesh.nodes[:, :2], heights, sole, 1.0)

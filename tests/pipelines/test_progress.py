@@ -45,7 +45,7 @@ def test_skipped_stages_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_stages_show_the_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each stage has a typical fraction of the time before it."""
+    """Each stage starts at its typical fraction of the total time, from which the remaining time follows."""
     clock = [1000.0]
     monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
     for bar, name, told in (

@@ -25,8 +25,9 @@ from tests.support.scenes import FLOOR, lying, round_ones
 
 
 def test_the_closed_form_has_the_least_error() -> None:
-    """Over all 2^8 labels: the sum over pixels of |mask - rendered labels| is linear in the labels, since weights in a
-    pixel sum to at most one: it is the weight outside where a label is 1, and inside where it is 0.
+    """Exhaustive search over all 2^8 labels. The sum over pixels of |mask - rendered labels| is linear in the labels,
+    because weights in a pixel sum to at most one: each Gaussian adds its weight outside the mask if its label is 1, and
+    its weight inside if it is 0.
     """
     random = np.random.default_rng(0)
     inside, outside = random.uniform(0.0, 5.0, (2, 8))

@@ -40,9 +40,9 @@ residual, full steps of another make progress. Every second attempt changes the 
 cycles.
 """
 _FULL_STEPS = wp.constant(12)
-"""Full steps of each attempt but the first."""
+"""Number of full steps in each attempt but the first."""
 _HALVINGS = wp.constant(10)
-"""Line search: halvings of a step."""
+"""Maximum number of halvings of a step in the line search."""
 _MAX_SWEPT = wp.constant(MAX_SWEPT_CONTACTS)
 _MIN_PIVOT = wp.constant(real(1e-5))
 """Pivot threshold of the elimination by blocks, which exchanges no rows. The equations have entries of about 1."""

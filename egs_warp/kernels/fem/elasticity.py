@@ -215,7 +215,7 @@ def segment_forces_kernel(
     # Out:
     forces_out: wp.array[Vec3],
 ):
-    """T phi u of each segment (Eq. 7), phi as in ``muscles.tension.force_length_factor``.
+    """Compute T phi u of each segment (Eq. 7), phi as in ``muscles.tension.force_length_factor``.
 
     One warp per segment (on a CPU one thread).
     """

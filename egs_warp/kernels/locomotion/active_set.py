@@ -460,7 +460,7 @@ def add_constraint(program: Program, search: ActiveSetState, active: int, row: i
 
 @wp.func
 def cost_of(program: Program, search: ActiveSetState, count: int):
-    """z^T z / 2."""
+    """Return the cost z^T z / 2."""
     cost = real(0.0)
     for i in range(count):
         row = search.active[i]
@@ -475,8 +475,7 @@ def cost_of(program: Program, search: ActiveSetState, count: int):
 
 @wp.func
 def dual_iterations(program: Program, search: ActiveSetState, active: int, pivots: int):
-    """Run the dual iterations from a dual feasible active set, adding the max_violation violated row first; return the
-    status."""
+    """Run the dual iterations from a dual feasible active set, the most violated row first; return the status."""
     count = int(active)
     for _ in range(pivots):
         row = most_violated(program.lower, program.upper, program.slack, search.side, search.values)
@@ -529,14 +528,14 @@ def optimum_kernel(
 
     First the guessed rows are set to their bounds, which is one linear system in their multipliers. Rows with
     multipliers of the wrong sign are dropped and violated rows are added, all at once. If that does not end within a
-    few rounds, the dual method adds the max_violation violated row one at a time, which terminates.
+    few rounds, the dual method adds the most violated row, one at a time, which terminates.
 
     Args:
         program: the QP.
         pivots: maximum number of dual iterations.
         search: state; ``side`` is the guess on entry and the active set at the end.
-        ended: (2,) status, and the number of active rows if the optimum was result.
-        point: address of the n numbers x of the optimum, written only if it was result.
+        ended: (2,) status, and the number of active rows if the optimum was found.
+        point: address of the n numbers x of the optimum, written only if it was found.
     """
     ended[0] = find_optimum(program, pivots, search)
     ended[1] = 0

@@ -1,8 +1,9 @@
 """OSQP iterations for all threads of a block, in coordinates with Hessian 1, which guess the active set of an optimum
+
 (Stellato, Banjac, Goulart, Bemporad and Boyd 2020).
 
-With P = 1, the step to the next z is a linear combination of rows. So the iterations run in the multipliers of the k
-selected rows: z = share z_0 + R^T sums.
+With P = 1, each step changes z by a linear combination of rows of R, the k selected rows. The iterations therefore
+update only its coefficients: z = ``share`` z_0 + R^T ``sums``.
 """
 
 import warp as wp

@@ -162,9 +162,10 @@ def apply_transition(program: Program, workspace: Workspace, contact: int, trans
 def find_next_modes(
     program: Program, workspace: Workspace, state: ActiveSet, active_count: int, mode_rows: int, objective: real
 ):
-    """Write the modes past all bounds with a significant multiplier, and past the strongest of them alone.
+    """Write two candidates for the next modes: those past all bounds with a significant multiplier, and those past the
+    strongest of these bounds only.
 
-    Returns: number of those bounds.
+    Returns: number of bounds with a significant multiplier.
     """
     lane = lane_of_block()
     m = program.m

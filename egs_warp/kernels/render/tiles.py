@@ -205,7 +205,7 @@ def finish_lists_kernel(
         slot = slot_and_gaussian[i]
         gaussians = 2 * capacity
         g = slot_and_gaussian[gaussians + slot]
-        # The sort is stable: pairs of equal keys are in the order of their slots, the order of equal depths.
+        # The sort is stable: pairs with equal keys keep the order of their slots, which also orders equal depths.
         place = i
         j = i - 1
         while j >= 0 and key[j] == own:
