@@ -41,7 +41,7 @@ COMMANDS = {
 KEYS = [{"time": 0.4, "part": "head", "quantity": "position", "value": [0, 0, -0.05]}]
 
 
-def made(folder: Path) -> Path:
+def write_inputs(folder: Path) -> Path:
     """Write the input files of the commands into ``folder``."""
     write_ply(folder / "pawn.ply", pawn(gaussian_count=2000, device="cpu").cloud)
     (folder / "keys.json").write_text(json.dumps(KEYS))
@@ -104,7 +104,7 @@ def ended_by(arguments: Sequence[str], number: int, ready: Path, after: float) -
 def test_a_run_that_is_killed_repeatedly(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The run is killed by SIGKILL and by Ctrl-C before its first part, between parts and in the video. Runs that need
     not be killed execute in this process."""
-    folder, whole, out = made(tmp_path), tmp_path / "whole", tmp_path / "out"
+    folder, whole, out = write_inputs(tmp_path), tmp_path / "whole", tmp_path / "out"
     assert coarse_main(animate("jump", folder, whole)) == 0
     parts = out / "trajectory.parts"
     moments = random.Random(18)
@@ -131,7 +131,7 @@ def test_a_run_that_is_killed_repeatedly(tmp_path: Path, capsys: pytest.CaptureF
 @pytest.mark.parametrize("name", COMMANDS)
 def test_random_moments(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """SIGKILL and Ctrl-C at any time, including preparation and video; a run without files is started again."""
-    folder, whole = made(tmp_path), tmp_path / "whole"
+    folder, whole = write_inputs(tmp_path), tmp_path / "whole"
     if name == "walk":
         # A coarser stool does not have four feet.
         monkeypatch.setenv("EGS_WARP_TEST_NODES", "500")
@@ -158,7 +158,7 @@ def test_each_file_operation_of_a_resumed_run_fails_once(
 
     The folder does not count as finished. A second ``resume`` completes the run.
     """
-    folder, whole, cut, out = made(tmp_path), tmp_path / "whole", tmp_path / "cut", tmp_path / "out"
+    folder, whole, cut, out = write_inputs(tmp_path), tmp_path / "whole", tmp_path / "cut", tmp_path / "out"
     assert coarse_main(animate("jump", folder, whole)) == 0
     with monkeypatch.context() as patch:
         patch.setattr("egs_warp.pipelines.animate.draw_film", interrupted)

@@ -40,7 +40,7 @@ def positions(creature: Creature) -> np.ndarray:
     return np.stack([nodes, lean, deep, nodes + np.array([0.0, 0.0, 1.0])])
 
 
-def taken(contacts: BatchContacts, world: int) -> np.ndarray:
+def points_of(contacts: BatchContacts, world: int) -> np.ndarray:
     return contacts.points[world, : int(contacts.counts[world])].numpy()
 
 
@@ -68,7 +68,7 @@ def test_selection_equals_that_of_one_world_in_every_step(
         contacts = detector.contacts(detector.select(previous, there, loaded, gaps), gaps, faces)
         for world, place in enumerate(places):
             expected = points.select(before[world], loads[world] > 0.0, one.gaps(place)[0])
-            assert np.array_equal(taken(contacts, world), expected)
+            assert np.array_equal(points_of(contacts, world), expected)
         # Without noise, all points of a cell would be equally deep.
         noisy = gaps + 0.01 * torch.from_numpy(random.normal(size=gaps.shape))
         deep = detector.find_deeper(contacts, noisy, 0.005)
@@ -76,13 +76,13 @@ def test_selection_equals_that_of_one_world_in_every_step(
         forces = torch.from_numpy(random.uniform(0.1, 1.0, (*contacts.points.shape, 3))) * contacts.valid[:, :, None]
         joined, wide = detector.append_contacts(contacts, forces, added)
         for world in range(WORLDS):
-            new = points.find_deeper(taken(contacts, world), noisy[world].numpy(), 0.005)
-            assert np.array_equal(taken(added, world), new)
+            new = points.find_deeper(points_of(contacts, world), noisy[world].numpy(), 0.005)
+            assert np.array_equal(points_of(added, world), new)
             joins += len(new)
-            assert np.array_equal(taken(joined, world), np.concatenate([taken(contacts, world), new]))
+            assert np.array_equal(points_of(joined, world), np.concatenate([points_of(contacts, world), new]))
             count = int(contacts.counts[world])
             assert torch.equal(wide[world, :count], forces[world, :count]) and not wide[world, count:].any()
-        before = [taken(joined, world) for world in range(WORLDS)]
+        before = [points_of(joined, world) for world in range(WORLDS)]
         loads = [np.where(random.random(len(each)) < 0.5, 1.0, 0.0) for each in before]
     assert joins > 0 and len(before[0]) > 0 and len({len(each) for each in before}) > 1
 
@@ -92,7 +92,7 @@ def test_frames_speeds_and_pushes_are_those_of_one(
 ) -> None:
     gaps, faces = detector.gaps(torch.from_numpy(positions))
     contacts = detector.contacts(gaps < 0.003, gaps, faces)
-    sets = alone(creature, [taken(contacts, world) for world in range(WORLDS)], positions)
+    sets = alone(creature, [points_of(contacts, world) for world in range(WORLDS)], positions)
     assert sets[3].count == 0 and min(one.count for one in sets[:3]) > 3
     random, nodes = np.random.default_rng(2), positions.shape[1]
     velocities = random.normal(size=(WORLDS, 3 * nodes, 2))
@@ -127,5 +127,7 @@ def test_forces_follow_their_points(detector: BatchDetector, positions: np.ndarr
     matched = detector.transfer_forces(now, then.points, then.valid, forces).numpy()
     for world in range(WORLDS):
         count, last = int(now.counts[world]), int(then.counts[world])
-        expected = ContactSelector.transfer_forces(taken(now, world), taken(then, world), forces[world, :last].numpy())
+        expected = ContactSelector.transfer_forces(
+            points_of(now, world), points_of(then, world), forces[world, :last].numpy()
+        )
         assert np.array_equal(matched[world, :count], expected) and not matched[world, count:].any()

@@ -24,13 +24,13 @@ class Outer(BatchedRecord):
     places: torch.Tensor
 
 
-def made(count: int = 4) -> Outer:
+def make_record(count: int = 4) -> Outer:
     return Outer(Inner(torch.arange(count)), "all", 10.0 * torch.arange(2 * count).reshape(count, 2))
 
 
 def test_some_worlds_of_a_record() -> None:
     """In the given order, also in nested records; fields without a world axis are unchanged."""
-    record = made()
+    record = make_record()
     some = record.gather(torch.tensor([3, 1]))
     assert some.inner.size.tolist() == [3, 1] and some.name == "all"
     assert some.places.tolist() == [[60.0, 70.0], [20.0, 30.0]]
@@ -39,7 +39,7 @@ def test_some_worlds_of_a_record() -> None:
 
 
 def test_worlds_are_written_back_in_place() -> None:
-    record = made()
+    record = make_record()
     record.scatter(torch.tensor([0, 2]), Outer(Inner(torch.tensor([7, 8])), "some", -torch.ones(2, 2)))
     assert record.inner.size.tolist() == [7, 1, 8, 3] and record.name == "all"
     assert record.places.tolist() == [[-1.0, -1.0], [20.0, 30.0], [-1.0, -1.0], [60.0, 70.0]]

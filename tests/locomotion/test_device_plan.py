@@ -82,7 +82,7 @@ def planner_of(stepper: LocomotionStepper) -> DevicePlanner:
     return planner
 
 
-def is_the_host_s(
+def equals_host_plan(
     stepper: LocomotionStepper, start: StepInputs, memory: WarmStart, objectives: Sequence[AnyObjective]
 ) -> bool:
     """Assert that the plan and its linearisation equal those of the host; return False if planning is left to the
@@ -113,7 +113,7 @@ def test_device_plans_equal_host_plans(creature: Creature, stepper: LocomotionSt
     state, memory, at_once = creature.start, stepper.initial_memory(), 0
     objectives = asks(creature, 0.1)
     for number in range(6):
-        at_once += is_the_host_s(stepper, begun(stepper, state, memory), memory, objectives)
+        at_once += equals_host_plan(stepper, begun(stepper, state, memory), memory, objectives)
         state, memory, reports = stepper.advance(state, memory, objectives, DT)
         assert all(report.converged for report in reports), number
     # The contact points of this body are nearly redundant, so the search fails numerically at times.
@@ -123,7 +123,7 @@ def test_device_plans_equal_host_plans(creature: Creature, stepper: LocomotionSt
     for _ in range(2):
         start = begun(stepper, flown, memory)
         assert start.contacts.count == 0
-        assert is_the_host_s(stepper, start, memory, objectives)
+        assert equals_host_plan(stepper, start, memory, objectives)
 
 
 def test_the_solve_continues_from_the_end_of_the_plan(
@@ -231,7 +231,7 @@ def test_a_restart_equals_that_of_the_host(
         monkeypatch.setattr(RelaxationWorkspace, "parse_result", lambda _: None)
     elif what == "second astray":
         monkeypatch.setattr(ModeSearchWorkspace, "parse_result", lambda *_: None)
-    assert is_the_host_s(stepper, start, memory, objectives)
+    assert equals_host_plan(stepper, start, memory, objectives)
     expected = {
         "costly": ["_enqueue_restart", "_replace_end"],
         "better": ["_enqueue_restart", "_replace_end"],

@@ -16,7 +16,7 @@ from tests.support.meshes import block_mesh
 from tests.support.stances import DT
 
 
-def asked(stepper: LocomotionStepper, step: int) -> list[AnyObjective]:
+def objectives_at(stepper: LocomotionStepper, step: int) -> list[AnyObjective]:
     """Return objectives: down for five steps, then up at increasing speed, upright."""
     up = -0.3 if step < 5 else min(0.3 * (step - 4), 0.9)
     return [
@@ -31,7 +31,7 @@ def thrust(steps: int) -> tuple[LocomotionStepper, list[BodyState], list[StepRep
     stepper, states, memory = creature.stepper, [creature.start], creature.stepper.initial_memory()
     reports: list[StepReport] = []
     for step in range(steps):
-        end, memory, fresh = stepper.advance(states[-1], memory, asked(stepper, step), DT)
+        end, memory, fresh = stepper.advance(states[-1], memory, objectives_at(stepper, step), DT)
         states.append(end)
         reports += fresh
     assert len(reports) == steps
@@ -55,7 +55,7 @@ def test_activations_cost_the_squares_of_their_muscles_work(monkeypatch: pytest.
     prospect = stepper.predict(stepper.step_inputs(problem, reports[-1].contacts, memory))
 
     def pieces() -> CoulombProgram:
-        return stepper.planner.program(prospect, memory.activations, asked(stepper, 7)).program
+        return stepper.planner.program(prospect, memory.activations, objectives_at(stepper, 7)).program
 
     with_work = pieces()
     P, q, constant = with_work.P.copy(), with_work.q.copy(), with_work.constant

@@ -20,22 +20,22 @@ from tests.support.meshes import box_mesh
 from tests.support.stances import FORWARD
 
 
-def run(made: CoarseCreature, start: BodyState) -> RolloutResult:
-    sequence = MotionSequence(made.place, motion("jump").parts(made.place.body.height))
-    return roll_out(made.stepper, made.stepper.geometry, start, sequence, frames=8)
+def run(creature: CoarseCreature, start: BodyState) -> RolloutResult:
+    sequence = MotionSequence(creature.place, motion("jump").parts(creature.place.body.height))
+    return roll_out(creature.stepper, creature.stepper.geometry, start, sequence, frames=8)
 
 
 @pytest.fixture(scope="module")
-def made() -> CoarseCreature:
+def creature() -> CoarseCreature:
     return coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
 
 
 @pytest.mark.parametrize("failure", [UnsolvableStepError("singular"), np.linalg.LinAlgError("singular"), None])
 def test_earlier_steps_are_kept(
-    made: CoarseCreature, failure: Exception | None, monkeypatch: pytest.MonkeyPatch
+    creature: CoarseCreature, failure: Exception | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The fourth step fails with an error, or does not converge in any of its parts."""
-    advance, whole = LocomotionStepper.advance, run(made, made.start)
+    advance, whole = LocomotionStepper.advance, run(creature, creature.start)
 
     def failing(stepper: LocomotionStepper, state: BodyState, *rest: Any) -> Any:
         end, memory, done = advance(stepper, state, *rest)
@@ -46,13 +46,13 @@ def test_earlier_steps_are_kept(
         return end, memory, [replace(report, converged=False) for report in done]
 
     monkeypatch.setattr(LocomotionStepper, "advance", failing)
-    cut = run(made, made.start)
+    cut = run(creature, creature.start)
     assert cut.stopped and not whole.stopped
     assert len(cut.reports) == 3 and cut.frames.tolist() == [0, 1, 2, 3]
     assert np.array_equal(cut.trajectory.positions, whole.trajectory.positions[:4])
 
 
-def test_a_divided_step_passes_on_its_last_part(made: CoarseCreature, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_divided_step_passes_on_its_last_part(creature: CoarseCreature, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second step begins at the end of the second part of the first step, with its contacts and activations."""
     advance, given, parts = LocomotionStepper.advance, [], []
 
@@ -66,7 +66,7 @@ def test_a_divided_step_passes_on_its_last_part(made: CoarseCreature, monkeypatc
         return end, after, done
 
     monkeypatch.setattr(LocomotionStepper, "advance", halved)
-    run(made, made.start)
+    run(creature, creature.start)
     state, memory = given[1]
     assert len(parts) == 2 and state is parts[1].state
     for name in ("points", "forces", "activations"):
@@ -76,15 +76,15 @@ def test_a_divided_step_passes_on_its_last_part(made: CoarseCreature, monkeypatc
 
 
 @pytest.mark.parametrize("before", [[], [True] * 5 + [False]], ids=["at once", "and goes on"])
-def test_a_finished_motion_rests_before_it_ends(made: CoarseCreature, before: list[bool]) -> None:
+def test_a_finished_motion_rests_before_it_ends(creature: CoarseCreature, before: list[bool]) -> None:
     """``REST_FRAMES`` frames in a row: a motion that continues in between resets the count."""
     frames = iter(before + [True] * 100)
-    nothing = np.zeros((100, made.stepper.muscles.segment_count))
+    nothing = np.zeros((100, creature.stepper.muscles.segment_count))
     done = roll_out(
-        made.stepper,
-        made.stepper.geometry,
-        made.start,
-        MotionSequence(made.place, motion("stand 1").parts(made.place.body.height)),
+        creature.stepper,
+        creature.stepper.geometry,
+        creature.start,
+        MotionSequence(creature.place, motion("stand 1").parts(creature.place.body.height)),
         frames=100,
         finished=lambda: next(frames),
         activations=nothing,
@@ -93,48 +93,48 @@ def test_a_finished_motion_rests_before_it_ends(made: CoarseCreature, before: li
 
 
 @pytest.mark.slow
-def test_steps_that_have_no_solution(made: CoarseCreature) -> None:
+def test_steps_that_have_no_solution(creature: CoarseCreature) -> None:
     """Steps without a solution are found at the start: NaN, and values too large for double precision."""
-    still, positions = np.zeros_like(made.start.velocities), made.start.positions
+    still, positions = np.zeros_like(creature.start.velocities), creature.start.positions
     for start in (
         BodyState(positions, still * np.nan),
         BodyState(positions, still - [0.0, 0.0, 1e20]),
         BodyState(positions + [1e9, 0.0, 0.0], still),
     ):
-        done = run(made, start)
+        done = run(creature, start)
         assert done.stopped and len(done.reports) == 0 and done.frames.tolist() == [0]
-        assert done.trajectory.activations.shape == (0, made.stepper.muscles.segment_count)
+        assert done.trajectory.activations.shape == (0, creature.stepper.muscles.segment_count)
 
 
 def test_a_body_that_stands_still_is_settled_in_few_steps(
-    made: CoarseCreature, monkeypatch: pytest.MonkeyPatch
+    creature: CoarseCreature, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The search ends where another long step would move the body by less than 2e-4 of its height, with its weight
     carried, before the last of twelve steps.
     """
     steps, passive = [], LocomotionStepper.passive_step
     monkeypatch.setattr(LocomotionStepper, "passive_step", lambda *given: steps.append(1) or passive(*given))
-    state, body = settle(made.stepper), made.stepper.body
+    state, body = settle(creature.stepper), creature.stepper.body
     assert 1 < len(steps) < 12
-    more = made.stepper.passive_step(state, made.stepper.initial_memory(), 0.25 * body.time_unit)
+    more = creature.stepper.passive_step(state, creature.stepper.initial_memory(), 0.25 * body.time_unit)
     assert 0.25 * body.time_unit * np.abs(more.velocities).max() < 2e-4 * body.height
     assert more.forces[:, 0].sum() == pytest.approx(body.weight, rel=0.01)
 
 
-def test_a_body_over_no_ground_is_not_followed_down(made: CoarseCreature) -> None:
+def test_a_body_over_no_ground_is_not_followed_down(creature: CoarseCreature) -> None:
     """Each step of sqrt(H / g) / 4 starts without velocity and lets it fall by g dt^2 = H / 16: after two steps its
     centre has moved by more than 0.1 H, and the body is returned."""
-    body, geometry = made.stepper.body, made.stepper.geometry
+    body, geometry = creature.stepper.body, creature.stepper.geometry
     (floor,) = geometry.planes
     below = replace(geometry, planes=(replace(floor, offset=floor.offset + 100.0),))
-    state = settle(LocomotionStepper(body, made.stepper.muscles, below, device="cpu"))
+    state = settle(LocomotionStepper(body, creature.stepper.muscles, below, device="cpu"))
     fallen = body.centre_of_mass(state.positions) - body.centre_of_mass(body.mesh.nodes)
     np.testing.assert_allclose(fallen, [0.0, 0.0, -body.height / 8.0], atol=1e-6)
 
 
-def test_zero_frames(made: CoarseCreature) -> None:
+def test_zero_frames(creature: CoarseCreature) -> None:
     """As with activations for less than a frame: the start is the only state, and no step failed."""
-    sequence = MotionSequence(made.place, motion("jump").parts(made.place.body.height))
-    done = roll_out(made.stepper, made.stepper.geometry, made.start, sequence, frames=0)
+    sequence = MotionSequence(creature.place, motion("jump").parts(creature.place.body.height))
+    done = roll_out(creature.stepper, creature.stepper.geometry, creature.start, sequence, frames=0)
     assert not done.stopped and done.reports == () and done.frames.tolist() == [0]
     assert len(done.trajectory.time) == 1

@@ -28,7 +28,7 @@ from tests.support.stances import DT, FLOOR, FORWARD
 
 
 @pytest.fixture(scope="module")
-def made() -> CoarseCreature:
+def creature() -> CoarseCreature:
     return coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
 
 
@@ -44,18 +44,18 @@ class Stands:
         return [AngularMomentumObjective(np.zeros(3), 1.0)]
 
 
-def watched(made: CoarseCreature, begin: Any = Stands) -> FallMonitor:
-    return FallMonitor(MotionSequence(made.place, [MotionTask("stand", {}, begin)]), made.place)
+def watched(creature: CoarseCreature, begin: Any = Stands) -> FallMonitor:
+    return FallMonitor(MotionSequence(creature.place, [MotionTask("stand", {}, begin)]), creature.place)
 
 
-def seen(
-    made: CoarseCreature, watch: FallMonitor, *, degrees: float, load: float, seconds: float, on: str = "base"
+def feed_monitor(
+    creature: CoarseCreature, watch: FallMonitor, *, degrees: float, load: float, seconds: float, on: str = "base"
 ) -> None:
     """Feed the monitor a body rotated by an angle, with ``load`` of its weight on its base or its top."""
-    body, start = made.place.body, made.start
+    body, start = creature.place.body, creature.start
     turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
     state = BodyState(start.positions @ turn.T, start.velocities)
-    height = made.place.standing[:, 2]
+    height = creature.place.standing[:, 2]
     node = int(np.argmin(height) if on == "base" else np.argmax(height))
     contacts = SimpleNamespace(nodes=np.array([[node] * 4]), count=0)
     report = SimpleNamespace(forces=np.array([[load * body.weight, 0.0, 0.0]]), contacts=contacts, min_gap=0.0)
@@ -64,8 +64,8 @@ def seen(
         watch.objectives(replace(state, time=step * DT), cast(Any, report), DT)
 
 
-def test_tilt_and_what_a_body_lies_on(made: CoarseCreature) -> None:
-    long = FALLEN_TIME * np.sqrt(made.place.body.height / 9.81)
+def test_tilt_and_what_a_body_lies_on(creature: CoarseCreature) -> None:
+    long = FALLEN_TIME * np.sqrt(creature.place.body.height / 9.81)
     cases: list[tuple[dict[str, Any], str | None]] = [
         ({"degrees": FALLEN_TILT + 1, "load": 1.0, "seconds": long}, "tilted by 61 degrees at 0.17 s"),
         ({"degrees": -170.0, "load": 0.2, "seconds": long}, "tilted by 170 degrees at 0.17 s"),
@@ -76,48 +76,48 @@ def test_tilt_and_what_a_body_lies_on(made: CoarseCreature) -> None:
         ({"degrees": 0.0, "load": 0.4, "seconds": 1.0, "on": "top"}, None),
     ]
     for given, said in cases:
-        watch = watched(made)
-        seen(made, watch, **given)
+        watch = watched(creature)
+        feed_monitor(creature, watch, **given)
         assert watch.fallen == said and watch.is_finished == (said is not None)
 
 
-def test_a_fallen_body_has_no_objectives(made: CoarseCreature) -> None:
-    watch = watched(made)
-    assert len(watch.objectives(made.start, None, DT)) == 1
-    seen(made, watch, degrees=90.0, load=1.0, seconds=1.0)
-    assert watch.objectives(made.start, None, DT) == []
+def test_a_fallen_body_has_no_objectives(creature: CoarseCreature) -> None:
+    watch = watched(creature)
+    assert len(watch.objectives(creature.start, None, DT)) == 1
+    feed_monitor(creature, watch, degrees=90.0, load=1.0, seconds=1.0)
+    assert watch.objectives(creature.start, None, DT) == []
 
 
-def test_a_body_that_gets_up_is_not_monitored(made: CoarseCreature) -> None:
+def test_a_body_that_gets_up_is_not_monitored(creature: CoarseCreature) -> None:
     """The motion that fell is marked, getting up replaces it, and only its failure counts as a fall."""
-    sequence = MotionSequence(made.place, [MotionTask("stand", {}, cast(Any, Stands))])
-    watch = FallMonitor(sequence, made.place, gets_up=True)
-    seen(made, watch, degrees=90.0, load=1.0, seconds=1.0)
+    sequence = MotionSequence(creature.place, [MotionTask("stand", {}, cast(Any, Stands))])
+    watch = FallMonitor(sequence, creature.place, gets_up=True)
+    feed_monitor(creature, watch, degrees=90.0, load=1.0, seconds=1.0)
     assert watch.fallen is None and not watch.is_finished
     fell, get_up = sequence.done
     assert fell.fall_note == "tilted by 90 degrees at 0.17 s" and not fell.got_up and get_up.name == "get up"
     assert sequence.time_left(1.0, [5.0]) > 0.0 and sequence.unstarted_note() == []
     get_up.motion.phase = GetUpPhase.GIVEN_UP  # type: ignore[attr-defined]
-    watch.objectives(replace(made.start, time=1.1), cast(Any, SimpleNamespace()), DT)
+    watch.objectives(replace(creature.start, time=1.1), cast(Any, SimpleNamespace()), DT)
     assert watch.fallen == fell.fall_note and watch.is_finished
 
 
-def test_keys_may_tip_the_body(made: CoarseCreature) -> None:
+def test_keys_may_tip_the_body(creature: CoarseCreature) -> None:
     key = Key(0.5, "body", Quantity.ORIENTATION, (90.0, 0.0, 0.0))
     for keys, falls in (([key], False), ([replace(key, quantity=Quantity.POSITION)], True)):
-        watch = watched(made, lambda place, keys=keys: Follow(place, keys))
-        seen(made, watch, degrees=90.0, load=1.0, seconds=0.4)
+        watch = watched(creature, lambda place, keys=keys: Follow(place, keys))
+        feed_monitor(creature, watch, degrees=90.0, load=1.0, seconds=0.4)
         assert (watch.fallen is not None) == falls
 
 
 def test_a_body_on_its_side_has_fallen() -> None:
     """A run of the stepper with weak muscles: they relax, and the run ends shortly after."""
-    made = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD, strength=0.2)
+    creature = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD, strength=0.2)
     turn = Rotation.from_euler("x", 90.0, degrees=True).as_matrix()
-    positions = made.start.positions @ turn.T
-    start = BodyState(positions - [0.0, 0.0, positions[:, 2].min()], made.start.velocities)
-    watch = FallMonitor(MotionSequence(made.place, motion("jump").parts(1.0)), made.place)
-    body, muscles = made.place.body, made.stepper.muscles
+    positions = creature.start.positions @ turn.T
+    start = BodyState(positions - [0.0, 0.0, positions[:, 2].min()], creature.start.velocities)
+    watch = FallMonitor(MotionSequence(creature.place, motion("jump").parts(1.0)), creature.place)
+    body, muscles = creature.place.body, creature.stepper.muscles
     everywhere = embed_points(body.mesh, body.mesh.nodes, device="cpu")
     geometry = ContactGeometry(body.mesh, (FLOOR,), 0.8, everywhere.tets.numpy(), everywhere.weights.numpy(), 0, 0.0)
     stepper = LocomotionStepper(body, muscles, geometry, device="cpu")

@@ -23,10 +23,10 @@ DT = 1 / 60
 
 @pytest.fixture
 def place() -> Stance:
-    return stood(block_mesh())
+    return standing_stance(block_mesh())
 
 
-def stood(mesh: TetMesh) -> Stance:
+def standing_stance(mesh: TetMesh) -> Stance:
     """Return the stance of a body of ``mesh`` at rest; forward is +y."""
     body = make_body(mesh, FLOOR, device="cpu")
     ground = GroundFrame.on_plane(FLOOR, np.array([0.0, 1.0, 0.0]), body.centre_of_mass(mesh.nodes))
@@ -108,7 +108,7 @@ def test_feet_are_ordered_counterclockwise_from_straight_ahead() -> None:
         (stool(), [(-1, 1), (-1, -1), (1, -1), (1, 1)]),
         (figure(), [(-1, 0), (1, 0)]),
     ):
-        place = stood(mesh)
+        place = standing_stance(mesh)
         follow = Follow(place, [key(0.5, "foot 2", Quantity.POSITION, (0.0, 0.0, 0.1))])
         feet = [part for name, part in follow.parts.items() if name.startswith("foot ")]
         assert [part.name for part in feet] == [f"foot {n + 1}" for n in range(len(corners))]
@@ -130,7 +130,7 @@ def test_an_unknown_part_is_refused_with_the_known_ones(place: Stance) -> None:
         Follow(place, [key(0.5, "foot 1", Quantity.POSITION, (0.0, 0.0, 0.1))])
     assert str(error.value) == "k.json, key 1: the body has no part 'foot 1'; it has body, base, head, foot"
     with pytest.raises(UserError, match=r"has no part 'foot'; it has body, base, head, foot 1, foot 2$"):
-        Follow(stood(figure()), [key(0.5, "foot", Quantity.POSITION, (0.0, 0.0, 0.1))])
+        Follow(standing_stance(figure()), [key(0.5, "foot", Quantity.POSITION, (0.0, 0.0, 0.1))])
 
 
 def test_missed_keys_are_reported_and_reached_ones_are_not(place: Stance) -> None:

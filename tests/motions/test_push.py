@@ -33,16 +33,18 @@ def block() -> CoarseCreature:
 
 
 @pytest.fixture(scope="module")
-def made() -> CoarseCreature:
+def standing_block() -> CoarseCreature:
     return block()
 
 
-def stood(made: CoarseCreature, pushes: str, frames: int = 40, **given: Path) -> tuple[RolloutResult, str | None]:
+def simulate_pushes(
+    standing_block: CoarseCreature, pushes: str, frames: int = 40, **given: Path
+) -> tuple[RolloutResult, str | None]:
     """Simulate a block that stands; return the result, and the description of its fall, if it fell."""
-    place = made.place
+    place = standing_block.place
     watch = FallMonitor(MotionSequence(place, motion("stand 0.5").parts(place.body.height)), place)
     simulation = roll_out(
-        *(made.stepper, made.stepper.geometry, made.start, watch),
+        *(standing_block.stepper, standing_block.stepper.geometry, standing_block.start, watch),
         frames=frames,
         kicks=PushKicks(place, read_pushes(pushes)),
         finished=lambda: watch.is_finished,
@@ -53,8 +55,8 @@ def stood(made: CoarseCreature, pushes: str, frames: int = 40, **given: Path) ->
 
 
 @pytest.fixture(scope="module")
-def pushed(made: CoarseCreature) -> Trajectory:
-    simulation, fallen = stood(made, "0.1 0.06 left 0.8, 0.2-0.3 0.05 back")
+def pushed(standing_block: CoarseCreature) -> Trajectory:
+    simulation, fallen = simulate_pushes(standing_block, "0.1 0.06 left 0.8, 0.2-0.3 0.05 back")
     assert fallen is None and all(report.converged for report in simulation.reports)
     return simulation.trajectory
 
@@ -68,10 +70,10 @@ def test_steps_share_out_all_of_a_push(push: Push, dt: float) -> None:
         assert sorted(shares)[-2:] == [0.0, 1.0]
 
 
-def test_a_push_has_its_momentum_and_its_lever_arm(made: CoarseCreature) -> None:
+def test_a_push_has_its_momentum_and_its_lever_arm(standing_block: CoarseCreature) -> None:
     """The unit m sqrt(g H) is the whole body at its unit of speed; a push at the top rotates the body, a push of all
     nodes does not."""
-    place, body = made.place, made.place.body
+    place, body = standing_block.place, standing_block.place.body
     for height in (None, 0.9, 0.1):
         kick = PushKicks(place, [Push(0.0, 0.3 * LEFT, height)])(0.0, DT)
         assert kick is not None
@@ -84,11 +86,11 @@ def test_a_push_has_its_momentum_and_its_lever_arm(made: CoarseCreature) -> None
     assert PushKicks(place, [Push(0.5, LEFT)])(0.0, DT) is None
 
 
-def test_a_push_acts_near_its_height(made: CoarseCreature) -> None:
+def test_a_push_acts_near_its_height(standing_block: CoarseCreature) -> None:
     """Nodes within a quarter of a body height are pushed; if a coarse cage has none there, the nearest ones are."""
-    heights = made.place.ground.local(made.place.standing)[:, 2] / made.place.body.height
+    heights = standing_block.place.ground.local(standing_block.place.standing)[:, 2] / standing_block.place.body.height
     for height in (0.0, 0.5, 1.0):
-        sizes = np.linalg.norm(kick_of(made.place, 0.1 * LEFT, height), axis=1)
+        sizes = np.linalg.norm(kick_of(standing_block.place, 0.1 * LEFT, height), axis=1)
         assert (np.abs(heights[sizes > 0.0] - height) < 0.25).all()
         assert sizes.argmax() in np.flatnonzero(np.abs(heights - height) < np.abs(heights - height).min() + 0.01)
     thin = block_place(box_mesh((4, 4, 1), (2.0, 2.0, 0.5)))
@@ -112,10 +114,12 @@ def test_the_balances_include_the_pushes(pushed: Trajectory) -> None:
         assert found.momentum_residual > 1e-4 and found.angular_momentum_residual > 1e-5
 
 
-def test_a_pushed_body_moves_with_the_push_and_keeps_its_feet(made: CoarseCreature, pushed: Trajectory) -> None:
+def test_a_pushed_body_moves_with_the_push_and_keeps_its_feet(
+    standing_block: CoarseCreature, pushed: Trajectory
+) -> None:
     """A tenth of a second after the first push its centre of mass has moved to the left; in the end the body is upright
     and at rest."""
-    place = made.place
+    place = standing_block.place
     com = np.array([place.body.centre_of_mass(place.ground.local(x)) for x in pushed.positions])
     after = int(np.searchsorted(pushed.time, 0.2))
     assert com[after, 1] > 0.005 > com[0, 1] + 0.001
@@ -125,26 +129,26 @@ def test_a_pushed_body_moves_with_the_push_and_keeps_its_feet(made: CoarseCreatu
     assert np.linalg.norm(pushed.node_mass @ pushed.velocities[-1]) < 0.05 * place.body.mass * place.body.speed_unit
 
 
-def test_a_hard_push_topples_the_body(made: CoarseCreature) -> None:
+def test_a_hard_push_topples_the_body(standing_block: CoarseCreature) -> None:
     """Its energy is several times what lifts the centre of mass over the edge, so that no controller can keep
     balance."""
-    simulation, fallen = stood(made, "0.05 1 left 0.9", frames=90)
+    simulation, fallen = simulate_pushes(standing_block, "0.05 1 left 0.9", frames=90)
     assert fallen is not None and fallen.startswith("tilted by")
     assert audit(simulation.trajectory).energy_residual < 1e-6
     t = simulation.trajectory
-    reached = StandFor(made.place, 0.5).outcome_record(t, 0, len(t.dt))
-    sole = made.place.ground.local(made.place.standing)[:, 2] < 0.01
-    middle = np.array([made.place.ground.local(x)[sole, :2].mean(axis=0) for x in t.positions])
-    shift = np.linalg.norm(middle - middle[0], axis=1).max() / made.place.body.height
+    reached = StandFor(standing_block.place, 0.5).outcome_record(t, 0, len(t.dt))
+    sole = standing_block.place.ground.local(standing_block.place.standing)[:, 2] < 0.01
+    middle = np.array([standing_block.place.ground.local(x)[sole, :2].mean(axis=0) for x in t.positions])
+    shift = np.linalg.norm(middle - middle[0], axis=1).max() / standing_block.place.body.height
     assert reached.sole_shift == pytest.approx(shift) and reached.lean > 0.2
 
 
 def test_a_pushed_run_continues_to_the_same_bits(pushed: Trajectory, tmp_path: Path) -> None:
     """The run is interrupted during the gust."""
     parts = tmp_path / "parts"
-    stood(block(), "0.1 0.06 left 0.8, 0.2-0.3 0.05 back", frames=15, parts=parts)
-    whole, _ = stood(block(), "0.1 0.06 left 0.8, 0.2-0.3 0.05 back")
-    again, _ = stood(block(), "0.1 0.06 left 0.8, 0.2-0.3 0.05 back", resume=parts)
+    simulate_pushes(block(), "0.1 0.06 left 0.8, 0.2-0.3 0.05 back", frames=15, parts=parts)
+    whole, _ = simulate_pushes(block(), "0.1 0.06 left 0.8, 0.2-0.3 0.05 back")
+    again, _ = simulate_pushes(block(), "0.1 0.06 left 0.8, 0.2-0.3 0.05 back", resume=parts)
     for name in ("positions", "velocities", "kick_step", "kick_velocity"):
         np.testing.assert_array_equal(getattr(again.trajectory, name), getattr(whole.trajectory, name))
 

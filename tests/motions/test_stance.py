@@ -12,7 +12,7 @@ from egs_warp.motions.stance import SOLE_HEIGHT, SUPPORT_MARGIN, BalanceControll
 GRAVITY, EDGE, DT = 9.81, 0.2, 1 / 60
 
 
-def stood(
+def measured_body(
     place: Stance, friction: float, moved: tuple[float, float, float]
 ) -> tuple[BalanceController, BodyState, Measurement]:
     """Return the controller, the state and the measurement of a body at rest whose nodes above the soles are displaced
@@ -38,7 +38,7 @@ def test_balance_targets_are_the_nearest_that_do_not_tip(
     """The change of m h (v + swing) is the load times the distance of the centre of pressure from the centre of mass,
     and the centre of pressure is within the footprint. Of all such targets, the controller picks the one with the least
     error of velocity and spin."""
-    pose, state, seen = stood(place, 1e3, (0.05, -0.03, 0.1))
+    pose, state, seen = measured_body(place, 1e3, (0.05, -0.03, 0.1))
     asked, spin = np.array([*wanted, up]), np.array(turning)
     velocity, turned = pose.balance_targets(seen, asked, spin, DT)
     load, height = GRAVITY + up / DT, seen.com[2]
@@ -67,12 +67,12 @@ def test_balance_targets_are_the_nearest_that_do_not_tip(
 
 
 def test_feasible_targets_are_unchanged_and_a_falling_body_may_move_in_both_directions(place: Stance) -> None:
-    pose, _, seen = stood(place, 1e3, (0.0, 0.0, 0.0))
+    pose, _, seen = measured_body(place, 1e3, (0.0, 0.0, 0.0))
     asked, spin = np.array([0.01, -0.005, 0.02]), np.array([0.01, 0.02, 0.5])
     velocity, turned = pose.balance_targets(seen, asked, spin, DT)
     np.testing.assert_allclose(velocity, asked, atol=1e-12)
     np.testing.assert_allclose(turned, spin, atol=1e-12)
-    pose, _, seen = stood(place, 1e3, (0.5, 0.0, 0.0))
+    pose, _, seen = measured_body(place, 1e3, (0.5, 0.0, 0.0))
     ways = [pose.balance_targets(seen, np.array([x, 0.0, 0.0]), np.zeros(3), DT)[0][0] for x in (-2.0, 2.0)]
     assert ways[0] < -0.5 * DT and ways[1] > 0.5 * DT
 
@@ -80,7 +80,7 @@ def test_feasible_targets_are_unchanged_and_a_falling_body_may_move_in_both_dire
 @pytest.mark.parametrize("up", [0.0, 0.25])
 def test_requests_are_limited_by_friction(place: Stance, up: float) -> None:
     """Coulomb: a request keeps its direction and is limited to 0.95 of the friction; a smaller one is unchanged."""
-    pose, _, seen = stood(place, 0.05, (0.0, 0.0, 0.0))
+    pose, _, seen = measured_body(place, 0.05, (0.0, 0.0, 0.0))
     wanted = np.array([0.009, -0.012])
     most = 0.95 * 0.05 * (GRAVITY + up / DT) * DT
     got, _ = pose.balance_targets(seen, np.array([*(10.0 * wanted), up]), np.zeros(3), DT)
@@ -109,7 +109,7 @@ def test_on_a_slope_friction_gives_less_uphill(way: tuple[float, float]) -> None
 @pytest.mark.parametrize("spin", [(0.0, -2.0, 0.0), (1.5, 1.0, 0.2)])
 def test_spin_replaces_velocity_where_friction_is_low(place: Stance, spin: tuple[float, float, float]) -> None:
     """On slippery ground, too, the requested centre of pressure is within the footprint."""
-    pose, state, seen = stood(place, 0.3, (0.05, -0.03, 0.1))
+    pose, state, seen = measured_body(place, 0.3, (0.05, -0.03, 0.1))
     velocity, turned = pose.balance_targets(seen, np.array([0.3, 0.01, 0.0]), np.array(spin), DT)
     change = velocity[:2] + swing(place, state, seen, turned)
     middle = place.ground.local(place.contact_points)[:, :2].mean(axis=0)
@@ -121,7 +121,7 @@ def test_spin_replaces_velocity_where_friction_is_low(place: Stance, spin: tuple
 def test_a_body_that_rotates_forward_is_caught_further_ahead(place: Stance) -> None:
     """The capture point follows from the angular momentum about the feet: for a body at rest, the acceleration over its
     position is zero, and spin counts as the velocity with the same momentum."""
-    pose, state, seen = stood(place, 1.0, (0.0, 0.0, 0.0))
+    pose, state, seen = measured_body(place, 1.0, (0.0, 0.0, 0.0))
     np.testing.assert_allclose(pose.capture_acceleration(seen, seen.com[:2]), 0.0, atol=1e-12)
     ahead = BodyState(state.positions, np.broadcast_to(0.1 * place.ground.axes[0], state.positions.shape))
     forward = pose.capture_acceleration(pose.measure(ahead, None), seen.com[:2])
@@ -146,7 +146,7 @@ def test_the_capture_margin_is_relative_to_the_edge(place: Stance, ahead: float,
 def test_a_leaning_body_rotates_as_in_its_static_bend(place: Stance) -> None:
     """The static bend under a horizontal load is solved densely with the sole clamped: the pose is the nearest affine
     map by mass, by least squares."""
-    pose, _, seen = stood(place, 0.8, (0.0, 0.0, 0.0))
+    pose, _, seen = measured_body(place, 0.8, (0.0, 0.0, 0.0))
     body, assembly = place.body, place.body.assembly
     upper = assembly.matrix(assembly.hessian_entries(place.standing, projected=True)).toarray()
     stiffness = upper + np.triu(upper, 1).T

@@ -21,7 +21,7 @@ COLOURS = {1: (0xD6, 0x27, 0x28), 2: (0x1F, 0x77, 0xB4), 3: (0x2C, 0xA0, 0x2C), 
 """Colours of the feet in the picture."""
 
 
-def seen(thing: BuiltInObject) -> BodyInfo:
+def inspected(thing: BuiltInObject) -> BodyInfo:
     return inspect_capture(thing.cloud, source=thing.name, plane=thing.plane, nodes=200)
 
 
@@ -52,7 +52,7 @@ def test_a_chair_is_described_by_its_measurements(chair: BodyInfo) -> None:
 
 def test_all_motions_are_listed(chair: BodyInfo) -> None:
     assert chair.motions() == dict.fromkeys(MOTIONS)
-    round_one = seen(pawn(gaussian_count=3000))
+    round_one = inspected(pawn(gaussian_count=3000))
     assert len(round_one.feet) == 1 and "stands   on one base" in round_one.lines()
     assert round_one.motions() == dict.fromkeys(MOTIONS), "it waddles"
     assert "jump       yes" in round_one.lines()

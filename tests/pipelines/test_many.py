@@ -52,13 +52,15 @@ def jobs(creature: Creature) -> list[Job]:
 
 
 @pytest.fixture(scope="module")
-def told() -> list[tuple[int, int]]:
+def progress_calls() -> list[tuple[int, int]]:
     return []
 
 
 @pytest.fixture(scope="module")
-def outcomes(creature: Creature, jobs: list[Job], told: list[tuple[int, int]]) -> tuple[JobResult, ...]:
-    return simulate_many(creature, jobs, workers=2, progress=lambda done, expected: told.append((done, expected)))
+def outcomes(creature: Creature, jobs: list[Job], progress_calls: list[tuple[int, int]]) -> tuple[JobResult, ...]:
+    return simulate_many(
+        creature, jobs, workers=2, progress=lambda done, expected: progress_calls.append((done, expected))
+    )
 
 
 def same(one: Trajectory, other: Trajectory) -> bool:
@@ -111,10 +113,12 @@ def test_reports_have_the_end_state(creature: Creature, outcomes: tuple[JobResul
     assert outcomes[2].report is not None and outcomes[2].report.asked["friction"] == 0.3
 
 
-def test_progress_ends_at_the_total(told: list[tuple[int, int]], outcomes: tuple[JobResult, ...]) -> None:
+def test_progress_ends_at_the_total(progress_calls: list[tuple[int, int]], outcomes: tuple[JobResult, ...]) -> None:
     frames = sum(len(outcome.frames) - 1 for outcome in outcomes if outcome.report is not None)
-    done = [one for one, _ in told]
-    assert told[-1] == (frames, frames) and done == sorted(done) and all(one <= of for one, of in told)
+    done = [one for one, _ in progress_calls]
+    assert (
+        progress_calls[-1] == (frames, frames) and done == sorted(done) and all(one <= of for one, of in progress_calls)
+    )
 
 
 @pytest.mark.slow
@@ -133,7 +137,7 @@ def test_worlds_of_a_batch_equal_single_runs(creature: Creature, tmp_path: Path)
         Job(asked, friction=-1.0, activations=held),
         Job(asked, activations=held[:, 1:]),
     ]
-    told: list[tuple[int, int]] = []
+    progress_calls: list[tuple[int, int]] = []
     ended: list[int] = []
     made = simulate_many(
         *(creature, jobs),
@@ -141,9 +145,9 @@ def test_worlds_of_a_batch_equal_single_runs(creature: Creature, tmp_path: Path)
         workers=1,
         out=tmp_path,
         ended=lambda number, one: ended.append(number),
-        progress=lambda done, of: told.append((done, of)),
+        progress=lambda done, of: progress_calls.append((done, of)),
     )
-    assert sorted(ended) == list(range(7)) and told[-1] == (19, 19)
+    assert sorted(ended) == list(range(7)) and progress_calls[-1] == (19, 19)
     assert [one.error for one in made[:5]] == [None] * 5
     assert made[5].error == "friction -1.0: give a Coulomb coefficient of at least 0"
     assert made[6].error is not None and made[6].error.startswith("activations: of shape (6, ")

@@ -20,7 +20,7 @@ CAMERAS = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 1.0, count=4, elevation
 
 
 @pytest.fixture(scope="module")
-def found() -> tuple[GaussianCloud, LocatedPlane]:
+def located_ball() -> tuple[GaussianCloud, LocatedPlane]:
     """A ball on a floor, located by a point."""
     cloud = concatenate(round_ones(shell(), 0.03), lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05)))
     return cloud, locate_plane(cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5])), plane=FLOOR)
@@ -30,13 +30,13 @@ def changed(located: LocatedPlane, object_mask: np.ndarray) -> LocatedPlane:
     return replace(located, segmentation=replace(located.segmentation, object_mask=object_mask))
 
 
-def test_a_complete_object_causes_no_warning(found: tuple[GaussianCloud, LocatedPlane]) -> None:
-    cloud, located = found
+def test_a_complete_object_causes_no_warning(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
+    cloud, located = located_ball
     assert segmentation_warnings(cloud, located, cloud.subset(located.segmentation.object_mask), CAMERAS) == []
 
 
-def test_an_object_at_the_edge_of_pictures(found: tuple[GaussianCloud, LocatedPlane]) -> None:
-    cloud, located = found
+def test_an_object_at_the_edge_of_pictures(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
+    cloud, located = located_ball
     thing = cloud.subset(located.segmentation.object_mask)
     near = [replace(CAMERAS[0], cx=CAMERAS[0].cx + 50.0), *CAMERAS[1:]]
     assert segmentation_warnings(cloud, located, thing, near) == [
@@ -44,17 +44,17 @@ def test_an_object_at_the_edge_of_pictures(found: tuple[GaussianCloud, LocatedPl
     ]
 
 
-def test_an_object_without_its_foot(found: tuple[GaussianCloud, LocatedPlane]) -> None:
+def test_an_object_without_its_foot(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
     """The lowest part of a ball of one unit is missing up to 0.17: a tenth of its size, the diagonal of its box."""
-    cloud, located = found
+    cloud, located = located_ball
     kept = located.segmentation.object_mask & (cloud.means.numpy()[:, 2] > 0.17)
     (line,) = segmentation_warnings(cloud, changed(located, kept), cloud.subset(kept), CAMERAS)
     assert line == "rests on nothing: its lowest part is 10 % of its size above the ground"
 
 
-def test_a_floor_that_came_along(found: tuple[GaussianCloud, LocatedPlane]) -> None:
+def test_a_floor_that_came_along(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
     """The part of the floor on one side was segmented with the object: half of the floor within the object's size."""
-    cloud, located = found
+    cloud, located = located_ball
     means = cloud.means.numpy()
     kept = located.segmentation.object_mask | ((np.arange(cloud.count) >= 1500) & (means[:, 0] > 0.0))
     (line,) = segmentation_warnings(
@@ -64,8 +64,8 @@ def test_a_floor_that_came_along(found: tuple[GaussianCloud, LocatedPlane]) -> N
     assert 45 <= int(line.split()[2]) <= 55
 
 
-def test_the_warnings_are_in_the_image(found: tuple[GaussianCloud, LocatedPlane]) -> None:
-    cloud, located = found
+def test_the_warnings_are_in_the_image(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
+    cloud, located = located_ball
     thing = cloud.subset(located.segmentation.object_mask)
     plain, told = (segmentation_picture(cloud, thing, cloud, CAMERAS[:2], words) for words in ((), ("taken along",)))
     np.testing.assert_array_equal(told[: len(plain)], plain)

@@ -14,19 +14,21 @@ NEAR = 20
 """Number of frames at the end for which the estimate is not tested."""
 
 
-def _told(text: str, frames: int | None = None) -> np.ndarray:
+def _estimates(text: str, frames: int | None = None) -> np.ndarray:
     """Return the number of done and expected frames (n, 2) after each frame."""
-    told: list[tuple[int, int]] = []
-    simulate(coarse_pawn(), motion(text), frames=frames, progress=lambda done, expected: told.append((done, expected)))
-    assert [done for done, _ in told] == list(range(1, len(told) + 1))
-    return np.array(told)
+    estimates: list[tuple[int, int]] = []
+    simulate(
+        coarse_pawn(), motion(text), frames=frames, progress=lambda done, expected: estimates.append((done, expected))
+    )
+    assert [done for done, _ in estimates] == list(range(1, len(estimates) + 1))
+    return np.array(estimates)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("text", ["jump", "hop x2 0.4 0.2", "twist 60", "twist 180", "walk 0.2", "jump 0 0.1, turn 30"])
 def test_the_estimate_is_within_a_factor_of_two(text: str) -> None:
     """The last frames are excluded; a twist decides in the air whether it needs another jump."""
-    done, expected = _told(text).T
+    done, expected = _estimates(text).T
     count = len(done)
     far = done < count - NEAR
     ratio = (expected - done)[far] / (count - done)[far]
@@ -39,4 +41,4 @@ def test_the_estimate_is_within_a_factor_of_two(text: str) -> None:
 
 def test_requested_frames_are_the_estimate() -> None:
     """The first frame is the body at rest."""
-    np.testing.assert_array_equal(_told("jump", frames=4)[:, 1], 3)
+    np.testing.assert_array_equal(_estimates("jump", frames=4)[:, 1], 3)

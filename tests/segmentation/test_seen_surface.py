@@ -15,7 +15,7 @@ SPACING = 0.03
 
 
 @pytest.fixture(scope="module")
-def seen() -> SeenSurface:
+def floor_view() -> SeenSurface:
     """A floor, viewed from 30 degrees above it."""
     eye = np.array([0.0, -2.2, 1.3])
     camera = Camera.look_at(
@@ -24,28 +24,28 @@ def seen() -> SeenSurface:
     return SeenSurface.of(lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, SPACING)), camera)
 
 
-def test_heights_are_right_where_depths_are_too_high(seen: SeenSurface) -> None:
-    rays = camera_rays(seen.camera)
-    by_depth = seen.camera.centre + seen.depth[..., None] * rays
-    assert seen.opaque.mean() > 0.9
-    assert by_depth[seen.opaque][:, 2].mean() > 0.1 * SPACING, "nearer splats hide those behind them"
-    points = seen.points(FLOOR, seen.opaque)
-    assert len(points) == seen.opaque.sum()
+def test_heights_are_right_where_depths_are_too_high(floor_view: SeenSurface) -> None:
+    rays = camera_rays(floor_view.camera)
+    by_depth = floor_view.camera.centre + floor_view.depth[..., None] * rays
+    assert floor_view.opaque.mean() > 0.9
+    assert by_depth[floor_view.opaque][:, 2].mean() > 0.1 * SPACING, "nearer splats hide those behind them"
+    points = floor_view.points(FLOOR, floor_view.opaque)
+    assert len(points) == floor_view.opaque.sum()
     assert np.abs(points[:, 2]).max() < 1e-6
     # Each point is on the ray of its own pixel.
-    along = (points - seen.camera.centre) @ seen.camera.rotation[2]
-    np.testing.assert_allclose(points, seen.camera.centre + along[:, None] * rays[seen.opaque], atol=1e-9)
+    along = (points - floor_view.camera.centre) @ floor_view.camera.rotation[2]
+    np.testing.assert_allclose(points, floor_view.camera.centre + along[:, None] * rays[floor_view.opaque], atol=1e-9)
 
 
-def test_a_rough_plane_is_sufficient(seen: SeenSurface) -> None:
+def test_a_rough_plane_is_sufficient(floor_view: SeenSurface) -> None:
     """For a plane tilted by two degrees, the error is the width of a splat times the sine of the tilt."""
     tilt = np.radians(2.0)
     rough = Plane(np.array([0.0, np.sin(tilt), np.cos(tilt)]), 0.02)
-    points = seen.points(rough, seen.opaque)
+    points = floor_view.points(rough, floor_view.opaque)
     assert np.abs(points[:, 2]).max() < 3.0 * SPACING * np.sin(tilt)
 
 
-def test_pixels_without_a_surface_have_no_depth(seen: SeenSurface) -> None:
+def test_pixels_without_a_surface_have_no_depth(floor_view: SeenSurface) -> None:
     """Empty pixels, rays at or above the horizon, and a plane above the camera."""
     up = Camera.look_at(
         np.array([0.0, -1.0, 0.5]), np.array([0.0, 1.0, 0.9]), np.array([0.0, 0.0, 1.0]), width=64, height=64
@@ -56,4 +56,4 @@ def test_pixels_without_a_surface_have_no_depth(seen: SeenSurface) -> None:
     slope = camera_rays(up) @ FLOOR.normal
     assert (depth[slope >= 0.0] == 0.0).all() and (depth[look.opaque & (slope < 0.0)] > 0.0).all()
     assert (depth[look.depth == 0.0] == 0.0).all()
-    assert not seen.depth_over(Plane(-FLOOR.normal, 5.0)).any()
+    assert not floor_view.depth_over(Plane(-FLOOR.normal, 5.0)).any()

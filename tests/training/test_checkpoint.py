@@ -95,15 +95,15 @@ def test_cut_off_three_times_it_has_the_same_bits(views: list[TrainingView], tmp
 def test_runs_that_cannot_be_resumed_are_reported(views: list[TrainingView], tmp_path: Path) -> None:
     path = tmp_path / "training.npz"
 
-    def told(views: list[TrainingView]) -> str:
+    def error_of(views: list[TrainingView]) -> str:
         with pytest.raises(UserError) as error:
             finetune(start(), views, options=OPTIONS, checkpoint=path, resume=True)
         return str(error.value)
 
-    assert told(views) == f"{path}: no checkpoint of an interrupted training here; start without resuming"
+    assert error_of(views) == f"{path}: no checkpoint of an interrupted training here; start without resuming"
     cut_off(views, path, 3, resume=False)
-    assert told(views[:9]) == (
+    assert error_of(views[:9]) == (
         f"{path}: it belongs to other photos, flags or another version of egs-warp; start the training again"
     )
     path.write_bytes(path.read_bytes()[:300])
-    assert told(views) == f"{path}: the checkpoint is damaged; start the training again"
+    assert error_of(views) == f"{path}: the checkpoint is damaged; start the training again"

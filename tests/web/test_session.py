@@ -47,7 +47,7 @@ def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
         _wait(session, woken, seen, lambda: any(isinstance(one, dict) and one.get("doing") == "jump" for one in seen))
         # Without a page the session is suspended; it continues from the same state.
         session.unsubscribe()
-        held = _held(session)
+        held = _still_seconds(session)
         session.subscribe(woken.set)
         seen = session.take_news()
         assert isinstance(seen[0], Frame) and seen[0].time == held
@@ -65,7 +65,7 @@ def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
     assert np.diff(times).min() >= 0.0 and max(np.diff(times)) == pytest.approx(1.0 / 60.0)
 
 
-def _held(session: Session) -> float:
+def _still_seconds(session: Session) -> float:
     """Return the seconds for which its state stays the same, once the current step is done, which takes time on a busy
     core."""
     for _ in range(30):
