@@ -33,7 +33,7 @@ def ended(body: str) -> tuple[int, str]:
     ("error", "status", "line"),
     [
         (UserError("bad"), 2, "prog: bad\n"),
-        (KeyboardInterrupt(), 130, "prog: stopped; finished files are whole, unfinished ones are gone\n"),
+        (KeyboardInterrupt(), 130, "prog: stopped; finished files are complete, unfinished ones are removed\n"),
         (MemoryError(), 1, "prog: not enough memory; give a smaller capture, picture or number of Gaussians\n"),
         (
             OSError(errno.ENOSPC, "No space left on device", "out/a.ply"),
@@ -100,7 +100,7 @@ def test_an_interrupt_swallowed_by_a_destructor_still_ends_the_program() -> None
         time.sleep(10)
     """
     code, said = ended(body)
-    assert code == 130 and said == "prog: stopped; finished files are whole, unfinished ones are gone\n"
+    assert code == 130 and said == "prog: stopped; finished files are complete, unfinished ones are removed\n"
 
 
 def test_a_second_interrupt_ends_at_once() -> None:
@@ -205,7 +205,7 @@ def test_ctrl_c_converted_by_a_library_is_recognised() -> None:
         except KeyboardInterrupt as error:
             raise ImportError("initialization failed") from error
     """
-    assert ended(body) == (130, "prog: stopped; finished files are whole, unfinished ones are gone\n")
+    assert ended(body) == (130, "prog: stopped; finished files are complete, unfinished ones are removed\n")
 
 
 def test_an_error_after_a_handled_ctrl_c_is_reported() -> None:
@@ -244,6 +244,6 @@ def test_ctrl_c_in_any_phase_is_one_line(after: float, tmp_path: Path) -> None:
     if run.returncode != 0:
         assert run.returncode == 130
         lines = [line for line in said.splitlines() if not line.startswith("Warp")]
-        assert lines == ["prog: stopped; finished files are whole, unfinished ones are gone"]
+        assert lines == ["prog: stopped; finished files are complete, unfinished ones are removed"]
     if out.exists():
         assert not [name for name in os.listdir(out) if name.startswith(".egs-")]

@@ -65,9 +65,9 @@ def one_line_errors(program: str) -> Iterator[None]:
         except UserError as error:
             end(1 if _is_exhausted(error.__cause__) else 2, error.format_message(flag_of))
         except KeyboardInterrupt as error:
-            end(130, _noted("stopped; finished files are whole, unfinished ones are gone", error))
+            end(130, _noted("stopped; finished files are complete, unfinished ones are removed", error))
         except _TerminatedError as error:
-            end(143, _noted("terminated by SIGTERM; finished files are whole, unfinished ones are gone", error))
+            end(143, _noted("terminated by SIGTERM; finished files are complete, unfinished ones are removed", error))
         except MemoryError:
             end(1, "not enough memory; give a smaller capture, picture or number of Gaussians")
         except OSError as error:

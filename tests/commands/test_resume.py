@@ -111,7 +111,7 @@ def test_a_run_that_is_killed_repeatedly(tmp_path: Path, capsys: pytest.CaptureF
     first, again = animate("jump", folder, out), ["resume", str(out)]
     assert ended_by(first, signal.SIGKILL, parts / "start.npz", 0.2 * moments.random())[0] == -signal.SIGKILL
     status, said = ended_by(again, signal.SIGINT, parts / "steps-000001.npz", 0.2 * moments.random())
-    told = "egs-warp: stopped; finished files are whole, unfinished ones are gone"
+    told = "egs-warp: stopped; finished files are complete, unfinished ones are removed"
     assert status == 130 and said.splitlines()[-1] == f"{told}; egs-warp resume {out} continues it"
     assert not [name for name in os.listdir(out) if name.startswith(".egs-")]
     assert ended_by(again, signal.SIGKILL, out / "plots.png", 0.0)[0] == -signal.SIGKILL

@@ -153,7 +153,7 @@ def test_no_worker_outlives_the_program(number: signal.Signals, crew: str, tmp_p
     finally:
         program.kill()
     if number == signal.SIGINT:
-        assert said == "prog: stopped; finished files are whole, unfinished ones are gone\n"
+        assert said == "prog: stopped; finished files are complete, unfinished ones are removed\n"
         assert program.returncode == 130
 
 
