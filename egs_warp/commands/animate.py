@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.report import Report
 
 
-EXIT_MISSED = 3
+EXIT_NOT_AS_REQUESTED = 3
 """Exit status of a run that has written its files, but is not what was requested (``State.is_failure``)."""
 _WRITES = (NAME, "trajectory.npz", "plots.png", "cage.vtu", "sheet.png", "creature.npz", "report.json")
 """Files that every run writes. The names of further files depend on the motion."""
@@ -168,7 +168,7 @@ def run_animate(args: argparse.Namespace) -> int:
         raise
     print(report.summary())
     print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz{more} into {args.out}")
-    return EXIT_MISSED if report.state.is_failure else 0
+    return EXIT_NOT_AS_REQUESTED if report.state.is_failure else 0
 
 
 def _animate_capture(args: argparse.Namespace) -> tuple[Report, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from egs_warp.commands.animate import EXIT_MISSED, run_animate
+from egs_warp.commands.animate import EXIT_NOT_AS_REQUESTED, run_animate
 from egs_warp.commands.config import NAME, changed_capture, with_config
 from egs_warp.commands.flags import Commands, named_path
 from egs_warp.errors import UserError
@@ -39,7 +39,7 @@ def _resume(args: argparse.Namespace) -> int:
         clean_up(folder, PARTS)
         print(f"{folder}: this run has finished")
         return (
-            EXIT_MISSED
+            EXIT_NOT_AS_REQUESTED
             if isinstance(report, dict) and report.get("state") in [state.value for state in State if state.is_failure]
             else 0
         )

@@ -60,9 +60,7 @@ def has_settled(body: SoftBody, max_displacement: Any, centre_displacement: Any)
     )
 
 
-def settle_as_captured(
-    stepper: LocomotionStepper, state: BodyState
-) -> tuple[LocomotionStepper, BodyState, float]:
+def settle_as_captured(stepper: LocomotionStepper, state: BodyState) -> tuple[LocomotionStepper, BodyState, float]:
     """Find the unloaded shape whose rest on the ground is the captured shape, so that the body does not sag.
 
     A fixed-point iteration (Sellier, "An iterative method for the inverse elasto-static problem", Journal of Fluids and

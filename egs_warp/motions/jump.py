@@ -436,13 +436,17 @@ class Jump:
         capture_time = stopping_time(self.controller.standing_height, falling, self.gravity, self._landing_time)
         capture = touch_down[:2] + measurement.velocity[:2] * capture_time + self.controller.base_offset
         # The capture point stays within this part of the feet, wherever they land.
-        low, high = (self._max_foothold_offset(edge) for edge in (self.controller.support_low, self.controller.support_high))
+        low, high = (
+            self._max_foothold_offset(edge) for edge in (self.controller.support_low, self.controller.support_high)
+        )
         return np.clip(self._start_base, capture - high, capture - low)
 
     def _max_foothold_offset(self, edge: np.ndarray) -> np.ndarray:
         """Return the largest offset (2,) in metres of the capture point towards an ``edge`` (2,) of the footprint."""
         width = np.abs(edge) / self.controller.standing_height
-        return MAX_FOOTHOLD_OFFSET * np.clip((width - NARROW_SUPPORT) / (WIDE_SUPPORT - NARROW_SUPPORT), 0.0, 1.0) * edge
+        return (
+            MAX_FOOTHOLD_OFFSET * np.clip((width - NARROW_SUPPORT) / (WIDE_SUPPORT - NARROW_SUPPORT), 0.0, 1.0) * edge
+        )
 
     def _body_objectives(
         self,

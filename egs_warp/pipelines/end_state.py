@@ -28,8 +28,8 @@ class State(Enum):
     """The requested number of frames was reached first."""
     GOT_UP = "got up"
     """The body fell, which ended it, and has got up."""
-    MISSED = "missed"
-    """It ended upright, but did not reach its target or not in time, or its feet slid."""
+    NOT_AS_REQUESTED = "not as requested"
+    """It ended upright, but missed its target or its time limit, or its feet slid."""
     FALLEN = "fallen"
     STOPPED = "stopped"
     """A step could not be solved."""
@@ -37,7 +37,7 @@ class State(Enum):
     @property
     def is_failure(self) -> bool:
         """True if the exit status reports this state as a failure."""
-        return self in (State.MISSED, State.FALLEN, State.STOPPED)
+        return self in (State.NOT_AS_REQUESTED, State.FALLEN, State.STOPPED)
 
     @classmethod
     def worst(cls, states: tuple[State, ...]) -> State:
@@ -87,7 +87,7 @@ class EndCause:
         slip = getattr(also_reached, "slip", 0.0)
         if self.base is SupportKind.FEET and slip > MAX_SLIP:
             missed.append(f"feet slide by {100.0 * slip:.0f} % of a stride")
-        return (State.MISSED, [f"missed: {', '.join(missed)}"]) if missed else (State.DONE, [])
+        return (State.NOT_AS_REQUESTED, [f"not as requested: {', '.join(missed)}"]) if missed else (State.DONE, [])
 
 
 def missed_targets(requested: Mapping[str, float], reached: MotionOutcome) -> list[str]:

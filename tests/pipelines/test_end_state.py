@@ -41,22 +41,22 @@ ON_FEET = EndCause(has_time_limit=True, base=SupportKind.FEET)
         (EndCause(), entry(distance=0.5), reached(0.41), True, State.DONE, []),
         (EndCause(), entry(distance=0.5, resting=False), reached(), True, State.CUT_OFF, []),
         (
-            *(ON_FEET, entry(distance=0.5, resting=False), reached(), True, State.MISSED),
-            ["missed: not at rest within the time limit of the motion"],
+            *(ON_FEET, entry(distance=0.5, resting=False), reached(), True, State.NOT_AS_REQUESTED),
+            ["not as requested: not at rest within the time limit of the motion"],
         ),
         (
-            *(EndCause(), entry(distance=0.5), reached(0.39), False, State.MISSED),
-            ["missed: distance 0.39 of 0.5 body heights"],
+            *(EndCause(), entry(distance=0.5), reached(0.39), False, State.NOT_AS_REQUESTED),
+            ["not as requested: distance 0.39 of 0.5 body heights"],
         ),
         (EndCause(), entry(distance=5.0), reached(4.6), False, State.DONE, []),
         (
-            *(EndCause(), entry(heading_degrees=-90.0, distance=0.0), reached(0.0, 8.0), True, State.MISSED),
-            ["missed: heading 8 of -90 degrees"],
+            *(EndCause(), entry(heading_degrees=-90.0, distance=0.0), reached(0.0, 8.0), True, State.NOT_AS_REQUESTED),
+            ["not as requested: heading 8 of -90 degrees"],
         ),
         (EndCause(), entry(heading_degrees=-90.0, distance=0.0), reached(0.0, -80.1), True, State.DONE, []),
         (
-            *(EndCause(), entry(distance=0.5, height=0.2), reached(0.2, height=0.14), True, State.MISSED),
-            ["missed: distance 0.2 of 0.5 body heights, height 0.14 of 0.2 body heights"],
+            *(EndCause(), entry(distance=0.5, height=0.2), reached(0.2, height=0.14), True, State.NOT_AS_REQUESTED),
+            ["not as requested: distance 0.2 of 0.5 body heights, height 0.14 of 0.2 body heights"],
         ),
         (EndCause(), entry(height=0.2), reached(height=0.5), True, State.DONE, []),
         (
@@ -91,11 +91,13 @@ def test_each_motion_has_a_state(
     assert ending.of(of, result, last=last) == (state, why)
 
 
-@pytest.mark.parametrize(("base", "state"), [(SupportKind.FEET, State.MISSED), (SupportKind.SINGLE_BASE, State.DONE)])
+@pytest.mark.parametrize(
+    ("base", "state"), [(SupportKind.FEET, State.NOT_AS_REQUESTED), (SupportKind.SINGLE_BASE, State.DONE)]
+)
 def test_feet_that_slide_are_reported(base: SupportKind, state: State) -> None:
     result, why = EndCause(base=base).of(entry(), reached(), SimpleNamespace(slip=0.35), last=True)
     assert result is state
-    assert why == (["missed: feet slide by 35 % of a stride"] if state is State.MISSED else [])
+    assert why == (["not as requested: feet slide by 35 % of a stride"] if state is State.NOT_AS_REQUESTED else [])
 
 
 def test_a_run_ends_in_the_worst_state_of_its_motions() -> None:
