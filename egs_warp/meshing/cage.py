@@ -253,13 +253,14 @@ class _Field:
     def __init__(self, distance: _Distance, dilation: float, *, thin_radius: float) -> None:
         """Compute the field. ``dilation`` is in longest sides; parts thinner than ``thin_radius`` (spacings) are
         thickened to it."""
-        smooth = distance.smooth
-        value = np.minimum(smooth, distance.sharp + 0.3) - dilation * distance.longest_side
+        # The solid is mirrored at z = 0: the nearest crest of a point above the plane lies above it.
+        above = np.s_[:, :, distance.smooth.shape[2] // 2 :]
+        value = np.minimum(distance.smooth[above], distance.sharp[above] + 0.3) - dilation * distance.longest_side
         if thin_radius > 0.0:
-            crest = distance.medial & (-value < thin_radius)
+            crest = distance.medial[above] & (-value < thin_radius)
             if crest.any():
                 value = np.minimum(value, _edt(~crest) - thin_radius)
-        self._value = value[:, :, value.shape[2] // 2 - 1 :]
+        self._value = np.concatenate([value[:, :, 1:2], value], axis=2)
         self._offset = np.array([distance.pad, distance.pad, 1.0])
         self._middle = distance.middle
 

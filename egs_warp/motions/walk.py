@@ -42,6 +42,10 @@ MIN_FOOT_LOAD = 0.01
 """Share of the weight that a foot must carry to count as landed."""
 MAX_LAG = 0.5
 """Mean lag of the feet, in steps, beyond which a step is repeated."""
+MIN_REAR_MARGIN, MAX_LEAD = 0.21, 0.04
+"""Smallest distance of the centre of mass of a walking body from the rear edge of its standing support, relative to its
+height above the ground, and largest distance in body heights by which the body leans forward to keep it (measured on
+the robot)."""
 MIN_STEP_LENGTH = 0.002
 """Smallest step length in body heights."""
 _SHIFT_TIME, _GATHER_TIME, _REST_TIME = 1.5, 3.0, 1.0
@@ -92,6 +96,8 @@ class Walk:
         self._posture = posture(stance, feet)
         self._planner = FootholdPlanner(stance, feet)
         self._start_com = body.centre_of_mass(standing)
+        self._footprint = self.ground.local(stance.contact_points)[:, :2] - self._start_com[:2]
+        """(n, 2) m, contact points of the standing body relative to its centre of mass."""
         self.gravity = float(np.linalg.norm(body.gravity))
         self._time_unit = float(np.sqrt(body.height / self.gravity))
         self._requested_length = step_length
@@ -356,7 +362,24 @@ class Walk:
 
     def _com_at(self, progress: float) -> np.ndarray:
         """Return the planned position (2,) of the centre of mass after ``progress`` steps."""
-        return self._start_com[:2] + self._place_at(progress)[:2]
+        return self._start_com[:2] + self._place_at(progress)[:2] + self._lead_at(progress)
+
+    def _lead_at(self, progress: float) -> np.ndarray:
+        """Return the distance (2,) in metres by which a body with a narrow support leans in the direction of travel.
+
+        Swinging a leg forward pushes the body back, towards the rear edge of its feet.
+        """
+        count = self.gait.step_count
+        k = min(max(int(progress), 0), count - 1)
+        step = (self.planar_poses[k + 1] - self.planar_poses[k])[:2]
+        length = float(np.linalg.norm(step))
+        if length == 0.0:
+            return np.zeros(2)
+        cosine, sine = np.cos(self.planar_poses[k][2]), np.sin(self.planar_poses[k][2])
+        ahead = step / length
+        margin = float((-self._footprint @ np.array([[cosine, sine], [-sine, cosine]]) @ ahead).max())
+        lead = np.clip(MIN_REAR_MARGIN * self._start_com[2] - margin, 0.0, MAX_LEAD * self.body.height)
+        return max(min(0.5 + progress, 1.0, count - progress), 0.0) * lead * ahead
 
     def _com_velocity(self, local: np.ndarray, velocity: np.ndarray, elapsed: float, dt: float) -> np.ndarray:
         """Return the target velocity (3,) in m/s of the centre of mass at the end of the time step.

@@ -23,7 +23,7 @@ from egs_warp.motions.footfalls import Footfalls
 from egs_warp.motions.pendulum import nearest_in_hull
 from egs_warp.motions.route import Route, path_route, straight_route, turn_route
 from egs_warp.motions.script import motion
-from egs_warp.motions.walk import Walk
+from egs_warp.motions.walk import MAX_LEAD, MIN_REAR_MARGIN, Walk
 from egs_warp.motions.walk_posture import LeggedPosture
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.simulated_run import simulate
@@ -212,6 +212,21 @@ def test_the_planned_pressure_is_under_the_standing_feet(mesh: Callable[[], TetM
         assert np.linalg.norm(nearest_in_hull(other, swing) - swing) > 0.0
     reach = 0.3 + np.ptp(place.standing[:, :2], axis=0)
     assert np.all(np.abs(plan.divergent - walk._start_com[:2]) < reach)
+
+
+def test_a_narrow_body_leans_in_the_direction_of_travel() -> None:
+    """The rear edge of the support gets a minimum distance from the centre of mass, once the body has turned to walk to
+    its left; nothing changes at rest."""
+    place = block_place(biped())
+    com = place.body.centre_of_mass(place.ground.local(place.standing))
+    narrow = replace(place, contact_points=0.35 * place.contact_points)
+    walk, wide = Walk(narrow, path_route(np.array([[0.0, 0.3]])), 0.06), Walk(place, straight_route(0.3), 0.06)
+    last = walk.gait.step_count
+    missing = MIN_REAR_MARGIN * com[2] - float((com[0] - narrow.ground.local(narrow.contact_points)[:, 0]).max())
+    assert 0.0 < missing < MAX_LEAD * place.body.height
+    np.testing.assert_allclose(walk._lead_at(last - 1.5), [0.0, missing], atol=1e-6)
+    np.testing.assert_allclose(walk._lead_at(float(last)), 0.0)
+    np.testing.assert_allclose(wide._lead_at(2.0), 0.0)
 
 
 def test_headings_of_feet_are_unwrapped() -> None:
