@@ -12,11 +12,10 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Undistortion
-from egs_warp.io.cameras import PosedImage
 from egs_warp.io.limits import MAX_PIXELS, check_pixels, picture_size
+from egs_warp.io.orientation import apply_orientation, orientation
+from egs_warp.io.posed_images import PosedImage
 
-_ORIENTATION = 0x0112
-"""EXIF tag of the orientation in which a viewer must show the picture."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _CHUNK = 12
 """Bytes of a PNG chunk in addition to its content."""
@@ -103,29 +102,6 @@ def at_size(camera: Camera, width: int, height: int) -> Camera:
         cx=camera.cx * x,
         cy=camera.cy * y,
     )
-
-
-def orientation(image: Path) -> int:
-    """Return the orientation that the file requests: EXIF's 1 (unchanged) to 8."""
-    from PIL import Image
-
-    try:
-        with Image.open(image) as opened:
-            turn = opened.getexif().get(_ORIENTATION, 1)
-    # The decoder reads untrusted bytes, and its errors share no base class.
-    except Exception:
-        return 1
-    return turn if turn in range(1, 9) else 1
-
-
-def apply_orientation(pixels: np.ndarray, turn: int) -> np.ndarray:
-    """Return ``pixels`` (H, W, ...) in EXIF's orientation ``turn``."""
-    if turn >= 5:
-        pixels = pixels.swapaxes(0, 1)
-    # Axes that run backwards after the swap.
-    rows = -1 if turn in (3, 4, 7, 8) else 1
-    columns = -1 if turn in (2, 3, 6, 7) else 1
-    return np.ascontiguousarray(pixels[::rows, ::columns])
 
 
 def decoded(image: Path) -> np.ndarray:
