@@ -1,8 +1,8 @@
 """Lens distortion models of camera calibration, and the undistortion of photos.
 
 Models: https://colmap.github.io/cameras.html; polynomials as in OpenCV's ``calib3d``; FOV after Devernay and Faugeras
-(2001), division after Fitzgibbon (2001), EUCM after Khomutenko, Garcia and Martinet (2016), and the fisheye with radial,
-tangential and thin prism terms after Project Aria (Fisheye624).
+(2001), division after Fitzgibbon (2001), EUCM after Khomutenko, Garcia and Martinet (2016), and the fisheye with
+radial, tangential and thin prism terms after Project Aria (Fisheye624).
 """
 
 from __future__ import annotations

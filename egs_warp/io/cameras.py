@@ -81,8 +81,9 @@ def _from_colmap(source: PoseSource) -> PosedImages:
     # ``distorted`` are those before the undistortion.
     is_distorted = "distorted" in folder.absolute().relative_to(source.root.absolute()).parts
     preferred = ("input",) if is_distorted else ()
-    places = [parent / "images" for parent in (folder, folder.parent, folder.parent.parent)]
-    places = [source.root / name for name in preferred] + places
+    places = [source.root / name for name in preferred]
+    places += [parent / "images" for parent in (folder, folder.parent, folder.parent.parent)]
+    places += [folder, source.root]
     located = PhotoFiles(source.root, preferred=preferred).locate([view.name for view in model.views], places)
     images, excluded = convert_each(
         ((view.name, (view, place)) for view, place in zip(model.views, located, strict=True)),

@@ -19,7 +19,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.limits import read_bytes
 from egs_warp.io.posed_images import ExcludedPhoto, convert_each
-from egs_warp.io.text import decode_text, decimal_number
+from egs_warp.io.text import decimal_number, decode_text
 
 # Name and parameters of each camera model by its number in the binary format.
 _MODELS = {

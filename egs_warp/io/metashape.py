@@ -1,7 +1,7 @@
 """Cameras of Agisoft Metashape (*Export Cameras*, .xml).
 
-A camera's ``transform`` maps its OpenCV axes to the chunk, and the ``transform`` of the chunk or component maps these to
-the world. The lens model is that of the appendix of the user manual; its P1 and P2 are OpenCV's p2 and p1.
+A camera's ``transform`` maps its OpenCV axes to the chunk, and the ``transform`` of the chunk or component maps these
+to the world. The lens model is that of the appendix of the user manual; its P1 and P2 are OpenCV's p2 and p1.
 """
 
 from __future__ import annotations

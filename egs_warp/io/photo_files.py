@@ -10,16 +10,14 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
 
-PICTURE_SUFFIXES = (
-    *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".jp2", ".avif"),
-    *(".heic", ".heif"),
-)
-"""Suffixes of pictures in lower case; the last two are found, to say that they cannot be read."""
+UNREADABLE_SUFFIXES = (".heic", ".heif")
+"""Suffixes of pictures that are found, but cannot be read."""
+_PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".jp2", ".avif", *UNREADABLE_SUFFIXES)
 _ADDED_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".webp")
 """Suffixes that are added to names without one."""
 _PHOTO_FOLDERS = ("images", "image", "imgs", "photos", "rgb", "color", "colour", "input", "undistorted")
@@ -69,6 +67,8 @@ class _Candidate:
     suffix: str
     rank: int
     """Preference of its folder; the smallest is best."""
+    base: tuple[str, ...] = ()
+    """Folders above the folder of masks, or of a mask beside its photo."""
 
 
 class PhotoFiles:
@@ -96,6 +96,8 @@ class PhotoFiles:
                 located.append(PhotoAndMask(None, None, photo.reason))
             elif masks is not None and masks[number]:
                 mask = self.find_named_mask(masks[number], folders[0])
+                by_photo = FoundFile(None) if mask.path else self.find_mask(photo.path, 1)
+                mask = by_photo if by_photo.path else mask
                 located.append(PhotoAndMask(photo.path, mask.path, mask.reason))
             else:
                 mask = self.find_mask(photo.path, 1 if photo.by_name else len(Path(name).parts))
@@ -105,6 +107,8 @@ class PhotoFiles:
     def find_photos(self, names: Sequence[str], folders: Sequence[Path]) -> list[FoundFile]:
         """Find the photos ``names``, which are relative to one of ``folders`` if they are where they should be."""
         found = [self._direct(name, folders) for name in names]
+        # A converted copy of a photo that cannot be read has the same stem.
+        found = [None if path and path.suffix.lower() in UNREADABLE_SUFFIXES else path for path in found]
         taken = {path for path in found if path is not None}
         stems = Counter(_parts(name)[1] for name in names)
         results = []
@@ -142,7 +146,11 @@ class PhotoFiles:
         if not _is_below(photo, self._root):
             return FoundFile(None)
         parents = tuple(part.lower() for part in photo.relative_to(self._root).parts[:-1])
-        candidates = [one for one in self._masks.get(_mask_stem(photo.name), ()) if one.path != photo]
+        candidates = [
+            one
+            for one in self._masks.get(_mask_stem(photo.name), ())
+            if one.path != photo and one.base == parents[: len(one.base)]
+        ]
         best = _longest_matches(candidates, parents)
         # Masks of other photos of the same name are in other folders.
         if best and best[0].folders and _match(best[0], parents) == 0 and self._is_repeated(photo):
@@ -219,11 +227,37 @@ class PhotoFiles:
             if at is not None:
                 rank = _MASK_FOLDERS.index(folders[at]) if folders[at] in _MASK_FOLDERS else len(_MASK_FOLDERS)
                 # Folders above that of the masks distinguish them as well: front/masks and back/masks.
-                candidate = _Candidate(path, (*folders[:at], *folders[at + 1 :]), path.suffix.lower(), rank)
+                below = (*folders[:at], *folders[at + 1 :])
+                candidate = _Candidate(path, below, path.suffix.lower(), rank, folders[:at])
                 files[_mask_stem(path.name)].append(candidate)
             elif _mask_stem(path.name) != _picture_stem(path.name):
-                files[_mask_stem(path.name)].append(_Candidate(path, folders, path.suffix.lower(), 100))
+                candidate = _Candidate(path, folders, path.suffix.lower(), 100, folders)
+                files[_mask_stem(path.name)].append(candidate)
         return files
+
+
+def has_photos(folder: Path) -> bool:
+    """Return True if ``folder`` contains pictures or a folder of photos."""
+    return any((folder / name).is_dir() for name in _PHOTO_FOLDERS) or any(
+        path.suffix.lower() in _PICTURE_SUFFIXES for path in folder.iterdir()
+    )
+
+
+def photos_without_pose(images: Iterable[Path]) -> dict[Path, int]:
+    """Return the number of other photos in the folders of ``images``, for folders that contain any."""
+    posed = defaultdict(set)
+    for image in images:
+        posed[image.parent].add(image.stem.lower())
+    counts = {}
+    for folder, stems in posed.items():
+        others = {
+            path.stem.lower()
+            for path in folder.iterdir()
+            if path.suffix.lower() in _PICTURE_SUFFIXES and not _NO_PHOTOS.search(path.stem)
+        }
+        if others - stems:
+            counts[folder] = len(others - stems)
+    return counts
 
 
 def _walk(root: Path) -> Iterator[tuple[Path, tuple[str, ...]]]:
@@ -241,7 +275,7 @@ def _walk(root: Path) -> Iterator[tuple[Path, tuple[str, ...]]]:
             count += 1
             if count > _MAX_FILES:
                 return
-            if os.path.splitext(name)[1].lower() in PICTURE_SUFFIXES and not name.startswith("."):
+            if os.path.splitext(name)[1].lower() in _PICTURE_SUFFIXES and not name.startswith("."):
                 yield Path(folder) / name, tuple(part.lower() for part in inside)
 
 
@@ -255,13 +289,13 @@ def _parts(name: str) -> tuple[tuple[str, ...], str, str]:
     if parts and re.fullmatch(r"[a-z]:|file:", parts[0]):
         del parts[0]
     last = PurePath(parts[-1]) if parts else PurePath("")
-    suffix = last.suffix if last.suffix in PICTURE_SUFFIXES else ""
+    suffix = last.suffix if last.suffix in _PICTURE_SUFFIXES else ""
     return tuple(parts[:-1]), last.name.removesuffix(suffix), suffix
 
 
 def _picture_stem(name: str) -> str:
     stem, suffix = os.path.splitext(name.lower())
-    return stem if suffix in PICTURE_SUFFIXES else name.lower()
+    return stem if suffix in _PICTURE_SUFFIXES else name.lower()
 
 
 def _mask_stem(name: str) -> str:
@@ -293,10 +327,9 @@ def _longest_matches(candidates: Sequence[_Candidate], parents: tuple[str, ...])
 
 
 def _with_suffix(candidates: list[_Candidate], suffix: str) -> list[_Candidate]:
-    """Return the candidates with ``suffix``, else those that can be read, else all."""
-    same = [one for one in candidates if one.suffix == suffix]
-    readable = [one for one in candidates if one.suffix not in (".heic", ".heif")]
-    return same or readable or candidates
+    """Return the candidates with ``suffix``, of those that can be read, if there are any."""
+    candidates = [one for one in candidates if one.suffix not in UNREADABLE_SUFFIXES] or candidates
+    return [one for one in candidates if one.suffix == suffix] or candidates
 
 
 def _only(candidates: list[_Candidate], root: Path) -> FoundFile:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from egs_warp.errors import UserError
 from egs_warp.io.colmap import read_colmap_model
+from egs_warp.io.photo_files import has_photos
 
 _JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
 _MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap", "distorted/sparse")
@@ -125,10 +126,14 @@ def _largest(models: list[Path], source: Path) -> tuple[Path, str]:
 def _data_folder(model: Path, source: Path) -> Path:
     """Return the folder of the data set of a COLMAP model: the folder above those that contain only models."""
     folder = model.absolute()
-    while folder.name.isdecimal() or folder.name in _BETWEEN:
+    if folder.name.isdecimal() and folder.parent.name in _BETWEEN:
         folder = folder.parent
-    # The user's spelling, where it is the same folder or one above.
-    return source if folder.is_relative_to(source.absolute()) else folder
+    while folder.name in _BETWEEN:
+        folder = folder.parent
+    # The user's folder, where it is the same, one above, or contains photos itself.
+    if folder.is_relative_to(source.absolute()) or has_photos(source):
+        return source
+    return folder
 
 
 def _exports(folder: Path) -> Iterator[Path]:

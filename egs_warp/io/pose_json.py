@@ -17,8 +17,8 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
-from egs_warp.io.photo_files import PhotoAndMask, PhotoFiles
 from egs_warp.io.orientation import orientation
+from egs_warp.io.photo_files import PhotoAndMask, PhotoFiles
 from egs_warp.io.posed_images import ExcludedPhoto, PosedImage, checked_camera, convert_each, is_rotation, size_of_photo
 from egs_warp.io.text import decimal_number, decode_text, whole_number
 
@@ -169,7 +169,9 @@ def _lens(record: _Record) -> Lens | None:
     try:
         return Lens.named(model, values)
     except ValueError as error:
-        raise UserError(f"{record.source}: {record.where} has no valid lens ({error}); export the poses again") from None
+        raise UserError(
+            f"{record.source}: {record.where} has no valid lens ({error}); export the poses again"
+        ) from None
 
 
 def _size(record: _Record, image: Path | None, common: tuple[int, int] | None) -> tuple[int, int]:
@@ -227,7 +229,7 @@ class _Record:
         return values[:3]
 
     def _array(self, key: str) -> np.ndarray:
-        """Return the numbers of a field; NaN if it has others values."""
+        """Return the numbers of a field; NaN if it has other values."""
         try:
             return np.array(_with_decimal_points(self.fields.get(key)), dtype=np.float64)
         except (TypeError, ValueError, OverflowError, RecursionError):
@@ -268,8 +270,12 @@ class _Record:
         return matrix
 
     def _wrong(self, key: str, expected: str) -> UserError:
-        value = f" {self.fields[key]!s:.60}" if key in self.fields else ""
-        return UserError(f"{self.source}: {self.where}: {key}{value} is not {expected}; export the poses again")
+        value = self.fields.get(key)
+        if isinstance(value, list):
+            given = f" of shape {self._array(key).shape}"
+        else:
+            given = f" {value!s:.60}" if isinstance(value, str | int | float) else ""
+        return UserError(f"{self.source}: {self.where}: {key}{given} is not {expected}; export the poses again")
 
 
 def _with_decimal_points(value: object) -> object:

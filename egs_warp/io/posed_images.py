@@ -63,6 +63,11 @@ class PosedImages:
     notes: tuple[str, ...] = ()
     """What the user should know about the choice of the files and their content."""
 
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """The notes, and a line for each excluded camera."""
+        return (*self.notes, *(f"left out camera {one.name}: {one.reason}" for one in self.excluded))
+
 
 def convert_each(
     entries: Iterable[tuple[str, _Entry]], convert: Callable[[_Entry], _Result], what: str
@@ -110,7 +115,7 @@ def size_of_photo(image: Path | None, what: str) -> tuple[int, int]:
     ``what``, for a photo that is missing or not readable."""
     size = picture_size(image, f"{image}: it") if image is not None else None
     if size is None:
-        raise UserError(f"{what}: the poses do not contain the photo's size, and it cannot be read; put the photo there")
+        raise UserError(f"{what}: the photo cannot be read, and the poses do not contain its size; put it there")
     return size
 
 

@@ -36,9 +36,7 @@ _OPTIONAL = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 _EXPORT = "export Internal/External camera parameters"
 
 
-def read_reality_scan(
-    source: Path, files: PhotoFiles
-) -> tuple[list[PosedImage], list[ExcludedPhoto], list[str]]:
+def read_reality_scan(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], list[ExcludedPhoto], list[str]]:
     """Read the cameras of a .csv, find their photos and masks in ``files``, and return notes for the user.
 
     Invalid rows, and photos that cannot be read, are excluded: only the photo contains its size. Raises ``UserError``

@@ -20,7 +20,8 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.io.cameras import read_cameras, read_points
 from egs_warp.io.frames import VIDEO_SUFFIXES, select_sharp_frames
-from egs_warp.io.photos import apply_orientation, decoded, orientation
+from egs_warp.io.orientation import apply_orientation, orientation
+from egs_warp.io.photos import decoded
 from egs_warp.io.run_folder import check_run_folder, run_folder
 
 _PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
