@@ -143,9 +143,10 @@ class PhotoFiles:
             for path in (folder / f"{file}.png", (folder / file).with_suffix(".png"), folder / file):
                 if os.path.isfile(path):
                     return FoundFile(path)
-        if not _is_below(photo, self._root):
+        inside = _inside(photo, self._root)
+        if inside is None:
             return FoundFile(None)
-        parents = tuple(part.lower() for part in photo.relative_to(self._root).parts[:-1])
+        parents = tuple(part.lower() for part in inside.parts[:-1])
         candidates = [
             one
             for one in self._masks.get(_mask_stem(photo.name), ())
@@ -178,8 +179,13 @@ class PhotoFiles:
         for text in dict.fromkeys((name, name.replace("\\", "/"))):
             for folder in folders:
                 path = folder / text
-                if "\0" in text or not (_stays_inside(text) or _is_below(path, self._root)):
+                if "\0" in text:
                     continue
+                if not _stays_inside(text):
+                    inside = _inside(path, self._root)
+                    if inside is None:
+                        continue
+                    path = self._root / inside
                 # os.path returns False where Path.is_file raises: for names that are too long or invalid.
                 for suffix in _ADDED_SUFFIXES:
                     if os.path.isfile(f"{path}{suffix}"):
@@ -350,7 +356,7 @@ def _stays_inside(name: str) -> bool:
     return not path.is_absolute() and not path.drive and ".." not in path.parts
 
 
-def _is_below(path: Path, folder: Path) -> bool:
-    """Return True if ``path``, with ``..`` resolved, is inside ``folder``."""
-    inside, base = os.path.normpath(os.path.abspath(path)), os.path.normpath(os.path.abspath(folder))
-    return inside == base or inside.startswith(base.rstrip(os.sep) + os.sep)
+def _inside(path: Path, folder: Path) -> Path | None:
+    """Return ``path``, with ``..`` resolved, relative to ``folder``; None if it is not inside."""
+    resolved, base = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
+    return resolved.relative_to(base) if resolved.is_relative_to(base) else None

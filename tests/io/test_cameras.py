@@ -247,9 +247,12 @@ def message(path: Path) -> str:
 
 def test_missing_or_unreadable(tmp_path: Path) -> None:
     assert message(tmp_path / "a.json") == ": no such file or folder; check the path"
-    assert message(tmp_path) == ": no camera poses; give a COLMAP model, a cameras.json or a transforms.json"
+    assert message(tmp_path) == (
+        ": no camera poses; give a COLMAP model, a cameras.json, a transforms.json, RealityScan's camera parameters"
+        " (.csv) or Metashape's cameras (.xml)"
+    )
     for text, expected in (
-        ("[", ": not readable JSON; give a cameras.json or a transforms.json"),
+        ("[", ": not readable JSON at line 1 (Expecting value); give a cameras.json or a transforms.json"),
         ("{}", ": neither a list of cameras nor frames; give a cameras.json or a transforms.json"),
         ("[]", ": it has no cameras; export the poses again"),
         ("[1]", ": camera 0 is not a record of fields; export the poses again"),
