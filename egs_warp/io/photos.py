@@ -22,6 +22,8 @@ _CHUNK = 12
 """Bytes of a PNG chunk in addition to its content."""
 _MAX_SIDE_RATIO = 16
 """Maximum side of a photo, in sides of its camera."""
+MAX_MASK_RATIO = _MAX_SIDE_RATIO**2
+"""Maximum number of pixels of a mask, in pixels of its camera."""
 _SAME_ASPECT = 0.01
 """Relative difference of aspect ratio up to which a photo is its camera's at another size."""
 
@@ -193,8 +195,7 @@ def _oriented_mask(path: Path, shape: tuple[int, ...], turn: int) -> np.ndarray:
             f"{path}: {size[0]} x {size[1]} pixels, but its photo has {width} x {height}; make the mask from the same"
             " photo"
         )
-    check_pixels(*size, f"{path}: it", at_most=min(_MAX_SIDE_RATIO**2 * width * height, MAX_PIXELS))
-    mask = read_mask_file(path)
+    mask = read_mask_file(path, at_most=min(MAX_MASK_RATIO * width * height, MAX_PIXELS))
     target = (width, height) if is_stored else (height, width)
     if mask.shape != target[::-1]:
         is_larger = mask.size > width * height
@@ -203,11 +204,14 @@ def _oriented_mask(path: Path, shape: tuple[int, ...], turn: int) -> np.ndarray:
     return apply_orientation(mask, turn) if is_stored else mask
 
 
-def read_mask_file(path: Path) -> np.ndarray:
+def read_mask_file(path: Path, *, at_most: int = MAX_PIXELS) -> np.ndarray:
     """(H, W) float32 from 0 to 1, the grey of a mask as stored, or its alpha channel if that is not opaque everywhere.
-    Raises ``UserError`` if it is not a readable picture."""
+    Raises ``UserError`` if it is not a readable picture, or has more than ``at_most`` pixels."""
     from PIL import Image
 
+    size = picture_size(path, f"{path}: it")
+    if size is not None:
+        check_pixels(*size, f"{path}: it", at_most=at_most)
     pixels = None
     try:
         with Image.open(path) as opened:

@@ -31,7 +31,7 @@ class PoseSource:
     root: Path
     """Folder of the data set, which contains photos and masks."""
     notes: tuple[str, ...] = ()
-    """What the user should know about the choice."""
+    """Messages for the user about the choice."""
 
 
 def find_poses(source: Path) -> PoseSource:

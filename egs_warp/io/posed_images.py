@@ -61,7 +61,7 @@ class PosedImages:
     excluded: tuple[ExcludedPhoto, ...] = ()
     """Photos whose pose or camera is invalid."""
     notes: tuple[str, ...] = ()
-    """What the user should know about the choice of the files and their content."""
+    """Messages for the user about the choice of the files and their content."""
 
     @property
     def messages(self) -> tuple[str, ...]:

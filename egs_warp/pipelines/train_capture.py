@@ -77,7 +77,7 @@ class TrainResult:
     background: tuple[float, float, float]
     """Background colour, 0 to 1."""
     sources: PhotoSources
-    """Where the photos are from, and how many are used."""
+    """Origin of the photos, and their numbers."""
     excluded: tuple[ExcludedPhoto, ...] = ()
     """Photos that were not used, or were excluded during the training, and the reasons."""
 

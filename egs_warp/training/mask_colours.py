@@ -1,4 +1,4 @@
-"""Which colour the object has in the masks of photos: white in most tools, black in some."""
+"""Colour of the object in the masks of photos: white in most tools, black in some."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
-from egs_warp.io.photos import at_size, read_mask_file
+from egs_warp.io.limits import MAX_PIXELS
+from egs_warp.io.photos import MAX_MASK_RATIO, at_size, read_mask_file
 from egs_warp.io.posed_images import PosedImage
 from egs_warp.training.initial_cloud import middle_of
 
@@ -82,7 +83,8 @@ class _MaskView:
         """Read the mask of ``one``; None if it is not readable or not of the camera's shape."""
         assert one.mask is not None
         try:
-            mask = read_mask_file(one.mask)
+            limit = MAX_MASK_RATIO * one.camera.width * one.camera.height
+            mask = read_mask_file(one.mask, at_most=min(limit, MAX_PIXELS))
         except UserError:
             return None
         factor = _SIDE / max(one.camera.width, one.camera.height)

@@ -35,7 +35,7 @@ class PhotoSources:
     masked: int
     """Number of used photos with a mask or an alpha channel."""
     notes: tuple[str, ...]
-    """What the user should know about the choice of the files and their content."""
+    """Messages for the user about the choice of the files and their content."""
 
     def summary(self) -> str:
         """Return a line for the terminal."""

@@ -325,7 +325,7 @@ _METASHAPE = b"""<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"
 </cameras></chunk></document>"""
 
 
-def _photo_beside() -> dict[str, bytes]:
+def _adjacent_photo() -> dict[str, bytes]:
     return {"a.png": _picture("PNG", "RGB")}
 
 
@@ -476,10 +476,15 @@ READERS: tuple[Reader, ...] = (
         for name in COLMAP_BIN
     ),
     Reader(
-        "transforms.json without sizes", "transforms.json", lambda: _json(_SIZELESS), _cameras, _photo_beside, json=True
+        "transforms.json without sizes",
+        "transforms.json",
+        lambda: _json(_SIZELESS),
+        _cameras,
+        _adjacent_photo,
+        json=True,
     ),
-    Reader("reality scan", "cameras.csv", lambda: _REALITY_SCAN, _cameras, _photo_beside),
-    Reader("metashape", "cameras.xml", lambda: _METASHAPE, _cameras, _photo_beside),
+    Reader("reality scan", "cameras.csv", lambda: _REALITY_SCAN, _cameras, _adjacent_photo),
+    Reader("metashape", "cameras.xml", lambda: _METASHAPE, _cameras, _adjacent_photo),
     Reader("mask of a photo", "mask.png", lambda: _picture("PNG", "RGBA"), _mask),
     Reader("point ply", "input.ply", _point_ply, _points),
     Reader("plane.json", "plane.json", lambda: _json(_PLANES), _planes, json=True),

@@ -127,6 +127,15 @@ def test_black_objects_are_found_on_sure_evidence(masks: list[np.ndarray], expec
     assert is_object_black(read_cameras(folder)) is expected
 
 
+def test_masks_that_are_too_large_are_no_evidence(tmp_path: Path) -> None:
+    """They would be decoded before their photo refuses them."""
+    for factor, expected in ((10, True), (20, False)):
+        folder = photo_set(
+            tmp_path / str(factor), [np.kron(255 - m, np.ones((factor,) * 2, np.uint8)) for m in silhouettes(8)]
+        )
+        assert is_object_black(read_cameras(folder)) is expected
+
+
 def test_inverted_masks_are_used_and_reported(tmp_path: Path) -> None:
     folder = photo_set(tmp_path, [255 - mask for mask in silhouettes(8)])
     photos = read_views(folder, max_side=16)
