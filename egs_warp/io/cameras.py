@@ -62,7 +62,8 @@ def read_points(path: Path | str) -> SparsePoints | None:
         return None
     tree = parse_pose_json(source)
     name = tree.get("ply_file_path") if isinstance(tree, dict) else "input.ply"
-    if not isinstance(name, str) or not _is_inside(name) or not os.path.isfile(source.parent / name):
+    name = name.replace("\\", "/") if isinstance(name, str) else None
+    if name is None or not _is_inside(name) or not os.path.isfile(source.parent / name):
         return None
     positions, colours = read_point_ply(source.parent / name)
     return SparsePoints(positions, colours) if len(positions) else None

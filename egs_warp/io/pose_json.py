@@ -224,6 +224,8 @@ class _Record:
     def matrix(self, key: str) -> np.ndarray:
         """Return the first three rows (3, 4) of an affine map, whose last row may be missing."""
         values = self._array(key)
+        if values.shape in ((12,), (16,)):
+            values = values.reshape(-1, 4)
         if values.shape not in ((3, 4), (4, 4)) or not np.isfinite(values).all():
             raise self._wrong(key, "a matrix of 3 or 4 rows of 4 finite numbers")
         return values[:3]

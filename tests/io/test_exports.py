@@ -268,7 +268,7 @@ def test_malformed_xml(text: str, expected: str, tmp_path: Path) -> None:
 # JSON ----------------------------------------------------------------------------------------------------------------
 
 
-def test_matrices_of_three_rows_and_decimal_commas(tmp_path: Path) -> None:
+def test_matrices_of_three_rows_or_in_one_list_and_decimal_commas(tmp_path: Path) -> None:
     write_photos(tmp_path)
     entries = frames()
     for number, entry in enumerate(entries):
@@ -277,6 +277,7 @@ def test_matrices_of_three_rows_and_decimal_commas(tmp_path: Path) -> None:
             entry["transform_matrix"] = [
                 [f"{x:.17g}".replace(".", ",") for x in row] for row in entry["transform_matrix"]
             ]
+    entries[2]["transform_matrix"] = np.ravel(entries[2]["transform_matrix"]).tolist()
     write_transforms(tmp_path, entries)
     check(read_posed_images(tmp_path))
 
