@@ -117,7 +117,6 @@ def _train(args: argparse.Namespace) -> int:
     from egs_warp.io import read_cameras
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.train_report import TrainReport
-    from egs_warp.training.mask_colours import MaskObject
 
     # Read first: unreadable poses must not leave a new folder.
     read_cameras(args.posed)
@@ -134,7 +133,7 @@ def _train(args: argparse.Namespace) -> int:
                 sh_degree=args.sh_degree,
                 background=background,
                 max_side=args.max_side or side,
-                mask_object=None if args.mask_object is None else MaskObject(args.mask_object),
+                inverted_masks=None if args.mask_object is None else args.mask_object == "black",
                 seed=args.seed,
                 device=args.device,
                 checkpoint=checkpoint,

@@ -249,9 +249,11 @@ def has_photos(folder: Path) -> bool:
     )
 
 
-def photos_without_pose(images: Iterable[Path]) -> dict[Path, int]:
-    """Return the number of other photos in the folders of ``images``, for folders that contain any."""
-    posed = defaultdict(set)
+def photos_without_pose(images: Iterable[Path], excluded: Iterable[str] = ()) -> dict[Path, int]:
+    """Return the number of other photos in the folders of ``images``, for folders that contain any. Photos of the names
+    ``excluded`` have an invalid pose."""
+    invalid = {_parts(name)[1] for name in excluded}
+    posed = defaultdict(lambda: set(invalid))
     for image in images:
         posed[image.parent].add(image.stem.lower())
     counts = {}

@@ -18,7 +18,6 @@ from egs_warp.io.posed_images import ExcludedPhoto
 from egs_warp.render import render_gaussians
 from egs_warp.training.finetune import Densification, FinetuneOptions, TrainingView, finetune
 from egs_warp.training.initial_cloud import MIN_POINTS, cloud_from_points, initial_cloud
-from egs_warp.training.mask_colours import MaskObject
 from egs_warp.training.metrics import match_tone, psnr, ssim_of
 from egs_warp.training.outlier_views import is_outlier
 from egs_warp.training.posed_photos import PhotoSources, backdrop_colour, laid_over, read_views
@@ -95,7 +94,7 @@ def train(
     sh_degree: int = 3,
     background: tuple[float, float, float] | None = None,
     max_side: int | None = None,
-    mask_object: MaskObject | None = None,
+    inverted_masks: bool | None = None,
     seed: int = 0,
     device: str | None = None,
     threads: int | None = None,
@@ -119,7 +118,7 @@ def train(
         background: Background colour, 0 to 1; None is white for photos with alpha, otherwise the mean colour at the
             borders of the photos, so that no Gaussians are used for a plain background.
         max_side: Larger photos are downscaled to this side, pixels; None keeps their size.
-        mask_object: Colour of the object in masks; None is white unless the masks show clearly that it is black.
+        inverted_masks: True if the object is black in masks; None decides on the masks, False if they are not clear.
         seed: Seed of the training.
         device: Warp device; None is the current one.
         threads: Number of threads; None is the default.
@@ -140,7 +139,7 @@ def train(
         raise ArgumentError("seed", "give a whole number of at least 0", value=seed)
     say = stage or (lambda _text: None)
     say(f"reading {posed}")
-    photos = read_views(posed, max_side=max_side, mask_object=mask_object)
+    photos = read_views(posed, max_side=max_side, inverted_masks=inverted_masks)
     for note in photos.sources.notes:
         say(note)
     for one in photos.left_out:

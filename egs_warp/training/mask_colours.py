@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 
 import cv2
 import numpy as np
@@ -31,13 +30,6 @@ _MIN_SEEN, _MIN_BLACK = 0.8, 0.95
 """A point of the hull is seen by this fraction of the cameras, and black in this fraction of these."""
 _MIN_COVERED = 0.7
 """Minimum fraction of the black pixels that the hull covers."""
-
-
-class MaskObject(Enum):
-    """Colour of the object in masks."""
-
-    WHITE = "white"
-    BLACK = "black"
 
 
 def is_object_black(images: Sequence[PosedImage]) -> bool:

@@ -18,7 +18,7 @@ from egs_warp.io.photo_files import photos_without_pose
 from egs_warp.io.photos import read_photo
 from egs_warp.io.posed_images import ExcludedPhoto
 from egs_warp.training.finetune import TrainingView
-from egs_warp.training.mask_colours import MaskObject, is_object_black
+from egs_warp.training.mask_colours import is_object_black
 
 
 @dataclass(frozen=True)
@@ -55,18 +55,17 @@ class PosedPhotos:
     sources: PhotoSources
 
 
-def read_views(posed: Path | str, *, max_side: int | None = None, mask_object: MaskObject | None = None) -> PosedPhotos:
+def read_views(posed: Path | str, *, max_side: int | None = None, inverted_masks: bool | None = None) -> PosedPhotos:
     """Read photos and cameras (``read_photo``); photos larger than ``max_side`` pixels are reduced.
 
-    Photos that are missing, unreadable or of another shape than their camera are excluded. ``mask_object`` is the
-    colour of the object in masks; None detects black objects (``is_object_black``). Raises ``UserError`` if no photo
-    can be used.
+    Photos that are missing, unreadable or of another shape than their camera are excluded. With ``inverted_masks``,
+    the object is black in masks; None detects it (``is_object_black``). Raises ``UserError`` if no photo can be used.
     """
     poses = read_posed_images(posed)
     notes = list(poses.notes)
-    is_black = is_object_black(poses.images) if mask_object is None else mask_object is MaskObject.BLACK
-    if is_black and mask_object is None:
-        notes.append("the object is black in the masks, so they are inverted; set --mask-object white to keep them")
+    is_black = is_object_black(poses.images) if inverted_masks is None else inverted_masks
+    if is_black and inverted_masks is None:
+        notes.append("the object is black in the masks, so they are inverted (docs/guide/photos.md#masks)")
     views, left_out, opaque = [], list(poses.excluded), set()
     folders: Counter[str] = Counter()
     for entry in poses.images:
@@ -94,11 +93,12 @@ def read_views(posed: Path | str, *, max_side: int | None = None, mask_object: M
         masked += len(opaque)
         if masked < len(views):
             notes.append(
-                f"{len(views) - masked} of {len(views)} photos have no mask and show their background; add their masks,"
+                f"photos without a mask, which show their background: {len(views) - masked} of {len(views)}; add masks,"
                 " or remove these photos"
             )
-    for folder, count in photos_without_pose(one.image for one in poses.images if one.image is not None).items():
-        notes.append(f"{count} photos in {_relative(folder, Path(posed))} have no pose and are not used")
+    images = [one.image for one in poses.images if one.image is not None]
+    for folder, count in photos_without_pose(images, [one.name for one in poses.excluded]).items():
+        notes.append(f"photos in {_relative(folder, Path(posed))} without a pose, not used: {count}")
     sources = PhotoSources(
         poses=_relative(poses.source, Path(posed)),
         total=len(views) + len(left_out),

@@ -11,6 +11,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.camera import Camera
+from egs_warp.io.cameras import PosedImages
 
 WIDTH, HEIGHT, FOCAL = 24, 18, 28.0
 NAMES = ("00.jpg", "01.jpg", "02.jpg", "03.jpg")
@@ -92,3 +93,14 @@ def silhouettes(count: int = len(NAMES)) -> list[np.ndarray]:
         off = np.linalg.norm(to_centre - (rays @ to_centre)[..., None] * rays, axis=-1)
         masks.append(np.where(off < 0.5, 255, 0).astype(np.uint8))
     return masks
+
+
+def check_poses(poses: PosedImages, offset: np.ndarray | float = 0.0, *, atol: float = 1e-9) -> None:
+    """Assert that the photos are found, with the poses of ``cameras`` moved by ``offset``."""
+    assert [one.name.removesuffix(".jpg") for one in poses.images] == [name.removesuffix(".jpg") for name in NAMES]
+    for one, camera in zip(poses.images, cameras(), strict=True):
+        assert one.image is not None and one.image.stem == one.name.removesuffix(".jpg")
+        np.testing.assert_allclose(one.camera.rotation, camera.rotation, atol=1e-9)
+        np.testing.assert_allclose(one.camera.centre, camera.centre + offset, atol=atol)
+        values = (one.camera.width, one.camera.height, one.camera.fx, one.camera.fy, one.camera.cx, one.camera.cy)
+        np.testing.assert_allclose(values, [WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2])

@@ -22,7 +22,7 @@ from tests.support.photo_sets import (
 )
 
 pytest.importorskip("torch")
-from egs_warp.training.mask_colours import MaskObject, is_object_black
+from egs_warp.training.mask_colours import is_object_black
 from egs_warp.training.posed_photos import read_views
 
 EIGHT = tuple(f"0{number}.jpg" for number in range(8))
@@ -51,8 +51,8 @@ def test_the_summary_names_numbers_and_folders(tmp_path: Path) -> None:
     )
     assert [one.name for one in photos.left_out] == ["03.jpg"]
     assert photos.sources.notes == (
-        "1 of 7 photos have no mask and show their background; add their masks, or remove these photos",
-        "2 photos in images have no pose and are not used",
+        "photos without a mask, which show their background: 1 of 7; add masks, or remove these photos",
+        "photos in images without a pose, not used: 2",
     )
 
 
@@ -63,6 +63,7 @@ def test_invalid_poses_are_left_out_of_the_photos(tmp_path: Path) -> None:
     (folder / "sparse/0/images.txt").write_text("\n".join(lines))
     photos = read_views(folder)
     assert len(photos.views) == 7 and photos.sources.total == 8
+    assert photos.sources.notes == ()
     assert photos.left_out[0].name == "02.jpg" and "has no valid pose (nan " in photos.left_out[0].reason
 
 
@@ -139,11 +140,11 @@ def test_masks_that_are_too_large_are_no_evidence(tmp_path: Path) -> None:
 def test_inverted_masks_are_used_and_reported(tmp_path: Path) -> None:
     folder = photo_set(tmp_path, [255 - mask for mask in silhouettes(8)])
     photos = read_views(folder, max_side=16)
-    note = "the object is black in the masks, so they are inverted; set --mask-object white to keep them"
+    note = "the object is black in the masks, so they are inverted (docs/guide/photos.md#masks)"
     assert photos.sources.notes == (note,)
     alpha = photos.views[0].alpha
     assert alpha is not None and alpha[6, 8] == 1.0 and not alpha[0].any()
-    kept = read_views(folder, mask_object=MaskObject.WHITE)
+    kept = read_views(folder, inverted_masks=False)
     assert kept.sources.notes == () and kept.views[0].alpha is not None and kept.views[0].alpha[0].all()
-    black = read_views(photo_set(tmp_path / "white", silhouettes(8)), mask_object=MaskObject.BLACK)
+    black = read_views(photo_set(tmp_path / "white", silhouettes(8)), inverted_masks=True)
     assert black.views[0].alpha is not None and black.views[0].alpha[0].all()
