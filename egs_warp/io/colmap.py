@@ -43,6 +43,8 @@ _MODELS = {
 }
 _PARAMETERS = {name: parameters.split() for name, parameters in _MODELS.values()}
 _IMAGE_LINE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+_IMAGE_START = 300
+"""Number of characters that contain the numbers of an image."""
 _POINT_BYTES = 24
 """Bytes of one point in the list of a photo."""
 _TRACK_BYTES = 8
@@ -184,7 +186,7 @@ def _intrinsics(path: Path, number: int, camera: _Camera) -> _Intrinsics:
 def _text_lines(data: bytes, path: Path) -> Iterator[tuple[int, str]]:
     """Return numbers and text of the lines that are neither empty nor comments, one at a time, as a list of all would
     take far more memory than the file."""
-    lines = io.StringIO(decode_text(data, path), newline=None)
+    lines = io.StringIO(decode_text(data, path))
     for number, line in enumerate(lines, start=1):
         text = line.strip()
         if text and not text.startswith("#"):
@@ -206,7 +208,12 @@ def _text_cameras(data: bytes, path: Path) -> dict[int, _Camera]:
 
 def _camera_number(word: str) -> float:
     """Return a number; NaN as Windows writes it, because a camera that no photo uses may have no values."""
-    return np.nan if re.fullmatch(r"[+-]?nan\(\w*\)|[+-]?1\.#\w+", word) else decimal_number(word)
+    try:
+        return decimal_number(word)
+    except ValueError:
+        if re.fullmatch(r"[+-]?nan\(\w*\)|[+-]?1\.#\w+", word):
+            return np.nan
+        raise
 
 
 def _text_poses(data: bytes, path: Path) -> list[_Pose]:
@@ -215,6 +222,11 @@ def _text_poses(data: bytes, path: Path) -> list[_Pose]:
     poses = []
     may_be_points = False
     for at, line in _text_lines(data, path):
+        # Lines of points are long, and few begin like an image.
+        words = line[:_IMAGE_START].split(maxsplit=9)
+        if may_be_points and not words[0].isdecimal() and _is_point_line(words[:3]):
+            may_be_points = False
+            continue
         words = line.split(maxsplit=9)
         if may_be_points and _is_point_line(words):
             may_be_points = False

@@ -29,6 +29,8 @@ _NO_PHOTOS = re.compile(r"mask|depth|normal|segment|matte|alpha|thumb|preview", 
 _MASK_FOLDERS = ("masks", "mask")
 """Folders of masks, in order of preference."""
 _MASK_FOLDER = re.compile(r"(?:.*[_-])?(?:masks?|mattes?|segmentations?|alphas?)(?:[_-].*)?", re.IGNORECASE)
+_MAY_BE_MASK = re.compile("mask|matte|segmentation|alpha", re.IGNORECASE)
+"""Part of the name of each mask, or of its folder."""
 _MASK_NAME = re.compile(r"(?:mask[._-])?(.+?)(?:[._-]mask)?")
 _MAX_DEPTH = 5
 """Depth of the folders that are searched below the data set."""
@@ -77,6 +79,7 @@ class PhotoFiles:
     def __init__(self, root: Path, *, preferred: Sequence[str] = ()) -> None:
         """Create the search in ``root``; ``preferred`` are names of folders that take precedence."""
         self._root = root
+        self._known_mask_folders: dict[tuple[Path, int], list[tuple[Path, int]]] = {}
         self._order = (*preferred, *(name for name in _PHOTO_FOLDERS if name not in preferred))
 
     def locate(
@@ -109,6 +112,8 @@ class PhotoFiles:
         found = [self._direct(name, folders) for name in names]
         # A converted copy of a photo that cannot be read has the same stem.
         found = [None if path and path.suffix.lower() in UNREADABLE_SUFFIXES else path for path in found]
+        if None not in found:
+            return [FoundFile(path) for path in found]
         taken = {path for path in found if path is not None}
         stems = Counter(_parts(name)[1] for name in names)
         results = []
@@ -138,11 +143,13 @@ class PhotoFiles:
         COLMAP appends .png to the photo's name; others keep the name, or append ``_mask``.
         """
         depth = max(1, min(depth, len(photo.parents) - 1))
-        relative = photo.relative_to(photo.parents[depth - 1])
-        for folder, file in ((photo.parents[depth] / "masks", relative), (photo.parent.parent / "masks", photo.name)):
+        for folder, parts in self._mask_folders(photo.parent, depth):
+            file = Path(*photo.parts[-parts:])
             for path in (folder / f"{file}.png", (folder / file).with_suffix(".png"), folder / file):
                 if os.path.isfile(path):
                     return FoundFile(path)
+        if not self._masks:
+            return FoundFile(None)
         inside = _inside(photo, self._root)
         if inside is None:
             return FoundFile(None)
@@ -169,6 +176,14 @@ class PhotoFiles:
             best = []
         found = _only(best, self._root)
         return found if found.path or found.reason else FoundFile(None, f"its mask {name} was not found; put it there")
+
+    def _mask_folders(self, folder: Path, depth: int) -> list[tuple[Path, int]]:
+        """Return the existing folders ``masks`` for photos of ``folder``, and how many parts of the photo's path are
+        repeated there."""
+        if (folder, depth) not in self._known_mask_folders:
+            places = [((folder, *folder.parents)[depth] / "masks", depth), (folder.parent / "masks", 1)]
+            self._known_mask_folders[folder, depth] = [place for place in places if os.path.isdir(place[0])]
+        return self._known_mask_folders[folder, depth]
 
     def _is_repeated(self, photo: Path) -> bool:
         """Return True if photos of several folders have the name of ``photo``."""
@@ -229,6 +244,8 @@ class PhotoFiles:
         """Masks by the stem of their photo."""
         files = defaultdict(list)
         for path, folders in self._files:
+            if not (_MAY_BE_MASK.search(path.name) or any(_MAY_BE_MASK.search(folder) for folder in folders)):
+                continue
             at = next((number for number, folder in enumerate(folders) if _MASK_FOLDER.fullmatch(folder)), None)
             if at is not None:
                 rank = _MASK_FOLDERS.index(folders[at]) if folders[at] in _MASK_FOLDERS else len(_MASK_FOLDERS)

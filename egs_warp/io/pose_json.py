@@ -70,9 +70,9 @@ def read_pose_json(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], l
     frames = tree["frames"]
     names = _names(frames, "file_path")
     places = files.locate(names, (source.parent,), _names(frames, "mask_path", default=""))
-    size = _common_size(tree, places, source)
-    entries = _entries(source, "frame", frames, places)
-    return convert_each(zip(names, entries, strict=True), lambda one: _transform(one, tree, size), empty)
+    sizes = _sizes(tree, places, source)
+    entries = zip(_entries(source, "frame", frames, places), sizes, strict=True)
+    return convert_each(zip(names, entries, strict=True), lambda one: _transform(one[0], tree, one[1]), empty)
 
 
 @dataclass(frozen=True)
@@ -121,9 +121,9 @@ def _inria(entry: _Entry) -> PosedImage:
     return PosedImage(name, camera, entry.place.image, None, entry.place.mask, entry.place.missing)
 
 
-def _transform(entry: _Entry, shared: dict, common: tuple[int, int] | None) -> PosedImage:
+def _transform(entry: _Entry, shared: dict, size: tuple[int, int] | None) -> PosedImage:
     """Convert a frame: ``transform_matrix`` is camera to world, y up and z backwards; intrinsics are in the frame or
-    shared. ``common`` is the size of photos that cannot be read."""
+    shared. ``size`` is that of the photo as stored, for a file without sizes."""
     if not isinstance(entry.fields, dict):
         raise UserError(f"{entry.source}: {entry.where} is not a record of fields; export the poses again")
     record = _Record(entry.source, entry.where, {**shared, **entry.fields})
@@ -132,7 +132,7 @@ def _transform(entry: _Entry, shared: dict, common: tuple[int, int] | None) -> P
     if "w" in record.fields and "h" in record.fields:
         width, height = record.size("w"), record.size("h")
     else:
-        width, height = _size(record, entry.place.image, common)
+        width, height = _oriented_size(record, entry.place.image, size)
     if "fl_x" in record.fields:
         fx = record.focal("fl_x")
     else:
@@ -174,14 +174,12 @@ def _lens(record: _Record) -> Lens | None:
         ) from None
 
 
-def _size(record: _Record, image: Path | None, common: tuple[int, int] | None) -> tuple[int, int]:
-    """Return the size of the photo, as stored unless its EXIF orientation is that in which the principal point fits."""
-    try:
-        width, height = size_of_photo(image, f"{record.source}: {record.where}")
-    except UserError:
-        if common is None:
-            raise
-        return common
+def _oriented_size(record: _Record, image: Path | None, size: tuple[int, int] | None) -> tuple[int, int]:
+    """Return the size of the photo: as stored, unless its EXIF orientation is that in which the principal point fits.
+
+    Raises the error of the photo if its ``size`` is unknown.
+    """
+    width, height = size or size_of_photo(image, f"{record.source}: {record.where}")
     if image is not None and "cx" in record.fields and "cy" in record.fields and orientation(image) >= 5:
         cx, cy = float(record.numbers("cx", ())), float(record.numbers("cy", ()))
         if np.hypot(cx - height / 2, cy - width / 2) < np.hypot(cx - width / 2, cy - height / 2):
@@ -189,18 +187,21 @@ def _size(record: _Record, image: Path | None, common: tuple[int, int] | None) -
     return width, height
 
 
-def _common_size(tree: dict, places: Sequence[PhotoAndMask], source: Path) -> tuple[int, int] | None:
-    """Return the size of all photos that can be read, if it is the same, for a file without sizes."""
+def _sizes(tree: dict, places: Sequence[PhotoAndMask], source: Path) -> list[tuple[int, int] | None]:
+    """Return the size of each photo as stored, for a file without sizes. If all that can be read have one size, it is
+    that of the others, too."""
     frames = [frame for frame in tree["frames"] if isinstance(frame, dict)]
-    if all("w" in (tree | frame) and "h" in (tree | frame) for frame in frames):
-        return None
-    sizes = set()
-    for place in places:
+    if all(key in tree or key in frame for frame in frames for key in ("w", "h")):
+        return [None] * len(places)
+    sizes: list[tuple[int, int] | None] = [None] * len(places)
+    for number, place in enumerate(places):
         with suppress(UserError):
-            sizes.add(size_of_photo(place.image, ""))
-    if not sizes:
+            sizes[number] = size_of_photo(place.image, "")
+    known = {size for size in sizes if size is not None}
+    if not known:
         raise UserError(f"{source}: it has no w and h, and none of its photos can be read; add w and h, or the photos")
-    return sizes.pop() if len(sizes) == 1 else None
+    common = known.pop() if len(known) == 1 else None
+    return [size or common for size in sizes]
 
 
 class _Record:

@@ -22,7 +22,9 @@ def read_text(path: Path | str) -> str:
 def decode_text(data: bytes, path: Path | str) -> str:
     """Decode UTF-8 or, after its byte order mark, UTF-16. Raises ``UserError`` for other bytes."""
     try:
-        return data.decode("utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
+        if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            return data.decode("utf-16")
+        return data.removeprefix(codecs.BOM_UTF8).decode()
     except UnicodeDecodeError:
         raise UserError(f"{path}: not a text file (UTF-8); save it as UTF-8") from None
 
