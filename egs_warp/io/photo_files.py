@@ -261,9 +261,11 @@ class PhotoFiles:
 
 def has_photos(folder: Path) -> bool:
     """Return True if ``folder`` contains pictures or a folder of photos."""
-    return any((folder / name).is_dir() for name in _PHOTO_FOLDERS) or any(
-        path.suffix.lower() in _PICTURE_SUFFIXES for path in folder.iterdir()
-    )
+    try:
+        content = list(folder.iterdir())
+    except OSError:
+        return False
+    return any(path.suffix.lower() in _PICTURE_SUFFIXES or path.name in _PHOTO_FOLDERS for path in content)
 
 
 def photos_without_pose(images: Iterable[Path], excluded: Iterable[str] = ()) -> dict[Path, int]:

@@ -12,8 +12,10 @@ from egs_warp.io.colmap import read_colmap_model
 from egs_warp.io.photo_files import has_photos
 
 _JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
-_MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap", "distorted/sparse")
+_MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap")
 """Folders of COLMAP models or of their numbered folders, in order of preference."""
+_DISTORTED = "distorted/sparse"
+"""Folder of the model before the undistortion, which has other photos."""
 _BETWEEN = ("sparse", "colmap", "distorted")
 """Names of folders between the model and the folder of the data set."""
 _MAX_DEPTH = 3
@@ -67,28 +69,27 @@ def _has_model(folder: Path) -> bool:
 
 
 def _model_folders(source: Path) -> list[Path]:
-    """Return the folders of COLMAP models of the most preferred kind."""
-    if _has_model(source):
-        return [source]
-    numbered = [folder for folder in _numbered(source) if _has_model(folder)]
-    if numbered:
-        return numbered
+    """Return the folders of COLMAP models, in order of preference; those before the undistortion only alone."""
+    places = [source, *_numbered(source)]
     for name in _MODEL_FOLDERS:
-        # Models of several folders come before one that was placed above them later.
-        found = [folder for folder in (*_numbered(source / name), source / name) if _has_model(folder)]
-        if found:
-            return found
-    return []
+        # Numbered folders come before a model that was placed above them later.
+        places += [*_numbered(source / name), source / name]
+    found = [folder for folder in places if _has_model(folder)]
+    return found or [folder for folder in (*_numbered(source / _DISTORTED), source / _DISTORTED) if _has_model(folder)]
 
 
 def _numbered(folder: Path) -> list[Path]:
     """Return the folders 0, 1, 2, ... in ``folder``."""
-    if not folder.is_dir():
+    numbered = [one for one in _content(folder) if one.name.isdecimal() and one.is_dir()]
+    return sorted(numbered, key=lambda one: (len(one.name), one.name))
+
+
+def _content(folder: Path) -> list[Path]:
+    """Return what is in ``folder``; nothing if it cannot be read."""
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
         return []
-    return sorted(
-        (one for one in folder.iterdir() if one.name.isdecimal() and one.is_dir()),
-        key=lambda one: (len(one.name), one.name),
-    )
 
 
 def _folders(source: Path) -> Iterator[Path]:
@@ -138,11 +139,14 @@ def _data_folder(model: Path, source: Path) -> Path:
 
 def _exports(folder: Path) -> Iterator[Path]:
     """Iterate over the files of RealityScan and Metashape in ``folder``."""
-    for path in sorted(folder.iterdir()):
+    for path in _content(folder):
         if path.suffix.lower() in (".csv", ".xml") and path.is_file():
-            with open(path, "rb") as file:
-                # UTF-16 has a zero after each of these letters.
-                start = file.read(_START_BYTES).replace(b"\0", b"").lower()
+            try:
+                with open(path, "rb") as file:
+                    # UTF-16 has a zero after each of these letters.
+                    start = file.read(_START_BYTES).replace(b"\0", b"").lower()
+            except OSError:
+                continue
             words = (b"name", b"heading", b"pitch") if path.suffix.lower() == ".csv" else (b"<document", b"<chunk")
             if all(word in start for word in words):
                 yield path

@@ -136,6 +136,8 @@ def test_a_photo_with_an_invalid_pose_or_camera_is_excluded(
         ({"sparse": 2, "sparse/0": 4}, "sparse/0"),
         ({"colmap/sparse/0": 2, "colmap/sparse/1": 4}, "colmap/sparse/1"),
         ({"colmap/0": 2, "colmap/1": 4}, "colmap/1"),
+        ({".": 2, "sparse/0": 4}, "sparse/0"),
+        ({"sparse/0": 2, "colmap/sparse/0": 3, "colmap/sparse/1": 4}, "colmap/sparse/1"),
         ({"distorted/sparse/0": 2, "distorted/sparse/1": 4}, "distorted/sparse/1"),
         # The undistorted model belongs to the photos in ``images``.
         ({"sparse/0": 3, "distorted/sparse/0": 4}, "sparse/0"),
