@@ -58,7 +58,11 @@ def read_metashape(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], l
     names = [camera.get("label") or f"camera {camera.get('id')}" for camera in cameras]
     places = files.locate(names, (source.parent / "images", source.parent))
     sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
-    frames = {component.get("id"): component.find("transform") for component in chunk.iter("component")}
+    frames = {
+        component.get("id"): frame
+        for component in chunk.iter("component")
+        if (frame := component.find("transform")) is not None
+    }
     entries = [
         _Entry(
             f"{source}: camera {name}",

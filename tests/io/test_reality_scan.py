@@ -113,3 +113,14 @@ def test_malformed_tables(text: str, expected: str, tmp_path: Path) -> None:
     with pytest.raises(UserError) as caught:
         read_posed_images(tmp_path / "cameras.csv")
     assert str(caught.value).startswith(f"{tmp_path}/cameras.csv: {expected}")
+
+
+def test_the_rotation_is_that_of_the_xmp_of_the_same_camera(tmp_path: Path) -> None:
+    """Both exports of one camera, published at https://forums.unrealengine.com/t/710449."""
+    write_photos(tmp_path)
+    row = rows()[0]
+    row[4:7] = ["163.736597399311", "83.4154313461628", "174.386496244756"]
+    (tmp_path / "cameras.csv").write_text(f"{COLUMNS}\n{','.join(row)}\n")
+    xmp = [0.982594073, 0.185426734, -0.011216689, -0.032113633, 0.110081027, -0.993403685, -0.182968856, 0.976472782]
+    rotation = read_posed_images(tmp_path).images[0].camera.rotation
+    np.testing.assert_allclose(rotation.ravel()[:8], xmp, atol=1e-8)
