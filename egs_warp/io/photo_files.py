@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -153,7 +154,7 @@ class PhotoFiles:
         inside = _inside(photo, self._root)
         if inside is None:
             return FoundFile(None)
-        parents = tuple(part.lower() for part in inside.parts[:-1])
+        parents = tuple(_key(part) for part in inside.parts[:-1])
         candidates = [
             one
             for one in self._masks.get(_mask_stem(photo.name), ())
@@ -227,7 +228,7 @@ class PhotoFiles:
         for path, folders in self._files:
             if is_wanted(folders):
                 suffix = path.suffix.lower()
-                files[path.stem.lower()].append(_Candidate(path, folders, suffix, self._rank(folders)))
+                files[_picture_stem(path.name)].append(_Candidate(path, folders, suffix, self._rank(folders)))
         return files
 
     def _rank(self, folders: tuple[str, ...]) -> int:
@@ -274,11 +275,11 @@ def photos_without_pose(images: Iterable[Path], excluded: Iterable[str] = ()) ->
     invalid = {_parts(name)[1] for name in excluded}
     posed = defaultdict(lambda: set(invalid))
     for image in images:
-        posed[image.parent].add(image.stem.lower())
+        posed[image.parent].add(_picture_stem(image.name))
     counts = {}
     for folder, stems in posed.items():
         others = {
-            path.stem.lower()
+            _picture_stem(path.name)
             for path in folder.iterdir()
             if path.suffix.lower() in _PICTURE_SUFFIXES and not _NO_PHOTOS.search(path.stem)
         }
@@ -303,12 +304,12 @@ def _walk(root: Path) -> Iterator[tuple[Path, tuple[str, ...]]]:
             if count > _MAX_FILES:
                 return
             if os.path.splitext(name)[1].lower() in _PICTURE_SUFFIXES and not name.startswith("."):
-                yield Path(folder) / name, tuple(part.lower() for part in inside)
+                yield Path(folder) / name, tuple(_key(part) for part in inside)
 
 
 def _parts(name: str) -> tuple[tuple[str, ...], str, str]:
     """Return folders, stem and suffix of a name of any machine, in lower case."""
-    parts = [part for part in re.split(r"[\\/]+", name.lower()) if part not in ("", ".")]
+    parts = [part for part in re.split(r"[\\/]+", _key(name)) if part not in ("", ".")]
     while ".." in parts:
         # The folder above is unknown where the name begins, and left again elsewhere.
         at = parts.index("..")
@@ -320,14 +321,19 @@ def _parts(name: str) -> tuple[tuple[str, ...], str, str]:
     return tuple(parts[:-1]), last.name.removesuffix(suffix), suffix
 
 
+def _key(name: str) -> str:
+    """Return ``name`` in lower case and composed letters, which systems store differently."""
+    return unicodedata.normalize("NFC", name).lower()
+
+
 def _picture_stem(name: str) -> str:
-    stem, suffix = os.path.splitext(name.lower())
-    return stem if suffix in _PICTURE_SUFFIXES else name.lower()
+    stem, suffix = os.path.splitext(_key(name))
+    return stem if suffix in _PICTURE_SUFFIXES else _key(name)
 
 
 def _mask_stem(name: str) -> str:
     """Return the stem of the photo to which the mask ``name`` belongs: 00.jpg.png, 00_mask.png and 00.png give 00."""
-    stem = name.lower()
+    stem = _key(name)
     while True:
         shorter = _picture_stem(stem)
         match = _MASK_NAME.fullmatch(shorter)

@@ -49,6 +49,7 @@ def found(poses: PosedImages, root: Path) -> list[str | None]:
         ("sparse/0", "images", ("00.jpg", "01.jpg"), ("00.JPG", "01.JPEG")),
         ("sparse/0", "images", ("00.jpg", "01.jpg"), ("00.png", "01.webp")),
         ("sparse/0", "images", ("Img_00.jpg", "IMG_01.jpg"), ("IMG_00.jpg", "img_01.jpg")),
+        ("sparse/0", "images", ("caf\u00e9.jpg", "01.jpg"), ("cafe\u0301.jpg", "01.jpg")),
         ("sparse/0", "images", ("front\\00.jpg", "back\\00.jpg"), ("front/00.jpg", "back/00.jpg")),
         ("sparse/0", "images", ("images/00.jpg", "images/01.jpg"), ("00.jpg", "01.jpg")),
         ("sparse/0", "input", FRONT_BACK, FRONT_BACK),
