@@ -114,7 +114,8 @@ def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, backgro
 
     from egs_warp.commands.object_flag import read_object
     from egs_warp.inpainting.holes import disc, footprint, unseen
-    from egs_warp.io import read_cameras, read_capture
+    from egs_warp.io import read_capture
+    from egs_warp.io.cameras import read_posed_images
 
     if args.object is not None:
         cloud = read_capture(args.object, device=args.device).cloud
@@ -134,5 +135,8 @@ def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, backgro
         raise UserError(f"--mask {args.mask}: no such file or folder; give a PNG or a folder of them")
     if args.cameras is None:
         raise UserError("--mask: a mask needs its camera; give --cameras")
-    spec = read_object(args.mask, background, read_cameras(args.cameras), view=args.view)
+    poses = read_posed_images(args.cameras)
+    for message in poses.messages:
+        print(f"note: {message}")
+    spec = read_object(args.mask, background, poses.images, view=args.view)
     return unseen(plane, spec.masks)

@@ -18,7 +18,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
-from egs_warp.io.cameras import PosedImage, read_cameras
+from egs_warp.io.cameras import PosedImage, read_posed_images
 from egs_warp.io.capture import read_capture
 from egs_warp.io.planes import read_planes
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -98,7 +98,8 @@ def read_scene(args: argparse.Namespace) -> SceneInput:
     up = parse_up(args.up) if args.up is not None else None
     plane = plane_of(args.plane) if args.plane is not None else None
     capture = read_capture(args.capture, device=args.device)
-    posed = read_cameras(args.cameras) if args.cameras else []
+    poses = read_posed_images(args.cameras) if args.cameras else None
+    posed = poses.images if poses is not None else ()
     spec = None
     if args.object is None and args.mask_model is not None:
         raise UserError("--mask-model: it needs clicks; give --object +u,v@photo")
@@ -106,4 +107,7 @@ def read_scene(args: argparse.Namespace) -> SceneInput:
         spec = read_object(args.object, capture.cloud, posed, view=args.view, mask_model=args.mask_model)
     if up is None and capture.up is not None:
         up = np.asarray(capture.up, dtype=float)
-    return SceneInput(capture.cloud, posed, spec, up, plane, capture.notes)
+    notes = capture.notes
+    if poses is not None:
+        notes = (*notes, *poses.messages)
+    return SceneInput(capture.cloud, posed, spec, up, plane, notes)

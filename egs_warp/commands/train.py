@@ -32,7 +32,11 @@ EXAMPLES = (
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     train = commands.add_parser("train", help="train a capture on posed photos")
-    train.add_argument("posed", help="COLMAP model, transforms.json or cameras.json, or a folder that contains one")
+    train.add_argument(
+        "posed",
+        help="COLMAP model, transforms.json, cameras.json, RealityScan's camera parameters (.csv) or Metashape's "
+        "cameras (.xml), or a folder that contains one",
+    )
     train.add_argument(
         "--out",
         required=True,
@@ -55,6 +59,11 @@ def add_parser(commands: Commands) -> None:
         "--background",
         help="background colour r,g,b from 0 to 1 or #rrggbb (default: white for photos with alpha, else the colour of "
         "their borders)",
+    )
+    train.add_argument(
+        "--mask-object",
+        choices=("white", "black"),
+        help="colour of the object in masks (default: white, unless the masks clearly show that it is black)",
     )
     train.add_argument(
         "--seed", type=seed, default=0, help="seed of the initial Gaussians and of the order of photos (0)"
@@ -124,6 +133,7 @@ def _train(args: argparse.Namespace) -> int:
                 sh_degree=args.sh_degree,
                 background=background,
                 max_side=args.max_side or side,
+                inverted_masks=None if args.mask_object is None else args.mask_object == "black",
                 seed=args.seed,
                 device=args.device,
                 checkpoint=checkpoint,

@@ -1,12 +1,14 @@
 """Lens distortion models of camera calibration, and the undistortion of photos.
 
-Models: https://colmap.github.io/cameras.html; polynomials as in OpenCV's ``calib3d``.
+Models: https://colmap.github.io/cameras.html; polynomials as in OpenCV's ``calib3d``; FOV after Devernay and Faugeras
+(2001), division after Fitzgibbon (2001), EUCM after Khomutenko, Garcia and Martinet (2016), and the fisheye with
+radial, tangential and thin prism terms after Project Aria (Fisheye624).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -33,17 +35,45 @@ class Lens:
     thin_prism: tuple[float, float] = (0.0, 0.0)
     """Coefficients of r^2 along x and y."""
     field_of_view: float = 0.0
-    """Angle in rad of the FOV model of Devernay and Faugeras, used if above 0."""
+    """Angle in rad of the FOV model, used if above 0."""
+    division: float = 0.0
+    """Coefficient k of the division model: the undistorted position is the distorted one over 1 + k r^2."""
+    unified: tuple[float, float] = (0.0, 1.0)
+    """Parameters alpha and beta of the enhanced unified camera model (EUCM)."""
+    high_radial: tuple[float, float] = (0.0, 0.0)
+    """Coefficients of r^10 and r^12."""
+    high_thin_prism: tuple[float, float] = (0.0, 0.0)
+    """Coefficients of r^4 along x and y."""
+    is_chained: bool = False
+    """Tangential and thin prism terms apply to the radially distorted position, as in Fisheye624."""
 
     @classmethod
     def named(cls, model: str, numbers: Mapping[str, float]) -> Lens | None:
-        """Create the lens of COLMAP's ``model`` from its distortion parameters by name; None if it has no
-        distortion."""
+        """Create the lens of COLMAP's ``model`` from its distortion parameters by name; None if it has no distortion.
+
+        Raises ``ValueError`` for parameters outside the range of the model.
+        """
         fisheye = "FISHEYE" in model
 
         def of(*names: str) -> tuple:
             return tuple(float(numbers.get(name, 0.0)) for name in names)
 
+        if model == "RAD_TAN_THIN_PRISM_FISHEYE":
+            # Fisheye624 names the tangential coefficients in the order opposite to OpenCV's.
+            return cls(
+                fisheye=True,
+                radial=of("k1", "k2", "k3", "k4"),
+                high_radial=of("k5", "k6"),
+                tangential=of("p2", "p1"),
+                thin_prism=of("s1", "s3"),
+                high_thin_prism=of("s2", "s4"),
+                is_chained=True,
+            )
+        if model == "EUCM":
+            alpha, beta = float(numbers.get("alpha", 0.0)), float(numbers.get("beta", 1.0))
+            if not (0.0 <= alpha <= 1.0 and beta > 0.0):
+                raise ValueError(f"alpha {alpha:g} is not from 0 to 1, or beta {beta:g} is not positive")
+            return cls(unified=(alpha, beta)) if alpha > 0.0 else None
         lens = cls(
             fisheye=fisheye,
             radial=(*of("k1", "k2", "k3"), 0.0) if model == "FULL_OPENCV" else of("k1", "k2", "k3", "k4"),
@@ -51,14 +81,14 @@ class Lens:
             tangential=of("p1", "p2"),
             thin_prism=of("sx1", "sy1"),
             field_of_view=float(numbers.get("omega", 0.0)),
+            division=float(numbers.get("k", 0.0)),
         )
         return lens if lens.is_distorted else None
 
     @property
     def is_distorted(self) -> bool:
         """True if a photo differs from a pinhole's."""
-        numbers = (*self.radial, *self.rational, *self.tangential, *self.thin_prism, self.field_of_view)
-        return self.fisheye or any(number != 0 for number in numbers)
+        return replace(self, unified=(self.unified[0], 1.0)) != Lens()
 
     def distorted(self, points: np.ndarray) -> np.ndarray:
         """(..., 2) distorted positions of ``points`` (..., 2) on the plane z = 1."""
@@ -66,6 +96,14 @@ class Lens:
         if self.field_of_view > 0:
             radius = np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-12)
             return points / radius * np.arctan(2 * radius * np.tan(self.field_of_view / 2)) / self.field_of_view
+        if self.division != 0.0:
+            # The smaller root of k r r_d^2 - r_d + r = 0. Beyond the last radius with a root, the image folds back.
+            root = 1.0 - 4.0 * self.division * (points**2).sum(axis=-1, keepdims=True)
+            return np.where(root >= 0.0, 2.0 * points / (1.0 + np.sqrt(np.maximum(root, 0.0))), 0.0)
+        alpha, beta = self.unified
+        if alpha > 0.0:
+            distance = np.sqrt(beta * (points**2).sum(axis=-1, keepdims=True) + 1.0)
+            return points / (alpha * distance + 1.0 - alpha)
         if self.fisheye:
             radius = np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-12)
             points = points / radius * np.arctan(radius)
@@ -75,11 +113,18 @@ class Lens:
         k5, k6, k7 = self.rational
         p1, p2 = self.tangential
         s1, s2 = self.thin_prism
-        gain = (1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))) / (1 + r2 * (k5 + r2 * (k6 + r2 * k7)))
+        k8, k9 = self.high_radial
+        t1, t2 = self.high_thin_prism
+        gain = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * (k4 + r2 * (k8 + r2 * k9)))))
+        gain = gain / (1 + r2 * (k5 + r2 * (k6 + r2 * k7)))
+        radial_x, radial_y = x * gain, y * gain
+        if self.is_chained:
+            x, y = radial_x, radial_y
+            r2 = x * x + y * y
         return np.stack(
             [
-                x * gain + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2,
-                y * gain + 2 * p2 * x * y + p1 * (r2 + 2 * y * y) + s2 * r2,
+                radial_x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * t1),
+                radial_y + 2 * p2 * x * y + p1 * (r2 + 2 * y * y) + r2 * (s2 + r2 * t2),
             ],
             axis=-1,
         )

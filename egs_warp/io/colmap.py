@@ -6,6 +6,7 @@ Public description: https://colmap.github.io/format.html
 from __future__ import annotations
 
 import io
+import re
 import struct
 from array import array
 from collections.abc import Iterator
@@ -17,6 +18,8 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.limits import read_bytes
+from egs_warp.io.posed_images import ExcludedPhoto, convert_each
+from egs_warp.io.text import decimal_number, decode_text
 
 # Name and parameters of each camera model by its number in the binary format.
 _MODELS = {
@@ -31,10 +34,17 @@ _MODELS = {
     8: ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"),
     9: ("RADIAL_FISHEYE", "f cx cy k1 k2"),
     10: ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4"),
+    12: ("SIMPLE_DIVISION", "f cx cy k"),
+    13: ("DIVISION", "fx fy cx cy k"),
     14: ("SIMPLE_FISHEYE", "f cx cy"),
     15: ("FISHEYE", "fx fy cx cy"),
+    16: ("EUCM", "fx fy cx cy alpha beta"),
 }
 _PARAMETERS = {name: parameters.split() for name, parameters in _MODELS.values()}
+_IMAGE_LINE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+_IMAGE_START = 300
+"""Number of characters that contain the numbers of an image."""
 _POINT_BYTES = 24
 """Bytes of one point in the list of a photo."""
 _TRACK_BYTES = 8
@@ -61,6 +71,16 @@ class ColmapView:
 
 
 @dataclass(frozen=True)
+class ColmapModel:
+    """Contents of ``cameras`` and ``images``."""
+
+    views: tuple[ColmapView, ...]
+    """Photos in the order of the file, at least one."""
+    excluded: tuple[ExcludedPhoto, ...]
+    """Photos without a valid pose or camera."""
+
+
+@dataclass(frozen=True)
 class SparsePoints:
     """Points triangulated from the photos."""
 
@@ -82,35 +102,51 @@ class _Intrinsics:
 
 
 @dataclass(frozen=True)
+class _Camera:
+    """A camera as in the file. It is checked when a photo uses it."""
+
+    model: str
+    width: int
+    height: int
+    parameters: tuple[float, ...]
+    line: int = 0
+    """Number of its line; 0 in binary files."""
+
+
+@dataclass(frozen=True)
 class _Pose:
     name: str
     camera: int
     values: tuple[float, ...]
 
 
-def read_colmap_model(folder: Path) -> list[ColmapView]:
-    """Read the photos of the model in ``folder``, in the order of its file; binary files are preferred.
+def read_colmap_model(folder: Path) -> ColmapModel:
+    """Read the photos of the model in ``folder``; binary files are preferred.
 
-    Raises ``UserError`` for a model that is incomplete or malformed, and for unknown lens models.
+    Photos without a valid pose or camera are excluded. Raises ``UserError`` for a model that is incomplete or
+    malformed, and if no photo is valid.
     """
     suffix = ".bin" if (folder / "images.bin").is_file() else ".txt"
     cameras_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
     cameras = (_binary_cameras if suffix == ".bin" else _text_cameras)(_read(cameras_file), cameras_file)
     poses = (_binary_poses if suffix == ".bin" else _text_poses)(_read(images_file), images_file)
-    if not poses:
-        raise UserError(f"{images_file}: it has no images; reconstruct the scene again")
-    views = []
-    for pose in poses:
+
+    def view(pose: _Pose) -> ColmapView:
+        where = f"{images_file}: image {pose.name}"
         if pose.camera not in cameras:
             raise UserError(
-                f"{images_file}: image {pose.name} has camera {pose.camera}, which is missing in"
-                f" {cameras_file.name}; export the model again"
+                f"{where} has camera {pose.camera}, which is missing in {cameras_file.name}; export the model again"
             )
         values = np.array(pose.values)
         if not np.isfinite(values).all() or not 1e-3 < np.abs(values[:4]).max() < 1e3:
-            raise UserError(f"{images_file}: image {pose.name} has no valid pose; reconstruct the scene again")
-        views.append(ColmapView(pose.name, quaternion=values[:4], translation=values[4:], **vars(cameras[pose.camera])))
-    return views
+            numbers = " ".join(f"{value:g}" for value in pose.values)
+            raise UserError(f"{where} has no valid pose ({numbers}); reconstruct the scene again")
+        intrinsics = _intrinsics(cameras_file, pose.camera, cameras[pose.camera])
+        return ColmapView(pose.name, quaternion=values[:4], translation=values[4:], **vars(intrinsics))
+
+    empty = f"{images_file}: it has no images; reconstruct the scene again"
+    views, excluded = convert_each(((pose.name, pose) for pose in poses), view, empty)
+    return ColmapModel(tuple(views), tuple(excluded))
 
 
 def read_colmap_points(folder: Path) -> SparsePoints | None:
@@ -127,61 +163,105 @@ def _read(path: Path) -> bytes:
     return read_bytes(path, missing="a COLMAP model needs it")
 
 
-def _intrinsics(
-    path: Path, number: int, model: str, width: int, height: int, parameters: tuple[float, ...]
-) -> _Intrinsics:
-    names = _PARAMETERS.get(model)
-    if names is None or len(parameters) != len(names):
+def _intrinsics(path: Path, number: int, camera: _Camera) -> _Intrinsics:
+    names = _PARAMETERS.get(camera.model)
+    where = f"{path}: camera {number}" + (f" (line {camera.line})" if camera.line else "")
+    if names is None or len(camera.parameters) != len(names):
         raise UserError(
-            f"{path}: camera {number} of model {model} with {len(parameters)} parameters is unknown;"
-            f" give one of {', '.join(_PARAMETERS)}"
+            f"{where} of model {camera.model} with {len(camera.parameters)} parameters is unknown; undistort the photos"
+            f" by `colmap image_undistorter`, or give one of {', '.join(_PARAMETERS)}"
         )
-    values = dict(zip(names, parameters, strict=True))
+    values = dict(zip(names, camera.parameters, strict=True))
     fx, fy = values.get("fx", values.get("f", 0.0)), values.get("fy", values.get("f", 0.0))
-    if width < 1 or height < 1 or not np.isfinite(parameters).all() or min(fx, fy) <= 0:
-        raise UserError(f"{path}: camera {number} has no valid size and focal length; reconstruct the scene again")
-    return _Intrinsics(width, height, fx, fy, values["cx"], values["cy"], Lens.named(model, values))
-
-
-def _text_lines(data: bytes, path: Path) -> Iterator[str]:
-    """Return the lines one at a time, as a list of all would take far more memory than the file."""
+    if min(camera.width, camera.height) < 1 or not np.isfinite(camera.parameters).all() or min(fx, fy) <= 0:
+        numbers = " ".join((f"{camera.width} x {camera.height},", *(f"{value:g}" for value in camera.parameters)))
+        raise UserError(f"{where} has no valid size and focal length ({numbers}); reconstruct the scene again")
     try:
-        text = data.decode()
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path}: not a text file; export the model again") from error
-    return (line.rstrip("\r\n") for line in io.StringIO(text) if not line.startswith("#"))
+        lens = Lens.named(camera.model, values)
+    except ValueError as error:
+        raise UserError(f"{where} has no valid lens ({error}); reconstruct the scene again") from error
+    return _Intrinsics(camera.width, camera.height, fx, fy, values["cx"], values["cy"], lens)
 
 
-def _text_cameras(data: bytes, path: Path) -> dict[int, _Intrinsics]:
+def _text_lines(data: bytes, path: Path) -> Iterator[tuple[int, str]]:
+    """Return numbers and text of the lines that are neither empty nor comments, one at a time, as a list of all would
+    take far more memory than the file."""
+    lines = io.StringIO(decode_text(data, path))
+    for number, line in enumerate(lines, start=1):
+        text = line.strip()
+        if text and not text.startswith("#"):
+            yield number, text
+
+
+def _text_cameras(data: bytes, path: Path) -> dict[int, _Camera]:
     cameras = {}
-    for line in _text_lines(data, path):
+    for at, line in _text_lines(data, path):
         words = line.split()
-        if not words:
-            continue
         try:
             number, width, height = int(words[0]), int(words[2]), int(words[3])
-            parameters = tuple(float(word) for word in words[4:])
+            parameters = tuple(_camera_number(word) for word in words[4:])
         except (ValueError, IndexError) as error:
-            raise UserError(f"{path}: malformed camera line {line[:60]!r}; export the model again") from error
-        cameras[number] = _intrinsics(path, number, words[1], width, height, parameters)
+            raise UserError(f"{path}: malformed camera in line {at}, {line[:60]!r}; export the model again") from error
+        cameras[number] = _Camera(words[1], width, height, parameters, at)
     return cameras
 
 
+def _camera_number(word: str) -> float:
+    """Return a number; NaN as Windows writes it, because a camera that no photo uses may have no values."""
+    try:
+        return decimal_number(word)
+    except ValueError:
+        if re.fullmatch(r"[+-]?nan\(\w*\)|[+-]?1\.#\w+", word):
+            return np.nan
+        raise
+
+
 def _text_poses(data: bytes, path: Path) -> list[_Pose]:
+    """Read the poses. COLMAP writes a second line for each image, with its points; other tools leave it out or empty,
+    so that each line is classified by its content."""
     poses = []
-    lines = _text_lines(data, path)
-    for line in lines:
-        if not line.strip():
+    may_be_points = False
+    for at, line in _text_lines(data, path):
+        # Lines of points are long, and few begin like an image.
+        words = line[:_IMAGE_START].split(maxsplit=9)
+        if may_be_points and not words[0].isdecimal() and _is_point_line(words[:3]):
+            may_be_points = False
             continue
-        words = line.strip().split(maxsplit=9)
+        words = line.split(maxsplit=9)
+        if may_be_points and _is_point_line(words):
+            may_be_points = False
+            continue
         try:
-            name = words[9]
-            poses.append(_Pose(name, int(words[8]), tuple(float(word) for word in words[1:8])))
+            values = tuple(_camera_number(word) for word in words[1:8])
+            poses.append(_Pose(words[9], int(words[8]), values))
+            int(words[0])
         except (ValueError, IndexError) as error:
-            raise UserError(f"{path}: malformed image line {line[:60]!r}; export the model again") from error
-        # The points seen in the image are on the next line, which may be empty.
-        next(lines, None)
+            raise UserError(
+                f"{path}: malformed image in line {at}, {line[:60]!r}; a line has {_IMAGE_LINE}, or the points of the"
+                " image in the line before"
+            ) from error
+        may_be_points = True
     return poses
+
+
+def _is_point_line(words: list[str]) -> bool:
+    """Return True for the points of an image: triples of two coordinates and a number, of which ``words`` are the first
+    nine and the rest."""
+    try:
+        for word in words[:9]:
+            _camera_number(word)
+    except ValueError:
+        return False
+    if len(words) < 10:
+        return len(words) % 3 == 0
+    # An image begins with a whole number, which few points do, and has a whole number and a name after the pose.
+    if not (words[0].isdecimal() and words[8].isdecimal()):
+        return True
+    rest = words[9].split()
+    try:
+        return len(rest) % 3 == 0 and all(np.isfinite(_camera_number(word)) for word in rest)
+    except ValueError:
+        return False
 
 
 class _Cursor:
@@ -220,28 +300,44 @@ class _Cursor:
         return UserError(f"{self.path}: truncated at {len(self.data)} bytes; copy or export it again")
 
 
-def _binary_cameras(data: bytes, path: Path) -> dict[int, _Intrinsics]:
+def _binary_cameras(data: bytes, path: Path) -> dict[int, _Camera]:
     cursor = _Cursor(data, path)
     cameras = {}
     for _ in range(cursor.take("Q")[0]):
         number, model, width, height = cursor.take("iiQQ")
         if model not in _MODELS:
             raise UserError(
-                f"{path}: camera {number} has model {model}, which is unknown; give one of {', '.join(_PARAMETERS)}"
+                f"{path}: camera {number} has model {model}, which is unknown; undistort the photos by"
+                f" `colmap image_undistorter`, or give one of {', '.join(_PARAMETERS)}"
             )
         name = _MODELS[model][0]
-        cameras[number] = _intrinsics(path, number, name, width, height, cursor.take(f"{len(_PARAMETERS[name])}d"))
+        cameras[number] = _Camera(name, width, height, cursor.take(f"{len(_PARAMETERS[name])}d"))
     return cameras
 
 
 def _binary_poses(data: bytes, path: Path) -> list[_Pose]:
-    cursor = _Cursor(data, path)
+    """Read the poses; some writers leave out the points and their number."""
+    try:
+        return _binary_records(_Cursor(data, path), with_points=True)
+    except UserError:
+        cursor = _Cursor(data, path)
+        try:
+            poses = _binary_records(cursor, with_points=False)
+        except UserError:
+            poses = []
+        if not poses or cursor.offset != len(data):
+            raise
+        return poses
+
+
+def _binary_records(cursor: _Cursor, *, with_points: bool) -> list[_Pose]:
     poses = []
     for _ in range(cursor.take("Q")[0]):
         values = cursor.take("i7di")
         name = cursor.text()
         poses.append(_Pose(name, values[8], values[1:8]))
-        cursor.skip(_POINT_BYTES * cursor.take("Q")[0])
+        if with_points:
+            cursor.skip(_POINT_BYTES * cursor.take("Q")[0])
     return poses
 
 
@@ -259,15 +355,12 @@ def _binary_points(data: bytes, path: Path) -> np.ndarray:
 
 def _text_points(data: bytes, path: Path) -> np.ndarray:
     points = array("d")
-    for line in _text_lines(data, path):
-        words = line.split()
-        if not words:
-            continue
+    for at, line in _text_lines(data, path):
         try:
-            values = [float(word) for word in words[1:7]]
+            values = [decimal_number(word) for word in line.split(maxsplit=7)[1:7]]
             if len(values) != 6:
                 raise ValueError
             points.extend(values)
         except ValueError as error:
-            raise UserError(f"{path}: malformed point line {line[:60]!r}; export the model again") from error
+            raise UserError(f"{path}: malformed point in line {at}, {line[:60]!r}; export the model again") from error
     return np.array(points, dtype=float).reshape(-1, 6)

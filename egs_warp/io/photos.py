@@ -12,16 +12,18 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Undistortion
-from egs_warp.io.cameras import PosedImage
 from egs_warp.io.limits import MAX_PIXELS, check_pixels, picture_size
+from egs_warp.io.orientation import apply_orientation, orientation
+from egs_warp.io.photo_files import UNREADABLE_SUFFIXES
+from egs_warp.io.posed_images import PosedImage
 
-_ORIENTATION = 0x0112
-"""EXIF tag of the orientation in which a viewer must show the picture."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _CHUNK = 12
 """Bytes of a PNG chunk in addition to its content."""
 _MAX_SIDE_RATIO = 16
 """Maximum side of a photo, in sides of its camera."""
+MAX_MASK_RATIO = _MAX_SIDE_RATIO**2
+"""Maximum number of pixels of a mask, in pixels of its camera."""
 _SAME_ASPECT = 0.01
 """Relative difference of aspect ratio up to which a photo is its camera's at another size."""
 
@@ -38,17 +40,20 @@ class Photo:
     """(H, W) float32, the photo's own, or that of its mask; None without either."""
     known: np.ndarray | None
     """(H, W) bool, False where the undistorted photo shows what the lens did not see; None if it sees everything."""
+    is_opaque: bool = False
+    """True if the photo has an alpha channel that is opaque everywhere, which is not in ``alpha``: most programs write
+    such a channel into photos without a cut-out."""
 
 
-def read_photo(posed: PosedImage, *, max_side: int | None = None) -> Photo:
+def read_photo(posed: PosedImage, *, max_side: int | None = None, is_mask_inverted: bool = False) -> Photo:
     """Read the photo of ``posed``; one larger than ``max_side`` pixels is reduced.
 
-    The EXIF orientation is applied only if the pixels would not fit the camera otherwise. Alpha is the photo's own or,
-    as in COLMAP, that of ``masks/PHOTO.png`` (or ``masks/`` with the photo's own name) beside the photos' folder, where
-    white is opaque. Raises ``UserError`` for a photo that is missing, unreadable or of another shape than its camera.
+    The EXIF orientation is applied only if the pixels would not fit the camera otherwise. Alpha is the smaller of the
+    photo's own, unless that is opaque everywhere, and its mask, where white is opaque; with ``is_mask_inverted`` black.
+    Raises ``UserError`` for a photo that is missing, unreadable or of another shape than its camera.
     """
     if posed.image is None:
-        raise UserError(f"{posed.name}: the photo is not beside the poses; put it there")
+        raise UserError(f"{posed.name}: {posed.missing or 'the photo is not beside the poses; put it there'}")
     size = picture_size(posed.image, f"{posed.image}: it")
     if size is not None:
         # Before decoding: a small file may contain a very large picture.
@@ -63,7 +68,13 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None) -> Photo:
     values = np.atleast_3d(np.asarray(pixels, dtype=np.float32)) / full
     colour = values[:, :, :3][:, :, ::-1] if values.shape[2] >= 3 else np.repeat(values[:, :, :1], 3, axis=2)
     colour = np.ascontiguousarray(colour)
-    alpha = values[:, :, 3] if values.shape[2] == 4 else _mask_of(posed.image, posed.name, shape, turn)
+    alpha = values[:, :, 3] if values.shape[2] == 4 else None
+    is_opaque = alpha is not None and alpha.min() >= 1.0
+    alpha = None if is_opaque else alpha
+    if posed.mask is not None:
+        mask = _oriented_mask(posed.mask, shape, turn)
+        mask = 1.0 - mask if is_mask_inverted else mask
+        alpha = mask if alpha is None else np.minimum(alpha, mask)
     camera = at_size(posed.camera, colour.shape[1], colour.shape[0])
     known = None
     if posed.lens is not None:
@@ -88,7 +99,7 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None) -> Photo:
             alpha = cv2.resize(alpha, (width, height), interpolation=cv2.INTER_AREA)
         if known is not None:
             known = cv2.resize(known.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
-    return Photo(camera, np.ascontiguousarray(colour, dtype=np.float32), alpha, known)
+    return Photo(camera, np.ascontiguousarray(colour, dtype=np.float32), alpha, known, is_opaque)
 
 
 def at_size(camera: Camera, width: int, height: int) -> Camera:
@@ -105,33 +116,12 @@ def at_size(camera: Camera, width: int, height: int) -> Camera:
     )
 
 
-def orientation(image: Path) -> int:
-    """Return the orientation that the file requests: EXIF's 1 (unchanged) to 8."""
-    from PIL import Image
-
-    try:
-        with Image.open(image) as opened:
-            turn = opened.getexif().get(_ORIENTATION, 1)
-    # The decoder reads untrusted bytes, and its errors share no base class.
-    except Exception:
-        return 1
-    return turn if turn in range(1, 9) else 1
-
-
-def apply_orientation(pixels: np.ndarray, turn: int) -> np.ndarray:
-    """Return ``pixels`` (H, W, ...) in EXIF's orientation ``turn``."""
-    if turn >= 5:
-        pixels = pixels.swapaxes(0, 1)
-    # Axes that run backwards after the swap.
-    rows = -1 if turn in (3, 4, 7, 8) else 1
-    columns = -1 if turn in (2, 3, 6, 7) else 1
-    return np.ascontiguousarray(pixels[::rows, ::columns])
-
-
 def decoded(image: Path) -> np.ndarray:
     """(H, W) or (H, W, C) as stored, BGR, without rotation. Raises ``UserError`` if the picture is damaged."""
     from PIL import Image
 
+    if image.suffix.lower() in UNREADABLE_SUFFIXES:
+        raise UserError(f"{image}: HEIC is not read; convert the photos to JPEG, and keep their names")
     size = picture_size(image, f"{image}: it")
     if size is not None:
         check_pixels(*size, f"{image}: it")
@@ -184,39 +174,55 @@ def _orientation_to_fit(posed: PosedImage, shape: tuple[int, ...]) -> int:
 
 
 def _same_aspect(camera: Camera, width: int, height: int) -> bool:
-    return abs(width / camera.width / (height / camera.height) - 1) <= _SAME_ASPECT
+    return _is_scaled((camera.width, camera.height), (width, height))
 
 
-def _mask_of(image: Path, name: str, shape: tuple[int, ...], turn: int) -> np.ndarray | None:
-    """(H, W) float32 from the photo's mask file, if there is one; ``shape`` is the photo's as stored."""
-    # COLMAP's names may contain folders, which the masks repeat.
-    depth = min(len(Path(name).parts), len(image.parents) - 1)
-    relative = image.relative_to(image.parents[depth - 1])
-    places = (
-        place
-        for folder, file in ((image.parents[depth] / "masks", relative), (image.parent.parent / "masks", image.name))
-        for place in (folder / f"{file}.png", (folder / file).with_suffix(".png"), folder / file)
-    )
-    path = next((place for place in places if place.is_file()), None)
-    if path is None:
-        return None
+def _is_scaled(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Return True if two pictures have the same aspect ratio."""
+    return abs(other[0] / size[0] / (other[1] / size[1]) - 1) <= _SAME_ASPECT
+
+
+def _oriented_mask(path: Path, shape: tuple[int, ...], turn: int) -> np.ndarray:
+    """(H, W) float32 from the mask file of a photo of ``shape`` (height, width) as stored, which was turned by
+    ``turn``. A mask of another size is scaled."""
+    height, width = shape
     size = picture_size(path, f"{path}: it")
     if size is None:
         raise UserError(f"{path}: not a readable picture; export the mask again")
-    if sorted(size) != sorted(shape):
+    is_stored = _is_scaled((width, height), size)
+    if not is_stored and not (turn >= 5 and _is_scaled((height, width), size)):
         raise UserError(
-            f"{path}: {size[0]} x {size[1]} pixels, but its photo has {shape[1]} x {shape[0]};"
-            " make the mask from the same photo"
+            f"{path}: {size[0]} x {size[1]} pixels, but its photo has {width} x {height}; make the mask from the same"
+            " photo"
         )
-    pixels = _pixels(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    mask = read_mask_file(path, at_most=min(MAX_MASK_RATIO * width * height, MAX_PIXELS))
+    target = (width, height) if is_stored else (height, width)
+    if mask.shape != target[::-1]:
+        is_larger = mask.size > width * height
+        mask = cv2.resize(mask, target, interpolation=cv2.INTER_AREA if is_larger else cv2.INTER_LINEAR)
+    # A mask of the photo as stored is turned with it.
+    return apply_orientation(mask, turn) if is_stored else mask
+
+
+def read_mask_file(path: Path, *, at_most: int = MAX_PIXELS) -> np.ndarray:
+    """(H, W) float32 from 0 to 1, the grey of a mask as stored, or its alpha channel if that is not opaque everywhere.
+    Raises ``UserError`` if it is not a readable picture, or has more than ``at_most`` pixels."""
+    from PIL import Image
+
+    size = picture_size(path, f"{path}: it")
+    if size is not None:
+        check_pixels(*size, f"{path}: it", at_most=at_most)
+    pixels = None
+    try:
+        with Image.open(path) as opened:
+            if "A" in opened.getbands() or "transparency" in opened.info:
+                pixels = np.asarray(opened.convert("RGBA"))[:, :, 3]
+    # The decoder reads untrusted bytes, and its errors share no base class.
+    except Exception as error:
+        raise UserError(f"{path}: not a readable picture; export the mask again") from error
+    if pixels is None or pixels.min() == pixels.max():
+        pixels = _pixels(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise UserError(f"{path}: not a readable picture; export the mask again")
-    if pixels.shape == shape:
-        # The mask was made for the photo as stored.
-        pixels = apply_orientation(pixels, turn)
-    elif pixels.shape != (shape if turn < 5 else shape[::-1]):
-        raise UserError(
-            f"{path}: {pixels.shape[1]} x {pixels.shape[0]} pixels, but its photo has {shape[1]} x {shape[0]};"
-            " make the mask from the same photo"
-        )
-    return pixels.astype(np.float32) / 255.0
+    # Masks of labels contain 0 and 1.
+    return pixels.astype(np.float32) / (1.0 if pixels.max() == 1 else 255.0)

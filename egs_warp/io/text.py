@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,27 @@ _EXACT_DIGITS = 15
 
 def read_text(path: Path | str) -> str:
     """Read the text of a file. Raises ``UserError`` if there is none."""
+    return decode_text(read_bytes(path, at_most=MAX_TEXT_BYTES), path)
+
+
+def decode_text(data: bytes, path: Path | str) -> str:
+    """Decode UTF-8 or, after its byte order mark, UTF-16. Raises ``UserError`` for other bytes."""
     try:
-        return read_bytes(path, at_most=MAX_TEXT_BYTES).decode("utf-8-sig")
+        if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            return data.decode("utf-16")
+        return data.removeprefix(codecs.BOM_UTF8).decode()
     except UnicodeDecodeError:
         raise UserError(f"{path}: not a text file (UTF-8); save it as UTF-8") from None
+
+
+def decimal_number(word: str) -> float:
+    """Parse a number whose decimal separator is a point or a comma. Raises ``ValueError`` for other words."""
+    try:
+        return float(word)
+    except ValueError:
+        if word.count(",") != 1 or "." in word:
+            raise
+        return float(word.replace(",", "."))
 
 
 def whole_number(digits: str) -> int | float:

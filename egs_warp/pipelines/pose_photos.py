@@ -20,7 +20,9 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.io.cameras import read_cameras, read_points
 from egs_warp.io.frames import VIDEO_SUFFIXES, select_sharp_frames
-from egs_warp.io.photos import apply_orientation, decoded, orientation
+from egs_warp.io.orientation import apply_orientation, orientation
+from egs_warp.io.photo_files import UNREADABLE_SUFFIXES
+from egs_warp.io.photos import decoded
 from egs_warp.io.run_folder import check_run_folder, run_folder
 
 _PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
@@ -161,7 +163,8 @@ def _work_folder(folder: Path) -> Iterator[Path]:
 def _copied(source: Path, images: Path) -> tuple[str, ...]:
     """Copy the photos below ``source`` upright to ``images``; return the reasons why files were left out."""
     unreadable = []
-    paths = sorted(path for path in source.rglob("*") if path.suffix.lower() in _PHOTO_SUFFIXES and path.is_file())
+    suffixes = (*_PHOTO_SUFFIXES, *UNREADABLE_SUFFIXES)
+    paths = sorted(path for path in source.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
     for path in paths:
         if any(part.startswith(".") for part in path.relative_to(source).parts):
             continue

@@ -14,12 +14,13 @@ import numpy as np
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import read_points
+from egs_warp.io.posed_images import ExcludedPhoto
 from egs_warp.render import render_gaussians
 from egs_warp.training.finetune import Densification, FinetuneOptions, TrainingView, finetune
 from egs_warp.training.initial_cloud import MIN_POINTS, cloud_from_points, initial_cloud
 from egs_warp.training.metrics import match_tone, psnr, ssim_of
 from egs_warp.training.outlier_views import is_outlier
-from egs_warp.training.posed_photos import ExcludedPhoto, backdrop_colour, laid_over, read_views
+from egs_warp.training.posed_photos import PhotoSources, backdrop_colour, laid_over, read_views
 
 _HOLD_OUT_EVERY = 8
 """Every eighth photo is used for evaluation and not for training, as in published methods."""
@@ -74,6 +75,8 @@ class TrainResult:
     """Score of each of ``views``."""
     background: tuple[float, float, float]
     """Background colour, 0 to 1."""
+    sources: PhotoSources
+    """Origin of the photos, and their numbers."""
     excluded: tuple[ExcludedPhoto, ...] = ()
     """Photos that were not used, or were excluded during the training, and the reasons."""
 
@@ -91,6 +94,7 @@ def train(
     sh_degree: int = 3,
     background: tuple[float, float, float] | None = None,
     max_side: int | None = None,
+    inverted_masks: bool | None = None,
     seed: int = 0,
     device: str | None = None,
     threads: int | None = None,
@@ -107,13 +111,14 @@ def train(
     each step, so that no Gaussian can imitate the background.
 
     Args:
-        posed: COLMAP model, ``transforms.json`` or ``cameras.json``.
+        posed: COLMAP model, ``transforms.json``, ``cameras.json``, or another file of ``read_posed_images``.
         iterations: Number of optimiser steps.
         max_gaussians: Maximum number of Gaussians; None adds Gaussians as long as the photos improve.
         sh_degree: SH degree of the capture, 0 to 3.
         background: Background colour, 0 to 1; None is white for photos with alpha, otherwise the mean colour at the
             borders of the photos, so that no Gaussians are used for a plain background.
         max_side: Larger photos are downscaled to this side, pixels; None keeps their size.
+        inverted_masks: True if the object is black in masks; None decides on the masks, False if they are not clear.
         seed: Seed of the training.
         device: Warp device; None is the current one.
         threads: Number of threads; None is the default.
@@ -134,7 +139,9 @@ def train(
         raise ArgumentError("seed", "give a whole number of at least 0", value=seed)
     say = stage or (lambda _text: None)
     say(f"reading {posed}")
-    photos = read_views(posed, max_side=max_side)
+    photos = read_views(posed, max_side=max_side, inverted_masks=inverted_masks)
+    for note in photos.sources.notes:
+        say(note)
     for one in photos.left_out:
         say(f"left out {one.name}: {one.reason}")
     background = background or backdrop_colour(photos.views)
@@ -169,7 +176,8 @@ def train(
         left_out.append(ExcludedPhoto(views[number].name, _outlier_reason(scores[number])))
         say(f"left out {left_out[-1].name}: {left_out[-1].reason}")
     return TrainResult(
-        *(result.cloud, result.losses, views, photos.views, cut_out, tuple(scores), background, tuple(left_out))
+        *(result.cloud, result.losses, views, photos.views, cut_out, tuple(scores), background, photos.sources),
+        excluded=tuple(left_out),
     )
 
 

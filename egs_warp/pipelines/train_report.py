@@ -12,8 +12,9 @@ import numpy as np
 from egs_warp.pipelines.report import versions, write_report
 
 if TYPE_CHECKING:
+    from egs_warp.io.posed_images import ExcludedPhoto
     from egs_warp.pipelines.train_capture import MeanScore, PhotoScore, TrainResult
-    from egs_warp.training.posed_photos import ExcludedPhoto
+    from egs_warp.training.posed_photos import PhotoSources
 
 _LAST_STEPS = 100
 """Number of last steps whose mean loss is the final loss."""
@@ -25,6 +26,7 @@ class TrainReport:
 
     photos: int
     """Number of photos used, including those held out."""
+    sources: PhotoSources
     left_out: tuple[ExcludedPhoto, ...]
     photo_size: tuple[int, int]
     """Width and height of the first photo, pixels."""
@@ -53,6 +55,7 @@ class TrainReport:
         photo = result.views[0].camera
         return cls(
             photos=len(result.views),
+            sources=result.sources,
             left_out=result.excluded,
             photo_size=(photo.width, photo.height),
             gaussians=result.cloud.count,
@@ -88,9 +91,9 @@ class TrainReport:
         write_report(path, self.to_json())
 
     def summary(self) -> list[str]:
-        """Return lines for the terminal: the means of held-out photos and of training photos."""
+        """Return lines for the terminal: the number of photos, and the means of held-out and of training photos."""
         means = {"held out": self.held_out, "trained on": self.trained_on}
-        return [
+        return [self.sources.summary()] + [
             f"{which}: {mean.psnr:.2f} dB, SSIM {mean.ssim:.3f} in each photo's exposure"
             for which, mean in means.items()
             if mean is not None

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.optimize import root
 
 from egs_warp.assets import pawn
 from egs_warp.geometry.camera import Camera
@@ -59,6 +60,77 @@ def test_thin_prisms_and_the_fov_model_by_hand() -> None:
     np.testing.assert_allclose(
         np.tan(0.8 * radius) / (2 * np.tan(0.4)), np.linalg.norm(POINTS, axis=1), rtol=1e-9, atol=1e-12
     )
+
+
+NEWER = {
+    "SIMPLE_DIVISION": {"k": -0.15},
+    "DIVISION": {"k": 0.12},
+    "EUCM": {"alpha": 0.6, "beta": 1.1},
+    "RAD_TAN_THIN_PRISM_FISHEYE": {
+        **{"k1": 0.02, "k2": -0.05, "k3": 0.04, "k4": -0.01, "k5": 0.002, "k6": -0.0003},
+        **{"p1": 0.004, "p2": -0.003, "s1": 0.002, "s2": -0.001, "s3": -0.003, "s4": 0.0015},
+    },
+}
+
+
+def ray_of(model: str, numbers: dict[str, float], bent: np.ndarray) -> np.ndarray:
+    """(2,) position on the plane z = 1 of the distorted one, as COLMAP's ``CamFromImg`` defines it."""
+    r2 = float(bent @ bent)
+    if "DIVISION" in model:
+        return bent / (1 + numbers["k"] * r2)
+    if model == "EUCM":
+        alpha, beta = numbers["alpha"], numbers["beta"]
+        depth = (1 - alpha**2 * beta * r2) / (alpha * np.sqrt(1 - (2 * alpha - 1) * beta * r2) + 1 - alpha)
+        return bent / depth
+
+    def residual(angle: np.ndarray) -> np.ndarray:
+        theta2 = angle @ angle
+        u = angle * (1 + sum(numbers[f"k{n}"] * theta2**n for n in range(1, 7)))
+        p = np.array([numbers["p1"], numbers["p2"]])
+        s2 = u @ u
+        tangential = 2 * (p @ u) * u + p * s2
+        prism = [numbers["s1"] * s2 + numbers["s2"] * s2**2, numbers["s3"] * s2 + numbers["s4"] * s2**2]
+        return u + tangential + prism - bent
+
+    found = root(residual, bent, tol=1e-13)
+    theta = np.linalg.norm(found.x)
+    return found.x * np.tan(theta) / theta
+
+
+@pytest.mark.parametrize("model", NEWER)
+def test_newer_lenses_of_colmap(model: str) -> None:
+    """The inverse, written by itself, leads back; the picture keeps its scale and grows along every radius."""
+    lens = Lens.named(model, NEWER[model])
+    assert lens is not None
+    bent = lens.distorted(POINTS)
+    assert np.abs(bent - POINTS).max() > 0.02
+    np.testing.assert_allclose([ray_of(model, NEWER[model], one) for one in bent], POINTS, atol=1e-9)
+    step = 1e-6
+    forward = (lens.distorted(np.eye(2) * step) - lens.distorted(-np.eye(2) * step)) / (2 * step)
+    np.testing.assert_allclose(forward, np.eye(2), atol=1e-6)
+    # The derivative of the inverse is the inverse of the derivative.
+    there = np.array(
+        [(lens.distorted(POINTS[0] + e) - lens.distorted(POINTS[0] - e)) / (2 * step) for e in np.eye(2) * step]
+    )
+    back = np.array(
+        [
+            (ray_of(model, NEWER[model], bent[0] + e) - ray_of(model, NEWER[model], bent[0] - e)) / (2 * step)
+            for e in np.eye(2) * step
+        ]
+    )
+    np.testing.assert_allclose(there @ back, np.eye(2), atol=1e-6)
+    assert lens.valid_radius(0.8) == 0.8
+
+
+def test_ranges_of_newer_lenses() -> None:
+    """The division model with k > 0 ends at the radius 1 / (2 sqrt(k)); EUCM is a pinhole for alpha = 0."""
+    division = Lens.named("SIMPLE_DIVISION", {"k": 0.25})
+    assert division is not None and division.valid_radius(3.0) == pytest.approx(1.0, abs=0.01)
+    assert Lens.named("DIVISION", {"k": 0.0}) is None
+    assert Lens.named("EUCM", {"alpha": 0.0, "beta": 1.3}) is None
+    for numbers in ({"alpha": 1.2, "beta": 1.0}, {"alpha": 0.5, "beta": 0.0}):
+        with pytest.raises(ValueError, match="is not from 0 to 1, or beta"):
+            Lens.named("EUCM", numbers)
 
 
 def test_a_lens_that_bends_nothing_is_none() -> None:

@@ -18,7 +18,8 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
 from egs_warp.io import read_cameras, read_capture
-from egs_warp.io.cameras import read_points
+from egs_warp.io.cameras import read_points, read_posed_images
+from egs_warp.io.pose_json import LENSES
 from tests.support.properties import examples
 
 
@@ -247,9 +248,12 @@ def message(path: Path) -> str:
 
 def test_missing_or_unreadable(tmp_path: Path) -> None:
     assert message(tmp_path / "a.json") == ": no such file or folder; check the path"
-    assert message(tmp_path) == ": no camera poses; give a COLMAP model, a cameras.json or a transforms.json"
+    assert message(tmp_path) == (
+        ": no camera poses; give a COLMAP model, a cameras.json, a transforms.json, RealityScan's camera parameters"
+        " (.csv) or Metashape's cameras (.xml)"
+    )
     for text, expected in (
-        ("[", ": not readable JSON; give a cameras.json or a transforms.json"),
+        ("[", ": not readable JSON at line 1 (Expecting value); give a cameras.json or a transforms.json"),
         ("{}", ": neither a list of cameras nor frames; give a cameras.json or a transforms.json"),
         ("[]", ": it has no cameras; export the poses again"),
         ("[1]", ": camera 0 is not a record of fields; export the poses again"),
@@ -261,12 +265,12 @@ def test_missing_or_unreadable(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"fx": -1.0}, "fx is not a positive number"),
-        ({"width": 3.5}, "width is not a number of pixels"),
-        ({"position": [0.0, 1.0]}, "position is not 3 finite numbers"),
+        ({"fx": -1.0}, "fx -1.0 is not a positive number"),
+        ({"width": 3.5}, "width 3.5 is not a number of pixels"),
+        ({"position": [0.0, 1.0]}, "position of shape (2,) is not 3 finite numbers"),
         ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "the pose is not a rotation"),
         ({"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, "the pose is not a rotation"),
-        ({"img_name": 5}, "img_name is not a name"),
+        ({"img_name": 5}, "img_name 5 is not a name"),
     ],
 )
 def test_bad_inria(change: dict, expected: str, tmp_path: Path) -> None:
@@ -274,21 +278,32 @@ def test_bad_inria(change: dict, expected: str, tmp_path: Path) -> None:
     entry |= {"position": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist()}
     path = tmp_path / "cameras.json"
     path.write_text(json.dumps([entry, entry | change]))
-    assert message(path) == f": camera 1: {expected}; export the poses again"
+    poses = read_posed_images(path)
+    assert [one.name for one in poses.images] == ["a"]
+    assert [one.reason for one in poses.excluded] == [f"{path}: camera 1: {expected}; export the poses again"]
+    # Without a valid camera, it is an error.
+    path.write_text(json.dumps([entry | change] * 2))
+    assert message(path) == f": camera 0: {expected}; export the poses again"
 
 
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"camera_angle_x": 4.0}, ": frame 0: camera_angle_x is not an angle between 0 and pi; export the poses again"),
-        ({"k1": "much"}, ": frame 0: k1 is not a finite number; export the poses again"),
+        (
+            {"camera_angle_x": 4.0},
+            ": frame 0: camera_angle_x 4.0 is not an angle between 0 and pi; export the poses again",
+        ),
+        ({"k1": "much"}, ": frame 0: k1 much is not a finite number; export the poses again"),
         (
             {"camera_model": "EQUIRECTANGULAR"},
-            ": frame 0 has the unknown lens model 'EQUIRECTANGULAR'; give one of SIMPLE_PINHOLE, PINHOLE,"
-            " SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, OPENCV_FISHEYE, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE",
+            f": frame 0 has the unknown lens model 'EQUIRECTANGULAR'; give one of {', '.join(LENSES)}",
         ),
         ({"w": None}, ": frame 0: w is not a finite number; export the poses again"),
-        ({"transform_matrix": [[1]]}, ": frame 0: transform_matrix is not 16 finite numbers; export the poses again"),
+        (
+            {"transform_matrix": [[1]]},
+            ": frame 0: transform_matrix of shape (1, 1) is not a matrix of 3 or 4 rows of 4 finite numbers; export the"
+            " poses again",
+        ),
     ],
 )
 def test_bad_transforms(change: dict, expected: str, tmp_path: Path) -> None:
@@ -312,9 +327,10 @@ def test_transforms_without_a_size(tmp_path: Path) -> None:
 
 
 def test_bad_colmap(tmp_path: Path) -> None:
-    colmap_text(tmp_path, camera="3 EUCM 640 480 500 500 320 240 0.01 0.02")
+    colmap_text(tmp_path, camera="3 EQUIRECTANGULAR 640 480 640 480")
     assert message(tmp_path).startswith(
-        "cameras.txt: camera 3 of model EUCM with 6 parameters is unknown; give one of SIMPLE_PINHOLE, PINHOLE, "
+        "cameras.txt: camera 3 (line 2) of model EQUIRECTANGULAR with 2 parameters is unknown; undistort the photos by"
+        " `colmap image_undistorter`, or give one of SIMPLE_PINHOLE, PINHOLE, "
     )
     colmap_text(tmp_path, camera="4 PINHOLE 640 480 500 510 320 240")
     assert (
@@ -322,9 +338,9 @@ def test_bad_colmap(tmp_path: Path) -> None:
         == "images.txt: image sub/with space.jpg has camera 3, which is missing in cameras.txt; export the model again"
     )
     colmap_text(tmp_path, camera="3 PINHOLE 640 480 500 510 320")
-    assert message(tmp_path).startswith("cameras.txt: camera 3 of model PINHOLE with 3 parameters is unknown")
+    assert message(tmp_path).startswith("cameras.txt: camera 3 (line 2) of model PINHOLE with 3 parameters is unknown")
     colmap_text(tmp_path, camera="3 PINHOLE wide")
-    assert message(tmp_path) == "cameras.txt: malformed camera line '3 PINHOLE wide'; export the model again"
+    assert message(tmp_path) == "cameras.txt: malformed camera in line 2, '3 PINHOLE wide'; export the model again"
     (tmp_path / "cameras.txt").unlink()
     assert message(tmp_path) == "cameras.txt: no such file or folder; a COLMAP model needs it"
     colmap_binary(tmp_path)

@@ -148,7 +148,11 @@ def test_a_mask_of_a_photo_is_measured_first(tmp_path: Path) -> None:
     large_png(tmp_path / "masks" / "a.png")
     camera = Camera(40, 30, 40.0, 40.0, 20.0, 15.0, np.eye(3), np.zeros(3))
     with pytest.raises(UserError, match="13300 x 13300 pixels, but its photo has 40 x 30"):
-        read_photo(PosedImage("a.png", camera, tmp_path / "images" / "a.png"))
+        read_photo(PosedImage("a.png", camera, tmp_path / "images" / "a.png", mask=tmp_path / "masks" / "a.png"))
+    # Of the photo's shape, and too large for it.
+    large_png(tmp_path / "masks" / "a.png", (13_200, 9_900))
+    with pytest.raises(UserError, match="13200 x 9900 pixels; at most 32768 a side and 307200 in all are read"):
+        read_photo(PosedImage("a.png", camera, tmp_path / "images" / "a.png", mask=tmp_path / "masks" / "a.png"))
 
 
 def test_cameras_of_no_photo(tmp_path: Path) -> None:
@@ -162,7 +166,7 @@ def test_cameras_of_no_photo(tmp_path: Path) -> None:
         ({"fx": 1e-300}, "fit no photo of 640 x 480 pixels"),
         ({"fy": 1e9}, "fit no photo of 640 x 480 pixels"),
         ({"position": [1e30, 0.0, 0.0]}, "it lies more than 1e\\+12 units from the origin"),
-        ({"width": int("9" * 400)}, "width is not a finite number"),
+        ({"width": int("9" * 400)}, "width inf is not a finite number"),
     ):
         (tmp_path / "cameras.json").write_text(json.dumps([entry | change]))
         with pytest.raises(UserError, match=said):

@@ -13,7 +13,8 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.cameras import PosedImage
-from egs_warp.io.photos import apply_orientation, decoded, orientation, read_photo
+from egs_warp.io.orientation import apply_orientation, orientation
+from egs_warp.io.photos import decoded, read_photo
 
 # All corners are different, and the image is smooth enough for JPEG.
 ROWS, COLUMNS = np.mgrid[:40, :60]
@@ -78,8 +79,9 @@ def test_masks_of_turned_photos_fit_either_way(drawn_upright: bool, tmp_path: Pa
         (tmp_path / folder).mkdir()
     path = saved(tmp_path / "images" / "a.png", PICTURE, 6)
     mask = np.where(PICTURE[..., 0] > 100, 255, 0).astype(np.uint8)
-    cv2.imwrite(str(tmp_path / "masks" / "a.png.png"), apply_orientation(mask, 6) if drawn_upright else mask)
-    photo = read_photo(PosedImage("a.png", camera(40, 60), path))
+    mask_path = tmp_path / "masks" / "a.png.png"
+    cv2.imwrite(str(mask_path), apply_orientation(mask, 6) if drawn_upright else mask)
+    photo = read_photo(PosedImage("a.png", camera(40, 60), path, mask=mask_path))
     np.testing.assert_array_equal(photo.alpha, apply_orientation(mask, 6) / 255.0)
 
 

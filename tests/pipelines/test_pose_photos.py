@@ -72,7 +72,9 @@ def test_a_folder_belongs_to_one_run(
     assert "no photo could be posed" in fails(capsys, str(photos), "--out", str(out))
     assert not list(out.iterdir())
     reconstruct_by(monkeypatch, model)
+    (photos / "phone.HEIC").write_bytes(b"\0\0\0\x18ftypheic")
     assert main(["pose", str(photos), "--out", str(out)]) == 0
+    assert "phone.HEIC: HEIC is not read; convert the photos to JPEG" in capsys.readouterr().err
     manifest = json.loads((out / MANIFEST).read_text())
     assert manifest["finished"] and manifest["command"] == "pose"
     assert set(manifest["files"]) == {

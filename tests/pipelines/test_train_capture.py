@@ -14,7 +14,7 @@ from PIL import Image
 from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.io import read_capture
-from egs_warp.io.photos import apply_orientation
+from egs_warp.io.orientation import apply_orientation
 from tests.support.posed import posed_folder
 from tests.support.training_views import ring
 
@@ -36,6 +36,7 @@ def test_command_writes_capture_report_and_sheet(tmp_path: Path, capsys: pytest.
     assert run(posed, out, "--sh-degree", "1") == 0
     printed = capsys.readouterr()
     assert "held out: " in printed.out and f"wrote {out}" in printed.out
+    assert f"photos: 9 of 9 used (9 in {posed}; poses of transforms.json), none with a mask" in printed.out
     assert "training 60/60" in printed.err and "frames/s" in printed.err
     assert sorted(path.name for path in out.parent.iterdir()) == ["ball.ply", "ball.report.json", "ball.sheet.png"]
     capture = read_capture(out, device="cpu").cloud
@@ -97,6 +98,7 @@ def test_unusable_photos_are_named_and_left_out(tmp_path: Path, capsys: pytest.C
     report = json.loads((tmp_path / "ball.report.json").read_text())
     assert [one["name"] for one in report["left_out"]] == ["r_3.png", "r_5.png", "r_6.png"]
     assert report["photos"] == 6
+    assert report["sources"]["total"] == 9 and report["sources"]["used"] == 6
 
 
 def test_without_any_photo_an_earlier_result_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -34,7 +34,7 @@ from egs_warp.io.cameras import PosedImage, read_points
 from egs_warp.io.glb import write_glb
 from egs_warp.io.limits import MAX_COORDINATE, MAX_SIDE
 from egs_warp.io.onnx import read_onnx
-from egs_warp.io.photos import read_photo
+from egs_warp.io.photos import read_mask_file, read_photo
 from egs_warp.io.planes import read_planes
 from egs_warp.io.ply import read_point_ply
 from egs_warp.io.run_folder import MANIFEST, has_finished
@@ -166,6 +166,11 @@ def _colmap(path: Path) -> None:
     _cameras(path.parent)
     points = read_points(path.parent)
     assert points is None or np.isfinite([points.positions, points.colours]).all()
+
+
+def _mask(path: Path) -> None:
+    mask = read_mask_file(path)
+    assert mask.ndim == 2 and mask.dtype == np.float32 and 0.0 <= mask.min() <= mask.max() <= 1.0
 
 
 def _points(path: Path) -> None:
@@ -304,6 +309,29 @@ _COLMAP = {
     "cameras.txt": b"# cameras\n1 OPENCV 24 16 30 30 12 8 0.1 0 0 0\n",
     "images.txt": b"# images\n1 1 0 0 0 0 0 2 1 a.png\n1.0 2.0 -1 3.0 4.0 1\n",
     "points3D.txt": b"1 0.5 0.5 2 255 128 0 0.3 1 0\n2 1 1 3 0 0 0 0.1 1 1\n",
+}
+
+
+_REALITY_SCAN = (
+    b"#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
+    b"a.png,1.5,-2,0.25,30,85,-1,35,0.001,-0.002,0.1,0,0,0,0.01,0\n"
+)
+_METASHAPE = b"""<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk><sensors>
+<sensor id="0" type="frame">
+<calibration type="frame" class="adjusted"><resolution width="24" height="16"/><f>30</f><cx>0.5</cx><b1>0.1</b1>
+<k1>0.1</k1><p1>0.01</p1></calibration></sensor></sensors><components><component id="0"><transform><rotation>1 0 0
+0 0 -1 0 1 0</rotation><translation>1 2 3</translation><scale>0.5</scale></transform></component></components><cameras>
+<camera id="0" sensor_id="0" component_id="0" label="a"><transform>1 0 0 0 0 1 0 0 0 0 1 2 0 0 0 1</transform></camera>
+</cameras></chunk></document>"""
+
+
+def _adjacent_photo() -> dict[str, bytes]:
+    return {"a.png": _picture("PNG", "RGB")}
+
+
+_SIZELESS = {
+    **{"camera_angle_x": 0.7, "camera_model": "EUCM", "alpha": 0.5, "beta": 1.1},
+    "frames": [{"file_path": ".\\a.jpg", "mask_path": "masks\\a.png", "transform_matrix": np.eye(4)[:3].tolist()}],
 }
 
 
@@ -447,6 +475,17 @@ READERS: tuple[Reader, ...] = (
         Reader(f"colmap {name}", name, lambda name=name: COLMAP_BIN[name], _colmap, lambda: COLMAP_BIN)
         for name in COLMAP_BIN
     ),
+    Reader(
+        "transforms.json without sizes",
+        "transforms.json",
+        lambda: _json(_SIZELESS),
+        _cameras,
+        _adjacent_photo,
+        json=True,
+    ),
+    Reader("reality scan", "cameras.csv", lambda: _REALITY_SCAN, _cameras, _adjacent_photo),
+    Reader("metashape", "cameras.xml", lambda: _METASHAPE, _cameras, _adjacent_photo),
+    Reader("mask of a photo", "mask.png", lambda: _picture("PNG", "RGBA"), _mask),
     Reader("point ply", "input.ply", _point_ply, _points),
     Reader("plane.json", "plane.json", lambda: _json(_PLANES), _planes, json=True),
     Reader("terrain", "terrain.json", lambda: _json([[[0, 0, 1, -0.1], [-1, 0, 0, 0.5]]]), _terrain, json=True),

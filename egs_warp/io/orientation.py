@@ -1,0 +1,33 @@
+"""Orientation of pictures, as cameras store it in EXIF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+_ORIENTATION = 0x0112
+"""EXIF tag of the orientation in which a viewer must show the picture."""
+
+
+def orientation(image: Path) -> int:
+    """Return the orientation that the file requests: EXIF's 1 (unchanged) to 8."""
+    from PIL import Image
+
+    try:
+        with Image.open(image) as opened:
+            turn = opened.getexif().get(_ORIENTATION, 1)
+    # The decoder reads untrusted bytes, and its errors share no base class.
+    except Exception:
+        return 1
+    return turn if turn in range(1, 9) else 1
+
+
+def apply_orientation(pixels: np.ndarray, turn: int) -> np.ndarray:
+    """Return ``pixels`` (H, W, ...) in EXIF's orientation ``turn``."""
+    if turn >= 5:
+        pixels = pixels.swapaxes(0, 1)
+    # Axes that run backwards after the swap.
+    rows = -1 if turn in (3, 4, 7, 8) else 1
+    columns = -1 if turn in (2, 3, 6, 7) else 1
+    return np.ascontiguousarray(pixels[::rows, ::columns])

@@ -1,0 +1,389 @@
+"""Search for the photos and masks of a data set.
+
+Tools name photos relative to different folders, with the paths of another machine, or with another suffix than that of
+the file. A name is looked up directly first; otherwise the file of the data set whose path ends in the same parts is
+used, if there is exactly one.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import unicodedata
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePath
+
+UNREADABLE_SUFFIXES = (".heic", ".heif")
+"""Suffixes of pictures that are found, but cannot be read."""
+_PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".jp2", ".avif", *UNREADABLE_SUFFIXES)
+_ADDED_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".webp")
+"""Suffixes that are added to names without one."""
+_PHOTO_FOLDERS = ("images", "image", "imgs", "photos", "rgb", "color", "colour", "input", "undistorted")
+"""Folders of photos, in order of preference."""
+_REDUCED = re.compile(r"(?:images|input|photos)_(\d{1,2})")
+"""Folder of photos reduced by a factor."""
+_NO_PHOTOS = re.compile(r"mask|depth|normal|segment|matte|alpha|thumb|preview", re.IGNORECASE)
+"""Names of folders whose pictures are not photos."""
+_MASK_FOLDERS = ("masks", "mask")
+"""Folders of masks, in order of preference."""
+_MASK_FOLDER = re.compile(r"(?:.*[_-])?(?:masks?|mattes?|segmentations?|alphas?)(?:[_-].*)?", re.IGNORECASE)
+_MAY_BE_MASK = re.compile("mask|matte|segmentation|alpha", re.IGNORECASE)
+"""Part of the name of each mask, or of its folder."""
+_MASK_NAME = re.compile(r"(?:mask[._-])?(.+?)(?:[._-]mask)?")
+_MAX_DEPTH = 5
+"""Depth of the folders that are searched below the data set."""
+_MAX_FILES = 200_000
+"""Maximum number of files that are searched."""
+
+
+@dataclass(frozen=True)
+class FoundFile:
+    """Result of a search."""
+
+    path: Path | None
+    reason: str = ""
+    """Reason why there is no path, if it is not just that there is no such file."""
+    by_name: bool = False
+    """True if the file is not where its name says."""
+
+
+@dataclass(frozen=True)
+class PhotoAndMask:
+    """Files of a posed photo."""
+
+    image: Path | None
+    mask: Path | None
+    missing: str
+    """Reason why the photo or, with a photo, its mask was not found, if there is a special one."""
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A picture of the data set."""
+
+    path: Path
+    folders: tuple[str, ...]
+    """Folders below the data set, or below the folder of masks, in lower case."""
+    suffix: str
+    rank: int
+    """Preference of its folder; the smallest is best."""
+    base: tuple[str, ...] = ()
+    """Folders above the folder of masks, or of a mask beside its photo."""
+
+
+class PhotoFiles:
+    """The pictures below the folder of a data set."""
+
+    def __init__(self, root: Path, *, preferred: Sequence[str] = ()) -> None:
+        """Create the search in ``root``; ``preferred`` are names of folders that take precedence."""
+        self._root = root
+        self._known_mask_folders: dict[tuple[Path, int], list[tuple[Path, int]]] = {}
+        self._order = (*preferred, *(name for name in _PHOTO_FOLDERS if name not in preferred))
+
+    def locate(
+        self, names: Sequence[str], folders: Sequence[Path], masks: Sequence[str] | None = None
+    ) -> list[PhotoAndMask]:
+        """Find photos and masks.
+
+        Args:
+            names: names of the photos in the file of poses.
+            folders: folders to which they are relative, in order of preference.
+            masks: names of the masks, relative to the first folder; empty for those that have no name. Masks without a
+                name are looked up by the name of their photo.
+        """
+        located = []
+        for number, (name, photo) in enumerate(zip(names, self.find_photos(names, folders), strict=True)):
+            if photo.path is None:
+                located.append(PhotoAndMask(None, None, photo.reason))
+            elif masks is not None and masks[number]:
+                mask = self.find_named_mask(masks[number], folders[0])
+                by_photo = FoundFile(None) if mask.path else self.find_mask(photo.path, 1)
+                mask = by_photo if by_photo.path else mask
+                located.append(PhotoAndMask(photo.path, mask.path, mask.reason))
+            else:
+                mask = self.find_mask(photo.path, 1 if photo.by_name else len(Path(name).parts))
+                located.append(PhotoAndMask(photo.path, mask.path, mask.reason))
+        return located
+
+    def find_photos(self, names: Sequence[str], folders: Sequence[Path]) -> list[FoundFile]:
+        """Find the photos ``names``, which are relative to one of ``folders`` if they are where they should be."""
+        found = [self._direct(name, folders) for name in names]
+        # A converted copy of a photo that cannot be read has the same stem.
+        found = [None if path and path.suffix.lower() in UNREADABLE_SUFFIXES else path for path in found]
+        if None not in found:
+            return [FoundFile(path) for path in found]
+        taken = {path for path in found if path is not None}
+        stems = Counter(_parts(name)[1] for name in names)
+        results = []
+        for name, path in zip(names, found, strict=True):
+            if path is not None:
+                results.append(FoundFile(path))
+                continue
+            parents, stem, suffix = _parts(name)
+            candidates = [one for one in self._photos.get(stem, ()) if one.path not in taken]
+            best = _longest_matches(candidates, parents)
+            # The folder is the only distinction between photos of one name.
+            if best and parents and stems[stem] > 1 and _match(best[0], parents) == 0:
+                best = []
+            best = _with_suffix(best, suffix)
+            results.append(_only(best, self._root))
+        chosen = Counter(one.path for one in results if one.by_name)
+        return [
+            FoundFile(None, f"{chosen[one.path]} poses would use {one.path}; give photos names of their own")
+            if one.by_name and chosen[one.path] > 1
+            else one
+            for one in results
+        ]
+
+    def find_mask(self, photo: Path, depth: int) -> FoundFile:
+        """Find the mask of ``photo`` in a folder of masks, or beside it; ``depth`` is the number of parts of its name.
+
+        COLMAP appends .png to the photo's name; others keep the name, or append ``_mask``.
+        """
+        depth = max(1, min(depth, len(photo.parents) - 1))
+        for folder, parts in self._mask_folders(photo.parent, depth):
+            file = Path(*photo.parts[-parts:])
+            for path in (folder / f"{file}.png", (folder / file).with_suffix(".png"), folder / file):
+                if os.path.isfile(path):
+                    return FoundFile(path)
+        if not self._masks:
+            return FoundFile(None)
+        inside = _inside(photo, self._root)
+        if inside is None:
+            return FoundFile(None)
+        parents = tuple(_key(part) for part in inside.parts[:-1])
+        candidates = [
+            one
+            for one in self._masks.get(_mask_stem(photo.name), ())
+            if one.path != photo and one.base == parents[: len(one.base)]
+        ]
+        best = _longest_matches(candidates, parents)
+        # Masks of other photos of the same name are in other folders.
+        if best and best[0].folders and _match(best[0], parents) == 0 and self._is_repeated(photo):
+            best = []
+        return _only(best, self._root)
+
+    def find_named_mask(self, name: str, folder: Path) -> FoundFile:
+        """Find the mask ``name``, which is relative to ``folder`` if it is where it should be."""
+        path = self._direct(name, (folder,))
+        if path is not None:
+            return FoundFile(path)
+        parents, stem, suffix = _parts(name)
+        best = _with_suffix(_longest_matches(self._pictures.get(stem, ()), parents), suffix)
+        if best and parents and _match(best[0], parents) == 0:
+            best = []
+        found = _only(best, self._root)
+        return found if found.path or found.reason else FoundFile(None, f"its mask {name} was not found; put it there")
+
+    def _mask_folders(self, folder: Path, depth: int) -> list[tuple[Path, int]]:
+        """Return the existing folders ``masks`` for photos of ``folder``, and how many parts of the photo's path are
+        repeated there."""
+        if (folder, depth) not in self._known_mask_folders:
+            places = [((folder, *folder.parents)[depth] / "masks", depth), (folder.parent / "masks", 1)]
+            self._known_mask_folders[folder, depth] = [place for place in places if os.path.isdir(place[0])]
+        return self._known_mask_folders[folder, depth]
+
+    def _is_repeated(self, photo: Path) -> bool:
+        """Return True if photos of several folders have the name of ``photo``."""
+        return len({one.folders for one in self._photos.get(_picture_stem(photo.name), ())}) > 1
+
+    def _direct(self, name: str, folders: Sequence[Path]) -> Path | None:
+        """Return the file ``name`` in the first of ``folders`` that contains it, if it is inside the data set."""
+        for text in dict.fromkeys((name, name.replace("\\", "/"))):
+            for folder in folders:
+                path = folder / text
+                if "\0" in text:
+                    continue
+                if not _stays_inside(text):
+                    inside = _inside(path, self._root)
+                    if inside is None:
+                        continue
+                    path = self._root / inside
+                # os.path returns False where Path.is_file raises: for names that are too long or invalid.
+                for suffix in _ADDED_SUFFIXES:
+                    if os.path.isfile(f"{path}{suffix}"):
+                        return Path(f"{path}{suffix}")
+        return None
+
+    @cached_property
+    def _files(self) -> list[tuple[Path, tuple[str, ...]]]:
+        """Pictures below the data set, with their folders in lower case."""
+        return list(_walk(self._root))
+
+    @cached_property
+    def _pictures(self) -> dict[str, list[_Candidate]]:
+        """All pictures by stem."""
+        return self._by_stem(lambda _folders: True)
+
+    @cached_property
+    def _photos(self) -> dict[str, list[_Candidate]]:
+        """Pictures that may be photos by stem."""
+        return self._by_stem(lambda folders: not any(_NO_PHOTOS.search(folder) for folder in folders))
+
+    def _by_stem(self, is_wanted: Callable[[tuple[str, ...]], bool]) -> dict[str, list[_Candidate]]:
+        files = defaultdict(list)
+        for path, folders in self._files:
+            if is_wanted(folders):
+                suffix = path.suffix.lower()
+                files[_picture_stem(path.name)].append(_Candidate(path, folders, suffix, self._rank(folders)))
+        return files
+
+    def _rank(self, folders: tuple[str, ...]) -> int:
+        for number, name in enumerate(self._order):
+            if name in folders:
+                return number
+        if not folders:
+            return 100
+        reduced = next((match for folder in folders if (match := _REDUCED.fullmatch(folder))), None)
+        return 200 + int(reduced[1]) if reduced else 400
+
+    @cached_property
+    def _masks(self) -> dict[str, list[_Candidate]]:
+        """Masks by the stem of their photo."""
+        files = defaultdict(list)
+        for path, folders in self._files:
+            if not (_MAY_BE_MASK.search(path.name) or any(_MAY_BE_MASK.search(folder) for folder in folders)):
+                continue
+            at = next((number for number, folder in enumerate(folders) if _MASK_FOLDER.fullmatch(folder)), None)
+            if at is not None:
+                rank = _MASK_FOLDERS.index(folders[at]) if folders[at] in _MASK_FOLDERS else len(_MASK_FOLDERS)
+                # Folders above that of the masks distinguish them as well: front/masks and back/masks.
+                below = (*folders[:at], *folders[at + 1 :])
+                candidate = _Candidate(path, below, path.suffix.lower(), rank, folders[:at])
+                files[_mask_stem(path.name)].append(candidate)
+            elif _mask_stem(path.name) != _picture_stem(path.name):
+                candidate = _Candidate(path, folders, path.suffix.lower(), 100, folders)
+                files[_mask_stem(path.name)].append(candidate)
+        return files
+
+
+def has_photos(folder: Path) -> bool:
+    """Return True if ``folder`` contains pictures or a folder of photos."""
+    try:
+        content = list(folder.iterdir())
+    except OSError:
+        return False
+    return any(path.suffix.lower() in _PICTURE_SUFFIXES or path.name in _PHOTO_FOLDERS for path in content)
+
+
+def photos_without_pose(images: Iterable[Path], excluded: Iterable[str] = ()) -> dict[Path, int]:
+    """Return the number of other photos in the folders of ``images``, for folders that contain any. Photos of the names
+    ``excluded`` have an invalid pose."""
+    invalid = {_parts(name)[1] for name in excluded}
+    posed = defaultdict(lambda: set(invalid))
+    for image in images:
+        posed[image.parent].add(_picture_stem(image.name))
+    counts = {}
+    for folder, stems in posed.items():
+        others = {
+            _picture_stem(path.name)
+            for path in folder.iterdir()
+            if path.suffix.lower() in _PICTURE_SUFFIXES and not _NO_PHOTOS.search(path.stem)
+        }
+        if others - stems:
+            counts[folder] = len(others - stems)
+    return counts
+
+
+def _walk(root: Path) -> Iterator[tuple[Path, tuple[str, ...]]]:
+    """Iterate over the pictures below ``root`` in a fixed order, without hidden folders."""
+    seen, count = set(), 0
+    for folder, folders, names in os.walk(root, followlinks=True):
+        inside = Path(folder).relative_to(root).parts
+        real = os.path.realpath(folder)
+        if real in seen:
+            folders.clear()
+            continue
+        seen.add(real)
+        folders[:] = sorted(one for one in folders if not one.startswith(".")) if len(inside) < _MAX_DEPTH else []
+        for name in sorted(names):
+            count += 1
+            if count > _MAX_FILES:
+                return
+            if os.path.splitext(name)[1].lower() in _PICTURE_SUFFIXES and not name.startswith("."):
+                yield Path(folder) / name, tuple(_key(part) for part in inside)
+
+
+def _parts(name: str) -> tuple[tuple[str, ...], str, str]:
+    """Return folders, stem and suffix of a name of any machine, in lower case."""
+    parts = [part for part in re.split(r"[\\/]+", _key(name)) if part not in ("", ".")]
+    while ".." in parts:
+        # The folder above is unknown where the name begins, and left again elsewhere.
+        at = parts.index("..")
+        del parts[max(at - 1, 0) : at + 1]
+    if parts and re.fullmatch(r"[a-z]:|file:", parts[0]):
+        del parts[0]
+    last = PurePath(parts[-1]) if parts else PurePath("")
+    suffix = last.suffix if last.suffix in _PICTURE_SUFFIXES else ""
+    return tuple(parts[:-1]), last.name.removesuffix(suffix), suffix
+
+
+def _key(name: str) -> str:
+    """Return ``name`` in lower case and composed letters, which systems store differently."""
+    return unicodedata.normalize("NFC", name).lower()
+
+
+def _picture_stem(name: str) -> str:
+    stem, suffix = os.path.splitext(_key(name))
+    return stem if suffix in _PICTURE_SUFFIXES else _key(name)
+
+
+def _mask_stem(name: str) -> str:
+    """Return the stem of the photo to which the mask ``name`` belongs: 00.jpg.png, 00_mask.png and 00.png give 00."""
+    stem = _key(name)
+    while True:
+        shorter = _picture_stem(stem)
+        match = _MASK_NAME.fullmatch(shorter)
+        shorter = match[1] if match else shorter
+        if shorter == stem:
+            return stem
+        stem = shorter
+
+
+def _match(candidate: _Candidate, parents: tuple[str, ...]) -> int:
+    """Return the number of last folders that ``candidate`` shares with ``parents``."""
+    count = 0
+    for one, other in zip(reversed(candidate.folders), reversed(parents), strict=False):
+        if one != other:
+            break
+        count += 1
+    return count
+
+
+def _longest_matches(candidates: Sequence[_Candidate], parents: tuple[str, ...]) -> list[_Candidate]:
+    """Return the candidates that share most folders with ``parents``."""
+    longest = max((_match(one, parents) for one in candidates), default=0)
+    return [one for one in candidates if _match(one, parents) == longest]
+
+
+def _with_suffix(candidates: list[_Candidate], suffix: str) -> list[_Candidate]:
+    """Return the candidates with ``suffix``, of those that can be read, if there are any."""
+    candidates = [one for one in candidates if one.suffix not in UNREADABLE_SUFFIXES] or candidates
+    return [one for one in candidates if one.suffix == suffix] or candidates
+
+
+def _only(candidates: list[_Candidate], root: Path) -> FoundFile:
+    """Return the candidate of the best rank, if it is the only one."""
+    if not candidates:
+        return FoundFile(None)
+    best = min(one.rank for one in candidates)
+    chosen = [one for one in candidates if one.rank == best]
+    if len(chosen) > 1:
+        names = " and ".join(os.path.relpath(one.path, root) for one in chosen[:2])
+        return FoundFile(None, f"{len(chosen)} files fit its name, {names}; keep one, or give its folder in the poses")
+    return FoundFile(chosen[0].path, by_name=True)
+
+
+def _stays_inside(name: str) -> bool:
+    """Return True if the relative path ``name`` does not leave its folder."""
+    path = PurePath(name)
+    return not path.is_absolute() and not path.drive and ".." not in path.parts
+
+
+def _inside(path: Path, folder: Path) -> Path | None:
+    """Return ``path``, with ``..`` resolved, relative to ``folder``; None if it is not inside."""
+    resolved, base = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
+    return resolved.relative_to(base) if resolved.is_relative_to(base) else None

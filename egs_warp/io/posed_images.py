@@ -1,0 +1,140 @@
+"""Records of posed photos, and the checks that all readers of camera poses share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.lens import Lens
+from egs_warp.io.limits import MAX_COORDINATE, check_pixels, picture_size
+
+_MAX_FOCAL = 1e3
+"""Maximum focal length in sides of the photo; the minimum is the reciprocal."""
+_MAX_CENTRE = 10.0
+"""Maximum distance of the principal point, in sides of the photo."""
+_MAX_OFFSET = 1e3
+"""Distance of the cameras from the origin, in radii of the camera path, up to which single precision is sufficient."""
+
+_Entry = TypeVar("_Entry")
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """A photo and its camera."""
+
+    name: str
+    camera: Camera
+    image: Path | None
+    """The photo's file; None if it was not found."""
+    lens: Lens | None = None
+    """Distortion of the photo; ``camera`` is then that of the undistorted photo, of the same size."""
+    mask: Path | None = None
+    """File of the photo's mask; None if there is none."""
+    missing: str = ""
+    """Reason why the photo or the mask was not found, if there is a special one."""
+
+
+@dataclass(frozen=True)
+class ExcludedPhoto:
+    """A photo that is not used."""
+
+    name: str
+    reason: str
+    """Reason, for the user."""
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """Contents of a file of camera poses."""
+
+    source: Path
+    """The file, or the folder of the COLMAP model."""
+    images: tuple[PosedImage, ...]
+    """Photos with valid poses, at least one."""
+    excluded: tuple[ExcludedPhoto, ...] = ()
+    """Photos whose pose or camera is invalid."""
+    notes: tuple[str, ...] = ()
+    """Messages for the user about the choice of the files and their content."""
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """The notes, and a line for each excluded camera."""
+        return (*self.notes, *(f"left out camera {one.name}: {one.reason}" for one in self.excluded))
+
+
+def convert_each(
+    entries: Iterable[tuple[str, _Entry]], convert: Callable[[_Entry], _Result], what: str
+) -> tuple[list[_Result], list[ExcludedPhoto]]:
+    """Convert named entries; those that raise ``UserError`` are excluded.
+
+    Raises the first of these errors if no entry can be converted, and ``UserError`` with the message ``what`` if there
+    are no entries.
+    """
+    results, excluded, first = [], [], None
+    for name, entry in entries:
+        try:
+            results.append(convert(entry))
+        except UserError as error:
+            first = first or error
+            excluded.append(ExcludedPhoto(name, str(error)))
+    if not results:
+        raise first or UserError(what)
+    return results, excluded
+
+
+def checked_camera(camera: Camera, what: str) -> Camera:
+    """Return ``camera`` if its values are plausible. Raises ``UserError``, whose message begins with ``what``."""
+    check_pixels(camera.width, camera.height, what)
+    side = max(camera.width, camera.height)
+    focal = np.array([camera.fx, camera.fy]) / side
+    middle = np.array([camera.cx, camera.cy]) / side
+    if not ((focal > 1.0 / _MAX_FOCAL) & (focal < _MAX_FOCAL)).all() or not (abs(middle) < _MAX_CENTRE).all():
+        raise UserError(
+            f"{what}: focal lengths {camera.fx:g}, {camera.fy:g} and middle {camera.cx:g}, {camera.cy:g} fit no photo"
+            f" of {camera.width} x {camera.height} pixels; export the poses again"
+        )
+    if not (abs(camera.translation) < MAX_COORDINATE).all():
+        raise UserError(f"{what}: it lies more than {MAX_COORDINATE:g} units from the origin; export the poses again")
+    return camera
+
+
+def is_rotation(matrix: np.ndarray) -> bool:
+    """Return True if ``matrix`` (3, 3) is a rotation, to three digits."""
+    return bool(np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) and np.linalg.det(matrix) > 0)
+
+
+def size_of_photo(image: Path | None, what: str) -> tuple[int, int]:
+    """Return width and height of a photo as stored, from its header. Raises ``UserError``, whose message begins with
+    ``what``, for a photo that is missing or not readable."""
+    size = picture_size(image, f"{image}: it") if image is not None else None
+    if size is None:
+        raise UserError(f"{what}: the photo cannot be read, and the poses do not contain its size; put it there")
+    return size
+
+
+def near_origin(images: list[PosedImage]) -> tuple[list[PosedImage], str]:
+    """Subtract the offset of georeferenced cameras, which single precision cannot represent.
+
+    Returns the images and a note for the user; empty if nothing was subtracted.
+    """
+    centres = np.array([one.camera.centre for one in images])
+    middle = np.median(centres, axis=0)
+    radius = np.linalg.norm(centres - middle, axis=1).max()
+    if np.linalg.norm(middle) <= _MAX_OFFSET * radius or radius == 0.0:
+        return images, ""
+    offset = np.round(middle)
+    moved = [
+        replace(one, camera=replace(one.camera, translation=one.camera.translation + one.camera.rotation @ offset))
+        for one in images
+    ]
+    return moved, (
+        f"the cameras are {np.linalg.norm(middle):.0f} units from the origin; {', '.join(f'{x:.0f}' for x in offset)}"
+        " was subtracted from their positions"
+    )
