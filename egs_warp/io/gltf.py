@@ -243,9 +243,13 @@ class _Asset:
         splats = _Splats(
             *(raw.means, raw.rotations, raw.log_scales, raw.opacity_logits, raw.sh, raw.antialiased, raw.notes)
         )
-        position = self.tree["accessors"][primitive["attributes"]["POSITION"]] if "attributes" in primitive else {}
-        bounds = np.array([position.get("min", [np.nan] * 3), position.get("max", [np.nan] * 3)], float)
-        if not len(raw.means) or bounds.shape != (2, 3) or not np.isfinite(bounds).all():
+        position: dict[str, Any] = {}
+        if "attributes" in primitive:
+            position = self.tree["accessors"][primitive["attributes"]["POSITION"]]
+        if not len(raw.means) or "min" not in position or "max" not in position:
+            return splats
+        bounds = np.array([position["min"], position["max"]], float)
+        if bounds.shape != (2, 3) or not np.isfinite(bounds).all():
             return splats
         stored = np.stack([raw.means.min(axis=0), raw.means.max(axis=0)])
         turned = np.sort(stored @ _HALF_TURN, axis=0)
