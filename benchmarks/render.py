@@ -21,7 +21,7 @@ import warp as wp
 
 import render_peers as peers
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
 from egs_warp.launching import available_threads
 from egs_warp.render import render_gaussians
 from egs_warp.render.compositing import Background, composite
@@ -136,7 +136,7 @@ def memory_row(*, seed: int) -> Row:
     before = wp.get_mempool_used_mem_current(device)
     picture = render_gaussians(cloud, camera)
     peak = wp.get_mempool_used_mem_high(device) - before
-    capture = sum(array.capacity for array in vars(cloud).values())
+    capture = sum(getattr(cloud, name).capacity for name in ARRAYS)
     return {
         "kind": "memory",
         "gaussians": count,

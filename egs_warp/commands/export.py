@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from egs_warp.commands.flags import SPLAT_FILES, Commands, named_path
+from egs_warp.commands.scene_flags import print_note
 from egs_warp.errors import UserError
 
 EXAMPLES = (
@@ -13,6 +14,8 @@ EXAMPLES = (
     "out/jump --to bundle --out jump.npz",
     "out/jump --to glb --out still --frame 40",
 )
+_WITHOUT_ANTIALIASING = ("splat", "usd")
+"""Formats that cannot state that a capture was trained with antialiasing."""
 
 
 def add_parser(commands: Commands) -> None:
@@ -61,6 +64,8 @@ def _export(args: argparse.Namespace) -> int:
         paths = [args.out]
     else:
         paths = export_splats(run, args.out, args.to, frame=args.frame, every=args.every, degree=args.degree)
+    if run.creature.splats.antialiased and args.to in _WITHOUT_ANTIALIASING:
+        print_note(f"the capture was trained with antialiasing, which {args.to} cannot state; set it in the viewer")
     size = sum(path.stat().st_size for path in paths)
     named = str(paths[0]) if len(paths) == 1 else f"{paths[0]} to {paths[-1].name}"
     print(f"wrote {named} ({size / 1e6:.1f} MB)")

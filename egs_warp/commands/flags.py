@@ -139,6 +139,6 @@ def guessed_up(capture: Capture) -> tuple[np.ndarray, str]:
 
     from egs_warp.segmentation.base_plane import guess_up
 
-    up, reason = guess_up(capture.cloud, capture.up)
-    axis = "xyz"[int(np.argmax(np.abs(up)))]
-    return up, f"up is estimated as {'-' if up.sum() < 0 else '+'}{axis} ({reason}); if that is wrong, give --up"
+    up, reason = guess_up(capture.cloud, capture.up, vertical_axis=capture.vertical_axis)
+    axis = int(np.argmax(np.abs(up)))
+    return up, f"up is estimated as {'-' if up[axis] < 0 else '+'}{'xyz'[axis]} ({reason}); if that is wrong, give --up"

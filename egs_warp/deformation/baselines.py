@@ -148,6 +148,7 @@ class _BaselineDeformer:
             log_scales=wp.empty_like(rest.log_scales),
             opacity_logits=rest.opacity_logits,
             sh=wp.clone(rest.sh),
+            antialiased=rest.antialiased,
         )
         polar_rotations = empty(rest.count, wp.vec4, rest.device)
         outputs = [cloud.means, cloud.rotations, cloud.log_scales, polar_rotations]

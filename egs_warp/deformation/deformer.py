@@ -104,6 +104,7 @@ class Deformer:
                     opacity_logits=cloud.opacity_logits,
                     # Band 0 never changes; without higher bands the colour is the rest cloud's own.
                     sh=wp.clone(cloud.sh) if self._degree else cloud.sh,
+                    antialiased=cloud.antialiased,
                 ),
                 rotations=empty(cloud.count, wp.vec4, cloud.device),
             )

@@ -230,6 +230,7 @@ def _gather(
             log_scales=empty(count, wp.vec3, cloud.device),
             opacity_logits=wp.array(opacity_logits, dtype=wp.float32),
             sh=empty((count, cloud.sh.shape[1]), wp.vec3, cloud.device),
+            antialiased=cloud.antialiased,
         )
         plan = [wp.array(sources, dtype=wp.int32), wp.array(axes, dtype=wp.int32), wp.array(offsets, dtype=wp.float32)]
     launch_rows(

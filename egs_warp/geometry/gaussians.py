@@ -14,6 +14,8 @@ from egs_warp.launching import device_of
 
 SH_BAND_0 = 0.28209479177387814
 """Spherical harmonic of band 0: a colour is 1/2 + SH_BAND_0 x its coefficient, higher bands apart."""
+ARRAYS = ("means", "rotations", "log_scales", "opacity_logits", "sh")
+"""Names of a cloud's arrays, in the order of its constructor."""
 MAX_VALUE, MAX_LOG_SCALE = 1e18, 41.0
 """Limits for any number of a cloud and for the logarithm of a standard deviation: their squares are finite in single
 precision."""
@@ -33,6 +35,9 @@ class GaussianCloud:
     """(n,) float32, finite."""
     sh: wp.array
     """(n, (degree+1)^2) vec3: real spherical-harmonic coefficients of colour, band 0 first, in the INRIA convention."""
+    antialiased: bool = False
+    """True if it was trained with antialiasing (the 3D and 2D filters of Mip-Splatting, gsplat's ``antialiased``): the
+    renderer then dims each splat by the factor by which the low-pass increases its area."""
 
     @classmethod
     def from_numpy(
@@ -43,6 +48,7 @@ class GaussianCloud:
         opacity_logits: np.ndarray,
         sh: np.ndarray,
         *,
+        antialiased: bool = False,
         device: str | None = None,
     ) -> GaussianCloud:
         """Upload (n, 3), (n, 4), (n, 3), (n,), (n, K, 3) arrays; quaternions are normalised.
@@ -91,12 +97,13 @@ class GaussianCloud:
             log_scales=upload(log_scales, wp.vec3),
             opacity_logits=upload(opacity_logits, wp.float32),
             sh=upload(sh, wp.vec3),
+            antialiased=antialiased,
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by the host arrays and the device's name."""
-        arrays = (self.means, self.rotations, self.log_scales, self.opacity_logits, self.sh)
-        return partial(GaussianCloud.from_numpy, device=str(self.device)), tuple(array.numpy() for array in arrays)
+        build = partial(GaussianCloud.from_numpy, antialiased=self.antialiased, device=str(self.device))
+        return build, tuple(getattr(self, name).numpy() for name in ARRAYS)
 
     @property
     def count(self) -> int:
@@ -131,6 +138,7 @@ class GaussianCloud:
             self.log_scales.numpy() + np.log(factor),
             self.opacity_logits.numpy(),
             self.sh.numpy(),
+            antialiased=self.antialiased,
             device=str(self.device),
         )
 
@@ -148,6 +156,7 @@ class GaussianCloud:
             self.log_scales.numpy()[chosen],
             self.opacity_logits.numpy()[chosen],
             self.sh.numpy()[chosen],
+            antialiased=self.antialiased,
             device=str(self.device),
         )
 
@@ -173,7 +182,10 @@ def unit_quaternions(quaternions: np.ndarray) -> np.ndarray:
 
 
 def concatenate(*clouds: GaussianCloud) -> GaussianCloud:
-    """Return one cloud with the Gaussians of all ``clouds`` in turn; all must have the same SH degree."""
+    """Return one cloud with the Gaussians of all ``clouds`` in turn; all must have the same SH degree.
+
+    It is antialiased if all of them are.
+    """
 
     def stack(name: str) -> np.ndarray:
         return np.concatenate([getattr(cloud, name).numpy() for cloud in clouds])
@@ -184,6 +196,7 @@ def concatenate(*clouds: GaussianCloud) -> GaussianCloud:
         stack("log_scales"),
         stack("opacity_logits"),
         stack("sh"),
+        antialiased=all(cloud.antialiased for cloud in clouds),
         device=str(clouds[0].device),
     )
 

@@ -166,6 +166,7 @@ def inpaint(
             f"inpaint: the hole is too narrow: none of its {int(grown.sum())} texels lie in a block of {spacing} x"
             f" {spacing}, the spacing of new Gaussians; make it wider"
         )
+    new = replace(new, antialiased=background.antialiased)
     if options.steps > 0:
         progress(_PAINTING)
         trained = lambda step, _: progress(_PAINTING + (1.0 - _PAINTING) * (step + 1) / options.steps)  # noqa: E731
@@ -338,6 +339,7 @@ def _trained(
         log_scales,
         trained.opacity_logits.numpy(),
         trained.sh.numpy(),
+        antialiased=trained.antialiased,
         device=str(retained.device),
     )
 

@@ -73,7 +73,8 @@ def with_underside(object_cloud: GaussianCloud, ground: HeightField, size: float
     new = flat_gaussians(window, unseen, seen, painted, film, spacing=_SPACING, device=str(object_cloud.device))
     if new is None:
         return object_cloud, 0
-    return concatenate(object_cloud, _of_degree(new, object_cloud.sh.shape[1])), new.count
+    new = replace(_of_degree(new, object_cloud.sh.shape[1]), antialiased=object_cloud.antialiased)
+    return concatenate(object_cloud, new), new.count
 
 
 def _of_degree(cloud: GaussianCloud, coefficients: int) -> GaussianCloud:

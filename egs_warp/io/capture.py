@@ -14,9 +14,9 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.compressed_ply import decode_compressed_ply, is_compressed
 from egs_warp.io.gltf import decode_glb, decode_gltf, is_glb
 from egs_warp.io.limits import FREE_BYTES, INFLATION, MAX_TEXT_BYTES, read_bytes
-from egs_warp.io.outliers import without_outliers
+from egs_warp.io.outliers import without_not_finite, without_outliers
 from egs_warp.io.ply import decode_ply, read_header
-from egs_warp.io.raw import EXTREME_LOGIT, RawCapture, check_finite
+from egs_warp.io.raw import EXTREME_LOGIT, RawCapture
 from egs_warp.io.sog import SogFiles, decode_sog
 from egs_warp.io.splat import SPLAT_ROW, decode_splat
 from egs_warp.io.spz import decode_spz
@@ -37,12 +37,16 @@ class Capture:
     """Number of Gaussians whose opacity logit in the file is infinite (opacity 0 or 1) or beyond 500; read as -16 or
     +16. Formats that store opacity in a byte have none, as their 0 and 255 stand for ranges."""
     up: np.ndarray | None
-    """(3,) float64 unit vector if the format defines the up direction, else None."""
-    antialiased: bool
-    """True if the file states that it was trained with antialiasing (.spz and SOG can); render it with antialiasing,
-    too."""
+    """(3,) float64 unit vector if the format or the file defines the up direction, else None."""
+    vertical_axis: int | None
+    """Index of the vertical axis, if the file names one without a reliable sign."""
     notes: tuple[str, ...]
     """Gaussians left out and values repaired, for the user."""
+
+    @property
+    def antialiased(self) -> bool:
+        """True if the file states that it was trained with antialiasing; the renderer then draws it so."""
+        return self.cloud.antialiased
 
 
 def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
@@ -53,11 +57,10 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
     ``UserError`` with one line for anything that cannot be read.
     """
     source = Path(path)
-    # Values too large for float32 and broken floats need no warning: check_finite reports them.
+    # Values too large for float32 and broken floats need no warning: they are left out and reported.
     with np.errstate(over="ignore", invalid="ignore"):
         raw = _decode(source)
-    check_finite(raw, source)
-    raw = without_outliers(raw, source)
+    raw = without_outliers(without_not_finite(raw, source), source)
     infinite = np.isinf(raw.opacity_logits)
     infinite_count = int(np.count_nonzero(infinite))
     notes = raw.notes
@@ -69,9 +72,10 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
         raw.log_scales,
         np.where(infinite, np.copysign(np.float32(EXTREME_LOGIT), raw.opacity_logits), raw.opacity_logits),
         raw.sh,
+        antialiased=raw.antialiased,
         device=device,
     )
-    return Capture(cloud, source, raw.format, infinite_count, raw.up, raw.antialiased, notes)
+    return Capture(cloud, source, raw.format, infinite_count, raw.up, raw.vertical_axis, notes)
 
 
 def _decode(source: Path) -> RawCapture:

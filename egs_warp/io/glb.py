@@ -41,8 +41,11 @@ def write_glb(path: Path | str, cloud: GaussianCloud) -> None:
         for k, values in enumerate(attributes.values())
     ]
     accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
-    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    splats: dict[str, object] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
+    if cloud.antialiased:
+        # The extension has no property for it.
+        splats |= {"extras": {"antialiased": True}}
     text = json.dumps(
         {
             "asset": {"version": "2.0", "generator": "egs_warp"},

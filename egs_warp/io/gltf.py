@@ -1,28 +1,46 @@
 """Reading of glTF 2.0 with splats: KHR_gaussian_splatting as ratified, in one .glb, or a .gltf with its buffers beside
-it."""
+it.
+
+Splats may be packed by KHR_gaussian_splatting_compression_spz_2 (a .spz in a buffer view). Required extensions that are
+not read are refused, as glTF demands. See https://github.com/KhronosGroup/glTF/tree/main/extensions.
+"""
 
 from __future__ import annotations
 
 import base64
 import binascii
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
+from egs_warp.geometry.affine import is_proper_similarity, transformed_colours, transformed_shapes
+from egs_warp.io.gltf_nodes import INSTANCING, placements
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
-from egs_warp.io.raw import EXTREME_LOGIT, RawCapture
+from egs_warp.io.raw import BAND_4, SH_COUNTS, RawCapture, bands_note, logits_from_opacities
+from egs_warp.io.spz import decode_spz
 from egs_warp.io.text import parse_json
 
 EXTENSION = "KHR_gaussian_splatting"
+_SPZ = (f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz")
+"""Packing by a .spz, as of the draft and as earlier files name it."""
+_SPZ_ALONE = "KHR_spz_gaussian_splats_compression"
+"""Draft of 2025, in place of ``EXTENSION``."""
+_QUANTIZED = "KHR_mesh_quantization"
+_READ = (EXTENSION, *_SPZ, _SPZ_ALONE, INSTANCING, _QUANTIZED)
+_SURFACES = ("KHR_materials_", "EXT_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")
+"""Beginnings of the names of extensions that change only how meshes look."""
+_MAX_COPIES = 1 << 21
+"""Maximum number of Gaussians that instances add to those of the file."""
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_HALF_TURN = np.diag([-1.0, 1.0, -1.0])
+"""Turn about y: from right, up, back, the axes of .spz, to left, up, front."""
 _Y_UP = np.array([0.0, 1.0, 0.0])
 
 
@@ -46,16 +64,20 @@ def decode_glb(data: bytes, source: Path) -> RawCapture:
     text = chunks.get(_JSON, b"")
     if not text or len(text) > MAX_TEXT_BYTES:
         raise UserError(f"{source}: .glb without a JSON chunk of at most {MAX_TEXT_BYTES} bytes; export it again")
-    return _decode(text, source, lambda uri: chunks.get(_BINARY, b"") if uri is None else _buffer(uri, source))
+
+    def read(number: int, uri: str | None) -> bytes | None:
+        if uri is None:
+            return chunks.get(_BINARY, b"") if number == 0 else None
+        return _buffer(uri, source)
+
+    return _decode(text, source, read)
 
 
 def decode_gltf(text: bytes, source: Path) -> RawCapture:
     """Decode a .gltf with buffers beside it or embedded. Raises ``UserError`` as ``decode_glb``."""
 
-    def read(uri: str | None) -> bytes:
-        if uri is None:
-            raise UserError(f"{source}: a buffer without a uri; export it again")
-        return _buffer(uri, source)
+    def read(_: int, uri: str | None) -> bytes | None:
+        return None if uri is None else _buffer(uri, source)
 
     return _decode(text, source, read)
 
@@ -72,7 +94,7 @@ def _buffer(uri: str, source: Path) -> bytes:
     return read_bytes(source.parent / name)
 
 
-def _decode(text: bytes, source: Path, read: Callable[[str | None], bytes]) -> RawCapture:
+def _decode(text: bytes, source: Path, read: Callable[[int, str | None], bytes | None]) -> RawCapture:
     try:
         tree = parse_json(text.decode("utf-8"), source)
         return _Asset(source, tree, read).capture()
@@ -80,58 +102,108 @@ def _decode(text: bytes, source: Path, read: Callable[[str | None], bytes]) -> R
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         if isinstance(error, UserError):
             raise
-        raise UserError(
-            f"{source}: not a glTF file with splats ({type(error).__name__}: {error}); export it again"
-        ) from error
+        raise UserError(f"{source}: malformed glTF ({type(error).__name__}: {error}); export it again") from error
+
+
+@dataclass(frozen=True)
+class _Splats:
+    """Splats of one primitive, in the axes of its mesh."""
+
+    means: np.ndarray
+    """(n, 3) float32."""
+    rotations: np.ndarray
+    """(n, 4) float32, w x y z."""
+    log_scales: np.ndarray
+    """(n, 3) float32."""
+    opacity_logits: np.ndarray
+    """(n,) float32."""
+    sh: np.ndarray
+    """(n, K, 3) float32."""
+    antialiased: bool = False
+    notes: tuple[str, ...] = ()
+
+    def transformed(self, transform: np.ndarray) -> _Splats:
+        """Return the splats after the (4, 4) affine ``transform``."""
+        matrix = transform[:3, :3]
+        means = self.means.astype(np.float64) @ matrix.T + transform[:3, 3]
+        finite = np.isfinite(self.rotations).all(axis=1) & np.isfinite(self.log_scales).all(axis=1)
+        rotations, log_scales = self.rotations.copy(), self.log_scales.copy()
+        rotations[finite], log_scales[finite] = transformed_shapes(rotations[finite], log_scales[finite], matrix)
+        sh = transformed_colours(self.sh, matrix)
+        return replace(self, means=means.astype(np.float32), rotations=rotations, log_scales=log_scales, sh=sh)
 
 
 @dataclass(frozen=True)
 class _Asset:
     source: Path
     tree: dict[str, Any]
-    read: Callable[[str | None], bytes]
+    read: Callable[[int, str | None], bytes | None]
+    """Return the bytes of a buffer, by its number and uri; None if the file does not contain it."""
 
     def capture(self) -> RawCapture:
-        """Return all splats of the file in the axes of their mesh."""
-        primitives = [
-            (number, primitive)
-            for number, mesh in enumerate(self.tree.get("meshes", []))
-            for primitive in mesh["primitives"]
-            if EXTENSION in primitive.get("extensions", {})
-        ]
-        if not primitives:
-            raise UserError(f"{self.source}: glTF without splats ({EXTENSION}); export it as splats, or as .ply")
-        turns = [self._scene_transform(number) for number, _ in primitives]
-        if any(not np.allclose(turn, turns[0], atol=1e-6) for turn in turns[1:]):
-            raise UserError(
-                f"{self.source}: its splats lie under different transforms; apply them, and export it again"
-            )
-        parts = [self._primitive(primitive) for _, primitive in primitives]
-        notes = []
-        if not np.allclose(turns[0], np.eye(4), atol=1e-6):
-            notes.append("the transforms of glTF's nodes were ignored: the capture is in the axes of its mesh")
-        coefficients = min(part["sh"].shape[1] for part in parts)
-        if any(part["sh"].shape[1] != coefficients for part in parts):
-            notes.append("bands of colour that only some meshes have were left out")
-        up = np.linalg.inv(turns[0][:3, :3]) @ _Y_UP
+        """Return all splats of the file: in the axes of their mesh if they share them, else in those of the scene."""
+        self._check_required()
+        meshes = self.tree.get("meshes", [])
+        splats = [[p for p in mesh["primitives"] if _is_splats(p)] for mesh in meshes]
+        if not any(splats):
+            kind = f", only {len(meshes)} meshes" if meshes else ""
+            raise UserError(f"{self.source}: glTF without splats ({EXTENSION}){kind}; export it as splats, or as .ply")
+        placed = placements(self.tree, self.source, self._accessor, lambda mesh: bool(splats[mesh]))
+        parts = {mesh: [self._primitive(p) for p in splats[mesh]] for mesh in {one.mesh for one in placed}}
+        left_out = sum(1 for mesh, found in enumerate(splats) if found and mesh not in parts)
+        notes = dict.fromkeys(note for found in parts.values() for part in found for note in part.notes)
+        if left_out:
+            notes[f"{left_out} meshes of splats that the scene does not show were left out"] = None
+        transforms = np.concatenate([one.transforms for one in placed])
+        up = _Y_UP
+        is_shared = np.allclose(transforms, transforms[0], rtol=1e-7, atol=1e-12)
+        if is_shared and is_proper_similarity(transforms[0, :3, :3]):
+            if not np.allclose(transforms[0], np.eye(4), atol=1e-6):
+                notes["the transforms of glTF's nodes were ignored: the capture is in the axes of its mesh"] = None
+                up = np.linalg.inv(transforms[0, :3, :3]) @ _Y_UP
+            shown = [part for one in placed for _ in one.transforms for part in parts[one.mesh]]
+            self._check_copies(shown, parts)
+        else:
+            self._check_copies([p for one in placed for _ in one.transforms for p in parts[one.mesh]], parts)
+            notes["the transforms of glTF's nodes were applied: the capture is in the axes of the scene"] = None
+            shown = [p.transformed(turn) for one in placed for turn in one.transforms for p in parts[one.mesh]]
+        coefficients = min(part.sh.shape[1] for part in shown)
+        if any(part.sh.shape[1] != coefficients for part in shown):
+            notes["bands of colour that only some meshes have were left out"] = None
         return RawCapture(
             format="glTF (KHR_gaussian_splatting)",
-            means=np.concatenate([part["means"] for part in parts]),
-            rotations=np.concatenate([part["rotations"] for part in parts]),
-            log_scales=np.concatenate([part["log_scales"] for part in parts]),
-            opacity_logits=np.concatenate([part["opacity_logits"] for part in parts]),
-            sh=np.concatenate([part["sh"][:, :coefficients] for part in parts]),
+            means=np.concatenate([part.means for part in shown]),
+            rotations=np.concatenate([part.rotations for part in shown]),
+            log_scales=np.concatenate([part.log_scales for part in shown]),
+            opacity_logits=np.concatenate([part.opacity_logits for part in shown]),
+            sh=np.concatenate([part.sh[:, :coefficients] for part in shown]),
             up=up / np.linalg.norm(up),
+            antialiased=all(part.antialiased for part in shown),
             notes=tuple(notes),
         )
 
-    def _primitive(self, primitive: dict[str, Any]) -> dict[str, np.ndarray]:
-        extension = primitive["extensions"][EXTENSION]
-        packed = [name for name in extension.get("extensions", {}) if "compression" in name]
-        if packed:
+    def _check_required(self) -> None:
+        required = self.tree.get("extensionsRequired", [])
+        unknown = [name for name in required if name not in _READ and not str(name).startswith(_SURFACES)]
+        if unknown:
             raise UserError(
-                f"{self.source}: splats packed by {packed[0]} are not read; export them unpacked, or as .spz"
+                f"{self.source}: it requires {', '.join(map(str, dict.fromkeys(unknown)))}, which is not read; export"
+                " it without, or as .ply or .spz"
             )
+
+    def _check_copies(self, shown: list[_Splats], parts: dict[int, list[_Splats]]) -> None:
+        count = sum(len(part.means) for part in shown)
+        own = sum(len(part.means) for found in parts.values() for part in found)
+        if count > own + _MAX_COPIES:
+            raise UserError(
+                f"{self.source}: its instances make up {count} Gaussians of {own}, at most {_MAX_COPIES} more are"
+                " read; export fewer"
+            )
+
+    def _primitive(self, primitive: dict[str, Any]) -> _Splats:
+        extensions = primitive["extensions"]
+        extension = extensions.get(EXTENSION, {})
+        nested = extension.get("extensions", {})
         if extension.get("kernel", "ellipse") != "ellipse":
             raise UserError(
                 f"{self.source}: splats of the kernel {extension['kernel']!r} are not read; export ellipses"
@@ -141,8 +213,54 @@ class _Asset:
                 f"{self.source}: splats in the colour space {extension['colorSpace']!r}; export"
                 " them in srgb_rec709_display"
             )
-        attributes = primitive["attributes"]
+        packed = next((nested[name] for name in _SPZ if name in nested), extensions.get(_SPZ_ALONE))
+        extras = extension.get("extras")
+        antialiased = isinstance(extras, dict) and extras.get("antialiased") is True
+        if packed is not None:
+            splats = self._packed(primitive, packed)
+        else:
+            others = [name for name in nested if "compression" in name]
+            position = self.tree["accessors"][primitive["attributes"]["POSITION"]]
+            if others and "bufferView" not in position:
+                raise UserError(
+                    f"{self.source}: splats packed by {others[0]} are not read; export them unpacked, or as .spz"
+                )
+            splats = self._unpacked(primitive["attributes"])
+        return replace(splats, antialiased=True) if antialiased else splats
 
+    def _packed(self, primitive: dict[str, Any], packed: dict[str, Any]) -> _Splats:
+        """Decode a .spz.
+
+        It is in the axes of the mesh or, as the draft demands and few tools do, turned about y; the bounds of
+        ``POSITION`` tell which.
+        """
+        view = self.tree["bufferViews"][packed["bufferView"]]
+        start, size = view.get("byteOffset", 0), view["byteLength"]
+        data = self._buffer_of(view)
+        if min(start, size) < 0 or start + size > len(data):
+            raise UserError(f"{self.source}: a packed buffer view extends beyond its buffer; copy or export it again")
+        raw = decode_spz(data[start : start + size], self.source)
+        splats = _Splats(
+            *(raw.means, raw.rotations, raw.log_scales, raw.opacity_logits, raw.sh, raw.antialiased, raw.notes)
+        )
+        position: dict[str, Any] = {}
+        if "attributes" in primitive:
+            position = self.tree["accessors"][primitive["attributes"]["POSITION"]]
+        if not len(raw.means) or "min" not in position or "max" not in position:
+            return splats
+        bounds = np.array([position["min"], position["max"]], float)
+        if bounds.shape != (2, 3) or not np.isfinite(bounds).all():
+            return splats
+        stored = np.stack([raw.means.min(axis=0), raw.means.max(axis=0)])
+        turned = np.sort(stored @ _HALF_TURN, axis=0)
+        tolerance = 0.01 * np.ptp(stored, axis=0).max()
+        if np.abs(turned - bounds).max() < tolerance < np.abs(stored - bounds).max():
+            turn = np.eye(4)
+            turn[:3, :3] = _HALF_TURN
+            return splats.transformed(turn)
+        return splats
+
+    def _unpacked(self, attributes: dict[str, int]) -> _Splats:
         count = len(self._accessor(attributes["POSITION"]))
 
         def of(name: str, width: int = 3) -> np.ndarray:
@@ -154,67 +272,71 @@ class _Asset:
                 )
             return values
 
-        opacity = of(f"{EXTENSION}:OPACITY", 1)[:, 0].astype(np.float64)
+        opacity = of(f"{EXTENSION}:OPACITY", 1)[:, 0]
         scales = of(f"{EXTENSION}:SCALE").astype(np.float64)
+        notes = []
         sh = [of(f"{EXTENSION}:SH_DEGREE_0_COEF_0")]
-        for degree in (1, 2, 3):
+        for degree in (1, 2, 3, 4):
             names = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k}" for k in range(2 * degree + 1)]
-            if not all(name in attributes for name in names):
+            present = sum(name in attributes for name in names)
+            if degree == 4 and present:
+                notes += bands_note(BAND_4)
+            elif present < len(names):
+                if present:
+                    notes.append(f"SH bands from {degree} up left out: band {degree} is not complete")
                 break
-            sh += [of(name) for name in names]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            logits = np.clip(np.log(opacity) - np.log1p(-opacity), -EXTREME_LOGIT, EXTREME_LOGIT)
-            log_scales = np.log(np.maximum(scales, np.finfo(np.float32).tiny))
-        return {
-            "means": of("POSITION"),
-            "rotations": of(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
-            "log_scales": log_scales.astype(np.float32),
-            "opacity_logits": logits.astype(np.float32),
-            "sh": np.stack(sh, axis=1),
-        }
+            elif degree < len(SH_COUNTS):
+                sh += [of(name) for name in names]
+        if (scales < 0.0).any():
+            # A review draft of the extension defined them so.
+            notes.append("scales are negative: read as logarithms")
+            log_scales = scales
+        else:
+            with np.errstate(invalid="ignore"):
+                log_scales = np.log(np.maximum(scales, np.finfo(np.float32).tiny))
+        return _Splats(
+            of("POSITION"),
+            of(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
+            log_scales.astype(np.float32),
+            logits_from_opacities(opacity),
+            np.stack(sh, axis=1),
+            notes=tuple(notes),
+        )
 
     def _accessor(self, number: int) -> np.ndarray:
         """(n, width) float32, unpacked according to the standard."""
         accessor = self.tree["accessors"][number]
+        if "sparse" in accessor or "bufferView" not in accessor:
+            kind = "sparse" if "sparse" in accessor else "without data"
+            raise UserError(f"{self.source}: accessor {number} is {kind}, which is not read; export it in full")
         view = self.tree["bufferViews"][accessor["bufferView"]]
         kind, width, count = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]], accessor["count"]
         stride = view.get("byteStride", kind.itemsize * width)
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        data = self.read(self.tree["buffers"][view["buffer"]].get("uri"))
+        data = self._buffer_of(view)
         end = start + (count - 1) * stride + kind.itemsize * width
-        if "sparse" in accessor or min(start, count - 1) < 0 or stride < kind.itemsize * width or end > len(data):
-            raise UserError(
-                f"{self.source}: accessor {number} extends beyond its buffer, or is sparse; export it again"
-            )
+        if min(start, count - 1) < 0 or stride < kind.itemsize * width or end > len(data):
+            raise UserError(f"{self.source}: accessor {number} extends beyond its buffer; copy or export it again")
         values = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
         if kind.kind == "f":
             return values.astype(np.float32)
         if not accessor.get("normalized", False):
+            if _QUANTIZED in self.tree.get("extensionsUsed", []):
+                return values.astype(np.float32)
             raise UserError(f"{self.source}: accessor {number} has integers that are not normalized; export it again")
         return np.maximum(values / np.float32(np.iinfo(kind).max), -1.0).astype(np.float32)
 
-    def _scene_transform(self, mesh: int) -> np.ndarray:
-        """(4, 4) transform from the mesh to the scene, by the nodes above it."""
-        nodes = self.tree.get("nodes", [])
-        above = {child: number for number, node in enumerate(nodes) for child in node.get("children", [])}
-        number = next((number for number, node in enumerate(nodes) if node.get("mesh") == mesh), None)
-        turn = np.eye(4)
-        for _ in range(len(nodes)):
-            if number is None:
-                break
-            turn = _transform(nodes[number]) @ turn
-            number = above.get(number)
-        if not np.isfinite(turn).all() or abs(np.linalg.det(turn[:3, :3])) < 1e-12:
-            raise UserError(f"{self.source}: a transform of its nodes is flat or not finite; export it again")
-        return turn
+    def _buffer_of(self, view: dict[str, Any]) -> bytes:
+        number = view["buffer"]
+        buffer = self.tree["buffers"][number]
+        data = self.read(number, buffer.get("uri"))
+        if data is None:
+            packing = next((name for name in view.get("extensions", {}) if "compression" in name), None)
+            reason = f"they are packed by {packing}, which is not read" if packing else "it has no uri"
+            raise UserError(f"{self.source}: the data of buffer {number} are missing: {reason}; export it unpacked")
+        return data
 
 
-def _transform(node: dict[str, Any]) -> np.ndarray:
-    if "matrix" in node:
-        return np.array(node["matrix"], float).reshape(4, 4).T
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix() @ np.diag(
-        np.array(node.get("scale", [1, 1, 1]), float)
-    )
-    turn[:3, 3] = node.get("translation", [0, 0, 0])
-    return turn
+def _is_splats(primitive: dict[str, Any]) -> bool:
+    extensions = primitive.get("extensions", {})
+    return EXTENSION in extensions or _SPZ_ALONE in extensions

@@ -24,6 +24,8 @@ MAX_SIDE = 1 << 15
 
 MAX_COORDINATE = 1e12
 """Maximum coordinate, scene units."""
+MIN_LOG_SCALE = -100.0
+"""Minimum logarithm of a standard deviation: below, exp gives 0 in single precision."""
 FREE_GAUSSIANS = 1 << 16
 """Number of Gaussians that a packed capture of any size may declare."""
 INFLATION = 4

@@ -1,6 +1,6 @@
-"""Outlier Gaussians that are errors of a capture: far away, larger than everything, or brighter than any light.
+"""Gaussians that are errors of a capture: not finite, far away, larger than everything, or brighter than any light.
 
-One of them is enough to stall a simulation or to overflow single precision. They are found by bounds that such
+One of them is enough to stall a simulation or to overflow single precision. Outliers are found by bounds that such
 Gaussians do not affect (medians), left out, and reported.
 """
 
@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.io.limits import MAX_COORDINATE
-from egs_warp.io.raw import RawCapture
+from egs_warp.io.limits import MAX_COORDINATE, MIN_LOG_SCALE
+from egs_warp.io.raw import RawCapture, property_names
 
 MAX_DISTANCE_RATIO = 1e4
 """Maximum distance from the capture's middle, in sizes of the capture: skies are some hundred sizes away."""
@@ -21,12 +21,57 @@ MAX_SCALE_RATIO = 1e2
 """Maximum standard deviation of a Gaussian, in sizes of the capture."""
 MAX_SH = 1e3
 """Maximum coefficient of a colour; that of a white surface is 1.8."""
-MIN_LOG_SCALE = -100.0
-"""Log scale below which exp gives 0 in single precision."""
 MAX_LOGIT = 500.0
 """An opacity logit beyond this is treated as infinite."""
 _MAX_OUTLIER_FRACTION = 0.5
 _SHOWN = 3
+
+
+def without_not_finite(raw: RawCapture, source: Path) -> RawCapture:
+    """Return ``raw`` without the Gaussians that have a value that is not finite, with a note of their number.
+
+    An opacity logit may be infinite, and a log scale may be minus infinity: the Gaussian is flat. Raises ``UserError``
+    for a capture without Gaussians, or if most of them are not finite.
+    """
+    count = len(raw.means)
+    if count == 0:
+        raise UserError(f"{source}: it has no Gaussians; export it again from the tool that made it")
+    good = np.ones(count, bool)
+    examples = []
+    for array, names in property_names(raw.sh.shape[1]).items():
+        values = getattr(raw, array).reshape(count, len(names))
+        if array == "opacity_logits":
+            finite = ~np.isnan(values)
+        else:
+            finite = values < np.inf if array == "log_scales" else np.isfinite(values)
+        if finite.all():
+            continue
+        good &= finite.all(axis=1)
+        column = int(np.flatnonzero(~finite.all(axis=0))[0])
+        examples.append((int(np.flatnonzero(~finite[:, column])[0]), names[column]))
+    if not examples:
+        return raw
+    number, name = min(examples)
+    bad = count - int(np.count_nonzero(good))
+    if bad > _MAX_OUTLIER_FRACTION * count:
+        raise UserError(
+            f"{source}: {bad} of {count} Gaussians have a value that is not finite ({name} of number {number});"
+            " export it again"
+        )
+    note = f"{bad} Gaussians left out that have a value that is not finite ({name} of number {number})"
+    return _subset(raw, good, (*raw.notes, note))
+
+
+def _subset(raw: RawCapture, chosen: np.ndarray | slice, notes: tuple[str, ...]) -> RawCapture:
+    return replace(
+        raw,
+        means=raw.means[chosen],
+        rotations=raw.rotations[chosen],
+        log_scales=raw.log_scales[chosen],
+        opacity_logits=raw.opacity_logits[chosen],
+        sh=raw.sh[chosen],
+        notes=notes,
+    )
 
 
 def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
@@ -66,16 +111,12 @@ def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
     without_rotation = int(np.count_nonzero((raw.rotations == 0.0).all(axis=1) & ~out))
     if without_rotation:
         notes = (*notes, f"{without_rotation} Gaussians with a rotation of length 0 read as unrotated")
-    kept = slice(None) if not count else ~out
-    logits = raw.opacity_logits[kept]
+    kept = _subset(raw, slice(None) if not count else ~out, notes)
+    logits = kept.opacity_logits
     return replace(
-        raw,
-        means=raw.means[kept],
-        rotations=raw.rotations[kept],
-        log_scales=np.maximum(raw.log_scales[kept], np.float32(MIN_LOG_SCALE)),
+        kept,
+        log_scales=np.maximum(kept.log_scales, np.float32(MIN_LOG_SCALE)),
         opacity_logits=np.where(np.abs(logits) > MAX_LOGIT, np.copysign(np.float32(np.inf), logits), logits),
-        sh=raw.sh[kept],
-        notes=notes,
     )
 
 

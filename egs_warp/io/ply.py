@@ -1,4 +1,4 @@
-"""Polygon File Format: header, elements, and the INRIA layout of a 3DGS capture.
+"""Polygon File Format: header, elements, and the INRIA layout of a 3DGS capture, with its variants.
 
 Public description: Kerbl et al. 2023, https://github.com/graphdeco-inria/gaussian-splatting (properties of
 ``point_cloud.ply``); PLY itself: G. Turk 1994.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -16,21 +17,27 @@ from typing import Any
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.io.activation import with_logarithms
 from egs_warp.io.atomic import atomic_write
-from egs_warp.io.limits import read_bytes
-from egs_warp.io.raw import RawCapture, property_names
+from egs_warp.io.limits import MIN_LOG_SCALE, read_bytes
+from egs_warp.io.ply_comments import ANTIALIASED_LINE, antialiased_of, up_of
+from egs_warp.io.raw import RawCapture, bands_note, full_bands, logits_from_opacities, property_names
 
 _TYPES = {
-    **{name: "i1" for name in ("char", "int8")},
-    **{name: "u1" for name in ("uchar", "uint8")},
-    **{name: "i2" for name in ("short", "int16")},
-    **{name: "u2" for name in ("ushort", "uint16")},
-    **{name: "i4" for name in ("int", "int32")},
-    **{name: "u4" for name in ("uint", "uint32")},
-    **{name: "f4" for name in ("float", "float32")},
-    **{name: "f8" for name in ("double", "float64")},
+    **dict.fromkeys(("char", "int8", "i1"), "i1"),
+    **dict.fromkeys(("uchar", "uint8", "u1"), "u1"),
+    **dict.fromkeys(("short", "int16", "i2"), "i2"),
+    **dict.fromkeys(("ushort", "uint16", "u2"), "u2"),
+    **dict.fromkeys(("int", "int32", "i4"), "i4"),
+    **dict.fromkeys(("uint", "uint32", "u4"), "u4"),
+    **dict.fromkeys(("int64", "i8"), "i8"),
+    **dict.fromkeys(("uint64", "u8"), "u8"),
+    **dict.fromkeys(("half", "float16", "f2"), "f2"),
+    **dict.fromkeys(("float", "float32", "f4"), "f4"),
+    **dict.fromkeys(("double", "float64", "f8"), "f8"),
 }
+"""Types of properties: those of G. Turk, those with their bits, those of NumPy, and halves, which Babylon.js writes."""
 _BYTE_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": None}
 # A block of this many rows stays in the cache while its columns are gathered one by one.
 _BLOCK_ROWS = 16384
@@ -44,7 +51,7 @@ class PlyElement:
     count: int
     """Number of rows that the header declares."""
     dtype: np.dtype | None
-    """Structured type of one row; None if it contains a list, so that its size is unknown."""
+    """Structured type of one row, possibly without a field; None if it contains a list, so that its size is unknown."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +63,8 @@ class PlyHeader:
     elements: tuple[PlyElement, ...]
     size: int
     """Size of the header in bytes."""
+    comments: tuple[str, ...] = ()
+    """Text of its ``comment`` and ``obj_info`` lines."""
 
     def element(self, name: str) -> PlyElement | None:
         """Return the element called ``name``, or None."""
@@ -69,11 +78,14 @@ def read_header(data: bytes, source: Path) -> PlyHeader:
         raise UserError(f"{source}: truncated: the .ply header has no end_header line; copy or export the file again")
     byte_order: str | None = ""
     elements: list[tuple[str, int, list[tuple[str, str | None]]]] = []
+    comments: list[str] = []
     for line in data[: end.start()].splitlines()[1:]:
         words = line.split()
         match words:
-            case [] | [b"comment", *_] | [b"obj_info", *_]:
+            case []:
                 continue
+            case [b"comment" | b"obj_info", *_]:
+                comments.append(line.strip().partition(b" ")[2].decode("latin-1").strip())
             case [b"format", kind, _] if kind in _BYTE_ORDERS:
                 byte_order = _BYTE_ORDERS[kind]
             case [b"element", name, count] if count.isdigit() and len(count) < 16:
@@ -90,7 +102,8 @@ def read_header(data: bytes, source: Path) -> PlyHeader:
         raise UserError(f"{source}: malformed .ply header, an element occurs twice; export the file again")
     if byte_order == "":
         raise UserError(f"{source}: malformed .ply header, no format line; export the file again")
-    return PlyHeader(byte_order, tuple(_element(source, byte_order, *element) for element in elements), end.end())
+    declared = tuple(_element(source, byte_order, *element) for element in elements)
+    return PlyHeader(byte_order, declared, end.end(), tuple(comments))
 
 
 def _element(
@@ -99,8 +112,6 @@ def _element(
     names = [property_name for property_name, _ in properties]
     if len(set(names)) < len(names):
         raise UserError(f"{source}: malformed .ply header, element {name} repeats a property; export the file again")
-    if not names:
-        raise UserError(f"{source}: malformed .ply header, element {name} has no property; export the file again")
     if any(kind is None for _, kind in properties):
         return PlyElement(name, count, None)
     return PlyElement(name, count, np.dtype([(n, f"{byte_order or '<'}{kind}") for n, kind in properties]))
@@ -138,6 +149,9 @@ def _read_text(data: bytes, header: PlyHeader, names: list[str], source: Path) -
     for element in header.elements:
         if not set(names) - set(arrays):
             break
+        if element.dtype is not None and not element.dtype.names:
+            # Rows without a number are empty lines.
+            continue
         count, start = 0, end
         for line in islice(lines, element.count):
             count, end = count + 1, line.end()
@@ -175,35 +189,103 @@ def columns_as_float32(rows: np.ndarray, names: list[str]) -> np.ndarray:
     return out
 
 
+_COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+"""Names of colours that are not SH coefficients."""
+
+
 def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
     """Decode the INRIA layout: the Gaussians are the rows of element ``vertex``, with properties in any order and of
     any numeric type.
 
-    Raises ``UserError`` for a file of another kind, with the missing properties.
+    Without ``scale_2`` they are flat, as those of 2D Gaussian Splatting. Colours may be red, green and blue instead of
+    SH coefficients, and alpha instead of the opacity's logit. Raises ``UserError`` for a file of another kind.
     """
     vertex = header.element("vertex")
-    present = set((vertex.dtype.names or ()) if vertex is not None and vertex.dtype is not None else ())
-    missing = [name for names in property_names(1).values() for name in names if name not in present]
+    kinds = vertex.dtype if vertex is not None and vertex.dtype is not None else np.dtype([])
+    present = kinds.names or ()
+    columns = property_names(1)
+    flat = "scale_2" not in present
+    if flat:
+        columns["log_scales"] = columns["log_scales"][:2]
+    colours = None
+    if not set(columns["sh"]) <= set(present):
+        colours = next((list(names) for names in _COLOURS if set(names) <= set(present)), None)
+    if "opacity" not in present and "alpha" in present:
+        columns["opacity_logits"] = ["alpha"]
+    rest = 0
+    if colours:
+        columns["sh"] = colours
+    else:
+        rest = _rest_count(present, source)
+        columns["sh"] += [f"f_rest_{c * rest + k}" for k in range(full_bands(rest)) for c in range(3)]
+    missing = [name for names in columns.values() for name in names if name not in present]
     if missing:
-        raise UserError(
-            f"{source}: not a 3DGS capture: element vertex has no {', '.join(missing)}; "
-            "a mesh or a point cloud cannot be animated, train or export it as Gaussians"
-        )
-    rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in present)
-    if rest not in (0, 9, 24, 45) or any(f"f_rest_{i}" not in present for i in range(rest)):
-        raise UserError(
-            f"{source}: {rest} f_rest properties, expected 0, 9, 24 or 45 counted from f_rest_0; export it again"
-        )
+        raise _not_gaussians(header, missing, source)
     rows = read_elements(data, header, ["vertex"], source)["vertex"]
-    arrays = {array: columns_as_float32(rows, names) for array, names in property_names(1 + rest // 3).items()}
-    return RawCapture(
+    arrays = {array: columns_as_float32(rows, names) for array, names in columns.items()}
+    if colours:
+        arrays["sh"] = (_fractions(arrays["sh"], kinds[colours[0]]) - np.float32(0.5)) / np.float32(SH_BAND_0)
+    logits, opacity = arrays["opacity_logits"][:, 0], columns["opacity_logits"][0]
+    if opacity == "alpha" or kinds[opacity].kind == "u":
+        logits = logits_from_opacities(_fractions(logits, kinds[opacity]))
+    scales = arrays["log_scales"]
+    if flat:
+        scales = np.pad(scales, ((0, 0), (0, 1)), constant_values=MIN_LOG_SCALE)
+    up, axis = up_of(header.comments)
+    raw = RawCapture(
         format="INRIA .ply" if header.byte_order else "INRIA .ply (text)",
         means=arrays["means"],
         rotations=arrays["rotations"],
-        log_scales=arrays["log_scales"],
-        opacity_logits=arrays["opacity_logits"][:, 0],
-        sh=arrays["sh"].reshape(len(rows), 1 + rest // 3, 3),
+        log_scales=scales,
+        opacity_logits=logits,
+        sh=arrays["sh"].reshape(len(rows), len(columns["sh"]) // 3, 3),
+        up=up,
+        vertical_axis=axis,
+        antialiased=antialiased_of(header.comments),
+        notes=(*bands_note(rest), *(("no scale_2: read as flat Gaussians (2DGS)",) if flat else ())),
     )
+    return with_logarithms(raw)
+
+
+def _rest_count(present: Sequence[str], source: Path) -> int:
+    """Return the number of SH coefficients above band 0 of each colour channel."""
+    numbers = {int(name[7:]) for name in present if re.fullmatch(r"f_rest_\d{1,6}", name)}
+    if numbers != set(range(len(numbers))) or len(numbers) % 3:
+        raise UserError(
+            f"{source}: {len(numbers)} f_rest properties, expected three times 0, 3, 8 or 15, counted from f_rest_0;"
+            " export it again"
+        )
+    return len(numbers) // 3
+
+
+def _fractions(values: np.ndarray, kind: np.dtype) -> np.ndarray:
+    """Return colours or opacities as 0 ... 1; integers cover the range of their type, floats 0 ... 1 or 0 ... 255."""
+    if kind.kind == "u":
+        return values / np.float32(np.iinfo(kind).max)
+    return values / np.float32(255.0) if np.nanmax(values, initial=0.0) > 1.0 else values
+
+
+def _not_gaussians(header: PlyHeader, missing: list[str], source: Path) -> UserError:
+    """Return the error for a .ply whose vertices lack the properties ``missing``."""
+    vertex = header.element("vertex")
+    if vertex is None:
+        names = ", ".join(element.name for element in header.elements) or "none"
+        return UserError(
+            f"{source}: not a 3DGS capture: no element vertex (elements: {names}); give a .ply of Gaussians"
+        )
+    if vertex.dtype is None:
+        return UserError(
+            f"{source}: not a 3DGS capture: element vertex has a list property; give a .ply of Gaussians without one"
+        )
+    lacking = f"{source}: not a 3DGS capture: element vertex has no {', '.join(missing)}"
+    if any(re.match(r"(f_dc|scale|rot|opacity)", name) for name in vertex.dtype.names or ()):
+        return UserError(f"{lacking}, but other properties of Gaussians; export it with all of them")
+    faces = next((element.count for element in header.elements if element.name in ("face", "tristrips")), 0)
+    if faces:
+        return UserError(
+            f"{lacking}; it is a mesh of {faces} faces, which cannot be animated, train or export it as Gaussians"
+        )
+    return UserError(f"{lacking}; it is a point cloud, which cannot be animated, train or export it as Gaussians")
 
 
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -252,7 +334,7 @@ def ply_bytes(cloud: GaussianCloud) -> bytes:
     rows[:, -8] = cloud.opacity_logits.numpy()
     rows[:, -7:-4] = cloud.log_scales.numpy()
     rows[:, -4:] = cloud.rotations.numpy()
-    header = "ply\nformat binary_little_endian 1.0\n"
+    header = "ply\nformat binary_little_endian 1.0\n" + ANTIALIASED_LINE * cloud.antialiased
     header += f"element vertex {count}\n" + "".join(f"property float {name}\n" for name in names) + "end_header\n"
     return header.encode() + rows.tobytes()
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import unit_quaternions
 
 EXTREME_LOGIT = 16.0
 """Value for an infinite opacity logit: 1 - opacity is then 1e-7, below half a step of float32 at 1."""
+SH_COUNTS = (0, 3, 8, 15)
+"""Number of SH coefficients above band 0 of degree 0 to 3."""
+BAND_4 = 24
+"""Number of SH coefficients above band 0 of degree 4, which is not rendered."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,9 @@ class RawCapture:
     sh: np.ndarray
     """(n, (degree+1)^2, 3) float32, coefficient-major."""
     up: np.ndarray | None = None
-    """(3,) float64 unit vector, if the format defines the up direction."""
+    """(3,) float64 unit vector, if the format or the file defines the up direction."""
+    vertical_axis: int | None = None
+    """Index of the vertical axis, if the file names one without a reliable sign."""
     antialiased: bool = False
     """True if the file states that it was trained with antialiasing."""
     notes: tuple[str, ...] = ()
@@ -51,22 +55,20 @@ def property_names(coefficient_count: int) -> dict[str, list[str]]:
     }
 
 
-def check_finite(raw: RawCapture, source: Path) -> None:
-    """Raise ``UserError`` for the first property with a value that is not finite; an opacity may be infinite."""
-    count = len(raw.means)
-    if count == 0:
-        raise UserError(f"{source}: it has no Gaussians; export it again from the tool that made it")
-    for array, names in property_names(raw.sh.shape[1]).items():
-        values = getattr(raw, array).reshape(count, len(names))
-        finite = ~np.isnan(values) if array == "opacity_logits" else np.isfinite(values)
-        if finite.all():
-            continue
-        column = int(np.flatnonzero(~finite.all(axis=0))[0])
-        not_finite = np.flatnonzero(~finite[:, column])
-        raise UserError(
-            f"{source}: {names[column]} of {len(not_finite)} Gaussians is not finite (first: number {not_finite[0]}); "
-            "remove them and export again"
-        )
+def full_bands(rest: int) -> int:
+    """Return how many of ``rest`` SH coefficients above band 0 make up complete bands that are rendered: 0, 3, 8 or
+    15."""
+    return max(count for count in SH_COUNTS if count <= rest)
+
+
+def bands_note(rest: int) -> tuple[str, ...]:
+    """Return the note for the user if only ``full_bands`` of ``rest`` SH coefficients are read; none if all are."""
+    extra = rest - full_bands(rest)
+    if not extra:
+        return ()
+    if rest == BAND_4:
+        return ("SH band 4 left out (degrees 0 to 3 are rendered)",)
+    return (f"{extra} of {rest} SH coefficients above band 0 left out: they make up no complete band of degree 1 to 3",)
 
 
 def logits_from_bytes(alphas: np.ndarray) -> np.ndarray:
@@ -74,6 +76,14 @@ def logits_from_bytes(alphas: np.ndarray) -> np.ndarray:
     opacity = np.arange(1, 255) / 255.0
     table = np.concatenate([[-EXTREME_LOGIT], np.log(opacity / (1.0 - opacity)), [EXTREME_LOGIT]])
     return table.astype(np.float32)[alphas]
+
+
+def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
+    """Float32 opacity logits of opacities of 0 to 1; both ends give -+``EXTREME_LOGIT``."""
+    values = opacities.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logits = np.log(values) - np.log1p(-values)
+    return np.clip(logits, -EXTREME_LOGIT, EXTREME_LOGIT).astype(np.float32)
 
 
 def bytes_from_logits(logits: np.ndarray) -> np.ndarray:

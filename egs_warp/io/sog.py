@@ -17,9 +17,9 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.io.limits import check_count, check_pixels, picture_size
-from egs_warp.io.raw import RawCapture, largest_restored, logits_from_bytes
+from egs_warp.io.raw import BAND_4, SH_COUNTS, RawCapture, bands_note, full_bands, largest_restored, logits_from_bytes
 
-_SH_COUNTS = (0, 3, 8, 15)
+_SH_COUNTS = (*SH_COUNTS, BAND_4)
 LABELS_PER_ROW = 64
 _MAX_LABELS = 1 << 16
 _PIXELS_PER_VALUE, _FREE_PIXELS = 2, 1 << 12
@@ -73,6 +73,12 @@ class SogMeta:
         for key in keys:
             value = value.get(key) if isinstance(value, dict) else None
         return value
+
+    @property
+    def antialiased(self) -> bool:
+        """True if the capture was trained with antialiasing: ``antialias`` of the description, ``model`` of
+        splat-transform."""
+        return self.entry("antialias") is True or self.entry("model") == "antialiased"
 
     def numbers(self, *keys: str, count: int) -> np.ndarray:
         """(count,) float64, finite."""
@@ -154,8 +160,9 @@ def decode_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
         rotations=_decode_quaternions(quaternions),
         log_scales=log_scales.astype(np.float32),
         opacity_logits=opacity_logits.astype(np.float32),
-        sh=np.concatenate([f_dc.astype(np.float32)[:, None], rest], axis=1),
-        antialiased=meta.entry("antialias") is True,
+        sh=np.concatenate([f_dc.astype(np.float32)[:, None], rest[:, : full_bands(rest.shape[1])]], axis=1),
+        antialiased=meta.antialiased,
+        notes=bands_note(rest.shape[1]),
     )
 
 
@@ -186,8 +193,8 @@ def _decode_rest(meta: SogMeta, files: SogFiles, version: int, pixels: Callable[
         coefficients = _SH_COUNTS[bands] if bands < len(_SH_COUNTS) else -1
     if coefficients not in _SH_COUNTS or width != LABELS_PER_ROW * coefficients:
         raise UserError(
-            f"{files.source}: {centroids_name} is {width} pixels wide, expected 192, 512 or 960 (SH degree 1, 2 or 3); "
-            "export the capture again"
+            f"{files.source}: {centroids_name} is {width} pixels wide, expected 192, 512, 960 or 1536 (SH degree"
+            " 1 to 4); export the capture again"
         )
     if version == 2:
         values = meta.code_book("shN")

@@ -56,6 +56,9 @@ def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = Fals
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": colour_book.tolist(), "files": ["sh0.webp"]},
     }
+    if cloud.antialiased:
+        # The entry of the description, and that of splat-transform.
+        meta |= {"antialias": True, "model": "antialiased"}
     if cloud.sh_degree > 0:
         palette, labels = _palette(sh[:, 1:].reshape(len(sh), -1))
         sh_book, centroids = _code_book(palette)

@@ -18,11 +18,17 @@ from egs_warp.io.raw import RawCapture, byte, bytes_from_logits, logits_from_byt
 _ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
 SPLAT_ROW = _ROW.itemsize
 """Bytes of one Gaussian."""
+_MAX_NEGATIVE = 0.5
+"""Fraction of Gaussians with a negative scale up to which a file is taken for a .splat."""
 _MIN_SCALE = float(np.finfo(np.float32).tiny)
 
 
 def decode_splat(data: bytes, source: Path) -> RawCapture:
-    """Decode a .splat. Raises ``UserError`` for one that ends inside a Gaussian or has a negative scale."""
+    """Decode a .splat.
+
+    A few negative scales become NaN. Raises ``UserError`` for a file that ends inside a Gaussian, or in which more than
+    half of the scales are negative.
+    """
     if len(data) % _ROW.itemsize:
         whole = len(data) // _ROW.itemsize
         raise UserError(
@@ -32,7 +38,7 @@ def decode_splat(data: bytes, source: Path) -> RawCapture:
     rows = np.frombuffer(data, _ROW)
     scales = rows["scale"]
     negative = np.flatnonzero((scales < 0).any(axis=1))
-    if len(negative):
+    if len(negative) > _MAX_NEGATIVE * len(rows):
         raise UserError(
             f"{source}: scale of {len(negative)} Gaussians is negative (first: number {negative[0]}); "
             "if the file is a .splat, export it again"
@@ -40,11 +46,13 @@ def decode_splat(data: bytes, source: Path) -> RawCapture:
     # In float32, exp of less than -104 is 0: such Gaussians arrive with scale 0.
     zero = int(np.count_nonzero((scales == 0).any(axis=1)))
     colour = rows["colour"]
+    with np.errstate(invalid="ignore"):
+        log_scales = np.log(np.where(scales == 0, np.float32(_MIN_SCALE), scales))
     return RawCapture(
         format=".splat",
         means=np.ascontiguousarray(rows["position"]),
         rotations=(rows["rotation"].astype(np.float32) - np.float32(128.0)) / np.float32(128.0),
-        log_scales=np.log(np.where(scales == 0, np.float32(_MIN_SCALE), scales)),
+        log_scales=log_scales,
         opacity_logits=logits_from_bytes(colour[:, 3]),
         sh=((colour[:, None, :3] / 255.0 - 0.5) / SH_BAND_0).astype(np.float32),
         notes=(f"{zero} Gaussians with a scale of 0 read as {_MIN_SCALE:.0e}",) if zero else (),

@@ -11,24 +11,29 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from egs_warp.errors import UserError
+from egs_warp.geometry.affine import transformed_colours, transformed_shapes
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import check_count
 from egs_warp.io.raw import (
+    BAND_4,
+    SH_COUNTS,
     RawCapture,
+    bands_note,
     byte,
     bytes_from_logits,
+    full_bands,
     largest_dropped,
     largest_restored,
     logits_from_bytes,
 )
-from egs_warp.io.spz_streams import deflate_streams, inflate_streams, stored_up_axis
+from egs_warp.io.spz_streams import deflate_streams, inflate_streams, stored_axes
 
 _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")
@@ -37,8 +42,7 @@ _FRACTIONAL_BITS = 12
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 _MAX_EXTENSION_BYTES = 1 << 20
 _MAX_FRACTIONAL_BITS = 24
-_SH_COUNTS = (0, 3, 8, 15, 24)
-_MAX_SH_COUNT = 15
+_SH_COUNTS = (*SH_COUNTS, BAND_4)
 # Precision of higher SH numbers, as in the reference writer: finer steps would only increase the gzip size.
 _BAND1_STEP, _REST_STEP = 8, 16
 
@@ -68,13 +72,13 @@ def decode_spz(data: bytes, source: Path) -> RawCapture:
     gzipped = data[:2] == b"\x1f\x8b"
     header = _inflated(inflate, data, _HEADER.size, source) if gzipped else data[: _HEADER.size]
     layout = _layout(header, gzipped, source)
-    up = None
+    axes = None
     if layout.version == 4:
         if gzipped:
             raise UserError(f"{source}: .spz version 4 inside gzip; unpack it first")
         check_count(layout.count, len(data), source)
         body = header + inflate_streams(data, [layout.count * width for width in layout.widths], source)
-        up = stored_up_axis(data, source) if layout.flags & _HAS_EXTENSIONS else None
+        axes = stored_axes(data, source) if layout.flags & _HAS_EXTENSIONS else None
     elif gzipped:
         check_count(layout.count, len(data), source)
         body = header + _inflated(inflate, inflate.unconsumed_tail, layout.size - len(header), source)
@@ -84,7 +88,23 @@ def decode_spz(data: bytes, source: Path) -> RawCapture:
         body = data
     if len(body) < layout.size:
         raise _truncated(source, layout, str(len(body)))
-    return _decode(body, layout, np.array([0.0, 1.0, 0.0]) if up is None else up)
+    up, is_left_handed = axes or (np.array([0.0, 1.0, 0.0]), False)
+    raw = _decode(body, layout, up)
+    return _mirrored(raw) if is_left_handed else raw
+
+
+def _mirrored(raw: RawCapture) -> RawCapture:
+    """Return ``raw`` with the first axis reversed, which is to the left or to the right in all axis systems of .spz."""
+    mirror = np.diag([-1.0, 1.0, 1.0])
+    rotations, log_scales = transformed_shapes(raw.rotations, raw.log_scales, mirror)
+    return replace(
+        raw,
+        means=raw.means * np.float32([-1.0, 1.0, 1.0]),
+        rotations=rotations,
+        log_scales=log_scales,
+        sh=transformed_colours(raw.sh, mirror),
+        notes=(*raw.notes, "left-handed axes: x was reversed"),
+    )
 
 
 def _inflated(inflate: zlib._Decompress, data: bytes, size: int, source: Path) -> bytes:
@@ -140,11 +160,11 @@ def _decode(body: bytes, layout: _Layout, up: np.ndarray) -> RawCapture:
         # Shifting up and down again extends the sign bit.
         fixed = ((low << 8 | middle << 16 | high << 24) >> 8).astype(np.float64)
         means = np.ldexp(fixed, -layout.fractional_bits).astype(np.float32)
-    rest = (sh.reshape(layout.count, layout.sh_count, 3)[:, :_MAX_SH_COUNT] - np.float32(128.0)) / np.float32(128.0)
+    rest = (
+        sh.reshape(layout.count, layout.sh_count, 3)[:, : full_bands(layout.sh_count)] - np.float32(128.0)
+    ) / np.float32(128.0)
     f_dc = ((colours / 255.0 - 0.5) / _COLOUR_SCALE).astype(np.float32)
-    notes = []
-    if layout.sh_count > _MAX_SH_COUNT:
-        notes.append("SH band 4 left out (degrees 0 to 3 are rendered)")
+    notes = [*bands_note(layout.sh_count)]
     if layout.flags & _HAS_EXTENSIONS:
         notes.append("vendor extensions left out")
     return RawCapture(
@@ -192,7 +212,7 @@ def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> No
         )
     fixed = np.rint(np.ldexp(means, bits)).astype(np.int32)
     sh = cloud.sh.numpy()
-    header = _HEADER.pack(_MAGIC, version, cloud.count, cloud.sh_degree, bits, 0, 0)
+    header = _HEADER.pack(_MAGIC, version, cloud.count, cloud.sh_degree, bits, _ANTIALIASED * cloud.antialiased, 0)
     quaternions = cloud.rotations.numpy()
     if version >= 3:
         three, largest = largest_dropped(quaternions[:, [1, 2, 3, 0]])

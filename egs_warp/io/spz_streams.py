@@ -77,11 +77,8 @@ def deflate_streams(header: bytes, blocks: Sequence[bytes]) -> list[bytes]:
     return [header[:_COMMON] + struct.pack("<BI12x", len(nonempty), _HEADER.size), table, *streams]
 
 
-def stored_up_axis(data: bytes, source: Path) -> np.ndarray | None:
-    """(3,) up, if an extension specifies the directions of the axes; None without one.
-
-    Raises ``UserError`` for left-handed axes: the capture would be mirrored.
-    """
+def stored_axes(data: bytes, source: Path) -> tuple[np.ndarray, bool] | None:
+    """(3,) up, and True if the axes are left-handed, if an extension specifies their directions; None without one."""
     table, _ = _table(data, source)
     place = _HEADER.size
     while place + _RECORD.size <= table:
@@ -89,7 +86,7 @@ def stored_up_axis(data: bytes, source: Path) -> np.ndarray | None:
         place += _RECORD.size
         if kind == _COORDINATES and size == 4 and place + 4 <= table:
             (number,) = struct.unpack_from("<I", data, place)
-            return _up_of(_AXES[number], source) if 0 < number < len(_AXES) else None
+            return _directions(_AXES[number]) if 0 < number < len(_AXES) else None
         place += size
     return None
 
@@ -106,11 +103,9 @@ def _table(data: bytes, source: Path) -> tuple[int, int]:
     return table, count
 
 
-def _up_of(axes: str, source: Path) -> np.ndarray:
+def _directions(axes: str) -> tuple[np.ndarray, bool]:
     signs = {letter: 1.0 if letter in "RUB" else -1.0 for letter in axes}
     hand = np.prod([signs[letter] for letter in axes])
     if axes[1] in "FB":
         hand = -hand
-    if hand < 0:
-        raise UserError(f"{source}: .spz in left-handed axes ({axes}), which would be mirrored; export it in RUB")
-    return np.array([signs[letter] if letter in "UD" else 0.0 for letter in axes])
+    return np.array([signs[letter] if letter in "UD" else 0.0 for letter in axes]), bool(hand < 0)

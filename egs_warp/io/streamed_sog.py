@@ -33,7 +33,8 @@ def decode_streamed_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
         ranges.setdefault(file, []).append((start, start + count))
     if not ranges:
         raise UserError(f"{files.source}: it has no Gaussians; export it again from the tool that made it")
-    return _concatenated([_part(files, names[file], ranges[file]) for file in sorted(ranges)])
+    parts = [_part(files, names[file], ranges[file]) for file in sorted(ranges)]
+    return _concatenated(parts, antialiased=meta.antialiased or all(part.antialiased for part in parts))
 
 
 def _leaves(tree: dict, files: SogFiles) -> Iterator[tuple[int, int, int]]:
@@ -75,10 +76,11 @@ def _part(files: SogFiles, name: str, ranges: list[tuple[int, int]]) -> RawCaptu
         opacity_logits=part.opacity_logits[chosen],
         sh=part.sh[chosen],
         antialiased=part.antialiased,
+        notes=part.notes,
     )
 
 
-def _concatenated(parts: list[RawCapture]) -> RawCapture:
+def _concatenated(parts: list[RawCapture], *, antialiased: bool) -> RawCapture:
     coefficients = max(part.sh.shape[1] for part in parts)
     sh = [np.pad(part.sh, ((0, 0), (0, coefficients - part.sh.shape[1]), (0, 0))) for part in parts]
     return RawCapture(
@@ -88,6 +90,6 @@ def _concatenated(parts: list[RawCapture]) -> RawCapture:
         log_scales=np.concatenate([part.log_scales for part in parts]),
         opacity_logits=np.concatenate([part.opacity_logits for part in parts]),
         sh=np.concatenate(sh),
-        antialiased=all(part.antialiased for part in parts),
-        notes=("finest level of detail",),
+        antialiased=antialiased,
+        notes=("finest level of detail", *dict.fromkeys(note for part in parts for note in part.notes)),
     )

@@ -69,6 +69,7 @@ def body_gaussians(cloud: GaussianCloud, frame: BodyFrame) -> GaussianCloud:
         np.rint(_STEPS_PER_E * sizes) / _STEPS_PER_E,
         cloud.opacity_logits.numpy(),
         cloud.sh.numpy()[:, :1],
+        antialiased=cloud.antialiased,
         device=str(cloud.device),
     )
     return body.subset(canonical_order(body))

@@ -49,6 +49,7 @@ def export_bundle(run: FinishedRun, path: Path, *, every: int = 1, degree: int |
         "log_scales": splats.log_scales.numpy(),
         "opacity_logits": splats.opacity_logits.numpy(),
         "sh": splats.sh.numpy(),
+        "antialiased": np.bool_(splats.antialiased),
         "rest_nodes": t.rest_positions,
         "tets": t.tets.astype(np.int32),
         "nodes": t.positions[run.steps[frames]].astype(np.float32),

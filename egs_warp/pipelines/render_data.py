@@ -12,7 +12,7 @@ import scipy.sparse as sp
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
 from egs_warp.io.arrays import READ_ERRORS, read_npz
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import MAX_COORDINATE, check_pixels
@@ -20,7 +20,6 @@ from egs_warp.motions.feet import Foot
 from egs_warp.muscles.muscle_set import MuscleSet
 
 FILE = "creature.npz"
-_SPLATS = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 _CAMERA = ("rotation", "translation", "width", "height", "fx", "fy", "cx", "cy", "near", "far")
 
 
@@ -70,7 +69,8 @@ class RenderData:
 
     def save(self, path: Path) -> None:
         """Write ``creature.npz`` (docs/guide/report.md); equal creatures give equal bytes."""
-        arrays: dict[str, Any] = {name: getattr(self.splats, name).numpy() for name in _SPLATS}
+        arrays: dict[str, Any] = {name: getattr(self.splats, name).numpy() for name in ARRAYS}
+        arrays["antialiased"] = np.bool_(self.splats.antialiased)
         arrays |= {f"camera_{name}": np.asarray(getattr(self.camera, name)) for name in _CAMERA}
         arrays |= {
             "muscle_end_starts": self.muscle_ends.indptr.astype(np.int32),
@@ -97,7 +97,12 @@ class RenderData:
             starts = arrays["muscle_end_starts"]
             rows = (arrays["muscle_end_weights"], arrays["muscle_end_nodes"], starts)
             data = cls(
-                GaussianCloud.from_numpy(*(arrays[name] for name in _SPLATS), device=device),
+                GaussianCloud.from_numpy(
+                    *(arrays[name] for name in ARRAYS),
+                    # Runs of earlier versions do not have it.
+                    antialiased=bool(arrays.get("antialiased", False)),
+                    device=device,
+                ),
                 Camera(**whole, **real, rotation=camera["rotation"], translation=camera["translation"]),
                 sp.csr_matrix(rows, shape=(len(starts) - 1, node_count)),
                 arrays["muscle_segments"],

@@ -15,15 +15,13 @@ import warp as wp
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
 from egs_warp.launching import available_threads, warp_stream
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import PendingImage, RenderedImage
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
 from egs_warp.render.rasteriser import background_of, tile_mask_array, translate_out_of_memory
 from egs_warp.render.tiles import TileLists
-
-_ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
 
 @dataclass(frozen=True)
@@ -101,7 +99,7 @@ def _check_tensors(*attributes: torch.Tensor) -> None:
     for number, (tensor, shape) in enumerate(zip(attributes, shapes, strict=True)):
         if tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device != device:
             raise UserError(
-                f"render: {_ATTRIBUTES[number]} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device},"
+                f"render: {ARRAYS[number]} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device},"
                 f" expected {shape} float32 on {device}"
             )
 

@@ -105,16 +105,16 @@ def backward(
             threads=threads,
             work=lists.tile_work,
         )
-    by_attributes = onto or GaussianCloud(
-        *empty_pooled(
+    if onto is None:
+        means, rotations, log_scales, opacity_logits, sh = empty_pooled(
             device,
             *((count, wp.vec3), (count, wp.vec4), (count, wp.vec3), (count, wp.float32)),
             (cloud.sh.shape, wp.vec3),
         )
-    )
+        onto = GaussianCloud(means, rotations, log_scales, opacity_logits, sh)
     gradients = CloudGradients(
-        *(by_attributes.means, by_attributes.rotations, by_attributes.log_scales),
-        *(by_attributes.opacity_logits, by_attributes.sh),
+        *(onto.means, onto.rotations, onto.log_scales),
+        *(onto.opacity_logits, onto.sh),
         screen=empty(count, wp.vec2, device) if want_screen else None,
         pose_rotation=empty(count, wp.mat33, device) if want_pose else None,
         pose_translation=empty(count, wp.vec3, device) if want_pose else None,

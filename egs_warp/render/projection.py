@@ -15,11 +15,9 @@ import warp as wp
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
 from egs_warp.kernels.render.projection import NOT_FINITE, View, project_kernel
 from egs_warp.launching import device_of, empty, empty_pooled, launch_rows
-
-_ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int)
     launch_rows(
         project_kernel,
         count,
-        inputs=[view, int(antialiased), *(getattr(cloud, name) for name in _ATTRIBUTES)],
+        inputs=[view, int(antialiased), *(getattr(cloud, name) for name in ARRAYS)],
         outputs=[ellipse, falloff, colour_depth, tile_count],
         device=device,
         threads=threads,
@@ -159,7 +157,7 @@ def _too_many(cloud: GaussianCloud, view: Any, slot_end: np.ndarray) -> UserErro
             f"render: {cloud.count} Gaussians cover {slot_end[-1]} tiles of {view.width} x {view.height} pixels, more"
             " than 2^30; render a smaller image or fewer Gaussians"
         )
-    finite = {name: bool(np.isfinite(getattr(cloud, name).numpy()[bad[0]]).all()) for name in _ATTRIBUTES}
+    finite = {name: bool(np.isfinite(getattr(cloud, name).numpy()[bad[0]]).all()) for name in ARRAYS}
     # Finite coefficients may still sum to a non-finite colour.
     attribute = next((name for name, is_finite in finite.items() if not is_finite), "sh")
     return UserError(f"render: {attribute} of Gaussian {bad[0]} is not finite; repair or remove it")

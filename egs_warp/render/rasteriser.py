@@ -29,7 +29,7 @@ def render_gaussians(
     camera: Camera,
     *,
     background: tuple[float, float, float] | np.ndarray | wp.array = (1.0, 1.0, 1.0),
-    antialiased: bool = False,
+    antialiased: bool | None = None,
     geometry: bool = False,
     mask: np.ndarray | None = None,
     threads: int | None = None,
@@ -40,7 +40,8 @@ def render_gaussians(
         cloud: Gaussians.
         camera: camera.
         background: one colour, or an image (H, W, 3) of this camera's size.
-        antialiased: dim each splat by the factor by which the 0.3 px low-pass increases its area.
+        antialiased: dim each splat by the factor by which the 0.3 px low-pass increases its area; None: as ``cloud``
+            was trained.
         geometry: add median depth, its splats and normals.
         mask: one bool for each tile of 16 x 16 pixels from the top left; tiles that are False show the background
             alone.
@@ -65,13 +66,15 @@ def enqueue_image(
     camera: Camera,
     *,
     background: tuple[float, float, float] | np.ndarray | wp.array = (1.0, 1.0, 1.0),
-    antialiased: bool = False,
+    antialiased: bool | None = None,
     mask: np.ndarray | None = None,
     threads: int | None = None,
 ) -> PendingImage:
     """Queue the image of ``render_gaussians`` without waiting; ``PendingImage.result`` waits for it."""
     threads = threads or available_threads()
     view = view_from_camera(camera)
+    if antialiased is None:
+        antialiased = cloud.antialiased
     with translate_out_of_memory(cloud, camera):
         behind = background_of(background, camera, cloud.device)
         tile_mask = tile_mask_array(mask, camera, cloud.device)

@@ -137,25 +137,31 @@ def _mass_quantile(values: np.ndarray, masses: np.ndarray, share: float) -> floa
     return float(values[order][min(int(np.searchsorted(mass, share * mass[-1])), len(values) - 1)])
 
 
-def guess_up(cloud: GaussianCloud, capture_format_up: np.ndarray | None = None) -> tuple[np.ndarray, str]:
-    """Return up (3,), unit, and the reason, for the user: the format's own up if it has one, else the best of the six
-    axes.
+def guess_up(
+    cloud: GaussianCloud, capture_format_up: np.ndarray | None = None, *, vertical_axis: int | None = None
+) -> tuple[np.ndarray, str]:
+    """Return up (3,), unit, and the reason, for the user: the file's own up if it has one, else the best of the six
+    axes, or of the two directions of ``vertical_axis``, the positive one unless the other is clearly better.
 
     An object rests on the side where its support is wide, level, and well below its weight. The score of an axis is the
     sum of three numbers: the area of the support polygon as a fraction of the silhouette seen along the axis, the
     fraction of low columns that end at one level, and the depth of the centre of opacity inside the polygon.
     """
     if capture_format_up is not None:
-        return np.asarray(capture_format_up, dtype=np.float64), "the file format defines it"
+        return np.asarray(capture_format_up, dtype=np.float64), "the file defines it"
     scores = []
     near, _ = _ordered(cloud)
     near = near.subset(np.arange(0, near.count, -(-near.count // _MAX_GAUSSIANS)))
-    for axis in range(3):
+    for axis in range(3) if vertical_axis is None else (vertical_axis,):
         for sign in (1.0, -1.0):
             up = np.zeros(3)
             up[axis] = sign
             shape = _support_shape(near, up)
             scores.append((shape.polygon + shape.level + shape.depth + _AXIS_BONUS[axis], shape, up))
+    if vertical_axis is not None:
+        clearly_down = scores[1][0] - scores[0][0] > _CLEAR_MARGIN
+        reason = f"the file names the axis {_AXIS_NAMES[vertical_axis]}, and its direction is guessed"
+        return scores[1 if clearly_down else 0][2], reason
     # Python's sort is stable, so a tie goes to the earlier axis.
     scores.sort(key=lambda entry: -entry[0])
     (best, shape, up), (second, _, other) = scores[0], scores[1]

@@ -180,7 +180,7 @@ def half_space(cloud: GaussianCloud, plane: Plane, chosen: np.ndarray) -> Gaussi
     values = {name: getattr(cloud, name).numpy().copy() for name, _ in shapes}
     for (name, _), part in zip(shapes, parts, strict=True):
         values[name][source] = part.numpy()
-    return GaussianCloud.from_numpy(**values, sh=cloud.sh.numpy(), device=str(device))
+    return GaussianCloud.from_numpy(**values, sh=cloud.sh.numpy(), antialiased=cloud.antialiased, device=str(device))
 
 
 def views_above(cloud: GaussianCloud, plane: Plane, cameras: Sequence[Camera]) -> list[TrainingView]:
@@ -236,7 +236,7 @@ def _subdivided(cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure, fine_r
         plan = [wp.array(values) for values in (source, axis, step)]
         out = [wp.empty(shape, dtype=field.dtype) for shape, field in zip(shapes, fields, strict=True)]
         means, rotations, log_scales, sh = out
-        split = GaussianCloud(means, rotations, log_scales, wp.array(logits), sh)
+        split = GaussianCloud(means, rotations, log_scales, wp.array(logits), sh, cloud.antialiased)
     launch_rows(split_kernel, len(source), inputs=[*plan, shrink, *fields], outputs=out, device=cloud.device)
     return _nonempty_subset(
         split, plane.heights(split.means.numpy()) > 0.0, "after splitting all of their means lie below the plane"

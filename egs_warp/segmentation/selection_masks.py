@@ -23,6 +23,7 @@ def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: S
         cloud.log_scales.numpy(),
         cloud.opacity_logits.numpy(),
         sh,
+        antialiased=cloud.antialiased,
         device=str(cloud.device),
     )
     return [

@@ -6,7 +6,7 @@ See docs/concepts/segmentation.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -62,13 +62,7 @@ def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
     """
     sums = np.zeros((cloud.count, 3))
     # The same grey for all: colours are not clipped, and SH bands above 0 are not needed.
-    grey = GaussianCloud(
-        cloud.means,
-        cloud.rotations,
-        cloud.log_scales,
-        cloud.opacity_logits,
-        wp.zeros((cloud.count, 1), dtype=wp.vec3, device=cloud.device),
-    )
+    grey = replace(cloud, sh=wp.zeros((cloud.count, 1), dtype=wp.vec3, device=cloud.device))
     for view in views:
         check_size(view)
         sums += _votes_of_view(grey, view)
@@ -108,7 +102,7 @@ def _votes_of_view(grey: GaussianCloud, masked: MaskedView) -> np.ndarray:
     inside = masked.mask.astype(np.float32)
     colour = np.stack([inside, 1.0 - inside, np.zeros_like(inside)], axis=2)
     with translate_out_of_memory(grey, masked.camera):
-        projected = project(grey, view, antialiased=False, threads=threads)
+        projected = project(grey, view, antialiased=grey.antialiased, threads=threads)
         behind = background_of((0.0, 0.0, 0.0), masked.camera, grey.device)
         rendered = PendingImage(projected, view, background=behind, threads=threads).result()
         gradients = backward(
@@ -116,7 +110,7 @@ def _votes_of_view(grey: GaussianCloud, masked: MaskedView) -> np.ndarray:
             colour_gradient=wp.array(colour, dtype=wp.vec3, device=grey.device),
             alpha_gradient=None,
             depth_gradient=None,
-            antialiased=False,
+            antialiased=grey.antialiased,
             want_pose=False,
             threads=threads,
         )

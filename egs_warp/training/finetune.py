@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ import warp as wp
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
 from egs_warp.render import render_gaussians
 from egs_warp.render.autograd import render_torch
 from egs_warp.training.checkpoint import Checkpoint, State, digest_of
@@ -89,7 +89,8 @@ class FinetuneOptions:
     """Optimise an exposure and a white balance for each view together with the cloud."""
     exclude_outliers: bool = False
     """Exclude views during the training that do not fit the others."""
-    antialiased: bool = False
+    antialiased: bool | None = None
+    """Render with antialiasing, for which the result is then marked. None: as the cloud is marked."""
     seed: int = 0
     threads: int | None = None
 
@@ -159,6 +160,7 @@ def finetune(
         UserError: a view does not fit its camera, the loss is not finite, or the checkpoint is of another training.
     """
     options = options or FinetuneOptions()
+    antialiased = cloud.antialiased if options.antialiased is None else options.antialiased
     _check(cloud, views, options, trainable)
     device = wp.device_to_torch(cloud.device)
     generator = torch.Generator(device=device).manual_seed(options.seed)
@@ -206,7 +208,7 @@ def finetune(
             torch.cat([tensors.sh_band_0, bands], dim=1),
             views[number].camera,
             background=background,
-            antialiased=options.antialiased,
+            antialiased=antialiased,
             threads=options.threads,
         )
         if tones is None:
@@ -252,13 +254,16 @@ def finetune(
                 state |= {f"{name}/{key}": value for key, value in part.state().items()}
             checkpoint_file.write(state)
     return FinetuneResult(
-        _cloud(population.tensors), losses, None if tones is None else tones.matrices(), tuple(outlier_views.indices)
+        replace(_cloud(population.tensors), antialiased=antialiased),
+        losses,
+        None if tones is None else tones.matrices(),
+        tuple(outlier_views.indices),
     )
 
 
 def _digest(cloud: GaussianCloud, views: Sequence[TrainingView], options: FinetuneOptions) -> str:
     """Return the digest that identifies this training."""
-    first = [getattr(cloud, one.name).numpy() for one in fields(cloud)]
+    first = [getattr(cloud, name).numpy() for name in ARRAYS]
     pictures = [array for view in views for array in (view.image, view.alpha, view.weight)]
     return digest_of([*first, *pictures], [view.camera for view in views], options)
 
@@ -273,7 +278,7 @@ def render_views(
     cameras: Sequence[Camera],
     *,
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    antialiased: bool = False,
+    antialiased: bool | None = None,
 ) -> list[TrainingView]:
     """Render the capture itself, as training views if there are no photos."""
     return [

@@ -109,6 +109,7 @@ def creature_header(
             "fov": float(np.degrees(2.0 * np.arctan(0.5 * camera.height / camera.fy))),
         },
         "degree": {"splats": render_data.splats.sh_degree, "scene": scene.sh_degree if scene else 0},
+        "antialiased": render_data.splats.antialiased,
     }
     arrays = {
         "rest": mesh.nodes.astype(np.float32),

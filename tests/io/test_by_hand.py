@@ -13,8 +13,10 @@ import pytest
 import zstandard
 
 from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
-from egs_warp.io import read_capture, write_ply, write_spz
+from egs_warp.io import read_capture, write_ply, write_splat, write_spz
+from egs_warp.render import render_gaussians
 from tests.support.captures import assert_same_bits, make_cloud, spz_of_streams
 
 
@@ -92,9 +94,38 @@ def test_spz_of_streams_declares_the_up_direction(axes: int, up: tuple[int, int,
     np.testing.assert_array_equal(read_capture(tmp_path / "4.spz", device="cpu").up, up)
 
 
+def test_left_handed_spz_is_mirrored(tmp_path: Path) -> None:
+    """LUB, as Unity has it: the same body seen in RUB."""
+    write_spz(tmp_path / "3.spz", make_cloud(50, 3))
+    plain = gzip.decompress((tmp_path / "3.spz").read_bytes())
+    records = struct.pack("<III", 0xADBE0003, 4, 3)
+    (tmp_path / "4.spz").write_bytes(spz_of_streams(plain, 50, 45, records))
+    capture = read_capture(tmp_path / "4.spz", device="cpu")
+    stored, read = read_capture(tmp_path / "3.spz", device="cpu").cloud, capture.cloud
+    assert capture.notes == ("vendor extensions left out", "left-handed axes: x was reversed")
+    np.testing.assert_array_equal(capture.up, [0, 1, 0])
+    mirror = np.array([-1.0, 1.0, 1.0])
+    np.testing.assert_array_equal(read.means.numpy(), stored.means.numpy() * mirror)
+    views = [
+        Camera.look_at(np.array([x, 2.0, 5.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]), width=64, height=48)
+        for x in (3.0, -3.0)
+    ]
+    pictures = [render_gaussians(cloud, view).colour.numpy() for cloud, view in zip((stored, read), views, strict=True)]
+    np.testing.assert_allclose(pictures[1], pictures[0][:, ::-1], atol=1e-4)
+
+
+def test_a_few_negative_scales_of_a_splat_are_left_out(tmp_path: Path) -> None:
+    write_splat(tmp_path / "a.splat", make_cloud(20))
+    data = bytearray((tmp_path / "a.splat").read_bytes())
+    data[32 * 4 + 12 : 32 * 4 + 16] = struct.pack("<f", -0.5)
+    (tmp_path / "a.splat").write_bytes(data)
+    capture = read_capture(tmp_path / "a.splat", device="cpu")
+    assert capture.cloud.count == 19
+    assert capture.notes == ("1 Gaussians left out that have a value that is not finite (scale_0 of number 4)",)
+
+
 def test_damaged_spz_of_streams_is_one_line(tmp_path: Path) -> None:
     good = spz_of_streams(_one_spz(tmp_path), 1, 0)
-    left = struct.pack("<III", 0xADBE0003, 4, 3)
     bomb = zstandard.ZstdCompressor().compress(bytes(1 << 26))
     for data, said in {
         good[:20]: "truncated: .spz header of 20 bytes, expected 32",
@@ -103,7 +134,6 @@ def test_damaged_spz_of_streams_is_one_line(tmp_path: Path) -> None:
         good[:15] + b"\4" + good[16:]: ".spz with 4 streams, expected 5",
         good[:112] + b"\0" * (len(good) - 112): "corrupted .spz data",
         good[:32] + struct.pack("<QQ", len(bomb), 1 << 26) + good[48:112] + bomb: "of which 9 are needed",
-        spz_of_streams(_one_spz(tmp_path), 1, 0, left): "left-handed axes (LUB), which would be mirrored",
         gzip.compress(good): "version 4 inside gzip; unpack it first",
     }.items():
         (tmp_path / "4.spz").write_bytes(data)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,8 @@ def spoiled(path: Path, rows: slice | list[int], *, sh: float = 0.0, **values: f
 def unchecked(arrays: dict[str, np.ndarray]) -> GaussianCloud:
     """Return a cloud with values that ``GaussianCloud.from_numpy`` refuses."""
     kinds = {name: getattr(GOOD, name).dtype for name in arrays}
-    return GaussianCloud(**{name: wp.array(value, dtype=kinds[name], device="cpu") for name, value in arrays.items()})
+    made: dict[str, Any] = {name: wp.array(value, dtype=kinds[name], device="cpu") for name, value in arrays.items()}
+    return GaussianCloud(**made)
 
 
 @pytest.mark.parametrize(

@@ -136,7 +136,7 @@ def test_bad_zip(tmp_path: Path) -> None:
         (("means", "files"), ["../../x", "y"], "meta.json names '../../x', which lies outside the capture"),
         (("quats", "files"), "quats.webp", "quats.files in meta.json is not 1 file names"),
         (("scales", "codebook"), [1.0] * 255, "scales.codebook in meta.json is not 256 finite numbers"),
-        (("shN", "bands"), 2, "shN_centroids.webp is 192 pixels wide, expected 192, 512 or 960"),
+        (("shN", "bands"), 2, "shN_centroids.webp is 192 pixels wide, expected 192, 512, 960 or 1536"),
         (("sh0", "files"), ["meta.json"], "meta.json is not a readable image; export the capture again"),
     ],
 )

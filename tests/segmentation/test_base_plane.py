@@ -105,7 +105,7 @@ def test_up_of_the_format_wins() -> None:
     """The up direction of a format that defines one is used."""
     up, reason = guess_up(pawn(gaussian_count=500).cloud, np.array([0.0, -1.0, 0.0]))
     assert np.array_equal(up, [0.0, -1.0, 0.0])
-    assert reason == "the file format defines it"
+    assert reason == "the file defines it"
 
 
 def test_no_height() -> None:

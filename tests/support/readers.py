@@ -29,6 +29,7 @@ from egs_warp.commands.object_flag import read_mask
 from egs_warp.contact.terrain import read_terrain
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import concatenate
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import PosedImage, read_points
 from egs_warp.io.glb import write_glb
@@ -53,6 +54,7 @@ from tests.support import onnx
 from tests.support.captures import ARRAYS, good_bytes, small_cloud, spz_of_streams
 from tests.support.finished_runs import arrays_as_json, draw_run, finished_run, npz_of_json
 from tests.support.meshes import block_mesh
+from tests.support.ply_variants import columns_of, ply_of, without
 from tests.support.reconstruction import COLMAP_BIN
 from tests.support.slides import slide
 
@@ -359,11 +361,64 @@ def _glb() -> bytes:
 
 
 def _gltf() -> bytes:
-    data = _glb()
+    return _gltf_of(_glb())
+
+
+def _gltf_of(data: bytes) -> bytes:
     size = int.from_bytes(data[12:16], "little")
     tree, binary = json.loads(data[20 : 20 + size]), data[28 + size :]
     tree["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
     return _json(tree)
+
+
+def _packed_glb() -> bytes:
+    """Return a .glb with a .spz inside, under two nodes, the second mirrored, with two instances."""
+    data = _glb()
+    size = int.from_bytes(data[12:16], "little")
+    tree = json.loads(data[20 : 20 + size])
+    packed = gzip.decompress(good_bytes("a.spz"))
+    offsets = np.array([[0, 0, 0], [3, 1, 0]], "<f4").tobytes()
+    binary = packed + bytes(-len(packed) % 4) + offsets
+    for accessor in tree["accessors"]:
+        del accessor["bufferView"]
+    tree["accessors"].append({"bufferView": 1, "componentType": 5126, "count": 2, "type": "VEC3"})
+    views = [{"buffer": 0, "byteLength": len(packed)}]
+    views.append({"buffer": 0, "byteOffset": len(binary) - len(offsets), "byteLength": len(offsets)})
+    tree |= {"bufferViews": views, "buffers": [{"byteLength": len(binary)}], "scenes": [{"nodes": [0, 1]}]}
+    instances = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": len(tree["accessors"]) - 1}}}
+    tree["nodes"] = [{"mesh": 0}, {"mesh": 0, "scale": [-1, 2, 1], "extensions": instances}]
+    splatting = tree["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+    splatting["extensions"] = {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}
+    tree["extensionsRequired"] = ["KHR_gaussian_splatting", "EXT_mesh_gpu_instancing"]
+    text = _json(tree)
+    text += b" " * (-len(text) % 4)
+    words = [0x46546C67, 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A]
+    return np.array(words, "<u4").tobytes() + text + np.array([len(binary), 0x004E4942], "<u4").tobytes() + binary
+
+
+def _packed_gltf() -> bytes:
+    return _gltf_of(_packed_glb())
+
+
+def _ply_variant() -> bytes:
+    """Return a .ply of halves, flat, with byte colours, in big-endian order, with tags."""
+    columns = without(columns_of(small_cloud()), "scale_2", "f_")
+    colours = dict.fromkeys(("red", "green", "blue"), np.arange(small_cloud().count))
+    return ply_of(
+        columns | colours,
+        comments=["SplatRenderMode: mip", "Vertical axis: 0 -3 4"],
+        kinds=dict.fromkeys(columns, "f2") | dict.fromkeys(colours, "u1"),
+        layout="binary_big_endian",
+    )
+
+
+def _activated_ply() -> bytes:
+    """Return a text .ply of activated values and of degree 4."""
+    cloud = concatenate(*[small_cloud()] * 3)
+    columns = without(columns_of(cloud), "f_rest")
+    columns |= {name: np.exp(values) for name, values in columns.items() if name.startswith("scale")}
+    columns |= {f"f_rest_{k}": np.zeros(cloud.count) for k in range(72)} | {"opacity": cloud.opacities()}
+    return ply_of(columns, layout="ascii")
 
 
 def _spz_of_streams() -> bytes:
@@ -458,6 +513,10 @@ READERS: tuple[Reader, ...] = (
     Reader("spz of streams", "a.spz", _spz_of_streams, _capture),
     Reader("glb", "a.glb", _glb, _capture),
     Reader("gltf", "a.gltf", _gltf, _capture, json=True),
+    Reader("packed glb", "a.glb", _packed_glb, _capture),
+    Reader("packed gltf", "a.gltf", _packed_gltf, _capture, json=True),
+    Reader("ply of other tools", "a.ply", _ply_variant, _capture),
+    Reader("activated ply", "a.ply", _activated_ply, _capture),
     Reader("splat", "a.splat", lambda: good_bytes("a.splat"), _capture),
     Reader("sog", "a.sog", lambda: good_bytes("a.sog"), _capture),
     Reader("sog meta", "a.sog", lambda: _sog()["meta.json"], _capture, wrap=_zip_with_meta, json=True),

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
 from tests.support.training_views import ball, ring
 
 torch = pytest.importorskip("torch")
@@ -60,7 +59,7 @@ def start() -> GaussianCloud:
 
 def bits(result: FinetuneResult) -> list[bytes]:
     assert result.tones is not None
-    arrays = [getattr(result.cloud, one.name).numpy() for one in fields(result.cloud)]
+    arrays = [getattr(result.cloud, name).numpy() for name in ARRAYS]
     return [array.tobytes() for array in (*arrays, result.losses, result.tones)]
 
 

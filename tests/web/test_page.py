@@ -7,6 +7,7 @@ import io
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,20 @@ def test_canvas_is_like_our_own_picture_of_the_same_frame_and_camera(
     for frame in (0, 12):
         page.evaluate("(frame) => egs.player.seek(frame)", frame)
         assert _psnr_on_body(_own_picture(recording, page, frame), _picture(page)) >= 40.0
+    assert complaints == []
+    page.close()
+
+
+def test_a_capture_trained_with_antialiasing_is_drawn_so(chromium: Any, recording: Recording, tmp_path: Path):
+    splats = replace(recording.creature.splats, antialiased=True)
+    smooth = replace(recording, creature=replace(recording.creature, splats=splats))
+    export_page(tmp_path / "page.html", [smooth])
+    # In a small picture more splats are smaller than a pixel.
+    page, complaints = opened(chromium, (tmp_path / "page.html").as_uri(), 240, 240)
+    page.evaluate("egs.setLayer('ground', false)")
+    picture = _picture(page)
+    likeness = _psnr_on_body(_own_picture(smooth, page, 0), picture)
+    assert likeness >= max(40.0, 5.0 + _psnr_on_body(_own_picture(recording, page, 0), picture))
     assert complaints == []
     page.close()
 

@@ -20,6 +20,8 @@ export interface Facts {
   motion: { name: string; reached?: Record<string, number> }[];
   notes: string[];
   degree: { splats: number; scene: number };
+  /** The capture was trained with antialiasing. */
+  antialiased: boolean;
   /** Only of live sessions: identifier of the session and limits of its sliders. */
   session?: string;
   limits?: { friction: [number, number]; sag: [number, number]; style: [number, number] };

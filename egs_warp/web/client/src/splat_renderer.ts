@@ -39,6 +39,7 @@ uniform usampler2D ordering;
 uniform usampler2DArray extSplats;
 uniform usampler2DArray extSplats2;
 uniform int splatCount;
+uniform bool antialiased;
 out vec2 offsetInSigmas;
 flat out vec4 rgba;
 
@@ -51,10 +52,9 @@ void main() {
   ivec3 texel = splatTexCoord(int(index));
   vec3 mean, squares, products;
   unpackSplatExtCov(texelFetch(extSplats, texel, 0), texelFetch(extSplats2, texel, 0), mean, rgba, squares, products);
-  float cut = log(255.0 * rgba.a);
   vec3 p = renderToViewBasis * mean + renderToViewPos;
   vec4 clip = projectionMatrix * vec4(p, 1.0);
-  if (!(cut > 0.0) || -clip.w > clip.z || clip.w <= 0.0) return;
+  if (-clip.w > clip.z || clip.w <= 0.0) return;
   // The Jacobian grows without bound outside the image, so it is evaluated at most 15 % of the image size beyond.
   vec2 focal = 0.5 * renderSize * vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
   vec2 slope = clamp(p.xy / -p.z, -0.65 * renderSize / focal, 0.65 * renderSize / focal);
@@ -65,7 +65,14 @@ void main() {
   mat3 covariance = mat3(
     squares.x, products.x, products.y, products.x, squares.y, products.z, products.y, products.z, squares.z);
   vec3 spread = covariance * right;
-  float a = dot(right, spread) + 0.3, b = dot(up, spread), d = dot(up, covariance * up) + 0.3;
+  float a = dot(right, spread), b = dot(up, spread), d = dot(up, covariance * up);
+  float sharp = a * d - b * b;
+  a += 0.3;
+  d += 0.3;
+  // The low-pass increases the area of a splat by the inverse of this factor.
+  if (antialiased) rgba.a *= sqrt(max(sharp / (a * d - b * b), 1e-12));
+  float cut = log(255.0 * rgba.a);
+  if (!(cut > 0.0)) return;
   float half_ = 0.5 * (a - d), root = sqrt(half_ * half_ + b * b), mid = 0.5 * (a + d);
   float large = mid + root, small = max(mid - root, 0.3);
   vec2 along = half_ > 0.0 ? vec2(half_ + root, b) : vec2(b, root - half_);
@@ -90,7 +97,7 @@ void main() {
   colour = vec4(rgba.rgb * alpha, alpha);
 }`;
 
-export function splatRenderer(renderer: THREE.WebGLRenderer, onDirty: () => void): SparkRenderer {
+export function splatRenderer(renderer: THREE.WebGLRenderer, antialiased: boolean, onDirty: () => void): SparkRenderer {
   const splatCount = { value: 0 };
   const spark = new SparkRenderer({
     renderer,
@@ -100,7 +107,7 @@ export function splatRenderer(renderer: THREE.WebGLRenderer, onDirty: () => void
     sortRadial: false,
     vertexShader: VERTEX,
     fragmentShader: FRAGMENT,
-    extraUniforms: { splatCount },
+    extraUniforms: { splatCount, antialiased: { value: antialiased } },
     onDirty,
   });
   spark.geometry.dispose();

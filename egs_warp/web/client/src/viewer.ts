@@ -51,7 +51,7 @@ export class Viewer {
     this.positions = new Float32Array(rest);
     this.cage = new Cage(rest, indicesOf(header, "tets"));
     this.splats = deformedSplats(header, "splats", this.cage.texture, { isStatic: false });
-    this.spark = splatRenderer(this.renderer, () => this.invalidate());
+    this.spark = splatRenderer(this.renderer, header.facts.antialiased, () => this.invalidate());
     this.scene.add(this.spark, this.splats.generator);
     this.overlays = new Overlays(header, (frame) => this.computeCentre(frame.positions));
     this.scene.add(this.overlays.group);

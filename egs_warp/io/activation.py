@@ -1,0 +1,63 @@
+"""Files that hold activated values, scales and opacities, where their format has logarithms and logits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from egs_warp.io.limits import MIN_LOG_SCALE
+from egs_warp.io.raw import RawCapture, logits_from_opacities
+
+_MIN_COUNT = 20
+"""Number of Gaussians from which their values are evidence: a few may be so by chance."""
+_SAMPLE = 1000
+"""Number of Gaussians that exclude activated values in most files."""
+
+
+def with_logarithms(raw: RawCapture) -> RawCapture:
+    """Return ``raw`` with logarithms and logits if it evidently holds activated values, with a note.
+
+    All scales are then positive and all opacities within 0 to 1: as logarithms and logits, each Gaussian would be wider
+    than one unit and half transparent. If only the scales are positive, they are activated if most Gaussians would
+    otherwise be wider than the capture. Opacities alone are no evidence: they stay, with a note.
+    """
+    few = slice(0, _SAMPLE)
+    if len(raw.means) < _MIN_COUNT or (
+        (raw.log_scales[few] < 0.0).any(axis=0)[:2].any() and not _within(raw.opacity_logits[few])
+    ):
+        return raw
+    # The third scale of a flat Gaussian is absent or minus infinity, and activated it is 0.
+    scales, opacities = raw.log_scales, raw.opacity_logits
+    absent = ~(scales > MIN_LOG_SCALE)
+    positive = bool((absent | (scales >= 0.0)).all() and (scales > 0.0).any())
+    within = _within(opacities)
+    if positive and (within or _wider_than_capture(raw)):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_scales = np.where(absent, scales, np.log(np.maximum(scales, 0.0)))
+        raw = replace(raw, log_scales=log_scales)
+        if not within:
+            note = "all scales are positive, and as logarithms wider than the capture: read as standard deviations"
+            return replace(raw, notes=(*raw.notes, note))
+        note = "all scales are positive and all opacities within 0 to 1: read as standard deviations and opacities"
+        note += ", not as their logarithms and logits"
+        return replace(raw, opacity_logits=logits_from_opacities(opacities), notes=(*raw.notes, note))
+    if within and float(np.nanmin(opacities)) < float(np.nanmax(opacities)):
+        note = "all opacities lie within 0 to 1, as activated ones do; they were read as logits"
+        return replace(raw, notes=(*raw.notes, note))
+    return raw
+
+
+def _within(opacities: np.ndarray) -> bool:
+    return not ((opacities < 0.0) | (opacities > 1.0)).any()
+
+
+def _wider_than_capture(raw: RawCapture) -> bool:
+    """Return True if the median Gaussian is wider than the capture with its scales read as logarithms, and not as they
+    are."""
+    means = raw.means[np.isfinite(raw.means).all(axis=1)].astype(np.float64)
+    if not len(means):
+        return False
+    distance = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+    widest = np.nanmedian(raw.log_scales.max(axis=1).astype(np.float64))
+    return float(np.exp(min(widest, 700.0))) > 2.0 * float(np.median(distance)) > widest
