@@ -116,6 +116,19 @@ def parse_direction(flag: str, text: str) -> np.ndarray:
     return direction / length
 
 
+def parse_numbers(flag: str, text: str, count: int) -> np.ndarray:
+    """Return the (count,) finite numbers of a text such as ``1,2,3``. Raises ``UserError``, which names ``flag``."""
+    import numpy as np
+
+    try:
+        numbers = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        numbers = np.zeros(0)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise UserError(f"--{flag} {text}: give {count} numbers, separated by commas")
+    return numbers
+
+
 def parse_plane(text: str) -> Plane:
     """Return the plane n.x + d = 0 of ``nx,ny,nz,d``. Raises ``UserError`` for other texts."""
     from egs_warp.geometry.plane import Plane

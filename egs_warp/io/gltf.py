@@ -107,8 +107,10 @@ class _Asset:
                 f"{self.source}: its splats lie under different transforms; apply them, and export it again"
             )
         parts = [self._primitive(primitive) for _, primitive in primitives]
-        notes = []
-        if not np.allclose(turns[0], np.eye(4), atol=1e-6):
+        notes, origin = [], None
+        if np.array_equal(turns[0][:3, :3], np.eye(3)):
+            origin = turns[0][:3, 3] if turns[0][:3, 3].any() else None
+        elif not np.allclose(turns[0], np.eye(4), atol=1e-6):
             notes.append("the transforms of glTF's nodes were ignored: the capture is in the axes of its mesh")
         coefficients = min(part["sh"].shape[1] for part in parts)
         if any(part["sh"].shape[1] != coefficients for part in parts):
@@ -122,6 +124,7 @@ class _Asset:
             opacity_logits=np.concatenate([part["opacity_logits"] for part in parts]),
             sh=np.concatenate([part["sh"][:, :coefficients] for part in parts]),
             up=up / np.linalg.norm(up),
+            origin=origin,
             notes=tuple(notes),
         )
 

@@ -67,6 +67,9 @@ def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
     if without_rotation:
         notes = (*notes, f"{without_rotation} Gaussians with a rotation of length 0 read as unrotated")
     kept = slice(None) if not count else ~out
+    rows = raw.rows
+    if count:
+        rows = np.flatnonzero(~out) if rows is None else rows[~out]
     logits = raw.opacity_logits[kept]
     return replace(
         raw,
@@ -75,6 +78,7 @@ def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
         log_scales=np.maximum(raw.log_scales[kept], np.float32(MIN_LOG_SCALE)),
         opacity_logits=np.where(np.abs(logits) > MAX_LOGIT, np.copysign(np.float32(np.inf), logits), logits),
         sh=raw.sh[kept],
+        rows=rows,
         notes=notes,
     )
 

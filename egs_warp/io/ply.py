@@ -32,6 +32,8 @@ _TYPES = {
     **{name: "f8" for name in ("double", "float64")},
 }
 _BYTE_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": None}
+_SHOWN = 5
+"""Maximum number of names in a note."""
 # A block of this many rows stays in the cache while its columns are gathered one by one.
 _BLOCK_ROWS = 16384
 
@@ -195,15 +197,44 @@ def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
             f"{source}: {rest} f_rest properties, expected 0, 9, 24 or 45 counted from f_rest_0; export it again"
         )
     rows = read_elements(data, header, ["vertex"], source)["vertex"]
-    arrays = {array: columns_as_float32(rows, names) for array, names in property_names(1 + rest // 3).items()}
+    properties = property_names(1 + rest // 3)
+    double = {name for name in present if vertex is not None and vertex.dtype is not None and vertex.dtype[name].str[1:] == "f8"}
+    arrays = {array: columns_as_float32(rows, names) for array, names in properties.items()}
+    used = [name for names in properties.values() for name in names]
+    notes = [
+        *_rounding_notes(rows, [name for name in used if name in double and name not in properties["means"]]),
+        *_omission_notes(header, present.difference(used, ("nx", "ny", "nz"))),
+    ]
     return RawCapture(
         format="INRIA .ply" if header.byte_order else "INRIA .ply (text)",
-        means=arrays["means"],
+        means=arrays["means"] if not double & set(properties["means"]) else _columns_as_float64(rows, ["x", "y", "z"]),
         rotations=arrays["rotations"],
         log_scales=arrays["log_scales"],
         opacity_logits=arrays["opacity_logits"][:, 0],
         sh=arrays["sh"].reshape(len(rows), 1 + rest // 3, 3),
+        notes=tuple(notes),
     )
+
+
+def _rounding_notes(rows: np.ndarray, names: list[str]) -> list[str]:
+    """Return a note of the named fields whose values are not those of single precision."""
+    rounded = [name for name in names if not np.array_equal(rows[name], rows[name].astype(np.float32))]
+    return [f"rounded to single precision: {_listed(rounded)}"] if rounded else []
+
+
+def _omission_notes(header: PlyHeader, properties: set[str]) -> list[str]:
+    """Return notes of the other elements, and of those properties of the Gaussians."""
+    notes = [f"properties left out: {_listed(sorted(properties))}"] if properties else []
+    elements = [element.name for element in header.elements if element.name != "vertex" and element.count]
+    return [*notes, *([f"elements left out: {_listed(elements)}"] if elements else [])]
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+
+
+def _columns_as_float64(rows: np.ndarray, names: list[str]) -> np.ndarray:
+    return np.stack([rows[name] for name in names], axis=1).astype(np.float64)
 
 
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -225,36 +256,44 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return positions[finite], colours[finite]
 
 
-def write_ply(path: Path | str, cloud: GaussianCloud) -> None:
+def write_ply(path: Path | str, cloud: GaussianCloud, *, origin: np.ndarray | None = None) -> None:
     """Write ``cloud`` as an INRIA .ply, binary little-endian, float32: reading it gives the same bits.
 
     Normals, always 0, are included because some viewers rely on the position of each property. Raises ``UserError`` if
     the file cannot be written.
+
+    Args:
+        path: The file.
+        cloud: The Gaussians.
+        origin: (3,) Offset that is added to the positions (``Capture.origin``), which then are doubles.
     """
-    with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        file.write(ply_bytes(cloud))
-
-
-def ply_bytes(cloud: GaussianCloud) -> bytes:
-    """Return the content of the file that ``write_ply`` writes."""
-    sh = cloud.sh.numpy()
-    count = cloud.count
     rest_count = 3 * ((cloud.sh_degree + 1) ** 2 - 1)
     names = [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
         *(f"f_rest_{i}" for i in range(rest_count)),
         *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
     ]
-    rows = np.zeros((count, len(names)), np.dtype("<f4"))
-    rows[:, 0:3] = cloud.means.numpy()
-    rows[:, 6:9] = sh[:, 0]
-    rows[:, 9 : 9 + rest_count] = channel_major(sh)
-    rows[:, -8] = cloud.opacity_logits.numpy()
-    rows[:, -7:-4] = cloud.log_scales.numpy()
-    rows[:, -4:] = cloud.rotations.numpy()
-    header = "ply\nformat binary_little_endian 1.0\n"
-    header += f"element vertex {count}\n" + "".join(f"property float {name}\n" for name in names) + "end_header\n"
-    return header.encode() + rows.tobytes()
+    kinds = ["float" if origin is None else "double"] * 3 + ["float"] * (len(names) - 3)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {cloud.count}\n"
+    header += "".join(f"property {kind} {name}\n" for kind, name in zip(kinds, names, strict=True)) + "end_header\n"
+    means, sh = cloud.means.numpy(), cloud.sh.numpy()
+    logits, log_scales, rotations = (a.numpy() for a in (cloud.opacity_logits, cloud.log_scales, cloud.rotations))
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write(header.encode())
+        for start in range(0, cloud.count, _BLOCK_ROWS):
+            block = slice(start, start + _BLOCK_ROWS)
+            rows = np.zeros((len(means[block]), len(names)), "<f4")
+            rows[:, 0:3] = means[block]
+            rows[:, 6:9] = sh[block, 0]
+            rows[:, 9 : 9 + rest_count] = channel_major(sh[block])
+            rows[:, -8] = logits[block]
+            rows[:, -7:-4] = log_scales[block]
+            rows[:, -4:] = rotations[block]
+            if origin is None:
+                file.write(rows.data)
+            else:
+                places = (means[block] + origin).astype("<f8")
+                file.write(np.concatenate([places.view("u1"), rows[:, 3:].copy().view("u1")], axis=1).data)
 
 
 def channel_major(sh: np.ndarray) -> np.ndarray:

@@ -52,6 +52,8 @@ class BodyInfo:
     """Properties of a capture in the frame of its body, metres; at rest, before it is deformed by its weight."""
 
     source: str
+    count: int
+    """Number of Gaussians of the capture."""
     standing: PlacedCage
     body: SoftBody
     muscles: MuscleSet
@@ -90,7 +92,7 @@ class BodyInfo:
         size = np.ptp(self.place.ground.local(self.place.standing), axis=0) / height
         mesh, kinds = self.standing.cage.mesh, self._kinds()
         lines = [
-            f"capture  {self.source}: {self.standing.gaussians.count} Gaussians",
+            f"capture  {self.source}: {self.count} Gaussians",
             f"up       {up}",
             f"ground   {_numbers(plane.normal, 4)},{plane.offset:.4g}",
             f"front    {ahead}" + (" as given" if self.front.reason is None else f" ({self.front.reason})"),
@@ -197,7 +199,9 @@ def inspect_capture(
         soles = np.array([place.ground.local(mesh.nodes[foot.sole])[:, :2].mean(axis=0) for foot in feet])
         feet = tuple(feet[index] for index in order_counterclockwise(soles))
     notes = (*notes, *capture_warnings(standing.gaussians, mesh, body.height))
-    return BodyInfo(source, standing, body, muscles, faces, base, place, feet, notes)
+    if standing.gaussians.count < cloud.count:
+        notes = (*notes, f"the body is measured from {standing.gaussians.count} of the {cloud.count} Gaussians")
+    return BodyInfo(source, cloud.count, standing, body, muscles, faces, base, place, feet, notes)
 
 
 _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#ff7f0e", "#9467bd", "#8c564b", "#e377c2", "#17becf")

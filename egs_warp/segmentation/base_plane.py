@@ -12,7 +12,7 @@ from egs_warp.geometry.body_frame import upright_frame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.unique_rows import distinct_rows
-from egs_warp.meshing.body_gaussians import canonical_order, centred
+from egs_warp.meshing.body_gaussians import canonical_order, centred, representatives
 
 _COLUMNS = 64
 """Columns across the longer side of the footprint."""
@@ -70,7 +70,7 @@ def find_base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:
     """
     normal = np.asarray(up, dtype=np.float64)
     normal = normal / np.linalg.norm(normal)
-    near, anchor = _ordered(cloud)
+    near, anchor = _ordered(representatives(cloud))
     underside = _underside(near, normal)
     level = min(_support_level(underside), _mass_quantile(underside.heights, underside.opacities, _MAX_MASS_BELOW))
     return Plane(normal, -level).moved(anchor)
@@ -148,7 +148,7 @@ def guess_up(cloud: GaussianCloud, capture_format_up: np.ndarray | None = None) 
     if capture_format_up is not None:
         return np.asarray(capture_format_up, dtype=np.float64), "the file format defines it"
     scores = []
-    near, _ = _ordered(cloud)
+    near, _ = _ordered(representatives(cloud))
     near = near.subset(np.arange(0, near.count, -(-near.count // _MAX_GAUSSIANS)))
     for axis in range(3):
         for sign in (1.0, -1.0):
