@@ -153,5 +153,9 @@ def guessed_up(capture: Capture) -> tuple[np.ndarray, str]:
     from egs_warp.segmentation.base_plane import guess_up
 
     up, reason = guess_up(capture.cloud, capture.up)
-    axis = "xyz"[int(np.argmax(np.abs(up)))]
-    return up, f"up is estimated as {'-' if up.sum() < 0 else '+'}{axis} ({reason}); if that is wrong, give --up"
+    axis = int(np.argmax(np.abs(up)))
+    if np.abs(up[axis]) == 1.0:
+        name = f"{'-' if up[axis] < 0 else '+'}{'xyz'[axis]}"
+    else:
+        name = ",".join(f"{x:.3f}" for x in up)
+    return up, f"up is estimated as {name} ({reason}); if that is wrong, give --up"

@@ -16,7 +16,7 @@ _STEPS_PER_E = 64
 """Log scales are rounded to this many steps per factor of e (1.6 %), as a file's log scales lose bits when its unit
 changes."""
 
-MAX_GAUSSIANS = 1_000_000
+MAX_GAUSSIANS = 500_000
 """Gaussians from which a body is measured (``representatives``)."""
 _WIDE = 1.0 / 64.0
 """Fraction of the body's size: a spacing of the lattice on which its solid is found."""
@@ -63,21 +63,21 @@ def _increasing_bits(values: np.ndarray) -> np.ndarray:
     return np.where(bits >> 31 == 1, ~bits, bits | np.uint32(1 << 31)).astype(np.uint64)
 
 
-def representatives(cloud: GaussianCloud, at_most: int = MAX_GAUSSIANS) -> GaussianCloud:
-    """Return about ``at_most`` Gaussians that show the same body; the cloud itself if it has no more.
+def representatives(cloud: GaussianCloud) -> GaussianCloud:
+    """Return at most ``MAX_GAUSSIANS`` that show the same body; the cloud itself if it has no more.
 
     Those that are wide, of which few show much of the surface, all remain, and an equal share of the others.
     """
-    if cloud.count <= at_most:
+    if cloud.count <= MAX_GAUSSIANS:
         return cloud
     means = cloud.means.numpy()
-    size = float(np.ptp(np.quantile(means[:: -(-cloud.count // at_most)], (0.01, 0.99), axis=0), axis=0).max())
+    size = float(np.ptp(np.quantile(means[:: -(-cloud.count // MAX_GAUSSIANS)], (0.01, 0.99), axis=0), axis=0).max())
     wide = cloud.breadths() > _WIDE * size
-    if np.count_nonzero(wide) > at_most // 2:
+    if np.count_nonzero(wide) > MAX_GAUSSIANS // 2:
         wide[:] = False
     order = canonical_order(cloud)
     others = order[~wide[order]]
-    chosen = others[:: -(-len(others) // (at_most - np.count_nonzero(wide)))]
+    chosen = others[:: -(-len(others) // (MAX_GAUSSIANS - np.count_nonzero(wide)))]
     return cloud.subset(np.concatenate([np.flatnonzero(wide), chosen]))
 
 

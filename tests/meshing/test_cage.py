@@ -193,6 +193,32 @@ def test_degenerate_objects(points: np.ndarray, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("side", "thickness", "thin"), [(1.0, 0.01, True), (0.0, 0.01, True), (1.0, 0.2, False), (0.0, 0.2, False)]
+)
+def test_a_thin_body_is_refused_with_a_remedy(side: float, thickness: float, thin: bool) -> None:
+    """A sheet (side 1) and a disc without edges: elements would make them several times as thick."""
+    random = np.random.default_rng(0)
+    points = random.uniform(-0.5, 0.5, (4000, 3))
+    if side == 0.0:
+        points = points[np.hypot(points[:, 0], points[:, 1]) < 0.5]
+    points[:, 2] = thickness * (random.uniform(size=len(points)) > 0.5)
+    cloud = GaussianCloud.from_numpy(
+        points,
+        np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)),
+        np.tile(np.log([0.03, 0.03, 0.002]), (len(points), 1)),
+        np.full(len(points), 3.0),
+        np.zeros((len(points), 1, 3)),
+    )
+    if thin:
+        with pytest.raises(UserError, match="it is too thin for its elements .* cut out a piece"):
+            build_cage(cloud, _FLOOR)
+    else:
+        cage = build_cage(cloud, _FLOOR)
+        assert cage.height(_FLOOR) == pytest.approx(thickness, rel=0.25)
+        assert 0.9 < cage.thickening < 1.3
+
+
 def test_target_nodes() -> None:
     """A larger target gives more nodes; invalid targets are refused."""
     thing, _ = _pawn_cage(6000)

@@ -11,8 +11,11 @@ import pytest
 from egs_warp.assets import pawn, stool
 from egs_warp.assets.object import BuiltInObject
 from egs_warp.cli import main
+from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
 from egs_warp.io import write_ply
+from egs_warp.meshing.body_gaussians import representatives
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.pipelines.info import BodyInfo, draw_info, inspect_capture
@@ -89,6 +92,42 @@ def test_a_lying_body_has_no_feet_and_is_drawn(tmp_path: Path) -> None:
     assert abs(info.front.direction[0]) > 0.99 and "the body lies along it" in str(info.front.reason)
     draw_info(tmp_path / "info.png", info)
     assert (tmp_path / "info.png").stat().st_size > 20_000
+
+
+@pytest.mark.parametrize(("gap", "said"), [(0.3, r"hangs 0\.3\d? of its height above the ground"), (0.035, None)])
+def test_a_body_above_the_ground_is_reported(gap: float, said: str | None) -> None:
+    """A ball; it drops through a small gap."""
+    directions = np.random.default_rng(0).normal(size=(4000, 3))
+    means = 0.3 * directions / np.linalg.norm(directions, axis=1, keepdims=True) + [0.0, 0.0, 0.3 + gap]
+    cloud = GaussianCloud.from_numpy(
+        means,
+        np.tile([1.0, 0.0, 0.0, 0.0], (len(means), 1)),
+        np.full((len(means), 3), np.log(0.006)),
+        np.full(len(means), 3.0),
+        np.zeros((len(means), 1, 3)),
+    )
+    ground = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+    if said is not None:
+        with pytest.raises(UserError, match=said) as caught:
+            inspect_capture(cloud, plane=ground, nodes=100)
+        assert "\n" not in str(caught.value)
+    else:
+        info = inspect_capture(cloud, plane=ground, nodes=100)
+        assert any("above the ground, and drops first" in note for note in info.notes)
+        assert set(info.motions()) and "Traceback" not in "\n".join(info.lines())
+
+
+def test_large_captures_are_measured_from_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    thing = pawn(gaussian_count=3000)
+    monkeypatch.setattr("egs_warp.meshing.body_gaussians.MAX_GAUSSIANS", 1000)
+    few = representatives(thing.cloud)
+    assert 900 <= few.count <= 1000
+    order = np.random.default_rng(0).permutation(thing.cloud.count)
+    again = representatives(thing.cloud.subset(order))
+    assert sorted(map(tuple, again.means.numpy())) == sorted(map(tuple, few.means.numpy()))
+    info = inspect_capture(thing.cloud, plane=thing.plane, nodes=100)
+    assert f"{thing.cloud.count} Gaussians" in info.lines()[0]
+    assert info.notes[-1].startswith("the body is measured from ")
 
 
 def test_the_command_prints_the_lines_and_writes_the_picture(
