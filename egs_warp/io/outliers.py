@@ -49,7 +49,9 @@ def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
             f"{source}: it extends {reach:.3g} units from the origin, the limit is {MAX_COORDINATE:g}; export it again"
         )
     far, large = distance > MAX_DISTANCE_RATIO * size, scales > MAX_SCALE_RATIO * size
-    bright = np.asarray((np.abs(raw.sh) > MAX_SH).any(axis=(1, 2)))
+    bright = np.zeros(len(means), bool)
+    if max(float(raw.sh.max()), -float(raw.sh.min())) > MAX_SH:
+        bright = np.asarray((np.abs(raw.sh) > MAX_SH).any(axis=(1, 2)))
     out = far | large | bright
     count = int(out.sum())
     if count > _MAX_OUTLIER_FRACTION * len(out):

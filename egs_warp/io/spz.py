@@ -190,12 +190,12 @@ def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> No
     means = cloud.means.numpy().astype(np.float64)
     reach = float(np.abs(means).max())
     bits = _fractional_bits(means, reach)
-    _check_sizes(cloud.log_scales.numpy(), path)
     if reach * 2**bits > 2**23 - 1:
         raise UserError(
             f"{path}: a mean lies {reach:g} units from the origin, the limit of .spz is {2**23 - 1}; scale the"
             " capture down"
         )
+    _check_sizes(cloud.log_scales.numpy(), path)
     fixed = np.rint(np.ldexp(means, bits)).astype(np.int32)
     sh = cloud.sh.numpy()
     header = _HEADER.pack(_MAGIC, version, cloud.count, cloud.sh_degree, bits, 0, 0)

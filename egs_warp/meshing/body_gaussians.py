@@ -70,15 +70,15 @@ def representatives(cloud: GaussianCloud) -> GaussianCloud:
     """
     if cloud.count <= MAX_GAUSSIANS:
         return cloud
-    means = cloud.means.numpy()
-    size = float(np.ptp(np.quantile(means[:: -(-cloud.count // MAX_GAUSSIANS)], (0.01, 0.99), axis=0), axis=0).max())
+    order = canonical_order(cloud)
+    some = cloud.means.numpy()[order[:: -(-cloud.count // MAX_GAUSSIANS)]]
+    size = float(np.ptp(np.quantile(some, (0.01, 0.99), axis=0), axis=0).max())
     wide = cloud.breadths() > _WIDE * size
     if np.count_nonzero(wide) > MAX_GAUSSIANS // 2:
         wide[:] = False
-    order = canonical_order(cloud)
     others = order[~wide[order]]
-    chosen = others[:: -(-len(others) // (MAX_GAUSSIANS - np.count_nonzero(wide)))]
-    return cloud.subset(np.concatenate([np.flatnonzero(wide), chosen]))
+    count = MAX_GAUSSIANS - np.count_nonzero(wide)
+    return cloud.subset(np.concatenate([np.flatnonzero(wide), others[np.arange(count) * len(others) // count]]))
 
 
 def find_body_frame(cloud: GaussianCloud, plane: Plane) -> BodyFrame:

@@ -191,8 +191,6 @@ def inspect_capture(
             " away (egs-warp convert --box), or give the ground",
             check=("plane", "up"),
         )
-    if lowest > _NEAR_GROUND * height:
-        notes = (*notes, f"the body hangs {lowest / height:.2g} of its height above the ground, and drops first")
     progress("front")
     faces = choose_front(standing, front)
     progress("muscles")

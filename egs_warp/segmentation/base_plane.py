@@ -170,14 +170,15 @@ def guess_up(
     scores.sort(key=lambda entry: -entry[0])
     (best, shape, up), (second, _, other) = scores[0], scores[1]
     resting = _resting_up(near) if tilted and shape.level < _SURE_LEVEL else None
-    if resting is not None and resting[1].score > best + _TILT_MARGIN:
+    advantage = resting[1].score - best if resting is not None else 0.0
+    if resting is not None and resting[1].level >= _SURE_LEVEL and advantage > _TILT_MARGIN:
         direction, support = resting
         angle = np.degrees(np.arccos(np.abs(direction).max()))
         return direction, (
             f"guessed: {support}; the capture is tilted by {angle:.0f} degrees from {_name(direction)}, clearly ahead of"
             f" the best axis {_name(up)}, score {support.score:.2f} to {best:.2f}"
         )
-    if best < _POOR_SCORE:
+    if best < _POOR_SCORE or advantage > _CLEAR_MARGIN:
         margin = "no axis fits well, and the capture may be tilted; just"
     else:
         margin = "clearly" if best - second > _CLEAR_MARGIN else "narrowly"
@@ -185,7 +186,7 @@ def guess_up(
 
 
 def _resting_up(cloud: GaussianCloud) -> tuple[np.ndarray, _Support] | None:
-    """Return the direction (3,) in which the object rests best, of those with a level support; None without one."""
+    """Return the direction (3,) in which the object rests best, tilted or not; None if it has no volume."""
     few = cloud.subset(np.arange(0, cloud.count, -(-cloud.count // _FEW_GAUSSIANS)))
     opacities = few.opacities()
     visible = opacities >= min(0.3, 0.5 * _mass_quantile(opacities, opacities, 0.5))
@@ -193,8 +194,7 @@ def _resting_up(cloud: GaussianCloud) -> tuple[np.ndarray, _Support] | None:
     if len(ups) == 0:
         return None
     up = max(ups, key=lambda direction: _support_shape(few, direction).score)
-    shape = _support_shape(cloud, up)
-    return (up, shape) if shape.level >= _SURE_LEVEL else None
+    return up, _support_shape(cloud, up)
 
 
 def _name(up: np.ndarray) -> str:

@@ -116,14 +116,14 @@ def test_offsets_are_kept_or_reported(tmp_path: Path, capsys: pytest.CaptureFixt
         said = capsys.readouterr()
         assert "nothing is lost" not in said.out and "positions are relative to 43" in said.err
         assert ("has no place in this format; the file is relative to it" in said.out) == (name == "b.spz")
-    whole = [read_capture(tmp_path / name, device="cpu") for name in ("a.ply", "b.ply", "b.glb")]
-    for capture in whole[1:]:
-        assert capture.origin is not None
-        np.testing.assert_array_equal(capture.origin, whole[0].origin)
-        np.testing.assert_allclose(capture.cloud.means.numpy(), whole[0].cloud.means.numpy(), rtol=0, atol=1e-7)
+    first, *others = (read_capture(tmp_path / name, device="cpu") for name in ("a.ply", "b.ply", "b.glb"))
+    assert first.origin is not None
+    for capture in others:
+        np.testing.assert_array_equal(capture.origin, first.origin)
+        np.testing.assert_allclose(capture.cloud.means.numpy(), first.cloud.means.numpy(), rtol=0, atol=1e-7)
     # Back to the capture's own origin, which needs no doubles.
-    back = ["--translate=" + ",".join(str(-x) for x in whole[0].origin or ())] if whole[0].origin is not None else []
-    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "c.ply"), *back]) == 0
+    back = ",".join(str(-x) for x in first.origin)
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "c.ply"), f"--translate={back}"]) == 0
     assert read_capture(tmp_path / "c.ply", device="cpu").origin is None
 
 
