@@ -9,6 +9,8 @@ import numpy as np
 
 MAX_ROUNDING = 2.0**-16
 """Largest rounding of positions to single precision, in sizes of the capture, without an origin of their own."""
+_SAMPLES = 200_000
+"""Gaussians, spread evenly, from which the size of a capture is measured."""
 COARSE_STEP = 2.0**-10
 """Steps of single precision, in sizes of the capture, that are reported."""
 
@@ -22,8 +24,9 @@ def relative_positions(means: np.ndarray) -> tuple[np.ndarray, np.ndarray | None
     Returns:
         Positions (n, 3) float32; the origin (3,) float64 that was subtracted, or None; and what was rounded.
     """
-    middle = np.median(means, axis=0).astype(np.float64)
-    offsets = means - middle
+    some = means[:: -(-len(means) // _SAMPLES)].astype(np.float64)
+    middle = np.median(some, axis=0)
+    offsets = some - middle
     size = float(np.sqrt(np.median(np.einsum("ni,ni->n", offsets, offsets)))) or float(np.abs(offsets).max())
     step = float(np.spacing(np.float32(np.abs(middle).max())))
     rounded, error = _rounded(means)
@@ -34,7 +37,7 @@ def relative_positions(means: np.ndarray) -> tuple[np.ndarray, np.ndarray | None
         rounded, error = _rounded(means - origin)
         text = ",".join(f"{x:.15g}" for x in origin)
         note = f"positions are relative to {text}, as single precision has steps of {step:.2g} units there"
-        return rounded, origin, (f"{note}; the remainder was rounded by at most {error:.2g} units",)
+        return rounded, origin, (f"{note}; the remainder was rounded by at most {error:.2g} units" if error else note,)
     if error > 0.0:
         return rounded, None, (f"positions were rounded to single precision, by at most {error:.2g} units",)
     if step > COARSE_STEP * size > 0.0:
@@ -45,5 +48,7 @@ def relative_positions(means: np.ndarray) -> tuple[np.ndarray, np.ndarray | None
 
 def _rounded(means: np.ndarray) -> tuple[np.ndarray, float]:
     """Return ``means`` in single precision, and the largest error."""
-    rounded = means.astype(np.float32)
+    rounded = means.astype(np.float32, copy=False)
+    if means.dtype == np.float32:
+        return rounded, 0.0
     return rounded, float(np.abs(rounded - means).max())

@@ -212,7 +212,7 @@ def test_a_thin_body_is_refused_with_a_remedy(shape: str) -> None:
         build_cage(cloud, _FLOOR)
 
 
-@pytest.mark.parametrize(("thickness", "thickening"), [(0.4, 1.1), (0.15, 1.35)])
+@pytest.mark.parametrize(("thickness", "thickening"), [(0.4, 1.2), (0.15, 1.35)])
 def test_thickening_of_a_slab(thickness: float, thickening: float) -> None:
     """The thinner the slab, the larger the part of the cage's margin in its height."""
     cage = build_cage(_cloud(_box_surface((-0.5, -0.5, 0.0), (0.5, 0.5, thickness), 6000), 0.005), _FLOOR)
