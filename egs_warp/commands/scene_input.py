@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -99,6 +99,8 @@ def read_scene(args: argparse.Namespace) -> SceneInput:
     plane = plane_of(args.plane) if args.plane is not None else None
     capture = read_capture(args.capture, device=args.device)
     posed = read_cameras(args.cameras) if args.cameras else []
+    if capture.origin is not None:
+        posed = [_relative_to(capture.origin, one) for one in posed]
     spec = None
     if args.object is None and args.mask_model is not None:
         raise UserError("--mask-model: it needs clicks; give --object +u,v@photo")
@@ -107,3 +109,9 @@ def read_scene(args: argparse.Namespace) -> SceneInput:
     if up is None and capture.up is not None:
         up = np.asarray(capture.up, dtype=float)
     return SceneInput(capture.cloud, posed, spec, up, plane, capture.notes)
+
+
+def _relative_to(origin: np.ndarray, posed: PosedImage) -> PosedImage:
+    """Return a photo whose camera is placed relative to ``origin`` (3,), as the positions of the capture are."""
+    camera = posed.camera
+    return replace(posed, camera=replace(camera, translation=camera.translation + camera.rotation @ origin))

@@ -95,8 +95,10 @@ def _cloud(
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     variances = np.maximum(variances, _MIN_VARIANCE * variances[:, 2:])
     areas = np.sqrt(variances[:, 1] * variances[:, 2])
-    arrays = [x.numpy()[sources] for x in (cloud.rotations, cloud.log_scales, cloud.opacity_logits)]
-    arrays[0][merged] = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
-    arrays[1][merged] = 0.5 * np.log(variances)
-    arrays[2][merged] = logit(np.clip(weights[merged] / areas, _MIN_OPACITY, _MAX_OPACITY))
-    return GaussianCloud.from_numpy(means, *arrays, sh, device=str(cloud.device))
+    rotations, log_scales, logits = (
+        x.numpy()[sources] for x in (cloud.rotations, cloud.log_scales, cloud.opacity_logits)
+    )
+    rotations[merged] = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
+    log_scales[merged] = 0.5 * np.log(variances)
+    logits[merged] = logit(np.clip(weights[merged] / areas, _MIN_OPACITY, _MAX_OPACITY))
+    return GaussianCloud.from_numpy(means, rotations, log_scales, logits, sh, device=str(cloud.device))

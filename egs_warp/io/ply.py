@@ -171,7 +171,8 @@ def _read_text(data: bytes, header: PlyHeader, names: list[str], source: Path) -
 def columns_as_float32(rows: np.ndarray, names: list[str]) -> np.ndarray:
     """(n, len(names)) float32 from the named fields of a structured array."""
     out = np.empty((len(rows), len(names)), np.float32)
-    fields = [(rows.dtype.fields or {})[name] for name in names]
+    layout = dict[str, Any](rows.dtype.fields or {})
+    fields = [layout[name] for name in names]
     aligned = rows.dtype.itemsize % 4 == 0 and all(kind == "<f4" and place % 4 == 0 for kind, place, *_ in fields)
     if aligned and len(names) > _FEW_COLUMNS:
         # One pass over the rows takes a quarter of the time of one for each column.
@@ -208,7 +209,11 @@ def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
         )
     rows = read_elements(data, header, ["vertex"], source)["vertex"]
     properties = property_names(1 + rest // 3)
-    double = {name for name in present if vertex is not None and vertex.dtype is not None and vertex.dtype[name].str[1:] == "f8"}
+    double = {
+        name
+        for name in present
+        if vertex is not None and vertex.dtype is not None and vertex.dtype[name].str[1:] == "f8"
+    }
     arrays = {array: columns_as_float32(rows, names) for array, names in properties.items()}
     used = [name for names in properties.values() for name in names]
     notes = [

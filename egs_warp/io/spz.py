@@ -242,8 +242,8 @@ def _check_sizes(log_scales: np.ndarray, path: Path | str) -> None:
     if not _MIN_LOG_SCALE - 0.5 / _LOG_SCALE_STEPS <= typical <= high + 0.5 / _LOG_SCALE_STEPS:
         factor = 10.0 ** np.rint(np.log10(np.exp(0.5 * (_MIN_LOG_SCALE + high) - typical)))
         raise UserError(
-            f"{path}: .spz stores standard deviations from {np.exp(_MIN_LOG_SCALE):.2g} to {np.exp(high):.3g} units, but"
-            f" those of this capture are about {np.exp(typical):.2g}; scale it by {factor:g}, or choose another format"
+            f"{path}: .spz stores standard deviations from {np.exp(_MIN_LOG_SCALE):.2g} to {np.exp(high):.3g} units,"
+            f" those of the capture are about {np.exp(typical):.2g}; scale it by {factor:g}, or choose another format"
         )
 
 

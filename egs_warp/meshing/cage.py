@@ -176,8 +176,8 @@ def cage_of_body(
 
 def _too_thin(why: str) -> UserError:
     return UserError(
-        f"object: it is too thin for its elements ({why}); choose a thicker object, or cut out a piece of at most 20 times"
-        " its thickness (egs-warp convert --box)",
+        f"object: it is too thin for its elements ({why}); choose a thicker object, or cut out a piece of at most 20"
+        " times its thickness (egs-warp convert --box)",
         check=("plane", "up"),
     )
 
@@ -187,7 +187,10 @@ def _thickening(cloud: GaussianCloud, solid: LatticeSolid, mesh: TetMesh) -> flo
     typical standard deviation on either side."""
     means = cloud.means.numpy()[solid.belongs].astype(np.float64)
     low, high = mass_quantiles(means, cloud.opacities()[solid.belongs], 0.001, 0.999)
-    extents, sizes = high - np.append(low[:2], 0.0), np.append(np.ptp(mesh.nodes[:, :2], axis=0), mesh.nodes[:, 2].max())
+    extents, sizes = (
+        high - np.append(low[:2], 0.0),
+        np.append(np.ptp(mesh.nodes[:, :2], axis=0), mesh.nodes[:, 2].max()),
+    )
     if np.any(sizes > extents):
         quaternions = cloud.rotations.numpy()[solid.belongs][:, [1, 2, 3, 0]]
         scales = np.exp(cloud.log_scales.numpy()[solid.belongs].astype(np.float64))

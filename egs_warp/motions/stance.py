@@ -183,7 +183,9 @@ class BalanceController:
         self._standing = standing
         self.base_offset = self._base(local) - body.centre_of_mass(local)[:2]
         if len(contact_points) == 0:
-            raise UserError("body: no point of it is on the ground at the start; check the ground", check=("plane", "up"))
+            raise UserError(
+                "body: no point of it is on the ground at the start; check the ground", check=("plane", "up")
+            )
         footprint = ground.local(contact_points)[:, :2] - body.centre_of_mass(local)[:2]
         self.support_low = np.minimum(footprint.min(axis=0), -0.01 * body.height)
         self.support_high = np.maximum(footprint.max(axis=0), 0.01 * body.height)

@@ -20,8 +20,8 @@ _MAX_THICKENING = 1.3
 
 
 def capture_warnings(cloud: GaussianCloud, cage: TetMesh, height: float, *, thickening: float = 1.0) -> tuple[str, ...]:
-    """Return one line for each warning: too few Gaussians, parts of ``cloud`` detached from its ``cage``, or a cage that
-    is thicker than the object (``Cage.thickening``).
+    """Return one line for each warning: too few Gaussians, parts of ``cloud`` detached from its ``cage``, or a cage
+    that is thicker than the object (``Cage.thickening``).
 
     ``cloud``, ``cage`` and the body's ``height`` are in the same unit and frame.
     """

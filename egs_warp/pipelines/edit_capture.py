@@ -94,10 +94,10 @@ def merge_captures(captures: Sequence[Capture]) -> Capture:
         return first
     clouds = [capture.cloud for capture in captures]
     coefficients = max(cloud.sh.shape[1] for cloud in clouds)
-    arrays = [
+    rotations, log_scales, logits = (
         np.concatenate([getattr(cloud, name).numpy() for cloud in clouds])
         for name in ("rotations", "log_scales", "opacity_logits")
-    ]
+    )
     sh = [np.pad(cloud.sh.numpy(), ((0, 0), (0, coefficients - cloud.sh.shape[1]), (0, 0))) for cloud in clouds]
     means, origin, notes = relative_positions(np.concatenate([_file_positions(capture) for capture in captures]))
     notes = (*(f"{capture.source}: {note}" for capture in captures for note in capture.notes), *notes)
@@ -107,10 +107,10 @@ def merge_captures(captures: Sequence[Capture]) -> Capture:
         notes = (*notes, "the captures have different up directions; they were merged in their own axes")
     if antialiased != any(capture.antialiased for capture in captures):
         notes = (*notes, "only some of the captures were trained with antialiasing; the mark is dropped")
-    cloud = GaussianCloud.from_numpy(means, *arrays, np.concatenate(sh), device=str(first.cloud.device))
-    return replace(
-        first, cloud=cloud, origin=origin, up=up, antialiased=antialiased, notes=notes, rows=None
+    cloud = GaussianCloud.from_numpy(
+        means, rotations, log_scales, logits, np.concatenate(sh), device=str(first.cloud.device)
     )
+    return replace(first, cloud=cloud, origin=origin, up=up, antialiased=antialiased, notes=notes, rows=None)
 
 
 def _file_positions(capture: Capture) -> np.ndarray:
@@ -134,7 +134,9 @@ def edit_capture(capture: Capture, edits: CaptureEdits) -> tuple[Capture, tuple[
         means = _file_positions(capture)
         inside = np.all((means >= low) & (means <= high), axis=1)
         if not inside.any():
-            bounds = " to ".join(",".join(f"{x:.6g}" for x in corner) for corner in (means.min(axis=0), means.max(axis=0)))
+            bounds = " to ".join(
+                ",".join(f"{x:.6g}" for x in corner) for corner in (means.min(axis=0), means.max(axis=0))
+            )
             raise ArgumentError("box", f"none of the {cloud.count} Gaussians lies in it; they extend from {bounds}")
         lines.append(f"box: {cloud.count - int(inside.sum())} of {cloud.count} Gaussians left out")
         cloud = cloud.subset(inside)

@@ -175,8 +175,8 @@ def guess_up(
         direction, support = resting
         angle = np.degrees(np.arccos(np.abs(direction).max()))
         return direction, (
-            f"guessed: {support}; the capture is tilted by {angle:.0f} degrees from {_name(direction)}, clearly ahead of"
-            f" the best axis {_name(up)}, score {support.score:.2f} to {best:.2f}"
+            f"guessed: {support}; the capture is tilted by {angle:.0f} degrees from {_name(direction)}, clearly ahead"
+            f" of the best axis {_name(up)}, score {support.score:.2f} to {best:.2f}"
         )
     if best < _POOR_SCORE or advantage > _CLEAR_MARGIN:
         margin = "no axis fits well, and the capture may be tilted; just"

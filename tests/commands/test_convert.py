@@ -79,7 +79,14 @@ def test_each_gaussian_is_compared_with_itself(kind: str, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("size", "deviation", "error"),
-    [(1e-4, 1e-6, None), (2e-3, 1e-4, 3e-4), (0.05, 1e-3, 3e-4), (1.0, 0.02, 3e-4), (1e6, 100.0, 3e-4), (1e6, 1e4, None)],
+    [
+        (1e-4, 1e-6, None),
+        (2e-3, 1e-4, 3e-4),
+        (0.05, 1e-3, 3e-4),
+        (1.0, 0.02, 3e-4),
+        (1e6, 100.0, 3e-4),
+        (1e6, 1e4, None),
+    ],
 )
 def test_spz_of_any_size_keeps_its_shape_or_is_refused(
     size: float, deviation: float, error: float | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]

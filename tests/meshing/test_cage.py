@@ -208,7 +208,7 @@ def test_a_thin_body_is_refused_with_a_remedy(shape: str) -> None:
         np.full(len(points), 3.0),
         np.zeros((len(points), 1, 3)),
     )
-    with pytest.raises(UserError, match="it is too thin for its elements .* cut out a piece"):
+    with pytest.raises(UserError, match=r"it is too thin for its elements .* cut out a piece"):
         build_cage(cloud, _FLOOR)
 
 

@@ -24,7 +24,9 @@ def test_a_block_rests_on_its_six_sides() -> None:
     assert np.abs(cosines).max(axis=1).min() > np.cos(np.radians(0.5))
 
 
-@pytest.mark.parametrize("points", [np.zeros((50, 3)), np.eye(3), np.random.default_rng(0).normal(size=(50, 3)) * [1, 1, 0]])
+@pytest.mark.parametrize(
+    "points", [np.zeros((50, 3)), np.eye(3), np.random.default_rng(0).normal(size=(50, 3)) * [1, 1, 0]]
+)
 def test_without_volume_there_are_none(points: np.ndarray) -> None:
     assert resting_directions(points, at_most=6).shape == (0, 3)
 
