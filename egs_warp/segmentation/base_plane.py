@@ -34,9 +34,9 @@ ever x."""
 _CLEAR_MARGIN = 0.3
 _POOR_SCORE = 1.75
 """Score below which no axis fits: that of the side of an object that is tilted."""
-_SURE_LEVEL, _TILT_MARGIN = 0.5, 0.5
-"""A tilted direction replaces an axis if its support is level, that of the axis is not, and its score is higher by the
-margin."""
+_SURE_LEVEL = 0.5
+"""A tilted direction replaces an axis if more of its support than this is level, less of that of the axis, and its
+score is clearly higher."""
 _FEW_GAUSSIANS, _MAX_DIRECTIONS = 20_000, 24
 """Gaussians from which tilted directions are searched, and the maximum number of these."""
 
@@ -171,7 +171,7 @@ def guess_up(
     (best, shape, up), (second, _, other) = scores[0], scores[1]
     resting = _resting_up(near) if tilted and shape.level < _SURE_LEVEL else None
     advantage = resting[1].score - best if resting is not None else 0.0
-    if resting is not None and resting[1].level >= _SURE_LEVEL and advantage > _TILT_MARGIN:
+    if resting is not None and resting[1].level >= _SURE_LEVEL and advantage > _CLEAR_MARGIN:
         direction, support = resting
         angle = np.degrees(np.arccos(np.abs(direction).max()))
         return direction, (
@@ -179,10 +179,10 @@ def guess_up(
             f" of the best axis {_name(up)}, score {support.score:.2f} to {best:.2f}"
         )
     if best < _POOR_SCORE or advantage > _CLEAR_MARGIN:
-        margin = "no axis fits well, and the capture may be tilted; just"
+        order = "no axis fits well, as if the capture were tilted; next is"
     else:
-        margin = "clearly" if best - second > _CLEAR_MARGIN else "narrowly"
-    return up, f"guessed: {shape}; {margin} ahead of {_name(other)}, score {best:.2f} to {second:.2f}"
+        order = f"{'clearly' if best - second > _CLEAR_MARGIN else 'narrowly'} ahead of"
+    return up, f"guessed: {shape}; {order} {_name(other)}, score {best:.2f} to {second:.2f}"
 
 
 def _resting_up(cloud: GaussianCloud) -> tuple[np.ndarray, _Support] | None:

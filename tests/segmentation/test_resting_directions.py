@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -31,14 +33,13 @@ def test_without_volume_there_are_none(points: np.ndarray) -> None:
     assert resting_directions(points, at_most=6).shape == (0, 3)
 
 
-def test_up_of_a_tilted_pawn_is_the_normal_of_its_base() -> None:
-    """Thirty degrees about x; level, it is one of the axes to the last bit."""
-    thing = pawn(gaussian_count=3000)
-    turn = Rotation.from_euler("x", 30, degrees=True).as_matrix()
+@pytest.mark.parametrize("degrees", [12, 30])
+def test_up_of_a_tilted_pawn_is_the_normal_of_its_base(degrees: int) -> None:
+    thing = pawn(gaussian_count=2000)
+    turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
     tilted = to_body_frame(thing.cloud, BodyFrame(turn, np.zeros(3), 1.0))
     up, reason = guess_up(tilted)
     assert up @ turn @ thing.up > np.cos(np.radians(2.0))
-    assert "tilted by 30 degrees from +z" in reason or "tilted by 29 degrees from +z" in reason
-    assert np.array_equal(guess_up(thing.cloud)[0], thing.up)
-    # Scenes keep to the axes; none fits.
-    assert "no axis fits well" in guess_up(tilted, tilted=False)[1]
+    assert re.search(rf"tilted by ({degrees}|{degrees - 1}|{degrees + 1}) degrees from \+z, clearly ahead of", reason)
+    # Scenes keep to the axes; none fits at 30 degrees.
+    assert ("no axis fits well" in guess_up(tilted, tilted=False)[1]) == (degrees == 30)
