@@ -6,6 +6,8 @@ colours least (J. H. Ward, "Hierarchical grouping to optimize an objective funct
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import logit
@@ -101,4 +103,13 @@ def _cloud(
     rotations[merged] = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
     log_scales[merged] = 0.5 * np.log(variances)
     logits[merged] = logit(np.clip(weights[merged] / areas, _MIN_OPACITY, _MAX_OPACITY))
-    return GaussianCloud.from_numpy(means, rotations, log_scales, logits, sh, device=str(cloud.device))
+    new = GaussianCloud.from_numpy(means, rotations, log_scales, logits, sh, device=str(cloud.device))
+    # Other properties of the cloud stay.
+    return replace(
+        cloud,
+        means=new.means,
+        rotations=new.rotations,
+        log_scales=new.log_scales,
+        opacity_logits=new.opacity_logits,
+        sh=new.sh,
+    )
