@@ -171,7 +171,7 @@ def _read_text(data: bytes, header: PlyHeader, names: list[str], source: Path) -
 def columns_as_float32(rows: np.ndarray, names: list[str]) -> np.ndarray:
     """(n, len(names)) float32 from the named fields of a structured array."""
     out = np.empty((len(rows), len(names)), np.float32)
-    layout = dict[str, Any](rows.dtype.fields or {})
+    layout: Any = rows.dtype.fields or {}
     fields = [layout[name] for name in names]
     aligned = rows.dtype.itemsize % 4 == 0 and all(kind == "<f4" and place % 4 == 0 for kind, place, *_ in fields)
     if aligned and len(names) > _FEW_COLUMNS:
