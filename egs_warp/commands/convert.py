@@ -5,27 +5,37 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from egs_warp.commands.flags import SPLAT_FILES, Commands, named_path
+from egs_warp.commands.flags import SPLAT_FILES, Commands, named_path, parse_numbers, parse_up
 from egs_warp.commands.scene_flags import print_note
 from egs_warp.errors import UserError
+
+if TYPE_CHECKING:
+    from egs_warp.pipelines.edit_capture import CaptureEdits
 
 EXAMPLES = (
     "scan.ply scan.spz",
     "scan.ply flat.splat --degree 0",
     "scan.ply scan.spz --to spz4",
     "frames spz_frames --to spz",
+    "chair.ply table.ply room.spz --up=-y --scale 0.5",
+    "scan.ply small.ply --box=-1,-1,-1,1,1,1 --drop-floaters --count 200000",
 )
 
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
-    convert = commands.add_parser("convert", help="write a capture in another format, and report what is lost")
+    convert = commands.add_parser(
+        "convert", help="write a capture in another format, turned, cropped or merged, and report what is lost"
+    )
     convert.add_argument(
-        "capture",
+        "captures",
         metavar="in",
+        nargs="+",
         type=named_path,
-        help=".ply, compressed .ply, .spz, .splat, .sog, .glb, a SOG folder, or, with --to, a folder of numbered files",
+        help=".ply, compressed .ply, .spz, .splat, .sog, .glb, a SOG folder, or, with --to, a folder of numbered files;"
+        " several are merged",
     )
     convert.add_argument(
         "out",
@@ -38,6 +48,16 @@ def add_parser(commands: Commands) -> None:
     convert.add_argument(
         "--degree", type=int, choices=(0, 1, 2, 3), help="highest degree of spherical harmonics to write (all)"
     )
+    edits = convert.add_argument_group("changes, made in this order")
+    edits.add_argument("--box", help="keep the Gaussians in the box x0,y0,z0,x1,y1,z1, in the input's units")
+    edits.add_argument(
+        "--drop-floaters", action="store_true", help="leave out small parts that are connected to nothing"
+    )
+    edits.add_argument("--up", help="axis of the input that points up: it is turned to +y, as --up=-y")
+    edits.add_argument("--rotate", help="turn by x,y,z degrees, about the x axis first, then y, then z")
+    edits.add_argument("--scale", type=float, default=1.0, help="multiply all lengths by this factor")
+    edits.add_argument("--translate", help="move by x,y,z")
+    edits.add_argument("--count", type=int, help="merge neighbours until this number of Gaussians is left")
     convert.set_defaults(run=_convert)
 
 
@@ -49,46 +69,66 @@ def _convert(args: argparse.Namespace) -> int:
     from egs_warp.io.conversion_loss import conversion_loss
     from egs_warp.io.run_folder import check_no_file_of_a_run
     from egs_warp.io.sequence import numbered_captures
-    from egs_warp.io.writing import WRITERS, writer_of
+    from egs_warp.io.writing import WRITERS, write_capture, writer_of
     from egs_warp.launching import use_device
+    from egs_warp.pipelines.edit_capture import edit_capture, merge_captures
     from egs_warp.pipelines.progress import conversion_bar
 
-    if args.to is None or args.capture.is_file():
+    edits = _edits(args)
+    first = args.captures[0]
+    if args.to is None or first.is_file() or len(args.captures) > 1:
         write = writer_of(args.out, kind=args.to)
         # Checked before a capture is read, which may take long.
         if not args.out.absolute().parent.is_dir():
             raise UserError(f"{args.out}: its folder does not exist; create {args.out.parent} first")
-        if args.out.exists() and args.capture.exists() and args.out.samefile(args.capture):
+        if args.out.exists() and any(source.exists() and args.out.samefile(source) for source in args.captures):
             raise UserError(f"{args.out}: is the input file; give another name")
         check_no_file_of_a_run(args.out)
-        pairs = [(args.capture, args.out)]
+        jobs = [(args.captures, args.out)]
     else:
         ending, write = WRITERS[args.to]
-        sources = numbered_captures(args.capture)
-        if args.out.exists() and args.out.samefile(args.capture):
+        sources = numbered_captures(first)
+        if args.out.exists() and args.out.samefile(first):
             raise UserError(f"{args.out}: is the input folder; give another one")
         folder = writable_folder(args.out)
-        pairs = [(source, folder / f"{source.name.split('.')[0]}{ending}") for source in sources]
+        jobs = [([source], folder / f"{source.name.split('.')[0]}{ending}") for source in sources]
     use_device("cpu")
-    losses: list[str] = []
+    lines: list[str] = []
     notes: list[str] = []
-    for source, target in tqdm(pairs, desc="convert", unit="file", disable=len(pairs) == 1, file=sys.stderr):
-        before = read_capture(source)
-        with conversion_bar(target.name, quiet=len(pairs) > 1) as begins:
+    for sources, target in tqdm(jobs, desc="convert", unit="file", disable=len(jobs) == 1, file=sys.stderr):
+        capture = merge_captures([read_capture(source) for source in sources])
+        capture, changes = edit_capture(capture, edits)
+        with conversion_bar(target.name, quiet=len(jobs) > 1) as begins:
             begins("write")
-            write(target, with_degree(before.cloud, args.degree))
-            if not losses:
-                notes = [f"{source}: {note}" for note in before.notes]
+            order = write_capture(target, with_degree(capture.cloud, args.degree), write, origin=capture.origin)
+            if not lines:
+                notes = [note if len(sources) > 1 else f"{sources[0]}: {note}" for note in capture.notes]
                 begins("compare")
-                losses = conversion_loss(before, read_capture(target))
+                lines = [*changes, *conversion_loss(capture, read_capture(target), order)]
     for note in notes:
         print_note(note)
-    size, input_size = (sum(_size(pair[k]) for pair in pairs) for k in (1, 0))
-    names = str(pairs[0][1]) if len(pairs) == 1 else f"{pairs[0][1]} to {pairs[-1][1].name}"
+    size = sum(_size(target) for _, target in jobs)
+    input_size = sum(_size(source) for sources, _ in jobs for source in sources)
+    names = str(jobs[0][1]) if len(jobs) == 1 else f"{jobs[0][1]} to {jobs[-1][1].name}"
     print(f"wrote {names} ({size / 1e6:.2f} MB from {input_size / 1e6:.2f} MB)")
-    for line in losses:
-        print(f"  {line}" if len(pairs) == 1 else f"  first file: {line}")
+    for line in lines:
+        print(f"  {line}" if len(jobs) == 1 else f"  first file: {line}")
     return 0
+
+
+def _edits(args: argparse.Namespace) -> CaptureEdits:
+    from egs_warp.pipelines.edit_capture import CaptureEdits
+
+    box = None if args.box is None else parse_numbers("box", args.box, 6).reshape(2, 3)
+    return CaptureEdits(
+        box=box,
+        drop_floaters=args.drop_floaters,
+        up=None if args.up is None else parse_up(args.up),
+        rotation=None if args.rotate is None else parse_numbers("rotate", args.rotate, 3),
+        scale=args.scale,
+        translation=None if args.translate is None else parse_numbers("translate", args.translate, 3),
+        count=args.count,
+    )
 
 
 def _size(path: Path) -> int:

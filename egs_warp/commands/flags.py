@@ -116,6 +116,19 @@ def parse_direction(flag: str, text: str) -> np.ndarray:
     return direction / length
 
 
+def parse_numbers(flag: str, text: str, count: int) -> np.ndarray:
+    """Return the (count,) finite numbers of a text such as ``1,2,3``. Raises ``UserError``, which names ``flag``."""
+    import numpy as np
+
+    try:
+        numbers = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        numbers = np.zeros(0)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise UserError(f"--{flag} {text}: give {count} numbers, separated by commas")
+    return numbers
+
+
 def parse_plane(text: str) -> Plane:
     """Return the plane n.x + d = 0 of ``nx,ny,nz,d``. Raises ``UserError`` for other texts."""
     from egs_warp.geometry.plane import Plane
@@ -141,4 +154,8 @@ def guessed_up(capture: Capture) -> tuple[np.ndarray, str]:
 
     up, reason = guess_up(capture.cloud, capture.up, vertical_axis=capture.vertical_axis)
     axis = int(np.argmax(np.abs(up)))
-    return up, f"up is estimated as {'-' if up[axis] < 0 else '+'}{'xyz'[axis]} ({reason}); if that is wrong, give --up"
+    if np.abs(up[axis]) == 1.0:
+        name = f"{'-' if up[axis] < 0 else '+'}{'xyz'[axis]}"
+    else:
+        name = ",".join(f"{x:.3f}" for x in up)
+    return up, f"up is estimated as {name} ({reason}); if that is wrong, give --up"

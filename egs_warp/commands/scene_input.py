@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -100,6 +100,8 @@ def read_scene(args: argparse.Namespace) -> SceneInput:
     capture = read_capture(args.capture, device=args.device)
     poses = read_posed_images(args.cameras) if args.cameras else None
     posed = poses.images if poses is not None else ()
+    if capture.origin is not None:
+        posed = tuple(_relative_to(capture.origin, one) for one in posed)
     spec = None
     if args.object is None and args.mask_model is not None:
         raise UserError("--mask-model: it needs clicks; give --object +u,v@photo")
@@ -111,3 +113,9 @@ def read_scene(args: argparse.Namespace) -> SceneInput:
     if poses is not None:
         notes = (*notes, *poses.messages)
     return SceneInput(capture.cloud, posed, spec, up, plane, notes)
+
+
+def _relative_to(origin: np.ndarray, posed: PosedImage) -> PosedImage:
+    """Return a photo whose camera is placed relative to ``origin`` (3,), as the positions of the capture are."""
+    camera = posed.camera
+    return replace(posed, camera=replace(camera, translation=camera.translation + camera.rotation @ origin))

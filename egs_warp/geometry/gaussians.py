@@ -69,22 +69,25 @@ class GaussianCloud:
         for name, (values, shape) in named.items():
             if np.shape(values) != shape:
                 raise UserError(f"capture: {name} has shape {np.shape(values)}, expected {shape}; export it again")
+            # Only the direction of a quaternion counts.
+            limit = {"log_scales": MAX_LOG_SCALE, "rotations": np.inf}.get(name, MAX_VALUE)
+            floor = -np.inf if name == "log_scales" else -limit
+            # Both are NaN if any value is. The first faulty Gaussian is only searched if there is one.
+            lowest, highest = np.min(values, initial=0.0), np.max(values, initial=0.0)
+            if np.isfinite(lowest) and np.isfinite(highest) and floor <= lowest and highest <= limit:
+                continue
             not_finite = np.flatnonzero(~np.isfinite(values).reshape(count, -1).all(axis=1))
             if len(not_finite):
                 raise UserError(
                     f"capture: {name} of {len(not_finite)} Gaussians is not finite (first: number {not_finite[0]}); "
                     "remove them and export again"
                 )
-            # Only the direction of a quaternion counts.
-            limit = {"log_scales": MAX_LOG_SCALE, "rotations": np.inf}.get(name, MAX_VALUE)
-            too_large = np.reshape(values, (count, -1)).max(axis=1) > limit
-            if name != "log_scales":
-                too_large |= np.reshape(values, (count, -1)).min(axis=1) < -limit
-            if too_large.any():
-                raise UserError(
-                    f"capture: {name} of {np.count_nonzero(too_large)} Gaussians is too large for single precision"
-                    f" (first: number {np.argmax(too_large)}); remove them and export again"
-                )
+            rows = np.reshape(values, (count, -1))
+            too_large = (rows.max(axis=1) > limit) | (rows.min(axis=1) < floor)
+            raise UserError(
+                f"capture: {name} of {np.count_nonzero(too_large)} Gaussians is too large for single precision"
+                f" (first: number {np.argmax(too_large)}); remove them and export again"
+            )
         if np.shape(sh)[1] not in (1, 4, 9, 16):
             raise UserError(f"capture: {np.shape(sh)[1]} SH coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
 

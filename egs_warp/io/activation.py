@@ -24,7 +24,7 @@ def with_logarithms(raw: RawCapture) -> RawCapture:
     """
     few = slice(0, _SAMPLE)
     if len(raw.means) < _MIN_COUNT or (
-        (raw.log_scales[few] < 0.0).any(axis=0)[:2].any() and not _within(raw.opacity_logits[few])
+        bool(np.any(raw.log_scales[few, :2] < 0.0)) and not _within(raw.opacity_logits[few])
     ):
         return raw
     # The third scale of a flat Gaussian is absent or minus infinity, and activated it is 0.

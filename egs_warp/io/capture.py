@@ -14,6 +14,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.compressed_ply import decode_compressed_ply, is_compressed
 from egs_warp.io.gltf import decode_glb, decode_gltf, is_glb
 from egs_warp.io.limits import FREE_BYTES, INFLATION, MAX_TEXT_BYTES, read_bytes
+from egs_warp.io.origin import relative_positions
 from egs_warp.io.outliers import without_not_finite, without_outliers
 from egs_warp.io.ply import decode_ply, read_header
 from egs_warp.io.raw import EXTREME_LOGIT, RawCapture
@@ -27,7 +28,7 @@ _META, _STREAMED_META = "meta.json", "lod-meta.json"
 
 @dataclass(frozen=True)
 class Capture:
-    """A capture as read from disk, in the axes and units of its file."""
+    """A capture as read from disk, in the axes and units of its file, relative to its ``origin``."""
 
     cloud: GaussianCloud
     source: Path
@@ -41,7 +42,11 @@ class Capture:
     vertical_axis: int | None
     """Index of the vertical axis, if the file names one without a reliable sign."""
     notes: tuple[str, ...]
-    """Gaussians left out and values repaired, for the user."""
+    """Gaussians left out, and values repaired or rounded, for the user."""
+    origin: np.ndarray | None = None
+    """(3,) float64, file units: offset of a georeferenced capture, which was subtracted from its positions."""
+    rows: np.ndarray | None = None
+    """(n,) numbers of the Gaussians in the file; None if all of them were read in order."""
 
     @property
     def antialiased(self) -> bool:
@@ -63,11 +68,14 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
     raw = without_outliers(without_not_finite(raw, source), source)
     infinite = np.isinf(raw.opacity_logits)
     infinite_count = int(np.count_nonzero(infinite))
-    notes = raw.notes
+    means, origin, rounding = relative_positions(raw.means)
+    if raw.origin is not None:
+        origin = raw.origin if origin is None else raw.origin + origin
+    notes = (*raw.notes, *rounding)
     if infinite_count:
         notes = (*notes, f"{infinite_count} infinite opacities were read as 0 or 1")
     cloud = GaussianCloud.from_numpy(
-        raw.means,
+        means,
         raw.rotations,
         raw.log_scales,
         np.where(infinite, np.copysign(np.float32(EXTREME_LOGIT), raw.opacity_logits), raw.opacity_logits),
@@ -75,7 +83,7 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
         antialiased=raw.antialiased,
         device=device,
     )
-    return Capture(cloud, source, raw.format, infinite_count, raw.up, raw.vertical_axis, notes)
+    return Capture(cloud, source, raw.format, infinite_count, raw.up, raw.vertical_axis, notes, origin, raw.rows)
 
 
 def _decode(source: Path) -> RawCapture:

@@ -131,11 +131,12 @@ def _decode_rest(rows: np.ndarray, count: int, source: Path) -> tuple[np.ndarray
     return table[np.clip(packed, 0, 255).astype(np.uint8)], bands_note(rest)
 
 
-def write_compressed_ply(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = False) -> None:
+def write_compressed_ply(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = False) -> np.ndarray:
     """Write ``cloud`` as a compressed .ply, about 16 bytes per Gaussian and one more for each higher SH number.
 
     Lossy: positions to 1/1024 of their chunk's size, SH to 1/32, opacity to 1/255. Gaussians are sorted in space, which
-    keeps chunks small, unless ``keep_order`` is set. Raises ``UserError`` if the file cannot be written.
+    keeps chunks small, unless ``keep_order`` is set. Returns the number (n,) in ``cloud`` of each Gaussian of the file.
+    Raises ``UserError`` if the file cannot be written.
     """
     means = cloud.means.numpy()
     order = np.arange(cloud.count) if keep_order else morton_order(means)
@@ -171,6 +172,7 @@ def write_compressed_ply(path: Path | str, cloud: GaussianCloud, *, keep_order: 
         file.write(header.encode() + b"end_header\n" + chunks.tobytes())
         file.write(np.stack([words[name] for name in _PACKED], axis=1).astype("<u4").tobytes())
         file.write(rest.tobytes())
+    return order
 
 
 def _packed(fractions: np.ndarray, fields: tuple[tuple[int, int], ...]) -> np.ndarray:

@@ -1,24 +1,35 @@
-"""Differences between a capture and its copy in another format, measured for each Gaussian."""
+"""Differences between a capture and its copy in another format, each Gaussian compared with itself."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import NamedTuple
+
 import numpy as np
-from scipy.spatial import KDTree
+from scipy.special import expit
 
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.capture import Capture
 
-_ARRAYS = ("means", "rotations", "log_scales", "opacity_logits", "sh")
-_FINE = 1000.0
-"""Weight of positions, in sizes of the capture, when Gaussians are matched."""
+_BLOCK_ROWS = 1 << 17
+"""Gaussians compared at a time, which bounds the memory."""
 
 
-def conversion_loss(before: Capture, after: Capture) -> list[str]:
-    """Describe, line by line for the user, how ``after``, written from ``before``, differs. Each Gaussian is matched
-    with the most similar one, as some formats change the order."""
+def conversion_loss(before: Capture, after: Capture, order: np.ndarray | None = None) -> list[str]:
+    """Describe, line by line for the user, how ``after`` differs from ``before``.
+
+    Args:
+        before: The capture that was written.
+        after: The file, read back.
+        order: (n,) number in ``before`` of each Gaussian in the order of the file, as its writer returns it; None if
+            the order is the same.
+    """
     old, new = before.cloud, after.cloud
+    order = np.arange(old.count) if order is None else order
+    if after.rows is not None:
+        order = order[after.rows]
     lines = []
-    if new.count != old.count:
+    if new.count < old.count:
         lines.append(f"{old.count - new.count} of {old.count} Gaussians are gone")
     if new.sh_degree < old.sh_degree:
         rest = "; colours no longer change with the view" if new.sh_degree == 0 else ""
@@ -29,51 +40,101 @@ def conversion_loss(before: Capture, after: Capture) -> list[str]:
         lines.append("the up direction is lost")
     if after.up is not None and (before.up is None or not np.allclose(before.up, after.up)):
         lines.append("the axes are unchanged, but this format's viewers take +y as up")
-    differences = _differences(old, new)
-    if not lines and not differences:
-        return ["nothing is lost: every bit is the same"]
-    return lines + differences
+    if before.origin is not None and after.origin is None:
+        offset = ",".join(f"{x:.12g}" for x in before.origin)
+        lines.append(f"the offset {offset} has no place in this format; the file is relative to it")
+    differences = _differences(old, new, order)
+    if lines or differences:
+        return lines + differences
+    if before.notes:
+        return ["every bit that was read is the same; the notes state what was not"]
+    return ["nothing is lost: every bit is the same"]
 
 
-def _differences(old: GaussianCloud, new: GaussianCloud) -> list[str]:
+class _Loss:
+    """Root mean square and largest value of one difference."""
+
+    def __init__(self) -> None:
+        self._squares, self._count, self._worst = 0.0, 0, 0.0
+
+    def add(self, values: np.ndarray) -> None:
+        """Add differences of any shape, of at least 0."""
+        self._squares += float(np.sum(values * values, dtype=np.float64))
+        self._count += values.size
+        self._worst = max(self._worst, float(values.max()))
+
+    def __str__(self) -> str:
+        return f"{(self._squares / self._count) ** 0.5:.2g} (at most {self._worst:.2g})"
+
+
+def _differences(old: GaussianCloud, new: GaussianCloud, order: np.ndarray) -> list[str]:
     coefficients = min(old.sh.shape[1], new.sh.shape[1])
-    same = old.count == new.count and all(
-        np.array_equal(_array(old, name, coefficients), _array(new, name, coefficients)) for name in _ARRAYS
-    )
-    if same:
+    if all(_is_same(*pair) for pair in _blocks(old, new, order, coefficients)):
         return []
-    extent = float(np.ptp(old.means.numpy(), axis=0).max()) or 1.0
-    order = np.asarray(KDTree(_features(old, extent)).query(_features(new, extent))[1], np.int64)
-    means = np.linalg.norm(new.means.numpy() - old.means.numpy()[order], axis=1)
-    scales = np.exp(np.abs(new.log_scales.numpy() - old.log_scales.numpy()[order])).max(axis=1)
-    cosines = np.abs(np.einsum("ni,ni->n", new.rotations.numpy(), old.rotations.numpy()[order]))
-    angles = 2.0 * np.degrees(np.arccos(np.minimum(cosines, 1.0)))
-    opacities = np.abs(new.opacities() - old.opacities()[order])
-    colours = SH_BAND_0 * np.abs(new.sh.numpy()[:, 0] - old.sh.numpy()[order, 0]).max(axis=1)
-
-    def both(values: np.ndarray, scale: float = 1.0) -> str:
-        return f"{scale * float(np.median(values)):.2g} (at most {scale * float(values.max()):.2g})"
-
-    parts = [
-        f"positions {both(means)} units, of a size of {extent:.3g}",
-        f"standard deviations by {both(scales - 1.0, 100.0)} %",
-        f"rotations {both(angles)} degrees",
-        f"opacities {both(opacities, 255.0)} of 255",
-        f"colours {both(colours, 255.0)} of 255",
-    ]
-    if coefficients > 1:
-        rest = np.abs(new.sh.numpy()[:, 1:coefficients] - old.sh.numpy()[order, 1:coefficients]).max(axis=(1, 2))
-        parts.append(f"coefficients of higher bands {both(rest)}")
-    return [f"changed, in the median: {', '.join(parts)}"]
+    measures = {
+        "positions {} units": _position_errors,
+        "standard deviations {} %": _size_errors,
+        "rotations {} degrees": _rotation_errors,
+        "opacities {} of 255": _opacity_errors,
+        "colours {} of 255": lambda a, b: 255.0 * SH_BAND_0 * np.abs(a.sh[:, 0] - b.sh[:, 0]).max(axis=1),
+        "coefficients of higher bands {}": lambda a, b: np.abs(a.sh[:, 1:] - b.sh[:, 1:]).max(axis=(1, 2)),
+    }
+    if coefficients == 1:
+        measures.popitem()
+    losses = {text: _Loss() for text in measures}
+    for pair in _blocks(old, new, order, coefficients):
+        for text, measure in measures.items():
+            losses[text].add(measure(*pair))
+    extent = float(np.ptp(old.means.numpy(), axis=0).max())
+    parts = [text.format(loss) for text, loss in losses.items()]
+    parts[0] += f", of a size of {extent:.3g}"
+    return [f"changed, root mean square: {', '.join(parts)}"]
 
 
-def _array(cloud: GaussianCloud, name: str, coefficients: int) -> np.ndarray:
-    values = getattr(cloud, name).numpy()
-    return values[:, :coefficients] if name == "sh" else values
+class _Block(NamedTuple):
+    """Some Gaussians, as arrays of a ``GaussianCloud``."""
+
+    means: np.ndarray
+    rotations: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
 
 
-def _features(cloud: GaussianCloud, extent: float) -> np.ndarray:
-    places = cloud.means.numpy().astype(np.float64) * (_FINE / extent)
-    return np.concatenate(
-        [places, cloud.log_scales.numpy(), cloud.sh.numpy()[:, 0], cloud.opacities()[:, None]], axis=1
-    )
+def _blocks(
+    old: GaussianCloud, new: GaussianCloud, order: np.ndarray, coefficients: int
+) -> Iterator[tuple[_Block, _Block]]:
+    """Yield the same Gaussians of both clouds, with bands of colour that both have."""
+    names = _Block._fields
+    before, after = ([getattr(cloud, name).numpy() for name in names] for cloud in (old, new))
+    before[-1], after[-1] = before[-1][:, :coefficients], after[-1][:, :coefficients]
+    for start in range(0, len(order), _BLOCK_ROWS):
+        rows = order[start : start + _BLOCK_ROWS]
+        yield _Block(*(a[rows] for a in before)), _Block(*(b[start : start + len(rows)] for b in after))
+
+
+def _is_same(old: _Block, new: _Block) -> bool:
+    return all(np.array_equal(a, b) for a, b in zip(old, new, strict=True))
+
+
+def _position_errors(old: _Block, new: _Block) -> np.ndarray:
+    return np.linalg.norm(new.means.astype(np.float64) - old.means, axis=1)
+
+
+def _size_errors(old: _Block, new: _Block) -> np.ndarray:
+    """Largest change of a standard deviation, percent of the Gaussian's largest one: a flat one that is a little less
+    flat looks the same."""
+    before, after = (np.exp(block.log_scales.astype(np.float64)) for block in (old, new))
+    return 100.0 * np.abs(after - before).max(axis=1) / before.max(axis=1)
+
+
+def _rotation_errors(old: _Block, new: _Block) -> np.ndarray:
+    """Angles in degrees. A quaternion and its negative are the same rotation."""
+    a, b = old.rotations.astype(np.float64), new.rotations.astype(np.float64)
+    chord = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
+    return 4.0 * np.degrees(np.arcsin(np.minimum(0.5 * chord, 1.0)))
+
+
+def _opacity_errors(old: _Block, new: _Block) -> np.ndarray:
+    before, after = (expit(block.opacity_logits.astype(np.float64)) for block in (old, new))
+    return 255.0 * np.abs(after - before)

@@ -19,8 +19,14 @@ _FLOAT = 5126
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
-def write_glb(path: Path | str, cloud: GaussianCloud) -> None:
-    """Write ``cloud``, y up, as one mesh of points. Raises ``UserError`` if the file cannot be written."""
+def write_glb(path: Path | str, cloud: GaussianCloud, *, origin: np.ndarray | None = None) -> None:
+    """Write ``cloud``, y up, as one mesh of points. Raises ``UserError`` if the file cannot be written.
+
+    Args:
+        path: The file.
+        cloud: The Gaussians.
+        origin: (3,) Translation of the mesh's node (``Capture.origin``).
+    """
     means, sh = cloud.means.numpy(), cloud.sh.numpy()
     opacities = cloud.opacities().astype(np.float32)[:, None]
     fallback = np.concatenate([np.clip(0.5 + SH_BAND_0 * sh[:, 0], 0.0, 1.0), opacities], axis=1)
@@ -46,13 +52,16 @@ def write_glb(path: Path | str, cloud: GaussianCloud) -> None:
     if cloud.antialiased:
         # The extension has no property for it.
         splats |= {"extras": {"antialiased": True}}
+    node: dict[str, object] = {"mesh": 0, "name": "creature"}
+    if origin is not None:
+        node["translation"] = origin.tolist()
     text = json.dumps(
         {
             "asset": {"version": "2.0", "generator": "egs_warp"},
             "extensionsUsed": [_EXTENSION],
             "scene": 0,
             "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0, "name": "creature"}],
+            "nodes": [node],
             "meshes": [
                 {
                     "primitives": [

@@ -110,7 +110,7 @@ class _Splats:
     """Splats of one primitive, in the axes of its mesh."""
 
     means: np.ndarray
-    """(n, 3) float32."""
+    """(n, 3) float32, or float64 once transformed."""
     rotations: np.ndarray
     """(n, 4) float32, w x y z."""
     log_scales: np.ndarray
@@ -130,7 +130,7 @@ class _Splats:
         rotations, log_scales = self.rotations.copy(), self.log_scales.copy()
         rotations[finite], log_scales[finite] = transformed_shapes(rotations[finite], log_scales[finite], matrix)
         sh = transformed_colours(self.sh, matrix)
-        return replace(self, means=means.astype(np.float32), rotations=rotations, log_scales=log_scales, sh=sh)
+        return replace(self, means=means, rotations=rotations, log_scales=log_scales, sh=sh)
 
 
 @dataclass(frozen=True)
@@ -155,10 +155,12 @@ class _Asset:
         if left_out:
             notes[f"{left_out} meshes of splats that the scene does not show were left out"] = None
         transforms = np.concatenate([one.transforms for one in placed])
-        up = _Y_UP
+        up, origin = _Y_UP, None
         is_shared = np.allclose(transforms, transforms[0], rtol=1e-7, atol=1e-12)
         if is_shared and is_proper_similarity(transforms[0, :3, :3]):
-            if not np.allclose(transforms[0], np.eye(4), atol=1e-6):
+            if np.array_equal(transforms[0, :3, :3], np.eye(3)):
+                origin = transforms[0, :3, 3] if transforms[0, :3, 3].any() else None
+            elif not np.allclose(transforms[0], np.eye(4), atol=1e-6):
                 notes["the transforms of glTF's nodes were ignored: the capture is in the axes of its mesh"] = None
                 up = np.linalg.inv(transforms[0, :3, :3]) @ _Y_UP
             shown = [part for one in placed for _ in one.transforms for part in parts[one.mesh]]
@@ -179,6 +181,7 @@ class _Asset:
             sh=np.concatenate([part.sh[:, :coefficients] for part in shown]),
             up=up / np.linalg.norm(up),
             antialiased=all(part.antialiased for part in shown),
+            origin=origin,
             notes=tuple(notes),
         )
 

@@ -62,7 +62,7 @@ def without_not_finite(raw: RawCapture, source: Path) -> RawCapture:
     return _subset(raw, good, (*raw.notes, note))
 
 
-def _subset(raw: RawCapture, chosen: np.ndarray | slice, notes: tuple[str, ...]) -> RawCapture:
+def _subset(raw: RawCapture, chosen: np.ndarray, notes: tuple[str, ...]) -> RawCapture:
     return replace(
         raw,
         means=raw.means[chosen],
@@ -70,6 +70,7 @@ def _subset(raw: RawCapture, chosen: np.ndarray | slice, notes: tuple[str, ...])
         log_scales=raw.log_scales[chosen],
         opacity_logits=raw.opacity_logits[chosen],
         sh=raw.sh[chosen],
+        rows=np.arange(len(raw.means))[chosen] if raw.rows is None else raw.rows[chosen],
         notes=notes,
     )
 
@@ -94,7 +95,9 @@ def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
             f"{source}: it extends {reach:.3g} units from the origin, the limit is {MAX_COORDINATE:g}; export it again"
         )
     far, large = distance > MAX_DISTANCE_RATIO * size, scales > MAX_SCALE_RATIO * size
-    bright = np.asarray((np.abs(raw.sh) > MAX_SH).any(axis=(1, 2)))
+    bright = np.zeros(len(means), bool)
+    if max(float(raw.sh.max()), -float(raw.sh.min())) > MAX_SH:
+        bright = np.asarray((np.abs(raw.sh) > MAX_SH).any(axis=(1, 2)))
     out = far | large | bright
     count = int(out.sum())
     if count > _MAX_OUTLIER_FRACTION * len(out):
@@ -111,7 +114,7 @@ def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
     without_rotation = int(np.count_nonzero((raw.rotations == 0.0).all(axis=1) & ~out))
     if without_rotation:
         notes = (*notes, f"{without_rotation} Gaussians with a rotation of length 0 read as unrotated")
-    kept = _subset(raw, slice(None) if not count else ~out, notes)
+    kept = _subset(raw, ~out, notes) if count else replace(raw, notes=notes)
     logits = kept.opacity_logits
     return replace(
         kept,

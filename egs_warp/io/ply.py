@@ -39,8 +39,11 @@ _TYPES = {
 }
 """Types of properties: those of G. Turk, those with their bits, those of NumPy, and halves, which Babylon.js writes."""
 _BYTE_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": None}
+_SHOWN = 5
+"""Maximum number of names in a note."""
 # A block of this many rows stays in the cache while its columns are gathered one by one.
 _BLOCK_ROWS = 16384
+_FEW_COLUMNS = 8
 
 
 @dataclass(frozen=True)
@@ -182,6 +185,17 @@ def _read_text(data: bytes, header: PlyHeader, names: list[str], source: Path) -
 def columns_as_float32(rows: np.ndarray, names: list[str]) -> np.ndarray:
     """(n, len(names)) float32 from the named fields of a structured array."""
     out = np.empty((len(rows), len(names)), np.float32)
+    layout: Any = rows.dtype.fields or {}
+    fields = [layout[name] for name in names]
+    aligned = rows.dtype.itemsize % 4 == 0 and all(kind == "<f4" and place % 4 == 0 for kind, place, *_ in fields)
+    if aligned and len(names) > _FEW_COLUMNS:
+        # One pass over the rows takes a quarter of the time of one for each column.
+        words = rows.view("<f4").reshape(len(rows), rows.dtype.itemsize // 4)
+        columns = [place // 4 for _, place, *_ in fields]
+        for start in range(0, len(rows), _BLOCK_ROWS):
+            block = slice(start, start + _BLOCK_ROWS)
+            np.take(words[block], columns, axis=1, out=out[block], mode="clip")
+        return out
     for start in range(0, len(rows), _BLOCK_ROWS):
         block = rows[start : start + _BLOCK_ROWS]
         for column, name in enumerate(names):
@@ -231,10 +245,13 @@ def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
     scales = arrays["log_scales"]
     if flat:
         scales = np.pad(scales, ((0, 0), (0, 1)), constant_values=MIN_LOG_SCALE)
+    used = [name for names in columns.values() for name in names]
+    double = {name for name in used if kinds[name].kind == "f" and kinds[name].itemsize == 8}
+    bands = [name for name in present if name.startswith("f_rest_")] if not colours else []
     up, axis = up_of(header.comments)
     raw = RawCapture(
         format="INRIA .ply" if header.byte_order else "INRIA .ply (text)",
-        means=arrays["means"],
+        means=_columns_as_float64(rows, columns["means"]) if double & set(columns["means"]) else arrays["means"],
         rotations=arrays["rotations"],
         log_scales=scales,
         opacity_logits=logits,
@@ -242,7 +259,12 @@ def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
         up=up,
         vertical_axis=axis,
         antialiased=antialiased_of(header.comments),
-        notes=(*bands_note(rest), *(("no scale_2: read as flat Gaussians (2DGS)",) if flat else ())),
+        notes=(
+            *bands_note(rest),
+            *(("no scale_2: read as flat Gaussians (2DGS)",) if flat else ()),
+            *_rounding_notes(rows, [name for name in used if name in double and name not in columns["means"]]),
+            *_omission_notes(header, set(present).difference(used, bands, ("nx", "ny", "nz"))),
+        ),
     )
     return with_logarithms(raw)
 
@@ -288,6 +310,27 @@ def _not_gaussians(header: PlyHeader, missing: list[str], source: Path) -> UserE
     return UserError(f"{lacking}; it is a point cloud, which cannot be animated, train or export it as Gaussians")
 
 
+def _rounding_notes(rows: np.ndarray, names: list[str]) -> list[str]:
+    """Return a note of the named fields whose values are not those of single precision."""
+    rounded = [name for name in names if not np.array_equal(rows[name], rows[name].astype(np.float32))]
+    return [f"rounded to single precision: {_listed(rounded)}"] if rounded else []
+
+
+def _omission_notes(header: PlyHeader, properties: set[str]) -> list[str]:
+    """Return notes of the other elements, and of those properties of the Gaussians."""
+    notes = [f"properties left out: {_listed(sorted(properties))}"] if properties else []
+    elements = [element.name for element in header.elements if element.name != "vertex" and element.count]
+    return [*notes, *([f"elements left out: {_listed(elements)}"] if elements else [])]
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+
+
+def _columns_as_float64(rows: np.ndarray, names: list[str]) -> np.ndarray:
+    return np.stack([rows[name] for name in names], axis=1).astype(np.float64)
+
+
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read positions (n, 3) float64 and colours (n, 3) float64, 0 to 1, of a .ply of coloured points; grey without
     colours.
@@ -307,36 +350,45 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return positions[finite], colours[finite]
 
 
-def write_ply(path: Path | str, cloud: GaussianCloud) -> None:
+def write_ply(path: Path | str, cloud: GaussianCloud, *, origin: np.ndarray | None = None) -> None:
     """Write ``cloud`` as an INRIA .ply, binary little-endian, float32: reading it gives the same bits.
 
     Normals, always 0, are included because some viewers rely on the position of each property. Raises ``UserError`` if
     the file cannot be written.
+
+    Args:
+        path: The file.
+        cloud: The Gaussians.
+        origin: (3,) Offset that is added to the positions (``Capture.origin``), which then are doubles.
     """
-    with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        file.write(ply_bytes(cloud))
-
-
-def ply_bytes(cloud: GaussianCloud) -> bytes:
-    """Return the content of the file that ``write_ply`` writes."""
-    sh = cloud.sh.numpy()
-    count = cloud.count
     rest_count = 3 * ((cloud.sh_degree + 1) ** 2 - 1)
     names = [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
         *(f"f_rest_{i}" for i in range(rest_count)),
         *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
     ]
-    rows = np.zeros((count, len(names)), np.dtype("<f4"))
-    rows[:, 0:3] = cloud.means.numpy()
-    rows[:, 6:9] = sh[:, 0]
-    rows[:, 9 : 9 + rest_count] = channel_major(sh)
-    rows[:, -8] = cloud.opacity_logits.numpy()
-    rows[:, -7:-4] = cloud.log_scales.numpy()
-    rows[:, -4:] = cloud.rotations.numpy()
+    kinds = ["float" if origin is None else "double"] * 3 + ["float"] * (len(names) - 3)
     header = "ply\nformat binary_little_endian 1.0\n" + ANTIALIASED_LINE * cloud.antialiased
-    header += f"element vertex {count}\n" + "".join(f"property float {name}\n" for name in names) + "end_header\n"
-    return header.encode() + rows.tobytes()
+    header += f"element vertex {cloud.count}\n"
+    header += "".join(f"property {kind} {name}\n" for kind, name in zip(kinds, names, strict=True)) + "end_header\n"
+    means, sh = cloud.means.numpy(), cloud.sh.numpy()
+    logits, log_scales, rotations = (a.numpy() for a in (cloud.opacity_logits, cloud.log_scales, cloud.rotations))
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write(header.encode())
+        for start in range(0, cloud.count, _BLOCK_ROWS):
+            block = slice(start, start + _BLOCK_ROWS)
+            rows = np.zeros((len(means[block]), len(names)), "<f4")
+            rows[:, 0:3] = means[block]
+            rows[:, 6:9] = sh[block, 0]
+            rows[:, 9 : 9 + rest_count] = channel_major(sh[block])
+            rows[:, -8] = logits[block]
+            rows[:, -7:-4] = log_scales[block]
+            rows[:, -4:] = rotations[block]
+            if origin is None:
+                file.write(rows.data)
+            else:
+                places = (means[block] + origin).astype("<f8")
+                file.write(np.concatenate([places.view("u1"), rows[:, 3:].copy().view("u1")], axis=1).data)
 
 
 def channel_major(sh: np.ndarray) -> np.ndarray:

@@ -18,12 +18,12 @@ BAND_4 = 24
 
 @dataclass(frozen=True)
 class RawCapture:
-    """Host arrays in float32 as the file contains them, not yet checked. Axes are the file's own."""
+    """Host arrays as the file contains them, not yet checked. Axes are the file's own."""
 
     format: str
     """Name of the format, as shown to the user."""
     means: np.ndarray
-    """(n, 3) float32, file units."""
+    """(n, 3) file units, float32; float64 if the file stores more than single precision."""
     rotations: np.ndarray
     """(n, 4) float32, w x y z, any length."""
     log_scales: np.ndarray
@@ -38,6 +38,10 @@ class RawCapture:
     """Index of the vertical axis, if the file names one without a reliable sign."""
     antialiased: bool = False
     """True if the file states that it was trained with antialiasing."""
+    origin: np.ndarray | None = None
+    """(3,) float64, file units: offset of the capture, which ``means`` do not include."""
+    rows: np.ndarray | None = None
+    """(n,) numbers of these Gaussians in the file; None if they are all."""
     notes: tuple[str, ...] = ()
     """Gaussians left out and values repaired, for the user."""
 

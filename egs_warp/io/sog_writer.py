@@ -22,12 +22,13 @@ _LLOYD_ROUNDS = 12
 _PALETTE_LEVELS = 16
 
 
-def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = False) -> None:
+def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = False) -> np.ndarray:
     """Write ``cloud`` as a .sog, a twentieth of the size of a .ply.
 
     Lossy: positions to 1/65535 of the extent (finer near the origin), scales, colours and SH to one of 256 values each
     chosen for the capture, rotations and opacity to 1/255; above 65,536 Gaussians similar SH sets are merged. Gaussians
-    are sorted in space unless ``keep_order`` is set. Raises ``UserError`` if the file cannot be written.
+    are sorted in space unless ``keep_order`` is set. Returns the number (n,) in ``cloud`` of each Gaussian of the file.
+    Raises ``UserError`` if the file cannot be written.
     """
     means = cloud.means.numpy().astype(np.float64)
     order = np.arange(cloud.count) if keep_order else morton_order(means)
@@ -74,6 +75,7 @@ def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = Fals
         for name, pixels in images.items():
             archive.writestr(name, _webp(pixels))
         archive.writestr("meta.json", json.dumps(meta))
+    return order
 
 
 def _code_book(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -39,6 +39,10 @@ _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")
 _COLOUR_SCALE = 0.15
 _FRACTIONAL_BITS = 12
+"""Fractional bits of a position, for captures of at least ``_SMALL`` units."""
+_SMALL = 0.25
+_MIN_LOG_SCALE, _LOG_SCALE_STEPS = -10.0, 16.0
+"""Log scales are stored as a byte, in steps of 1/16 from -10."""
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 _MAX_EXTENSION_BYTES = 1 << 20
 _MAX_FRACTIONAL_BITS = 24
@@ -99,7 +103,7 @@ def _mirrored(raw: RawCapture) -> RawCapture:
     rotations, log_scales = transformed_shapes(raw.rotations, raw.log_scales, mirror)
     return replace(
         raw,
-        means=raw.means * np.float32([-1.0, 1.0, 1.0]),
+        means=raw.means * np.array([-1.0, 1.0, 1.0], dtype=np.float32),
         rotations=rotations,
         log_scales=log_scales,
         sh=transformed_colours(raw.sh, mirror),
@@ -171,7 +175,7 @@ def _decode(body: bytes, layout: _Layout, up: np.ndarray) -> RawCapture:
         format=f".spz version {layout.version}",
         means=means,
         rotations=_quaternions(rotations, layout.version),
-        log_scales=scales.astype(np.float32) / np.float32(16.0) - np.float32(10.0),
+        log_scales=scales.astype(np.float32) / np.float32(_LOG_SCALE_STEPS) + np.float32(_MIN_LOG_SCALE),
         opacity_logits=logits_from_bytes(alphas[:, 0]),
         sh=np.concatenate([f_dc[:, None], rest], axis=1),
         up=up,
@@ -197,19 +201,21 @@ def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> No
 
     Versions 3 and 4 contain the same numbers; files of version 4 are smaller, and fewer programs read them.
 
-    Lossy: positions to 2^-13 (fewer bits if the capture is so large that they do not fit), log scales to 1/32 within
-    -10 ... 5.9, opacity and colour to 1/255. Raises ``UserError`` if the file cannot be written.
+    Lossy: positions to 2^-13 units, or 2^-13 of the size of a small capture (to fewer bits if the capture reaches so
+    far that they do not fit); log scales to 1/32 within -10 ... 5.9; opacity and colour to 1/255. Raises ``UserError``
+    if the file cannot be written, or most Gaussians are too small or too large for it.
     """
     if version not in (2, 3, 4):
         raise UserError(f"{path}: .spz version {version} cannot be written; choose 2, 3 or 4")
     means = cloud.means.numpy().astype(np.float64)
     reach = float(np.abs(means).max())
-    bits = int(np.clip(np.floor(np.log2((2**23 - 1) / reach)), 0, _FRACTIONAL_BITS)) if reach > 0 else _FRACTIONAL_BITS
+    bits = _fractional_bits(means, reach)
     if reach * 2**bits > 2**23 - 1:
         raise UserError(
             f"{path}: a mean lies {reach:g} units from the origin, the limit of .spz is {2**23 - 1}; scale the"
             " capture down"
         )
+    _check_sizes(cloud.log_scales.numpy(), path)
     fixed = np.rint(np.ldexp(means, bits)).astype(np.int32)
     sh = cloud.sh.numpy()
     header = _HEADER.pack(_MAGIC, version, cloud.count, cloud.sh_degree, bits, _ANTIALIASED * cloud.antialiased, 0)
@@ -227,7 +233,7 @@ def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> No
         fixed.astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
         bytes_from_logits(cloud.opacity_logits.numpy()).tobytes(),
         byte((sh[:, 0].astype(np.float64) * _COLOUR_SCALE + 0.5) * 255.0).tobytes(),
-        byte((cloud.log_scales.numpy() + 10.0) * 16.0).tobytes(),
+        byte((cloud.log_scales.numpy() - _MIN_LOG_SCALE) * _LOG_SCALE_STEPS).tobytes(),
         packed_rotations,
         _packed_rest(sh[:, 1:]).tobytes(),
     )
@@ -235,6 +241,30 @@ def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> No
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         for part in packed:
             file.write(part)
+
+
+def _fractional_bits(means: np.ndarray, reach: float) -> int:
+    """Return the fractional bits of positions: enough for the size of the capture (the median distance from its middle,
+    in each direction), if the farthest at ``reach`` fits."""
+    size = 2.0 * float(np.median(np.abs(means - np.median(means, axis=0)).max(axis=1)))
+    bits = _FRACTIONAL_BITS
+    if 0.0 < size < _SMALL:
+        bits = int(np.ceil(_FRACTIONAL_BITS - np.log2(size)))
+    if reach > 0.0:
+        bits = min(bits, int(np.floor(np.log2((2**23 - 1) / reach))))
+    return int(np.clip(bits, 0, _MAX_FRACTIONAL_BITS))
+
+
+def _check_sizes(log_scales: np.ndarray, path: Path | str) -> None:
+    """Raise ``UserError`` if most Gaussians have another size than the format can store."""
+    high = _MIN_LOG_SCALE + 255.0 / _LOG_SCALE_STEPS
+    typical = float(np.median(log_scales.max(axis=1)))
+    if not _MIN_LOG_SCALE - 0.5 / _LOG_SCALE_STEPS <= typical <= high + 0.5 / _LOG_SCALE_STEPS:
+        factor = 10.0 ** np.rint(np.log10(np.exp(0.5 * (_MIN_LOG_SCALE + high) - typical)))
+        raise UserError(
+            f"{path}: .spz stores standard deviations from {np.exp(_MIN_LOG_SCALE):.2g} to {np.exp(high):.3g} units,"
+            f" those of the capture are about {np.exp(typical):.2g}; scale it by {factor:g}, or choose another format"
+        )
 
 
 def _deflated(blocks: tuple[bytes, ...]) -> Iterator[bytes]:

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.compressed_ply import write_compressed_ply
@@ -15,7 +17,9 @@ from egs_warp.io.sog_writer import write_sog
 from egs_warp.io.splat import write_splat
 from egs_warp.io.spz import write_spz
 
-CaptureWriter = Callable[[Path, GaussianCloud], None]
+CaptureWriter = Callable[[Path, GaussianCloud], "np.ndarray | None"]
+"""Writer of a capture; returns the number (n,) in the cloud of each Gaussian of the file, or None if it keeps the
+order."""
 WRITERS: dict[str, tuple[str, CaptureWriter]] = {
     "compressed-ply": (".compressed.ply", write_compressed_ply),
     "ply": (".ply", write_ply),
@@ -27,6 +31,16 @@ WRITERS: dict[str, tuple[str, CaptureWriter]] = {
 }
 """Ending and writer of each kind of splat file. A longer ending comes before a shorter one that it ends in. Of two
 kinds with one ending, the first is the default."""
+
+
+def write_capture(
+    path: Path, cloud: GaussianCloud, write: CaptureWriter, *, origin: np.ndarray | None
+) -> np.ndarray | None:
+    """Call ``write``, and return what it returns. ``origin`` (3,) of the capture is kept by .ply and .glb only."""
+    if origin is None or write not in (write_ply, write_glb):
+        return write(path, cloud)
+    (write_ply if write is write_ply else write_glb)(path, cloud, origin=origin)
+    return None
 
 
 def writer_of(path: Path, *, kind: str | None = None) -> CaptureWriter:

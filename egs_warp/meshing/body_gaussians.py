@@ -16,6 +16,11 @@ _STEPS_PER_E = 64
 """Log scales are rounded to this many steps per factor of e (1.6 %), as a file's log scales lose bits when its unit
 changes."""
 
+MAX_GAUSSIANS = 500_000
+"""Gaussians from which a body is measured (``representatives``)."""
+_WIDE = 1.0 / 64.0
+"""Fraction of the body's size: a spacing of the lattice on which its solid is found."""
+
 
 def centred(cloud: GaussianCloud) -> tuple[GaussianCloud, np.ndarray]:
     """Move the capture to an origin amid its Gaussians. Returns it and the origin (3,), capture's units.
@@ -33,17 +38,47 @@ def centred(cloud: GaussianCloud) -> tuple[GaussianCloud, np.ndarray]:
 def canonical_order(cloud: GaussianCloud) -> np.ndarray:
     """(n,) indices that sort the Gaussians by their values, first by their means, so that the order in a file does not
     matter."""
-    return np.lexsort(
-        np.concatenate(
-            [
-                cloud.sh.numpy()[:, 0].T,
-                cloud.log_scales.numpy().T,
-                cloud.rotations.numpy().T,
-                cloud.opacity_logits.numpy()[None],
-                cloud.means.numpy()[:, ::-1].T,
-            ]
-        )
+    keys = np.concatenate(
+        [
+            cloud.sh.numpy()[:, 0].T,
+            cloud.log_scales.numpy().T,
+            cloud.rotations.numpy().T,
+            cloud.opacity_logits.numpy()[None],
+            cloud.means.numpy()[:, ::-1].T,
+        ]
     )
+    # Few Gaussians agree in x and y. One sort of both is faster than one for each of the keys.
+    first = _increasing_bits(keys[-1]) << np.uint64(32) | _increasing_bits(keys[-2])
+    order = np.argsort(first)
+    equal = first[order][1:] == first[order][:-1]
+    tied = np.append(equal, False) | np.append(False, equal)
+    rows = np.sort(order[tied])
+    order[tied] = rows[np.lexsort(keys[:, rows])]
+    return order
+
+
+def _increasing_bits(values: np.ndarray) -> np.ndarray:
+    """(n,) uint64 below 2^32 in the order of float32 ``values`` (n,); the same for 0 and -0."""
+    bits = (values + np.float32(0.0)).view(np.uint32)
+    return np.where(bits >> 31 == 1, ~bits, bits | np.uint32(1 << 31)).astype(np.uint64)
+
+
+def representatives(cloud: GaussianCloud) -> GaussianCloud:
+    """Return at most ``MAX_GAUSSIANS`` that show the same body; the cloud itself if it has no more.
+
+    Those that are wide, of which few show much of the surface, all remain, and an equal share of the others.
+    """
+    if cloud.count <= MAX_GAUSSIANS:
+        return cloud
+    order = canonical_order(cloud)
+    some = cloud.means.numpy()[order[:: -(-cloud.count // MAX_GAUSSIANS)]]
+    size = float(np.ptp(np.quantile(some, (0.01, 0.99), axis=0), axis=0).max())
+    wide = cloud.breadths() > _WIDE * size
+    if np.count_nonzero(wide) > MAX_GAUSSIANS // 2:
+        wide[:] = False
+    others = order[~wide[order]]
+    count = MAX_GAUSSIANS - np.count_nonzero(wide)
+    return cloud.subset(np.concatenate([np.flatnonzero(wide), others[np.arange(count) * len(others) // count]]))
 
 
 def find_body_frame(cloud: GaussianCloud, plane: Plane) -> BodyFrame:

@@ -10,6 +10,7 @@ import warp as wp
 from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -18,13 +19,15 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.geometry.unique_rows import distinct_rows
 from egs_warp.kernels.meshing.occupancy import inside_mesh_kernel
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
-from egs_warp.meshing.occupancy import LatticeSolid, solid_from_gaussians
+from egs_warp.meshing.occupancy import LatticeSolid, mass_quantiles, solid_from_gaussians
 from egs_warp.meshing.stuffing import isosurface_stuffing
 from egs_warp.meshing.tetwild import tetwild
 
 _MIN_DIHEDRAL_DEGREES = 8.0
 _MIN_ENCLOSED_FRACTION = 0.9993
 MIN_NODES, MAX_NODES = 50, 20_000
+_MAX_THICKENING = 2.5
+"""Objects that elements make thicker than this are refused."""
 _MAX_GROWTH_STEPS = 6
 _GROWTH_SAMPLE = 20000
 _REFINEMENT_PER_STEP = 0.15
@@ -67,6 +70,9 @@ class Cage:
     """Fraction, by opacity, of all Gaussians whose mean lies below the plane."""
     dilation: float
     """Distance by which the cage was grown beyond the occupied space, in the mesh's units."""
+    thickening: float
+    """Largest ratio of an extent of the cage, along the axes of the body's frame, to that of the object's Gaussians. It
+    is above 1 for a thin object: elements have a minimum thickness."""
 
     def height(self, plane: Plane) -> float:
         """Return the body height H above ``plane``, in the mesh's units."""
@@ -153,6 +159,9 @@ def cage_of_body(
     if best is None:
         raise UserError("cage: no mesh could be built; choose another object")
     _, grown, mesh, used = best
+    thickening = _thickening(cloud, solid, mesh)
+    if thickening > _MAX_THICKENING:
+        raise _too_thin(f"its elements would make it {thickening:.2g} times as thick")
     return Cage(
         mesh=mesh,
         method=used,
@@ -161,7 +170,33 @@ def cage_of_body(
         floater_opacity_mass=_share(cloud, ~solid.belongs & ~solid.below_plane),
         below_plane_opacity_mass=_share(cloud, solid.below_plane),
         dilation=grown * solid.longest_side,
+        thickening=thickening,
     )
+
+
+def _too_thin(why: str) -> UserError:
+    return UserError(
+        f"object: it is too thin for its elements ({why}); choose a thicker object, or cut out a piece of at most 20"
+        " times its thickness (egs-warp convert --box)",
+        check=("plane", "up"),
+    )
+
+
+def _thickening(cloud: GaussianCloud, solid: LatticeSolid, mesh: TetMesh) -> float:
+    """Return ``Cage.thickening``: extents of the object are those of the means of all but 0.2 % of its opacity, and a
+    typical standard deviation on either side."""
+    means = cloud.means.numpy()[solid.belongs].astype(np.float64)
+    low, high = mass_quantiles(means, cloud.opacities()[solid.belongs], 0.001, 0.999)
+    extents, sizes = (
+        high - np.append(low[:2], 0.0),
+        np.append(np.ptp(mesh.nodes[:, :2], axis=0), mesh.nodes[:, 2].max()),
+    )
+    if np.any(sizes > extents):
+        quaternions = cloud.rotations.numpy()[solid.belongs][:, [1, 2, 3, 0]]
+        scales = np.exp(cloud.log_scales.numpy()[solid.belongs].astype(np.float64))
+        along = Rotation.from_quat(quaternions).as_matrix() * scales[:, None, :]
+        extents += 2.0 * np.median(np.sqrt(np.einsum("nij,nij->ni", along, along)), axis=0)
+    return float((sizes / np.maximum(extents, 1e-6 * sizes)).max())
 
 
 def _share(cloud: GaussianCloud, chosen: np.ndarray) -> float:
@@ -174,11 +209,7 @@ def _check_thickness(solid: LatticeSolid) -> None:
     thickest = float(_edt(np.pad(solid.inside, 1)[:, :, 1:]).max())
     size = np.ptp(np.argwhere(solid.inside), axis=0) + 1
     if thickest < 2.0 or size.min() < 4:
-        raise UserError(
-            "object: it is flat (no part is thicker than 1/20 of its longest side), so it has no volume to move; "
-            "choose another object",
-            check=("plane", "up"),
-        )
+        raise _too_thin("it is flat: no part is thicker than 1/20 of its longest side")
 
 
 def _mesh(

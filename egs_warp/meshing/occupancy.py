@@ -68,7 +68,7 @@ def solid_from_gaussians(cloud: GaussianCloud, *, resolution: int = 64) -> Latti
 
 def _robust_bounds(means: np.ndarray, opacities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a box (3,), (3,) without far outliers: the central 98 % of the mass, enlarged by 60 % of its size."""
-    low, high = _mass_quantiles(means, opacities, 0.01, 0.99)
+    low, high = mass_quantiles(means, opacities, 0.01, 0.99)
     grow = 0.6 * (high - low)
     return np.maximum(low - grow, means.min(axis=0)), np.minimum(high + grow, means.max(axis=0))
 
@@ -77,11 +77,11 @@ def _longest_side(means: np.ndarray, opacities: np.ndarray) -> float:
     """Return the longest side of the box from the plane up, without the outermost thousandths of the mass."""
     if len(means) == 0:
         return 0.0
-    low, high = _mass_quantiles(means, opacities, 0.001, 0.999)
+    low, high = mass_quantiles(means, opacities, 0.001, 0.999)
     return float(np.max(high - np.append(low[:2], 0.0)))
 
 
-def _mass_quantiles(means: np.ndarray, opacities: np.ndarray, *shares: float) -> list[np.ndarray]:
+def mass_quantiles(means: np.ndarray, opacities: np.ndarray, *shares: float) -> list[np.ndarray]:
     """Return the points (3,) below which, along each axis, these shares of the mass lie."""
     quantiles = np.empty((len(shares), 3))
     for axis in range(3):

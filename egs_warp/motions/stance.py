@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.geometry.frames import kabsch_rotation
@@ -181,6 +182,10 @@ class BalanceController:
         self._sole_share = sole_shares(body, ground, standing)
         self._standing = standing
         self.base_offset = self._base(local) - body.centre_of_mass(local)[:2]
+        if len(contact_points) == 0:
+            raise UserError(
+                "body: no point of it is on the ground at the start; check the ground", check=("plane", "up")
+            )
         footprint = ground.local(contact_points)[:, :2] - body.centre_of_mass(local)[:2]
         self.support_low = np.minimum(footprint.min(axis=0), -0.01 * body.height)
         self.support_high = np.maximum(footprint.max(axis=0), 0.01 * body.height)

@@ -168,7 +168,8 @@ def animate(
         notes = options.notes
         if options.creature.front is None:
             notes = (*notes, creature.front.description(creature.frame))
-        notes = (*notes, *capture_warnings(creature.cloud, creature.cage.mesh, creature.body.height))
+        cage, height = creature.cage, creature.body.height
+        notes = (*notes, *capture_warnings(creature.cloud, cage.mesh, height, thickening=cage.thickening))
         with simulation_bar(quiet=quiet) as show_progress:
             performance = simulate(
                 creature,

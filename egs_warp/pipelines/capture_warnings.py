@@ -15,15 +15,23 @@ _DETACHED_DISTANCE = 0.15
 _MIN_DETACHED_SHARE = 0.01
 """Fraction of the opacity that must be detached for a warning."""
 
+_MAX_THICKENING = 1.3
+"""Thickening of the cage above which there is a warning."""
 
-def capture_warnings(cloud: GaussianCloud, cage: TetMesh, height: float) -> tuple[str, ...]:
-    """Return one line for each warning: too few Gaussians, or parts of ``cloud`` detached from its ``cage``.
+
+def capture_warnings(cloud: GaussianCloud, cage: TetMesh, height: float, *, thickening: float = 1.0) -> tuple[str, ...]:
+    """Return one line for each warning: too few Gaussians, parts of ``cloud`` detached from its ``cage``, or a cage
+    that is thicker than the object (``Cage.thickening``).
 
     ``cloud``, ``cage`` and the body's ``height`` are in the same unit and frame.
     """
     notes = []
     if cloud.count < MIN_GAUSSIANS:
         notes.append(f"only {cloud.count} Gaussians: most of the body is guessed")
+    if thickening > _MAX_THICKENING:
+        notes.append(
+            f"the body is {thickening:.2g} times as thick as what is visible of it: it is too thin for its elements"
+        )
     distance, _ = KDTree(cage.nodes).query(cloud.means.numpy().astype(np.float64))
     opacity = cloud.opacities()
     is_detached = distance > max(_DETACHED_DISTANCE * height, mean_edge_length(cage))

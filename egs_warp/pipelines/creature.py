@@ -22,7 +22,7 @@ from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.settling import SHAPE_TOLERANCE, settle, settle_as_captured
 from egs_warp.locomotion.stepper import LocomotionStepper
-from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
+from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame, representatives
 from egs_warp.meshing.cage import Cage, cage_of_body
 from egs_warp.meshing.occupancy import solid_from_gaussians
 from egs_warp.motions.feet import SupportKind, support_kind_of
@@ -259,7 +259,7 @@ class PlacedCage:
     frame: BodyFrame
     """Frame of the body in the capture."""
     gaussians: GaussianCloud
-    """Gaussians that define the body (``body_gaussians``)."""
+    """Gaussians that define the body (``body_gaussians``), of a large capture a part (``representatives``)."""
     cage: Cage
     """Tetrahedral mesh around the Gaussians."""
     limbs: Limbs
@@ -283,7 +283,7 @@ def place_cage(
         metres_per_unit: Length of one unit of the capture, m; None makes the body 1 m tall.
         nodes: Approximate number of cage nodes.
     """
-    near, anchor = centred(cloud)
+    near, anchor = centred(representatives(cloud))
     if plane is None:
         assert up is not None, "make_creature requires plane or up"
         plane = find_base_plane(near, up)

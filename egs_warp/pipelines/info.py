@@ -39,6 +39,8 @@ _SIDE = 480
 """Width and height of a picture of the capture, pixels."""
 _NEAR_GROUND = 0.01
 """Body heights below which a node at rest touches the ground."""
+_MAX_GAP = 0.05
+"""Body heights over the ground from which a body is not measured."""
 _PALE = 0.82
 """Grey of parts that are not limbs."""
 _LINE = 68
@@ -52,6 +54,8 @@ class BodyInfo:
     """Properties of a capture in the frame of its body, metres; at rest, before it is deformed by its weight."""
 
     source: str
+    count: int
+    """Number of Gaussians of the capture."""
     standing: PlacedCage
     body: SoftBody
     muscles: MuscleSet
@@ -90,7 +94,7 @@ class BodyInfo:
         size = np.ptp(self.place.ground.local(self.place.standing), axis=0) / height
         mesh, kinds = self.standing.cage.mesh, self._kinds()
         lines = [
-            f"capture  {self.source}: {self.standing.gaussians.count} Gaussians",
+            f"capture  {self.source}: {self.count} Gaussians",
             f"up       {up}",
             f"ground   {_numbers(plane.normal, 4)},{plane.offset:.4g}",
             f"front    {ahead}" + (" as given" if self.front.reason is None else f" ({self.front.reason})"),
@@ -178,6 +182,15 @@ def inspect_capture(
     progress("cage")
     standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, nodes=nodes)
     mesh = standing.cage.mesh
+    height = standing.cage.height(GROUND)
+    lowest = float(mesh.nodes[:, 2].min())
+    if lowest > _MAX_GAP * height:
+        raise UserError(
+            f"object: its body hangs {lowest / height:.2g} of its height above the ground that was"
+            f" {'found' if plane is None else 'given'}; parts of the capture that lie lower are apart from it: cut them"
+            " away (egs-warp convert --box), or give the ground",
+            check=("plane", "up"),
+        )
     progress("front")
     faces = choose_front(standing, front)
     progress("muscles")
@@ -187,7 +200,7 @@ def inspect_capture(
         body,
         GroundFrame.on_plane(GROUND, faces.direction, body.centre_of_mass(mesh.nodes)),
         mesh.nodes,
-        mesh.nodes[mesh.nodes[:, 2] < _NEAR_GROUND * body.height],
+        mesh.nodes[mesh.nodes[:, 2] < lowest + _NEAR_GROUND * body.height],
         solver_steps(body, None)[0],
         limbs=standing.limbs,
     )
@@ -196,8 +209,10 @@ def inspect_capture(
     if len(feet) > 1:
         soles = np.array([place.ground.local(mesh.nodes[foot.sole])[:, :2].mean(axis=0) for foot in feet])
         feet = tuple(feet[index] for index in order_counterclockwise(soles))
-    notes = (*notes, *capture_warnings(standing.gaussians, mesh, body.height))
-    return BodyInfo(source, standing, body, muscles, faces, base, place, feet, notes)
+    notes = (*notes, *capture_warnings(standing.gaussians, mesh, body.height, thickening=standing.cage.thickening))
+    if standing.gaussians.count < cloud.count:
+        notes = (*notes, f"the body is measured from {standing.gaussians.count} of the {cloud.count} Gaussians")
+    return BodyInfo(source, cloud.count, standing, body, muscles, faces, base, place, feet, notes)
 
 
 _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#ff7f0e", "#9467bd", "#8c564b", "#e377c2", "#17becf")

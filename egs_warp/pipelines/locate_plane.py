@@ -244,7 +244,7 @@ def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray,
         if values[0] < 0.1 * values[1]:
             axis = vectors[:, 0]
             return axis * (1.0 if axis @ ups > 0 else -1.0), "the cameras are held upright", _MAX_TILT_OF_CAMERAS
-    return *guess_up(cloud), _MAX_TILT
+    return *guess_up(cloud, tilted=False), _MAX_TILT
 
 
 def _standing(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, tilt: float) -> tuple[Plane, Segmentation]:

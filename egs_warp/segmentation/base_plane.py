@@ -12,7 +12,8 @@ from egs_warp.geometry.body_frame import upright_frame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.unique_rows import distinct_rows
-from egs_warp.meshing.body_gaussians import canonical_order, centred
+from egs_warp.meshing.body_gaussians import canonical_order, centred, representatives
+from egs_warp.segmentation.resting_directions import resting_directions
 
 _COLUMNS = 64
 """Columns across the longer side of the footprint."""
@@ -31,6 +32,13 @@ _AXIS_BONUS = {1: 0.10, 2: 0.05, 0: 0.0}
 """Bonus of each axis in the score of up: trainers and generators mostly use y (COLMAP: -y, glTF: +y), then z, hardly
 ever x."""
 _CLEAR_MARGIN = 0.3
+_POOR_SCORE = 1.75
+"""Score below which no axis fits: that of the side of an object that is tilted."""
+_SURE_LEVEL = 0.5
+"""A tilted direction replaces an axis if more of its support than this is level, less of that of the axis, and its
+score is clearly higher."""
+_FEW_GAUSSIANS, _MAX_DIRECTIONS = 20_000, 24
+"""Gaussians from which tilted directions are searched, and the maximum number of these."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +78,7 @@ def find_base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:
     """
     normal = np.asarray(up, dtype=np.float64)
     normal = normal / np.linalg.norm(normal)
-    near, anchor = _ordered(cloud)
+    near, anchor = _ordered(representatives(cloud))
     underside = _underside(near, normal)
     level = min(_support_level(underside), _mass_quantile(underside.heights, underside.opacities, _MAX_MASS_BELOW))
     return Plane(normal, -level).moved(anchor)
@@ -138,26 +146,32 @@ def _mass_quantile(values: np.ndarray, masses: np.ndarray, share: float) -> floa
 
 
 def guess_up(
-    cloud: GaussianCloud, capture_format_up: np.ndarray | None = None, *, vertical_axis: int | None = None
+    cloud: GaussianCloud,
+    capture_format_up: np.ndarray | None = None,
+    *,
+    tilted: bool = True,
+    vertical_axis: int | None = None,
 ) -> tuple[np.ndarray, str]:
     """Return up (3,), unit, and the reason, for the user: the file's own up if it has one, else the best of the six
-    axes, or of the two directions of ``vertical_axis``, the positive one unless the other is clearly better.
+    axes, or with ``tilted`` another direction if the object surely rests in it.
 
-    An object rests on the side where its support is wide, level, and well below its weight. The score of an axis is the
-    sum of three numbers: the area of the support polygon as a fraction of the silhouette seen along the axis, the
+    Of a known ``vertical_axis`` it is the positive direction, unless the other is clearly better.
+
+    An object rests on the side where its support is wide, level, and well below its weight. The score of a direction is
+    the sum of three numbers: the area of the support polygon as a fraction of the silhouette seen along it, the
     fraction of low columns that end at one level, and the depth of the centre of opacity inside the polygon.
     """
     if capture_format_up is not None:
         return np.asarray(capture_format_up, dtype=np.float64), "the file defines it"
     scores = []
-    near, _ = _ordered(cloud)
+    near, _ = _ordered(representatives(cloud))
     near = near.subset(np.arange(0, near.count, -(-near.count // _MAX_GAUSSIANS)))
     for axis in range(3) if vertical_axis is None else (vertical_axis,):
         for sign in (1.0, -1.0):
             up = np.zeros(3)
             up[axis] = sign
             shape = _support_shape(near, up)
-            scores.append((shape.polygon + shape.level + shape.depth + _AXIS_BONUS[axis], shape, up))
+            scores.append((shape.score + _AXIS_BONUS[axis], shape, up))
     if vertical_axis is not None:
         clearly_down = scores[1][0] - scores[0][0] > _CLEAR_MARGIN
         reason = f"the file names the axis {_AXIS_NAMES[vertical_axis]}, and its direction is guessed"
@@ -165,13 +179,32 @@ def guess_up(
     # Python's sort is stable, so a tie goes to the earlier axis.
     scores.sort(key=lambda entry: -entry[0])
     (best, shape, up), (second, _, other) = scores[0], scores[1]
-    margin = "clearly" if best - second > _CLEAR_MARGIN else "narrowly"
-    reason = (
-        f"guessed: the support polygon there is {100 * shape.polygon:.0f} % of the silhouette and "
-        f"{100 * shape.level:.0f} % of the low parts end at one level; {margin} ahead of {_name(other)}, "
-        f"score {best:.2f} to {second:.2f}"
-    )
-    return up, reason
+    resting = _resting_up(near) if tilted and shape.level < _SURE_LEVEL else None
+    advantage = resting[1].score - best if resting is not None else 0.0
+    if resting is not None and resting[1].level >= _SURE_LEVEL and advantage > _CLEAR_MARGIN:
+        direction, support = resting
+        angle = np.degrees(np.arccos(np.abs(direction).max()))
+        return direction, (
+            f"guessed: {support}; the capture is tilted by {angle:.0f} degrees from {_name(direction)}, clearly ahead"
+            f" of the best axis {_name(up)}, score {support.score:.2f} to {best:.2f}"
+        )
+    if best < _POOR_SCORE or advantage > _CLEAR_MARGIN:
+        order = "no axis fits well, as if the capture were tilted; next is"
+    else:
+        order = f"{'clearly' if best - second > _CLEAR_MARGIN else 'narrowly'} ahead of"
+    return up, f"guessed: {shape}; {order} {_name(other)}, score {best:.2f} to {second:.2f}"
+
+
+def _resting_up(cloud: GaussianCloud) -> tuple[np.ndarray, _Support] | None:
+    """Return the direction (3,) in which the object rests best, tilted or not; None if it has no volume."""
+    few = cloud.subset(np.arange(0, cloud.count, -(-cloud.count // _FEW_GAUSSIANS)))
+    opacities = few.opacities()
+    visible = opacities >= min(0.3, 0.5 * _mass_quantile(opacities, opacities, 0.5))
+    ups = resting_directions(few.means.numpy()[visible].astype(np.float64), at_most=_MAX_DIRECTIONS)
+    if len(ups) == 0:
+        return None
+    up = max(ups, key=lambda direction: _support_shape(few, direction).score)
+    return up, _support_shape(cloud, up)
 
 
 def _name(up: np.ndarray) -> str:
@@ -189,6 +222,17 @@ class _Support:
     """Fraction of the low columns that end at the support's level."""
     depth: float
     """Distance of the centre of opacity from the polygon's edge over the radius of the disc of its area; 0 outside."""
+
+    @property
+    def score(self) -> float:
+        """Sum of the three, 0 to 3."""
+        return self.polygon + self.level + self.depth
+
+    def __str__(self) -> str:
+        return (
+            f"the support polygon there is {100 * self.polygon:.0f} % of the silhouette and "
+            f"{100 * self.level:.0f} % of the low parts end at one level"
+        )
 
 
 def _support_shape(cloud: GaussianCloud, up: np.ndarray) -> _Support:

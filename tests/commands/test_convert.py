@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from egs_warp.cli import main
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -34,23 +36,148 @@ def test_a_capture_becomes_another(kind: str, tmp_path: Path, capsys: pytest.Cap
 
 
 def test_reported_losses_are_the_actual_ones(tmp_path: Path) -> None:
-    """The changes are known, and the Gaussians are in a shuffled order."""
+    """Known changes in a shuffled order, a larger one of a single Gaussian, and Gaussians that are gone."""
     cloud = make_cloud(500, 1)
-    rng = np.random.default_rng(0)
-    step = np.array([0.003, 0.0, 0.0])
+    order = np.random.default_rng(0).permutation(500)
+    means = cloud.means.numpy() + np.array([0.003, 0.0, 0.0])
+    means[7, 1] += 0.4
     changed = GaussianCloud.from_numpy(
-        cloud.means.numpy() + step,
+        means,
         cloud.rotations.numpy(),
         cloud.log_scales.numpy() + np.log(1.02),
         cloud.opacity_logits.numpy(),
         cloud.sh.numpy(),
-    ).subset(rng.permutation(500)[:498])
+    ).subset(order)
     write_ply(tmp_path / "a.ply", cloud)
     write_ply(tmp_path / "b.ply", changed)
-    gone, said = conversion_loss(read_capture(tmp_path / "a.ply"), read_capture(tmp_path / "b.ply"))
-    assert gone == "2 of 500 Gaussians are gone"
-    assert "positions 0.003 (at most 0.003) units" in said and "deviations by 2 (at most 2) %" in said
+    before, after = (read_capture(tmp_path / name, device="cpu") for name in ("a.ply", "b.ply"))
+    (said,) = conversion_loss(before, after, order)
+    assert "positions 0.018 (at most 0.4) units, of a size of 4" in said and "deviations 2 (at most 2) %" in said
     assert "opacities 0 (at most 0) of 255" in said and "higher bands 0 (at most 0)" in said
+    rows = np.arange(2, 500)
+    fewer = replace(after, cloud=after.cloud.subset(rows), rows=rows)
+    gone, _ = conversion_loss(before, fewer, order)
+    assert gone == "2 of 500 Gaussians are gone"
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_each_gaussian_is_compared_with_itself(kind: str, tmp_path: Path) -> None:
+    """Also where the file has another order: an outline of look-alikes would hide that all are displaced."""
+    cloud = make_cloud(300)
+    path = tmp_path / f"a{WRITERS[kind][0]}"
+    order = WRITERS[kind][1](path, cloud)
+    assert (order is None) == (kind not in ("compressed-ply", "sog"))
+    order = np.arange(300) if order is None else order
+    assert sorted(order) == list(range(300))
+    read = read_capture(path, device="cpu").cloud.means.numpy()
+    errors = np.linalg.norm(read.astype(float) - cloud.means.numpy()[order], axis=1)
+    assert errors.max() < 0.01
+    said = " ".join(conversion_loss(replace(read_capture(path), cloud=cloud), read_capture(path), order))
+    if errors.any():
+        assert f"positions {np.sqrt(np.mean(errors**2)):.2g} (at most {errors.max():.2g}) units" in said
+
+
+@pytest.mark.parametrize(
+    ("size", "deviation", "error"),
+    [
+        (1e-4, 1e-6, None),
+        (2e-3, 1e-4, 3e-4),
+        (0.05, 1e-3, 3e-4),
+        (1.0, 0.02, 3e-4),
+        (1e6, 100.0, 3e-4),
+        (1e6, 1e4, None),
+    ],
+)
+def test_spz_of_any_size_keeps_its_shape_or_is_refused(
+    size: float, deviation: float, error: float | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    random = np.random.default_rng(0)
+    cloud = GaussianCloud.from_numpy(
+        random.uniform(-0.5 * size, 0.5 * size, (200, 3)),
+        random.normal(size=(200, 4)),
+        np.full((200, 3), np.log(deviation)),
+        np.zeros(200),
+        np.zeros((200, 1, 3)),
+    )
+    write_ply(tmp_path / "a.ply", cloud)
+    status = main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.spz")])
+    if error is None:
+        said = capsys.readouterr().err
+        assert status == 2 and not (tmp_path / "a.spz").exists()
+        factor = re.search(r"scale it by (\S+), or choose another format", said)
+        assert factor is not None
+        assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.spz"), "--scale", factor[1]]) == 0
+        return
+    assert status == 0
+    read = read_capture(tmp_path / "a.spz", device="cpu").cloud
+    assert np.abs(read.means.numpy() - cloud.means.numpy()).max() <= error * size
+    np.testing.assert_allclose(read.log_scales.numpy(), cloud.log_scales.numpy(), atol=1 / 32 + 1e-6)
+
+
+def test_offsets_are_kept_or_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A georeferenced capture, through formats with and without a place for its offset."""
+    place = np.array([431000.0, 5403000.0, 120.0])
+    write_ply(tmp_path / "a.ply", make_cloud(100), origin=place)
+    for name in ("b.ply", "b.glb", "b.spz"):
+        assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / name)]) == 0
+        said = capsys.readouterr()
+        assert "nothing is lost" not in said.out and "positions are relative to 43" in said.err
+        assert ("has no place in this format; the file is relative to it" in said.out) == (name == "b.spz")
+    first, *others = (read_capture(tmp_path / name, device="cpu") for name in ("a.ply", "b.ply", "b.glb"))
+    assert first.origin is not None
+    for capture in others:
+        np.testing.assert_array_equal(capture.origin, first.origin)
+        np.testing.assert_allclose(capture.cloud.means.numpy(), first.cloud.means.numpy(), rtol=0, atol=1e-7)
+    # Back to the capture's own origin, which needs no doubles.
+    back = ",".join(str(-x) for x in first.origin)
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "c.ply"), f"--translate={back}"]) == 0
+    assert read_capture(tmp_path / "c.ply", device="cpu").origin is None
+
+
+def test_captures_are_turned_cut_and_merged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cloud = make_cloud(60, 1)
+    write_ply(tmp_path / "a.ply", cloud)
+    write_ply(tmp_path / "b.ply", make_cloud(40, seed=2))
+    means = cloud.means.numpy().astype(float)
+
+    def convert(*flags: str, sources: tuple[str, ...] = ("a.ply",)) -> GaussianCloud:
+        paths = [str(tmp_path / name) for name in (*sources, "out.ply")]
+        assert main(["convert", *paths, *flags]) == 0
+        return read_capture(tmp_path / "out.ply", device="cpu").cloud
+
+    for flags, expected in (
+        (["--up=-y"], means * [1, -1, -1]),
+        (["--up", "z"], means[:, [0, 2, 1]] * [1, 1, -1]),
+        (["--scale", "3"], 3.0 * means),
+        (["--rotate", "0,0,90", "--translate=1,2,3"], means[:, [1, 0, 2]] * [-1, 1, 1] + [1, 2, 3]),
+        (["--rotate", "90,0,90"], means[:, [2, 0, 1]]),
+        (["--up=-y", "--scale", "2", "--translate", "0,0,1"], 2.0 * means * [1, -1, -1] + [0, 0, 1]),
+    ):
+        np.testing.assert_allclose(convert(*flags).means.numpy(), expected, atol=1e-5, err_msg=str(flags))
+    inside = np.all(np.abs(means) <= 1.0, axis=1)
+    np.testing.assert_array_equal(convert("--box=-1,-1,-1,1,1,1").means.numpy(), means[inside].astype(np.float32))
+    assert f"box: {60 - inside.sum()} of 60 Gaussians left out" in capsys.readouterr().out
+    merged = convert(sources=("a.ply", "b.ply"))
+    assert merged.count == 100 and merged.sh_degree == 1 and not merged.sh.numpy()[60:, 1:].any()
+    # Colours turn with the Gaussians: there and back again.
+    convert("--rotate", "30,-50,70")
+    turn = Rotation.from_euler("xyz", [30, -50, 70], degrees=True).inv().as_euler("xyz", degrees=True)
+    (tmp_path / "out.ply").rename(tmp_path / "turned.ply")
+    back = convert("--rotate=" + ",".join(map(str, turn)), sources=("turned.ply",))
+    np.testing.assert_allclose(back.sh.numpy(), cloud.sh.numpy(), atol=1e-5)
+    np.testing.assert_allclose(back.means.numpy(), means, atol=1e-5)
+
+
+def test_floaters_are_dropped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    random = np.random.default_rng(0)
+    means = np.concatenate([random.uniform(-0.5, 0.5, (2000, 3)), [[4.0, 0.0, 0.0], [0.0, -3.0, 1.0]]])
+    cloud = GaussianCloud.from_numpy(
+        means, np.tile([1.0, 0, 0, 0], (2002, 1)), np.full((2002, 3), -3.5), np.ones(2002), np.zeros((2002, 1, 3))
+    )
+    write_ply(tmp_path / "a.ply", cloud)
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--drop-floaters"]) == 0
+    assert "floaters: 2 of 2002 Gaussians left out" in capsys.readouterr().out
+    np.testing.assert_array_equal(read_capture(tmp_path / "b.ply").cloud.means.numpy(), cloud.means.numpy()[:2000])
 
 
 def test_a_sequence_is_converted_in_the_order_of_its_numbers(
@@ -89,6 +216,10 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         (["two", "out", "--to", "ply"], "it has two sequences (a0001.ply and b0001.ply)"),
         (["same", "out", "--to", "ply"], "two of its captures have the same number"),
         (["two", "two", "--to", "ply"], "it has two sequences"),
+        (["a.ply", "b.ply", "--scale", "0"], "--scale 0.0: give a positive number"),
+        (["a.ply", "b.ply", "--count", "0"], "--count 0: give a number of at least 1"),
+        (["a.ply", "b.ply", "--rotate", "1,2"], "--rotate 1,2: give 3 numbers, separated by commas"),
+        (["a.ply", "b.ply", "--box", "7,7,7,8,8,8"], "--box: none of the 3 Gaussians lies in it; they extend from"),
     ):
         paths = [str(tmp_path / part) for part in flags[:2]]
         assert main(["convert", *paths, *flags[2:]]) == 2

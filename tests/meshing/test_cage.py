@@ -193,6 +193,33 @@ def test_degenerate_objects(points: np.ndarray, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("shape", ["sheet", "disc"])
+def test_a_thin_body_is_refused_with_a_remedy(shape: str) -> None:
+    """A hundredth as thick as long, without side walls: elements would make it several times as thick."""
+    random = np.random.default_rng(0)
+    points = random.uniform(-0.5, 0.5, (4000, 3))
+    if shape == "disc":
+        points = points[np.hypot(points[:, 0], points[:, 1]) < 0.5]
+    points[:, 2] = 0.01 * random.integers(0, 2, len(points))
+    cloud = GaussianCloud.from_numpy(
+        points,
+        np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)),
+        np.tile(np.log([0.03, 0.03, 0.002]), (len(points), 1)),
+        np.full(len(points), 3.0),
+        np.zeros((len(points), 1, 3)),
+    )
+    with pytest.raises(UserError, match=r"it is too thin for its elements .* cut out a piece"):
+        build_cage(cloud, _FLOOR)
+
+
+@pytest.mark.parametrize(("thickness", "thickening"), [(0.4, 1.2), (0.15, 1.35)])
+def test_thickening_of_a_slab(thickness: float, thickening: float) -> None:
+    """The thinner the slab, the larger the part of the cage's margin in its height."""
+    cage = build_cage(_cloud(_box_surface((-0.5, -0.5, 0.0), (0.5, 0.5, thickness), 6000), 0.005), _FLOOR)
+    assert cage.thickening == pytest.approx(cage.height(_FLOOR) / (thickness + 0.01), rel=0.02)
+    assert 1.0 < cage.thickening < thickening
+
+
 def test_target_nodes() -> None:
     """A larger target gives more nodes; invalid targets are refused."""
     thing, _ = _pawn_cage(6000)

@@ -11,8 +11,11 @@ import pytest
 from egs_warp.assets import pawn, stool
 from egs_warp.assets.object import BuiltInObject
 from egs_warp.cli import main
+from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
 from egs_warp.io import write_ply
+from egs_warp.meshing.body_gaussians import representatives
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.pipelines.info import BodyInfo, draw_info, inspect_capture
@@ -89,6 +92,37 @@ def test_a_lying_body_has_no_feet_and_is_drawn(tmp_path: Path) -> None:
     assert abs(info.front.direction[0]) > 0.99 and "the body lies along it" in str(info.front.reason)
     draw_info(tmp_path / "info.png", info)
     assert (tmp_path / "info.png").stat().st_size > 20_000
+
+
+def test_a_body_above_the_ground_is_refused() -> None:
+    """A cube, half its height above the ground."""
+    random = np.random.default_rng(0)
+    means = random.uniform(-0.3, 0.3, (4000, 3))
+    means[np.arange(4000), np.arange(4000) % 3] = 0.3 * random.choice([-1.0, 1.0], 4000)
+    cloud = GaussianCloud.from_numpy(
+        means + [0.0, 0.0, 0.6],
+        np.tile([1.0, 0.0, 0.0, 0.0], (len(means), 1)),
+        np.full((len(means), 3), np.log(0.006)),
+        np.full(len(means), 3.0),
+        np.zeros((len(means), 1, 3)),
+    )
+    ground = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+    with pytest.raises(UserError, match=r"hangs 0\.\d+ of its height above the ground that was given") as caught:
+        inspect_capture(cloud, plane=ground, nodes=100)
+    assert "\n" not in str(caught.value)
+
+
+def test_large_captures_are_measured_from_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    thing = pawn(gaussian_count=3000)
+    monkeypatch.setattr("egs_warp.meshing.body_gaussians.MAX_GAUSSIANS", 1000)
+    few = representatives(thing.cloud)
+    assert few.count == 1000
+    order = np.random.default_rng(0).permutation(thing.cloud.count)
+    again = representatives(thing.cloud.subset(order))
+    assert sorted(map(tuple, again.means.numpy())) == sorted(map(tuple, few.means.numpy()))
+    info = inspect_capture(thing.cloud, plane=thing.plane, nodes=100)
+    assert f"{thing.cloud.count} Gaussians" in info.lines()[0]
+    assert info.notes[-1].startswith("the body is measured from ")
 
 
 def test_the_command_prints_the_lines_and_writes_the_picture(

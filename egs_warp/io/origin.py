@@ -1,0 +1,54 @@
+"""Positions of georeferenced captures: a capture far from its origin is kept relative to a point amid its Gaussians.
+
+Coordinates of a map, such as 5403000 m north, leave single precision steps of half a metre.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+MAX_ROUNDING = 2.0**-16
+"""Largest rounding of positions to single precision, in sizes of the capture, without an origin of their own."""
+_SAMPLES = 200_000
+"""Gaussians, spread evenly, from which the size of a capture is measured."""
+COARSE_STEP = 2.0**-10
+"""Steps of single precision, in sizes of the capture, that are reported."""
+
+
+def relative_positions(means: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
+    """Return positions in single precision, the origin that they are relative to, and notes for the user.
+
+    Args:
+        means: (n, 3) float32 or float64, n > 0, finite.
+
+    Returns:
+        Positions (n, 3) float32; the origin (3,) float64 that was subtracted, or None; and what was rounded.
+    """
+    some = means[:: -(-len(means) // _SAMPLES)].astype(np.float64)
+    middle = np.median(some, axis=0)
+    offsets = some - middle
+    size = float(np.sqrt(np.median(np.einsum("ni,ni->n", offsets, offsets)))) or float(np.abs(offsets).max())
+    step = float(np.spacing(np.float32(np.abs(middle).max())))
+    rounded, error = _rounded(means)
+    if size > 0.0 and error > MAX_ROUNDING * size:
+        # A multiple of a power of two has few digits, and is subtracted without an error.
+        unit = 2.0 ** np.floor(np.log2(size))
+        origin = unit * np.rint(middle / unit)
+        rounded, error = _rounded(means - origin)
+        text = ",".join(f"{x:.15g}" for x in origin)
+        note = f"positions are relative to {text}, as single precision has steps of {step:.2g} units there"
+        return rounded, origin, (f"{note}; the remainder was rounded by at most {error:.2g} units" if error else note,)
+    if error > 0.0:
+        return rounded, None, (f"positions were rounded to single precision, by at most {error:.2g} units",)
+    if step > COARSE_STEP * size > 0.0:
+        note = f"positions lie in steps of {step:.2g} units, {100.0 * step / size:.2g} % of the capture's size"
+        return rounded, None, (f"{note}: it is far from its origin; export it with an offset, or in double precision",)
+    return rounded, None, ()
+
+
+def _rounded(means: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return ``means`` in single precision, and the largest error."""
+    rounded = means.astype(np.float32, copy=False)
+    if means.dtype == np.float32:
+        return rounded, 0.0
+    return rounded, float(np.abs(rounded - means).max())

@@ -1,0 +1,176 @@
+"""Editing of captures before they are written: merging, cropping, cleaning, turning, scaling and decimation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from egs_warp.deformation.rigid import to_body_frame
+from egs_warp.errors import ArgumentError
+from egs_warp.geometry.body_frame import BodyFrame
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.io.capture import Capture
+from egs_warp.io.decimation import decimated
+from egs_warp.io.origin import relative_positions
+from egs_warp.segmentation.connectivity import connected_parts
+
+Y_UP = np.array([0.0, 1.0, 0.0])
+"""Up in the formats and viewers that define it."""
+_CELLS = 128
+"""Cells of the grid that connects Gaussians, over the size of a capture."""
+_FLOATER_SHARE = 0.01
+"""A part with less than this share of the opacity of the largest part is a floater."""
+
+
+@dataclass(frozen=True)
+class CaptureEdits:
+    """Changes of a capture, in the order in which they are made; the default changes nothing."""
+
+    box: np.ndarray | None = None
+    """(2, 3) Opposite corners; Gaussians whose means lie outside are left out. File units, as before any turn."""
+    drop_floaters: bool = False
+    """True to leave out small parts that are connected to nothing."""
+    up: np.ndarray | None = None
+    """(3,) Direction that is turned to +y."""
+    rotation: np.ndarray | None = None
+    """(3,) Angles in degrees, about the x axis first, then y, then z."""
+    scale: float = 1.0
+    """Factor of all lengths, positive."""
+    translation: np.ndarray | None = None
+    """(3,) Displacement, in the units after scaling."""
+    count: int | None = None
+    """Number of Gaussians to which neighbours are merged (``decimated``)."""
+
+    def __post_init__(self) -> None:
+        if not 1e-9 <= self.scale <= 1e9:
+            raise ArgumentError("scale", "give a positive number, from 1e-9 to 1e9", value=self.scale)
+        if self.count is not None and self.count < 1:
+            raise ArgumentError("count", "give a number of at least 1", value=self.count)
+
+    @property
+    def changes_nothing(self) -> bool:
+        """True for the default."""
+        return not (self.drop_floaters or self.moves) and self.box is None and self.count is None
+
+    @property
+    def moves(self) -> bool:
+        """True if positions change."""
+        return self.scale != 1.0 or any(x is not None for x in (self.up, self.rotation, self.translation))
+
+    def frame(self) -> BodyFrame:
+        """Return the transform to the edited capture."""
+        turn = Rotation.identity()
+        if self.up is not None:
+            # About x if that suffices, so that y-down and z-up captures keep left and right.
+            turn = _shortest_turn(self.up)
+        if self.rotation is not None:
+            turn = Rotation.from_euler("xyz", self.rotation, degrees=True) * turn
+        axes = turn.as_matrix()
+        shift = np.zeros(3) if self.translation is None else self.translation
+        return BodyFrame(axes, -(shift @ axes) / self.scale, self.scale)
+
+
+def _shortest_turn(up: np.ndarray) -> Rotation:
+    """Return the shortest rotation of ``up`` (3,) to +y; half a turn is about x."""
+    direction = up / np.linalg.norm(up)
+    axis = np.cross(direction, Y_UP)
+    sine, cosine = float(np.linalg.norm(axis)), float(direction @ Y_UP)
+    axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
+    return Rotation.from_rotvec(np.arctan2(sine, cosine) * axis)
+
+
+def merge_captures(captures: Sequence[Capture]) -> Capture:
+    """Return one capture with the Gaussians of all ``captures`` in turn.
+
+    Lower SH degrees are filled up with zeros. A property that not all of them share (up, antialiasing) is dropped, with
+    a note.
+    """
+    first = captures[0]
+    if len(captures) == 1:
+        return first
+    clouds = [capture.cloud for capture in captures]
+    coefficients = max(cloud.sh.shape[1] for cloud in clouds)
+    rotations, log_scales, logits = (
+        np.concatenate([getattr(cloud, name).numpy() for cloud in clouds])
+        for name in ("rotations", "log_scales", "opacity_logits")
+    )
+    sh = [np.pad(cloud.sh.numpy(), ((0, 0), (0, coefficients - cloud.sh.shape[1]), (0, 0))) for cloud in clouds]
+    means, origin, notes = relative_positions(np.concatenate([_file_positions(capture) for capture in captures]))
+    notes = (*(f"{capture.source}: {note}" for capture in captures for note in capture.notes), *notes)
+    up, antialiased = first.up, all(capture.antialiased for capture in captures)
+    if not all(_same(capture.up, up) for capture in captures):
+        up = None
+        notes = (*notes, "the captures have different up directions; they were merged in their own axes")
+    if antialiased != any(capture.antialiased for capture in captures):
+        notes = (*notes, "only some of the captures were trained with antialiasing; the mark is dropped")
+    cloud = GaussianCloud.from_numpy(
+        means, rotations, log_scales, logits, np.concatenate(sh), device=str(first.cloud.device)
+    )
+    return replace(first, cloud=cloud, origin=origin, up=up, antialiased=antialiased, notes=notes, rows=None)
+
+
+def _file_positions(capture: Capture) -> np.ndarray:
+    """(n, 3) positions with the offset, float32 without one."""
+    means = capture.cloud.means.numpy()
+    return means if capture.origin is None else means + capture.origin
+
+
+def _same(a: np.ndarray | None, b: np.ndarray | None) -> bool:
+    return a is b if a is None or b is None else np.allclose(a, b)
+
+
+def edit_capture(capture: Capture, edits: CaptureEdits) -> tuple[Capture, tuple[str, ...]]:
+    """Return the changed capture, and a line about each change for the user.
+
+    Raises ``UserError`` if no Gaussian is left.
+    """
+    cloud, lines, origin = capture.cloud, [], capture.origin
+    if edits.box is not None:
+        low, high = edits.box.min(axis=0), edits.box.max(axis=0)
+        means = _file_positions(capture)
+        inside = np.all((means >= low) & (means <= high), axis=1)
+        if not inside.any():
+            bounds = " to ".join(
+                ",".join(f"{x:.6g}" for x in corner) for corner in (means.min(axis=0), means.max(axis=0))
+            )
+            raise ArgumentError("box", f"none of the {cloud.count} Gaussians lies in it; they extend from {bounds}")
+        lines.append(f"box: {cloud.count - int(inside.sum())} of {cloud.count} Gaussians left out")
+        cloud = cloud.subset(inside)
+    if edits.drop_floaters:
+        stays = ~floaters(cloud)
+        lines.append(f"floaters: {cloud.count - int(stays.sum())} of {cloud.count} Gaussians left out")
+        cloud = cloud.subset(stays)
+    up = capture.up
+    if edits.moves:
+        frame = edits.frame()
+        if origin is not None:
+            # The displacement belongs to the offset, which has double precision.
+            origin = frame.points(origin)
+            frame = replace(frame, origin=np.zeros(3))
+            origin = origin if origin.any() else None
+        cloud = to_body_frame(cloud, frame)
+        up = None if up is None else frame.axes @ up
+        up = Y_UP if edits.up is not None and edits.rotation is None else up
+    if edits.count is not None and edits.count < cloud.count:
+        before = cloud.count
+        cloud, moved = decimated(cloud, edits.count)
+        lines.append(f"decimated: {before} Gaussians merged to {cloud.count}, moved by {moved:.2g} units (RMS)")
+    return replace(capture, cloud=cloud, origin=origin, up=up, rows=None), tuple(lines)
+
+
+def floaters(cloud: GaussianCloud) -> np.ndarray:
+    """(n,) bool, Gaussians of parts that are connected to nothing and have less than 1 % of the opacity of the largest
+    part."""
+    means = cloud.means.numpy().astype(np.float64)
+    low, high = np.quantile(means, (0.01, 0.99), axis=0)
+    size = float((high - low).max())
+    if not size > 0.0:
+        return np.zeros(cloud.count, bool)
+    everywhere = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+    parts = connected_parts(cloud, np.arange(cloud.count), cell=size / _CELLS, plane=everywhere, above=-np.inf)
+    masses = np.bincount(parts, weights=cloud.opacities())
+    return masses[parts] < _FLOATER_SHARE * masses.max()
