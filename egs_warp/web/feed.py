@@ -56,6 +56,8 @@ class LiveFeed:
             "height": body.height,
             "weight": body.weight,
             "friction": creature.geometry.friction,
+            "front": creature.front.direction[:2].tolist(),
+            "flat": len(creature.geometry.planes) == 1 and creature.geometry.field is None,
             # The momentum residual is known only after a step; only takes contain its curve.
             "curves": curve_facts([curve for curve in CURVES if curve[0] != "residual"]),
             "audit": {},

@@ -41,6 +41,8 @@ class Recording(FinishedRun):
             "height": t.height,
             "weight": float(t.node_mass.sum() * np.linalg.norm(t.gravity)),
             "friction": t.friction,
+            "front": t.front[:2].tolist(),
+            "flat": len(t.planes) == 1 and t.ground_coefficients.size == 0,
             "curves": curve_facts(CURVES),
             "audit": report.get("audit", {}),
             "motion": report.get("motion", []),

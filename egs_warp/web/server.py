@@ -139,7 +139,7 @@ class PageServer:
         assert feed is not None
         await page.accept()
         if self._has_client:
-            await page.close(1013, "another page already shows this session; close it first")
+            await page.close(1013, "another page shows this session; close it there, and the creature appears here")
             return
         self._has_client = True
         try:

@@ -13,6 +13,10 @@ export interface Facts {
   height: number;
   weight: number;
   friction: number;
+  /** Horizontal unit vector in which the body at rest faces. */
+  front: [number, number];
+  /** True if the ground is the plane z = 0. */
+  flat: boolean;
   curves: Curve[];
   fibres: { name: string; kind: string }[];
   camera: { position: [number, number, number]; forward: [number, number, number]; fov: number };
