@@ -27,7 +27,11 @@ export class Ground {
   private readonly points: THREE.BufferAttribute;
 
   constructor(surface: Int32Array, nodeCount: number, height: number) {
-    this.target = new THREE.WebGLRenderTarget(SHADOW_SIDE, SHADOW_SIDE, { depthBuffer: false });
+    this.target = new THREE.WebGLRenderTarget(SHADOW_SIDE, SHADOW_SIDE, {
+      depthBuffer: false,
+      generateMipmaps: true,
+      minFilter: THREE.LinearMipmapLinearFilter,
+    });
     const half = 1.5 * height;
     this.shadow = { texture: this.target.texture, region: new THREE.Vector4(0, 0, half, height) };
     this.camera = new THREE.OrthographicCamera(-half, half, half, -half, -100 * height, 100 * height);
@@ -152,8 +156,8 @@ export class Ground {
     }
     const half = this.shadow.region.z;
     const at = (x: number, centre: number): number => 0.5 + (0.5 * (x - centre)) / half;
-    // One texel more than the blur radius, clipped to the shadow map.
-    const edge = WIDE_RADIUS + 2 / SHADOW_SIDE;
+    // The blur radius and a texel of the coarser level, clipped to the shadow map.
+    const edge = WIDE_RADIUS + 10 / SHADOW_SIDE;
     (this.mesh.material.uniforms.box!.value as THREE.Vector4).set(
       Math.max(at(left, centreOfMass.x) - edge, 0),
       Math.max(at(near, centreOfMass.y) - edge, 0),

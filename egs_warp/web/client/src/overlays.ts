@@ -114,7 +114,8 @@ export class Overlays {
       lines.set(this.ends.subarray(3 * segments[k]!, 3 * segments[k]! + 3), 3 * k);
       const level = (frame.activations[k >> 1] ?? 0) / 127;
       const towards = level > 0 ? COLOURS.contracts : COLOURS.extends;
-      const strength = Math.sqrt(Math.abs(level));
+      // Small activations are visible, too.
+      const strength = Math.abs(level) ** 0.4;
       for (let c = 0; c < 3; c++) {
         colours[3 * k + c] = COLOURS.relaxed[c]! + strength * (towards[c]! - COLOURS.relaxed[c]!);
       }
