@@ -23,7 +23,7 @@ from egs_warp.web.packets import Frame
 from egs_warp.web.recording import CURVES, creature_header, curve_facts
 from egs_warp.web.session import Session
 
-_HALF_VIEW_HEIGHT = 1.25
+_HALF_VIEW_HEIGHT = 1.0
 """Half of the height that the initial camera shows, in body heights."""
 
 

@@ -11,7 +11,8 @@ import json
 import os
 import secrets
 import socket
-from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence
+import threading
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator, Sequence
 from typing import Protocol
 from urllib.parse import urlsplit
 
@@ -118,6 +119,17 @@ class PageServer:
         """Serve until ``stop`` or Ctrl-C."""
         with contextlib.suppress(KeyboardInterrupt):
             self._server.run(sockets=[self._socket])
+
+    @contextlib.contextmanager
+    def serve_in_background(self) -> Iterator[threading.Thread]:
+        """Serve in a thread within the context."""
+        thread = threading.Thread(target=self.serve, name="page server", daemon=True)
+        thread.start()
+        try:
+            yield thread
+        finally:
+            self.stop()
+            thread.join()
 
     def stop(self) -> None:
         """End ``serve``; can be called from any thread."""

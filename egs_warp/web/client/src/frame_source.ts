@@ -56,6 +56,9 @@ export type News =
   | { type: "told"; text: string }
   | { type: "script"; text: string; motions: number }
   | { type: "busy"; on: boolean }
+  | { type: "preparing"; stage: string }
+  | { type: "failed"; text: string }
+  | { type: "ready" }
   | { type?: undefined; error: string };
 
 /** A live session: receives frames and messages, and sends commands. */

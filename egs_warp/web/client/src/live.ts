@@ -244,7 +244,7 @@ export class Live {
     } else if (news.type === "script") {
       if (news.motions === 0) this.showMessage("there is no motion to save yet");
       else save(new Blob([news.text], { type: "application/json" }), "script.json");
-    } else this.showMessage(news.error, true);
+    } else if (news.type === undefined) this.showMessage(news.error, true);
   }
 
   private show(state: State): void {

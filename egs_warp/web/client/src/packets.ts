@@ -26,6 +26,8 @@ export interface Facts {
   degree: { splats: number; scene: number };
   /** The capture was trained with antialiasing. */
   antialiased: boolean;
+  /** True for the still capture that is shown while its creature is prepared. */
+  preparing?: boolean;
   /** Only of live sessions: identifier of the session and limits of its sliders. */
   session?: string;
   limits?: { friction: [number, number]; sag: [number, number]; style: [number, number] };

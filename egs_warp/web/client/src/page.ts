@@ -7,6 +7,7 @@ import { Legend } from "./legend";
 import { VideoRecorder } from "./video_recorder";
 import { Live } from "./live";
 import { Player } from "./player";
+import { Preparation } from "./preparation";
 import { LiveSource, type FrameSource } from "./frame_source";
 import { Viewer, type Preset, type LayerToggle } from "./viewer";
 
@@ -75,7 +76,11 @@ export class Page {
       const viewer = new Viewer(canvas, source);
       this.viewers.push(viewer);
     }
-    if (first instanceof LiveSource) this.live = new Live(first, this.viewers[0] as Viewer);
+    const preparation =
+      first instanceof LiveSource && first.header.facts.preparing ? new Preparation(first) : undefined;
+    if (first instanceof LiveSource && preparation === undefined) {
+      this.live = new Live(first, this.viewers[0] as Viewer);
+    }
     for (const viewer of this.viewers) {
       viewer.controls.addEventListener("change", () => {
         for (const other of this.viewers) if (other !== viewer) other.copyCamera(viewer);
@@ -85,7 +90,8 @@ export class Page {
     this.playButton = button("play", "Play (space)", () => this.player.toggle());
     this.playButton.classList.add("play");
     this.legend = new Legend(first.header.arrays.has("plan"));
-    const controls = this.live?.elements() ?? [this.playbackBar(), this.keySheet];
+    const recorded = preparation === undefined ? [this.playbackBar()] : [preparation.element];
+    const controls = this.live?.elements() ?? [...recorded, this.keySheet];
     const notes = element("div", { class: "notes" }, this.legend.element, this.charts.panel);
     root.append(this.toolbar(), notes, ...controls);
     this.charts.panel.hidden = true;
