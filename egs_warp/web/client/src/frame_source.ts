@@ -107,7 +107,8 @@ const TRY_AGAIN_LATER = 1013;
 /** Time after which a closed connection is tried again, ms. */
 const RETRY_TIME = 500;
 
-/** Connect to a session, wait while another page shows it, and reconnect after a lost connection. The header comes first, then frames and messages. */
+/** Connect to a session, wait while another page shows it, and reconnect after a lost connection. The header comes
+ * first, then frames and messages. */
 export function fromSocket(address: string, onState: (lost: string | undefined) => void): Promise<LiveSource> {
   return new Promise((resolve, reject) => {
     let source: LiveSource | undefined;
