@@ -5,8 +5,8 @@ export const WIDE_RADIUS = 0.08;
 
 export const SHADOW_GLSL = /* glsl */ `
 /* Fraction of light at uv of a shadow map. Its red channel is the part of the sky that the body hides, its green
-   channel marks what is close to the ground. The shadow at what touches the ground is spread over the radius softness. Coarser
-   levels of the map make its few samples smooth. */
+   channel marks what is close to the ground. The shadow at what touches the ground is spread over the radius
+   softness. Coarser levels of the map make its few samples smooth. */
 float egsShade(sampler2D shade, vec2 uv, float softness) {
   float near = 0.0, wide = 0.0, weights = 0.0;
   for (int k = 0; k < 12; k++) {
