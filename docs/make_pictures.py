@@ -142,7 +142,8 @@ def record(page: Path, film: Path) -> None:
     """Record a ``page`` in the system's Chromium, from the side, with the path of the centre of mass."""
     with started() as browser, tempfile.TemporaryDirectory() as folder:
         shown, _ = opened(browser, page.as_uri(), *RECORDED)
-        bare = "for (const part of document.querySelectorAll('.tools, .dock, .notes, figcaption')) part.style.display = 'none'"
+        controls = ".tools, .dock, .notes, figcaption"
+        bare = f"for (const part of document.querySelectorAll('{controls}')) part.style.display = 'none'"
         shown.evaluate(f"() => {{ {bare} }}")
         shown.evaluate(SIDE_VIEW)
         count = shown.evaluate("egs.viewers[0].source.frames.length")
