@@ -25,13 +25,13 @@ ASSETS = ROOT / "docs" / "assets"
 RECORDED, RECORDED_RATE = (720, 360), 20
 """Window size in pixels in which a page is recorded, and frames per second of its recording."""
 SIDE_VIEW = """() => {
-    const [viewer] = egs.viewers, { centre } = viewer.bounds;
+    const [viewer] = egs.viewers, { bounds } = viewer, centre = bounds.getCenter(viewer.centreOfMass);
     egs.player.seek(0);
     const from = viewer.centreOfMass;
     egs.player.seek(1e6);
     const ahead = viewer.centreOfMass.sub(from).setZ(0).normalize();
     const way = centre.clone().set(ahead.y + 0.35 * ahead.x, 0.35 * ahead.y - ahead.x, 0.3).normalize();
-    viewer.setCamera(centre.clone().addScaledVector(way, 1.25 * viewer.bounds.size), centre);
+    viewer.setCamera(centre.clone().addScaledVector(way, 1.25 * bounds.min.distanceTo(bounds.max)), centre);
     egs.setLayer("path", true);
 }"""
 CAPTURES = "python examples/captures.py --out out/captures"
@@ -142,7 +142,8 @@ def record(page: Path, film: Path) -> None:
     """Record a ``page`` in the system's Chromium, from the side, with the path of the centre of mass."""
     with started() as browser, tempfile.TemporaryDirectory() as folder:
         shown, _ = opened(browser, page.as_uri(), *RECORDED)
-        bare = "for (const part of document.querySelectorAll('.tools, .dock, figcaption')) part.style.display = 'none'"
+        controls = ".tools, .dock, .notes, figcaption"
+        bare = f"for (const part of document.querySelectorAll('{controls}')) part.style.display = 'none'"
         shown.evaluate(f"() => {{ {bare} }}")
         shown.evaluate(SIDE_VIEW)
         count = shown.evaluate("egs.viewers[0].source.frames.length")

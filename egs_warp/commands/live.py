@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
+import threading
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +13,10 @@ from egs_warp.commands.flags import Commands, add_qp_flag, guessed_up, named_pat
 from egs_warp.commands.scene_flags import print_note, start_device
 
 if TYPE_CHECKING:
-    from egs_warp.web.server import PageServer
+    import numpy as np
+
+    from egs_warp.geometry.plane import Plane
+    from egs_warp.io.capture import Capture
     from egs_warp.web.session import Session
 
 EXAMPLES = (
@@ -39,8 +44,7 @@ def add_parser(commands: Commands) -> None:
     body.add_argument(
         "--nodes",
         type=int,
-        default=250,
-        help="approximate number of cage nodes (250); fewer are faster; animate uses 500",
+        help="approximate number of cage nodes; fewer are faster (default: 120 to 500 by the speed of the machine)",
     )
     body.add_argument("--friction", type=float, default=0.8, help="initial Coulomb friction coefficient (0.8)")
     body.add_argument(
@@ -59,83 +63,116 @@ def add_parser(commands: Commands) -> None:
 
 
 def _live(args: argparse.Namespace) -> int:
+    import webbrowser
+
+    from egs_warp.commands.scene_input import plane_of
+    from egs_warp.errors import UserError
     from egs_warp.io import read_capture
+    from egs_warp.io.run_folder import check_out
+    from egs_warp.io.text import parse_json, read_text
     from egs_warp.launching import reserve_core
+    from egs_warp.meshing.cage import check_nodes
     from egs_warp.web.feed import LiveFeed
     from egs_warp.web.page import page_text
+    from egs_warp.web.preview import PreviewFeed, preview_of
     from egs_warp.web.server import PageServer, check_port
 
     # Errors that can be detected before any long work.
     page_text()
     check_port(args.port)
+    check_out(args.out)
+    if args.nodes is not None:
+        check_nodes(args.nodes)
+    if args.muscles is not None:
+        parse_json(read_text(args.muscles), args.muscles)
+    up = parse_up(args.up) if args.up is not None else None
+    plane = plane_of(args.plane) if args.plane is not None else None
     start_device(args.device)
     background = read_capture(args.background, device=args.device).cloud if args.background is not None else None
-    session = _session(args)
-    scene = session.creature.placed(background) if background is not None else None
-    server = PageServer([], port=args.port, feed=LiveFeed(session, scene=scene))
-    with reserve_core():
-        _serve(session, server, open_browser=not args.no_browser)
+    capture = read_capture(args.capture, device=args.device)
+    if plane is None and up is None:
+        up, note = guessed_up(capture)
+        print_note(note)
+    feed = PreviewFeed(preview_of(capture.cloud, title=Path(args.capture).name, up=up, plane=plane))
+    server = PageServer([], port=args.port, feed=feed)
+    with server.serve_in_background() as thread:
+        print(f"open {server.address}\nend with Ctrl-C", flush=True)
+        if not args.no_browser:
+            webbrowser.open(server.address)
+        try:
+            session = _session(args, capture, up=up, plane=plane, begin_stage=feed.show_stage)
+        except UserError as error:
+            feed.show_error(str(error))
+            raise
+        scene = session.creature.placed(background) if background is not None else None
+        with reserve_core():
+            session.start()
+            feed.start(LiveFeed(session, scene=scene))
+            try:
+                _wait(thread)
+            finally:
+                session.stop()
     return 0
 
 
-def _serve(session: Session, server: PageServer, *, open_browser: bool) -> None:
-    """Run the session and its page until Ctrl-C."""
-    import webbrowser
-
-    session.start()
-    print(f"open {server.address}\nend with Ctrl-C", flush=True)
-    if open_browser:
-        webbrowser.open(server.address)
-    try:
-        server.serve()
-    finally:
-        session.stop()
+def _wait(thread: threading.Thread) -> None:
+    """Wait until ``thread`` ends or Ctrl-C."""
+    with suppress(KeyboardInterrupt):
+        while thread.is_alive():
+            # A wait without limit cannot be interrupted on Windows.
+            thread.join(timeout=0.5)
 
 
-def _session(args: argparse.Namespace) -> Session:
-    """Read the capture, build its creature and return a session that is not started."""
-    from egs_warp.commands.scene_input import ground_of, plane_of
-    from egs_warp.io import read_capture
-    from egs_warp.io.run_folder import check_out
-    from egs_warp.io.text import parse_json, read_text
+def _session(
+    args: argparse.Namespace,
+    capture: Capture,
+    *,
+    up: np.ndarray | None,
+    plane: Plane | None,
+    begin_stage: Callable[[str], object],
+) -> Session:
+    """Build the creature of ``capture`` and return a session that is not started."""
+    from egs_warp.commands.scene_input import ground_of
     from egs_warp.locomotion.settings import LocomotionSettings
-    from egs_warp.meshing.cage import check_nodes
     from egs_warp.pipelines.creature import CreatureOptions, make_creature
     from egs_warp.pipelines.progress import preparation_bar
     from egs_warp.web.feed import live_render_data
     from egs_warp.web.presplit import presplit_gaussians
     from egs_warp.web.session import Session, SessionOptions
 
-    check_out(args.out)
-    check_nodes(args.nodes)
-    if args.muscles is not None:
-        parse_json(read_text(args.muscles), args.muscles)
-    options = CreatureOptions(friction=args.friction, metres_per_unit=args.metres_per_unit)
-    up = parse_up(args.up) if args.up is not None else None
-    plane = plane_of(args.plane) if args.plane is not None else None
     front = parse_direction("front", args.front) if args.front is not None else None
-    capture = read_capture(args.capture, device=args.device)
-    if plane is None and up is None:
-        up, note = guessed_up(capture)
-        print_note(note)
-    with preparation_bar() as begins:
-        creature = make_creature(
-            capture.cloud,
-            up=up,
-            plane=plane,
-            options=replace(
-                options,
-                ground=ground_of(args.plane, flat=False),
-                front=front,
-                muscles_file=args.muscles,
-                settings=LocomotionSettings(qp_solver=args.qp),
-                nodes=args.nodes,
-            ),
-            progress=begins,
-        )
+    options = CreatureOptions(
+        friction=args.friction,
+        metres_per_unit=args.metres_per_unit,
+        ground=ground_of(args.plane, flat=False),
+        front=front,
+        muscles_file=args.muscles,
+        settings=LocomotionSettings(qp_solver=args.qp),
+        nodes=_nodes(args),
+    )
+    with preparation_bar() as update_bar:
+
+        def begins(stage: str) -> None:
+            update_bar(stage)
+            begin_stage(stage)
+
+        creature = make_creature(capture.cloud, up=up, plane=plane, options=options, progress=begins)
         begins("split")
         drawn_as = live_render_data(creature, presplit_gaussians(creature))
     if front is None:
         print_note(creature.front.description(creature.frame))
     session_options = SessionOptions(source=Path(args.capture).name, takes=args.out, muscles_file=args.muscles)
     return Session(creature, drawn_as, session_options)
+
+
+def _nodes(args: argparse.Namespace) -> int:
+    """Return the number of nodes: the given one, or one for the speed of the device, with a note."""
+    from egs_warp.web.node_choice import GPU_NODES, choose_nodes
+
+    if args.nodes is not None:
+        return args.nodes
+    if args.device != "cpu":
+        return GPU_NODES
+    choice = choose_nodes()
+    print_note(choice.description())
+    return choice.nodes

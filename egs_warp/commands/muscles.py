@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from egs_warp.commands.flags import Commands, guessed_up, named_path, parse_up
+from egs_warp.commands.flags import Commands, guessed_up, named_path, parse_direction, parse_up
 from egs_warp.commands.scene_flags import print_note, start_device
 
 EXAMPLES = ("pawn.ply --plot muscles.png",)
@@ -15,7 +15,10 @@ def add_parser(commands: Commands) -> None:
     muscles = commands.add_parser("muscles", help="draw the muscles of a body, automatic ones or your own")
     muscles.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
     muscles.add_argument(
-        "--plot", required=True, type=named_path, help="image (.png, .jpg, ...) that shows the body from three sides"
+        "--plot",
+        required=True,
+        type=named_path,
+        help="image (.png, .jpg, ...) that shows the body from the front, its left and above",
     )
     muscles.add_argument(
         "--muscles",
@@ -27,6 +30,9 @@ def add_parser(commands: Commands) -> None:
         "--plane",
         help="ground plane n.x + d = 0 as nx,ny,nz,d in the capture's units, or a plane.json (default: estimated)",
     )
+    muscles.add_argument(
+        "--front", help="direction in which the body faces: x,y,z or an axis, as --front=-x (default: estimated)"
+    )
     muscles.set_defaults(run=_muscles)
 
 
@@ -36,25 +42,33 @@ def _muscles(args: argparse.Namespace) -> int:
     from egs_warp.geometry.body_frame import GROUND
     from egs_warp.io import read_capture
     from egs_warp.muscles.plot import check_picture_name, plot_muscles
-    from egs_warp.pipelines.creature import body_muscles, place_cage
+    from egs_warp.pipelines.creature import body_muscles, check_front, choose_front, place_cage
     from egs_warp.pipelines.progress import info_bar
 
     start_device("cpu")
     check_picture_name(args.plot)
     up = parse_up(args.up) if args.up else None
     plane = plane_of(args.plane) if args.plane else None
+    front = parse_direction("front", args.front) if args.front is not None else None
     capture = read_capture(args.capture)
     for note in capture.notes:
         print_note(note)
     if plane is None and up is None:
         up, note = guessed_up(capture)
         print_note(note)
+    normal = plane.normal if plane is not None else up
+    if front is not None and normal is not None:
+        check_front(normal, front)
     with info_bar() as begins:
         begins("cage")
         standing = place_cage(capture.cloud, up=up, plane=plane)
+        begins("front")
+        facing = choose_front(standing, front)
         begins("muscles")
         body = make_body(standing.cage.mesh, GROUND)
         muscles = body_muscles(body, args.muscles, standing.frame)
-    plot_muscles(body.mesh, muscles, args.plot, up=GROUND.normal)
+    plot_muscles(body.mesh, muscles, args.plot, up=GROUND.normal, front=facing.direction)
+    if front is None:
+        print_note(facing.description(standing.frame))
     print(f"{muscles.fibre_count} fibres, {muscles.segment_count} segments; wrote {args.plot}")
     return 0

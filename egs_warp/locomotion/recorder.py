@@ -37,6 +37,7 @@ class Recorder:
         *,
         drag: float,
         frame: BodyFrame | None = None,
+        front: np.ndarray | None = None,
         folder: Callable[[], Path] | None = None,
     ) -> None:
         """Write down the start of a run.
@@ -49,6 +50,7 @@ class Recorder:
             start_gap: m, smallest gap at ``start``.
             drag: 1/s, alpha of Rayleigh damping.
             frame: placement of the body in its capture.
+            front: (3,) unit vector in which the body faces; None is its x axis.
             folder: function that returns the folder of the parts, called after the first step; a missing folder is
                 created. None keeps all parts in memory.
         """
@@ -57,7 +59,7 @@ class Recorder:
         self._reports: list[StepReport] = []
         self._requests: list[tuple[int, int]] = []
         self._kicks: list[tuple[int, np.ndarray]] = []
-        self.start = self._first(body, muscles, geometry, start, start_gap, drag, frame)
+        self.start = self._first(body, muscles, geometry, start, start_gap, drag, frame, front)
         """Arrays of the first part."""
         self._parts = [self.start]
 
@@ -108,6 +110,7 @@ class Recorder:
         start_gap: float,
         drag: float,
         frame: BodyFrame | None,
+        front: np.ndarray | None,
     ) -> dict[str, np.ndarray]:
         """Return the arrays of the first part: the start, and all that is constant in a run."""
         material = body.assembly.material
@@ -160,6 +163,8 @@ class Recorder:
                 "body_origin": frame.origin,
                 "metres_per_unit": np.float64(frame.scale),
             }
+        if front is not None:
+            part["front"] = front
         return part
 
     def _part(self) -> dict[str, np.ndarray]:

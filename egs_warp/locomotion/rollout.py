@@ -67,6 +67,7 @@ def roll_out(
     frames: int,
     step: float | None = None,
     place: BodyFrame | None = None,
+    front: np.ndarray | None = None,
     parts: Callable[[], Path] | None = None,
     resume: Path | None = None,
     finished: Callable[[], bool] = lambda: False,
@@ -85,6 +86,7 @@ def roll_out(
         frames: maximum number of frames.
         step: s, maximum size of a solver step, see ``solver_steps``.
         place: placement of the body in its capture.
+        front: (3,) unit vector in which the body faces, for the recording; None is its x axis.
         parts: function that returns the folder in which steps are recorded (``Recorder``).
         resume: folder of a recording whose steps are not solved again (``Replay``).
         finished: function that returns True once the motion has finished.
@@ -111,6 +113,7 @@ def roll_out(
         float(gaps.min()),
         drag=stepper.settings.drag,
         frame=place,
+        front=front,
         folder=parts,
     )
     replay = Replay(resume, recorder.start, stepper.detector) if resume is not None else None

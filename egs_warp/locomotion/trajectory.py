@@ -129,6 +129,8 @@ class Trajectory:
     """(3,) this frame's origin in the capture, in the capture's unit."""
     metres_per_unit: float = 1.0
     """Length of the capture's unit, m."""
+    front: np.ndarray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
+    """(3,) unit vector along the ground in which the body at rest faces; x in files without it."""
 
     def in_capture(self, points: np.ndarray) -> np.ndarray:
         """Return ``points`` (..., 3) of this frame in the capture's frame and unit."""

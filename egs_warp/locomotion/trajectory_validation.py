@@ -44,6 +44,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "planned_com": ("planned", 3),
     "body_axes": (3, 3),
     "body_origin": (3,),
+    "front": (3,),
 }
 """Extents of each array by name; extents of one name are equal."""
 _INDICES = {
@@ -98,6 +99,8 @@ def check_trajectory(t: Trajectory) -> None:
         raise ValueError("gravity is zero")
     if np.abs(t.body_axes @ t.body_axes.T - np.eye(3)).max() > 1e-6:
         raise ValueError("body_axes are not orthonormal")
+    if abs(np.linalg.norm(t.front) - 1.0) > 1e-6 or abs(t.front[2]) > 1e-6:
+        raise ValueError("front is no unit vector along the ground")
 
 
 def _extents(t: Trajectory) -> dict[str, int]:

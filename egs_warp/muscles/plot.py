@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.frames import orthonormal_basis
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.atomic import atomic_write
 from egs_warp.muscles.fibres import FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet
 
-_BGR = {
-    FibreKind.LONGITUDINAL: (60, 60, 210),
-    FibreKind.RADIAL: (60, 160, 60),
-    FibreKind.CIRCULAR: (200, 120, 40),
-    FibreKind.OBLIQUE_LEFT: (190, 60, 170),
-    FibreKind.OBLIQUE_RIGHT: (30, 150, 240),
-    FibreKind.USER: (90, 90, 90),
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FIBRE_COLOURS = {
+    FibreKind.LONGITUDINAL: "#d23c3c",
+    FibreKind.RADIAL: "#3ca03c",
+    FibreKind.CIRCULAR: "#2878c8",
+    FibreKind.OBLIQUE_LEFT: "#aa3cbe",
+    FibreKind.OBLIQUE_RIGHT: "#f0961e",
+    FibreKind.USER: "#5a5a5a",
 }
+"""Colour of the fibres of each kind."""
 _EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
-_PANEL = 640
-_MARGIN = 40
-_SUPERSAMPLING = 2
-"""Factor by which the image is drawn larger before it is averaged down."""
-_SUBPIXEL_BITS = 4
+_MARGIN = 0.06
+"""Margin around the body, as a fraction of its largest extent."""
 
 
 def check_picture_name(path: Path) -> None:
@@ -42,25 +43,55 @@ def check_picture_name(path: Path) -> None:
         raise UserError(f"{path}: its folder does not exist; create {path.parent} first")
 
 
-def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarray) -> None:
-    """Write an image of the body from the front, the side and above, with fibres coloured by kind.
+def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarray, front: np.ndarray) -> None:
+    """Write an image of the body from the front, its left and above, with fibres coloured by kind.
+
+    The ticks are body heights from the middle of the body along the ground, and from its lowest point upwards.
 
     Args:
         mesh: cage at rest.
         muscles: its muscles.
         path: image file.
-        up: (3,) up direction of the first two views.
+        up: (3,) up direction.
+        front: (3,) direction in which the body faces, not parallel to ``up``.
 
     Raises:
         UserError: ``path`` cannot be written.
     """
     check_picture_name(path)
-    up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    left, near = orthonormal_basis(up)
-    right, away = -left, -near
-    views = {"front": (right, up, away), "side": (away, up, -right), "above": (right, away, -up)}
-    panels = [_panel(title, np.stack(axes), mesh, muscles) for title, axes in views.items()]
-    image = np.concatenate([np.concatenate(panels, axis=1), _legend(muscles, 3 * _PANEL)])
+    # Imported here because the import takes a quarter of a second.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    figure = Figure(figsize=(19.2, 7.2), dpi=100, layout="constrained", facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    local = _BodyAxes(mesh, up=up, front=front)
+    # Directions to the right, up and towards the viewer in the picture; each is one of ahead, left and up, or its
+    # opposite.
+    ahead, left, above = np.eye(3)
+    views = {
+        "from the front": (left, above, ahead),
+        "from its left": (-ahead, above, left),
+        "from above": (-left, ahead, above),
+    }
+    panels = figure.subplots(1, len(views))
+    for axes, (title, directions) in zip(panels, views.items(), strict=True):
+        _draw_view(axes, local, mesh, muscles, np.stack(directions))
+        axes.set_title(title)
+    counts = {kind: len(muscles.segments_of_kind(kind)) for kind in FibreKind}
+    figure.legend(
+        handles=[
+            Line2D([], [], color=FIBRE_COLOURS[kind], linewidth=3.0, label=f"{kind.value.replace('_', ' ')} ({count})")
+            for kind, count in counts.items()
+            if count
+        ],
+        loc="outside lower center",
+        ncols=len(counts),
+        frameon=False,
+    )
+    canvas.draw()
+    image = np.asarray(canvas.buffer_rgba())[..., 2::-1]
     written, data = cv2.imencode(path.suffix, image)
     if not written:
         raise UserError(f"{path}: the picture could not be encoded; give another ending")
@@ -68,52 +99,58 @@ def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarra
         temporary.write_bytes(data.tobytes())
 
 
-def _panel(title: str, axes: np.ndarray, mesh: TetMesh, muscles: MuscleSet) -> np.ndarray:
-    size = _PANEL * _SUPERSAMPLING
-    image = np.full((size, size, 3), 255, np.uint8)
-    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-    scale = (_PANEL - 2 * _MARGIN) * _SUPERSAMPLING / float((high - low).max())
-    middle = 0.5 * (low + high)
+class _BodyAxes:
+    """Transform of points to ahead, left and up of the body, in body heights."""
 
-    def pixels(points: np.ndarray) -> np.ndarray:
-        flat = (points - middle) @ axes[:2].T * [scale, -scale] + 0.5 * size
-        return np.round(flat * 2**_SUBPIXEL_BITS).astype(np.int32)
+    def __init__(self, mesh: TetMesh, *, up: np.ndarray, front: np.ndarray) -> None:
+        up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+        left = np.cross(up, front)
+        left /= np.linalg.norm(left)
+        self._axes = np.stack([np.cross(left, up), left, up])
+        flat = mesh.nodes @ self._axes.T
+        low, high = flat.min(axis=0), flat.max(axis=0)
+        self._origin = np.append(0.5 * (low + high)[:2], low[2])
+        self._height = float(high[2] - low[2])
+        self.low, self.high = self(mesh.nodes).min(axis=0), self(mesh.nodes).max(axis=0)
+        """(3,) Bounds of the body."""
 
-    faces = mesh.boundary_faces()
-    corners = mesh.nodes[faces]
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Transform ``points`` (..., 3)."""
+        return (points @ self._axes.T - self._origin) / self._height
+
+
+def _draw_view(axes: Axes, local: _BodyAxes, mesh: TetMesh, muscles: MuscleSet, directions: np.ndarray) -> None:
+    """Draw the body seen with ``directions`` (3, 3), rows right, up and towards the viewer, ahead, left and up."""
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    # The ticks show these coordinates; one that increases to the left is drawn on an inverted axis.
+    shown = np.abs(directions)
+    corners = local(mesh.nodes[mesh.boundary_faces()])
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    depth = corners.mean(axis=1) @ axes[2]
-    brightness = 225 - 40 * np.clip(normals @ axes[2] + 1.0, 0.0, 1.0)
-    outlines = pixels(corners)
-    for face in np.argsort(-depth, kind="stable"):
-        if normals[face] @ axes[2] < 0:
-            shade = (int(brightness[face]),) * 3
-            cv2.fillConvexPoly(image, outlines[face], shade, cv2.LINE_AA, _SUBPIXEL_BITS)
-            cv2.polylines(image, [outlines[face]], True, (200, 200, 200), 1, cv2.LINE_AA, _SUBPIXEL_BITS)
-    ends = muscles.end_points(mesh.nodes)
-    end_pixels = pixels(ends)
-    middles = ends[muscles.segments].mean(axis=1) @ axes[2]
-    for segment in np.argsort(-middles, kind="stable"):
-        i, k = muscles.segments[segment]
-        colour = _BGR[muscles.fibre_kinds[muscles.fibre_from_segment[segment]]]
-        first, last = (end_pixels[i].tolist(), end_pixels[k].tolist())
-        cv2.line(image, first, last, colour, 2 * _SUPERSAMPLING, cv2.LINE_AA, _SUBPIXEL_BITS)
-        for end in (first, last):
-            cv2.circle(image, end, 3 * _SUPERSAMPLING * 2**_SUBPIXEL_BITS, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
-    image = cv2.resize(image, (_PANEL, _PANEL), interpolation=cv2.INTER_AREA)
-    cv2.putText(image, title, (12, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (0, 0, 0), 1, cv2.LINE_AA)
-    return image
-
-
-def _legend(muscles: MuscleSet, width: int) -> np.ndarray:
-    strip = np.full((48, width, 3), 255, np.uint8)
-    x = 16
-    for kind in FibreKind:
-        count = len(muscles.segments_of_kind(kind))
-        if count:
-            text = f"{kind.value} ({count})"
-            cv2.line(strip, (x, 24), (x + 32, 24), _BGR[kind], 3, cv2.LINE_AA)
-            cv2.putText(strip, text, (x + 40, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1, cv2.LINE_AA)
-            x += 70 + cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.6, 1)[0][0]
-    return strip
+    facing = normals @ directions[2] / np.linalg.norm(normals, axis=1)
+    order = np.argsort(corners.mean(axis=1) @ directions[2], kind="stable")
+    order = order[facing[order] > 0.0]
+    greys = np.repeat(0.72 + 0.2 * facing[order, None], 3, axis=1)
+    axes.add_collection(
+        PolyCollection(list(corners[order] @ shown[:2].T), facecolors=greys, edgecolors="0.8", linewidths=0.5)
+    )
+    ends = local(muscles.end_points(mesh.nodes))[muscles.segments]
+    order = np.argsort(ends.mean(axis=1) @ directions[2], kind="stable")
+    kinds = [muscles.fibre_kinds[fibre] for fibre in muscles.fibre_from_segment[order]]
+    colours = [FIBRE_COLOURS[kind] for kind in kinds]
+    lines = ends[order] @ shown[:2].T
+    axes.add_collection(LineCollection(list(lines), colors=colours, linewidths=2.0))
+    axes.scatter(*lines.reshape(-1, 2).T, s=14.0, c=np.repeat(colours, 2), linewidths=0.0, zorder=3)
+    low, high = shown[:2] @ local.low, shown[:2] @ local.high
+    half = (0.5 + _MARGIN) * float((local.high - local.low).max())
+    middle = 0.5 * (low + high)
+    limits = np.stack([middle - half, middle + half], axis=1)
+    left_limit, right_limit = limits[0] if directions[0].sum() > 0.0 else limits[0, ::-1]
+    axes.set_xlim(left_limit, right_limit)
+    axes.set_ylim(limits[1, 0], limits[1, 1])
+    axes.set_aspect("equal")
+    names = ("ahead", "left", "up")
+    axes.set_xlabel(f"{names[int(shown[0].argmax())]}, body heights")
+    axes.set_ylabel(f"{names[int(shown[1].argmax())]}, body heights")
+    axes.grid(alpha=0.25)
+    axes.set_axisbelow(True)

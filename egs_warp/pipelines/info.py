@@ -27,6 +27,7 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import SOLE_HEIGHT, GroundFrame
 from egs_warp.muscles.fibres import FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.muscles.plot import FIBRE_COLOURS
 from egs_warp.pipelines.capture_warnings import capture_warnings
 from egs_warp.pipelines.creature import PlacedCage, body_muscles, check_front, choose_front, place_cage
 from egs_warp.pipelines.facing_direction import Front
@@ -216,14 +217,6 @@ def inspect_capture(
 
 
 _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#ff7f0e", "#9467bd", "#8c564b", "#e377c2", "#17becf")
-_KINDS = {
-    FibreKind.LONGITUDINAL: "#d23c3c",
-    FibreKind.RADIAL: "#3ca03c",
-    FibreKind.CIRCULAR: "#2878c8",
-    FibreKind.OBLIQUE_LEFT: "#aa3cbe",
-    FibreKind.OBLIQUE_RIGHT: "#f0961e",
-    FibreKind.USER: "#5a5a5a",
-}
 
 
 def draw_info(path: Path, info: BodyInfo) -> None:
@@ -399,7 +392,12 @@ def _draw_muscles(axes: Axes, info: BodyInfo) -> None:
         for number, (first, last) in enumerate(own_segments):
             label = f"{kind.value} ({count})" if number == 0 else None
             axes.plot(
-                *ends[[first, last]].T, color=_KINDS[kind], linewidth=1.8, marker=".", markersize=4.0, label=label
+                *ends[[first, last]].T,
+                color=FIBRE_COLOURS[kind],
+                linewidth=1.8,
+                marker=".",
+                markersize=4.0,
+                label=label,
             )
     axes.legend(fontsize="small", loc="lower center", ncols=3, frameon=False, bbox_to_anchor=(0.5, -0.12))
     axes.set_title(f"{muscles.segment_count} muscle segments")

@@ -99,11 +99,9 @@ def _draw_residual(axes: Axes, t: Trajectory, energy: EnergyBalance) -> None:
 def _draw_centre(axes: Axes, t: Trajectory) -> None:
     up = -t.gravity / np.linalg.norm(t.gravity)
     com = np.einsum("n,fni->fi", t.node_mass, t.positions) / t.node_mass.sum()
-    moved = com[-1] - com[0]
-    level = moved - (moved @ up) * up
-    length = np.linalg.norm(level)
-    ahead = level / length if length > 1e-3 * t.height else np.zeros(3)
-    for direction, label, colour in ((up, "up", "C0"), (ahead, "ahead", "C1")):
+    left = np.cross(up, t.front)
+    left /= np.linalg.norm(left)
+    for direction, label, colour in ((up, "up", "C0"), (np.cross(left, up), "ahead", "C1"), (left, "left", "C2")):
         axes.plot(t.time, (com - com[0]) @ direction / t.height, colour, label=label)
         if len(t.planned_com):
             axes.plot(

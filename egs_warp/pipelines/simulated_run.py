@@ -222,6 +222,7 @@ def simulate(
         frames=max_frames + get_up_frames,
         step=step,
         place=creature.frame,
+        front=creature.front.direction,
         parts=parts,
         resume=resume,
         finished=lambda: frames is None and is_over(),

@@ -23,7 +23,7 @@ from egs_warp.web.packets import Frame
 from egs_warp.web.recording import CURVES, creature_header, curve_facts
 from egs_warp.web.session import Session
 
-_HALF_VIEW_HEIGHT = 1.25
+_HALF_VIEW_HEIGHT = 1.0
 """Half of the height that the initial camera shows, in body heights."""
 
 
@@ -56,6 +56,8 @@ class LiveFeed:
             "height": body.height,
             "weight": body.weight,
             "friction": creature.geometry.friction,
+            "front": creature.front.direction[:2].tolist(),
+            "flat": len(creature.geometry.planes) == 1 and creature.geometry.field is None,
             # The momentum residual is known only after a step; only takes contain its curve.
             "curves": curve_facts([curve for curve in CURVES if curve[0] != "residual"]),
             "audit": {},

@@ -41,6 +41,8 @@ class Recording(FinishedRun):
             "height": t.height,
             "weight": float(t.node_mass.sum() * np.linalg.norm(t.gravity)),
             "friction": t.friction,
+            "front": t.front[:2].tolist(),
+            "flat": len(t.planes) == 1 and t.ground_coefficients.size == 0,
             "curves": curve_facts(CURVES),
             "audit": report.get("audit", {}),
             "motion": report.get("motion", []),
@@ -126,11 +128,11 @@ def creature_header(
         "foot_from_node": render_data.foot_from_node.astype(np.int32),
         "mean_tets": deformer.plan.mean_tets.numpy(),
         "arms": _arms(deformer),
-        **_splat_arrays("splats", render_data.splats),
+        **splat_arrays("splats", render_data.splats),
         **(more or {}),
     }
     if scene is not None:
-        arrays |= _splat_arrays("scene", scene)
+        arrays |= splat_arrays("scene", scene)
     return header(facts, arrays)
 
 
@@ -151,7 +153,7 @@ def _arms(deformer: Deformer) -> np.ndarray:
     return np.concatenate([part[:, rows].T for part in parts], axis=1).astype(np.float32)
 
 
-def _splat_arrays(name: str, cloud: GaussianCloud) -> dict[str, np.ndarray]:
+def splat_arrays(name: str, cloud: GaussianCloud) -> dict[str, np.ndarray]:
     """Return the arrays of ``cloud``, whose names begin with ``name``.
 
     SH coefficients of degree 1 and above are bytes, 128 + 127 v / s, where s is the maximum of each coefficient over

@@ -61,6 +61,7 @@ class SessionRecording:
             float(gaps.min()),
             drag=stepper.settings.drag,
             frame=self.creature.frame,
+            front=self.creature.front.direction,
         )
 
     @property

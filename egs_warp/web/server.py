@@ -11,7 +11,8 @@ import json
 import os
 import secrets
 import socket
-from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence
+import threading
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator, Sequence
 from typing import Protocol
 from urllib.parse import urlsplit
 
@@ -119,6 +120,17 @@ class PageServer:
         with contextlib.suppress(KeyboardInterrupt):
             self._server.run(sockets=[self._socket])
 
+    @contextlib.contextmanager
+    def serve_in_background(self) -> Iterator[threading.Thread]:
+        """Serve in a thread within the context."""
+        thread = threading.Thread(target=self.serve, name="page server", daemon=True)
+        thread.start()
+        try:
+            yield thread
+        finally:
+            self.stop()
+            thread.join()
+
     def stop(self) -> None:
         """End ``serve``; can be called from any thread."""
         self._server.should_exit = True
@@ -139,7 +151,7 @@ class PageServer:
         assert feed is not None
         await page.accept()
         if self._has_client:
-            await page.close(1013, "another page already shows this session; close it first")
+            await page.close(1013, "another page shows this session; close it there, and the creature appears here")
             return
         self._has_client = True
         try:

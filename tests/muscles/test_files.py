@@ -17,6 +17,7 @@ from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.plot import plot_muscles
 from tests.support.meshes import block_mesh
 
+UP = np.array([0.0, 0.0, 1.0])
 MESH = block_mesh(5, 5, 11)
 """A column of 0.4 x 0.4 x 1 standing on z = 0."""
 
@@ -136,10 +137,32 @@ def test_the_plot_shows_each_kind_in_its_colour(tmp_path: Path) -> None:
 
     for fibres, expected in (([STRAIGHT], (True, False)), ([STRAIGHT, SPOKES], (True, True))):
         muscles = read_muscles(write(tmp_path, {"fibres": fibres}), MESH, body_weight=1.0)
-        plot_muscles(MESH, muscles, tmp_path / "muscles.png", up=np.array([0.0, 0.0, 1.0]))
+        plot_muscles(MESH, muscles, tmp_path / "muscles.png", up=UP, front=np.array([1.0, 0.0, 0.0]))
         image = cv2.imread(str(tmp_path / "muscles.png"))
         assert image is not None
-        assert image.shape[1] == 3 * 640
+        assert image.shape[1] == 1920
         assert (seen(image, red) > 500, seen(image, green) > 500) == expected
     with pytest.raises(UserError, match=r"muscles\.png: its folder does not exist; create"):
-        plot_muscles(MESH, muscles, tmp_path / "none" / "muscles.png", up=np.array([0.0, 0.0, 1.0]))
+        plot_muscles(MESH, muscles, tmp_path / "none" / "muscles.png", up=UP, front=np.array([1.0, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("front", "sides"), [((1, 0, 0), (0, -1)), ((-1, 0, 0), (0, 1)), ((0, 1, 0), (-1, 0)), ((0, -1, 0), (1, 0))]
+)
+def test_the_views_are_those_of_the_front(tmp_path: Path, front: tuple[int, ...], sides: tuple[int, int]) -> None:
+    """The fibre at x = 0.1 is in the middle, to the left or to the right of the views from the front and the left."""
+    muscles = read_muscles(write(tmp_path, {"fibres": [STRAIGHT]}), MESH, body_weight=1.0)
+    plot_muscles(MESH, muscles, tmp_path / "muscles.png", up=UP, front=np.array(front))
+    image = cv2.imread(str(tmp_path / "muscles.png"))
+    assert image is not None
+    third = image.shape[1] // 3
+    for view, side in enumerate(sides):
+        # Without the legend below.
+        panel = image[: int(0.85 * len(image)), view * third : (view + 1) * third].astype(int)
+        grey = np.ptp(panel, axis=2).max(axis=0) < 40
+        columns = ((panel.max(axis=2) < 240) & (panel.min(axis=2) > 150)).sum(axis=0) > 300
+        # Not the lines of the grid.
+        body = np.flatnonzero(np.convolve(columns, np.ones(9), "same") > 8.0)
+        fibre = np.flatnonzero(~grey).mean()
+        middle, quarter = 0.5 * (body[0] + body[-1]), 0.25 * (body[-1] - body[0])
+        assert fibre == pytest.approx(middle + side * quarter, abs=0.2 * quarter), view

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from PIL import Image
 
 from egs_warp.locomotion.ledger import energy_balance
@@ -42,6 +44,24 @@ def test_the_same_run_gives_the_same_bytes_and_another_another_picture(tmp_path:
     for row, column in ((0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1)):
         here = changed[row * high : (row + 1) * high, column * wide : (column + 1) * wide]
         assert here.sum() > 200, (row, column)
+
+
+def test_ahead_is_the_front_of_the_body(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A flight along x of a body that faces y goes to its right."""
+    drawn = {}
+    plot = Axes.plot
+
+    def recorded(axes: Axes, *values: Any, **options: Any) -> Any:
+        drawn[options.get("label")] = values
+        return plot(axes, *values, **options)
+
+    monkeypatch.setattr(Axes, "plot", recorded)
+    t = replace(rigid_flight(), front=np.array([0.0, 1.0, 0.0]))
+    draw_plots(tmp_path / "plots.png", t, energy_balance(t))
+    com = t.node_mass @ t.positions[-1] / t.node_mass.sum() - t.node_mass @ t.positions[0] / t.node_mass.sum()
+    assert abs(com[0]) > 0.1 * t.height
+    for label, expected in (("up", com[2]), ("ahead", com[1]), ("left", -com[0])):
+        assert drawn[label][1][-1] == pytest.approx(expected / t.height, abs=1e-9), label
 
 
 def test_a_flight_without_contact_or_pull_is_drawn(tmp_path: Path) -> None:

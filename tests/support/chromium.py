@@ -39,8 +39,13 @@ def started() -> Iterator[Any]:
         browser.close()
 
 
-def opened(chromium: Any, address: str, width: int = 480, height: int = 480) -> tuple[Any, list[str]]:
-    """Open a page and wait until it is loaded; returns the page and the list of the browser's errors and warnings."""
+def opened(
+    chromium: Any, address: str, width: int = 480, height: int = 480, *, plays: bool = False
+) -> tuple[Any, list[str]]:
+    """Open a page and wait until it is loaded; returns the page and the list of the browser's errors and warnings.
+
+    Unless it ``plays``, a recorded run is stopped at its first frame.
+    """
     page = chromium.new_page(viewport={"width": width, "height": height})
     if SHOTS is not None:
         _keep_shot(page, Path(SHOTS))
@@ -49,6 +54,8 @@ def opened(chromium: Any, address: str, width: int = 480, height: int = 480) -> 
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.goto(address)
     wait_until(page, "window.egs !== undefined")
+    if not plays:
+        page.evaluate("if (egs.live === undefined) { egs.player.playing = false; egs.player.seek(0); }")
     return page, complaints
 
 

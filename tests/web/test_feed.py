@@ -12,6 +12,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from egs_warp.assets.pawn import pawn
 from egs_warp.cli import main
 from egs_warp.io import write_ply
 from egs_warp.launching import THREADS, available_threads
@@ -91,7 +92,7 @@ def test_strangers_and_giants_do_not_disturb_it(session: Session, capfd: pytest.
             pass
         with _socket(server) as socket:
             socket.recv(timeout=20)
-            with _socket(server) as second, pytest.raises(ConnectionClosed, match="another page already shows"):
+            with _socket(server) as second, pytest.raises(ConnectionClosed, match="another page shows"):
                 second.recv(timeout=20)
             with pytest.raises(ConnectionClosed):
                 socket.send(b"x" * 100_000_000)
@@ -162,8 +163,11 @@ def test_the_command_leaves_a_core_to_the_page_while_it_serves(
     used = []
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(3)), raising=False)
     monkeypatch.delenv(THREADS, raising=False)
-    monkeypatch.setattr("egs_warp.commands.live._session", lambda _: session_of(coarse_pawn(), tmp_path))
-    monkeypatch.setattr(PageServer, "serve", lambda self: used.append(available_threads()))
-    assert main(["live", "pawn.ply", "--no-browser"]) == 0
-    assert used == [2] and available_threads() == 3
+    monkeypatch.setattr("egs_warp.commands.live._session", lambda *_, **__: session_of(coarse_pawn(), tmp_path))
+    monkeypatch.setattr(
+        "egs_warp.commands.live._wait", lambda thread: used.append((thread.is_alive(), available_threads()))
+    )
+    write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=2000).cloud)
+    assert main(["live", str(tmp_path / "pawn.ply"), "--up", "z", "--no-browser"]) == 0
+    assert used == [(True, 2)] and available_threads() == 3
     assert "open http://127.0.0.1:" in capsys.readouterr().out

@@ -125,17 +125,64 @@ def test_a_lost_connection_is_restored_and_the_session_continues(chromium: Any, 
 
 
 @in_browser
-def test_a_second_page_gets_a_one_line_error(chromium: Any, session: Session):
+def test_a_second_page_shows_the_creature_when_the_first_is_closed(chromium: Any, session: Session):
     with living(session) as server:
         first, complaints = opened(chromium, server.address)
         second = chromium.new_page()
         second.goto(server.address)
-        second.wait_for_selector("[role=alert]:has-text('another page already shows this session; close it first')")
-        second.close()
+        message = second.locator("[role=alert]:has-text('another page shows this session; close it there')")
+        message.wait_for()
+        size, colour = message.evaluate("(one) => [getComputedStyle(one).fontSize, getComputedStyle(one).color]")
+        assert float(size.removesuffix("px")) >= 16.0
+        assert colour == second.evaluate("getComputedStyle(document.body).color")
         first.keyboard.press(" ")
         wait_until(first, "egs.live.state?.doing === 'jump'")
         assert complaints == []
         first.close()
+        wait_until(second, "window.egs !== undefined && egs.live.state !== undefined")
+        second.close()
+
+
+@in_browser
+def test_the_camera_follows_along_the_ground_but_not_a_jump(chromium: Any, session: Session):
+    with watched(chromium, session) as page:
+        wait_until(page, "egs.live.state?.resting")
+        seen = page.evaluate(
+            """() => {
+                const viewer = egs.viewers[0], { frames } = viewer.source, last = frames.at(-1);
+                const { height } = viewer.source.header.facts;
+                const seen = [];
+                for (let k = 0; k <= 10; k++) {
+                    const moved = [0.1 * k * height, 0, 0.5 * height * Math.sin(Math.PI * k / 10)];
+                    const positions = last.positions.map((x, i) => x + moved[i % 3]);
+                    frames.push({ ...last, positions, contacts: new Float32Array(0), time: last.time + k / 60 });
+                    viewer.show(frames.length - 1);
+                    const { camera, controls, centreOfMass } = viewer;
+                    seen.push([camera.position, controls.target, centreOfMass].map((point) => point.toArray()));
+                }
+                return seen;
+            }"""
+        )
+        eye, target, centre = np.array(seen).transpose(1, 0, 2) / session.creature.body.height
+        np.testing.assert_allclose(np.ptp(centre, axis=0), [1.0, 0.0, 0.5], atol=1e-5)
+        for point in (eye, target):
+            np.testing.assert_allclose(point - point[0], (centre - centre[0]) * [1.0, 1.0, 0.0], atol=1e-5)
+
+
+@in_browser
+def test_a_key_pressed_during_a_motion_shows_that_it_was_taken(chromium: Any, session: Session):
+    with watched(chromium, session) as page:
+        page.keyboard.press(" ")
+        wait_until(page, "egs.live.state?.doing === 'jump'")
+        wait_until(page, "document.querySelector('.next').textContent === ''")
+        # At once, and as long as the session reports it.
+        page.keyboard.press("h")
+        assert page.text_content(".next") == "next: hop"
+        wait_until(page, "egs.live.state?.queued === 'hop' && egs.live.sent === undefined")
+        assert page.text_content(".next") == "next: hop"
+        assert page.locator(".next").is_visible()
+        wait_until(page, "egs.live.state?.doing === 'hop'")
+        wait_until(page, "document.querySelector('.next').textContent === ''")
 
 
 @in_browser

@@ -21,47 +21,15 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io import write_ply
 from egs_warp.web.page import PAGE, page_text
 from egs_warp.web.recording import CURVES, Recording, _curves
+from tests.support.packets import read_packets
 from tests.support.slides import slide
 
 needs_page = pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it")
 
 
-def _read(data: bytes) -> tuple[dict, dict[str, np.ndarray], list[dict]]:
-    """Read packets as docs/guide/view.md describes them."""
-    assert data[:8] == b"EGSPAGE1"
-    length = int(np.frombuffer(data, "<u4", 1, 8)[0])
-    facts = json.loads(data[12 : 12 + length])
-    base = -(-(12 + length) // 8) * 8
-    arrays = {
-        name: np.frombuffer(data, entry["type"], int(np.prod(entry["shape"])), base + entry["start"]).reshape(
-            entry["shape"]
-        )
-        for name, entry in facts["arrays"].items()
-    }
-    frames, at = [], base + facts["bytes"]
-    while at < len(data):
-        size = int(np.frombuffer(data, "<u4", 1, at)[0])
-        words = np.frombuffer(data, "<u4", 8, at + 4)
-        place = at + 36
-        parts = {"index": int(words[0]), "time": float(np.frombuffer(data, "<f4", 1, at + 8)[0])}
-        nodes, segments, contacts, curves = map(int, words[2:6])
-        for name, kind, count in (
-            ("positions", "<f4", 3 * nodes),
-            ("activations", "i1", segments),
-            ("contacts", "<f4", 9 * contacts),
-            ("curves", "<f4", curves),
-        ):
-            parts[name] = np.frombuffer(data, kind, count, place)
-            place += -(-parts[name].nbytes // 4) * 4
-        assert place == at + 4 + size
-        frames.append(parts)
-        at = place
-    return facts, arrays, frames
-
-
 def test_the_written_layout_is_the_documented_one(run_folder: Path):
     recording = Recording.read(run_folder)
-    facts, arrays, frames = _read(recording.bytes())
+    facts, arrays, frames = read_packets(recording.bytes())
     t = recording.trajectory
     assert len(frames) == facts["frames"] == 13
     np.testing.assert_allclose([frame["time"] for frame in frames], np.arange(13) / 60.0, atol=1e-6)
@@ -144,7 +112,7 @@ def test_a_scene_behind_it_travels_too(run_folder: Path, tmp_path: Path):
     shutil.copytree(run_folder, folder)
     bare = Recording.read(folder)
     write_ply(folder / "background.ply", bare.creature.splats)
-    _, arrays, _ = _read(Recording.read(folder).bytes())
+    _, arrays, _ = read_packets(Recording.read(folder).bytes())
     t = bare.trajectory
     expected = t.metres_per_unit * ((bare.creature.splats.means.numpy() - t.body_origin) @ t.body_axes.T)
     np.testing.assert_allclose(arrays["scene_means"], expected, atol=1e-5)

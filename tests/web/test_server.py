@@ -150,7 +150,7 @@ def test_a_second_page_gets_a_message_and_the_first_continues(server: PageServer
         assert closed.value.rcvd is not None
         assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (
             1013,
-            "another page already shows this session; close it first",
+            "another page shows this session; close it there, and the creature appears here",
         )
         assert first.recv(timeout=20)
 

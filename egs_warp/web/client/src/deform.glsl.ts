@@ -2,6 +2,7 @@
 // because it returns a covariance.
 
 import { TEXTURE_WIDTH } from "./cage";
+import { SHADOW_GLSL } from "./shadow.glsl";
 
 export const DEFORM_GLSL = /* glsl */ `
 vec4 egsTexel(sampler2D map, int k) { return texelFetch(map, ivec2(k % ${TEXTURE_WIDTH}, k / ${TEXTURE_WIDTH}), 0); }
@@ -66,18 +67,14 @@ vec3 egsColour(sampler2D bands, mat4 scales, int index, int degree, vec3 d) {
   return c;
 }
 
+${SHADOW_GLSL}
 /* Fraction of light that reaches a background splat at p under the creature's shadow. region: centre of the shadow map
    (x, y), half its side length, body height. */
 float egsLight(sampler2D shade, vec4 region, vec3 p) {
   vec2 uv = 0.5 + 0.5 * (p.xy - region.xy) / region.z;
   float near = 1.0 - smoothstep(0.02, 0.08, abs(p.z) / region.w);
   if (near <= 0.0 || any(greaterThan(abs(uv - 0.5), vec2(0.5)))) return 1.0;
-  float dark = 0.0;
-  for (int k = 0; k < 12; k++) {
-    float a = 2.399963 * float(k), r = 0.04 * sqrt((float(k) + 0.5) / 12.0);
-    dark += texture(shade, uv + r * vec2(cos(a), sin(a))).r;
-  }
-  return 1.0 - 0.05 * dark * near;
+  return mix(1.0, egsShade(shade, uv, 0.02), near);
 }
 
 CovSplat egsDeformed(

@@ -56,6 +56,9 @@ export type News =
   | { type: "told"; text: string }
   | { type: "script"; text: string; motions: number }
   | { type: "busy"; on: boolean }
+  | { type: "preparing"; stage: string }
+  | { type: "failed"; text: string }
+  | { type: "ready" }
   | { type?: undefined; error: string };
 
 /** A live session: receives frames and messages, and sends commands. */
@@ -99,7 +102,13 @@ export class LiveSource implements FrameSource {
   }
 }
 
-/** Connect to a session, and reconnect after a lost connection. The header comes first, then frames and messages. */
+/** Code with which the server closes the socket of a second page (RFC 6455). */
+const TRY_AGAIN_LATER = 1013;
+/** Time after which a closed connection is tried again, ms. */
+const RETRY_TIME = 500;
+
+/** Connect to a session, wait while another page shows it, and reconnect after a lost connection. The header comes
+ * first, then frames and messages. */
 export function fromSocket(address: string, onState: (lost: string | undefined) => void): Promise<LiveSource> {
   return new Promise((resolve, reject) => {
     let source: LiveSource | undefined;
@@ -122,11 +131,14 @@ export function fromSocket(address: string, onState: (lost: string | undefined) 
         if (source?.frames.length === 1) resolve(source);
       };
       socket.onclose = ({ code, reason }) => {
-        if (source === undefined) reject(new Error(reason || `no connection (${code})`));
+        if (source === undefined && code === TRY_AGAIN_LATER) {
+          onState(reason);
+          setTimeout(connect, RETRY_TIME);
+        } else if (source === undefined) reject(new Error(reason || `no connection (${code})`));
         else if (code === 1000) source.isOpen = false;
         else {
           onState(reason || "connection lost, trying again");
-          setTimeout(connect, 500);
+          setTimeout(connect, RETRY_TIME);
         }
       };
     };

@@ -1,26 +1,37 @@
-// Ground plane with a grid that fades with distance, and the creature's soft shadow on it.
+// Floor with a grid that turns into a sky without an edge, as in the film, and the creature's soft shadow.
 
 import * as THREE from "three";
+import { SHADOW_GLSL, WIDE_RADIUS } from "./shadow.glsl";
 
 const SHADOW_SIDE = 256;
+/** Radius of the contact shadow, as a fraction of the side of the shadow map. */
+const SOFTNESS = 0.014;
+/** Look of the film (egs_warp/render/backdrop.py, where the quantities are explained), sRGB. */
+const FLOOR = [0.85, 0.85, 0.86];
+const HORIZON = [0.95, 0.953, 0.96];
+const SKY = [0.82, 0.85, 0.89];
+const LINE = [0.75, 0.755, 0.775];
+const [CLEAR, HAZY] = [1, 3.5];
+const MIN_SLOPE = 0.1;
+const SKY_RISE = 0.5;
 
 export class Ground {
   /** Shadow map and its region on the ground: centre (x, y), half its side length, body height. */
   readonly shadow: { texture: THREE.Texture; region: THREE.Vector4 };
-  readonly mesh: THREE.Mesh<THREE.PlaneGeometry, THREE.ShaderMaterial>;
+  /** Sky and floor, drawn as one triangle behind everything else. */
+  readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
   private readonly target: THREE.WebGLRenderTarget;
   private readonly camera: THREE.OrthographicCamera;
   private readonly caster: THREE.Mesh;
   private readonly casters = new THREE.Scene();
   private readonly points: THREE.BufferAttribute;
 
-  constructor(
-    surface: Int32Array,
-    nodeCount: number,
-    private readonly height: number,
-    reach: number,
-  ) {
-    this.target = new THREE.WebGLRenderTarget(SHADOW_SIDE, SHADOW_SIDE, { depthBuffer: false });
+  constructor(surface: Int32Array, nodeCount: number, height: number) {
+    this.target = new THREE.WebGLRenderTarget(SHADOW_SIDE, SHADOW_SIDE, {
+      depthBuffer: false,
+      generateMipmaps: true,
+      minFilter: THREE.LinearMipmapLinearFilter,
+    });
     const half = 1.5 * height;
     this.shadow = { texture: this.target.texture, region: new THREE.Vector4(0, 0, half, height) };
     this.camera = new THREE.OrthographicCamera(-half, half, half, -half, -100 * height, 100 * height);
@@ -36,7 +47,7 @@ export class Ground {
           void main() { z = position.z; gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
         fragmentShader: `uniform float height; varying float z;
           void main() {
-            float dark = 1.0 / (1.0 + 6.0 * max(z, 0.0) / height); gl_FragColor = vec4(dark, 0.0, 0.0, 1.0);
+            float h = max(z, 0.0) / height; gl_FragColor = vec4(1.0 / (1.0 + 3.0 * h), exp(-h / 0.05), 0.0, 1.0);
           }`,
         side: THREE.DoubleSide,
         depthTest: false,
@@ -48,55 +59,67 @@ export class Ground {
     );
     this.caster.frustumCulled = false;
     this.casters.add(this.caster);
+    const colour = ([r, g, b]: number[]): string => `vec3(${r}, ${g}, ${b})`;
     const material = new THREE.ShaderMaterial({
       uniforms: {
         shade: { value: this.target.texture },
-        centre: { value: new THREE.Vector2() },
         shadeCentre: { value: new THREE.Vector2() },
         shadeHalf: { value: half },
-        reach: { value: reach },
         cell: { value: 0.25 * height },
-        softness: { value: 0.04 },
         box: { value: new THREE.Vector4() },
+        viewToWorld: { value: new THREE.Matrix3() },
+        eye: { value: new THREE.Vector3() },
+        forward: { value: new THREE.Vector3() },
+        slope: { value: new THREE.Vector2() },
       },
-      vertexShader: `varying vec3 world;
+      vertexShader: `varying vec3 ray; uniform mat3 viewToWorld; uniform vec2 slope;
         void main() {
-          vec4 p = modelMatrix * vec4(position, 1.0); world = p.xyz;
-          gl_Position = projectionMatrix * viewMatrix * p;
+          ray = viewToWorld * vec3(position.xy * slope, -1.0);
+          gl_Position = vec4(position.xy, 1.0, 1.0);
         }`,
       fragmentShader: `
-        varying vec3 world; uniform sampler2D shade; uniform vec2 centre, shadeCentre;
-        uniform float shadeHalf, reach, cell, softness; uniform vec4 box;
-        float line(vec2 p, float width) {
-          vec2 d = abs(fract(p / cell + 0.5) - 0.5) * cell, w = fwidth(p) * width;
-          vec2 l = clamp(1.0 - d / w, 0.0, 1.0) * clamp(0.35 * cell / w, 0.0, 1.0);
+        varying vec3 ray; uniform sampler2D shade; uniform vec2 shadeCentre; uniform vec3 eye, forward;
+        uniform float shadeHalf, cell; uniform vec4 box;
+        ${SHADOW_GLSL}
+        /* 1 on the lines of a grid; lines that come closer than some pixels are blended out. */
+        float line(vec2 p, vec2 pixel, float cell) {
+          vec2 d = abs(fract(p / cell + 0.5) - 0.5) * cell;
+          vec2 l = clamp(1.1 - d / pixel, 0.0, 1.0) * clamp(0.2 * cell / pixel - 1.0, 0.0, 1.0);
           return max(l.x, l.y);
         }
         void main() {
-          vec2 p = world.xy;
-          float fade = smoothstep(1.0, 0.25, distance(p, centre) / reach);
-          vec3 colour = mix(vec3(0.105, 0.115, 0.13), vec3(0.21, 0.23, 0.26), line(p, 1.1));
-          vec2 uv = 0.5 + 0.5 * (p - shadeCentre) / shadeHalf;
-          if (all(greaterThan(uv, box.xy)) && all(lessThan(uv, box.zw))) {
-            float dark = 0.0;
-            for (int i = 0; i < 12; i++) {
-              float a = 2.399963 * float(i), r = sqrt((float(i) + 0.5) / 12.0) * softness;
-              dark += texture2D(shade, uv + r * vec2(cos(a), sin(a))).r;
-            }
-            colour *= 1.0 - 0.06 * dark;
+          vec3 to = normalize(ray);
+          vec3 colour = mix(${colour(HORIZON)}, ${colour(SKY)}, clamp(to.z / ${SKY_RISE.toFixed(2)}, 0.0, 1.0));
+          // Also where there is no floor, because derivatives need all pixels of a block.
+          vec2 p = eye.xy - to.xy * (eye.z / min(to.z, -1e-6));
+          vec2 pixel = max(fwidth(p), 1e-9);
+          if (to.z < 0.0 && eye.z > 0.0) {
+            float strength = max(0.4 * line(p, pixel, cell), line(p, pixel, 4.0 * cell));
+            vec3 ground = mix(${colour(FLOOR)}, ${colour(LINE)}, strength);
+            vec2 uv = 0.5 + 0.5 * (p - shadeCentre) / shadeHalf;
+            if (all(greaterThan(uv, box.xy)) && all(lessThan(uv, box.zw))) ground *= egsShade(shade, uv, ${SOFTNESS});
+            float middle = eye.z / max(-forward.z, ${MIN_SLOPE.toFixed(2)}), depth = dot(vec3(p, 0.0) - eye, forward);
+            float haze = smoothstep(${CLEAR.toFixed(2)} * middle, ${HAZY.toFixed(2)} * middle, depth);
+            colour = mix(ground, ${colour(HORIZON)}, haze);
           }
-          gl_FragColor = vec4(colour, fade);
+          gl_FragColor = vec4(colour, 1.0);
         }`,
-      transparent: true,
+      depthTest: false,
       depthWrite: false,
     });
-    this.mesh = new THREE.Mesh(new THREE.PlaneGeometry(2 * reach, 2 * reach), material);
+    const triangle = new THREE.BufferGeometry();
+    triangle.setAttribute("position", new THREE.Float32BufferAttribute([-1, -1, 0, 3, -1, 0, -1, 3, 0], 3));
+    this.mesh = new THREE.Mesh(triangle, material);
+    this.mesh.frustumCulled = false;
     this.mesh.renderOrder = -10;
-  }
-
-  centreOn(x: number, y: number): void {
-    this.mesh.position.set(x, y, 0);
-    (this.mesh.material.uniforms.centre!.value as THREE.Vector2).set(x, y);
+    this.mesh.onBeforeRender = (_renderer, _scene, camera) => {
+      const { viewToWorld, eye, forward, slope } = material.uniforms;
+      (viewToWorld!.value as THREE.Matrix3).setFromMatrix4(camera.matrixWorld);
+      (eye!.value as THREE.Vector3).setFromMatrixPosition(camera.matrixWorld);
+      camera.getWorldDirection(forward!.value as THREE.Vector3);
+      const projection = camera.projectionMatrix.elements;
+      (slope!.value as THREE.Vector2).set(1 / projection[0]!, 1 / projection[5]!);
+    };
   }
 
   /** Render the shadow map of the cage at node `positions`, centred at `centreOfMass`. */
@@ -105,8 +128,7 @@ export class Ground {
     this.points.needsUpdate = true;
     const { uniforms } = this.mesh.material;
     (uniforms.shadeCentre!.value as THREE.Vector2).set(centreOfMass.x, centreOfMass.y);
-    uniforms.softness!.value = 0.02 + 0.05 * Math.min(Math.max(centreOfMass.z / this.height - 0.2, 0), 1.5);
-    this.updateShadowBox(positions, centreOfMass, uniforms.softness!.value as number);
+    this.updateShadowBox(positions, centreOfMass);
     this.camera.position.set(centreOfMass.x, centreOfMass.y, 0);
     this.shadow.region.x = centreOfMass.x;
     this.shadow.region.y = centreOfMass.y;
@@ -124,7 +146,7 @@ export class Ground {
   }
 
   /** Set the bounding box of the shadow; the shader samples the shadow map only inside it. */
-  private updateShadowBox(positions: Float32Array, centreOfMass: THREE.Vector3, softness: number): void {
+  private updateShadowBox(positions: Float32Array, centreOfMass: THREE.Vector3): void {
     let [left, right, near, far] = [Infinity, -Infinity, Infinity, -Infinity];
     for (let k = 0; k < positions.length; k += 3) {
       left = Math.min(left, positions[k]!);
@@ -134,8 +156,8 @@ export class Ground {
     }
     const half = this.shadow.region.z;
     const at = (x: number, centre: number): number => 0.5 + (0.5 * (x - centre)) / half;
-    // One texel more than the blur radius, clipped to the shadow map.
-    const edge = softness + 2 / SHADOW_SIDE;
+    // The blur radius and a texel of the coarser level, clipped to the shadow map.
+    const edge = WIDE_RADIUS + 10 / SHADOW_SIDE;
     (this.mesh.material.uniforms.box!.value as THREE.Vector4).set(
       Math.max(at(left, centreOfMass.x) - edge, 0),
       Math.max(at(near, centreOfMass.y) - edge, 0),

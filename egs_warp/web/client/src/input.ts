@@ -68,6 +68,7 @@ export class InputControls {
   constructor(
     private readonly source: LiveSource,
     private readonly push: () => void,
+    private readonly onRequest: (motion: string, action: Action) => void,
   ) {}
 
   press(action: Action, source: string): void {
@@ -106,7 +107,10 @@ export class InputControls {
     const { pressed } = this;
     const drive = pressed === undefined ? undefined : this.driveFor(pressed.action);
     if (pressed !== undefined && drive !== undefined) {
-      if (!pressed.isRepeating && now - pressed.since >= REPEAT_DELAY) this.source.send({ type: "drive", ...drive });
+      if (!pressed.isRepeating && now - pressed.since >= REPEAT_DELAY) {
+        this.source.send({ type: "drive", ...drive });
+        this.onRequest("drive", pressed.action);
+      }
       pressed.isRepeating ||= now - pressed.since >= REPEAT_DELAY;
       return;
     }
@@ -122,7 +126,9 @@ export class InputControls {
 
   private request(action: Action): void {
     this.lastSent = performance.now() / 1000;
-    this.source.send({ type: "motion", text: motionText(action, this.walks) });
+    const text = motionText(action, this.walks);
+    this.source.send({ type: "motion", text });
+    this.onRequest(text.split(" ", 1)[0]!, action);
   }
 
   private pollGamepad(): void {
@@ -156,6 +162,7 @@ export class Pointer {
     private readonly viewer: Viewer,
     private readonly source: LiveSource,
     private readonly push: (node: number) => void,
+    private readonly go: (x: number, y: number) => void,
   ) {
     const { canvas } = viewer;
     const container = canvas.parentElement as HTMLElement;
@@ -209,6 +216,6 @@ export class Pointer {
     }
     if (event.type !== "pointerup" || Math.hypot(event.clientX - start.x, event.clientY - start.y) > 4) return;
     const point = this.viewer.groundPoint(event.clientX, event.clientY);
-    if (point !== undefined) this.source.send({ type: "go", x: point.x, y: point.y });
+    if (point !== undefined) this.go(point.x, point.y);
   }
 }

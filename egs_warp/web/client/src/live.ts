@@ -5,6 +5,7 @@ import { button, element, icon, save } from "./dom";
 import { LiveClock } from "./clock";
 import { InputControls, Pointer, type Action } from "./input";
 import { Gizmos } from "./gizmos";
+import { createKeySheet } from "./key_sheet";
 import { PushTool } from "./push_tool";
 import { createSlider, type Slider } from "./slider";
 import type { LiveSource, News } from "./frame_source";
@@ -13,6 +14,10 @@ import type { Viewer } from "./viewer";
 type State = Extract<News, { type: "state" }>;
 /** Time for which a message is shown, ms. */
 const TOAST_TIME = 7000;
+/** Duration of the flash of a button whose key was pressed, ms. */
+const FLASH_TIME = 400;
+/** Time within which the session reports a request that changes something, ms. */
+const MAX_ANSWER_TIME = 5000;
 /** Default sag of a body, rho g H / E. */
 const DEFAULT_SAG = 0.05;
 /** Below this fraction of real time the speed is displayed. */
@@ -30,6 +35,12 @@ const HELP: [string[], string][] = [
   [["."], "one step"],
   [["R"], "record a take"],
   [["\u232b"], "reset to the start"],
+  [["click"], "on the ground: go there"],
+  [["click"], "the creature: push it there, away from you"],
+  [["drag"], "the creature: pull it"],
+  [["1", "\u2026", "8"], "show or hide a layer"],
+  [["C"], "curves"],
+  [["?"], "these keys"],
 ];
 
 export class Live {
@@ -43,6 +54,7 @@ export class Live {
   private readonly gizmos: Gizmos;
   private readonly pushTool: PushTool;
   private readonly speedLabel = element("output", { class: "pace", title: "Simulation speed relative to real time" });
+  private readonly nextLabel = element("output", { class: "next", title: "Motion that comes next" });
   private readonly pauseButton: HTMLButtonElement;
   private readonly recordButton: HTMLButtonElement;
   private readonly toasts = element("div", { class: "toasts", role: "status", "aria-live": "polite" });
@@ -51,6 +63,8 @@ export class Live {
   private readonly sliders: { friction: Slider; sag: Slider };
   private readonly stylePanel: StylePanel;
   private busy = false;
+  /** Request that the session has not reported yet. */
+  private sent: { motion: string; since: number } | undefined;
   private lastMotion = -Infinity;
   private isFacingShown = false;
 
@@ -62,8 +76,17 @@ export class Live {
     this.gizmos = new Gizmos(source.header.facts.height);
     viewer.add(this.gizmos.group);
     this.pushTool = new PushTool(viewer, source, this.gizmos);
-    this.input = new InputControls(source, () => this.pushTool.push());
-    this.pointer = new Pointer(viewer, source, (node) => this.pushTool.push(node));
+    this.input = new InputControls(
+      source,
+      () => this.pushTool.push(),
+      (motion, action) => this.showRequest(motion, action),
+    );
+    this.pointer = new Pointer(
+      viewer,
+      source,
+      (node) => this.pushTool.push(node),
+      (x, y) => this.go(x, y),
+    );
     this.pauseButton = button("pause", "Pause (p)", () => this.togglePause());
     const recording = "Record a take: a run folder, as animate writes one (r)";
     this.recordButton = button("record", recording, () => this.toggleRecording());
@@ -98,7 +121,7 @@ export class Live {
       this.sliders.sag.element,
       push.element,
     );
-    this.helpSheet = createHelpSheet();
+    this.helpSheet = createKeySheet(HELP);
     source.onFrame = () => this.clock.addArrival(performance.now() / 1000);
     source.listen((news) => this.handleNews(news));
     document.addEventListener("keyup", (event) => this.input.keyUp(event));
@@ -151,7 +174,8 @@ export class Live {
       button("help", "Keys (?)", toggleSheet(this.helpSheet, this.settingsSheet)),
     );
     const step = button("step", "One step (.)", () => this.step());
-    const time = element("div", {}, this.pauseButton, step, this.speedLabel);
+    const labels = element("div", { class: "labels" }, this.speedLabel, this.nextLabel);
+    const time = element("div", {}, this.pauseButton, step, labels);
     const dock = element("footer", { class: "dock live" }, time, pad, actions);
     return [dock, this.settingsSheet, this.helpSheet, this.toasts];
   }
@@ -175,6 +199,22 @@ export class Live {
       this.isFacingShown = true;
     }
     this.updateSpeedLabel();
+    this.updateNextLabel();
+  }
+
+  /** Show at once that a request was made: the session answers only after its step. */
+  private showRequest(motion: string, action?: Action): void {
+    this.sent = { motion, since: performance.now() };
+    this.updateNextLabel();
+    const pressed = action === undefined ? null : document.getElementById(action);
+    pressed?.animate([{ background: "rgb(127 209 184 / 55%)" }, { background: "transparent" }], FLASH_TIME);
+  }
+
+  private go(x: number, y: number): void {
+    this.source.send({ type: "go", x, y });
+    this.gizmos.showGoal([x, y]);
+    this.viewer.invalidate();
+    this.showRequest("go");
   }
 
   /** Handle a key press; return true if the key has a function. */
@@ -204,12 +244,13 @@ export class Live {
     } else if (news.type === "script") {
       if (news.motions === 0) this.showMessage("there is no motion to save yet");
       else save(new Blob([news.text], { type: "application/json" }), "script.json");
-    } else this.showMessage(news.error, true);
+    } else if (news.type === undefined) this.showMessage(news.error, true);
   }
 
   private show(state: State): void {
     const before = this.state;
     this.state = state;
+    this.sent = undefined;
     this.input.walks = state.walks;
     this.input.queued = state.queued;
     if (state.paused || state.resting) this.clock.resetSpeed();
@@ -223,6 +264,7 @@ export class Live {
     this.sliders.sag.show(-Math.log(state.sag));
     this.stylePanel.show(state.style);
     this.gizmos.showGoal(state.goal);
+    this.updateNextLabel();
     this.viewer.invalidate();
   }
 
@@ -238,6 +280,13 @@ export class Live {
     }
     else text = `1\u00d7 \u00b7 ${state?.doing ?? ""}`;
     if (this.speedLabel.textContent !== text) this.speedLabel.textContent = text;
+  }
+
+  private updateNextLabel(): void {
+    if (this.sent !== undefined && performance.now() - this.sent.since > MAX_ANSWER_TIME) this.sent = undefined;
+    const next = this.sent?.motion ?? this.state?.queued;
+    const text = next ? `next: ${next}` : "";
+    if (this.nextLabel.textContent !== text) this.nextLabel.textContent = text;
   }
 
   private showMessage(line: string, isError = false): void {
@@ -260,16 +309,4 @@ export class Live {
   private toggleRecording(): void {
     this.source.send({ type: "record", on: !(this.state?.recording ?? false) });
   }
-}
-
-function createHelpSheet(): HTMLElement {
-  const list = element("dl", { class: "keys" });
-  for (const [keys, what] of HELP) {
-    const names = keys.flatMap((key) => [" ", element("kbd", {}, key)]);
-    list.append(element("dt", {}, ...names), element("dd", {}, what));
-  }
-  list.append(element("dt", {}, "click"), element("dd", {}, "on the ground: go there"));
-  list.append(element("dt", {}, "click"), element("dd", {}, "the creature: push it there, away from you"));
-  list.append(element("dt", {}, "drag"), element("dd", {}, "the creature: pull it"));
-  return element("section", { class: "sheet", "aria-label": "Keys", hidden: "" }, list);
 }

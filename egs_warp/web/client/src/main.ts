@@ -5,6 +5,8 @@ import { Page } from "./page";
 import { fromAddress, fromElement, fromSocket, type FrameSource } from "./frame_source";
 import "./style.css";
 
+const LOADING = "Loading\u2026";
+
 /** Return the runs of this page: embedded in it, sent by a socket, or files on the server. */
 async function findRuns(): Promise<FrameSource[]> {
   const embedded = [...document.querySelectorAll<HTMLElement>("script[data-run]")];
@@ -22,6 +24,10 @@ async function findRuns(): Promise<FrameSource[]> {
 
 /** Show why the connection is lost; undefined means that it is restored. */
 function showConnection(reason: string | undefined): void {
+  if (window.egs === undefined) {
+    showMessage(reason ?? LOADING);
+    return;
+  }
   document.body.classList.toggle("lost", reason !== undefined);
   document.body.dataset.lost = reason ?? "";
 }
@@ -50,7 +56,7 @@ async function start(): Promise<void> {
     );
     return;
   }
-  showMessage("Loading\u2026");
+  showMessage(LOADING);
   try {
     window.egs = new Page(root, await findRuns());
   } catch (error) {

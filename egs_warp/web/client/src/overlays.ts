@@ -1,27 +1,18 @@
 // Mechanical quantities drawn over the splats: cage, muscles, soles, contacts and centre of mass.
 
 import * as THREE from "three";
+import { LAYER_COLOURS } from "./layer_colours";
 import { SoleOverlay } from "./sole_overlay";
 import { floatsOf, indicesOf, type Frame, type Header } from "./packets";
 import { WideLines } from "./wide_lines";
 
 export type Layer = "cage" | "muscles" | "feet" | "contacts" | "path";
 
-/** Convert a colour to linear RGB, in which Three.js blends. */
-const linear = (hex: number): number[] => new THREE.Color(hex).toArray();
-
-const COLOURS = {
-  cage: linear(0x9fb8dc),
-  relaxed: linear(0x6f7a8a),
-  contracts: linear(0xff5a3c),
-  extends: linear(0x4aa8ff),
-  force: linear(0xffc24a),
-  cone: linear(0x7fd1b8),
-  past: linear(0xc3a6ff),
-  future: linear(0x6f6390),
-  plan: linear(0xf4f1e8),
-  plumb: linear(0x6f7a8a),
-};
+type Tint = keyof typeof LAYER_COLOURS;
+/** Colours in linear RGB, in which Three.js blends. */
+const COLOURS = Object.fromEntries(
+  Object.entries(LAYER_COLOURS).map(([name, hex]) => [name, new THREE.Color(hex).toArray()]),
+) as Record<Tint, [number, number, number]>;
 const CONE_SIDES = 14;
 /** Length of an arrow of one body weight, in body heights. */
 const WEIGHT_LENGTH = 0.5;
@@ -29,12 +20,12 @@ const WEIGHT_LENGTH = 0.5;
 export class Overlays {
   readonly group = new THREE.Group();
   private readonly lines: Record<Exclude<Layer, "feet">, WideLines> = {
-    cage: new WideLines(1, 0.4, 10),
+    cage: new WideLines(1, 0.5, 10, { hasRim: false }),
     muscles: new WideLines(2.5, 0.9, 11),
     contacts: new WideLines(3, 1, 14),
     path: new WideLines(2.5, 0.95, 12),
   };
-  private readonly cones = new WideLines(1, 0.4, 13);
+  private readonly cones = new WideLines(1.2, 0.8, 13);
   private readonly centreMarker: THREE.Mesh;
   private readonly points: THREE.Points;
   private readonly feet: SoleOverlay;
@@ -51,14 +42,14 @@ export class Overlays {
     const height = header.facts.height;
     this.centreMarker = new THREE.Mesh(
       new THREE.SphereGeometry(0.018 * height, 20, 14),
-      new THREE.MeshBasicMaterial({ color: 0xf4f6fa, depthTest: false, transparent: true }),
+      new THREE.MeshBasicMaterial({ color: LAYER_COLOURS.centre, depthTest: false, transparent: true }),
     );
     this.centreMarker.renderOrder = 14;
     this.points = new THREE.Points(
       new THREE.BufferGeometry(),
       new THREE.PointsMaterial({
-        color: 0x7fd1b8,
-        size: 8,
+        color: LAYER_COLOURS.point,
+        size: 9,
         sizeAttenuation: false,
         map: disc(),
         depthTest: false,
@@ -123,7 +114,8 @@ export class Overlays {
       lines.set(this.ends.subarray(3 * segments[k]!, 3 * segments[k]! + 3), 3 * k);
       const level = (frame.activations[k >> 1] ?? 0) / 127;
       const towards = level > 0 ? COLOURS.contracts : COLOURS.extends;
-      const strength = Math.sqrt(Math.abs(level));
+      // Small activations are visible, too.
+      const strength = Math.abs(level) ** 0.4;
       for (let c = 0; c < 3; c++) {
         colours[3 * k + c] = COLOURS.relaxed[c]! + strength * (towards[c]! - COLOURS.relaxed[c]!);
       }
@@ -207,15 +199,18 @@ class SegmentList {
   }
 }
 
-/** Create the texture of a round dot. */
+/** Create the texture of a round dot with a dark rim. */
 function disc(): THREE.Texture {
   const side = 32;
   const canvas = document.createElement("canvas");
   canvas.width = canvas.height = side;
   const context = canvas.getContext("2d") as CanvasRenderingContext2D;
-  context.fillStyle = "#fff";
-  context.arc(side / 2, side / 2, side / 2 - 1, 0, 2 * Math.PI);
-  context.fill();
+  for (const [colour, radius] of [["#14181f", side / 2 - 1], ["#fff", 0.32 * side]] as const) {
+    context.fillStyle = colour;
+    context.beginPath();
+    context.arc(side / 2, side / 2, radius, 0, 2 * Math.PI);
+    context.fill();
+  }
   return new THREE.CanvasTexture(canvas);
 }
 

@@ -13,6 +13,10 @@ export interface Facts {
   height: number;
   weight: number;
   friction: number;
+  /** Horizontal unit vector in which the body at rest faces. */
+  front: [number, number];
+  /** True if the ground is the plane z = 0. */
+  flat: boolean;
   curves: Curve[];
   fibres: { name: string; kind: string }[];
   camera: { position: [number, number, number]; forward: [number, number, number]; fov: number };
@@ -22,6 +26,8 @@ export interface Facts {
   degree: { splats: number; scene: number };
   /** The capture was trained with antialiasing. */
   antialiased: boolean;
+  /** True for the still capture that is shown while its creature is prepared. */
+  preparing?: boolean;
   /** Only of live sessions: identifier of the session and limits of its sliders. */
   session?: string;
   limits?: { friction: [number, number]; sag: [number, number]; style: [number, number] };

@@ -2,9 +2,12 @@
 
 import { Charts } from "./charts";
 import { button, element, icon, save } from "./dom";
+import { createKeySheet } from "./key_sheet";
+import { Legend } from "./legend";
 import { VideoRecorder } from "./video_recorder";
 import { Live } from "./live";
 import { Player } from "./player";
+import { Preparation } from "./preparation";
 import { LiveSource, type FrameSource } from "./frame_source";
 import { Viewer, type Preset, type LayerToggle } from "./viewer";
 
@@ -28,6 +31,19 @@ const PRESETS: { name: Preset; title: string }[] = [
   { name: "side", title: "Side" },
   { name: "top", title: "Top" },
 ];
+/** Keys of a recorded run; a live session has its own. */
+const HELP: [string[], string][] = [
+  [["Space"], "play or pause"],
+  [["\u2190", "\u2192"], "one frame back or forward"],
+  [["L"], "loop"],
+  [["1", "\u2026", "8"], "show or hide a layer"],
+  [["C"], "curves of the audit"],
+  [["S"], "save an image"],
+  [["drag"], "turn the camera"],
+  [["right drag"], "move the camera"],
+  [["wheel"], "zoom"],
+  [["?"], "these keys"],
+];
 
 export class Page {
   readonly viewers: Viewer[] = [];
@@ -35,6 +51,8 @@ export class Page {
   /** Only of live sessions. */
   readonly live: Live | undefined;
   private readonly charts: Charts;
+  private readonly legend: Legend;
+  private readonly keySheet = createKeySheet(HELP);
   private readonly recorder = new VideoRecorder();
   private readonly playButton: HTMLButtonElement;
   private readonly slider = element("input", {
@@ -58,7 +76,11 @@ export class Page {
       const viewer = new Viewer(canvas, source);
       this.viewers.push(viewer);
     }
-    if (first instanceof LiveSource) this.live = new Live(first, this.viewers[0] as Viewer);
+    const preparation =
+      first instanceof LiveSource && first.header.facts.preparing ? new Preparation(first) : undefined;
+    if (first instanceof LiveSource && preparation === undefined) {
+      this.live = new Live(first, this.viewers[0] as Viewer);
+    }
     for (const viewer of this.viewers) {
       viewer.controls.addEventListener("change", () => {
         for (const other of this.viewers) if (other !== viewer) other.copyCamera(viewer);
@@ -67,7 +89,11 @@ export class Page {
     this.charts = new Charts(first, (framePosition) => this.player.seek(framePosition));
     this.playButton = button("play", "Play (space)", () => this.player.toggle());
     this.playButton.classList.add("play");
-    root.append(this.toolbar(), this.charts.panel, ...(this.live?.elements() ?? [this.playbackBar()]));
+    this.legend = new Legend(first.header.arrays.has("plan"));
+    const recorded = preparation === undefined ? [this.playbackBar()] : [preparation.element];
+    const controls = this.live?.elements() ?? [...recorded, this.keySheet];
+    const notes = element("div", { class: "notes" }, this.legend.element, this.charts.panel);
+    root.append(this.toolbar(), notes, ...controls);
     this.charts.panel.hidden = true;
     new ResizeObserver(() => {
       for (const viewer of this.viewers) viewer.resize();
@@ -78,6 +104,8 @@ export class Page {
     for (const { name, on } of LAYERS) {
       for (const viewer of this.viewers) viewer.setLayerVisible(name, on && this.isShown(name, viewer));
     }
+    const isStill = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
+    this.player.playing = this.live === undefined && this.player.lastFrame > 0 && !isStill;
     this.update();
     requestAnimationFrame((now) => this.animate(now));
   }
@@ -87,6 +115,7 @@ export class Page {
     const box = this.checkboxes.get(name);
     if (box !== undefined) box.checked = on;
     for (const viewer of this.viewers) viewer.setLayerVisible(name, on);
+    this.legend.show(name, on);
     this.update();
   }
 
@@ -141,6 +170,7 @@ export class Page {
       button("curves", "Curves (c)", () => this.toggleCurves()),
       button("camera", this.live === undefined ? "Screenshot (s)" : "Screenshot", () => void this.screenshot()),
       record,
+      ...(this.live === undefined ? [button("help", "Keys (?)", () => this.toggleKeys())] : []),
       layers,
       views,
     );
@@ -161,6 +191,10 @@ export class Page {
     loop.id = "loop";
     loop.setAttribute("aria-pressed", "true");
     return element("footer", { class: "dock" }, this.playButton, this.slider, this.clock, speed, loop);
+  }
+
+  private toggleKeys(): void {
+    this.keySheet.hidden = !this.keySheet.hidden;
   }
 
   private toggleCurves(): void {
@@ -227,6 +261,8 @@ export class Page {
     else if (event.key === "ArrowLeft") this.player.step(-1);
     else if (event.key === "s") void this.screenshot();
     else if (event.key === "l") document.getElementById("loop")?.click();
+    else if (event.key === "?") this.toggleKeys();
+    else if (event.key === "Escape") this.keySheet.hidden = true;
     else return;
     event.preventDefault();
   }

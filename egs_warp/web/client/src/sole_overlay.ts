@@ -1,11 +1,12 @@
 // Soles of the feet, bright while they carry load.
 
 import * as THREE from "three";
+import { LAYER_COLOURS } from "./layer_colours";
 import { indicesOf, type Frame, type Header } from "./packets";
 import { WideLines } from "./wide_lines";
 
-const LOADED_COLOUR = new THREE.Color(0x7fd1b8).toArray();
-const UNLOADED_COLOUR = new THREE.Color(0x8a94a6).toArray();
+const LOADED_COLOUR = new THREE.Color(LAYER_COLOURS.loaded).toArray();
+const UNLOADED_COLOUR = new THREE.Color(LAYER_COLOURS.lifted).toArray();
 /** Minimum load of a loaded foot, in body weights. */
 const MIN_LOAD = 1e-3;
 

@@ -40,7 +40,9 @@ uniform usampler2DArray extSplats;
 uniform usampler2DArray extSplats2;
 uniform int splatCount;
 uniform bool antialiased;
+uniform float floorDepth;
 out vec2 offsetInSigmas;
+flat out vec3 heightOverFloor;
 flat out vec4 rgba;
 
 void main() {
@@ -79,6 +81,15 @@ void main() {
   vec2 axis = root < 1e-6 * mid ? vec2(1.0, 0.0) : normalize(along);
   float reach = sqrt(2.0 * cut);
   vec2 offset = reach * (position.x * sqrt(large) * axis + position.y * sqrt(small) * vec2(-axis.y, axis.x));
+  heightOverFloor = vec3(0.0);
+  if (floorDepth > 0.0) {
+    /* World z of the mean, and of the densest point along the ray of a pixel, which is linear in the pixel. */
+    vec3 upInView = vec3(viewMatrix[2]);
+    vec3 spreadUp = covariance * (upInView * renderToViewBasis);
+    vec2 shared = vec2(dot(right, spreadUp), dot(up, spreadUp));
+    vec2 perAxis = vec2(dot(shared, axis) / sqrt(large), dot(shared, vec2(-axis.y, axis.x)) / sqrt(small));
+    heightOverFloor = vec3(perAxis, dot(upInView, p - viewMatrix[3].xyz));
+  }
   vec2 outside = abs(clip.xy) / clip.w * renderSize - renderSize;
   if (max(outside.x, outside.y) > 2.0 * reach * sqrt(large)) return;
   offsetInSigmas = reach * position.xy;
@@ -87,18 +98,35 @@ void main() {
 
 const FRAGMENT = /* glsl */ `
 precision highp float;
+uniform float floorDepth;
 in vec2 offsetInSigmas;
 flat in vec4 rgba;
+flat in vec3 heightOverFloor;
 out vec4 colour;
 
 void main() {
   float alpha = min(rgba.a * exp(-0.5 * dot(offsetInSigmas, offsetInSigmas)), 0.999);
+  if (floorDepth > 0.0) {
+    float height = heightOverFloor.z + dot(heightOverFloor.xy, offsetInSigmas);
+    alpha *= smoothstep(-floorDepth, -0.2 * floorDepth, height);
+  }
   if (alpha < 1.0 / 255.0) discard;
   colour = vec4(rgba.rgb * alpha, alpha);
 }`;
 
-export function splatRenderer(renderer: THREE.WebGLRenderer, antialiased: boolean, onDirty: () => void): SparkRenderer {
+export interface SplatRenderer {
+  spark: SparkRenderer;
+  /** Depth below the plane z = 0 from which an opaque floor there hides the splats, m; 0 without such a floor. */
+  floorDepth: { value: number };
+}
+
+export function splatRenderer(
+  renderer: THREE.WebGLRenderer,
+  antialiased: boolean,
+  onDirty: () => void,
+): SplatRenderer {
   const splatCount = { value: 0 };
+  const floorDepth = { value: 0 };
   const spark = new SparkRenderer({
     renderer,
     accumExtSplats: true,
@@ -107,10 +135,10 @@ export function splatRenderer(renderer: THREE.WebGLRenderer, antialiased: boolea
     sortRadial: false,
     vertexShader: VERTEX,
     fragmentShader: FRAGMENT,
-    extraUniforms: { splatCount, antialiased: { value: antialiased } },
+    extraUniforms: { splatCount, floorDepth, antialiased: { value: antialiased } },
     onDirty,
   });
   spark.geometry.dispose();
   spark.geometry = new QuadBatches(splatCount);
-  return spark;
+  return { spark, floorDepth };
 }

@@ -1,17 +1,27 @@
 // Viewer of one run on one canvas: splats, overlays, ground and camera.
 
-import type { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { Cage, identityCage } from "./cage";
-import { splatRenderer } from "./splat_renderer";
+import { splatRenderer, type SplatRenderer } from "./splat_renderer";
 import { Ground } from "./ground";
 import { Overlays, type Layer } from "./overlays";
 import { floatsOf, indicesOf, type Frame } from "./packets";
 import type { FrameSource } from "./frame_source";
 import { deformedSplats, type DeformedSplats } from "./splats";
 
-export const BACKGROUND = 0x14161a;
+/** Colour behind a captured scene, and behind the creature if the ground is hidden. */
+export const BACKGROUND = 0xb9bec6;
+/** Fraction of the picture that the body or its run fills in the views front, side and top. */
+const FILL = 0.86;
+/** Depth below which the floor hides splats, in body heights; a body may press its soles in by a part of it. */
+const FLOOR_DEPTH = 0.015;
+/** Height by which the ground must change before a following camera changes its height, in body heights. */
+const GROUND_CHANGE = 0.02;
+/** Fraction of a change of the ground's height that a following camera makes in one image. */
+const RISE_PER_FRAME = 0.1;
+/** Half of the height that a view of the body alone shows, in body heights. */
+const HALF_VIEW_HEIGHT = 1;
 export type Preset = "film" | "front" | "side" | "top";
 export type LayerToggle = Layer | "splats" | "scene" | "ground";
 
@@ -24,16 +34,21 @@ export class Viewer {
   /** Fraction of the canvas resolution along each side; reduced on slow machines. */
   private resolution = 1;
   private readonly scene = new THREE.Scene();
-  private readonly spark: SparkRenderer;
+  private readonly splatRenderer: SplatRenderer;
   private readonly cage: Cage;
   private readonly splats: DeformedSplats;
   private readonly background: DeformedSplats | undefined;
   private readonly overlays: Overlays;
   private readonly ground: Ground;
   private readonly masses: Float32Array;
-  private readonly bounds: { centre: THREE.Vector3; size: number };
+  /** Bounds of the body over the run. */
+  private readonly bounds: THREE.Box3;
+  /** Middle of the body in the first frame. */
+  private readonly startCentre: THREE.Vector3;
   private readonly positions: Float32Array;
   private readonly currentCentre = new THREE.Vector3();
+  /** Height of the ground under the body that the camera follows, m. */
+  private groundHeight = 0;
   private filmFov = 30;
   private dirty = true;
 
@@ -51,15 +66,14 @@ export class Viewer {
     this.positions = new Float32Array(rest);
     this.cage = new Cage(rest, indicesOf(header, "tets"));
     this.splats = deformedSplats(header, "splats", this.cage.texture, { isStatic: false });
-    this.spark = splatRenderer(this.renderer, header.facts.antialiased, () => this.invalidate());
-    this.scene.add(this.spark, this.splats.generator);
+    this.splatRenderer = splatRenderer(this.renderer, header.facts.antialiased, () => this.invalidate());
+    this.scene.add(this.splatRenderer.spark, this.splats.generator);
     this.overlays = new Overlays(header, (frame) => this.computeCentre(frame.positions));
     this.scene.add(this.overlays.group);
     this.bounds = this.runBounds();
-    const { height } = header.facts;
-    const runBounds = 3.5 * height + 1.5 * this.bounds.size;
-    this.ground = new Ground(indicesOf(header, "surface"), rest.length / 3, height, runBounds);
-    this.ground.centreOn(this.bounds.centre.x, this.bounds.centre.y);
+    const [start] = source.frames as [Frame];
+    this.startCentre = new THREE.Box3().setFromArray(start.positions).getCenter(new THREE.Vector3());
+    this.ground = new Ground(indicesOf(header, "surface"), rest.length / 3, header.facts.height);
     if (header.arrays.has("scene_means")) {
       const { shadow } = this.ground;
       this.background = deformedSplats(header, "scene", identityCage(), { isStatic: true, shadow });
@@ -107,32 +121,90 @@ export class Viewer {
     this.splats.update();
     this.overlays.update(fraction < 0.5 ? before : after, this.positions, frames);
     const centre = this.computeCentre(this.positions);
-    if (this.follow) {
-      const moved = centre.clone().sub(this.currentCentre);
-      this.camera.position.add(moved);
-      this.controls.target.add(moved);
-    }
+    if (this.follow) this.followBody(centre, before);
     this.currentCentre.copy(centre);
-    if (this.source.isOpen) this.ground.centreOn(centre.x, centre.y);
     this.ground.cast(this.renderer, this.positions, centre);
     this.invalidate();
   }
 
+  /** Move with the body along the ground, and up or down only with the ground that carries it: the camera does not
+   * follow a jump. */
+  private followBody(centre: THREE.Vector3, frame: Frame): void {
+    const moved = centre.clone().sub(this.currentCentre).setZ(0);
+    if (frame.contacts.length > 0) {
+      let lowest = Infinity;
+      for (let k = 2; k < this.positions.length; k += 3) lowest = Math.min(lowest, this.positions[k]!);
+      // Pressed soles and small bumps are no change of the ground.
+      const rise = lowest - this.groundHeight;
+      const threshold = GROUND_CHANGE * this.source.header.facts.height;
+      moved.z = RISE_PER_FRAME * Math.sign(rise) * Math.max(Math.abs(rise) - threshold, 0);
+      this.groundHeight += moved.z;
+    }
+    this.camera.position.add(moved);
+    this.controls.target.add(moved);
+  }
+
   preset(name: Preset): void {
-    const { camera } = this.source.header.facts;
+    const { camera, height } = this.source.header.facts;
     this.filmFov = camera.fov;
-    const { centre, size } = this.bounds;
+    // Where the camera follows, it shows the body; elsewhere, its whole run.
+    const isFollowing = this.follow || this.source.isOpen;
+    const box = isFollowing ? new THREE.Box3().setFromArray(this.positions) : this.bounds;
+    const centre = box.getCenter(new THREE.Vector3());
     if (name === "film") {
       const eye = new THREE.Vector3(...camera.position);
       const forward = new THREE.Vector3(...camera.forward);
+      const shift = isFollowing ? centre.clone().sub(this.startCentre).setZ(0) : new THREE.Vector3();
+      eye.add(shift);
       this.setCamera(eye, eye.clone().addScaledVector(forward, Math.max(centre.clone().sub(eye).dot(forward), 1e-3)));
     } else {
-      const directions = { front: [1, 0, 0.12], side: [0, -1, 0.12], top: [0, -1e-3, 1] } as const;
-      const direction = new THREE.Vector3(...directions[name]).normalize();
-      const distance = (0.62 * size) / Math.tan((Math.PI * camera.fov) / 360);
+      const direction = this.direction(name);
+      const half = Math.tan((Math.PI * camera.fov) / 360);
+      const distance = isFollowing ? (HALF_VIEW_HEIGHT * height) / half : this.distanceToShow(box, direction, half);
       this.setCamera(centre.clone().addScaledVector(direction, distance), centre);
     }
+    this.groundHeight = 0;
     this.resize();
+  }
+
+  /** Return the unit vector from the body to the camera of a view; the body may have turned since the start. */
+  private direction(name: Exclude<Preset, "film">): THREE.Vector3 {
+    const [ahead, left] = this.source.header.facts.front;
+    const yaw = this.yaw();
+    const front = new THREE.Vector3(ahead, left, 0).applyAxisAngle(this.camera.up, yaw);
+    // The side is the left: the front is at the left of the picture.
+    const side = new THREE.Vector3(-left, ahead, 0).applyAxisAngle(this.camera.up, yaw);
+    if (name === "top") return front.multiplyScalar(-1e-3).setZ(1).normalize();
+    return (name === "front" ? front : side).setZ(0.12).normalize();
+  }
+
+  /** Return the angle about the vertical by which the body has turned since it was at rest, in radians. */
+  private yaw(): number {
+    const { positions, masses } = this;
+    const rest = floatsOf(this.source.header, "rest");
+    const [before, now] = [this.computeCentre(rest), this.computeCentre(positions)];
+    let [cosine, sine] = [0, 0];
+    masses.forEach((mass, k) => {
+      const [x, y] = [rest[3 * k]! - before.x, rest[3 * k + 1]! - before.y];
+      const [u, v] = [positions[3 * k]! - now.x, positions[3 * k + 1]! - now.y];
+      cosine += mass * (x * u + y * v);
+      sine += mass * (x * v - y * u);
+    });
+    return Math.atan2(sine, cosine);
+  }
+
+  /** Return the distance from the centre of `box` at which a camera in `direction` shows all of it. */
+  private distanceToShow(box: THREE.Box3, direction: THREE.Vector3, half: number): number {
+    const right = new THREE.Vector3().crossVectors(this.camera.up, direction).normalize();
+    const up = new THREE.Vector3().crossVectors(direction, right);
+    const size = box.getSize(new THREE.Vector3()).multiplyScalar(0.5);
+    let distance = 0;
+    for (let k = 0; k < 8; k++) {
+      const corner = new THREE.Vector3(k & 1 ? 1 : -1, k & 2 ? 1 : -1, k & 4 ? 1 : -1).multiply(size);
+      const beside = Math.max(Math.abs(corner.dot(right)), Math.abs(corner.dot(up)));
+      distance = Math.max(distance, corner.dot(direction) + beside / (FILL * half));
+    }
+    return distance;
   }
 
   setCamera(eye: THREE.Vector3, target: THREE.Vector3): void {
@@ -181,14 +253,14 @@ export class Viewer {
 
   /** True while the splats of the last image are being sorted. */
   get sorting(): boolean {
-    return this.spark.sorting;
+    return this.splatRenderer.spark.sorting;
   }
 
   /** Draw if something has changed; return true if so. */
   draw(): boolean {
     this.controls.update();
     if (!this.dirty) return false;
-    this.renderer.render(this.scene, this.camera);
+    this.render();
     // This image contains the regenerated splats; Spark calls invalidate() again once they are sorted.
     this.dirty = false;
     return true;
@@ -196,21 +268,30 @@ export class Viewer {
 
   /** Draw after the splats are sorted for the current view. */
   async drawSorted(): Promise<void> {
+    const { spark } = this.splatRenderer;
     for (let round = 0; round < 2; round++) {
       this.camera.updateMatrixWorld();
       this.splats.update();
-      this.renderer.render(this.scene, this.camera);
-      await this.spark.update({ scene: this.scene, camera: this.camera });
-      while (this.spark.sorting) await new Promise((resolve) => setTimeout(resolve, 5));
+      this.render();
+      await spark.update({ scene: this.scene, camera: this.camera });
+      while (spark.sorting) await new Promise((resolve) => setTimeout(resolve, 5));
     }
     this.dirty = false;
+    this.render();
+  }
+
+  private render(): void {
+    const { facts } = this.source.header;
+    const isOverFloor = facts.flat && this.ground.mesh.visible && this.camera.position.z > 0;
+    const hasSceneInView = this.background?.generator.visible ?? false;
+    this.splatRenderer.floorDepth.value = isOverFloor && !hasSceneInView ? FLOOR_DEPTH * facts.height : 0;
     this.renderer.render(this.scene, this.camera);
   }
 
   /** Return a PNG image of the current view. */
   screenshot(): Promise<Blob> {
     // The canvas keeps its content only until the browser has presented it.
-    this.renderer.render(this.scene, this.camera);
+    this.render();
     return new Promise((resolve, reject) => {
       const finish = (blob: Blob | null): void => {
         if (blob === null) reject(new Error("the browser returned no image"));
@@ -287,13 +368,13 @@ export class Viewer {
     return sum.divideScalar(total);
   }
 
-  private runBounds(): { centre: THREE.Vector3; size: number } {
+  private runBounds(): THREE.Box3 {
     const box = new THREE.Box3();
     for (const frame of this.source.frames) {
       for (let k = 0; k < frame.positions.length; k += 3) {
         box.expandByPoint(new THREE.Vector3().fromArray(frame.positions, k));
       }
     }
-    return { centre: box.getCenter(new THREE.Vector3()), size: box.getSize(new THREE.Vector3()).length() };
+    return box;
   }
 }

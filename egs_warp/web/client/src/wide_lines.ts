@@ -1,29 +1,35 @@
-// Lines with a width in pixels that may change every frame.
+// Lines with a width in pixels that may change every frame, with a dark rim that separates them from any background.
 
 import * as THREE from "three";
 import { LineMaterial } from "three/examples/jsm/lines/LineMaterial.js";
 import { LineSegments2 } from "three/examples/jsm/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/examples/jsm/lines/LineSegmentsGeometry.js";
 
+/** Width of the rim at each side of a line, pixels, and its colour and opacity. */
+const RIM_WIDTH = 1.25;
+const RIM_COLOUR = 0x14181f;
+const RIM_OPACITY = 0.7;
+
 export class WideLines {
-  readonly object: LineSegments2;
-  private readonly material: LineMaterial;
+  readonly object = new THREE.Group();
+  private readonly parts: LineSegments2[];
   private geometry = new LineSegmentsGeometry();
   private positions = new Float32Array(0);
   private colours = new Float32Array(0);
 
-  constructor(width: number, opacity: number, order: number) {
-    this.material = new LineMaterial({
-      linewidth: width,
-      vertexColors: true,
-      transparent: true,
-      opacity,
-      depthTest: false,
-      depthWrite: false,
+  constructor(width: number, opacity: number, order: number, { hasRim = true } = {}) {
+    const shared = { transparent: true, depthTest: false, depthWrite: false };
+    const lines = new LineMaterial({ ...shared, linewidth: width, vertexColors: true, opacity });
+    const rim = { linewidth: width + 2 * RIM_WIDTH, color: RIM_COLOUR, opacity: RIM_OPACITY * opacity };
+    const materials = hasRim ? [new LineMaterial({ ...shared, ...rim }), lines] : [lines];
+    this.parts = materials.map((material, k) => {
+      const part = new LineSegments2(this.geometry, material);
+      part.frustumCulled = false;
+      // The rims of all lines lie under all lines of the same order.
+      part.renderOrder = order + 0.1 * k;
+      return part;
     });
-    this.object = new LineSegments2(this.geometry, this.material);
-    this.object.frustumCulled = false;
-    this.object.renderOrder = order;
+    this.object.add(...this.parts);
   }
 
   /** Set the segments: six coordinates and six colour values each. */
@@ -35,7 +41,7 @@ export class WideLines {
       this.colours = new Float32Array(this.positions.length);
       this.geometry.setPositions(this.positions);
       this.geometry.setColors(this.colours);
-      this.object.geometry = this.geometry;
+      for (const part of this.parts) part.geometry = this.geometry;
     }
     this.geometry.instanceCount = positions.length / 6;
     if (positions.length === 0) return;
@@ -46,7 +52,7 @@ export class WideLines {
 
   dispose(): void {
     this.geometry.dispose();
-    this.material.dispose();
+    for (const part of this.parts) part.material.dispose();
   }
 }
 

@@ -1,0 +1,22 @@
+// Status line of the page while the creature of a live session is prepared.
+
+import { element } from "./dom";
+import type { LiveSource, News } from "./frame_source";
+
+export class Preparation {
+  readonly element = element("p", { class: "dock status", role: "status", "aria-live": "polite" });
+
+  constructor(source: LiveSource) {
+    source.listen((news) => this.handleNews(news));
+  }
+
+  private handleNews(news: News): void {
+    if (news.type === "ready") location.reload();
+    else if (news.type === "preparing") {
+      this.element.textContent = `Preparing the body${news.stage === "" ? "" : `: ${news.stage}`}\u2026`;
+    } else if (news.type === "failed") {
+      this.element.textContent = news.text;
+      this.element.classList.add("wrong");
+    }
+  }
+}

@@ -1,0 +1,71 @@
+"""Number of cage nodes of a live creature, chosen by the measured speed of the machine."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.locomotion.threads import one_blas_thread
+
+GPU_NODES = 500
+"""Number on a GPU, where a step of it takes less than 1 / 60 s (docs/benchmarks/step.md)."""
+MIN_CHOSEN, MAX_CHOSEN = 120, 500
+"""Smallest and largest number that is chosen; limbs of most bodies need the former, and ``animate`` uses the latter."""
+_PROBE_TIME = 0.3
+"""s, for which the speed is measured. Other processes then take their usual share."""
+_MIN_SPEED = 0.5
+"""Fraction of real time that the chosen number shall reach."""
+_PROBE_SIZE, _PROBE_COLUMNS = 300, 60
+_STEP_TIME_PER_PROBE = 20.5
+"""Mean time of a step of a jumping pawn with ``_STEP_NODES`` nodes, relative to one pass of the probe beside it (160 ms
+and 7.8 ms on two busy cores of a Xeon)."""
+_STEP_NODES, _STEP_EXPONENT = 250, 0.54
+"""Requested number of nodes of that step, and the power of it with which the time grows (97 ms and 7.0 ms with 120)."""
+
+
+@dataclass(frozen=True)
+class NodeChoice:
+    """Chosen number of nodes and the speed that is expected from it."""
+
+    nodes: int
+    speed: float
+    """Expected fraction of real time, at most 1."""
+
+    def description(self) -> str:
+        """Return one line for the user."""
+        speed = "real time" if self.speed >= 1.0 else f"{self.speed:.1g} of real time"
+        return (
+            f"a body of about {self.nodes} nodes is built, which this machine now simulates in about {speed};"
+            " --nodes sets another number"
+        )
+
+
+def choose_nodes(seconds: float | None = None) -> NodeChoice:
+    """Choose the largest number of nodes that the CPU simulates in at least half of real time, within limits.
+
+    Args:
+        seconds: Time of one pass of the probe, s; None measures it (``probe_seconds``).
+    """
+    per_node = _STEP_TIME_PER_PROBE * (probe_seconds() if seconds is None else seconds) / _STEP_NODES**_STEP_EXPONENT
+    fitting = (1.0 / (_MIN_SPEED * FRAME_RATE * per_node)) ** (1.0 / _STEP_EXPONENT)
+    nodes = int(np.clip(10.0 * np.floor(0.1 * fitting), MIN_CHOSEN, MAX_CHOSEN))
+    return NodeChoice(nodes, min(1.0 / (FRAME_RATE * per_node * nodes**_STEP_EXPONENT), 1.0))
+
+
+def probe_seconds() -> float:
+    """Return the mean wall-clock time of a dense factorisation and solve, with the load of the machine, s."""
+    random = np.random.default_rng(0)
+    half = random.standard_normal((_PROBE_SIZE, _PROBE_SIZE))
+    matrix = half @ half.T + _PROBE_SIZE * np.eye(_PROBE_SIZE)
+    columns = random.standard_normal((_PROBE_SIZE, _PROBE_COLUMNS))
+    passes = 0
+    with one_blas_thread():
+        started = time.perf_counter()
+        while passes < 2 or time.perf_counter() < started + _PROBE_TIME:
+            scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix), columns)
+            passes += 1
+        return (time.perf_counter() - started) / passes

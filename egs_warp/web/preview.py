@@ -1,0 +1,180 @@
+"""Feed of a live page that shows the still capture while its creature is prepared."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import secrets
+from collections.abc import AsyncGenerator, Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.deformation.rigid import to_body_frame
+from egs_warp.geometry.body_frame import BodyFrame, upright_frame
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.pipelines.simulated_run import FILMED_FROM
+from egs_warp.web.packets import Frame, header
+from egs_warp.web.recording import splat_arrays
+from egs_warp.web.server import FrameFeed
+
+_OUTLIERS = 0.5
+"""Percentage of the opaque Gaussians at each end of an axis that the size of the still capture ignores."""
+_OPAQUE = 0.3
+"""Opacity above which a Gaussian counts for the size."""
+_FOV_DEGREES = 30.0
+_DISTANCE = 1.0 / np.tan(np.radians(0.5 * _FOV_DEGREES))
+"""Distance of the camera at which half of the picture's height is one body height, body heights."""
+
+
+@dataclass(frozen=True)
+class Preview:
+    """The still capture as a run of one frame, in a frame that is close to that of the body."""
+
+    header: bytes
+    frame: bytes
+    """Packet of the frame."""
+
+
+def preview_of(
+    cloud: GaussianCloud, *, title: str = "capture", up: np.ndarray | None = None, plane: Plane | None = None
+) -> Preview:
+    """Return the preview of a capture.
+
+    Args:
+        cloud: The capture.
+        title: Title of the page.
+        up: (3,) up in the capture's frame; may be None if there is a plane.
+        plane: Ground plane in the capture's frame; None takes a plane below the capture.
+    """
+    means, opacities = cloud.means.numpy().astype(np.float64), cloud.opacities()
+    opaque = means[opacities > _OPAQUE] if (opacities > _OPAQUE).any() else means
+    if plane is None:
+        assert up is not None, "preview_of requires up or a plane"
+        up = up / np.linalg.norm(up)
+        plane = Plane(up, -float(np.percentile(opaque @ up, _OUTLIERS)))
+    frame = upright_frame(opaque, np.ones(len(opaque)), plane)
+    frame = frame.scaled(1.0 / max(float(np.percentile(frame.points(opaque)[:, 2], 100.0 - _OUTLIERS)), 1e-9))
+    return _run_of_one_frame(to_body_frame(cloud, frame), _bounds(frame, opaque), title=title)
+
+
+def _bounds(frame: BodyFrame, points: np.ndarray) -> np.ndarray:
+    """Return the lower and the upper corner (2, 3) of the ``points`` (n, 3), without outliers, in ``frame``."""
+    return np.percentile(frame.points(points), [_OUTLIERS, 100.0 - _OUTLIERS], axis=0)
+
+
+def _run_of_one_frame(splats: GaussianCloud, bounds: np.ndarray, *, title: str) -> Preview:
+    """Return the Gaussians as a run whose cage is one tetrahedron at a corner of the box ``bounds`` (2, 3)."""
+    low, high = bounds
+    nodes = np.array([[(low, high)[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
+    middle = 0.5 * (low + high)
+    direction = np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM)
+    facts = {
+        "title": title,
+        "session": secrets.token_hex(8),
+        "preparing": True,
+        "rate": FRAME_RATE,
+        "frames": 1,
+        "height": 1.0,
+        "weight": 1.0,
+        "friction": 0.0,
+        "front": [1.0, 0.0],
+        "flat": True,
+        "curves": [],
+        "audit": {},
+        "motion": [],
+        "notes": [],
+        "fibres": [],
+        "antialiased": splats.antialiased,
+        "camera": {
+            "position": (middle + _DISTANCE * direction).tolist(),
+            "forward": (-direction).tolist(),
+            "fov": _FOV_DEGREES,
+        },
+        "degree": {"splats": splats.sh_degree, "scene": 0},
+    }
+    no_indices = np.zeros(0, np.int32)
+    arrays = {
+        "rest": nodes.astype(np.float32),
+        "tets": np.array([[0, 1, 2, 4]], np.int32),
+        "node_mass": np.ones(len(nodes), np.float32),
+        "planes": np.array([[0.0, 0.0, 1.0, 0.0]], np.float32),
+        "surface": no_indices.reshape(0, 3),
+        "edges": no_indices.reshape(0, 2),
+        "muscle_end_starts": np.zeros(1, np.int32),
+        "muscle_end_nodes": no_indices,
+        "muscle_end_weights": np.zeros(0, np.float32),
+        "muscle_segments": no_indices.reshape(0, 2),
+        "fibre_from_segment": no_indices,
+        "foot_from_node": np.full(len(nodes), -1, np.int32),
+        "mean_tets": np.zeros(splats.count, np.int32),
+        "arms": np.zeros((0, 15), np.float32),
+        **splat_arrays("splats", splats),
+    }
+    frame = Frame(0, 0.0, nodes, np.zeros(0), np.zeros((0, 9)), np.zeros(0))
+    return Preview(header(facts, arrays), frame.packet())
+
+
+class PreviewFeed:
+    """``FrameFeed`` that sends a preview and the stages of the preparation, and then the frames of a session."""
+
+    def __init__(self, preview: Preview) -> None:
+        """Create the feed of ``preview``."""
+        self._preview = preview
+        self._session: FrameFeed | None = None
+        self._event: dict[str, str] = {"type": "preparing", "stage": ""}
+        self._wake: Callable[[], object] = lambda: None
+
+    # Called by the thread that prepares the creature.
+
+    def show_stage(self, stage: str) -> None:
+        """Show that ``stage`` of the preparation starts."""
+        self._send({"type": "preparing", "stage": stage})
+
+    def show_error(self, text: str) -> None:
+        """Show why there will be no creature."""
+        self._send({"type": "failed", "text": text})
+
+    def start(self, session: FrameFeed) -> None:
+        """Send the frames of ``session`` from now on; a page that shows the preview loads itself again."""
+        self._session = session
+        self._send({"type": "ready"})
+
+    def _send(self, event: dict[str, str]) -> None:
+        self._event = event
+        self._wake()
+
+    # Called by the server.
+
+    def header(self) -> bytes:
+        """Return the header of the preview, or of the session once there is one."""
+        return self._preview.header if self._session is None else self._session.header()
+
+    async def packets(self) -> AsyncGenerator[bytes | str]:
+        """Yield the frame of the preview and the events, or the packets of the session once there is one."""
+        if self._session is not None:
+            async for packet in self._session.packets():
+                yield packet
+            return
+        loop, has_news = asyncio.get_running_loop(), asyncio.Event()
+        self._wake = lambda: loop.call_soon_threadsafe(has_news.set)
+        try:
+            yield self._preview.frame
+            while True:
+                event = self._event
+                yield json.dumps(event)
+                if event["type"] == "ready":
+                    return
+                while self._event is event:
+                    await has_news.wait()
+                    has_news.clear()
+        finally:
+            self._wake = lambda: None
+
+    def receive(self, message: dict[str, object]) -> None:
+        """Pass a message of the page to the session. Raises ``ValueError`` if there is none or it is invalid."""
+        if self._session is None:
+            raise ValueError("the creature is being prepared")
+        self._session.receive(message)

@@ -1,0 +1,36 @@
+"""The number of nodes of a live creature follows the speed of the machine."""
+
+from __future__ import annotations
+
+import pytest
+
+from egs_warp.web.node_choice import MAX_CHOSEN, MIN_CHOSEN, choose_nodes, probe_seconds
+
+
+@pytest.mark.parametrize(
+    ("seconds", "nodes", "speed"),
+    [
+        (1e-5, MAX_CHOSEN, 1.0),
+        (1.5e-3, 290, 0.5),
+        # The steps that were measured: 97 ms with 120 nodes.
+        (7.0e-3, MIN_CHOSEN, 0.172),
+        (0.1, MIN_CHOSEN, 0.012),
+    ],
+)
+def test_slower_machines_get_fewer_nodes_within_limits(seconds: float, nodes: int, speed: float):
+    choice = choose_nodes(seconds)
+    assert choice.nodes == nodes
+    assert choice.speed == pytest.approx(speed, rel=0.05)
+    assert f"about {nodes} nodes" in choice.description()
+
+
+def test_the_speed_is_that_of_the_clock(monkeypatch: pytest.MonkeyPatch):
+    now = [0.0]
+
+    def tick() -> float:
+        now[0] += 0.02
+        return now[0]
+
+    monkeypatch.setattr("egs_warp.web.node_choice.time.perf_counter", tick)
+    # A pass takes one reading of the clock, and there are two more around all passes.
+    assert probe_seconds() == pytest.approx(0.02, rel=0.2)
