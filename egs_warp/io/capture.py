@@ -21,15 +21,17 @@ from egs_warp.io.sog import SogFiles, decode_sog
 from egs_warp.io.splat import SPLAT_ROW, decode_splat
 from egs_warp.io.spz import decode_spz
 from egs_warp.io.streamed_sog import decode_streamed_sog
+from egs_warp.short_repr import short_repr
 
 _META, _STREAMED_META = "meta.json", "lod-meta.json"
 
 
 @dataclass(frozen=True)
-class Capture:
-    """A capture as read from disk, in the axes and units of its file."""
+class Capture(GaussianCloud):
+    """A capture as read from disk, in the axes and units of its file: a cloud, with facts about the file."""
 
-    cloud: GaussianCloud
+    __repr__ = short_repr
+
     source: Path
     format: str
     """Name for the user, such as ``.spz version 2``."""
@@ -43,6 +45,11 @@ class Capture:
     too."""
     notes: tuple[str, ...]
     """Gaussians left out and values repaired, for the user."""
+
+    @property
+    def cloud(self) -> GaussianCloud:
+        """The Gaussians alone."""
+        return GaussianCloud(self.means, self.rotations, self.log_scales, self.opacity_logits, self.sh)
 
 
 def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
@@ -71,7 +78,8 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
         raw.sh,
         device=device,
     )
-    return Capture(cloud, source, raw.format, infinite_count, raw.up, raw.antialiased, notes)
+    arrays = (cloud.means, cloud.rotations, cloud.log_scales, cloud.opacity_logits, cloud.sh)
+    return Capture(*arrays, source, raw.format, infinite_count, raw.up, raw.antialiased, notes)
 
 
 def _decode(source: Path) -> RawCapture:
