@@ -22,7 +22,7 @@ from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
-from egs_warp.render.backdrop import grid_floor
+from egs_warp.render.backdrop import studio_floor
 from egs_warp.render.compositing import PendingImage
 from egs_warp.render.rasteriser import enqueue_image, render_gaussians
 from egs_warp.render.shadow import ContactShadow, shadow_blur_radius
@@ -49,7 +49,7 @@ class Studio:
         ground = ContactShadow(
             self.camera, GROUND, blur_radius=shadow_blur_radius(creature.cloud), height=height, **where
         )
-        self.behind = grid_floor(ground, cell=0.25 * height)
+        self.behind = studio_floor(ground, cell=0.25 * height)
 
     def deform(self, nodes: np.ndarray) -> GaussianCloud:
         """Return the Gaussians, deformed by the cage with nodes at ``nodes`` (N, 3)."""
@@ -57,7 +57,8 @@ class Studio:
 
     def enqueue(self, cloud: GaussianCloud) -> PendingImage:
         """Queue the rendering of ``cloud``; returns at once."""
-        return enqueue_image(cloud, self.camera, background=self.behind.background(cloud))
+        behind = self.behind
+        return enqueue_image(cloud, self.camera, background=behind.background(cloud), max_depth=behind.floor_depth)
 
 
 def measure(creature: Creature, size: tuple[int, int], *, repeats: int) -> Row:

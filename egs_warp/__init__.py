@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from egs_warp.inpainting.inpainters import Inpainter, inpainter_by_name
     from egs_warp.io.atomic import writable_folder
     from egs_warp.io.cameras import read_cameras
-    from egs_warp.io.capture import read_capture
+    from egs_warp.io.capture import Capture, read_capture
     from egs_warp.io.ply import write_ply
     from egs_warp.io.video import VideoWriter, contact_sheet, write_png
     from egs_warp.launching import use_device
@@ -35,8 +36,10 @@ if TYPE_CHECKING:
     from egs_warp.locomotion.strategies import Strategy
     from egs_warp.locomotion.trajectory import Trajectory
     from egs_warp.motions.command import Drive
+    from egs_warp.motions.keyframes import Key, Quantity
     from egs_warp.motions.push import Push, read_pushes
-    from egs_warp.motions.script import Script, drive_script, motion
+    from egs_warp.motions.script import Script, drive_script, keyframe_script, motion, own_script
+    from egs_warp.motions.sequence import BodyMotion
     from egs_warp.motions.style import Style, read_style
     from egs_warp.pipelines.animate import AnimateOptions, animate
     from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
@@ -80,7 +83,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "inpainting.inpainters": ("Inpainter", "inpainter_by_name"),
     "io.atomic": ("writable_folder",),
     "io.cameras": ("read_cameras",),
-    "io.capture": ("read_capture",),
+    "io.capture": ("Capture", "read_capture"),
     "io.ply": ("write_ply",),
     "io.video": ("VideoWriter", "contact_sheet", "write_png"),
     "launching": ("use_device",),
@@ -88,8 +91,10 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "locomotion.strategies": ("Strategy",),
     "locomotion.trajectory": ("Trajectory",),
     "motions.command": ("Drive",),
+    "motions.keyframes": ("Key", "Quantity"),
     "motions.push": ("Push", "read_pushes"),
-    "motions.script": ("Script", "drive_script", "motion"),
+    "motions.script": ("Script", "drive_script", "keyframe_script", "motion", "own_script"),
+    "motions.sequence": ("BodyMotion",),
     "motions.style": ("Style", "read_style"),
     "pipelines.animate": ("AnimateOptions", "animate"),
     "pipelines.creature": ("Creature", "CreatureOptions", "make_creature"),
@@ -123,8 +128,10 @@ __all__ = [
     "BUILT_IN_SCENES",
     "AnimateOptions",
     "ArgumentError",
+    "BodyMotion",
     "Box",
     "Camera",
+    "Capture",
     "Click",
     "Creature",
     "CreatureOptions",
@@ -139,6 +146,7 @@ __all__ = [
     "Inpainter",
     "Job",
     "JobResult",
+    "Key",
     "LearningRates",
     "LocomotionSettings",
     "MaskedView",
@@ -146,6 +154,7 @@ __all__ = [
     "Plane",
     "PreparedScene",
     "Push",
+    "Quantity",
     "Report",
     "Scene",
     "SceneOptions",
@@ -174,9 +183,11 @@ __all__ = [
     "footprint",
     "inpaint",
     "inpainter_by_name",
+    "keyframe_script",
     "make_creature",
     "motion",
     "one_line_errors",
+    "own_script",
     "prepare_scene",
     "psnr",
     "read_cameras",
@@ -200,7 +211,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import and return the public ``name`` (PEP 562)."""
     if name not in _MODULE_OF:
-        raise AttributeError(f"module 'egs_warp' has no attribute {name!r}")
+        # With its name and object, Python suggests the nearest name.
+        raise AttributeError(f"module 'egs_warp' has no attribute {name!r}", name=name, obj=sys.modules[__name__])
     value = getattr(import_module(_MODULE_OF[name]), name)
     globals()[name] = value
     return value

@@ -7,12 +7,13 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Mapping, Sequence
-from typing import NoReturn
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NoReturn
 
 from egs_warp.commands import COMMANDS, GROUPS
 from egs_warp.commands.config import with_config
 from egs_warp.commands.exit_handling import HandledExit, one_line_errors
+from egs_warp.errors import did_you_mean
 from egs_warp.version import __version__
 
 
@@ -28,6 +29,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             words = _attach_negative_values(sys.argv[1:] if arguments is None else arguments)
             parser, commands = _parsers()
             command = commands.get(words[0]) if words else None
+            if words:
+                _check_flags(words[:1], parser)
+            if command is not None:
+                _check_flags(words[1:], command)
             if command is not None and "--config" in command._option_string_actions:
                 words = [words[0], *with_config(words[1:], command)]
             args = parser.parse_args(words)
@@ -38,10 +43,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Argument parser that reports an error in one line, without the usage."""
+    """Argument parser that reports an error in one line, without the usage, and suggests the nearest name."""
+
+    complete_help: Callable[[argparse.ArgumentParser], None] | None = None
+    """Completes the help texts that a module makes from a registry, which is slow to import."""
+
+    def format_help(self) -> str:
+        """Return the text of ``--help``."""
+        if self.complete_help is not None:
+            self.complete_help(self)
+        return super().format_help()
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            names = [str(choice) for choice in action.choices]
+            raise argparse.ArgumentError(
+                action, f"{value!r} is unknown{did_you_mean(value, names)}; give one of {', '.join(names)}"
+            )
+
+
+def _check_flags(words: Sequence[str], command: argparse.ArgumentParser) -> None:
+    """End with an error for the first unknown flag in ``words``.
+
+    argparse would first report required flags that are missing, of which the unknown one may be a misspelling.
+    """
+    known = list(command._option_string_actions)
+    for word in words:
+        flag = word.partition("=")[0]
+        if not flag.startswith("--") or any(name.startswith(flag) for name in known):
+            continue
+        name = flag.lstrip("-")
+        near = f" (did you mean the command egs-warp {name}?)" if name in COMMANDS else did_you_mean(flag, known)
+        command.error(f"unrecognized arguments: {flag}{near}")
 
 
 class _Overview(_Parser):
@@ -97,6 +133,7 @@ def _parsers() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentP
         module = importlib.import_module(f"egs_warp.commands.{name}")
         module.add_parser(subparsers)
         command = subparsers.choices[name]
+        command.complete_help = getattr(module, "complete_help", None)
         command.formatter_class = argparse.RawDescriptionHelpFormatter
         examples = "\n".join(f"  {command.prog} {example}".rstrip() for example in module.EXAMPLES)
         command.epilog = f"examples:\n{examples}\n\n{_EXIT_STATUSES}"

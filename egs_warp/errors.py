@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import difflib
+from collections.abc import Callable, Iterable, Sequence
 
 _MAX_MESSAGE_LENGTH = 2000
 """Maximum number of characters of a message; the middle of a longer one is cut out."""
+
+
+def did_you_mean(name: object, names: Iterable[str]) -> str:
+    """Return `` (did you mean 'walk'?)`` for the member of ``names`` that is nearest to the unknown ``name``; an empty
+    text if none is near."""
+    # Of a name in upper case, too; of two equal members, the first.
+    by_lower = {str(known).lower(): str(known) for known in reversed(list(names))}
+    near = difflib.get_close_matches(str(name).lower(), by_lower, n=1)
+    return f" (did you mean {by_lower[near[0]]!r}?)" if near else ""
 
 
 class UserError(ValueError):

@@ -23,7 +23,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 import warp as wp
 
-from egs_warp.errors import ArgumentError, UserError
+from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.worker_threads import worker_threads
 
 Shape: TypeAlias = int | tuple[int, ...]
@@ -70,13 +70,17 @@ def reserve_core() -> Iterator[None]:
         _reserved -= 1
 
 
+# Warp's default prints seven lines when it starts. A level that the user has set before, or sets later, stays.
+if wp.config.log_level == wp.LOG_INFO:
+    wp.config.log_level = wp.LOG_WARNING
+
+
 def use_device(device: str) -> None:
-    """Initialize Warp for ``device`` and limit its output to warnings. Programs call this first.
+    """Initialize Warp for ``device``. Programs call this first.
 
     Raises:
         UserError: Warp has no such device, or cannot create its kernel cache.
     """
-    wp.config.log_level = wp.LOG_WARNING
     try:
         with _without_driver_warning() if device == "cpu" else nullcontext():
             wp.init()
@@ -86,7 +90,15 @@ def use_device(device: str) -> None:
             f"kernel cache {place}: cannot be created ({error.strerror}); set WARP_CACHE_PATH to a writable folder"
         ) from error
     if device not in (devices := [str(known) for known in wp.get_devices()]):
-        raise ArgumentError("device", f"this machine has {', '.join(devices)}", value=device)
+        near = did_you_mean(device, devices)
+        raise ArgumentError("device", f"this machine has {', '.join(devices)}{near}", value=device)
+
+
+@cache
+def start_on_cpu() -> None:
+    """Initialize Warp without its warning about a missing GPU driver, which does not matter for arrays on a CPU."""
+    with _without_driver_warning():
+        wp.init()
 
 
 @contextmanager

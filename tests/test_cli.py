@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -13,16 +16,20 @@ import numpy as np
 import pytest
 
 from egs_warp.assets import pawn
-from egs_warp.cli import _parsers, main
+from egs_warp.cli import _FIRST_EXAMPLES, _attach_negative_values, _parsers, main
+from egs_warp.commands import COMMANDS
 from egs_warp.commands.camera_flags import TRANSPARENT
-from egs_warp.commands.config import _WORDS
+from egs_warp.commands.config import _WORDS, NAME, with_config
 from egs_warp.commands.flags import named_path, parse_plane, parse_up
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.inpainting.inpainters import OpenCvMethod
 from egs_warp.io import write_ply
+from egs_warp.io.run_folder import CONFIG
 from egs_warp.io.writing import WRITERS
 from egs_warp.locomotion.solvers import QpSolver
+from egs_warp.motions.repertoire import MOTIONS
+from egs_warp.motions.style import PRESETS
 from egs_warp.pipelines.render_run import Show
 from egs_warp.pipelines.shot import CameraMove
 from egs_warp.segmentation.clearance import StraddlingPolicy
@@ -145,6 +152,36 @@ def test_a_flat_object_does_not_overwrite_an_earlier_result(tmp_path: Path, caps
     assert [path.name for path in out.iterdir()] == ["jump.mp4"]
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "animate flat.ply --up z --out new/out",
+        "animate flat.ply --up z --object 5,5,5 --out new/out",
+        "segment flat.ply --up z --object 5,5,5 --out new/out",
+        "plane flat.ply --up z --object 5,5,5 --out new/out",
+        "convert frames new/out --to spz",
+        "animate flat.ply --up z --out new.mp4",
+        "plane flat.ply --object 0,0,0 --out plane.json",
+    ],
+)
+def test_what_is_refused_leaves_no_folder(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(-1, 1, (100, 2)), np.zeros(100)])
+    cloud = GaussianCloud.from_numpy(
+        flat, np.tile([1.0, 0, 0, 0], (100, 1)), np.full((100, 3), -6.0), np.full(100, 3.0), np.zeros((100, 1, 3))
+    )
+    monkeypatch.chdir(tmp_path)
+    write_ply(tmp_path / "flat.ply", cloud)
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "frames" / "frame0001.ply").write_text("not a capture")
+    before = sorted(path.name for path in tmp_path.rglob("*"))
+    assert main(line.split()) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith("egs-warp: ")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == before
+
+
 def test_own_muscles_are_plotted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The plot shows the fibres of the file; a fibre outside the body is refused by name."""
     thing = pawn()
@@ -201,7 +238,142 @@ def test_choices_of_flags_are_those_of_the_library() -> None:
     assert choices("animate", "--qp") == choices("live", "--qp") == {solver.value for solver in QpSolver}
     assert choices("render", "--show") == {show.value for show in Show}
     assert choices("segment", "--straddling") == {method.value for method in StraddlingPolicy}
+    assert NAME == CONFIG
     assert {"patch", TRANSPARENT, *CameraMove, *(method.value for method in OpenCvMethod)} == set(_WORDS)
+
+
+@pytest.mark.parametrize(
+    ("line", "suggestion"),
+    [
+        ("animte a.ply", "'animte' is unknown (did you mean 'animate'?); give one of doctor, "),
+        ("animate a.ply --out b --resume", "--resume (did you mean the command egs-warp resume?)"),
+        ("animate a.ply --otu b", "unrecognized arguments: --otu (did you mean '--out'?)"),
+        ("animate a.ply --out b --motion wlak", "unknown motion 'wlak' (did you mean 'walk'?)"),
+        ("animate a.ply --out b --motion jump,HPO", "unknown motion 'hpo' (did you mean 'hop'?)"),
+        ("animate a.ply --out b --motion jump.hieght=1", "unknown motion 'jump.hieght=1'"),
+        ("animate a.ply --out b --style hevy", "unknown word 'hevy' (did you mean 'heavy'?)"),
+        ("animate a.ply --out b --style squish=1.2", "unknown word 'squish=1.2' (did you mean 'squash'?)"),
+        ("animate a.ply --out b --camera folow", "--camera folow (did you mean 'follow'?)"),
+        ("animate a.ply --out b --background transparnt", "no such file (did you mean 'transparent'?)"),
+        ("animate a.ply --out b --background blu", "no such file (did you mean 'blue'?)"),
+        ("animate a.ply --out b --background blue", "a.ply: no such file or folder"),
+        ("animate a.ply --out b --qp osq", "'osq' is unknown (did you mean 'osqp'?)"),
+        ("export a --to plly --out b", "'plly' is unknown (did you mean 'ply'?)"),
+        (
+            "convert a.ply b.splt",
+            "give a name that ends in .compressed.ply, .ply, .spz, .sog, .splat, .glb (did you mean ",
+        ),
+        ("info pwan.ply", "pwan.ply: no such file or folder (did you mean 'pawn.ply'?)"),
+        ("--versoin", "--versoin (did you mean '--version'?)"),
+        ("inpaint a.ply --plane 0,0,1,0 --hole 0,0,0,1 --out b.ply --inpainter tela", "tela (did you mean 'telea'?)"),
+    ],
+)
+def test_a_misspelt_name_is_answered_by_the_nearest_one(
+    line: str, suggestion: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pawn.ply").touch()
+    try:
+        status = main(line.split())
+    except SystemExit as stop:
+        status = stop.code
+    error = capsys.readouterr().err
+    assert status == 2 and error.count("\n") == 1
+    assert suggestion in error
+
+
+def test_names_of_a_run_file_and_of_python_are_answered_too(tmp_path: Path) -> None:
+    import egs_warp as egs
+
+    (tmp_path / "run.yaml").write_text("capture: a.ply\nmotoin: jump\n")
+    with pytest.raises(UserError, match=r"unknown key 'motoin' \(did you mean 'motion'\?\)"):
+        with_config([f"--config={tmp_path / 'run.yaml'}"], _parsers()[1]["animate"])
+    with pytest.raises(UserError, match=r"'distanse' is unknown \(did you mean 'distance'\?\); jump takes"):
+        egs.motion("jump distanse=1")
+    with pytest.raises(UserError, match=r"scene 'pwan' is unknown \(did you mean 'pawn'\?\)"):
+        egs.scene("pwan")
+    with pytest.raises(AttributeError) as raised:
+        egs.anmiate  # noqa: B018
+    assert (raised.value.name, raised.value.obj) == ("anmiate", egs)
+
+
+def _examples() -> list[str]:
+    commands = [
+        f"{name} {example}"
+        for name in COMMANDS
+        for example in importlib.import_module(f"egs_warp.commands.{name}").EXAMPLES
+    ]
+    return [*commands, *_FIRST_EXAMPLES]
+
+
+@pytest.mark.parametrize("example", _examples())
+def test_the_examples_of_the_help_are_accepted(
+    example: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In an empty folder, each is only refused because its files are missing."""
+    monkeypatch.chdir(tmp_path)
+    words = shlex.split(example)
+    if words[0] in ("doctor", "samples"):
+        assert _parsers()[0].parse_args(words).command == words[0]
+        return
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert re.search(
+        "no such (file|folder)|no folder|not a folder|no run has written|no camera poses|make web|not installed|"
+        "this machine has",
+        error,
+    ), error
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_commands_of_the_pages_are_accepted() -> None:
+    """Each line of a code block that begins with ``egs-warp`` can be parsed; placeholders in capitals are names."""
+    parser, root, count = _parsers()[0], Path(__file__).parents[1], 0
+    for page in (root / "README.md", *sorted((root / "docs").rglob("*.md"))):
+        if "notebook" in page.parts:
+            continue
+        for block in re.findall(r"^```\w*\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
+            for line in re.sub(r"\\\n\s*", " ", block).splitlines():
+                if line.startswith("egs-warp ") and "..." not in line:
+                    words = shlex.split(line, comments=True)[1:]
+                    command = _parsers()[1].get(words[0])
+                    if command is not None and "--config" in words:
+                        continue
+                    try:
+                        parser.parse_args(_attach_negative_values(words))
+                    except SystemExit as stop:
+                        assert stop.code == 0, f"{page.name}: {line}"
+                    count += 1
+    assert count > 40
+
+
+def test_the_help_of_animate_lists_the_registry(capsys: pytest.CaptureFixture[str]) -> None:
+    """All motions and their own default values; the flags that matter first."""
+    with pytest.raises(SystemExit):
+        main(["animate", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    for name, kind in MOTIONS.items():
+        assert re.search(rf"(one of|,) {name}( FILE)?(,| --object)", text), name
+        for value in kind.parameters:
+            if value.name in ("distance", "height", "heading_degrees"):
+                flag = value.name.replace("_", "-")
+                (described,) = re.findall(rf"--{flag} [A-Z_]+ (.*?) --", text)
+                assert f"{name} ({value.default:g})" in described
+    assert all(preset in text for preset in PRESETS)
+    first = text[text.index("most used:") : text.index("motion: --distance")]
+    assert re.findall(r"--(\w+) [A-Z]", first) == ["out", "up", "motion", "object", "camera", "size", "device"]
+    table = (Path(__file__).parents[1] / "docs" / "guide" / "capture.md").read_text()
+    (row,) = re.findall(r"^\| `--motion` \|(.*)$", table, re.MULTILINE)
+    assert all(re.search(rf"`{name}[ `]", row) for name in MOTIONS)
+
+
+def test_tables_of_the_pages_have_as_many_cells_in_each_row() -> None:
+    for page in sorted((Path(__file__).parents[1] / "docs").rglob("*.md")):
+        width = 0
+        for number, line in enumerate(page.read_text().splitlines(), start=1):
+            cells = len(re.findall(r"(?<!\\)\|", re.sub(r"`[^`]*`", "", line))) if line.startswith("|") else 0
+            assert width in (0, cells) or cells == 0, f"{page.name}:{number}: {cells - 1} cells, not {width - 1}"
+            width = cells
 
 
 def test_axes_and_planes_are_read() -> None:

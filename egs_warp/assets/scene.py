@@ -13,15 +13,18 @@ from egs_warp.assets.object import BuiltInObject
 from egs_warp.assets.pawn import pawn
 from egs_warp.assets.snake import snake
 from egs_warp.assets.stool import stool
-from egs_warp.errors import UserError
+from egs_warp.errors import UserError, did_you_mean
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
+from egs_warp.short_repr import short_repr
 
 
 @dataclass(frozen=True)
 class Scene:
     """An object on its plane in an environment. The object is one unit tall, or two units long if it lies."""
+
+    __repr__ = short_repr
 
     name: str
     object: GaussianCloud
@@ -65,7 +68,9 @@ BUILT_IN_SCENES: tuple[str, ...] = tuple(_SCENES)
 def scene(name: str, *, seed: int = 0, device: str | None = None) -> Scene:
     """Create the built-in scene ``name``. Equal arguments give equal bits. Raises ``UserError`` for an unknown name."""
     if name not in _SCENES:
-        raise UserError(f"scene {name!r} is unknown; built in are {', '.join(BUILT_IN_SCENES)}")
+        raise UserError(
+            f"scene {name!r} is unknown{did_you_mean(name, BUILT_IN_SCENES)}; built in are {', '.join(BUILT_IN_SCENES)}"
+        )
     make_object, make_environment, eye, target = _SCENES[name]
     built = make_object(seed=seed, device=device)
     return Scene(

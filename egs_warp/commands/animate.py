@@ -62,8 +62,7 @@ def add_parser(commands: Commands) -> None:
     common.add_argument(
         "--motion",
         default="jump",
-        help="jump (default), hop, twist, walk, walk to, walk along, run, turn, drive, stand, get up, dance or "
-        'trajectory; several, as "hop x3, twist 180"; or a script.json (docs/motions/index.md)',
+        help='motion (jump), several as "hop x3, twist 180", or a script.json (docs/motions/index.md)',
     )
     motion = animate.add_argument_group("motion")
     body = animate.add_argument_group("body and ground")
@@ -75,17 +74,17 @@ def add_parser(commands: Commands) -> None:
     motion.add_argument(
         "--distance",
         type=float,
-        help="distance of each motion in body heights: jump (0.5), hop (0.7), twist (0), walk (0.4), run (1)",
+        help="distance of each motion in body heights",
     )
     motion.add_argument(
         "--height",
         type=float,
-        help="rise of the centre of mass in body heights: jump (0.2), hop (0.3), twist (0.2)",
+        help="rise of the centre of mass in body heights",
     )
     motion.add_argument(
         "--heading-degrees",
         type=float,
-        help="rotation in degrees, counter-clockwise seen from above: twist (180), turn (90)",
+        help="rotation in degrees, counter-clockwise seen from above",
     )
     motion.add_argument(
         "--push",
@@ -99,8 +98,7 @@ def add_parser(commands: Commands) -> None:
     )
     motion.add_argument(
         "--style",
-        help="style of jumps: light, heavy, rubbery, or factors from 0.5 to 2, as anticipation=1.3 squash=1.2 "
-        "timing=0.8",
+        help="style of jumps",
     )
     motion.add_argument(
         "--frames", type=int, help="number of frames at 60 Hz, the first at rest (default: until the body is at rest)"
@@ -148,6 +146,30 @@ def add_parser(commands: Commands) -> None:
     animate.set_defaults(run=_animate, parser=animate, resume=False)
 
 
+def complete_help(parser: argparse.ArgumentParser) -> None:
+    """Write the names and default values of the registry into the help texts."""
+    from egs_warp.motions.repertoire import MOTIONS
+    from egs_warp.motions.style import MAX_FACTOR, MIN_FACTOR, PRESETS, Style
+
+    names = ", ".join(f"{name} FILE" if kind.file else name for name, kind in MOTIONS.items())
+    factors = " ".join(f"{name}=1.2" for name in vars(Style()))
+    added = {
+        "motion": f"one of {names}",
+        "style": f"{', '.join(PRESETS)}, or factors from {MIN_FACTOR:g} to {MAX_FACTOR:g}, as {factors}",
+    }
+    for target in ("distance", "height", "heading_degrees"):
+        defaults = [
+            f"{name} ({value.default:g})"
+            for name, kind in MOTIONS.items()
+            for value in kind.parameters
+            if value.name == target
+        ]
+        added[target] = ", ".join(defaults)
+    for action in parser._actions:
+        if action.dest in added and action.help is not None and added[action.dest] not in action.help:
+            action.help = f"{action.help}: {added[action.dest]}"
+
+
 def _animate(args: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import check_run_folder
 
@@ -160,19 +182,19 @@ def _animate(args: argparse.Namespace) -> int:
 def run_animate(args: argparse.Namespace) -> int:
     """Run ``egs-warp animate`` with the output folder already checked; return the exit status."""
     try:
-        report, more = _animate_scene(args) if args.object is not None else _animate_capture(args)
+        report = _animate_scene(args) if args.object is not None else _animate_capture(args)
     except BaseException as error:
         # With --overwrite the folder may still contain the earlier run, which cannot be resumed as this one.
         if not args.overwrite and (args.out / NAME).is_file():
             error.add_note(f"egs-warp resume {args.out} continues it")
         raise
     print(report.summary())
-    print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz{more} into {args.out}")
+    print(f"film: {args.out / str(report.film)} (sheet.png, plots.png and report.json are beside it)")
     return EXIT_NOT_AS_REQUESTED if report.state.is_failure else 0
 
 
-def _animate_capture(args: argparse.Namespace) -> tuple[Report, str]:
-    """Animate a capture that contains only the object; return the report and, for a message, further file names."""
+def _animate_capture(args: argparse.Namespace) -> Report:
+    """Animate a capture that contains only the object."""
     from egs_warp.commands.scene_input import ground_of, plane_of
     from egs_warp.io import read_capture
     from egs_warp.io.run_folder import run_folder
@@ -195,6 +217,7 @@ def _animate_capture(args: argparse.Namespace) -> tuple[Report, str]:
     if plane is None and up is None:
         up, note = guessed_up(capture)
         notes = (*notes, note)
+    for note in notes:
         print_note(note)
     with run_folder(args.out, overwrite=args.overwrite, resume=args.resume) as run:
         run.begin_with(lambda: write_config(run.file(NAME), args, args.parser))
@@ -212,12 +235,13 @@ def _animate_capture(args: argparse.Namespace) -> tuple[Report, str]:
                 notes=notes,
                 creature=replace(options.creature, ground=ground_of(args.plane, flat=args.flat)),
             ),
+            show_note=print_note,
         )
         run.finish()
-    return report, f", {NAME}"
+    return report
 
 
-def _animate_scene(args: argparse.Namespace) -> tuple[Report, str]:
+def _animate_scene(args: argparse.Namespace) -> Report:
     """Animate an object segmented from a scene, with the rest of the scene as background; see ``_animate_capture``."""
     from egs_warp.commands.scene_input import read_scene
     from egs_warp.io.run_folder import run_folder
@@ -245,8 +269,8 @@ def _animate_scene(args: argparse.Namespace) -> tuple[Report, str]:
         scene = scene_input.prepared(scene_options)
         # Written first: a later error must not lose minutes of work.
         scene.write(run)
-        pictures = _write_pictures(run, scene_input, scene)
-        for note in scene.notes:
+        _write_pictures(run, scene_input, scene)
+        for note in (*scene_input.notes, *scene.notes):
             print_note(note)
         report = animate(
             scene.object,
@@ -265,16 +289,14 @@ def _animate_scene(args: argparse.Namespace) -> tuple[Report, str]:
                     seen_from=mean_view(scene_input.cameras, scene.located.centre),
                 ),
             ),
+            show_note=print_note,
         )
         run.finish()
-    return report, ", ".join(["", NAME, "object.ply", "background.ply", "plane.json", *pictures])
+    return report
 
 
-def _write_pictures(run: RunFolder, scene_input: SceneInput, scene: PreparedScene) -> list[str]:
-    """Write the images by which the user checks each step, as ``plane``, ``segment`` and ``inpaint`` write them.
-
-    Returns their names.
-    """
+def _write_pictures(run: RunFolder, scene_input: SceneInput, scene: PreparedScene) -> None:
+    """Write the images by which the user checks each step, as ``plane``, ``segment`` and ``inpaint`` write them."""
     from egs_warp.inpainting.picture import before_and_after
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
@@ -295,7 +317,6 @@ def _write_pictures(run: RunFolder, scene_input: SceneInput, scene: PreparedScen
         pictures["filled.png"] = before_and_after(scene.filled)
     for name, picture in pictures.items():
         write_png(run.file(name), picture)
-    return list(pictures)
 
 
 def _options(args: argparse.Namespace) -> AnimateOptions:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 from typing import TYPE_CHECKING
 
-from egs_warp.errors import UserError
+from egs_warp.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
     from egs_warp.pipelines.shot import Shot
 
 TRANSPARENT = "transparent"
 """Value of ``--background`` for a transparent video."""
-COLOURS = "give three numbers r,g,b from 0 to 1, or #rrggbb"
-"""Advice of the messages about colours."""
+COLOURS = "r,g,b from 0 to 1, #rrggbb, or a name"
+"""Forms of a colour, for messages."""
 
 
 def add_camera_flags(
@@ -29,14 +30,17 @@ def add_camera_flags(
     """
     first = common or parser
     first.add_argument(
-        "--camera", default="fixed", help="fixed (default), follow, orbit, or a path.json with key cameras"
+        "--camera",
+        default="auto",
+        help="auto (default: follows a creature that travels, unless it is in a scene), fixed, follow, orbit, or a "
+        "path.json with key cameras",
     )
     first.add_argument("--size", help=f"size of the video in pixels, for example 512 or 640x360 ({size})")
     parser.add_argument("--fps", type=float, default=60.0, help="video frames per second of motion (60)")
     parser.add_argument(
         "--background",
-        help="background of the creature: a capture, a colour r,g,b from 0 to 1 or #rrggbb, or transparent (the shadow "
-        "stays)",
+        help="background of the creature: a capture, a colour (r,g,b from 0 to 1, #rrggbb or its name in CSS), or "
+        "transparent (the shadow stays)",
     )
 
 
@@ -46,10 +50,16 @@ def shot_of(args: argparse.Namespace) -> tuple[Shot, str | None]:
 
     colour = parse_colour(args.background) if args.background is not None else None
     transparent = args.background == TRANSPARENT
+    background_path = None if colour is not None or transparent else args.background
+    if background_path is not None and not os.path.lexists(background_path):
+        near = did_you_mean(background_path, [TRANSPARENT, *_colour_names()])
+        raise UserError(
+            f"--background {background_path}: no such file{near}; give a capture, transparent, or a colour: {COLOURS}"
+        )
     size = parse_size(args.size) if args.size is not None else None
     shot = Shot(args.camera, size, args.fps, colour, transparent)
     shot.check()
-    return shot, None if colour is not None or transparent else args.background
+    return shot, background_path
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -61,10 +71,13 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_colour(text: str) -> tuple[float, float, float] | None:
-    """Return (r, g, b), each 0 to 1, from ``r,g,b`` or ``#rrggbb``; None if ``text`` is neither.
+    """Return (r, g, b), each 0 to 1, from ``r,g,b``, ``#rrggbb`` or the name of a CSS colour that is no file; None for
+    other texts.
 
     Raises ``UserError`` for numbers outside of 0 to 1.
     """
+    if text.isalpha() and not os.path.lexists(text):
+        text = _colour_names().get(text.lower(), text)
     if re.fullmatch(r"#[0-9a-fA-F]{6}", text):
         red, green, blue = (int(text[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
         return red, green, blue
@@ -73,5 +86,12 @@ def parse_colour(text: str) -> tuple[float, float, float] | None:
     except ValueError:
         return None
     if not all(0.0 <= value <= 1.0 for value in (red, green, blue)):
-        raise UserError(f"--background {text}: {COLOURS}")
+        raise UserError(f"--background {text}: give a colour: {COLOURS}")
     return red, green, blue
+
+
+def _colour_names() -> dict[str, str]:
+    """Return ``#rrggbb`` of each CSS colour."""
+    from PIL.ImageColor import colormap
+
+    return {name: value for name, value in colormap.items() if isinstance(value, str)}

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from egs_warp.commands.camera_flags import TRANSPARENT
-from egs_warp.errors import UserError
+from egs_warp.errors import UserError, did_you_mean
 
 NAME = "run.yaml"
-"""Name of the file in the run folder."""
+"""Name of the file in the run folder, as in ``egs_warp.io.run_folder``, which is slow to import."""
 _CHECKSUM = "capture_sha256"
 _PATHS = ("capture", "object", "plane", "cameras", "background", "terrain", "muscles", "inpainter", "camera", "beats")
 """Flags that may name files. In the YAML file, these paths are relative to its folder."""
-_WORDS = ("fixed", "follow", "orbit", "patch", "telea", "ns", TRANSPARENT)
+_WORDS = ("auto", "fixed", "follow", "orbit", "patch", "telea", "ns", TRANSPARENT)
 """Values of these flags that do not name files."""
 _IN_MOTION = re.compile(r"\S+\.(?:json|csv)", re.IGNORECASE)
 """File names within ``--motion``."""
@@ -58,8 +58,8 @@ def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> li
         if name == _CHECKSUM:
             continue
         if name not in actions:
-            near = ", ".join(sorted(actions))
-            raise UserError(f"{path}: unknown key {_short(key)}; known keys are {near}")
+            near, known = did_you_mean(name, actions), ", ".join(sorted(actions))
+            raise UserError(f"{path}: unknown key {_short(key)}{near}; known keys are {known}")
         if value is None or value is False:
             continue
         action = actions[name]

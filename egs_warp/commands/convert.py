@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,20 +64,30 @@ def add_parser(commands: Commands) -> None:
 
 
 def _convert(args: argparse.Namespace) -> int:
+    with ExitStack() as stack:
+        return _convert_files(args, stack)
+
+
+def _convert_files(args: argparse.Namespace, stack: ExitStack) -> int:
+    """Convert the files; ``stack`` removes a new folder in which nothing could be written."""
     from tqdm import tqdm
 
     from egs_warp.geometry.gaussians import with_degree
-    from egs_warp.io import read_capture, writable_folder
+    from egs_warp.io import read_capture
+    from egs_warp.io.atomic import result_folder
     from egs_warp.io.conversion_loss import conversion_loss
+    from egs_warp.io.limits import missing_error
     from egs_warp.io.run_folder import check_no_file_of_a_run
     from egs_warp.io.sequence import numbered_captures
-    from egs_warp.io.writing import WRITERS, write_capture, writer_of
+    from egs_warp.io.writing import WRITERS, is_capture_name, write_capture, writer_of
     from egs_warp.launching import use_device
     from egs_warp.pipelines.edit_capture import edit_capture, merge_captures
     from egs_warp.pipelines.progress import conversion_bar
 
     edits = _edits(args)
     first = args.captures[0]
+    if args.to is not None and not os.path.lexists(first):
+        raise missing_error(first)
     if args.to is None or first.is_file() or len(args.captures) > 1:
         write = writer_of(args.out, kind=args.to)
         # Checked before a capture is read, which may take long.
@@ -90,7 +102,9 @@ def _convert(args: argparse.Namespace) -> int:
         sources = numbered_captures(first)
         if args.out.exists() and args.out.samefile(first):
             raise UserError(f"{args.out}: is the input folder; give another one")
-        folder = writable_folder(args.out)
+        if is_capture_name(args.out) and not args.out.is_dir():
+            raise UserError(f"{args.out}: several files are written; give the name of a folder")
+        folder = stack.enter_context(result_folder(args.out))
         jobs = [([source], folder / f"{source.name.split('.')[0]}{ending}") for source in sources]
     use_device("cpu")
     lines: list[str] = []

@@ -12,7 +12,7 @@ EXAMPLES = (
     "out/jump --to ply --out frames --every 2",
     "out/jump --to usd --out jump.usdc",
     "out/jump --to bundle --out jump.npz",
-    "out/jump --to glb --out still --frame 40",
+    "out/jump --to glb --out still.glb --frame 40",
 )
 _WITHOUT_ANTIALIASING = ("splat", "usd")
 """Formats that cannot state that a capture was trained with antialiasing."""
@@ -32,7 +32,8 @@ def add_parser(commands: Commands) -> None:
         "--out",
         required=True,
         type=named_path,
-        help="folder for numbered files, a .usdc or .usda file for usd, or an .npz file for bundle",
+        help="folder for numbered files, or a file for a single --frame; a .usdc or .usda file for usd; an .npz file "
+        "for bundle",
     )
     export.add_argument("--every", type=int, default=1, metavar="N", help="write every N-th frame of the 60 Hz run (1)")
     export.add_argument(

@@ -23,8 +23,6 @@ SPLAT_FILES = ("ply", "compressed-ply", "spz", "spz4", "sog", "splat", "glb")
 """Keys of ``egs_warp.io.writing.WRITERS``, repeated here because that module is slow to import."""
 QP_SOLVERS = ("osqp", "admm", "daqp")
 """Values of ``egs_warp.locomotion.solvers.QpSolver``, repeated here because that module is slow to import."""
-_AXES = {"x": 0, "y": 1, "z": 2}
-"""Index of each axis name."""
 _FLAGS = {"muscles_file": "--muscles", "solids": "--terrain"}
 """Flags of the library arguments whose names differ."""
 
@@ -86,13 +84,11 @@ def chosen_inpainter(args: argparse.Namespace, *, seed: int = 0) -> Inpainter:
 
 def parse_up(text: str) -> np.ndarray:
     """Return the (3,) unit vector of an axis name such as ``-y``. Raises ``UserError`` for other texts."""
-    import numpy as np
+    from egs_warp.geometry.frames import AXES, axis_named
 
-    name = text.strip().lower().lstrip("+-")
-    if name not in _AXES:
-        raise UserError(f"--up {text}: give one of x, y, z, -x, -y, -z")
-    up = np.zeros(3)
-    up[_AXES[name]] = -1.0 if text.strip().startswith("-") else 1.0
+    up = axis_named(text)
+    if up is None:
+        raise UserError(f"--up {text}: give one of {AXES}")
     return up
 
 
@@ -103,8 +99,11 @@ def parse_direction(flag: str, text: str) -> np.ndarray:
     """
     import numpy as np
 
-    if text.strip().lower().lstrip("+-") in _AXES:
-        return parse_up(text)
+    from egs_warp.geometry.frames import axis_named
+
+    axis = axis_named(text)
+    if axis is not None:
+        return axis
     try:
         direction = np.array([float(part) for part in text.split(",")])
     except ValueError:
@@ -148,14 +147,6 @@ def parse_plane(text: str) -> Plane:
 
 def guessed_up(capture: Capture) -> tuple[np.ndarray, str]:
     """Estimate the up direction of a capture; return the (3,) unit vector and a note for the user."""
-    import numpy as np
+    from egs_warp.pipelines.creature import estimated_up
 
-    from egs_warp.segmentation.base_plane import guess_up
-
-    up, reason = guess_up(capture.cloud, capture.up, vertical_axis=capture.vertical_axis)
-    axis = int(np.argmax(np.abs(up)))
-    if np.abs(up[axis]) == 1.0:
-        name = f"{'-' if up[axis] < 0 else '+'}{'xyz'[axis]}"
-    else:
-        name = ",".join(f"{x:.3f}" for x in up)
-    return up, f"up is estimated as {name} ({reason}); if that is wrong, give --up"
+    return estimated_up(capture, advice="give --up")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.errors import UserError
+from egs_warp.errors import UserError, did_you_mean
 from egs_warp.geometry.camera import downscale
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.lens import Undistortion
@@ -171,9 +171,11 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str) -> Pos
     for one in posed:
         if view in (one.name, Path(one.name).name, Path(one.name).stem):
             return one
-    names = ", ".join(Path(one.name).name for one in posed[:3])
+    names = [Path(one.name).name for one in posed]
     flag = f"--object {what}" if what.endswith(f"@{view}") else f"--view {view}"
-    raise UserError(f"{flag}: no such camera; the {len(posed)} cameras are {names}, ...")
+    raise UserError(
+        f"{flag}: no such camera{did_you_mean(view, names)}; the {len(posed)} cameras are {', '.join(names[:3])}, ..."
+    )
 
 
 def _read_masks(path: Path, posed: Sequence[PosedImage] | None, view: str | None) -> list[MaskedView]:

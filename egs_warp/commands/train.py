@@ -57,7 +57,8 @@ def add_parser(commands: Commands) -> None:
     )
     train.add_argument(
         "--background",
-        help="background colour r,g,b from 0 to 1 or #rrggbb (default: white for photos with alpha, else the colour of "
+        help="background colour: r,g,b from 0 to 1, #rrggbb or a name of CSS (default: white for photos with "
+        "alpha, else the colour of "
         "their borders)",
     )
     train.add_argument(
@@ -75,7 +76,7 @@ def add_parser(commands: Commands) -> None:
 def _train(args: argparse.Namespace) -> int:
     background = parse_colour(args.background) if args.background is not None else None
     if background is None and args.background is not None:
-        raise UserError(f"--background {args.background}: {COLOURS}")
+        raise UserError(f"--background {args.background}: give a colour: {COLOURS}")
     for flag, value, minimum in (
         ("--iterations", args.iterations, 1),
         ("--gaussians", args.gaussians, 100),

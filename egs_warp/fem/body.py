@@ -16,6 +16,7 @@ from egs_warp.fem.elasticity import ElasticAssembly
 from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.short_repr import short_repr
 
 GRAVITY = 9.81
 """Gravitational acceleration, m/s^2."""
@@ -33,6 +34,8 @@ _MAX_LINEAR_SAG = 1e4
 @dataclass(frozen=True)
 class SoftBody:
     """A tetrahedral body under gravity."""
+
+    __repr__ = short_repr
 
     mesh: TetMesh
     """Cage as captured, m; muscles, contact points and Gaussians are embedded in it."""
@@ -117,6 +120,8 @@ class SoftBody:
 @dataclass(frozen=True)
 class BodyState:
     """Positions and velocities of the nodes at one point in time."""
+
+    __repr__ = short_repr
 
     positions: np.ndarray
     """(N, 3) float64, m."""

@@ -81,6 +81,35 @@ def downscale(camera: Camera, side: int) -> Camera:
     )
 
 
+def fitted_camera(camera: Camera, points: np.ndarray, *, sides: float, top: float, bottom: float) -> Camera:
+    """Return ``camera`` moved, without rotation, as near to ``points`` (n, 3) as it shows them all, in their middle.
+
+    A point at the depth d below the eye is within the margins if its coordinates across are within slopes times d.
+    Each margin is thus linear in the position of the eye, and the nearest one is exact.
+
+    Args:
+        camera: rotation and intrinsics; its principal point is in the picture.
+        points: world units.
+        sides, top, bottom: fraction of the picture from the principal point to each edge that the points may fill.
+    """
+    across, down, along = camera.rotation @ points.T
+    centre, slopes = [], []
+    for values, focal, before, after in (
+        (across, camera.fx, sides * camera.cx, sides * (camera.width - camera.cx)),
+        (down, camera.fy, top * camera.cy, bottom * (camera.height - camera.cy)),
+    ):
+        least, most = before / focal, after / focal
+        # The eye at e and the depth along - z: values - e is from -least (along - z) to most (along - z).
+        slopes.append((least, most))
+        centre.append(((values - most * along).max(), (values + least * along).min()))
+    depth = min((high - low) / (least + most) for (low, high), (least, most) in zip(centre, slopes, strict=True))
+    eye = [
+        0.5 * (low + most * depth + high - least * depth)
+        for (low, high), (least, most) in zip(centre, slopes, strict=True)
+    ]
+    return replace(camera, translation=-np.array([*eye, depth]), near=0.01 * float(along.mean() - depth))
+
+
 def camera_rays(camera: Camera) -> np.ndarray:
     """(H, W, 3) world-space rays r = R^T K^-1 [u, v, 1] of Eq. (18), with z-depth 1."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)

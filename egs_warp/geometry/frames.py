@@ -2,7 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TypeAlias
+
 import numpy as np
+
+from egs_warp.errors import ArgumentError
+
+Direction: TypeAlias = np.ndarray | Sequence[float] | str
+"""Three numbers, or the name of an axis such as ``-y``."""
+AXES = "x, y, z, -x, -y, -z"
+"""Names of axes, for messages."""
+
+
+def axis_named(name: str) -> np.ndarray | None:
+    """Return the (3,) unit vector of an axis such as ``-y``; None for other names."""
+    name = name.strip().lower()
+    axis = ("x", "y", "z").index(name.lstrip("+-")) if name.lstrip("+-") in ("x", "y", "z") else None
+    return None if axis is None else (-1.0 if name.startswith("-") else 1.0) * np.eye(3)[axis]
+
+
+def direction_of(direction: Direction, argument: str) -> np.ndarray:
+    """Return the (3,) float64 vector of ``direction``.
+
+    Raises ``ArgumentError`` about ``argument`` for other names, and unless the numbers are finite and not all zero.
+    """
+    vector = axis_named(direction) if isinstance(direction, str) else None
+    try:
+        vector = np.asarray(direction, dtype=np.float64) if vector is None else vector
+    except (TypeError, ValueError):
+        vector = np.zeros(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
+        raise ArgumentError(argument, f"give three numbers or one of {AXES}", value=direction)
+    return vector
 
 
 def orthonormal_basis(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,14 +8,21 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from scipy.spatial.transform import Rotation
 
-from egs_warp.errors import UserError
-from egs_warp.launching import device_of
+from egs_warp.errors import ArgumentError, UserError
+from egs_warp.geometry.plane import Plane
+from egs_warp.launching import device_of, start_on_cpu
+from egs_warp.short_repr import short_repr
 
 SH_BAND_0 = 0.28209479177387814
 """Spherical harmonic of band 0: a colour is 1/2 + SH_BAND_0 x its coefficient, higher bands apart."""
 ARRAYS = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 """Names of a cloud's arrays, in the order of its constructor."""
+_TRANSPARENT_LOGIT = -16.0
+"""Opacity logit of a hidden Gaussian: 1e-7, which no renderer draws."""
+_THIRD_BELOW = 0.43
+"""Height of a mean, standard deviations, at which a third of a normal distribution lies below a plane."""
 MAX_VALUE, MAX_LOG_SCALE = 1e18, 41.0
 """Limits for any number of a cloud and for the logarithm of a standard deviation: their squares are finite in single
 precision."""
@@ -24,6 +31,8 @@ precision."""
 @dataclass(frozen=True)
 class GaussianCloud:
     """A 3DGS capture. All arrays live on one device; ``wp.to_torch`` gives torch views without copies."""
+
+    __repr__ = short_repr
 
     means: wp.array
     """(n,) vec3, scene units (metres once animated)."""
@@ -56,6 +65,8 @@ class GaussianCloud:
         Raises ``UserError`` for zero Gaussians and mismatched counts, and for a value that is not finite or exceeds
         ``MAX_VALUE``; the message names it.
         """
+        if device in (None, "cpu"):
+            start_on_cpu()
         count = len(means)
         if count == 0:
             raise UserError("capture: it has no Gaussians; export it again from the tool that made it")
@@ -202,6 +213,30 @@ def concatenate(*clouds: GaussianCloud) -> GaussianCloud:
         antialiased=all(cloud.antialiased for cloud in clouds),
         device=str(clouds[0].device),
     )
+
+
+def check_cloud(cloud: object) -> None:
+    """Raise ``ArgumentError`` unless ``cloud`` is a ``GaussianCloud``, for example the path of a file."""
+    if not isinstance(cloud, GaussianCloud):
+        advice = "give Gaussians, as read_capture returns them"
+        raise ArgumentError("cloud", advice, value=f"{str(cloud)[:80]} ({type(cloud).__name__})")
+
+
+def hidden_below(cloud: GaussianCloud, plane: Plane, *, margin: float) -> GaussianCloud:
+    """Return ``cloud`` with the Gaussians below ``plane`` made transparent; their number and order stay.
+
+    They have their mean more than ``margin`` (world units) below it, or a third of their mass below it and a standard
+    deviation that reaches four times as deep.
+    """
+    heights = plane.heights(cloud.means.numpy())
+    axes = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
+    along = np.einsum("i,nij->nj", plane.normal, axes) * np.exp(cloud.log_scales.numpy().astype(np.float64))
+    spreads = np.linalg.norm(along, axis=1)
+    below = (heights < -margin) | ((heights < _THIRD_BELOW * spreads) & (heights - spreads < -4.0 * margin))
+    if not below.any():
+        return cloud
+    logits = np.where(below, np.float32(_TRANSPARENT_LOGIT), cloud.opacity_logits.numpy())
+    return replace(cloud, opacity_logits=wp.array(logits, dtype=wp.float32, device=cloud.device))
 
 
 def with_degree(cloud: GaussianCloud, degree: int | None) -> GaussianCloud:

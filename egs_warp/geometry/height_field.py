@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.plane import Plane
+from egs_warp.short_repr import short_repr
 
 _BOUNDARY = "mirror"
 _NEWTON_STEPS = 8
@@ -23,6 +24,8 @@ class HeightField:
 
     Outside the grid, the edge continues level. Lengths are in the units of the frame that it lies in.
     """
+
+    __repr__ = short_repr
 
     axes: np.ndarray
     """(3, 3) rows: the grid's columns run along the first, its rows along the second, heights along the third;

@@ -10,11 +10,14 @@ import numpy as np
 import scipy.sparse as sp
 
 from egs_warp.errors import UserError
+from egs_warp.short_repr import short_repr
 
 
 @dataclass(frozen=True)
 class TetMesh:
     """Nodes and tetrahedra; every tetrahedron has positive volume."""
+
+    __repr__ = short_repr
 
     nodes: np.ndarray
     """(N, 3) float64, m."""

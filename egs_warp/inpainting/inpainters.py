@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from egs_warp.errors import ArgumentError, UserError
+from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis
 from egs_warp.io.onnx import OnnxFile, read_onnx
 
@@ -176,7 +176,8 @@ def inpainter_by_name(name: str, *, seed: int = 0, device: str = "cpu", trust: b
         network = OnnxInpainter(path)
         network._load()
         return network
-    raise ArgumentError("inpainter", "give patch, telea, ns or an ONNX file (.onnx)", value=name)
+    near = did_you_mean(name, ("patch", *(method.value for method in OpenCvMethod)))
+    raise ArgumentError("inpainter", "give patch, telea, ns or an ONNX file (.onnx)", value=f"{name}{near}")
 
 
 def _padded(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

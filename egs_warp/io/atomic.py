@@ -76,6 +76,28 @@ def writable_folder(path: Path | str) -> Path:
     return folder
 
 
+@contextmanager
+def result_folder(path: Path | str) -> Iterator[Path]:
+    """Create folder ``path``, as ``writable_folder``; if the block fails before it contains anything, remove what was
+    created."""
+    folder = Path(path)
+    created = []
+    try:
+        created = [parent for parent in (folder, *folder.parents) if not parent.exists()]
+    # Such as a name that is too long, which writable_folder reports.
+    except (OSError, ValueError):
+        pass
+    try:
+        yield writable_folder(folder)
+    except BaseException:
+        for empty in created:
+            try:
+                empty.rmdir()
+            except OSError:
+                break
+        raise
+
+
 def sweep(folder: Path) -> bool:
     """Remove files in ``folder`` that ``atomic_write`` of killed processes has left; those of running processes are
     locked.

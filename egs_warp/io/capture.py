@@ -22,15 +22,18 @@ from egs_warp.io.sog import SogFiles, decode_sog
 from egs_warp.io.splat import SPLAT_ROW, decode_splat
 from egs_warp.io.spz import decode_spz
 from egs_warp.io.streamed_sog import decode_streamed_sog
+from egs_warp.short_repr import short_repr
 
 _META, _STREAMED_META = "meta.json", "lod-meta.json"
 
 
-@dataclass(frozen=True)
-class Capture:
-    """A capture as read from disk, in the axes and units of its file, relative to its ``origin``."""
+@dataclass(frozen=True, kw_only=True)
+class Capture(GaussianCloud):
+    """A capture as read from disk, in the axes and units of its file, relative to its ``origin``: a cloud, with facts
+    about the file."""
 
-    cloud: GaussianCloud
+    __repr__ = short_repr
+
     source: Path
     format: str
     """Name for the user, such as ``.spz version 2``."""
@@ -49,9 +52,10 @@ class Capture:
     """(n,) numbers of the Gaussians in the file; None if all of them were read in order."""
 
     @property
-    def antialiased(self) -> bool:
-        """True if the file states that it was trained with antialiasing; the renderer then draws it so."""
-        return self.cloud.antialiased
+    def cloud(self) -> GaussianCloud:
+        """The Gaussians alone."""
+        arrays = (self.means, self.rotations, self.log_scales, self.opacity_logits, self.sh)
+        return GaussianCloud(*arrays, antialiased=self.antialiased)
 
 
 def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
@@ -83,7 +87,18 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
         antialiased=raw.antialiased,
         device=device,
     )
-    return Capture(cloud, source, raw.format, infinite_count, raw.up, raw.vertical_axis, notes, origin, raw.rows)
+    return Capture(
+        *(cloud.means, cloud.rotations, cloud.log_scales, cloud.opacity_logits, cloud.sh),
+        antialiased=cloud.antialiased,
+        source=source,
+        format=raw.format,
+        infinite_opacities=infinite_count,
+        up=raw.up,
+        vertical_axis=raw.vertical_axis,
+        notes=notes,
+        origin=origin,
+        rows=raw.rows,
+    )
 
 
 def _decode(source: Path) -> RawCapture:

@@ -12,7 +12,7 @@ import stat
 import warnings
 from pathlib import Path
 
-from egs_warp.errors import UserError
+from egs_warp.errors import UserError, did_you_mean
 
 MAX_TEXT_BYTES = 32 << 20
 """Maximum size of JSON and other text in bytes; parsed, they take some thirty times as much memory."""
@@ -90,7 +90,7 @@ def read_bytes(path: Path | str, *, at_most: int | None = None, missing: str = "
                 )
             return file.read()
     except FileNotFoundError as error:
-        raise UserError(f"{path}: no such file or folder; {missing}") from error
+        raise missing_error(path, missing) from error
     except IsADirectoryError as error:
         raise UserError(f"{path}: is a folder; give a file") from error
     except UserError:
@@ -99,3 +99,12 @@ def read_bytes(path: Path | str, *, at_most: int | None = None, missing: str = "
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise UserError(f"{path}: cannot be read ({reason}); check the path and its permissions") from error
+
+
+def missing_error(path: Path | str, advice: str = "check the path") -> UserError:
+    """Return the error about a missing ``path``, with the name in its folder that may be meant."""
+    try:
+        names = sorted(os.listdir(Path(path).parent))
+    except (OSError, ValueError):
+        names = []
+    return UserError(f"{path}: no such file or folder{did_you_mean(Path(path).name, names)}; {advice}")

@@ -4,11 +4,11 @@ backed up."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from egs_warp.errors import ArgumentError, UserError
-from egs_warp.io.atomic import lock, sweep_all, writable_folder
+from egs_warp.io.atomic import lock, result_folder, sweep_all
 from egs_warp.io.run_folder import back_up, check_out
 
 
@@ -32,8 +32,11 @@ def named_files(*paths: Path, overwrite: bool = False) -> Iterator[NamedFiles]:
     (``overwrite``).
     """
     check_named_files(*paths, overwrite=overwrite)
-    folders = [writable_folder(folder) for folder in dict.fromkeys(path.parent for path in paths)]
-    with lock(paths[0].parent / f".egs-{paths[0].name}.lock") as acquired:
+    with ExitStack() as stack:
+        folders = [
+            stack.enter_context(result_folder(folder)) for folder in dict.fromkeys(path.parent for path in paths)
+        ]
+        acquired = stack.enter_context(lock(paths[0].parent / f".egs-{paths[0].name}.lock"))
         if not acquired:
             raise UserError(f"{paths[0]}: another run is writing this file; wait for it, or choose another name")
         # Files may have been created between the check and the lock.

@@ -17,16 +17,20 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from egs_warp.errors import ArgumentError, UserError
-from egs_warp.io.atomic import atomic_write, lock, sweep, sweep_all, writable_folder
+from egs_warp.io.atomic import atomic_write, lock, result_folder, sweep, sweep_all
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.version import __version__
 
 MANIFEST = "manifest.json"
+CONFIG = "run.yaml"
+"""File with the flags of a run, from which the command resumes it."""
 ANIMATE = "animate"
 """The command whose runs can be resumed."""
 _LOCK = ".egs-run.lock"
 _SCHEMA = 1
+_FILE_ENDINGS = (".mp4", ".mov", ".webm", ".png", ".ply", ".spz", ".splat", ".sog", ".glb", ".json", ".npz", ".yaml")
+"""Endings of files, which no folder of results has."""
 
 
 class RunFolder:
@@ -134,8 +138,7 @@ def run_folder(
         yield out
         return
     _check(out, overwrite=overwrite, resume=resume)
-    folder = writable_folder(out)
-    with lock(folder / _LOCK) as acquired:
+    with result_folder(out) as folder, lock(folder / _LOCK) as acquired:
         if not acquired:
             raise UserError(f"{out}: another run is writing into this folder; wait for it, or choose another folder")
         # Files may have been created between the check and the lock.
@@ -165,6 +168,14 @@ def _check(out: Path | str, *, overwrite: bool, resume: bool) -> None:
         raise UserError(f"{out}: this run has finished; there is nothing to resume")
 
 
+def is_interrupted(folder: Path) -> bool:
+    """Return True if a run of ``animate`` in ``folder`` has written files, but not all of them."""
+    manifest = _manifest(folder) if (folder / MANIFEST).is_file() else None
+    if not isinstance(manifest, dict) or manifest.get("finished") is not False or _is_unfinished(folder):
+        return False
+    return manifest.get("command", ANIMATE) == ANIMATE
+
+
 def has_finished(out: Path | str) -> bool:
     """Return True if the run in the folder ``out`` has written all of its files. Raises ``UserError`` if there is no
     run that can be resumed, or one of another version."""
@@ -192,6 +203,9 @@ def check_run_folder(out: Path | str, *, overwrite: bool = False, writes: Sequen
     """Raise the ``UserError`` of ``run_folder``, and of the files that the run ``writes``, as far as it is predictable,
     without creating anything, before any long computation."""
     check_out(out)
+    if Path(out).suffix.lower() in _FILE_ENDINGS and not Path(out).is_dir():
+        problem = f"the results are a folder of files; give a name without {Path(out).suffix}"
+        raise ArgumentError("out", problem, value=out)
     if overwrite:
         return
     if (Path(out) / MANIFEST).is_file() and not _is_unfinished(Path(out)):

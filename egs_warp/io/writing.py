@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.errors import UserError
+from egs_warp.errors import UserError, did_you_mean
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.compressed_ply import write_compressed_ply
 from egs_warp.io.glb import write_glb
@@ -43,6 +43,11 @@ def write_capture(
     return None
 
 
+def is_capture_name(path: Path) -> bool:
+    """Return True if ``path`` ends as a capture does; it is then the name of a file and not of a folder."""
+    return path.name.lower().endswith(tuple(ending for ending, _ in WRITERS.values()))
+
+
 def writer_of(path: Path, *, kind: str | None = None) -> CaptureWriter:
     """Return the writer for a capture at ``path``, by ``kind``, a key of ``WRITERS``, or by the ending.
 
@@ -53,7 +58,8 @@ def writer_of(path: Path, *, kind: str | None = None) -> CaptureWriter:
     ending = next((ending for ending in endings if name.endswith(ending) and name != ending), None)
     allowed = list(endings) if kind is None else [WRITERS[kind][0]]
     if ending not in allowed:
-        raise UserError(f"{path}: give a name that ends in {', '.join(allowed)}")
+        near = did_you_mean(path.suffix, allowed)
+        raise UserError(f"{path}: give a name that ends in {', '.join(allowed)}{near}")
     if path.is_dir():
         raise UserError(f"{path}: is a folder; give the name of a file")
     if kind is not None:

@@ -21,6 +21,7 @@ from egs_warp.locomotion.replay import Replay, digest
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.short_repr import short_repr
 
 FRAME_RATE = 60
 """Frames of a video, 1/s."""
@@ -40,6 +41,8 @@ class Motion(Protocol):
 @dataclass(frozen=True)
 class RolloutResult:
     """Result of a simulation."""
+
+    __repr__ = short_repr
 
     trajectory: Trajectory
     reports: tuple[StepReport, ...]

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from egs_warp.errors import UserError
+from egs_warp.errors import UserError, did_you_mean
 from egs_warp.launching import Device
 from egs_warp.locomotion.active_set import WhitenedQp, solve_from_guess
 from egs_warp.locomotion.admm import AdmmStatus
@@ -59,7 +59,8 @@ class QpSolver(Enum):
 
     @classmethod
     def _missing_(cls, value: object) -> QpSolver:
-        raise UserError(f"QP solver {value!r} is not known; give one of {', '.join(one.value for one in cls)}")
+        names = [one.value for one in cls]
+        raise UserError(f"QP solver {value!r} is not known{did_you_mean(value, names)}; give one of {', '.join(names)}")
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,7 @@ from egs_warp.locomotion.synergies import Synergies, find_synergies
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy, activation_jacobian
+from egs_warp.short_repr import short_repr
 
 MAX_HALVINGS = 4
 """Maximum number of successive halvings of a step that does not converge."""
@@ -72,6 +73,8 @@ class WarmStart:
 @dataclass(frozen=True)
 class StepReport:
     """Result of one step."""
+
+    __repr__ = short_repr
 
     state: BodyState
     """State at the end of the step."""

@@ -12,7 +12,7 @@ from enum import Enum
 import numpy as np
 import warp as wp
 
-from egs_warp.errors import UserError
+from egs_warp.errors import UserError, did_you_mean
 from egs_warp.launching import Device
 from egs_warp.locomotion.branch_and_bound import exact_states
 from egs_warp.locomotion.complementarity import (
@@ -73,7 +73,8 @@ class Strategy(Enum):
 
     @classmethod
     def _missing_(cls, value: object) -> Strategy:
-        raise UserError(f"strategy {value!r} is not known; give one of {', '.join(one.value for one in cls)}")
+        names = [one.value for one in cls]
+        raise UserError(f"strategy {value!r} is not known{did_you_mean(value, names)}; give one of {', '.join(names)}")
 
 
 @dataclass(frozen=True)

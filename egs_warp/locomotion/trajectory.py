@@ -13,6 +13,7 @@ from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.io.arrays import read_npz
 from egs_warp.io.atomic import atomic_write
+from egs_warp.short_repr import short_repr
 
 SCHEMA = 3
 """Version of ``trajectory.npz`` (docs/guide/report.md)."""
@@ -43,6 +44,8 @@ class Trajectory:
 
     The frame is the body's own. ``body_axes``, ``body_origin`` and ``metres_per_unit`` place it in the capture.
     """
+
+    __repr__ = short_repr
 
     time: np.ndarray
     """(F+1,) s."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -40,21 +40,21 @@ USUAL_HOLD_TIME = 1.5
 
 @dataclass(frozen=True)
 class FollowPlan:
-    """Number and duration of the key frames, and the largest error so far."""
+    """Number and duration of the key frames, and the largest errors so far."""
 
     keys: float
     duration: float
     """Seconds."""
-    worst_miss: float
-    """Largest error at a key, in the unit of its quantity."""
+    worst_miss: Mapping[str, float]
+    """Largest error at a key of each quantity that has one, by its name and in its unit."""
 
 
 @dataclass(frozen=True)
 class FollowOutcome:
     """Measured result of following key frames."""
 
-    worst_miss: float
-    """Largest error at a key, in the unit of its quantity."""
+    worst_miss: Mapping[str, float]
+    """Largest error at a key of each quantity that has one, by its name and in its unit."""
 
 
 class FollowPhase(Enum):
@@ -106,15 +106,18 @@ class Follow:
         return self.phase is FollowPhase.REST
 
     def plan_record(self) -> FollowPlan:
-        """Return the number of keys, their duration and the largest error so far."""
-        misses = [float(np.linalg.norm(self._miss(index))) for index in self._reached]
-        return FollowPlan(float(len(self.keys)), self._end, max(misses, default=0.0))
+        """Return the number of keys, their duration and the largest errors so far."""
+        misses: dict[str, float] = {}
+        for index in self._reached:
+            name = self.keys[index].quantity.value
+            misses[name] = max(misses.get(name, 0.0), float(np.linalg.norm(self._miss(index))))
+        return FollowPlan(float(len(self.keys)), self._end, misses)
 
     def planned_com(self, elapsed: float) -> None:
         """Return None: keys refer to parts of the body."""
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> FollowOutcome:
-        """Return the largest error of all keys."""
+        """Return the largest error of the keys of each quantity."""
         return FollowOutcome(self.plan_record().worst_miss)
 
     def notes(self) -> list[str]:

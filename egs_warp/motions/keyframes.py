@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from egs_warp.errors import UserError
+from egs_warp.errors import UserError, did_you_mean
 from egs_warp.io.text import parse_json, read_text
 
 
@@ -112,6 +112,23 @@ def read_keyframes(path: Path) -> tuple[Key, ...]:
     return tuple(keys)
 
 
+def checked_keys(keys: Sequence[Key]) -> tuple[Key, ...]:
+    """Return ``keys`` with the checks of a file.
+
+    Raises:
+        UserError: for the first malformed key, by its number.
+    """
+    if not keys:
+        raise UserError("keys: no key frames; give at least one")
+    checked = []
+    for number, key in enumerate(keys, start=1):
+        quantity = key.quantity.value if isinstance(key.quantity, Quantity) else key.quantity
+        entry = {"time": key.time, "part": key.part, "quantity": quantity, "value": list(key.value)}
+        checked.append(_key({**entry, "weight": key.weight}, f"key {number}"))
+    channels(checked)
+    return tuple(checked)
+
+
 def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
     """Group keys by part and quantity.
 
@@ -196,15 +213,19 @@ def _key(entry: Mapping[str, Any], where: str) -> Key:
             raise UserError(f'{where}: "{name}" is missing; a key has {", ".join(_FIELDS[:4])}')
     for name in entry:
         if name not in _FIELDS:
-            raise UserError(f'{where}: "{name}" is unknown; a key has {", ".join(_FIELDS)}')
+            raise UserError(
+                f'{where}: "{name}" is unknown{did_you_mean(name, _FIELDS)}; a key has {", ".join(_FIELDS)}'
+            )
     part, quantity, value = entry["part"], entry["quantity"], entry["value"]
     if part not in PARTS and not (isinstance(part, str) and _NUMBERED_FOOT.fullmatch(part)):
         raise UserError(
-            f"{where}: part {part!r} is unknown; give one of {', '.join(PARTS)}, or of several feet foot 1, foot 2, ..."
+            f"{where}: part {part!r} is unknown{did_you_mean(part, PARTS)}; give one of {', '.join(PARTS)}, or of"
+            " several feet foot 1, foot 2, ..."
         )
     names = [member.value for member in Quantity]
     if quantity not in names:
-        raise UserError(f"{where}: quantity {quantity!r} is unknown; give one of {', '.join(names)}")
+        near = did_you_mean(quantity, names)
+        raise UserError(f"{where}: quantity {quantity!r} is unknown{near}; give one of {', '.join(names)}")
     time = _number(entry["time"])
     if not 0.0 < time <= MAX_TIME:
         raise UserError(f"{where}: time {entry['time']!r}: give seconds above 0, at most {MAX_TIME:g}")

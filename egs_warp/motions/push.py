@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from egs_warp.errors import ArgumentError, UserError
+from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.motions.sequence import Stance
 
 DIRECTIONS: Mapping[str, tuple[float, float, float]] = {
@@ -133,7 +133,8 @@ def _push(piece: str, where: str) -> Push:
     start = _number(times[1], "time", "seconds", 0.0, MAX_TIME, where)
     end = start if times[2] is None else _number(times[2], "time", "seconds", start, MAX_TIME, where)
     if words[2] not in DIRECTIONS:
-        raise UserError(f"{where}: unknown direction {words[2]!r}; give one of {', '.join(DIRECTIONS)}")
+        near = did_you_mean(words[2], DIRECTIONS)
+        raise UserError(f"{where}: unknown direction {words[2]!r}{near}; give one of {', '.join(DIRECTIONS)}")
     size = _number(words[1], "impulse", "m sqrt(g H)", 0.0, MAX_IMPULSE, where)
     height = _number(words[3], "height", "body heights", 0.0, 1.0, where) if len(words) == 4 else None
     return Push(start, size * np.array(DIRECTIONS[words[2]]), height, end - start)

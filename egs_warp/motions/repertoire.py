@@ -178,6 +178,8 @@ def _trajectory_tasks(request: MotionRequest, height: float) -> list[MotionTask]
 
 
 def _keys(request: MotionRequest) -> tuple[Key, ...]:
+    if request.keys is not None:
+        return request.keys
     assert request.file is not None
     return read_keyframes(request.file)
 
@@ -289,10 +291,24 @@ MOTIONS: Mapping[str, MotionKind] = {
 }
 
 
+def _own_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
+    assert request.begin is not None
+    return _repeat_task(request, request.asked, request.begin)
+
+
+_OWN = MotionKind((), _own_tasks, lambda request: int(np.ceil(60.0 * request.seconds)), jumps=True)
+"""Motion of the user's own class, which may jump."""
+
+
+def kind_of_request(request: MotionRequest) -> MotionKind:
+    """Return the kind of the motion of ``request``."""
+    return MOTIONS[request.name] if request.begin is None else _OWN
+
+
 def tasks_of_request(request: MotionRequest, height: float) -> list[MotionTask]:
     """Return the tasks of ``request``, with all repeats, for a body of ``height`` metres, in the style of the request
     if it has one."""
-    parts, style = MOTIONS[request.name].build_tasks(request, height), request.style
+    parts, style = kind_of_request(request).build_tasks(request, height), request.style
     if style is None:
         return parts
     return [replace(part, begin=partial(_begin_with_style, style, part.begin)) for part in parts]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from egs_warp.motions.command import DrivePlan
+from egs_warp.motions.keyframes import Key
+from egs_warp.motions.sequence import BodyMotion, Stance
 from egs_warp.motions.style import Style
 
 MAX_TARGET = 10.0
@@ -27,5 +29,11 @@ class MotionRequest:
     """File of key frames of a trajectory, points of a path, speeds of a drive, or beats of a dance."""
     drive: DrivePlan | None = None
     """Commands of a drive without a file."""
+    keys: tuple[Key, ...] | None = None
+    """Key frames of a trajectory without a file."""
+    begin: Callable[[Stance], BodyMotion] | None = None
+    """Creation of a motion that is not in the registry."""
+    seconds: float = 0.0
+    """Time limit of such a motion, s."""
     style: Style | None = None
     """Style of its jumps, if it differs from that of the run."""

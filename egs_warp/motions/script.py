@@ -9,21 +9,26 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-from egs_warp.errors import ArgumentError, UserError
+from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.io.text import parse_json, read_text, whole_number
 from egs_warp.motions.beats import parse_beats
 from egs_warp.motions.command import Drive, DrivePlan
-from egs_warp.motions.repertoire import MOTIONS, MotionKind, tasks_of_request
+from egs_warp.motions.keyframes import Key, checked_keys
+from egs_warp.motions.repertoire import MOTIONS, MotionKind, kind_of_request, tasks_of_request
 from egs_warp.motions.request import MotionRequest
-from egs_warp.motions.sequence import MotionTask, Stance
+from egs_warp.motions.sequence import BodyMotion, MotionTask, Stance
 from egs_warp.motions.style import Style, read_style
 
+MotionFactory: TypeAlias = "Callable[[Stance], BodyMotion]"
+"""Creation of a motion from the stance of a body."""
 MAX_MOTIONS = 100
+_MAX_SECONDS = 3600.0
+"""Largest time limit of a motion of the user's own class, s."""
 _NAMES = ", ".join(MOTIONS)
 _BEATS_FILE = "file of beats"
 """Key of the file of beats among the default values of a script."""
@@ -31,9 +36,12 @@ _BEATS_FILE = "file of beats"
 
 @dataclass(frozen=True)
 class Script:
-    """Sequence of motions."""
+    """Sequence of motions; ``+`` appends another one."""
 
     requests: tuple[MotionRequest, ...]
+
+    def __add__(self, other: Script) -> Script:
+        return Script((*self.requests, *other.requests))
 
     @property
     def name(self) -> str:
@@ -48,7 +56,7 @@ class Script:
         Raises:
             UserError: for an invalid file.
         """
-        frames = sum(request.repeat * MOTIONS[request.name].frames(request) for request in self.requests)
+        frames = sum(request.repeat * kind_of_request(request).frames(request) for request in self.requests)
         return round(frames * max(1.0, height**0.5))
 
     def style(self, text: str | None) -> Style:
@@ -59,7 +67,7 @@ class Script:
         """
         if text is None:
             return Style()
-        if not any(MOTIONS[request.name].jumps for request in self.requests):
+        if not any(kind_of_request(request).jumps for request in self.requests):
             raise ArgumentError("style", f"nothing jumps in {self.name!r}; add a jump, hop, twist or dance")
         return read_style(text)
 
@@ -120,6 +128,35 @@ def drive_script(*steps: tuple[float, Drive]) -> Script:
     """
     plan = DrivePlan(tuple(time for time, _ in steps), tuple(command for _, command in steps))
     return Script((MotionRequest("drive", {}, drive=plan),))
+
+
+def keyframe_script(*keys: Key) -> Script:
+    """Return a script of one ``trajectory`` through ``keys``, in the order of their times.
+
+    Raises:
+        UserError: for the first malformed key, by its number.
+    """
+    return Script((MotionRequest("trajectory", {}, keys=checked_keys(keys)),))
+
+
+def own_script(name: str, begin: MotionFactory, *, seconds: float) -> Script:
+    """Return a script of one motion of your own class.
+
+    Args:
+        name: name in reports and of the video, which is not that of a built-in motion.
+        begin: returns the motion of a body from its stance; each ``BodyMotion`` has the attributes of the protocol.
+        seconds: time limit of a body of 1 m; the motion is cut off after it.
+
+    Raises:
+        ArgumentError: for a name that is taken or not that of a file, and for a time limit that is not positive.
+    """
+    if not re.fullmatch(r"[\w -]{1,60}", name) or name in MOTIONS:
+        raise ArgumentError(
+            "name", "give letters, digits and spaces, and not the name of a built-in motion", value=name
+        )
+    if not 0.0 < seconds <= _MAX_SECONDS:
+        raise ArgumentError("seconds", f"give a time above 0, at most {_MAX_SECONDS:g} s", value=seconds)
+    return Script((MotionRequest(name, {}, begin=begin, seconds=seconds),))
 
 
 def _from_words(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRequest:
@@ -200,7 +237,7 @@ def _is_number(word: str) -> bool:
 
 def _kind(name: str, where: str) -> MotionKind:
     if name not in MOTIONS:
-        raise UserError(f"{where}: unknown motion {name!r}; known motions are: {_NAMES}")
+        raise UserError(f"{where}: unknown motion {name!r}{did_you_mean(name, MOTIONS)}; known motions are: {_NAMES}")
     return MOTIONS[name]
 
 
@@ -211,7 +248,7 @@ def _request(
     known = {value.name: value for value in kind.parameters}
     for key in values:
         if key not in known:
-            raise UserError(f"{where}: {key!r} is unknown; {kind.usage(name)}")
+            raise UserError(f"{where}: {key!r} is unknown{did_you_mean(key, known)}; {kind.usage(name)}")
     if not 1 <= repeat <= MAX_MOTIONS:
         raise UserError(f"{where}: repeat {repeat}; give a whole number from 1 to {MAX_MOTIONS}")
     if file is None and kind.file is not None:

@@ -20,6 +20,7 @@ from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.limbs import Limbs
 from egs_warp.motions.stance import GroundFrame, heading_between, sole_shares
 from egs_warp.motions.style import Style
+from egs_warp.short_repr import short_repr
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -34,6 +35,8 @@ REMAINING_TIME_FRACTION = 0.03
 @dataclass(frozen=True)
 class Stance:
     """Stance of a body: its standing pose, upright and at rest, on a ground frame with a forward direction."""
+
+    __repr__ = short_repr
 
     body: SoftBody
     ground: GroundFrame

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
-from egs_warp.errors import ArgumentError
+from egs_warp.errors import ArgumentError, did_you_mean
 from egs_warp.motions.values import Value
 
 MIN_FACTOR, MAX_FACTOR = 0.5, 2.0
@@ -60,7 +60,8 @@ def read_style(text: str) -> Style:
         elif equals and name in _NAMES:
             values[name] = Value(name, 1.0, MIN_FACTOR, MAX_FACTOR, "times the usual").parse(value, "style")
         else:
-            raise ArgumentError("style", f"unknown word {word!r}; give {_usage()}")
+            near = did_you_mean(name, _NAMES if equals else (*PRESETS, *_NAMES))
+            raise ArgumentError("style", f"unknown word {word!r}{near}; give {_usage()}")
     return Style(**values)
 
 

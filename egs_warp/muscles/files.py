@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from egs_warp.errors import UserError
+from egs_warp.errors import UserError, did_you_mean
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.frames import orthonormal_basis
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
@@ -105,7 +105,8 @@ def _fibres(
     where = f'{path}: fibre "{name}"'
     kind = entry.get("kind")
     if not isinstance(kind, str) or kind not in _SHAPES:
-        raise UserError(f'{where} has the kind {json.dumps(kind)}; give "kind" as one of {", ".join(_SHAPES)}')
+        near = did_you_mean(kind, _SHAPES)
+        raise UserError(f'{where} has the kind {json.dumps(kind)}{near}; give "kind" as one of {", ".join(_SHAPES)}')
     shape, shape_keys, fibre_kind = _SHAPES[kind]
     _refuse_unknown_keys(where, entry, _COMMON_KEYS | shape_keys)
     if "strength" in entry and "stiffness" in entry:
@@ -211,7 +212,9 @@ def _check(path: Path, fibres: list[Fibre], mesh: TetMesh, frame: BodyFrame) -> 
 def _refuse_unknown_keys(where: str, entry: dict[str, Any], known: set[str]) -> None:
     for key in entry:
         if key not in known:
-            raise UserError(f'{where}: "{key}" is not known here; use {", ".join(sorted(known))}')
+            raise UserError(
+                f'{where}: "{key}" is not known here{did_you_mean(key, known)}; use {", ".join(sorted(known))}'
+            )
 
 
 def _is_number(value: Any) -> bool:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from egs_warp.errors import ArgumentError
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.frames import Direction, direction_of
+from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
@@ -17,6 +19,7 @@ from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.request import MAX_TARGET, MAX_TURN
+from egs_warp.motions.script import Script
 from egs_warp.motions.script import motion as script
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.capture_warnings import capture_warnings
@@ -59,8 +62,9 @@ class AnimateOptions:
     """Width and height of the video, pixels, if ``shot`` has no size."""
     shadow: bool = True
     """Draw a shadow on the ground under the object."""
-    view_from: np.ndarray | None = None
-    """(3,) Direction from the object to the camera, in the capture's frame; of several (n, 3) the best is chosen."""
+    view_from: Direction | None = None
+    """(3,) Direction from the object to the camera, in the capture's frame, or an axis; of several (n, 3) the best is
+    chosen."""
     shot: Shot = field(default_factory=Shot)
     """Camera motion, size, frame rate and background colour of the video."""
     creature: CreatureOptions = field(default_factory=CreatureOptions)
@@ -91,10 +95,17 @@ class AnimateOptions:
         """Return the targets by the names that ``script`` uses."""
         return {"distance": self.distance, "height": self.height, "heading_degrees": self.heading_degrees}
 
+    def directions_to_camera(self) -> np.ndarray | None:
+        """Return ``view_from`` as (3,) or (n, 3) numbers."""
+        directions = self.view_from
+        if directions is None or (not isinstance(directions, str) and np.ndim(directions) == 2):
+            return None if directions is None else np.asarray(directions)
+        return direction_of(directions, "view_from")
+
     def to_json(self, *, up: np.ndarray | None = None, plane: Plane | None = None) -> dict[str, JsonValue]:
         """Return ``asked`` of the report, with ``up`` and ``plane`` of the run; what was not given is null."""
         creature, solver = self.creature, self.creature.settings and self.creature.settings.qp_solver
-        view_from = None if self.view_from is None or np.asarray(self.view_from).ndim != 1 else self.view_from
+        view_from = self.directions_to_camera()
         return {
             **self.targets(),
             "frames": self.frames,
@@ -107,7 +118,7 @@ class AnimateOptions:
             **self.shot.to_json(),
             "up": _numbers(up),
             "plane": None if plane is None else [*map(float, plane.normal), plane.offset],
-            "view_from": _numbers(view_from),
+            "view_from": None if view_from is None or view_from.ndim != 1 else _numbers(view_from),
             "gravity_up": _numbers(creature.gravity_up),
             "front": _numbers(creature.front),
             "push": self.push or None,
@@ -123,14 +134,15 @@ def animate(
     cloud: GaussianCloud,
     out: Path | str | RunFolder,
     *,
-    motion: str = "jump",
-    up: np.ndarray | None = None,
+    motion: Script | str = "jump",
+    up: Direction | None = None,
     plane: Plane | None = None,
     background: GaussianCloud | None = None,
     options: AnimateOptions | None = None,
     overwrite: bool = False,
     resume: bool = False,
     quiet: bool = False,
+    show_note: Callable[[str], object] = lambda note: None,
 ) -> Report:
     """Animate a capture, and write video, contact sheet, plots, report and trajectory into ``out``.
 
@@ -140,14 +152,15 @@ def animate(
     Args:
         cloud: The capture of a single object, scene units.
         out: Folder for the files.
-        motion: One motion, several in a row, or the name of a JSON script (``egs_warp.motions.script``).
-        up: (3,) Up in the capture's frame (``make_creature``).
+        motion: One motion, several in a row, the name of a JSON script, or a script (``egs_warp.motions.script``).
+        up: (3,) Up in the capture's frame, or an axis (``make_creature``).
         plane: Ground plane in the capture's frame (``make_creature``).
         background: Gaussians behind the object, in the capture's frame and units; None draws a plain floor.
         options: Targets, video and creature; None is the default.
         overwrite: Move an earlier run in ``out`` aside.
         resume: Continue the interrupted run in ``out``; equal arguments give equal bits.
         quiet: Show no progress bars.
+        show_note: Called once with each note for the user beyond ``options.notes``, as soon as it is known.
 
     Returns:
         The contents of ``report.json`` (docs/guide/report.md).
@@ -155,9 +168,12 @@ def animate(
     Raises:
         UserError: An argument is invalid; files of an earlier run are not touched.
     """
+    check_cloud(cloud)
     options = options or AnimateOptions()
     options.shot.check()
-    requested_motion = script(motion, beats=options.beats, **options.targets())
+    view_from = options.directions_to_camera()
+    up = None if up is None else direction_of(up, "up")
+    requested_motion = _requested(motion, options)
     requested_motion.frames()  # Reads the files that the motions name.
     jump_style = requested_motion.style(options.style)
     pushes = read_pushes(options.push) if options.push is not None else ()
@@ -165,11 +181,12 @@ def animate(
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
         with preparation_bar(quiet=quiet) as begin_stage:
             creature = make_creature(cloud, up=up, plane=plane, options=options.creature, progress=begin_stage)
-        notes = options.notes
-        if options.creature.front is None:
-            notes = (*notes, creature.front.description(creature.frame))
+        fronts = () if options.creature.front is not None else (creature.front.description(creature.frame),)
         cage, height = creature.cage, creature.body.height
-        notes = (*notes, *capture_warnings(creature.cloud, cage.mesh, height, thickening=cage.thickening))
+        warnings = capture_warnings(creature.cloud, cage.mesh, height, thickening=cage.thickening)
+        notes = [*creature.notes, *fronts, *warnings]
+        for note in notes:
+            show_note(note)
         with simulation_bar(quiet=quiet) as show_progress:
             performance = simulate(
                 creature,
@@ -195,7 +212,7 @@ def animate(
             size=options.size,
             shot=options.shot,
             background=background,
-            view_from=options.view_from,
+            view_from=view_from,
             shadow=options.shadow,
             quiet=quiet,
         )
@@ -206,22 +223,35 @@ def animate(
         coverage_warning = ground_coverage_warning(
             simulation.trajectory.positions[-1], placed_background, creature.solids[0], creature.body.height
         )
-        notes = (*notes, *performance.unfinished_note(), *coverage_warning)
+        for note in (last_notes := (*performance.unfinished_note(), *coverage_warning)):
+            show_note(note)
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
             *(performance.sequence.done, energy),
             gaussians=GaussianCounts.of(creature, film.splats.count),
             drawing=film.milliseconds,
             source=options.source,
-            notes=notes,
+            notes=(*options.notes, *notes, *last_notes),
             seed=options.seed,
             asked=options.to_json(up=up, plane=plane),
             ending=performance.ending,
+            film=film.file,
         )
         report.write(run.file("report.json"))
         if not isinstance(out, RunFolder):
             run.finish()
     return report
+
+
+def _requested(motion: Script | str, options: AnimateOptions) -> Script:
+    """Return the script of ``animate``. Raises ``ArgumentError`` for targets beside a script, which has its own."""
+    given = {"beats": options.beats, **options.targets()}
+    if isinstance(motion, str):
+        return script(motion, **given)
+    for name, value in given.items():
+        if value is not None:
+            raise ArgumentError(name, "the motion is a script with numbers of its own; give one of them", value=value)
+    return motion
 
 
 def _recorded(run: RunFolder) -> Path | None:
@@ -230,5 +260,5 @@ def _recorded(run: RunFolder) -> Path | None:
     return folder if run.resumed and any(folder.glob("*.npz")) else None
 
 
-def _numbers(vector: np.ndarray | None) -> tuple[float, ...] | None:
-    return None if vector is None else tuple(float(x) for x in vector)
+def _numbers(vector: Direction | None) -> tuple[float, ...] | None:
+    return None if vector is None else tuple(map(float, direction_of(vector, "direction")))

@@ -14,10 +14,12 @@ from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.frames import Direction, direction_of
+from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
+from egs_warp.io.capture import Capture
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.settling import SHAPE_TOLERANCE, settle, settle_as_captured
@@ -33,7 +35,8 @@ from egs_warp.motions.style import Style
 from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
 from egs_warp.pipelines.facing_direction import Front, find_front
-from egs_warp.segmentation.base_plane import find_base_plane
+from egs_warp.segmentation.base_plane import find_base_plane, guess_up
+from egs_warp.short_repr import short_repr
 
 MIN_SAG = 0.004
 """Fraction of the height: a body that its weight bends is made stiffer until its sag is below this."""
@@ -68,16 +71,17 @@ class CreatureOptions:
     """Approximate number of cage nodes."""
     muscles_file: Path | None = None
     """Muscles (JSON, ``egs_warp.muscles.files``); None creates automatic ones."""
-    front: np.ndarray | None = None
-    """(3,) Direction in which the body faces and moves; None estimates it (``find_front``)."""
+    front: Direction | None = None
+    """(3,) Direction in which the body faces and moves, or an axis; None estimates it (``find_front``)."""
     seen_from: np.ndarray | None = None
     """(3,) Mean of the unit vectors from the object to the cameras of its photos, for the estimate of ``front``."""
     friction: float = 0.8
     """Coulomb coefficient of the ground, 0 to 10."""
     ground: HeightField | None = None
     """Ground that is not flat, in place of a plane."""
-    gravity_up: np.ndarray | None = None
-    """(3,) Direction against gravity; None is the normal of the ground, other directions make it a slope."""
+    gravity_up: Direction | None = None
+    """(3,) Direction against gravity, or an axis; None is the normal of the ground, other directions make it a slope.
+    """
     solids: tuple[Solid, ...] = ()
     """Steps and walls beside the ground."""
     settings: LocomotionSettings | None = None
@@ -97,6 +101,8 @@ class CreatureOptions:
 class Creature:
     """A capture with a cage, a body, muscles and a ground, at rest; metres, all in the frame of the body."""
 
+    __repr__ = short_repr
+
     frame: BodyFrame
     """Frame of the body in the capture."""
     cloud: GaussianCloud
@@ -113,6 +119,8 @@ class Creature:
     """State at rest on the ground."""
     solids: tuple[Surface, ...]
     """Surfaces that the body can touch, the ground first."""
+    notes: tuple[str, ...] = ()
+    """Guesses about the capture, for the user."""
 
     def placed(self, cloud: GaussianCloud) -> GaussianCloud:
         """Transform another cloud of the same capture, such as its background, to the frame of the body."""
@@ -147,7 +155,7 @@ class Creature:
 def make_creature(
     cloud: GaussianCloud,
     *,
-    up: np.ndarray | None = None,
+    up: Direction | None = None,
     plane: Plane | None = None,
     options: CreatureOptions | None = None,
     progress: Callable[[str], object] = lambda stage: None,
@@ -155,26 +163,33 @@ def make_creature(
     """Create a creature from a capture of a single object, at rest on the ground.
 
     All arguments are in the frame and units of the capture; the result is in the frame of the body, so it does not
-    depend on the frame of the file. One of ``plane``, ``up`` and ``options.ground`` is required.
+    depend on the frame of the file.
 
     Args:
         cloud: The capture.
-        up: (3,) Up; without a ``plane``, the ground is the base of the object, orthogonal to ``up``.
+        up: (3,) Up, or an axis such as ``"-y"``; without a ``plane``, the ground is the base of the object, orthogonal
+            to ``up``. Without ``plane``, ``up`` and ``options.ground``, up is that of the file, else estimated
+            (``guess_up``), with a note.
         plane: Ground plane.
         options: Body, muscles, ground and solver; None is the default.
         progress: Called with the name of each stage as it starts.
 
     Raises:
-        UserError: The ground is unknown or too steep, or the capture gives no body.
+        UserError: An argument is invalid, the ground is too steep, or the capture gives no body.
     """
+    check_cloud(cloud)
     options = options or CreatureOptions()
-    ground, gravity_up, front, sag = options.ground, options.gravity_up, options.front, options.sag
+    ground, sag, notes = options.ground, options.sag, ()
+    gravity_up = None if options.gravity_up is None else direction_of(options.gravity_up, "gravity_up")
+    front = None if options.front is None else direction_of(options.front, "front")
+    up = None if up is None else direction_of(up, "up")
     if ground is not None:
         plane = plane_below(cloud, ground)
+    if plane is None and up is None:
+        up, note = estimated_up(cloud, advice="give up")
+        notes = (note,)
     normal = plane.normal if plane is not None else up
-    if normal is None:
-        advice = "neither the ground nor which way is up is known; give one of them"
-        raise ArgumentError("plane", advice, check=("plane", "up"))
+    assert normal is not None
     if gravity_up is not None:
         _check_slope(normal / np.linalg.norm(normal), gravity_up)
     if front is not None:
@@ -215,8 +230,18 @@ def make_creature(
         if is_stiff_enough or sag < MIN_SAG:
             surfaces = (field or Solid((GROUND,)), *solids)
             placed = to_body_frame(cloud, frame)
-            return Creature(frame, placed, facing, standing.limbs, cage, stepper, start, surfaces)
+            return Creature(frame, placed, facing, standing.limbs, cage, stepper, start, surfaces, notes)
         sag *= 0.5
+
+
+def estimated_up(cloud: GaussianCloud, *, advice: str) -> tuple[np.ndarray, str]:
+    """Return up (3,) of a capture, from its file or estimated, and a note that ends with ``advice`` for the user."""
+    file_up, vertical_axis = (cloud.up, cloud.vertical_axis) if isinstance(cloud, Capture) else (None, None)
+    up, reason = guess_up(cloud, file_up, vertical_axis=vertical_axis)
+    axis = int(np.argmax(np.abs(up)))
+    is_axis = np.abs(up[axis]) == 1.0
+    name = f"{'-' if up[axis] < 0 else '+'}{'xyz'[axis]}" if is_axis else ",".join(f"{x:.3f}" for x in up)
+    return up, f"up is estimated as {name} ({reason}); if that is wrong, {advice}"
 
 
 def plane_below(cloud: GaussianCloud, ground: HeightField) -> Plane:
@@ -255,6 +280,8 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
 @dataclass(frozen=True)
 class PlacedCage:
     """The cage of a capture, in metres and in the frame of the body."""
+
+    __repr__ = short_repr
 
     frame: BodyFrame
     """Frame of the body in the capture."""

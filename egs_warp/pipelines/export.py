@@ -11,8 +11,9 @@ from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.gaussians import with_degree
+from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.io.sequence import frame_paths
-from egs_warp.io.writing import WRITERS
+from egs_warp.io.writing import WRITERS, is_capture_name, writer_of
 from egs_warp.pipelines.finished_run import FinishedRun
 
 _Y_UP = BodyFrame(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3), 1.0)
@@ -32,7 +33,7 @@ def chosen_frames(run: FinishedRun, *, frame: int | None, every: int) -> np.ndar
 
 def export_splats(
     run: FinishedRun,
-    folder: Path | str,
+    out: Path | str,
     kind: str,
     *,
     frame: int | None = None,
@@ -40,14 +41,15 @@ def export_splats(
     degree: int | None = None,
     quiet: bool = False,
 ) -> list[Path]:
-    """Write ``frame0000.ply`` and so on into ``folder``, numbered at 60 Hz, and return the paths.
+    """Write ``frame0000.ply`` and so on into ``out``, numbered at 60 Hz, or one ``frame`` to the file ``out``; return
+    the paths.
 
     Files are in the frame and units of the capture, so that they fit its background; ``glb`` files are in metres with
     y up, as glTF requires.
 
     Args:
         run: The run to export.
-        folder: Folder for the files.
+        out: Folder for the files; for a single ``frame`` also the name of a file with the ending of its kind.
         kind: A key of ``WRITERS``.
         frame: Export this frame alone; negative numbers count from the end.
         every: Export each ``every``-th frame.
@@ -55,12 +57,20 @@ def export_splats(
         quiet: Show no progress bar.
 
     Raises:
-        UserError: The run does not have ``frame``, or ``folder`` has other frames.
+        UserError: The run does not have ``frame``, ``out`` has other frames, or is a file of another kind, of several
+            frames or of a run.
     """
     ending, write = WRITERS[kind]
-    frames = chosen_frames(run, frame=frame, every=every)
-    # Several single frames may be in one folder.
-    paths = frame_paths(folder, frames, ending, alone=frame is None)
+    frames, target = chosen_frames(run, frame=frame, every=every), Path(out)
+    if is_capture_name(target) and not target.is_dir():
+        if frame is None:
+            raise ArgumentError("out", "several frames are written; give a folder, or a single frame", value=out)
+        writer_of(target, kind=kind)
+        check_no_file_of_a_run(target)
+        paths = [target]
+    else:
+        # Several single frames may be in one folder.
+        paths = frame_paths(target, frames, ending, alone=frame is None)
     deformer = run.deformer()
     place = _Y_UP if kind == "glb" else run.capture_frame
     for index, path in zip(tqdm(frames, desc="export", unit="frame", disable=quiet), paths, strict=True):

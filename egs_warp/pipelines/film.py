@@ -16,28 +16,35 @@ from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.deformation.splitting import split_for_motion
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud, hidden_below
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.io.video import VideoWriter, contact_sheet, write_png
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.shot import Shot, nearest_steps, resized
 from egs_warp.pipelines.simulated_run import SimulatedRun
-from egs_warp.render.backdrop import Backdrop, captured_scene, grid_floor, plain_colour
+from egs_warp.render.backdrop import Backdrop, captured_scene, plain_colour, studio_floor
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.render.shadow import ContactShadow, shadow_blur_radius
+from egs_warp.short_repr import short_repr
 
 SHEET_FRAMES = 12
 """Frames on the contact sheet."""
 SPLIT_KEY_FRAMES = 24
 """Frames whose deformation decides which Gaussians are split."""
+_BELOW_GROUND = 0.005
+"""Depth below flat ground, body heights, from which the Gaussians of a capture without a scene are hidden."""
 
 
 @dataclass(frozen=True)
 class Film:
-    """Gaussians and camera of a rendered film, and its cost."""
+    """File, Gaussians and camera of a rendered film, and its cost."""
 
+    __repr__ = short_repr
+
+    file: str
+    """Name of the video in the folder of the run."""
     splats: GaussianCloud
     """Rendered Gaussians at rest, after splitting."""
     camera: Camera
@@ -98,12 +105,16 @@ def draw_film(
     steps = simulation.frames if shot.fps == FRAME_RATE else nearest_steps(trajectory.time, shot.fps)
     scene = creature.placed(background) if background is not None else None
     camera = resized(performance.camera(size, view_from, scene=scene), *(shot.size or (size, size)))
-    cameras = shot.cameras(camera, trajectory, steps)
+    cameras = shot.cameras(camera, trajectory, steps, in_scene=scene is not None)
     # The whole motion is known, so Gaussians are split before the first frame and no frame shows a sudden change.
     started = time.perf_counter()
     keys = simulation.frames[:: max(1, len(simulation.frames) // SPLIT_KEY_FRAMES)]
     embedding = embed_gaussians(creature.cloud, creature.cage.mesh)
-    split = split_for_motion(creature.cloud, embedding, [trajectory.positions[step] for step in keys])
+    cloud = creature.cloud
+    if scene is None and trajectory.ground_coefficients.size == 0:
+        # Haze of the captured ground, which would be seen below the creature in the air.
+        cloud = hidden_below(cloud, GROUND, margin=_BELOW_GROUND * trajectory.height)
+    split = split_for_motion(cloud, embedding, [trajectory.positions[step] for step in keys])
     splitting = 1e3 * (time.perf_counter() - started)
     frames = drawn_frames(
         Deformer(split.cloud, split.embedding),
@@ -135,7 +146,7 @@ def draw_film(
     labels = [f"{trajectory.time[steps[i]]:.2f} s" for i in sheet_indices]
     write_png(run.file("sheet.png"), contact_sheet(sheet_images, 4, labels))
     milliseconds["split"] = [splitting / len(steps)]
-    return Film(split.cloud, camera, milliseconds)
+    return Film(path.name, split.cloud, camera, milliseconds)
 
 
 def drawn_frames(
@@ -161,6 +172,8 @@ def drawn_frames(
     """
     path = np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
     grain, device = shadow_blur_radius(deformer.rest), deformer.rest.device
+    # Below the level of uneven ground, whose shape is not drawn, the creature is visible.
+    is_flat = trajectory.ground_coefficients.size == 0
     setting: Backdrop | None = None
     for index, (step, camera) in enumerate(zip(steps, cameras, strict=True)):
         marks = [time.perf_counter()]
@@ -173,7 +186,7 @@ def drawn_frames(
             )
         shade = setting.shadow_opacity(cloud) if shot.transparent else None
         backdrop = setting.background(cloud) if shade is None else (0.0, 0.0, 0.0)
-        image = render_gaussians(cloud, camera, background=backdrop)
+        image = render_gaussians(cloud, camera, background=backdrop, max_depth=setting.floor_depth if is_flat else None)
         wp.synchronize_device(cloud.device)
         marks.append(time.perf_counter())
         deforming, rendering = (1e3 * np.diff(marks)).tolist()
@@ -225,4 +238,4 @@ def _backdrop_of(
     ground = ContactShadow(camera, GROUND, centre=centre, reach=reach, device=device, blur_radius=grain, height=height)
     if is_plain:
         return plain_colour(ground, shot.colour or (0.0, 0.0, 0.0), shadow=shadow)
-    return grid_floor(ground, cell=0.25 * height, shadow=shadow)
+    return studio_floor(ground, cell=0.25 * height, shadow=shadow)

@@ -18,6 +18,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.arrays import READ_ERRORS
 from egs_warp.io.capture import read_capture
+from egs_warp.io.run_folder import CONFIG, is_interrupted
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
@@ -25,6 +26,7 @@ from egs_warp.locomotion.trajectory_validation import check_trajectory
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.shot import nearest_steps
+from egs_warp.short_repr import short_repr
 
 PARTS = "trajectory.parts"
 """Folder that receives the steps of a run while it is simulated; it is removed when the run has finished."""
@@ -56,6 +58,8 @@ def read_trajectory(path: Path) -> Trajectory:
 class FinishedRun:
     """Files of a finished run."""
 
+    __repr__ = short_repr
+
     folder: Path
     trajectory: Trajectory
     creature: RenderData
@@ -76,6 +80,9 @@ class FinishedRun:
         """
         if not folder.is_dir():
             raise UserError(f"{folder}: is not a folder; give the one that egs-warp animate wrote")
+        if is_interrupted(folder):
+            cure = f"egs-warp resume {folder} continues it" if (folder / CONFIG).is_file() else "start it again"
+            raise UserError(f"{folder}: the run has not finished; if it was interrupted, {cure}")
         trajectory = read_trajectory(folder / "trajectory.npz")
         creature = RenderData.load(folder / render_data.FILE, node_count=len(trajectory.rest_positions))
         if len(creature.muscle_bounds) != trajectory.activations.shape[1]:

@@ -16,6 +16,7 @@ from egs_warp.motions.style import Style
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run
 from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
+from egs_warp.short_repr import short_repr
 
 RunSummary: TypeAlias = tuple[Report, np.ndarray, Trajectory]
 """Report of a run, (n,) index into the trajectory's times for each frame of a video, and trajectory."""
@@ -24,6 +25,8 @@ RunSummary: TypeAlias = tuple[Report, np.ndarray, Trajectory]
 @dataclass(frozen=True)
 class Job:
     """Arguments of one run: those of ``simulate``, under the same names, and the friction of the ground."""
+
+    __repr__ = short_repr
 
     motion: Script
     friction: float | None = None

@@ -28,11 +28,14 @@ from egs_warp.pipelines.worker_pool import (
     WorkerPool,
     ended_tasks,
 )
+from egs_warp.short_repr import short_repr
 
 
 @dataclass(frozen=True)
 class JobResult:
     """Result of a job."""
+
+    __repr__ = short_repr
 
     job: Job
     attempts: int

@@ -12,17 +12,20 @@ import warp as wp
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.frames import Direction, direction_of
+from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, hole_under
 from egs_warp.inpainting.underside import with_underside
+from egs_warp.io.capture import Capture
 from egs_warp.io.planes import PlaneRecord, write_planes
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, with_measured_ground
 from egs_warp.segmentation.clearance import StraddlingOptions, StraddlingPolicy, clear_plane, plane_extents
 from egs_warp.segmentation.object_spec import ObjectSpec
+from egs_warp.short_repr import short_repr
 from egs_warp.training import has_torch
 
 if TYPE_CHECKING:
@@ -76,6 +79,8 @@ class SceneOptions:
 class PreparedScene:
     """A capture that is separated into object and background; scene units."""
 
+    __repr__ = short_repr
+
     object: GaussianCloud
     """The object, cleared of the plane."""
     background: GaussianCloud
@@ -118,7 +123,7 @@ def prepare_scene(
     *,
     cameras: Sequence[Camera] = (),
     photographs: Sequence[TrainingView] | None = None,
-    up: np.ndarray | None = None,
+    up: Direction | None = None,
     plane: Plane | None = None,
     options: SceneOptions | None = None,
     progress: Callable[[str, float], None] = lambda stage, done: None,
@@ -130,7 +135,7 @@ def prepare_scene(
         spec: Specification of the object.
         cameras: Cameras of the capture, if known.
         photographs: Photos of the whole scene for the fine-tuning at the plane; None uses renders of the capture.
-        up: (3,) Approximate up; None estimates it.
+        up: (3,) Approximate up, or an axis such as ``"-y"``; None is that of the file, else estimated.
         plane: The ground plane; None finds it.
         options: Options; None is the default.
         progress: Called with the name of a stage and its finished fraction.
@@ -138,7 +143,11 @@ def prepare_scene(
     Raises:
         UserError: A stage failed.
     """
+    check_cloud(cloud)
     options = options or SceneOptions()
+    if up is None and isinstance(cloud, Capture):
+        up = cloud.up
+    up = None if up is None else direction_of(up, "up")
     progress("plane", 0.0)
     located = locate_plane(cloud, spec, cameras=cameras, up=up, plane=plane)
     if not options.flat:

@@ -18,6 +18,7 @@ from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import MAX_COORDINATE, check_pixels
 from egs_warp.motions.feet import Foot
 from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.short_repr import short_repr
 
 FILE = "creature.npz"
 _CAMERA = ("rotation", "translation", "width", "height", "fx", "fy", "cx", "cy", "near", "far")
@@ -29,6 +30,8 @@ class RenderData:
 
     P end points, N nodes, M segments, F fibres.
     """
+
+    __repr__ = short_repr
 
     splats: GaussianCloud
     """Gaussians at rest, after splitting; embedded in the rest cage of the trajectory, they give the film's images."""

@@ -70,7 +70,7 @@ def render_run(
     t = run.trajectory
     if hold is None:
         steps = nearest_steps(t.time, shot.fps)
-        cameras = shot.cameras(run.creature.camera, t, steps)
+        cameras = shot.cameras(run.creature.camera, t, steps, in_scene=run.scene is not None)
     else:
         steps = np.full(turntable(shot.fps), run.steps[run.frame_number(hold, argument="turntable")])
         base = resized(run.creature.camera, *(shot.size or (run.creature.camera.width, run.creature.camera.height)))

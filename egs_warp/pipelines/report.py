@@ -7,6 +7,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -20,6 +21,7 @@ from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory, measure
 from egs_warp.motions.sequence import MotionRecord, spans_of
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.end_state import EndCause, State
+from egs_warp.short_repr import short_repr
 from egs_warp.version import __version__
 
 if TYPE_CHECKING:
@@ -64,6 +66,8 @@ def installed_version(name: str) -> str | None:
 class MotionReport:
     """Requested, planned and reached values of one motion."""
 
+    __repr__ = short_repr
+
     name: str
     asked: Mapping[str, float]
     """Requested values; lengths in body heights."""
@@ -89,18 +93,28 @@ class MotionReport:
             "notes": list(self.notes),
         }
 
-    def summary(self) -> list[str]:
-        """Return the lines for the terminal."""
-        reached = asdict(self.reached)
-        pairs = [
-            f"{name} {reached[name]:.3f}" + (f" of {self.asked[name]:g}" if name in self.asked else "")
-            for name in ("distance", "height", "heading_degrees")
-        ]
-        line = (
-            f"{self.name}: {', '.join(pairs)}, tilt {self.reached.tilt_degrees:.1f} degrees, "
-            f"airborne {self.reached.airborne_frames:.0f} frames (lengths in body heights)"
-        )
-        return [line, *(f"note: {note}" for note in self.notes)]
+
+def _result(motions: Sequence[MotionReport]) -> str:
+    """Return what ``motions`` of one name reached, against what was requested, and why a target was missed."""
+    values = []
+    for name, unit in (("distance", " body heights"), ("height", " body heights"), ("heading_degrees", " degrees")):
+        requested = {motion.asked.get(name, 0.0) for motion in motions}
+        if requested != {0.0}:
+            reached = _span([getattr(motion.reached, name) for motion in motions])
+            values.append(f"{name.partition('_')[0]} {reached} of {_span(sorted(requested))}{unit}")
+    values.append(f"tilt {_span([motion.reached.tilt_degrees for motion in motions], digits=0)} degrees")
+    count = f" x{len(motions)}" if len(motions) > 1 else ""
+    # The state comes first in the line.
+    notes = dict.fromkeys(note.removeprefix(f"{motion.state.value}: ") for motion in motions for note in motion.notes)
+    return "; ".join([f"{motions[0].name}{count}: {', '.join(values)}", *notes])
+
+
+def _span(values: Sequence[float], *, digits: int = 2) -> str:
+    """Return the range of ``values`` as text."""
+    texts = [f"{value:.{digits}f}" for value in (min(values), max(values))]
+    if digits:
+        texts = [text.rstrip("0").rstrip(".") for text in texts]
+    return " to ".join(dict.fromkeys(texts))
 
 
 @dataclass(frozen=True)
@@ -222,6 +236,11 @@ class Report:
     asked: Mapping[str, JsonValue] = field(default_factory=dict)
     """Requested options of the run, ready for JSON."""
     versions: Mapping[str, str] = field(default_factory=versions)
+    film: str | None = None
+    """Name of the video in the folder of the run; None if it was not filmed."""
+
+    def __repr__(self) -> str:
+        return f"Report({self.source!r}, {self.summary().splitlines()[0]!r})"
 
     @property
     def state(self) -> State:
@@ -247,6 +266,7 @@ class Report:
             "versions": dict(self.versions),
             "device": self.device,
             "seed": self.seed,
+            "film": self.film,
         }
 
     def write(self, path: Path) -> None:
@@ -254,11 +274,11 @@ class Report:
         write_report(path, self.to_json())
 
     def summary(self) -> str:
-        """Return a summary of a few lines for the terminal."""
-        lines = [line for motion in self.motion for line in motion.summary()]
-        lines.append(f"muscle work: {self.energy.muscle_work:.2f} of the energy that lifts the body by its height")
-        lines.append(verdict(self.audit))
-        return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
+        """Return two lines for the terminal: the result against the request, and the verdict of the audit."""
+        groups = [list(group) for _, group in groupby(self.motion, key=lambda motion: motion.name)]
+        result = ", then ".join(map(_result, groups)) or "no motion began"
+        state = "" if self.state is State.DONE else f"{self.state.value}: "
+        return f"{state}{result}\n{verdict(self.audit)}"
 
 
 AUDIT_LIMITS = {
@@ -277,14 +297,14 @@ AUDIT_LIMITS = {
 
 
 def verdict(result: Audit) -> str:
-    """Return one line that says if the run satisfies its equations, with the residuals."""
-    values = asdict(result)
-    # Not "value > limit": NaN must fail, too.
-    exceeded = {name: value for name, value in values.items() if not value <= AUDIT_LIMITS[name]}
-    if exceeded:
-        failures = ", ".join(f"{name} {value:.2g} (at most {AUDIT_LIMITS[name]:g})" for name, value in exceeded.items())
-        return f"audit: FAILED: {failures}"
-    return "audit: passed (" + ", ".join(f"{name} {value:.2g}" for name, value in values.items()) + ")"
+    """Return one line that says if the run satisfies its equations, with what exceeds its limit."""
+    exceeded = []
+    for name, value in asdict(result).items():
+        limit = AUDIT_LIMITS[name]
+        # Not "value > limit": NaN must fail, too.
+        if not value <= limit:
+            exceeded.append(f"{name} {value / limit:,.1f} times its limit" if limit else f"{name} {value}, not 0")
+    return f"audit: FAILED: {', '.join(exceeded)}" if exceeded else "audit: passed"
 
 
 def report_of_run(
@@ -302,6 +322,7 @@ def report_of_run(
     seed: int,
     asked: Mapping[str, JsonValue],
     ending: EndCause | None = None,
+    film: str | None = None,
 ) -> Report:
     """Create the report of a run.
 
@@ -319,6 +340,7 @@ def report_of_run(
         seed: Seed of the run.
         asked: Requested options.
         ending: Cause that ended the last motion early.
+        film: Name of the video.
     """
     mesh = creature.cage.mesh
     return Report(
@@ -335,6 +357,7 @@ def report_of_run(
         device=str(creature.cloud.device),
         seed=seed,
         asked=asked,
+        film=film,
     )
 
 

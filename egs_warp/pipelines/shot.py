@@ -11,9 +11,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from egs_warp.errors import ArgumentError, UserError
+from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.geometry.body_frame import BodyFrame
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import Camera, fitted_camera
 from egs_warp.geometry.frames import box_corners
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.locomotion.rollout import FRAME_RATE
@@ -26,10 +26,13 @@ MIN_SIDE, MAX_SIDE = 16, 4096
 """Limits of the side of a film, pixels."""
 MAX_FPS = 1000.0
 """Maximum frame rate, Hz."""
-_SMOOTHING_TIME = 0.25
+_SMOOTHING_TIME = 0.5
 """Standard deviation of the window that smooths the path of a following camera, s."""
-_FOLLOW_MARGIN = 1.2
-"""Ratio of the radius that a following camera shows to that of the body."""
+_SIDES, _TOP, _BOTTOM = 0.86, 0.86, 0.76
+"""Fraction of the picture from its centre to each edge that the creature fills at most; its shadow is below it."""
+_FOLLOWED_SIZE = 1.15
+"""Ratio of the creature's smallest sizes in the pictures of a following and a fixed camera above which ``auto``
+follows."""
 _ORBIT_MARGIN = 0.06
 """Margin of an orbiting camera, as a fraction of the shorter side of a picture."""
 _TURNTABLE_TIME = 4.0
@@ -39,6 +42,8 @@ _TURNTABLE_TIME = 4.0
 class CameraMove(StrEnum):
     """Built-in camera motion."""
 
+    AUTO = "auto"
+    """``follow`` if the creature is then notably larger and has no scene around it, else ``fixed``."""
     FIXED = "fixed"
     FOLLOW = "follow"
     ORBIT = "orbit"
@@ -48,8 +53,9 @@ class CameraMove(StrEnum):
 class Shot:
     """Options of a film."""
 
-    camera: str = CameraMove.FIXED
-    """``fixed``, ``follow``, ``orbit`` (once around during the film), or the name of a JSON file with key cameras."""
+    camera: str = CameraMove.AUTO
+    """``auto``, ``fixed``, ``follow`` (along the ground), ``orbit`` (once around during the film), or the name of a
+    JSON file with key cameras."""
     size: tuple[int, int] | None = None
     """Width and height, pixels; None is the default of the film."""
     fps: float = FRAME_RATE
@@ -67,7 +73,8 @@ class Shot:
         if not 1.0 <= self.fps <= MAX_FPS:
             raise ArgumentError("fps", f"give a number of frames a second from 1 to {MAX_FPS:g}", value=self.fps)
         if self.camera not in list(CameraMove) and not self.camera.endswith(".json"):
-            raise ArgumentError("camera", f"give {', '.join(CameraMove)} or a path.json", value=self.camera)
+            near = did_you_mean(self.camera, CameraMove)
+            raise ArgumentError("camera", f"give {', '.join(CameraMove)} or a path.json", value=f"{self.camera}{near}")
 
     def to_json(self) -> dict[str, JsonValue]:
         """Return the options for ``asked`` of the report."""
@@ -79,13 +86,30 @@ class Shot:
         if self.camera not in list(CameraMove):
             _keys(Path(self.camera))
 
-    def cameras(self, camera: Camera, trajectory: Trajectory, steps: np.ndarray) -> list[Camera]:
+    def cameras(
+        self, camera: Camera, trajectory: Trajectory, steps: np.ndarray, *, in_scene: bool = False
+    ) -> list[Camera]:
         """Return the camera of each of the ``steps`` (n,) of a trajectory.
 
-        ``camera`` is the default camera of the film. Raises ``UserError`` for an invalid file of key cameras.
+        Args:
+            camera: Fixed camera of the film.
+            trajectory: Node positions.
+            steps: Indices of the states.
+            in_scene: The creature has a scene around it, in which ``auto`` is fixed.
+
+        Raises:
+            UserError: The file of key cameras is invalid.
         """
         base = resized(camera, *self.size) if self.size is not None else camera
-        if self.camera == CameraMove.FIXED:
+        if self.camera == CameraMove.AUTO and not in_scene:
+            following, fixed = _following(base, trajectory, steps), [base] * len(steps)
+            middles = trajectory.positions[steps].mean(axis=1)
+            near, far = (
+                max((middle - one.centre) @ one.rotation[2] for one, middle in zip(cameras, middles, strict=True))
+                for cameras in (following, fixed)
+            )
+            return following if far > _FOLLOWED_SIZE * near else fixed
+        if self.camera in (CameraMove.FIXED, CameraMove.AUTO):
             return [base] * len(steps)
         if self.camera == CameraMove.FOLLOW:
             return _following(base, trajectory, steps)
@@ -142,18 +166,20 @@ def around(camera: Camera, positions: np.ndarray, *, count: int | None = None) -
     return rotated
 
 
+def framed(camera: Camera, points: np.ndarray) -> Camera:
+    """Return ``camera`` at the distance, and beside the ``points`` (n, 3), from which they fill its picture."""
+    return fitted_camera(camera, points, sides=_SIDES, top=_TOP, bottom=_BOTTOM)
+
+
 def _following(camera: Camera, trajectory: Trajectory, steps: np.ndarray) -> list[Camera]:
+    """Return cameras that follow the centre of mass along the ground: a jump is seen against a ground at rest."""
     masses = trajectory.node_mass / trajectory.node_mass.sum()
     positions = trajectory.positions[steps]
-    path = np.einsum("n,fni->fi", masses, positions)
-    reach = float(np.linalg.norm(positions - path[:, None], axis=2).max())
+    path = np.einsum("n,fni->fi", masses, positions) * [1.0, 1.0, 0.0]
     rate = (len(steps) - 1) / max(float(trajectory.time[steps[-1]] - trajectory.time[steps[0]]), 1e-9)
     smooth = gaussian_filter1d(path, _SMOOTHING_TIME * rate, axis=0, mode="nearest") if len(path) > 1 else path
-    # The distance by which the smoothed camera path lags must be in the picture, too.
-    reach = _FOLLOW_MARGIN * reach + float(np.linalg.norm(path - smooth, axis=1).max())
-    half = min(0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
-    distance = reach / np.sin(np.arctan(half))
-    return [_moved(camera, middle - distance * camera.rotation[2]) for middle in smooth]
+    start = framed(camera, (positions - smooth[:, None]).reshape(-1, 3))
+    return [_moved(start, start.centre + place) for place in smooth]
 
 
 def _moved(camera: Camera, eye: np.ndarray) -> Camera:

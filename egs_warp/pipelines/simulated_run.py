@@ -10,22 +10,24 @@ import numpy as np
 
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.frames import box_corners
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.locomotion.rollout import FRAME_RATE, REST_FRAMES, RolloutResult, roll_out, solver_steps
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.fall_monitor import FallMonitor
 from egs_warp.motions.push import Push, PushKicks
 from egs_warp.motions.script import Script
+from egs_warp.motions.script import motion as script
 from egs_warp.motions.sequence import MotionSequence, Stance
 from egs_warp.motions.style import Style
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.end_state import EndCause
 from egs_warp.pipelines.planned_path import planned_com
+from egs_warp.pipelines.shot import framed
 from egs_warp.pipelines.time_estimate import RemainingFrames
 
-FILMED_FROM = (0.6, -1.0, 0.22)
-"""Direction from the body to the camera of a film: ahead, left and up. It shows the face and the path ahead."""
+FILMED_FROM = (0.82, -0.57, 0.27)
+"""Direction from the body to the camera of a film: ahead, left and up. It is 35 degrees off the face, so that the face
+is seen in three quarters and a path ahead is not foreshortened to a point."""
 _MAX_GET_UP_TIME = 120.0
 """Maximum total time for getting up in one run, in units of sqrt(H / g)."""
 MIN_FRAMES = 2
@@ -61,6 +63,13 @@ class SimulatedRun:
     """Pushes that were requested."""
     has_frame_count: bool = False
     """True if the number of frames was requested."""
+
+    def __repr__(self) -> str:
+        names, time = ", ".join(record.name for record in self.sequence.done), self.trajectory.time
+        end = " stopped" if self.simulation.stopped else " fallen" if self.fallen is not None else ""
+        return (
+            f"SimulatedRun({names or 'nothing'}: {len(self.simulation.frames)} frames, {time[-1] - time[0]:.2f} s{end})"
+        )
 
     @property
     def ending(self) -> EndCause:
@@ -100,7 +109,6 @@ class SimulatedRun:
         low, high = local.min(axis=0), local.max(axis=0)
         low[2] = min(low[2], 0.0)
         middle = 0.5 * (low + high)
-        corners = box_corners(low, high)
         distance = float(np.linalg.norm(high - low))
         direction = (
             np.array(FILMED_FROM) if scene is None else self._clear_side(scene, middle, _OCCLUSION_DISTANCE * distance)
@@ -112,22 +120,15 @@ class SimulatedRun:
         direction /= np.linalg.norm(direction)
         # In views from above or below, the front of the body is up in the picture.
         upwards = ground.axes[0] if abs(direction[2]) > _VERTICAL_COSINE else ground.axes[2]
-        for _ in range(60):
-            camera = Camera.look_at(
-                ground.world(middle + distance * direction),
-                ground.world(middle),
-                upwards,
-                width=size,
-                height=size,
-                vertical_fov_degrees=30.0,
-                near=0.01 * distance,
-            )
-            camera_points = ground.world(corners) @ camera.rotation.T + camera.translation
-            reach = np.abs(camera_points[:, :2] / camera_points[:, 2:]).max() * camera.fx / (0.5 * size)
-            if camera_points[:, 2].min() > 0 and reach < 0.86:
-                break
-            distance *= 1.05
-        return camera
+        camera = Camera.look_at(
+            ground.world(middle + distance * direction),
+            ground.world(middle),
+            upwards,
+            width=size,
+            height=size,
+            vertical_fov_degrees=30.0,
+        )
+        return framed(camera, self.trajectory.positions.reshape(-1, 3))
 
     def _clear_side(self, scene: GaussianCloud, middle: np.ndarray, reach: float) -> np.ndarray:
         """Return the direction (3,) from ``middle`` (3,) to the camera, ground axes.
@@ -162,7 +163,7 @@ def check_frames(frames: int | None) -> None:
 
 def simulate(
     creature: Creature,
-    motion: Script,
+    motion: Script | str,
     *,
     frames: int | None = None,
     max_seconds: float | None = None,
@@ -179,7 +180,7 @@ def simulate(
 
     Args:
         creature: The creature at rest.
-        motion: The motion or motions.
+        motion: The motion or motions, as a script or as its text (``egs_warp.motions.script``).
         frames: Number of frames at 60 Hz, the first at rest; None runs until the body has come to rest or fallen, or
             the time limit is reached.
         max_seconds: Time limit of the motion, s; None is the motion's own limit.
@@ -197,6 +198,7 @@ def simulate(
         UserError: The body cannot perform the motion, an argument is invalid, or ``resume`` belongs to another run.
     """
     check_frames(frames)
+    motion = script(motion) if isinstance(motion, str) else motion
     if activations is not None:
         activations = checked_activations(creature, activations, step)
     place = initial_stance(creature, step=step, style=style)

@@ -1,4 +1,4 @@
-"""Backdrop of an animation: a plain floor with a grid, one colour, or a captured scene, with the object's soft shadow
+"""Backdrop of an animation: a floor with a grid, one colour, or a captured scene, with the object's soft shadow
 on it."""
 
 from __future__ import annotations
@@ -13,10 +13,19 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.render import backdrop as kernels
 from egs_warp.launching import empty, launch_rows
+from egs_warp.render.projection import view_from_camera
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.render.shadow import ContactShadow
 
-_SKY, _FLOOR, _LINE = wp.vec3(1.0, 1.0, 1.0), wp.vec3(0.86, 0.86, 0.87), wp.vec3(0.74, 0.75, 0.78)
+_FLOOR, _HORIZON, _SKY = wp.vec3(0.85, 0.85, 0.86), wp.vec3(0.95, 0.953, 0.96), wp.vec3(0.82, 0.85, 0.89)
+_LINE = wp.vec3(0.75, 0.755, 0.775)
+_CLEAR, _HAZY = 1.0, 3.5
+"""Depths at which the haze over the floor begins and is complete, relative to that of the floor in the middle of the
+picture."""
+_MIN_SLOPE = 0.1
+"""Smallest downward slope of the view from which that depth is computed."""
+_SKY_RISE = 0.5
+"""Sine of the angle above the horizon at which the sky has its own colour."""
 _MAX_BUMP_HEIGHT = 0.06
 """Height over the plane, relative to the shadow's reach, at which a surface receives the shadow at half strength. Below
 the plane the range is twice as large, because thin spots of a captured floor appear deeper."""
@@ -33,6 +42,9 @@ class Backdrop:
     shadow: ContactShadow
     strength: wp.array | None
     """(H W,) float32, strength of the shadow at each pixel; None without shadow."""
+    floor_depth: wp.array | None = None
+    """(H W,) float32, z-depth of an opaque floor that hides what is below it, 0 where there is none; None if there is
+    no such floor."""
 
     def shadow_opacity(self, body: GaussianCloud) -> wp.array:
         """Return (H, W) float32, 0 to about 0.5, the opacity of the shadow of ``body``."""
@@ -53,23 +65,38 @@ class Backdrop:
         return colour.reshape(shape)
 
 
-def grid_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> Backdrop:
-    """Return a pale plane with a grid whose lines are ``cell`` (world units) apart."""
+def studio_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> Backdrop:
+    """Return a pale floor with a grid, which turns into a sky without an edge.
+
+    Args:
+        ground: the ground and its shadow.
+        cell: distance of the fine lines, world units; every fourth one is strong.
+        shadow: False for no shadow.
+    """
+    camera, plane = ground.camera, ground.plane
+    depth = abs(float(plane.heights(camera.centre))) / max(float(-camera.rotation[2] @ plane.normal), _MIN_SLOPE)
+    studio = kernels.Studio()
+    studio.floor, studio.horizon, studio.sky, studio.line = _FLOOR, _HORIZON, _SKY, _LINE
+    studio.cell, studio.sky_rise = cell, _SKY_RISE
+    studio.clear_depth, studio.hazy_depth = _CLEAR * depth, _HAZY * depth
     colour = empty(len(ground.depth), wp.vec3, ground.device)
     launch_rows(
-        kernels.grid_kernel,
+        kernels.studio_kernel,
         len(colour),
-        inputs=[ground.flat, ground.pixel, ground.fade, cell, _SKY, _FLOOR, _LINE],
+        inputs=[
+            *(view_from_camera(camera), wp.vec3(*plane.normal.tolist())),
+            *(ground.depth, ground.flat, ground.pixel, studio),
+        ],
         outputs=[colour],
         device=ground.device,
     )
-    return Backdrop(colour, ground, ground.fade if shadow else None)
+    return Backdrop(colour, ground, ground.fade if shadow else None, ground.depth)
 
 
 def plain_colour(ground: ContactShadow, colour: tuple[float, float, float], *, shadow: bool = True) -> Backdrop:
     """Return a backdrop of one colour with only the shadow. Its ``shadow_opacity`` can be laid over another image."""
     colour_without_shadow = wp.full(len(ground.depth), wp.vec3(*colour), dtype=wp.vec3, device=ground.device)
-    return Backdrop(colour_without_shadow, ground, ground.fade if shadow else None)
+    return Backdrop(colour_without_shadow, ground, ground.fade if shadow else None, ground.depth)
 
 
 def captured_scene(

@@ -17,6 +17,7 @@ from egs_warp.kernels.render.quantise import quantise_kernel
 from egs_warp.launching import device_of, empty, empty_pooled, launch_rows
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists, build_tile_lists, lists_fit
+from egs_warp.short_repr import short_repr
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,8 @@ class Background:
 @dataclass(frozen=True)
 class RenderedImage:
     """Rendered image. Pixel (row, column) has its centre at (column + 0.5, row + 0.5)."""
+
+    __repr__ = short_repr
 
     colour: wp.array
     """(H, W) vec3 float32, background included; display-referred as the capture's colours are, not clipped above 1."""
@@ -81,13 +84,15 @@ class PendingImage:
         threads: int,
         onto: RenderedImage | None = None,
         tile_mask: wp.array | None = None,
+        max_depth: wp.array | None = None,
         guess: bool = True,
     ) -> None:
         self.projected, self.view = projected, view
         self.lists = replace(build_tile_lists(projected, view, threads=threads, guess=guess), tile_mask=tile_mask)
-        self.image = composite(projected, self.lists, view, background=background, threads=threads, onto=onto)
+        options: dict[str, Any] = {"background": background, "threads": threads, "max_depth": max_depth}
+        self.image = composite(projected, self.lists, view, **options, onto=onto)
         self._fit = partial(lists_fit, self.lists, projected)
-        options = {"background": background, "threads": threads, "tile_mask": tile_mask}
+        options["tile_mask"] = tile_mask
         self._render_again = partial(PendingImage, projected, view, onto=self.image, guess=False, **options)
 
     def result(self) -> PendingImage:
@@ -104,8 +109,12 @@ def composite(
     background: Background,
     threads: int,
     onto: RenderedImage | None = None,
+    max_depth: wp.array | None = None,
 ) -> RenderedImage:
-    """Blend every tile's Gaussians from front to back over ``background``, into the arrays of ``onto`` if given."""
+    """Blend every tile's Gaussians from front to back over ``background``, into the arrays of ``onto`` if given.
+
+    Gaussians beyond ``max_depth`` (H * W,) are hidden, see ``render_gaussians``.
+    """
     device = device_of(projected.ellipse)
     width, height = int(view.width), int(view.height)
     shape = (height, width)
@@ -121,6 +130,7 @@ def composite(
         projected.colour_depth,
         background.flat,
         background.image,
+        max_depth,
     ]
     launch_rows(
         composite_tile_kernel,

@@ -32,6 +32,7 @@ def render_gaussians(
     antialiased: bool | None = None,
     geometry: bool = False,
     mask: np.ndarray | None = None,
+    max_depth: wp.array | None = None,
     threads: int | None = None,
 ) -> RenderedImage:
     """Render ``cloud`` through ``camera``, on the device of the cloud.
@@ -45,6 +46,8 @@ def render_gaussians(
         geometry: add median depth, its splats and normals.
         mask: one bool for each tile of 16 x 16 pixels from the top left; tiles that are False show the background
             alone.
+        max_depth: (H * W,) float32, on the device of the cloud: z-depth of an opaque surface at each pixel, which hides
+            the Gaussians with deeper means there; 0 where there is none.
         threads: CPU threads, by default the available cores; the image does not depend on it.
 
     Raises:
@@ -53,7 +56,7 @@ def render_gaussians(
     """
     threads = threads or available_threads()
     arguments = {"background": background, "antialiased": antialiased, "mask": mask, "threads": threads}
-    pending = enqueue_image(cloud, camera, **arguments)
+    pending = enqueue_image(cloud, camera, **arguments, max_depth=max_depth)
     with translate_out_of_memory(cloud, camera):
         pending = pending.result()
         if geometry:
@@ -68,6 +71,7 @@ def enqueue_image(
     background: tuple[float, float, float] | np.ndarray | wp.array = (1.0, 1.0, 1.0),
     antialiased: bool | None = None,
     mask: np.ndarray | None = None,
+    max_depth: wp.array | None = None,
     threads: int | None = None,
 ) -> PendingImage:
     """Queue the image of ``render_gaussians`` without waiting; ``PendingImage.result`` waits for it."""
@@ -79,7 +83,9 @@ def enqueue_image(
         behind = background_of(background, camera, cloud.device)
         tile_mask = tile_mask_array(mask, camera, cloud.device)
         projected = project(cloud, view, antialiased=antialiased, threads=threads)
-        return PendingImage(projected, view, background=behind, threads=threads, tile_mask=tile_mask)
+        return PendingImage(
+            projected, view, background=behind, threads=threads, tile_mask=tile_mask, max_depth=max_depth
+        )
 
 
 def render_views(

@@ -14,7 +14,7 @@ from egs_warp.kernels.render import backdrop as kernels
 from egs_warp.launching import empty, launch_cached, launch_rows, zeros
 from egs_warp.render.projection import view_from_camera
 
-_LAYERS = ((0.0, 0.08, 0.02), (0.08, 0.3, 0.06), (0.3, 2.0, 0.13))
+_LAYERS = ((0.0, 0.1, 0.035), (0.1, 0.35, 0.08), (0.35, 2.0, 0.16))
 """Height range over the plane and blur width of each layer, relative to the body height."""
 _MIN_BLUR = 0.6
 """Smallest standard deviation of a blur, texels."""
@@ -59,7 +59,7 @@ class ContactShadow:
             height: height of the body, world units; 0 without a body.
             depth: (H, W) z-depth of the uneven ground that receives the shadow, 0 where that is the plane.
         """
-        self.camera, self.device = camera, device
+        self.camera, self.plane, self.device = camera, plane, device
         edges = height * np.array([layer[:2] for layer in _LAYERS])
         self._layers = kernels.Layers()
         self._layers.low, self._layers.high = wp.vec3(*edges[:, 0].tolist()), wp.vec3(*edges[:, 1].tolist())
@@ -114,7 +114,7 @@ class ContactShadow:
         self._blur_layers(layers, scratch, self._blur)
         shade = empty(shape[1:], wp.float32, self.device)
         # Higher layers block less of the sky, so they darken less.
-        max_opacity = wp.vec3(*(0.5 - 1.4 * blur for _, _, blur in _LAYERS))
+        max_opacity = wp.vec3(*(0.5 - 1.5 * blur for _, _, blur in _LAYERS))
         self._launch(kernels.combine_layers_kernel, _MAP * _MAP, [layers, max_opacity], [shade])
         return shade
 

@@ -211,7 +211,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         (["a.ply", "out", "--to", "spz4"], "out: give a name that ends in .spz"),
         (["a.ply", "b.ply", "--to", "compressed-ply"], "b.ply: give a name that ends in .compressed.ply"),
         (["a.ply", "b.compressed.ply", "--to", "ply"], "b.compressed.ply: give a name that ends in .ply"),
-        (["no", "out", "--to", "ply"], "no: not a folder"),
+        (["no", "out", "--to", "ply"], "no: no such file or folder"),
         ([".", "out", "--to", "ply"], "it has no numbered captures such as frame0001.ply"),
         (["two", "out", "--to", "ply"], "it has two sequences (a0001.ply and b0001.ply)"),
         (["same", "out", "--to", "ply"], "two of its captures have the same number"),

@@ -145,7 +145,9 @@ def test_missed_keys_are_reported_and_reached_ones_are_not(place: Stance) -> Non
         follow.objectives(BodyState(positions, 0 * positions, time), None, DT)
     assert follow.phase is FollowPhase.FOLLOW
     planned = follow.plan_record()
-    assert planned == FollowPlan(3.0, 0.3, planned.worst_miss) and planned.worst_miss == pytest.approx(0.08)
+    assert planned == FollowPlan(3.0, 0.3, planned.worst_miss) and planned.worst_miss == pytest.approx(
+        {"position": 0.08}
+    )
     assert follow.notes()[0].startswith("k.json, key 2: head position at 0.2 s: reached (0.12, ")
     assert follow.notes()[1] == "k.json, key 3: head position at 0.3 s was not reached in time"
     follow.objectives(BodyState(place.standing, 0 * place.standing, 0.4), None, DT)
@@ -201,7 +203,7 @@ def test_a_turn_is_measured_in_the_requested_direction(place: Stance, part: str,
         follow = Follow(place, [key(1.0, part, Quantity.ORIENTATION, (0.0, 0.0, asked))])
         for time in np.linspace(0.0, 1.0, 61):
             follow.objectives(spun(place, share * time * asked, time), None, DT)
-        assert follow.plan_record().worst_miss == pytest.approx(miss, abs=1e-6)
+        assert follow.plan_record().worst_miss == pytest.approx({"orientation": miss}, abs=1e-6)
         assert len(follow.notes()) == (miss > 36.0)
 
 

@@ -66,7 +66,8 @@ def test_a_run_contains_its_options_and_its_manifest(run: Callable[..., Report],
     asked = json.loads((tmp_path / "report.json").read_text())["asked"]
     assert asked["friction"] == 0.6 and asked["size"] == 32 and asked["frames"] == 2 and asked["up"] is None
     assert asked["plane"] == pytest.approx([*thing().plane.normal, thing().plane.offset])
-    assert verdict(report.audit).startswith("audit: passed (momentum_residual ")
+    assert verdict(report.audit) == "audit: passed" == report.summary().splitlines()[1]
+    assert json.loads((tmp_path / "report.json").read_text())["film"] == report.film == "jump.mp4"
     energy = json.loads((tmp_path / "report.json").read_text())["energy"]
     assert energy["gained"] == pytest.approx(sum(energy["flows"].values()), abs=1e-9)
     assert energy["muscle_work"] >= energy["flows"]["muscles"] and energy["worst_residual"] < 1e-6
@@ -173,5 +174,6 @@ def test_a_disk_that_is_full_at_any_file(
 
 def test_a_verdict_names_the_violated_limits(run: Callable[..., Report], tmp_path: Path) -> None:
     audit = run(tmp_path).audit
-    said = verdict(replaced(audit, penetration=0.02, momentum_residual=float("nan")))
-    assert said == "audit: FAILED: momentum_residual nan (at most 1e-05), penetration 0.02 (at most 0.01)"
+    said = verdict(replaced(audit, penetration=0.02, momentum_residual=float("nan"), inverted_elements=3))
+    expected = "momentum_residual nan times its limit, penetration 2.0 times its limit, inverted_elements 3, not 0"
+    assert said == f"audit: FAILED: {expected}"

@@ -126,10 +126,15 @@ def test_a_run_that_stops_or_falls_writes_all_of_its_files(
     out = tmp_path / "out"
     flags = ["--up", "z", "--size", "32", "--motion", "jump, twist", "--no-get-up", "--out", str(out)]
     assert cli.main(["animate", str(tmp_path / "pawn.ply"), *flags]) == 3
-    said = capsys.readouterr().out
+    said = capsys.readouterr()
     state = "fallen" if after == "fall" else "stopped"
-    assert f"note: {state}: " in said and "1 of 2 motions did not begin: twist" in said
-    assert "cut off" not in said
+    result, verdict, film = said.out.splitlines()
+    reason = "tilted by 90 degrees" if after == "fall" else "the next step could not be solved"
+    assert result.startswith(f"{state}: jump: distance ") and f"; {reason}" in result
+    assert verdict.startswith("audit: ") and film.startswith(f"film: {out / 'motions.mp4'} (")
+    # Notes are printed once, when they are known.
+    assert said.err.count("1 of 2 motions did not begin: twist") == 1 == said.err.count("front is taken to be")
+    assert "cut off" not in said.out + said.err
     report = json.loads((out / "report.json").read_text())
     assert report["state"] == state and [motion["state"] for motion in report["motion"]] == [state]
     assert json.loads((out / "manifest.json").read_text())["finished"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io import read_capture
+from egs_warp.io.run_folder import MANIFEST
 from egs_warp.io.writing import WRITERS
 from egs_warp.pipelines.export import export_splats
 from egs_warp.pipelines.finished_run import FinishedRun
@@ -46,6 +48,51 @@ def test_splat_files_are_in_the_frame_of_the_capture(run: FinishedRun, tmp_path:
     # Some writers reorder the Gaussians.
     distance, _ = KDTree(means).query(expected)
     assert distance.max() < tolerance
+
+
+@pytest.mark.parametrize("kind", ["ply", "compressed-ply", "spz4", "glb"])
+def test_a_single_frame_may_be_a_file(run: FinishedRun, tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]):
+    file = tmp_path / f"one{WRITERS[kind][0]}"
+    assert main(["export", str(run.folder), "--to", kind, "--frame", "4", "--out", str(file)]) == 0
+    assert file.is_file() and [path.name for path in tmp_path.iterdir()] == [file.name]
+    assert capsys.readouterr().out.startswith(f"wrote {file} (")
+    assert read_capture(file).cloud.count == run.creature.splats.count
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--out", "all.ply"], "--out all.ply: several frames are written; give a folder, or a single frame"),
+        (["--out", "a.spz", "--frame", "4"], "a.spz: give a name that ends in .ply"),
+    ],
+)
+def test_a_file_has_the_ending_of_its_kind_and_one_frame(
+    run: FinishedRun,
+    tmp_path: Path,
+    flags: list[str],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", str(run.folder), "--to", "ply", *flags]) == 2
+    assert message in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_run_is_resumed_and_not_exported(
+    run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Whatever files it has: the film may be what is missing."""
+    folder = tmp_path / "run"
+    shutil.copytree(run.folder, folder)
+    manifest = json.loads((folder / MANIFEST).read_text()) if (folder / MANIFEST).is_file() else {"files": {}}
+    manifest |= {"command": "animate", "finished": False, "files": {"trajectory.npz": None}}
+    (folder / MANIFEST).write_text(json.dumps(manifest))
+    (folder / "run.yaml").write_text("capture: a.ply\n")
+    for line in ("render {run} --out a.mp4", "export {run} --to ply --out a", "view {run} --export a.html"):
+        assert main(line.format(run=folder).split()) == 2
+        error = capsys.readouterr().err
+        assert f"if it was interrupted, egs-warp resume {folder} continues it" in error or "make web" in error
 
 
 def test_a_sequence_is_numbered_at_sixty_hertz(run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

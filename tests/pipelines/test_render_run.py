@@ -20,7 +20,7 @@ from egs_warp.io.video import VideoWriter
 from egs_warp.pipelines.film import drawn_frames
 from egs_warp.pipelines.finished_run import FinishedRun
 from egs_warp.pipelines.render_run import Show, render_run
-from egs_warp.pipelines.shot import Shot, around, nearest_steps, resized
+from egs_warp.pipelines.shot import Shot, around, framed, nearest_steps, resized
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +83,23 @@ def test_every_camera_shows_the_whole_creature(camera: str, run: FinishedRun) ->
         assert (pixels > 0).all() and (pixels < [160, 90]).all()
     moved = any(not np.allclose(one.centre, cameras[0].centre) for one in cameras)
     assert moved == (camera != "fixed")
+    if camera == "follow":
+        # Along the ground: a jump does not look like a sinking floor.
+        np.testing.assert_allclose([one.centre[2] for one in cameras], cameras[0].centre[2])
+
+
+def test_the_default_camera_follows_what_travels_unless_a_scene_is_around_it(run: FinishedRun) -> None:
+    base, t = run.creature.camera, run.trajectory
+    steps = np.arange(len(t.time))
+    places = t.positions + 0.5 * np.arange(len(steps))[:, None, None] * [1.0, 0.0, 0.0]
+    far = replace(t, positions=places, time=0.5 * np.arange(len(steps)))
+    base = framed(base, far.positions.reshape(-1, 3))
+    following = Shot().cameras(base, far, steps)
+    np.testing.assert_array_equal(following[-1].centre, Shot("follow").cameras(base, far, steps)[-1].centre)
+    assert np.linalg.norm(following[-1].centre - following[0].centre) > 3.0
+    assert Shot().cameras(base, far, steps, in_scene=True) == [base] * len(steps)
+    still = replace(t, positions=np.repeat(t.positions[:1], len(t.positions), axis=0))
+    assert Shot().cameras(run.creature.camera, still, steps) == [run.creature.camera] * len(steps)
 
 
 def test_a_turn_about_it_keeps_height_and_distance(run: FinishedRun) -> None:
@@ -196,13 +213,13 @@ def test_a_turntable_shows_one_frame(run: FinishedRun, tmp_path: Path) -> None:
         (["--size", "wide"], "--size wide: give pixels, as 512 or 640x360"),
         (["--fps", "0"], "--fps 0.0: give a number of frames a second from 1 to 1000"),
         (["--fps", "nan"], "--fps nan: give a number of frames a second"),
-        (["--camera", "sideways"], "--camera sideways: give fixed, follow, orbit or a path.json"),
+        (["--camera", "sideways"], "--camera sideways: give auto, fixed, follow, orbit or a path.json"),
         (["--camera", "none.json"], "none.json: no such file"),
         (["--camera", "{tmp}/bad.json"], "bad.json: key 0 needs time, eye [x, y, z] and target [x, y, z], finite"),
         (["--camera", "{tmp}/back.json"], "back.json: the times of its keys do not increase"),
         (["--camera", "{tmp}/up.json"], "up.json: its camera points straight up or down"),
         (["--camera", "{tmp}/fov.json"], "fov.json: fov of key 0 is 180; give degrees from 1 to 150"),
-        (["--background", "2,0,0"], "--background 2,0,0: give three numbers r,g,b from 0 to 1"),
+        (["--background", "2,0,0"], "--background 2,0,0: give a colour: r,g,b from 0 to 1"),
         (["--background", "nowhere.ply"], "nowhere.ply: no such file"),
         (["--background", "transparent"], "--background transparent: H.264, depth and alpha have no transparency"),
         (["--turntable", "99"], "--turntable 99: the run has 13 frames; give 0 to 12, or -1"),

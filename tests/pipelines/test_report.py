@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
+from egs_warp.locomotion.audit import Audit
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.pipelines.report import StageTime, stage_times, versions
+from egs_warp.locomotion.trajectory import MotionOutcome
+from egs_warp.pipelines.end_state import State
+from egs_warp.pipelines.report import MotionReport, Report, StageTime, stage_times, versions
 
 
 def test_a_frame_without_a_stage_spends_no_time_in_it() -> None:
@@ -23,3 +27,34 @@ def test_a_package_without_metadata_is_reported() -> None:
     """The package is missing, or was copied without its ``dist-info``."""
     told = versions(("numpy", "egs-warp-is-no-such-package"))
     assert told["numpy"] == np.__version__ and told["egs-warp-is-no-such-package"] == "no metadata"
+
+
+def motion_report(name: str, asked: dict[str, float], state: State = State.DONE, *notes: str, **reached: float) -> Any:
+    measured = {"distance": 0.0, "height": 0.0, "heading_degrees": 0.0, "tilt_degrees": 1.2, "airborne_frames": 0.0}
+    return MotionReport(name, asked, cast(Any, None), MotionOutcome(**measured | reached), state, None, notes)
+
+
+def test_the_result_is_one_line_without_exponents() -> None:
+    """Each motion has its measured and requested values; equal motions in a row are one; a bad end comes first."""
+    jump = motion_report("jump", {"distance": 0.5, "height": 0.2}, distance=0.4921, height=1.98e-1)
+    hops = [
+        motion_report("hop", {"distance": 0.7, "height": 0.3, "square": k}, distance=0.7 + 0.01 * k) for k in (1, 2)
+    ]
+    twist = motion_report(
+        "twist", {"heading_degrees": 180.0, "distance": 0.0}, State.FALLEN, "fallen: it tripped", tilt_degrees=88
+    )
+    report = dataclasses.replace(_report(), motion=(jump, *hops, twist))
+    result, verdict = report.summary().splitlines()
+    assert result == (
+        "fallen: jump: distance 0.49 of 0.5 body heights, height 0.2 of 0.2 body heights, tilt 1 degrees, then"
+        " hop x2: distance 0.71 to 0.72 of 0.7 body heights, height 0 of 0.3 body heights, tilt 1 degrees, then"
+        " twist: heading 0 of 180 degrees, tilt 88 degrees; it tripped"
+    )
+    assert verdict == "audit: FAILED: penetration 3.0 times its limit"
+    assert repr(report) == f"Report('pawn', {result!r})"
+
+
+def _report() -> Report:
+    values: Any = {field.name: 0 for field in dataclasses.fields(Audit)} | {"penetration": 0.03}
+    report: Any = {field.name: None for field in dataclasses.fields(Report)}
+    return Report(**report | {"source": "pawn", "motion": (), "audit": Audit(**values)})

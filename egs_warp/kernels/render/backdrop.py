@@ -110,30 +110,63 @@ def ground_kernel(
     texel_out[tid] = texel_of(ground, place)
 
 
-@wp.kernel
-def grid_kernel(
-    first_row: wp.int32,
-    # In:
-    flat: wp.array[wp.vec2],
-    pixel: wp.array[wp.float32],
-    fade: wp.array[wp.float32],
-    cell: wp.float32,
-    sky: wp.vec3,
-    floor: wp.vec3,
-    line: wp.vec3,
-    # Out:
-    colour_out: wp.array[wp.vec3],
-):
-    """Draw a floor with lines ``cell`` apart that fades into the sky."""
-    tid = wp.tid() + first_row
-    across = flat[tid]
+@wp.struct
+class Studio:
+    """Colours of a floor that turns into its surroundings without an edge, and its grid."""
+
+    floor: wp.vec3
+    """Floor near the camera."""
+    horizon: wp.vec3
+    """Floor far away, and sky at the horizon."""
+    sky: wp.vec3
+    """Sky from ``sky_rise`` on."""
+    line: wp.vec3
+    cell: wp.float32
+    """Distance of the fine lines, world units."""
+    clear_depth: wp.float32
+    """z-depth up to which the floor is clear; it reaches the colour of the horizon at ``hazy_depth``."""
+    hazy_depth: wp.float32
+    sky_rise: wp.float32
+    """Slope of the rays to the top of the sky's gradient."""
+
+
+@wp.func
+def line_strength(across: wp.vec2, cell: wp.float32, pixel: wp.float32) -> wp.float32:
+    """Return 1 on the lines of a grid, 0 beside them; lines that come closer than some pixels are blended out."""
     nearest = wp.float32(1e30)
     for axis in range(2):
         cell_position = across[axis] / cell + 0.5
         nearest = wp.min(nearest, wp.abs(cell_position - wp.floor(cell_position) - 0.5) * cell)
-    on_line = wp.clamp(1.0 - nearest / (1.2 * pixel[tid]), 0.0, 1.0)
-    colour = floor + on_line * (line - floor)
-    colour_out[tid] = sky + fade[tid] * (colour - sky)
+    return wp.clamp(1.1 - nearest / pixel, 0.0, 1.0) * wp.clamp(0.2 * cell / pixel - 1.0, 0.0, 1.0)
+
+
+@wp.kernel
+def studio_kernel(
+    first_row: wp.int32,
+    # In:
+    view: View,
+    normal: wp.vec3,
+    depth: wp.array[wp.float32],
+    flat: wp.array[wp.vec2],
+    pixel: wp.array[wp.float32],
+    studio: Studio,
+    # Out:
+    colour_out: wp.array[wp.vec3],
+):
+    """Draw a floor with fine lines ``studio.cell`` apart and strong ones four times as far, in haze, below a sky."""
+    tid = wp.tid() + first_row
+    u = wp.float32(tid % view.width) + 0.5
+    v = wp.float32(tid / view.width) + 0.5
+    ray = wp.transpose(view.rotation) * wp.vec3((u - view.cx) / view.fx, (v - view.cy) / view.fy, 1.0)
+    rise = wp.clamp(wp.dot(ray, normal) / wp.length(ray) / studio.sky_rise, 0.0, 1.0)
+    colour = wp.lerp(studio.horizon, studio.sky, rise)
+    if depth[tid] > 0.0:
+        fine = line_strength(flat[tid], studio.cell, pixel[tid])
+        strong = line_strength(flat[tid], 4.0 * studio.cell, pixel[tid])
+        floor = wp.lerp(studio.floor, studio.line, wp.max(0.4 * fine, strong))
+        haze = wp.clamp((depth[tid] - studio.clear_depth) / (studio.hazy_depth - studio.clear_depth), 0.0, 1.0)
+        colour = wp.lerp(floor, studio.horizon, haze * haze * (3.0 - 2.0 * haze))
+    colour_out[tid] = colour
 
 
 @wp.kernel
@@ -253,14 +286,14 @@ def combine_layers_kernel(
     # Out:
     shade_out: wp.array2d[wp.float32],
 ):
-    """Combine the layers by their maximum."""
+    """Combine the layers: each lets a part of the light pass."""
     tid = wp.tid() + first_row
     row = tid / TEXELS
     column = tid % TEXELS
-    shade = wp.float32(0.0)
+    passing = wp.float32(1.0)
     for layer in range(LAYERS):
-        shade = wp.max(shade, opacity[layer, row, column] * max_opacity[layer])
-    shade_out[row, column] = shade
+        passing *= 1.0 - opacity[layer, row, column] * max_opacity[layer]
+    shade_out[row, column] = 1.0 - passing
 
 
 @wp.func

@@ -85,7 +85,7 @@ _EACH_HALF = """
             const f8 alpha = raw < limit ? raw : limit;
             const f8 before = *(f8*)(passing + at);
             const f8 after = before * (one - alpha);
-            const i8 hit = (alpha >= cut) & (before > none);
+            const i8 hit = (alpha >= cut) & (before > none)ALSO_NEAR;
             const i8 stop = hit & (after <= stopped);
 """
 
@@ -93,15 +93,19 @@ FORWARD = (
     _SHARED
     + """
     // Transmittance; zero outside the image, negative once a pixel is opaque.
-    alignas(64) float passing[256], red[256], green[256], blue[256], far[256];
+    alignas(64) float passing[256], red[256], green[256], blue[256], far[256], bound[256];
     for (int i = 0; i < 256; ++i) {
-        passing[i] = column_of(i) < tile_width && row_of(i) < tile_height ? 1.0f : 0.0f;
+        const bool inside = column_of(i) < tile_width && row_of(i) < tile_height;
+        passing[i] = inside ? 1.0f : 0.0f;
         red[i] = green[i] = blue[i] = far[i] = 0.0f;
+        const bool bounded = inside && max_depth.shape[0] > 0;
+        const float floor = bounded ? max_depth.data[(top + row_of(i)) * width + left + column_of(i)] : 0.0f;
+        bound[i] = floor > 0.0f ? floor : 3.0e38f;
     }
     for (int i = start; i < end && open != 0; ++i) {
         const int id = gaussians.data[i];
 """
-    + _EACH_HALF
+    + _EACH_HALF.replace("ALSO_NEAR", " & (c[3] <= *(f8*)(bound + at))")
     + """
             const f8 weight = (hit & ~stop) ? before * alpha : none;
             const f8 left_over = stop ? -before : (hit ? after : before);
@@ -151,7 +155,7 @@ BACKWARD = (
         const int id = gaussians.data[i];
         f8 sums[10] = {};
 """
-    + _EACH_HALF
+    + _EACH_HALF.replace("ALSO_NEAR", "")
     + """
             const i8 blended = hit & ~stop;
             const f8 weight = blended ? before * alpha : none;

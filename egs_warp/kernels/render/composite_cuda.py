@@ -55,6 +55,7 @@ _BATCHES = """
         return f.y - f.x * dy * dy - shape.z * u * u;
     };
     bool open = inside;
+    ALSO_START
     // The loads of the next batch are in flight while this one is blended.
     float4 next_shape, next_colour;
     float2 next_falloff;
@@ -92,8 +93,16 @@ _BATCHES = """
 """
 
 
-def _batches(*, also_fetch: str = "", also_store: str = "") -> str:
-    return _BATCHES.replace("ALSO_FETCH", also_fetch).replace("ALSO_STORE", also_store)
+def _batches(*, also_start: str = "", also_fetch: str = "", also_store: str = "") -> str:
+    code = _BATCHES.replace("ALSO_START", also_start)
+    return code.replace("ALSO_FETCH", also_fetch).replace("ALSO_STORE", also_store)
+
+
+_BOUND = """float bound = 3.0e38f;
+    if (inside && max_depth.shape[0] > 0) {
+        const float floor = max_depth.data[(top + (int)py) * width + left + (int)px];
+        if (floor > 0.0f) bound = floor;
+    }"""
 
 
 FORWARD = (
@@ -101,7 +110,7 @@ FORWARD = (
     + """
     float passing = 1.0f, r = 0.0f, g = 0.0f, b = 0.0f, d = 0.0f;
 """
-    + _batches()
+    + _batches(also_start=_BOUND)
     + """
             if (!__any_sync(0xffffffffu, open)) break;
             unsigned mine_here = __ballot_sync(0xffffffffu, (s_parts[group + lane] >> part) & 1u);
@@ -121,12 +130,12 @@ FORWARD = (
                 for (int i = 0; i < 4; ++i) {
                     const float alpha = alphas[i];
                     const float after = passing * (1.0f - alpha);
-                    if (open && alpha >= CUT) {
+                    const float4 c = s_colour[chosen[i]];
+                    if (open && alpha >= CUT && c.w <= bound) {
                         if (after <= STOP) {
                             open = false;
                         } else {
                             const float weight = passing * alpha;
-                            const float4 c = s_colour[chosen[i]];
                             r = fmaf(weight, c.x, r);
                             g = fmaf(weight, c.y, g);
                             b = fmaf(weight, c.z, b);

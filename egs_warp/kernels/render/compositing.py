@@ -36,11 +36,15 @@ def composite_tile(
     colour_depth: wp.array[wp.vec4],
     flat_background: wp.vec3,
     background: wp.array[wp.vec3],
+    max_depth: wp.array[wp.float32],
     colour: wp.array2d[wp.vec3],
     alpha_out: wp.array2d[wp.float32],
     depth: wp.array2d[wp.float32],
 ):
-    """Blend one tile from front to back, by its thread (CPU) or block (CUDA)."""
+    """Blend one tile from front to back, by its thread (CPU) or block (CUDA).
+
+    Splats whose mean is deeper than ``max_depth`` of a pixel do not count there; 0 and an empty array are no limit.
+    """
     ...
 
 
@@ -104,6 +108,7 @@ def composite_tile_kernel(
     colour_depth: wp.array[wp.vec4],
     flat_background: wp.vec3,
     background: wp.array[wp.vec3],
+    max_depth: wp.array[wp.float32],
     # Out:
     colour_out: wp.array2d[wp.vec3],
     alpha_out: wp.array2d[wp.float32],
@@ -129,6 +134,7 @@ def composite_tile_kernel(
         colour_depth,
         flat_background,
         background,
+        max_depth,
         colour_out,
         alpha_out,
         depth_out,

@@ -1,0 +1,38 @@
+"""Selections of Gaussians."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from egs_warp.geometry.gaussians import GaussianCloud, hidden_below
+from egs_warp.geometry.plane import Plane
+
+
+def test_what_lies_below_a_plane_is_hidden_and_stays_in_its_place() -> None:
+    heights = np.array([0.5, -0.5, -0.005, 0.0, -0.02])
+    cloud = GaussianCloud.from_numpy(
+        np.column_stack([np.zeros((5, 2)), heights + 1.0]),
+        np.tile([1.0, 0.0, 0.0, 0.0], (5, 1)),
+        np.full((5, 3), -5.0),
+        np.full(5, 2.0),
+        np.zeros((5, 1, 3)),
+    )
+    hidden = hidden_below(cloud, Plane(np.eye(3)[2], -1.0), margin=0.01)
+    np.testing.assert_array_equal(hidden.opacities() < 1.0 / 255.0, [False, True, False, False, True])
+    np.testing.assert_array_equal(hidden.means.numpy(), cloud.means.numpy())
+    assert hidden_below(cloud, Plane(np.eye(3)[2], 0.5), margin=0.01) is cloud
+
+
+def test_what_reaches_far_below_a_plane_is_hidden_too() -> None:
+    """Of Gaussians with their means on the plane, those that stand on it and not those that lie on it; a third of the
+    mass below it is needed."""
+    half = np.sqrt(0.5)
+    cloud = GaussianCloud.from_numpy(
+        np.column_stack([np.zeros((4, 2)), [0.0, 0.0, 0.04, 0.08]]),
+        np.array([[1.0, 0.0, 0.0, 0.0], [half, 0.0, half, 0.0], [half, 0.0, half, 0.0], [half, 0.0, half, 0.0]]),
+        np.tile(np.log([0.15, 0.01, 0.01]), (4, 1)),
+        np.full(4, 2.0),
+        np.zeros((4, 1, 3)),
+    )
+    hidden = hidden_below(cloud, Plane(np.eye(3)[2], 0.0), margin=0.01)
+    np.testing.assert_array_equal(hidden.opacities() < 1.0 / 255.0, [False, True, True, False])

@@ -1,0 +1,143 @@
+"""The Python API takes what its functions give: captures, axes by name, scripts and motions of the user's own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import egs_warp as egs
+from egs_warp.assets import pawn
+from egs_warp.motions.sequence import Stance
+from egs_warp.pipelines.creature import PlacedCage
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> egs.Capture:
+    """A small pawn with z up, from a file that does not state it."""
+    path = tmp_path_factory.mktemp("capture") / "pawn.ply"
+    egs.write_ply(path, pawn(gaussian_count=1500, device="cpu").cloud)
+    return egs.read_capture(path)
+
+
+@pytest.fixture(scope="module")
+def creature(capture: egs.Capture) -> egs.Creature:
+    return egs.make_creature(capture, options=egs.CreatureOptions(nodes=60))
+
+
+def test_a_creature_is_made_of_a_capture_alone(creature: egs.Creature) -> None:
+    """Up is estimated, as the command does, and said."""
+    (note,) = creature.notes
+    assert note.startswith("up is estimated as +z (guessed: ") and note.endswith("; if that is wrong, give up")
+    np.testing.assert_allclose(creature.frame.axes[2], [0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("up", ["z", "+Z", " z ", [0, 0, 2], np.array([0.0, 0.0, 1.0])])
+def test_up_is_an_axis_or_three_numbers(up: Any, capture: egs.Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    class PlacedError(Exception):
+        pass
+
+    def place(*_: Any, up: np.ndarray, **__: Any) -> PlacedCage:
+        raise PlacedError(up / np.linalg.norm(up))
+
+    monkeypatch.setattr("egs_warp.pipelines.creature.place_cage", place)
+    with pytest.raises(PlacedError) as placed:
+        egs.make_creature(capture, up=up)
+    np.testing.assert_array_equal(placed.value.args[0], [0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"up": "w"}, "up w: give three numbers or one of x, y, z, -x, -y, -z"),
+        ({"up": [1, 2]}, r"up \[1, 2\]: give three numbers or one of"),
+        ({"up": [0, 0, 0]}, r"up \[0, 0, 0\]: give three numbers"),
+        ({"options": egs.CreatureOptions(front="ahead")}, "front ahead: give three numbers"),
+        ({"options": egs.CreatureOptions(gravity_up="up")}, "gravity_up up: give three numbers"),
+        ({"cloud": "pawn.ply"}, r"cloud pawn.ply \(str\): give Gaussians, as read_capture returns them"),
+    ],
+)
+def test_what_is_wrong_is_named(arguments: dict[str, Any], message: str, capture: egs.Capture) -> None:
+    with pytest.raises(egs.UserError, match=message):
+        egs.make_creature(**{"cloud": capture, **arguments})
+    if "cloud" in arguments:
+        with pytest.raises(egs.UserError, match=message):
+            egs.animate(arguments["cloud"], "out")
+        with pytest.raises(egs.UserError, match=message):
+            egs.prepare_scene(arguments["cloud"], egs.ObjectSpec(point=np.zeros(3)))
+
+
+@dataclass(frozen=True)
+class Record:
+    seconds: float
+
+
+class Still:
+    """Motion of the user's own: no objective, at rest after its time."""
+
+    expected_time = 0.05
+
+    def __init__(self, stance: Stance) -> None:
+        self.stance, self.begin, self.is_at_rest = stance, None, False
+
+    def objectives(self, state: Any, report: Any, dt: float) -> Sequence[Any]:
+        self.begin = state.time if self.begin is None else self.begin
+        self.is_at_rest = state.time - self.begin >= self.expected_time
+        return []
+
+    def plan_record(self) -> Record:
+        return Record(self.expected_time)
+
+    def planned_com(self, elapsed: float) -> None:
+        return None
+
+    def outcome_record(self, trajectory: egs.Trajectory, first: int, last: int) -> None:
+        return None
+
+    def notes(self) -> list[str]:
+        return ["nothing was to be done"]
+
+
+def test_a_motion_of_ones_own_needs_no_file(creature: egs.Creature, capture: egs.Capture, tmp_path: Path) -> None:
+    own: Any = Still
+    script = egs.own_script("wait", own, seconds=1.0) + egs.motion("stand 0.05")
+    performance = egs.simulate(creature, script, frames=8)
+    assert [record.name for record in performance.sequence.done] == ["wait", "stand"]
+    assert repr(performance) == f"SimulatedRun(wait, stand: 8 frames, {7 / 60:.2f} s)"
+    key = egs.Key(0.1, "head", egs.Quantity.POSITION, (0.01, 0.0, 0.0))
+    trajectory = egs.simulate(creature, egs.keyframe_script(key), frames=8).sequence.done[0]
+    assert trajectory.motion.plan_record().worst_miss["position"] < 0.02  # type: ignore[attr-defined]
+    with pytest.raises(egs.UserError, match="key 1: part 'haed' is unknown \\(did you mean 'head'\\?\\)"):
+        egs.keyframe_script(egs.Key(0.1, "haed", egs.Quantity.POSITION, (0.0, 0.0, 0.0)))
+    with pytest.raises(egs.UserError, match="name jump: give letters, digits and spaces, and not the name of"):
+        egs.own_script("jump", own, seconds=1.0)
+    with pytest.raises(egs.UserError, match="seconds 0: give a time above 0"):
+        egs.own_script("wait", own, seconds=0)
+    with pytest.raises(egs.UserError, match=r"distance 1\.0: the motion is a script with numbers of its own"):
+        egs.animate(capture, tmp_path, motion=script, options=egs.AnimateOptions(distance=1.0))
+    assert len(egs.simulate(creature, "stand 0.05", frames=2).frames) == 2
+
+
+def test_records_are_short_in_print(creature: egs.Creature, capture: egs.Capture) -> None:
+    performance = egs.simulate(creature, "stand 0.05", frames=2)
+    for record in (capture, capture.cloud, creature, performance, performance.simulation, performance.trajectory):
+        assert len(repr(record)) < 1500 and "\n" not in repr(record), type(record)
+    count = capture.count
+    assert repr(capture.cloud).startswith(f"GaussianCloud(means=vec3f[{count}], rotations=vec4f[{count}], ")
+    assert repr(capture).endswith("up=None, antialiased=False, notes=())")
+
+
+def test_warp_starts_silently_unless_it_is_asked_to_speak(capture: egs.Capture) -> None:
+    """Its greeting of seven lines, and its warning about a missing driver."""
+    script = "import warp as wp; {}import egs_warp as egs; egs.read_capture({!r})"
+    for asked, is_silent in (("", True), ("wp.config.log_level = wp.LOG_DEBUG; ", False)):
+        command = [sys.executable, "-c", script.format(asked, str(capture.source))]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, env=dict(os.environ))
+        assert (done.stdout + done.stderr == "") == is_silent
