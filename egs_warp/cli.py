@@ -105,7 +105,8 @@ _EXIT_STATUSES = """exit status:
   0    done
   1    out of memory or disk space, or a disk error; doctor: a required component is missing
   2    invalid input; the message says what to change
-  3    animate, resume: the files are written, but the body missed its target or fell, or a step could not be solved
+  3    animate, resume: the files are written, but the body fell or missed its target, or a step
+       could not be solved
   130  stopped by Ctrl-C; no half-written file is left
   143  stopped by SIGTERM; no half-written file is left"""
 

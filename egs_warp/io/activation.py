@@ -19,8 +19,9 @@ def with_logarithms(raw: RawCapture) -> RawCapture:
     """Return ``raw`` with logarithms and logits if it evidently holds activated values, with a note.
 
     All scales are then positive and all opacities within 0 to 1: as logarithms and logits, each Gaussian would be wider
-    than one unit and half transparent. If only the scales are positive, they are activated if most Gaussians would
-    otherwise be wider than the capture. Opacities alone are no evidence: they stay, with a note.
+    than one unit and half transparent. If only the scales are positive, or the opacities are all the same, they are
+    activated if most Gaussians would otherwise be wider than the capture. Opacities alone are no evidence: they stay,
+    with a note.
     """
     few = slice(0, _SAMPLE)
     if len(raw.means) < _MIN_COUNT or (
@@ -32,7 +33,8 @@ def with_logarithms(raw: RawCapture) -> RawCapture:
     absent = ~(scales > MIN_LOG_SCALE)
     positive = bool((absent | (scales >= 0.0)).all() and (scales > 0.0).any())
     within = _within(opacities)
-    if positive and (within or _wider_than_capture(raw)):
+    varies = within and float(np.nanmin(opacities)) < float(np.nanmax(opacities))
+    if positive and (varies or _wider_than_capture(raw)):
         with np.errstate(divide="ignore", invalid="ignore"):
             log_scales = np.where(absent, scales, np.log(np.maximum(scales, 0.0)))
         raw = replace(raw, log_scales=log_scales)
@@ -42,7 +44,7 @@ def with_logarithms(raw: RawCapture) -> RawCapture:
         note = "all scales are positive and all opacities within 0 to 1: read as standard deviations and opacities"
         note += ", not as their logarithms and logits"
         return replace(raw, opacity_logits=logits_from_opacities(opacities), notes=(*raw.notes, note))
-    if within and float(np.nanmin(opacities)) < float(np.nanmax(opacities)):
+    if varies:
         note = "all opacities lie within 0 to 1, as activated ones do; they were read as logits"
         return replace(raw, notes=(*raw.notes, note))
     return raw

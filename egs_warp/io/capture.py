@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
 from egs_warp.io.compressed_ply import decode_compressed_ply, is_compressed
 from egs_warp.io.gltf import decode_glb, decode_gltf, is_glb
 from egs_warp.io.limits import FREE_BYTES, INFLATION, MAX_TEXT_BYTES, read_bytes
@@ -56,6 +57,10 @@ class Capture(GaussianCloud):
         """The Gaussians alone."""
         arrays = (self.means, self.rotations, self.log_scales, self.opacity_logits, self.sh)
         return GaussianCloud(*arrays, antialiased=self.antialiased)
+
+    def with_cloud(self, cloud: GaussianCloud, **changes: Any) -> Capture:
+        """Return the capture with the Gaussians of ``cloud`` and other ``changes`` of its fields."""
+        return replace(self, **{name: getattr(cloud, name) for name in (*ARRAYS, "antialiased")}, **changes)
 
 
 def read_capture(path: Path | str, *, device: str | None = None) -> Capture:

@@ -108,9 +108,11 @@ def merge_captures(captures: Sequence[Capture]) -> Capture:
     if antialiased != any(capture.antialiased for capture in captures):
         notes = (*notes, "only some of the captures were trained with antialiasing; the mark is dropped")
     cloud = GaussianCloud.from_numpy(
-        means, rotations, log_scales, logits, np.concatenate(sh), device=str(first.cloud.device)
+        *(means, rotations, log_scales, logits, np.concatenate(sh)),
+        antialiased=antialiased,
+        device=str(first.cloud.device),
     )
-    return replace(first, cloud=cloud, origin=origin, up=up, antialiased=antialiased, notes=notes, rows=None)
+    return first.with_cloud(cloud, origin=origin, up=up, notes=notes, rows=None)
 
 
 def _file_positions(capture: Capture) -> np.ndarray:
@@ -159,7 +161,7 @@ def edit_capture(capture: Capture, edits: CaptureEdits) -> tuple[Capture, tuple[
         before = cloud.count
         cloud, moved = decimated(cloud, edits.count)
         lines.append(f"decimated: {before} Gaussians merged to {cloud.count}, moved by {moved:.2g} units (RMS)")
-    return replace(capture, cloud=cloud, origin=origin, up=up, rows=None), tuple(lines)
+    return capture.with_cloud(cloud, origin=origin, up=up, rows=None), tuple(lines)
 
 
 def floaters(cloud: GaussianCloud) -> np.ndarray:

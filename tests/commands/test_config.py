@@ -66,7 +66,7 @@ def test_an_interrupted_run_has_its_file(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr("egs_warp.pipelines.animate.simulate", refused)
     assert cli.main([*flags[:-1], str(tmp_path / "b")]) == 2
-    assert list((tmp_path / "b").iterdir()) == []
+    assert not (tmp_path / "b").exists()
 
 
 def _given(arguments: list[str]) -> dict:
@@ -121,7 +121,7 @@ def test_clicks_are_a_list_and_clicks_of_the_command_line_replace_those_of_the_f
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("speed: 3", "unknown key 'speed'; known keys are background, beats, camera,"),
+        ("speed: 3", "unknown key 'speed' (did you mean"),
         ("trust: true", "unknown key 'trust'"),
         ("motion: [jump]", "motion is ['jump']; give a text or a number"),
         ("motion: true", "motion is True; give a text or a number"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +54,7 @@ def test_reported_losses_are_the_actual_ones(tmp_path: Path) -> None:
     assert "positions 0.018 (at most 0.4) units, of a size of 4" in said and "deviations 2 (at most 2) %" in said
     assert "opacities 0 (at most 0) of 255" in said and "higher bands 0 (at most 0)" in said
     rows = np.arange(2, 500)
-    fewer = replace(after, cloud=after.cloud.subset(rows), rows=rows)
+    fewer = after.with_cloud(after.subset(rows), rows=rows)
     gone, _ = conversion_loss(before, fewer, order)
     assert gone == "2 of 500 Gaussians are gone"
 
@@ -72,7 +71,7 @@ def test_each_gaussian_is_compared_with_itself(kind: str, tmp_path: Path) -> Non
     read = read_capture(path, device="cpu").cloud.means.numpy()
     errors = np.linalg.norm(read.astype(float) - cloud.means.numpy()[order], axis=1)
     assert errors.max() < 0.01
-    said = " ".join(conversion_loss(replace(read_capture(path), cloud=cloud), read_capture(path), order))
+    said = " ".join(conversion_loss(read_capture(path).with_cloud(cloud), read_capture(path), order))
     if errors.any():
         assert f"positions {np.sqrt(np.mean(errors**2)):.2g} (at most {errors.max():.2g}) units" in said
 

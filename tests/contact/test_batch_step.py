@@ -17,7 +17,7 @@ from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.pipelines.creature import Creature
-from tests.support.creatures import coarse_pawn
+from tests.support.creatures import coarse_pawn, sagging
 
 FRICTIONS = (0.8, 0.2, 0.6, 1.0, 0.5)
 DRAG = 0.3
@@ -25,7 +25,7 @@ DRAG = 0.3
 
 @pytest.fixture(scope="module")
 def creature() -> Creature:
-    return coarse_pawn()
+    return sagging(coarse_pawn())
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from egs_warp.contact.coulomb import coulomb_forces, pack_contacts
 from egs_warp.kernels.contact.coulomb import sweeps_kernel
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.simulated_run import simulate
-from tests.support.creatures import coarse_pawn
+from tests.support.creatures import coarse_pawn, sagging
 
 COUNT = 5
 
@@ -210,7 +210,7 @@ def test_more_points_than_nodes_are_solved_by_continuation(monkeypatch: pytest.M
     present forces the kernel alone does not converge; continuation from compliant contacts does, also for many
     worlds.
     """
-    creature = coarse_pawn()
+    creature = sagging(coarse_pawn())
     first = simulate(creature, motion("jump"), frames=2).simulation.reports[0]
     problems: list[tuple[Any, ...]] = []
 

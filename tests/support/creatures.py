@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -28,6 +28,12 @@ def coarse_pawn(*, friction: float = 0.8, device: str = "cpu") -> Creature:
     """The built-in pawn with few Gaussians, in a cage of about 50 nodes, built once per process."""
     scene = pawn(gaussian_count=3000, device=device)
     return make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=50, friction=friction))
+
+
+def sagging(creature: Creature) -> Creature:
+    """Return the creature with its captured shape as the unloaded one: it sags until most of its base touches."""
+    stepper = creature.stepper.with_unloaded_shape(creature.body.mesh.nodes)
+    return replace(creature, stepper=stepper, start=settle(stepper))
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,6 @@ def on_device(
         "egs_warp.locomotion.stepper.linear_solver_on", lambda _, pattern: DenseCholesky(pattern, device=device)
     )
     patch.setattr("egs_warp.fem.elasticity.SimdElasticity", WarpElasticity)
-    mesh, material = creature.body.mesh, creature.body.assembly.material
+    mesh, material = creature.body.assembly.mesh, creature.body.assembly.material
     body = replace(creature.body, assembly=ElasticAssembly(mesh, material, device=device))
     return LocomotionStepper(body, creature.muscles, creature.geometry, settings=settings, device=device)
