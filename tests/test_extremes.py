@@ -64,7 +64,7 @@ def ordinary() -> dict[str, np.ndarray]:
     }
 
 
-def cloud_of(values: dict[str, np.ndarray]) -> GaussianCloud:
+def cloud_of(values: dict[str, Any]) -> GaussianCloud:
     return GaussianCloud.from_numpy(**values, device="cpu")
 
 

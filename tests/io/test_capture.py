@@ -140,7 +140,7 @@ def test_real_sog_survives_being_written_again(name: str, data_dir: Path, tmp_pa
 
 # Lossy round trips --------------------------------------------------------------------------------------------------
 
-WRITERS: dict[str, Callable[..., None]] = {
+WRITERS: dict[str, Callable[..., object]] = {
     "a.compressed.ply": lambda path, cloud: write_compressed_ply(path, cloud, keep_order=True),
     "a2.spz": lambda path, cloud: write_spz(path, cloud, version=2),
     "a3.spz": write_spz,

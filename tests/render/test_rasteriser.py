@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import warp as wp
@@ -30,7 +32,7 @@ def random_scene(
     }
 
 
-def cloud_of(values: dict[str, np.ndarray], device: str = "cpu") -> GaussianCloud:
+def cloud_of(values: dict[str, Any], device: str = "cpu") -> GaussianCloud:
     return GaussianCloud.from_numpy(**values, device=device)
 
 

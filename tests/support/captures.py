@@ -69,7 +69,7 @@ def spz_of_streams(plain: bytes, count: int, sh_bytes: int, records: bytes = b""
     return header + struct.pack("<I12x", 32 + len(records)) + records + table + b"".join(streams)
 
 
-WRITERS: dict[str, Callable[..., None]] = {
+WRITERS: dict[str, Callable[..., object]] = {
     "a.ply": write_ply,
     "b.ply": write_compressed_ply,
     "a.spz": write_spz,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from egs_warp.geometry.camera import Camera
@@ -17,7 +19,7 @@ def ring(count: int = 6, size: int = 40) -> list[Camera]:
     ]
 
 
-def ball(count: int = 150, seed: int = 0) -> dict[str, np.ndarray]:
+def ball(count: int = 150, seed: int = 0) -> dict[str, Any]:
     random = np.random.default_rng(seed)
     directions = random.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
