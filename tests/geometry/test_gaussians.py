@@ -23,9 +23,9 @@ def test_what_lies_below_a_plane_is_hidden_and_stays_in_its_place() -> None:
     assert hidden_below(cloud, Plane(np.eye(3)[2], 0.5), margin=0.01) is cloud
 
 
-def test_what_reaches_far_below_a_plane_is_hidden_too() -> None:
-    """Of Gaussians with their means on the plane, those that stand on it and not those that lie on it; a third of the
-    mass below it is needed."""
+def test_gaussians_that_reach_far_below_a_plane_are_hidden() -> None:
+    """Gaussians with their means on the plane are hidden if they stand on it, and stay if they lie on it; a third of the
+    mass must be below the plane."""
     half = np.sqrt(0.5)
     cloud = GaussianCloud.from_numpy(
         np.column_stack([np.zeros((4, 2)), [0.0, 0.0, 0.04, 0.08]]),
