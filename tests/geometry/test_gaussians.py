@@ -24,8 +24,10 @@ def test_what_lies_below_a_plane_is_hidden_and_stays_in_its_place() -> None:
 
 
 def test_gaussians_that_reach_far_below_a_plane_are_hidden() -> None:
-    """Gaussians with their means on the plane are hidden if they stand on it, and stay if they lie on it; a third of the
-    mass must be below the plane."""
+    """Gaussians with their means on the plane are hidden if they stand on it, and stay if they lie on it.
+
+    A third of the mass must be below the plane.
+    """
     half = np.sqrt(0.5)
     cloud = GaussianCloud.from_numpy(
         np.column_stack([np.zeros((4, 2)), [0.0, 0.0, 0.04, 0.08]]),
