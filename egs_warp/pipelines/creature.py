@@ -222,11 +222,7 @@ def make_creature(
         muscles = body_muscles(body, options.muscles_file, frame)
         stepper = LocomotionStepper(body, muscles, geometry, settings=options.settings, device=device)
         progress("stand")
-        start = settle(stepper)
-        is_stiff_enough = _stands(stepper, start)
-        if is_stiff_enough or sag < MIN_SAG:
-            stepper, start, shape_error = settle_as_captured(stepper, start)
-            is_stiff_enough = shape_error <= SHAPE_TOLERANCE
+        stepper, start, is_stiff_enough = _settled(stepper, standing.limbs)
         if is_stiff_enough or sag < MIN_SAG:
             surfaces = (field or Solid((GROUND,)), *solids)
             placed = to_body_frame(cloud, frame)
@@ -273,7 +269,7 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
     new_body = make_body(creature.cage.mesh, GROUND, up=up, sag=sag, device=device)
     muscles = body_muscles(new_body, muscles_file, creature.frame)
     stepper = LocomotionStepper(new_body, muscles, geometry, settings=creature.stepper.settings, device=device)
-    stepper, start, _ = settle_as_captured(stepper, settle(stepper))
+    stepper, start, _ = _settled(stepper, creature.limbs)
     return replace(creature, stepper=stepper, start=start)
 
 
@@ -390,6 +386,24 @@ def body_muscles(body: SoftBody, file: Path | None, frame: BodyFrame) -> MuscleS
         strength=4.0 * body.stiffening,
         young_modulus=body.young_modulus,
     )
+
+
+def _settled(stepper: LocomotionStepper, limbs: Limbs) -> tuple[LocomotionStepper, BodyState, bool]:
+    """Let a body come to rest in its captured shape (``settle_as_captured``).
+
+    A body on a round base, or one that lies along the ground, is soft enough to flatten where it touches the ground. It
+    keeps the captured shape as its unloaded one: captured as a round body, it would otherwise touch at a point.
+
+    Returns:
+        The stepper with the unloaded shape; the state at rest; and False if the body is too soft for that.
+    """
+    start, mesh = settle(stepper), stepper.body.mesh
+    if not _stands(stepper, start):
+        return stepper, start, False
+    if support_kind_of(mesh, mesh.nodes[:, 2], limbs.count) in (SupportKind.ROUND_BASE, SupportKind.LYING):
+        return stepper, start, True
+    stepper, start, shape_error = settle_as_captured(stepper, start)
+    return stepper, start, shape_error <= SHAPE_TOLERANCE
 
 
 def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
