@@ -222,7 +222,7 @@ def make_creature(
         muscles = body_muscles(body, options.muscles_file, frame)
         stepper = LocomotionStepper(body, muscles, geometry, settings=options.settings, device=device)
         progress("stand")
-        stepper, start, is_stiff_enough = _settled(stepper, standing.limbs)
+        stepper, start, is_stiff_enough = _rest_state(stepper, standing.limbs)
         if is_stiff_enough or sag < MIN_SAG:
             surfaces = (field or Solid((GROUND,)), *solids)
             placed = to_body_frame(cloud, frame)
@@ -269,7 +269,7 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
     new_body = make_body(creature.cage.mesh, GROUND, up=up, sag=sag, device=device)
     muscles = body_muscles(new_body, muscles_file, creature.frame)
     stepper = LocomotionStepper(new_body, muscles, geometry, settings=creature.stepper.settings, device=device)
-    stepper, start, _ = _settled(stepper, creature.limbs)
+    stepper, start, _ = _rest_state(stepper, creature.limbs)
     return replace(creature, stepper=stepper, start=start)
 
 
@@ -388,7 +388,7 @@ def body_muscles(body: SoftBody, file: Path | None, frame: BodyFrame) -> MuscleS
     )
 
 
-def _settled(stepper: LocomotionStepper, limbs: Limbs) -> tuple[LocomotionStepper, BodyState, bool]:
+def _rest_state(stepper: LocomotionStepper, limbs: Limbs) -> tuple[LocomotionStepper, BodyState, bool]:
     """Let a body come to rest in its captured shape (``settle_as_captured``).
 
     A body on a round base, or one that lies along the ground, is soft enough to flatten where it touches the ground. It
