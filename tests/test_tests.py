@@ -9,11 +9,14 @@ TESTS = Path(__file__).parent
 ROOT = TESTS.parent
 FILES = sorted(TESTS.rglob("test_*.py"))
 ACROSS = {
+    "io/test_antialiased.py",
     "io/test_by_hand.py",
     "io/test_errors.py",
+    "io/test_ply_variants.py",
     "meshing/test_body_frame.py",
     "motions/test_runs.py",
     "pipelines/test_invariance.py",
+    "pipelines/test_python_api.py",
     "web/test_live_page.py",
     "web/test_steered.py",
 }

@@ -250,9 +250,9 @@ def _animate_scene(args: argparse.Namespace) -> Report:
     from egs_warp.pipelines.facing_direction import mean_view
     from egs_warp.pipelines.prepare_scene import SceneOptions, viewing_directions
 
-    shot, background_path = shot_of(args)
-    if background_path is not None:
+    if args.background is not None:
         raise UserError("--background: with --object the rest of the scene is the background; leave one of them out")
+    shot, _ = shot_of(args)
     if args.inpainter is not None and args.no_inpaint:
         raise UserError("--inpainter: --no-inpaint leaves the floor as captured; leave one of them out")
     options = _options(args)

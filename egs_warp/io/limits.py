@@ -6,6 +6,7 @@ limits of this module; docs/reliability.md lists them.
 
 from __future__ import annotations
 
+import difflib
 import io
 import os
 import stat
@@ -103,8 +104,12 @@ def read_bytes(path: Path | str, *, at_most: int | None = None, missing: str = "
 
 def missing_error(path: Path | str, advice: str = "check the path") -> UserError:
     """Return the error about a missing ``path``, with the name in its folder that may be meant."""
+    missing = Path(path)
     try:
-        names = sorted(os.listdir(Path(path).parent))
+        names = sorted(os.listdir(missing.parent))
     except (OSError, ValueError):
         names = []
-    return UserError(f"{path}: no such file or folder{did_you_mean(Path(path).name, names)}; {advice}")
+    # Names that share only their suffix are not alike.
+    stem = missing.stem.lower()
+    names = [name for name in names if difflib.SequenceMatcher(None, stem, Path(name).stem.lower()).ratio() > 0.6]
+    return UserError(f"{path}: no such file or folder{did_you_mean(missing.name, names)}; {advice}")

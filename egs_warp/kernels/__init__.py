@@ -1,5 +1,4 @@
-"""Every Warp kernel and device function, in the packages of their host code; they import only warp, ``precision`` and
-each other.
+"""Every Warp kernel and device function, by package of the host code; imports only warp, ``precision`` and each other.
 
-Kernels read and write Warp arrays; one thread or block handles one element, point, Gaussian, pixel or QP.
+Input: Warp arrays. Output: Warp arrays: the quantities of the paper's equations, one thread or block for each element.
 """

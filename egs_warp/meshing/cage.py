@@ -177,7 +177,7 @@ def cage_of_body(
 def _too_thin(why: str) -> UserError:
     return UserError(
         f"object: it is too thin for its elements ({why}); choose a thicker object, or cut out a piece of at most 20"
-        " times its thickness (egs-warp convert --box)",
+        " times its thickness",
         check=("plane", "up"),
     )
 

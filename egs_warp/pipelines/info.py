@@ -189,7 +189,7 @@ def inspect_capture(
         raise UserError(
             f"object: its body hangs {lowest / height:.2g} of its height above the ground that was"
             f" {'found' if plane is None else 'given'}; parts of the capture that lie lower are apart from it: cut them"
-            " away (egs-warp convert --box), or give the ground",
+            " away, or give the ground",
             check=("plane", "up"),
         )
     progress("front")

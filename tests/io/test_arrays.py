@@ -33,7 +33,7 @@ def _member(shape: str, dtype: str, data: bytes = b"") -> bytes:
         (_member("(10**9, 10**9)", "<f8"), "malformed|Cannot parse"),
         (_member("(1000000000000000,)", "<f8"), "does not match its number of bytes"),
         (_member("(-1, -8)", "|u1", b"12345678"), "does not match its number of bytes"),
-        (_member("(2,)", "|O", b"12345678"), "an array of object"),
+        (_member("(2,)", "|O", b"12345678"), "an array of type object"),
         (_member("(1000000000,)", "|V0"), "an array of"),
         (b"\x93NUMPY\x03\x00", "an array of format 3.0"),
     ],

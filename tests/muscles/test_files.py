@@ -76,7 +76,10 @@ def test_stiffness_strain_units_groups_and_partners(tmp_path: Path) -> None:
         ([], "the file contains no object"),
         ({}, 'no fibres; give a list "fibres"'),
         ({"fibres": []}, 'no fibres; give a list "fibres"'),
-        ({"fibres": [STRAIGHT], "fibers": []}, '"fibers" is not known here; use fibres, max_strain, mirror_plane'),
+        (
+            {"fibres": [STRAIGHT], "fibers": []},
+            "\"fibers\" is not known here (did you mean 'fibres'?); use fibres, max_strain, mirror_plane",
+        ),
         ({"fibres": [STRAIGHT], "max_strain": 1.5}, '"max_strain" is 1.5; give a number below 1'),
         ({"fibres": [STRAIGHT], "mirror_plane": 1}, '"mirror_plane" must be an object'),
         (

@@ -131,7 +131,7 @@ def test_records_are_short_in_print(creature: egs.Creature, capture: egs.Capture
         assert len(repr(record)) < 1500 and "\n" not in repr(record), type(record)
     count = capture.count
     assert repr(capture.cloud).startswith(f"GaussianCloud(means=vec3f[{count}], rotations=vec4f[{count}], ")
-    assert repr(capture).endswith("up=None, antialiased=False, notes=())")
+    assert repr(capture).endswith("up=None, vertical_axis=None, notes=(), origin=None, rows=None)")
 
 
 def test_warp_starts_silently_unless_it_is_asked_to_speak(capture: egs.Capture) -> None:
