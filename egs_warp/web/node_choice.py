@@ -40,7 +40,7 @@ class NodeChoice:
         speed = "real time" if self.speed >= 1.0 else f"{self.speed:.1g} of real time"
         return (
             f"a body of about {self.nodes} nodes is built, which this machine now simulates in about {speed};"
-            " --nodes sets another number"
+            " give the number of nodes to choose another"
         )
 
 
