@@ -20,14 +20,15 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constrain
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
 
-# A capture on two feet, where the data are.
+# A capture on two feet, where the data are. Its feet slide by more than 10 % of a stride, which exit status 3 reports.
 MONKEY := $(or $(EGS_WARP_DATA),../shared/data)/objects/monkey.ply
 examples: setup
 	for motion in jump twist hop walk waddle crawl turn get_up dance; do \
 		$(BIN)/python examples/$$motion.py --out out/$$motion $(FRAMES:%=--frames %) || exit 1; \
 	done
 	if [ -e "$(MONKEY)" ]; then \
-		$(BIN)/egs-warp animate "$(MONKEY)" --up y --motion walk --out out/monkey --overwrite $(FRAMES:%=--frames %); \
+		$(BIN)/egs-warp animate "$(MONKEY)" --up y --motion walk --out out/monkey --overwrite $(FRAMES:%=--frames %) \
+			|| [ $$? -eq 3 ]; \
 	fi
 	$(BIN)/python examples/finetune.py --out out/finetune $(FRAMES:%=--steps %)
 
