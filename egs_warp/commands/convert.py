@@ -79,7 +79,7 @@ def _convert_files(args: argparse.Namespace, stack: ExitStack) -> int:
     from egs_warp.io.limits import missing_error
     from egs_warp.io.run_folder import check_no_file_of_a_run
     from egs_warp.io.sequence import numbered_captures
-    from egs_warp.io.writing import WRITERS, is_capture_name, write_capture, writer_of
+    from egs_warp.io.writing import WRITERS, is_capture_name, stored_origin, write_capture, writer_of
     from egs_warp.launching import use_device
     from egs_warp.pipelines.edit_capture import edit_capture, merge_captures
     from egs_warp.pipelines.progress import conversion_bar
@@ -118,7 +118,8 @@ def _convert_files(args: argparse.Namespace, stack: ExitStack) -> int:
             if not lines:
                 notes = [note if len(sources) > 1 else f"{sources[0]}: {note}" for note in capture.notes]
                 begins("compare")
-                lines = [*changes, *conversion_loss(capture, read_capture(target), order)]
+                origin = stored_origin(write, capture.origin)
+                lines = [*changes, *conversion_loss(capture, read_capture(target), order, origin=origin)]
     for note in notes:
         print_note(note)
     size = sum(_size(target) for _, target in jobs)

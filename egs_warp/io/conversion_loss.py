@@ -15,7 +15,9 @@ _BLOCK_ROWS = 1 << 17
 """Gaussians compared at a time, which bounds the memory."""
 
 
-def conversion_loss(before: Capture, after: Capture, order: np.ndarray | None = None) -> list[str]:
+def conversion_loss(
+    before: Capture, after: Capture, order: np.ndarray | None = None, *, origin: np.ndarray | None = None
+) -> list[str]:
     """Describe, line by line for the user, how ``after`` differs from ``before``.
 
     Args:
@@ -23,6 +25,7 @@ def conversion_loss(before: Capture, after: Capture, order: np.ndarray | None = 
         after: The file, read back.
         order: (n,) number in ``before`` of each Gaussian in the order of the file, as its writer returns it; None if
             the order is the same.
+        origin: (3,) offset of ``before`` that the file includes (``stored_origin``); None without one.
     """
     old, new = before.cloud, after.cloud
     order = np.arange(old.count) if order is None else order
@@ -40,10 +43,11 @@ def conversion_loss(before: Capture, after: Capture, order: np.ndarray | None = 
         lines.append("the up direction is lost")
     if after.up is not None and (before.up is None or not np.allclose(before.up, after.up)):
         lines.append("the axes are unchanged, but this format's viewers take +y as up")
-    if before.origin is not None and after.origin is None:
+    if before.origin is not None and origin is None:
         offset = ",".join(f"{x:.12g}" for x in before.origin)
         lines.append(f"the offset {offset} has no place in this format; the file is relative to it")
-    differences = _differences(old, new, order)
+    shift = np.zeros(3) if origin is None else (0.0 if after.origin is None else after.origin) - origin
+    differences = _differences(old, new, order, shift)
     if lines or differences:
         return lines + differences
     if before.notes:
@@ -67,9 +71,9 @@ class _Loss:
         return f"{(self._squares / self._count) ** 0.5:.2g} (at most {self._worst:.2g})"
 
 
-def _differences(old: GaussianCloud, new: GaussianCloud, order: np.ndarray) -> list[str]:
+def _differences(old: GaussianCloud, new: GaussianCloud, order: np.ndarray, shift: np.ndarray) -> list[str]:
     coefficients = min(old.sh.shape[1], new.sh.shape[1])
-    if all(_is_same(*pair) for pair in _blocks(old, new, order, coefficients)):
+    if all(_is_same(*pair) for pair in _blocks(old, new, order, coefficients, shift)):
         return []
     measures = {
         "positions {} units": _position_errors,
@@ -82,7 +86,7 @@ def _differences(old: GaussianCloud, new: GaussianCloud, order: np.ndarray) -> l
     if coefficients == 1:
         measures.popitem()
     losses = {text: _Loss() for text in measures}
-    for pair in _blocks(old, new, order, coefficients):
+    for pair in _blocks(old, new, order, coefficients, shift):
         for text, measure in measures.items():
             losses[text].add(measure(*pair))
     extent = float(np.ptp(old.means.numpy(), axis=0).max())
@@ -102,15 +106,19 @@ class _Block(NamedTuple):
 
 
 def _blocks(
-    old: GaussianCloud, new: GaussianCloud, order: np.ndarray, coefficients: int
+    old: GaussianCloud, new: GaussianCloud, order: np.ndarray, coefficients: int, shift: np.ndarray
 ) -> Iterator[tuple[_Block, _Block]]:
-    """Yield the same Gaussians of both clouds, with bands of colour that both have."""
+    """Yield the same Gaussians of both clouds, with bands of colour that both have, and those of ``new`` moved by
+    ``shift`` (3,)."""
     names = _Block._fields
     before, after = ([getattr(cloud, name).numpy() for name in names] for cloud in (old, new))
     before[-1], after[-1] = before[-1][:, :coefficients], after[-1][:, :coefficients]
     for start in range(0, len(order), _BLOCK_ROWS):
         rows = order[start : start + _BLOCK_ROWS]
-        yield _Block(*(a[rows] for a in before)), _Block(*(b[start : start + len(rows)] for b in after))
+        same = _Block(*(b[start : start + len(rows)] for b in after))
+        if shift.any():
+            same = same._replace(means=same.means + shift)
+        yield _Block(*(a[rows] for a in before)), same
 
 
 def _is_same(old: _Block, new: _Block) -> bool:

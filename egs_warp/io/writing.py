@@ -33,11 +33,17 @@ WRITERS: dict[str, tuple[str, CaptureWriter]] = {
 kinds with one ending, the first is the default."""
 
 
+def stored_origin(write: CaptureWriter, origin: np.ndarray | None) -> np.ndarray | None:
+    """Return the ``origin`` (3,) of a capture if its file includes it: only .ply and .glb do."""
+    return origin if write in (write_ply, write_glb) else None
+
+
 def write_capture(
     path: Path, cloud: GaussianCloud, write: CaptureWriter, *, origin: np.ndarray | None
 ) -> np.ndarray | None:
-    """Call ``write``, and return what it returns. ``origin`` (3,) of the capture is kept by .ply and .glb only."""
-    if origin is None or write not in (write_ply, write_glb):
+    """Call ``write``, and return what it returns; ``origin`` (3,) of the capture is included if possible
+    (``stored_origin``)."""
+    if stored_origin(write, origin) is None:
         return write(path, cloud)
     (write_ply if write is write_ply else write_glb)(path, cloud, origin=origin)
     return None

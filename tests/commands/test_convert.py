@@ -13,6 +13,7 @@ from egs_warp.cli import main
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io import read_capture, write_ply, write_spz
 from egs_warp.io.conversion_loss import conversion_loss
+from egs_warp.io.glb import write_glb
 from egs_warp.io.sequence import numbered_captures
 from egs_warp.io.writing import WRITERS
 from tests.support.captures import assert_same_bits, make_cloud
@@ -131,6 +132,23 @@ def test_offsets_are_kept_or_reported(tmp_path: Path, capsys: pytest.CaptureFixt
     back = ",".join(str(-x) for x in first.origin)
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "c.ply"), f"--translate={back}"]) == 0
     assert read_capture(tmp_path / "c.ply", device="cpu").origin is None
+
+
+@pytest.mark.parametrize("place", [(1.0, 2.0, 3.0), (5403000.5, 431000.25, 7.1)])
+def test_an_offset_that_is_read_as_another_one_is_no_loss(
+    place: tuple[float, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A .ply holds positions with the offset: none is read if single precision suffices, or a rounder one."""
+    write_glb(tmp_path / "a.glb", make_cloud(100), origin=np.array(place))
+    assert main(["convert", str(tmp_path / "a.glb"), str(tmp_path / "b.ply")]) == 0
+    said = capsys.readouterr()
+    assert "positions are relative to" in said.err and "has no place" not in said.out
+    error = re.search(r"positions \S+ \(at most (\S+)\) units", said.out)
+    assert error is not None and 0.0 < float(error[1]) < 1e-6
+    a, b = (read_capture(tmp_path / name, device="cpu") for name in ("a.glb", "b.ply"))
+    assert (a.origin is not None) and (b.origin is None) == (place[0] == 1.0)
+    there = b.means.numpy() + (0.0 if b.origin is None else b.origin)
+    np.testing.assert_allclose(there, a.means.numpy() + a.origin, rtol=0, atol=1e-6)
 
 
 def test_captures_are_turned_cut_and_merged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
