@@ -156,10 +156,13 @@ class _Asset:
             notes[f"{left_out} meshes of splats that the scene does not show were left out"] = None
         transforms = np.concatenate([one.transforms for one in placed])
         up, origin = _Y_UP, None
-        is_shared = np.allclose(transforms, transforms[0], rtol=1e-7, atol=1e-12)
+        is_shared = np.allclose(transforms, transforms[0], rtol=1e-14, atol=1e-14)
         if is_shared and is_proper_similarity(transforms[0, :3, :3]):
             if np.array_equal(transforms[0, :3, :3], np.eye(3)):
                 origin = transforms[0, :3, 3] if transforms[0, :3, 3].any() else None
+                if origin is not None:
+                    text = ",".join(f"{x:.15g}" for x in origin)
+                    notes[f"positions are relative to {text}, the translation of glTF's nodes"] = None
             elif not np.allclose(transforms[0], np.eye(4), atol=1e-6):
                 notes["the transforms of glTF's nodes were ignored: the capture is in the axes of its mesh"] = None
                 up = np.linalg.inv(transforms[0, :3, :3]) @ _Y_UP

@@ -195,6 +195,12 @@ def test_two_nodes_of_one_mesh(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.up, [0, 1, 0])
 
 
+def test_nodes_near_each_other_and_far_from_the_origin_are_two(tmp_path: Path) -> None:
+    nodes = [{"mesh": 0, "translation": [x, 0, 0]} for x in (5403000.0, 5403000.25)]
+    means = _with_nodes(tmp_path, make_cloud(30), nodes).cloud.means.numpy()
+    np.testing.assert_allclose(means[30:] - means[:30], np.tile([0.25, 0, 0], (30, 1)), atol=1e-6)
+
+
 def _euler(*degrees: float) -> Rotation:
     return Rotation.from_euler("xyz", degrees, degrees=True)
 
