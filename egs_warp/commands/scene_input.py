@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -98,10 +98,8 @@ def read_scene(args: argparse.Namespace) -> SceneInput:
     up = parse_up(args.up) if args.up is not None else None
     plane = plane_of(args.plane) if args.plane is not None else None
     capture = read_capture(args.capture, device=args.device)
-    poses = read_posed_images(args.cameras) if args.cameras else None
+    poses = read_posed_images(args.cameras).relative_to(capture.origin) if args.cameras else None
     posed = poses.images if poses is not None else ()
-    if capture.origin is not None:
-        posed = tuple(_relative_to(capture.origin, one) for one in posed)
     spec = None
     if args.object is None and args.mask_model is not None:
         raise UserError("--mask-model: it needs clicks; give --object +u,v@photo")
@@ -113,9 +111,3 @@ def read_scene(args: argparse.Namespace) -> SceneInput:
     if poses is not None:
         notes = (*notes, *poses.messages)
     return SceneInput(capture.cloud, posed, spec, up, plane, notes)
-
-
-def _relative_to(origin: np.ndarray, posed: PosedImage) -> PosedImage:
-    """Return a photo whose camera is placed relative to ``origin`` (3,), as the positions of the capture are."""
-    camera = posed.camera
-    return replace(posed, camera=replace(camera, translation=camera.translation + camera.rotation @ origin))

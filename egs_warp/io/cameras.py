@@ -14,7 +14,7 @@ from egs_warp.io.photo_files import PhotoAndMask, PhotoFiles
 from egs_warp.io.ply import read_point_ply
 from egs_warp.io.pose_files import PoseSource, find_poses
 from egs_warp.io.pose_json import parse_pose_json, read_pose_json, write_cameras
-from egs_warp.io.posed_images import PosedImage, PosedImages, checked_camera, convert_each
+from egs_warp.io.posed_images import PosedImage, PosedImages, checked_camera, convert_each, near_origin
 from egs_warp.io.reality_scan import read_reality_scan
 
 __all__ = ["PosedImage", "PosedImages", "read_cameras", "read_points", "read_posed_images", "write_cameras"]
@@ -41,12 +41,13 @@ def read_posed_images(path: Path | str) -> PosedImages:
     if source.path.is_dir():
         return _from_colmap(source)
     files = PhotoFiles(source.root)
-    if suffix in (".csv", ".xml"):
-        images, excluded, notes = (read_reality_scan if suffix == ".csv" else read_metashape)(source.path, files)
+    notes: list[str] = []
+    if suffix == ".xml":
+        images, excluded, notes = read_metashape(source.path, files)
     else:
-        images, excluded = read_pose_json(source.path, files)
-        notes = []
-    return PosedImages(source.path, tuple(images), tuple(excluded), (*source.notes, *notes))
+        images, excluded = (read_reality_scan if suffix == ".csv" else read_pose_json)(source.path, files)
+    poses = PosedImages(source.path, tuple(images), tuple(excluded), (*source.notes, *notes))
+    return near_origin(poses) if suffix in (".csv", ".xml") else poses
 
 
 def read_points(path: Path | str) -> SparsePoints | None:

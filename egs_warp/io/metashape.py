@@ -23,7 +23,6 @@ from egs_warp.io.posed_images import (
     checked_camera,
     convert_each,
     is_rotation,
-    near_origin,
 )
 
 _TYPES = {"frame": False, "fisheye": True, "equidistant_fisheye": True}
@@ -76,11 +75,10 @@ def read_metashape(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], l
     ]
     empty = f"{source}: it has no cameras; {_EXPORT}"
     images, excluded = convert_each(((entry.name, entry) for entry in entries), _posed, empty)
-    images, note = near_origin(images)
     skew = max((abs(_calibration_number(sensor, "b2")) for sensor in sensors.values()), default=0.0)
     if skew > _MAX_SKEW:
         notes.append(f"the skew b2 of {skew:g} pixels is ignored; export undistorted photos if that matters")
-    return images, excluded, [*notes, note] if note else notes
+    return images, excluded, notes
 
 
 @dataclass(frozen=True)

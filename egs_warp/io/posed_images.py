@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -62,6 +62,15 @@ class PosedImages:
     """Photos whose pose or camera is invalid."""
     notes: tuple[str, ...] = ()
     """Messages for the user about the choice of the files and their content."""
+    origin: np.ndarray | None = None
+    """(3,) float64: offset of georeferenced cameras, which was subtracted from their positions (``near_origin``)."""
+
+    def relative_to(self, origin: np.ndarray | None) -> PosedImages:
+        """Return the cameras relative to the ``origin`` (3,) of their capture; unchanged if it has none."""
+        if origin is None:
+            return self
+        shift = origin if self.origin is None else origin - self.origin
+        return replace(self, images=tuple(_shifted(self.images, shift)), origin=origin)
 
     @property
     def messages(self) -> tuple[str, ...]:
@@ -119,22 +128,23 @@ def size_of_photo(image: Path | None, what: str) -> tuple[int, int]:
     return size
 
 
-def near_origin(images: list[PosedImage]) -> tuple[list[PosedImage], str]:
-    """Subtract the offset of georeferenced cameras, which single precision cannot represent.
-
-    Returns the images and a note for the user; empty if nothing was subtracted.
-    """
-    centres = np.array([one.camera.centre for one in images])
+def near_origin(poses: PosedImages) -> PosedImages:
+    """Subtract the offset of georeferenced cameras, which single precision cannot represent, with a note."""
+    centres = np.array([one.camera.centre for one in poses.images])
     middle = np.median(centres, axis=0)
     radius = np.linalg.norm(centres - middle, axis=1).max()
     if np.linalg.norm(middle) <= _MAX_OFFSET * radius or radius == 0.0:
-        return images, ""
+        return poses
     offset = np.round(middle)
-    moved = [
-        replace(one, camera=replace(one.camera, translation=one.camera.translation + one.camera.rotation @ offset))
-        for one in images
-    ]
-    return moved, (
+    note = (
         f"the cameras are {np.linalg.norm(middle):.0f} units from the origin; {', '.join(f'{x:.0f}' for x in offset)}"
         " was subtracted from their positions"
     )
+    return replace(poses, images=tuple(_shifted(poses.images, offset)), notes=(*poses.notes, note), origin=offset)
+
+
+def _shifted(images: Iterable[PosedImage], shift: np.ndarray) -> Iterator[PosedImage]:
+    """Iterate over ``images`` with ``shift`` (3,) subtracted from the positions of their cameras."""
+    for one in images:
+        camera = one.camera
+        yield replace(one, camera=replace(camera, translation=camera.translation + camera.rotation @ shift))

@@ -22,7 +22,6 @@ from egs_warp.io.posed_images import (
     PosedImage,
     checked_camera,
     convert_each,
-    near_origin,
     size_of_photo,
 )
 from egs_warp.io.text import decimal_number, decode_text
@@ -36,8 +35,8 @@ _OPTIONAL = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 _EXPORT = "export Internal/External camera parameters"
 
 
-def read_reality_scan(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], list[ExcludedPhoto], list[str]]:
-    """Read the cameras of a .csv, find their photos and masks in ``files``, and return notes for the user.
+def read_reality_scan(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], list[ExcludedPhoto]]:
+    """Read the cameras of a .csv, and find their photos and masks in ``files``.
 
     Invalid rows, and photos that cannot be read, are excluded: only the photo contains its size. Raises ``UserError``
     for a file that is malformed or has no valid camera.
@@ -67,8 +66,7 @@ def read_reality_scan(source: Path, files: PhotoFiles) -> tuple[list[PosedImage]
         lambda one: _posed(*one),
         f"{source}: it has no cameras; {_EXPORT}",
     )
-    images, note = near_origin(images)
-    return images, excluded, [note] if note else []
+    return images, excluded
 
 
 def _words(line: str) -> set[str]:

@@ -69,6 +69,9 @@ def test_georeferenced_cameras_are_moved_to_the_origin(tmp_path: Path) -> None:
         "the cameras are 5420163 units from the origin; 431000, 5403000, 121 was subtracted from their positions"
     )
     check_poses(poses, np.array([0.0, 0.0, -1.0]), atol=1e-6)
+    # A capture in the same coordinates has another origin.
+    check_poses(poses.relative_to(OFFSET - [3.0, 4.0, 5.0]), np.array([3.0, 4.0, 5.0]), atol=1e-6)
+    check_poses(poses.relative_to(None), np.array([0.0, 0.0, -1.0]), atol=1e-6)
 
 
 def test_reality_scans_lens_and_principal_point(tmp_path: Path) -> None:
