@@ -212,7 +212,9 @@ def _animate_capture(args: argparse.Namespace) -> Report:
     plane = plane_of(args.plane) if args.plane is not None else None
     view_from = parse_direction("view-from", args.view_from) if args.view_from is not None else None
     capture = read_capture(args.capture, device=args.device)
-    background = read_capture(background_path, device=args.device).cloud if background_path is not None else None
+    background = None
+    if background_path is not None:
+        background = read_capture(background_path, device=args.device).cloud_beside(capture)
     notes = capture.notes
     if plane is None and up is None:
         up, note = guessed_up(capture)

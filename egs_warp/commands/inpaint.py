@@ -11,9 +11,9 @@ from egs_warp.commands.scene_flags import add_overwrite_flag, start_device
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
-    from egs_warp.geometry.gaussians import GaussianCloud
     from egs_warp.geometry.plane import Plane
     from egs_warp.inpainting.holes import Hole
+    from egs_warp.io import Capture
 
 EXAMPLES = (
     "background.ply --plane plane.json --out filled.ply",
@@ -81,7 +81,7 @@ def _inpaint(args: argparse.Namespace) -> int:
     start_device(args.device)
     inpainter = chosen_inpainter(args, seed=args.seed)
     background = read_capture(args.background, device=args.device)
-    hole = _hole(args, plane, recorded, background.cloud)
+    hole = _hole(args, plane, recorded, background)
     assert hole is not None, "one of them was given"
     with named_files(args.out, picture, overwrite=args.overwrite) as files:
         with scene_bar({"inpaint": options.steps > 0}) as show_progress:
@@ -108,7 +108,7 @@ def _plane(text: str) -> tuple[Plane, Hole | None]:
     return known.plane, Hole.of_outline(known.plane, known.hole) if known.hole is not None else None
 
 
-def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, background: GaussianCloud) -> Hole | None:
+def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, background: Capture) -> Hole | None:
     """Return the hole that the flags define, else the ``recorded`` one."""
     import numpy as np
 
@@ -118,7 +118,7 @@ def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, backgro
     from egs_warp.io.cameras import read_posed_images
 
     if args.object is not None:
-        cloud = read_capture(args.object, device=args.device).cloud
+        cloud = read_capture(args.object, device=args.device).cloud_beside(background)
         # The recorded hole may belong to another object.
         if recorded is None or not recorded.window.sample(recorded.mask, cloud.means.numpy()).any():
             return footprint(cloud, plane)
@@ -135,8 +135,8 @@ def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, backgro
         raise UserError(f"--mask {args.mask}: no such file or folder; give a PNG or a folder of them")
     if args.cameras is None:
         raise UserError("--mask: a mask needs its camera; give --cameras")
-    poses = read_posed_images(args.cameras)
+    poses = read_posed_images(args.cameras).relative_to(background.origin)
     for message in poses.messages:
         print(f"note: {message}")
-    spec = read_object(args.mask, background, poses.images, view=args.view)
+    spec = read_object(args.mask, background.cloud, poses.images, view=args.view)
     return unseen(plane, spec.masks)

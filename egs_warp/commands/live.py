@@ -88,8 +88,10 @@ def _live(args: argparse.Namespace) -> int:
     up = parse_up(args.up) if args.up is not None else None
     plane = plane_of(args.plane) if args.plane is not None else None
     start_device(args.device)
-    background = read_capture(args.background, device=args.device).cloud if args.background is not None else None
+    background = read_capture(args.background, device=args.device) if args.background is not None else None
     capture = read_capture(args.capture, device=args.device)
+    for note in capture.notes:
+        print_note(note)
     if plane is None and up is None:
         up, note = guessed_up(capture)
         print_note(note)
@@ -104,7 +106,7 @@ def _live(args: argparse.Namespace) -> int:
         except UserError as error:
             feed.show_error(str(error))
             raise
-        scene = session.creature.placed(background) if background is not None else None
+        scene = session.creature.placed(background.cloud_beside(capture)) if background is not None else None
         with reserve_core():
             session.start()
             feed.start(LiveFeed(session, scene=scene))

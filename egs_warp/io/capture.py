@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
@@ -58,9 +59,35 @@ class Capture(GaussianCloud):
         arrays = (self.means, self.rotations, self.log_scales, self.opacity_logits, self.sh)
         return GaussianCloud(*arrays, antialiased=self.antialiased)
 
+    def cloud_beside(self, other: Capture) -> GaussianCloud:
+        """Return the Gaussians alone, relative to the origin of ``other`` if both captures have one."""
+        if self.origin is None or other.origin is None or np.array_equal(self.origin, other.origin):
+            return self.cloud
+        means = self.means.numpy() + (self.origin - other.origin)
+        return replace(self.cloud, means=wp.array(means, dtype=wp.vec3, device=self.device))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the cloud, and the facts about the file."""
+        arrays = (*ARRAYS, "antialiased")
+        facts = {one.name: getattr(self, one.name) for one in fields(self) if one.name not in arrays}
+        return _capture, (self.cloud, facts)
+
+    def subset(self, chosen: np.ndarray) -> Capture:
+        """Return the Gaussians that a boolean mask or an index array selects, with the facts about the file.
+
+        Raises ``UserError`` if it selects none.
+        """
+        rows = np.arange(self.count) if self.rows is None else self.rows
+        return self.with_cloud(self.cloud.subset(chosen), rows=rows[chosen])
+
     def with_cloud(self, cloud: GaussianCloud, **changes: Any) -> Capture:
         """Return the capture with the Gaussians of ``cloud`` and other ``changes`` of its fields."""
         return replace(self, **{name: getattr(cloud, name) for name in (*ARRAYS, "antialiased")}, **changes)
+
+
+def _capture(cloud: GaussianCloud, facts: dict[str, Any]) -> Capture:
+    """Return the capture of ``cloud`` and ``facts``, its other fields."""
+    return Capture(**{name: getattr(cloud, name) for name in (*ARRAYS, "antialiased")}, **facts)
 
 
 def read_capture(path: Path | str, *, device: str | None = None) -> Capture:

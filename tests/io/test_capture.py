@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -30,6 +31,19 @@ def angles_degrees(first: GaussianCloud, second: GaussianCloud) -> np.ndarray:
     p, q = first.rotations.numpy().astype(float), second.rotations.numpy().astype(float)
     p *= np.sign(np.einsum("ni,ni->n", p, q))[:, None]
     return np.degrees(4.0 * np.arcsin(np.linalg.norm(p - q, axis=1) / 2.0))
+
+
+def test_parts_and_copies_of_a_capture_keep_the_facts_about_its_file(tmp_path: Path) -> None:
+    """Up of the file, for example, which ``make_creature`` takes from the capture."""
+    write_spz(tmp_path / "a.spz", make_cloud(50, 1))
+    capture = read_capture(tmp_path / "a.spz", device="cpu")
+    part = capture.subset(np.arange(10, 50)).subset(np.array([0, 3]))
+    copy = pickle.loads(pickle.dumps(part))
+    for one in (part, copy):
+        np.testing.assert_array_equal(one.means.numpy(), capture.means.numpy()[[10, 13]])
+        np.testing.assert_array_equal(one.up, [0, 1, 0])
+        np.testing.assert_array_equal(one.rows, [10, 13])
+        assert one.source == capture.source and one.format == capture.format
 
 
 # Real captures ------------------------------------------------------------------------------------------------------
