@@ -214,7 +214,7 @@ def _animate_capture(args: argparse.Namespace) -> Report:
     capture = read_capture(args.capture, device=args.device)
     background = None
     if background_path is not None:
-        background = read_capture(background_path, device=args.device).cloud_beside(capture)
+        background = read_capture(background_path, device=args.device).cloud_aligned_with(capture)
     notes = capture.notes
     if plane is None and up is None:
         up, note = guessed_up(capture)

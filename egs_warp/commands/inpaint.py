@@ -118,7 +118,7 @@ def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, backgro
     from egs_warp.io.cameras import read_posed_images
 
     if args.object is not None:
-        cloud = read_capture(args.object, device=args.device).cloud_beside(background)
+        cloud = read_capture(args.object, device=args.device).cloud_aligned_with(background)
         # The recorded hole may belong to another object.
         if recorded is None or not recorded.window.sample(recorded.mask, cloud.means.numpy()).any():
             return footprint(cloud, plane)

@@ -106,7 +106,7 @@ def _live(args: argparse.Namespace) -> int:
         except UserError as error:
             feed.show_error(str(error))
             raise
-        scene = session.creature.placed(background.cloud_beside(capture)) if background is not None else None
+        scene = session.creature.placed(background.cloud_aligned_with(capture)) if background is not None else None
         with reserve_core():
             session.start()
             feed.start(LiveFeed(session, scene=scene))

@@ -59,7 +59,7 @@ class Capture(GaussianCloud):
         arrays = (self.means, self.rotations, self.log_scales, self.opacity_logits, self.sh)
         return GaussianCloud(*arrays, antialiased=self.antialiased)
 
-    def cloud_beside(self, other: Capture) -> GaussianCloud:
+    def cloud_aligned_with(self, other: Capture) -> GaussianCloud:
         """Return the Gaussians alone, relative to the origin of ``other`` if both captures have one."""
         if self.origin is None or other.origin is None or np.array_equal(self.origin, other.origin):
             return self.cloud

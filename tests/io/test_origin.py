@@ -64,7 +64,7 @@ def test_files_with_a_place_for_the_offset_keep_it(tmp_path: Path) -> None:
 
 
 def test_captures_beside_each_other_share_an_origin(tmp_path: Path) -> None:
-    """Such as an object and its background, which are relative to their own middles."""
+    """An object and its background are each relative to their own middle."""
     cloud = make_cloud(200, 1)
     write_ply(tmp_path / "object.ply", cloud, origin=_PLACE)
     write_ply(tmp_path / "background.ply", cloud, origin=_PLACE + [40.0, 30.0, 0.0])
@@ -73,10 +73,10 @@ def test_captures_beside_each_other_share_an_origin(tmp_path: Path) -> None:
         read_capture(tmp_path / f"{name}.ply", device="cpu") for name in ("object", "background", "near")
     )
     assert thing.origin is not None and background.origin is not None and (thing.origin != background.origin).any()
-    steps = background.cloud_beside(thing).means.numpy() - thing.means.numpy()
+    steps = background.cloud_aligned_with(thing).means.numpy() - thing.means.numpy()
     np.testing.assert_allclose(steps, np.tile([40.0, 30.0, 0.0], (200, 1)), atol=1e-5)
     # Parts that segment wrote have no origin, and belong to a capture that has one.
-    np.testing.assert_array_equal(near.cloud_beside(thing).means.numpy(), near.means.numpy())
+    np.testing.assert_array_equal(near.cloud_aligned_with(thing).means.numpy(), near.means.numpy())
 
 
 def test_what_a_ply_holds_besides_is_reported(tmp_path: Path) -> None:
