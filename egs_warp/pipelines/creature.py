@@ -402,7 +402,13 @@ def _rest_state(stepper: LocomotionStepper, limbs: Limbs) -> tuple[LocomotionSte
         return stepper, start, False
     if support_kind_of(mesh, mesh.nodes[:, 2], limbs.count) in (SupportKind.ROUND_BASE, SupportKind.LYING):
         return stepper, start, True
-    stepper, start, shape_error = settle_as_captured(stepper, start)
+    # The unloaded shape belongs to the body: it does not depend on the friction of the ground.
+    friction = stepper.geometry.friction
+    reference = stepper.with_friction(CreatureOptions.friction)
+    stepper, start, shape_error = settle_as_captured(reference, settle(reference))
+    if friction != CreatureOptions.friction:
+        stepper = stepper.with_friction(friction)
+        start = settle(stepper)
     return stepper, start, shape_error <= SHAPE_TOLERANCE
 
 
