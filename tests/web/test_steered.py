@@ -112,7 +112,7 @@ def test_a_drag_pulls_at_it(chromium: Any, session: Session):
         )
         page.mouse.move(*seen)
         page.mouse.down()
-        page.mouse.move(seen[0] + 40, seen[1], steps=4)
+        page.mouse.move(seen[0] + 80, seen[1], steps=4)
         wait_until(page, "egs.live.state?.pulled")
         wait_until(page, _FAR.format(before))
         page.mouse.up()
