@@ -3,21 +3,37 @@
 /** Radius of the wide part of the shadow, as a fraction of the side of the shadow map. */
 export const WIDE_RADIUS = 0.08;
 
+const GOLDEN_ANGLE = 2.399963;
+const NEAR_SAMPLES = 6;
+const WIDE_SAMPLES = 10;
+
+/** Offsets of samples on a disc of radius 1, of which sample k has the fraction (k + 0.5) / count of the area inside. */
+function discOffset(k: number, count: number): string {
+  const radius = Math.sqrt((k + 0.5) / count);
+  const [x, y] = [radius * Math.cos(GOLDEN_ANGLE * k), radius * Math.sin(GOLDEN_ANGLE * k)];
+  return `vec2(${x.toFixed(6)}, ${y.toFixed(6)})`;
+}
+
+function nearSample(k: number): string {
+  return `near += textureLod(shade, uv + softness * ${discOffset(k, NEAR_SAMPLES)}, 1.5).g;`;
+}
+
+const WIDE_WEIGHTS = Array.from({ length: WIDE_SAMPLES }, (_, k) => Math.exp((-2 * (k + 0.5)) / WIDE_SAMPLES));
+const WIDE_TOTAL = WIDE_WEIGHTS.reduce((sum, weight) => sum + weight, 0);
+
+function wideSample(k: number): string {
+  const share = (WIDE_WEIGHTS[k]! / WIDE_TOTAL).toFixed(6);
+  return `wide += ${share} * textureLod(shade, uv + ${WIDE_RADIUS} * ${discOffset(k, WIDE_SAMPLES)}, 3.0).r;`;
+}
+
 export const SHADOW_GLSL = /* glsl */ `
 /* Fraction of light at uv of a shadow map. Its red channel is the part of the sky that the body hides, its green
    channel marks what is close to the ground. The shadow at what touches the ground is spread over the radius
    softness. Coarser levels of the map make its few samples smooth. */
 float egsShade(sampler2D shade, vec2 uv, float softness) {
-  float near = 0.0, wide = 0.0, weights = 0.0;
-  for (int k = 0; k < 12; k++) {
-    float a = 2.399963 * float(k), r = softness * sqrt((float(k) + 0.5) / 12.0);
-    near += textureLod(shade, uv + r * vec2(cos(a), sin(a)), 1.5).g;
-  }
-  for (int k = 0; k < 20; k++) {
-    float a = 2.399963 * float(k), q = (float(k) + 0.5) / 20.0, weight = exp(-2.0 * q);
-    wide += weight * textureLod(shade, uv + ${WIDE_RADIUS} * sqrt(q) * vec2(cos(a), sin(a)), 3.0).r;
-    weights += weight;
-  }
-  return (1.0 - 0.45 * near / 12.0) * (1.0 - 0.4 * wide / weights);
+  float near = 0.0, wide = 0.0;
+  ${Array.from({ length: NEAR_SAMPLES }, (_, k) => nearSample(k)).join("\n  ")}
+  ${Array.from({ length: WIDE_SAMPLES }, (_, k) => wideSample(k)).join("\n  ")}
+  return (1.0 - 0.45 * near / ${NEAR_SAMPLES}.0) * (1.0 - 0.4 * wide);
 }
 `;
