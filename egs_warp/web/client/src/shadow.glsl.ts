@@ -7,7 +7,7 @@ const GOLDEN_ANGLE = 2.399963;
 const NEAR_SAMPLES = 6;
 const WIDE_SAMPLES = 10;
 
-/** Offsets of samples on a disc of radius 1, of which sample k has the fraction (k + 0.5) / count of the area inside. */
+/** Offset of sample k on a disc of radius 1; the fraction (k + 0.5) / count of the disc's area is further inside. */
 function discOffset(k: number, count: number): string {
   const radius = Math.sqrt((k + 0.5) / count);
   const [x, y] = [radius * Math.cos(GOLDEN_ANGLE * k), radius * Math.sin(GOLDEN_ANGLE * k)];
