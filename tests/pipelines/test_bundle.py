@@ -57,6 +57,7 @@ def test_the_reader_needs_only_numpy_and_the_frame_is_the_capture_s(
     code += "assert not {'warp', 'scipy', 'egs_warp'} & set(sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
     assert f"{run.creature.splats.count} splats, 13 frames at 60 a second" in done.stdout
+    assert len(READER.read_text().splitlines()) <= 60
     with np.load(path) as data:
         assert data["sh"].shape[1] == 1
         np.testing.assert_array_equal(data["body_axes"], run.trajectory.body_axes)
