@@ -179,7 +179,6 @@ class LocomotionStepper:
         other.detector.geometry = other.geometry
         other.solver = replace(self.solver, detector=other.detector)
         other.planner = replace(self.planner, friction=friction)
-        other._device_planner = _make_device_planner(other.planner, other.linearizer, other.solver)
         other._prefetched = None
         return other
 
