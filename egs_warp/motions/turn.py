@@ -18,9 +18,8 @@ from egs_warp.motions.twist import AIRBORNE_FRACTION, twist
 HEADING_TOLERANCE = np.radians(8.0)
 """Largest heading error in radians of a landing after which no further jump follows."""
 MAX_JUMPS = 5
-EXPECTED_JUMPS = 4.0 / 3.0
-"""Expected number of jumps for a turn that one jump should complete: a third of the landings miss by more than
-``HEADING_TOLERANCE``, which takes another jump."""
+CORRECTION_RATE = 1.0 / 3.0
+"""Fraction of the largest turns whose landing misses by more than ``HEADING_TOLERANCE``, which takes another jump."""
 PYRAMID_FRICTION_RATIO = 0.79
 """Tangential force of a friction pyramid with four edges relative to Coulomb's cone, mean over all directions."""
 MAX_TURN_FRACTION = 0.8
@@ -54,8 +53,9 @@ class Turn:
         """Expected duration in seconds of the jumps so far and those for the remaining turn."""
         before, at_once = len(self.jumps) - 1, self.max_turn_per_jump
         if self._remaining_after_jump is None:
-            # The correction of a landing is a small turn, which succeeds.
-            count = before + (1.0 if before else EXPECTED_JUMPS) * max(abs(self._remaining_turn) / at_once, 1.0)
+            # A small turn, such as the correction of a landing, needs no correction itself.
+            share = abs(self._remaining_turn) / at_once
+            count = before + np.ceil(share) + CORRECTION_RATE * min(share, 1.0)
         else:
             further = np.ceil(abs(self._remaining_after_jump) / at_once)
             count = before + 1 + further * self._chance_of_another(abs(self._remaining_after_jump))

@@ -285,7 +285,7 @@ OTHER_FORMULAS: list[Mutation] = [
         ),
         (
             *("twist: the angular velocity of the standing body, not of the crouched one", "motions/twist.py"),
-            *("return inertia @ spin_for_rotation(", "return seen.inertia @ spin_for_rotation("),
+            *("return inertia @ spin_for_rotation(", "return measurement.inertia @ spin_for_rotation("),
             "motions/test_twist.py::test_a_twist_requests_the_remaining_spin_from_friction",
         ),
         (
