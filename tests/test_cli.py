@@ -182,6 +182,7 @@ def test_what_is_refused_leaves_no_folder(
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_own_muscles_are_plotted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The plot shows the fibres of the file; a fibre outside the body is refused by name."""
     thing = pawn()

@@ -352,7 +352,7 @@ def test_bad_colmap(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-@settings(max_examples=examples(200))
+@settings(max_examples=examples(100))
 @given(st.data())
 @pytest.mark.parametrize("name", ["cameras.txt", "images.txt", "cameras.bin", "images.bin", "transforms.json"])
 def test_any_bytes(name: str, data: st.DataObject) -> None:

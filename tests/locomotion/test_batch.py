@@ -171,6 +171,7 @@ def test_a_world_continues_from_its_last_step(creature: Creature, jump: Trajecto
         check(creature, report, other)
 
 
+@pytest.mark.slow
 def test_unconverged_steps_are_halved_as_in_single_runs(creature: Creature) -> None:
     starts, activations, dt = rough(creature)
     expected = runs_alone(creature, starts, activations[:1], dt)

@@ -42,12 +42,14 @@ def located(folds: tuple[GaussianCloud, np.ndarray]) -> LocatedPlane:
     return with_measured_ground(cloud, locate_plane(cloud, BALL, up=UP), BALL)
 
 
+@pytest.mark.slow
 def test_the_plane_of_folds_is_level(located: LocatedPlane) -> None:
     """Within 2 degrees and 2 % of the ball's height; the plane is only the start."""
     assert located.plane.normal @ UP > np.cos(np.radians(2.0))
     assert abs(float(located.plane.heights(np.zeros(3)))) < 0.02
 
 
+@pytest.mark.slow
 def test_heights_are_those_of_the_cloth(located: LocatedPlane, folds: tuple[GaussianCloud, np.ndarray]) -> None:
     """Around the ball, on folds with an amplitude of 4 % of its height: the error is 0.13 % on average and 0.6 % in 99
     of 100 points, with both signs, so occlusion of splats causes no bias.
@@ -69,6 +71,7 @@ def test_messages(located: LocatedPlane) -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_object_reaches_the_ground(located: LocatedPlane, folds: tuple[GaussianCloud, np.ndarray]) -> None:
     """The ball stands within a fold: it is segmented completely, down to its lowest Gaussian, with little of the
     cloth."""
