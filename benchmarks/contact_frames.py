@@ -12,12 +12,11 @@ from egs_warp.contact.detection import contact_geometry
 from egs_warp.fem.body import BodyState, make_body
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.io import read_capture
-from egs_warp.locomotion.contact_modes import CoulombProgram
+from egs_warp.locomotion.contact_modes import CoulombProgram, PredictedContact
 from egs_warp.locomotion.objectives import AngularMomentumObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart, make_step_linearizer
-from egs_warp.locomotion.strategies import PredictedContact
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.meshing.cage import build_cage
 from egs_warp.motions.stance import Weights

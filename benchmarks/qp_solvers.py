@@ -1,4 +1,4 @@
-"""OSQP, its iterations as kernels, and DAQP on the engine's quadratic programs, over the number of contacts.
+"""OSQP and DAQP on the engine's quadratic programs, over the number of contacts.
 
 python benchmarks/qp_solvers.py [--quick] [--device cpu] [--seed 0] [--body pawn] [--json PATH] [--plot PATH]
 
@@ -11,18 +11,23 @@ weights, velocities in sqrt(g H)); ``objective`` is relative to DAQP's. This ben
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from contact_frames import Frame, animation_frames, body_named
-from egs_warp.locomotion.complementarity import SEPARATE, states_of_pairs
-from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, quadratic_program
-from egs_warp.locomotion.strategies import Strategy, contact_response, search_program
+from egs_warp.locomotion.strategies import Strategy, search_program
 from harness import Row, Table, flags, report, timed
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks.contact_states.complementarity import SEPARATE, states_of_pairs
+from benchmarks.contact_states.pyramid_program import PyramidProgram
+from benchmarks.contact_states.state_search import contact_response
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,11 +36,12 @@ CONTACTS = (1, 2, 4, 8, 16, 32)
 GROUPS = 40
 DIRECTIONS = 4
 QP_LIMIT = LocomotionSettings.qp_limit
+SOLVERS = QpSolver.OSQP, QpSolver.DAQP
 
 
-def frame_figures(frame: Frame, solver: QpSolver, device: str) -> Row:
-    """Return the figures of one program; the kernels run on ``device``."""
-    program = ContactProgram.of(frame.program, DIRECTIONS)
+def frame_figures(frame: Frame, solver: QpSolver) -> Row:
+    """Return the figures of one program."""
+    program = PyramidProgram.of(frame.program, DIRECTIONS)
     y = contact_response(program, frame.predicted.activations)
     separate = np.full(program.layout.contacts, SEPARATE)
     states = separate if y is None else states_of_pairs(program.layout, *program.pairs(y))
@@ -43,7 +49,7 @@ def frame_figures(frame: Frame, solver: QpSolver, device: str) -> Row:
     changed = separate if other is None else states_of_pairs(program.layout, *program.pairs(other))
 
     def first() -> tuple[Any, QpSolution]:
-        qp = quadratic_program(program.P, program.q, program.A, solver=solver, device=device)
+        qp = quadratic_program(program.P, program.q, program.A, solver=solver)
         return qp, qp.solve(*program.bounds(states))
 
     (qp, solution), first_time = timed(first)
@@ -56,7 +62,6 @@ def frame_figures(frame: Frame, solver: QpSolver, device: str) -> Row:
         directions=DIRECTIONS,
         qp_limit=QP_LIMIT,
         solver=solver,
-        device=device,
     )
     breach = 0.0
     for result, chosen in ((solution, states), (resolved, changed)):
@@ -104,16 +109,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
             strength=0.2,
             seed=options.seed,
         )[4:]
-        figures: dict[QpSolver, list[Row]] = {solver: [] for solver in QpSolver}
+        figures: dict[QpSolver, list[Row]] = {solver: [] for solver in SOLVERS}
         for frame in frames_of_body:
-            for solver in QpSolver:
-                figures[solver].append(frame_figures(frame, solver, options.device))
+            for solver in SOLVERS:
+                figures[solver].append(frame_figures(frame, solver))
         reference = np.array([row["objective"] for row in figures[QpSolver.DAQP]])
         for solver, measured in figures.items():
             column = {name: np.array([row[name] for row in measured]) for name in measured[0]}
             row = {
                 "contacts": contacts,
-                "variables": ContactProgram.of(frames_of_body[0].program, DIRECTIONS).layout.variables,
+                "variables": PyramidProgram.of(frames_of_body[0].program, DIRECTIONS).layout.variables,
                 "solver": solver.value,
                 **{name: float(np.median(column[name])) for name in ("first", "again", "search")},
                 "qps": float(column["qps"].mean()),
@@ -137,7 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def draw(figure: Figure, rows: list[Row]) -> None:
     """Draw milliseconds, and the largest violation of a bound, over the number of contacts."""
     left, right = figure.subplots(1, 2)
-    for solver, colour in zip(QpSolver, ("tab:orange", "tab:green", "tab:blue"), strict=True):
+    for solver, colour in zip(SOLVERS, ("tab:orange", "tab:blue"), strict=True):
         own = [row for row in rows if row["solver"] == solver.value]
         contacts = [row["contacts"] for row in own]
         left.plot(contacts, [row["again"] for row in own], "o-", color=colour, label=f"{solver.value}, re-solve")

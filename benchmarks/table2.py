@@ -8,13 +8,13 @@ directions, that is 60 variables and 50 complementarity pairs a frame. Each fram
 is the animation's own motion; every strategy gets the same programs. A second table has smaller problems of the same
 bodies, and random ones, compared with the optimum over all contact states (branch and bound).
 
-``modes``, the default of the engine, has the exact friction cone, and activations as its only unknowns. All others have
-the pyramid, also ``exact``, so ``modes`` may be better than it. ``objective`` is the program's, at the activations and
-forces that a strategy returns; ``true`` is the same objective with the contact forces of the exact cone under its
-activations, which is what a step then computes. ``paper`` is the paper's: the states of stage 1 (Eq. 12), then one
-contact at a time. ``qpcc`` starts from all-static and changes one contact at a time by its own multipliers; if
-all-static has no solution, it starts from the states that follow from the last activations. ``qpcc-our-moves`` differs
-from it only in our rules for the moves, so that rules and start can be judged separately.
+``modes``, the default of the engine, has the exact friction cone. All others have the pyramid, also ``exact``, so
+``modes`` may be better than it. ``modes`` and ``paper`` have activations as their only unknowns. ``objective`` is the
+program's, at the activations and forces that a strategy returns; ``true`` is the same objective with the contact forces
+of the exact cone under its activations, which is what a step then computes. ``paper`` is the paper's: the states of
+stage 1 (Eq. 12), then one contact at a time. ``qpcc`` starts from all-static and changes one contact at a time by its
+own multipliers; if all-static has no solution, it starts from the states that follow from the last activations.
+``qpcc-our-moves`` differs from it only in our rules for the moves, so that rules and start can be judged separately.
 
 The ratios of ``exact`` to ``qpcc`` are also reported; they bound the possible gain. Aims, over all frames together:
 ``qps_vs_qpcc`` (``modes`` takes at most 0.37 of qpcc's QPs) and ``objective_vs_qpcc`` (its mean objective is at most
@@ -26,7 +26,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -34,10 +34,11 @@ from contact_frames import CAPTURES, BenchBody, Frame, animation_frames, body_na
 from harness import Row, Table, data_folder, flags, report, timed
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks.contact_states.state_search import StateSearch, search_pyramid
 from egs_warp.contact.coulomb import coulomb_forces
-from egs_warp.locomotion.contact_modes import CoulombProgram
+from egs_warp.locomotion.contact_modes import CoulombProgram, PredictedContact
 from egs_warp.locomotion.solvers import QpSolver
-from egs_warp.locomotion.strategies import PredictedContact, Strategy, search_program
+from egs_warp.locomotion.strategies import Strategy, search_program
 from tests.support.contact_programs import small_problem
 
 if TYPE_CHECKING:
@@ -46,22 +47,23 @@ if TYPE_CHECKING:
 PAPER_QPS, PAPER_OBJECTIVE = 17.01 / 46.19, 0.83 / 1.29
 """Ratios of the paper's own strategy to QPCC in its Table 2: 0.37 and 0.64."""
 QP_LIMIT = 1000
+Search: TypeAlias = Strategy | StateSearch
+SEARCHES: tuple[Search, ...] = (*Strategy, *StateSearch)
+"""Strategies of the engine, and searches to which they are compared."""
 
 
-def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[Strategy, np.ndarray]:
-    """(frames, 4) for each strategy: QPs, objective, true objective, milliseconds."""
+def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[Search, np.ndarray]:
+    """(frames, 4) for each search: QPs, objective, true objective, milliseconds."""
+    options: dict[str, Any] = {"directions": directions, "qp_limit": QP_LIMIT, "solver": solver}
     results = {}
-    for strategy in Strategy:
+    for kind in SEARCHES:
         figures = []
         for frame in frames:
-            search, milliseconds = timed(
-                search_program,
-                frame.program,
-                strategy,
-                frame.predicted,
-                directions=directions,
-                qp_limit=QP_LIMIT,
-                solver=solver,
+            given = frame.program, kind, frame.predicted
+            search, milliseconds = (
+                timed(search_program, *given, **options)
+                if isinstance(kind, Strategy)
+                else timed(search_pyramid, *given, **options)
             )
             x = search.x
             objectives = (
@@ -70,7 +72,7 @@ def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[St
                 else [frame.program.objective(y) for y in (x, with_exact_forces(frame, x))]
             )
             figures.append((search.qp_count, *objectives, milliseconds))
-        results[strategy] = np.array(figures)
+        results[kind] = np.array(figures)
     return results
 
 
@@ -100,9 +102,9 @@ def lively_frames(bench: BenchBody, strength: float, **options: Any) -> tuple[li
             strength *= 0.5
 
 
-def table_rows(table: str, body: str, results: dict[Strategy, np.ndarray], **more: Any) -> list[Row]:
+def table_rows(table: str, body: str, results: dict[Search, np.ndarray], **more: Any) -> list[Row]:
     """Return one row for each strategy."""
-    best = results[Strategy.EXACT][:, 1]
+    best = results[StateSearch.EXACT][:, 1]
     rows = []
     for strategy, figures in results.items():
         qps, objective, true, milliseconds = figures.T
@@ -150,16 +152,16 @@ def print_rows(rows: list[Row]) -> None:
         )
 
 
-def pooled(parts: list[dict[Strategy, np.ndarray]]) -> dict[Strategy, np.ndarray]:
+def pooled(parts: list[dict[Search, np.ndarray]]) -> dict[Search, np.ndarray]:
     """Concatenate all frames."""
-    return {strategy: np.concatenate([part[strategy] for part in parts]) for strategy in Strategy}
+    return {strategy: np.concatenate([part[strategy] for part in parts]) for strategy in SEARCHES}
 
 
 def random_frames(count: int, seed: int) -> list[Frame]:
     """Return random programs of three contacts, whose optimum without complementarity is far from the true one."""
     frames = []
     for index in range(count):
-        program = small_problem(1000 * seed + index, contacts=3).pieces
+        program = small_problem(1000 * seed + index, contacts=3).coulomb
         at_rest = np.zeros(program.activation_count)
         forces = contact_forces(program, at_rest, np.zeros((3, 3)))
         velocities = (program.rows[:, program.activation_count :] @ forces.ravel() + program.offset).reshape(-1, 3)
@@ -175,8 +177,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     solver = QpSolver(options.solver)
     strengths = (0.2,) if options.quick else (0.2, 0.4)
-    large: list[dict[Strategy, np.ndarray]] = []
-    small: list[dict[Strategy, np.ndarray]] = []
+    large: list[dict[Search, np.ndarray]] = []
+    small: list[dict[Search, np.ndarray]] = []
     rows, skipped = [], []
     for name in options.bodies:
         if name in CAPTURES and not data_folder().is_dir():
@@ -200,13 +202,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("\nSmall problems (4 muscle groups, 3 contacts of 4 directions) and random ones against the exact optimum")
     print_rows([row for row in rows if row["table"] in ("small", "random")])
     total = pooled(large)
-    qpcc, near = total[Strategy.QPCC], pooled(small)
+    qpcc, near = total[StateSearch.QPCC], pooled(small)
     ratios = {
         strategy: tuple(float(column) for column in (total[strategy].mean(axis=0) / qpcc.mean(axis=0))[:3])
-        for strategy in (Strategy.MODES, Strategy.PAPER, Strategy.EXACT)
+        for strategy in (Strategy.MODES, Strategy.PAPER, StateSearch.EXACT)
     }
     within = {
-        strategy: float((near[strategy][:, 1] <= 1.02 * near[Strategy.EXACT][:, 1] + 1e-12).mean())
+        strategy: float((near[strategy][:, 1] <= 1.02 * near[StateSearch.EXACT][:, 1] + 1e-12).mean())
         for strategy in ratios
     }
     for strategy, (qps, objective, true) in ratios.items():
@@ -238,10 +240,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
 
 
-def draw(figure: Figure, total: dict[Strategy, np.ndarray], near: dict[Strategy, np.ndarray]) -> None:
+def draw(figure: Figure, total: dict[Search, np.ndarray], near: dict[Search, np.ndarray]) -> None:
     """Draw QPs per frame, and the objective over the exact optimum's, over the share of frames."""
     left, *others = figure.subplots(1, 3)
-    shown = [strategy for strategy in Strategy if strategy is not Strategy.EXACT]
+    shown = [strategy for strategy in SEARCHES if strategy is not StateSearch.EXACT]
     palette = ("tab:blue", "tab:green", "tab:gray", "tab:orange", "tab:olive", "tab:purple")
     colours = dict(zip(shown, palette, strict=True))
     counts = [total[strategy][:, 0] for strategy in shown]
@@ -254,7 +256,7 @@ def draw(figure: Figure, total: dict[Strategy, np.ndarray], near: dict[Strategy,
     left.set_xscale("log")
     left.set_xlabel("QPs a frame (triangle: mean)")
     for axes, results, title in zip(others, (total, near), ("60 variables, 50 pairs", "small problems"), strict=True):
-        best = results[Strategy.EXACT][:, 1] + 1e-12
+        best = results[StateSearch.EXACT][:, 1] + 1e-12
         for strategy in shown:
             ratio = np.sort((results[strategy][:, 1] + 1e-12) / best)
             share = np.arange(1, len(ratio) + 1) / len(ratio)

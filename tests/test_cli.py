@@ -28,6 +28,7 @@ from egs_warp.io import write_ply
 from egs_warp.io.run_folder import CONFIG
 from egs_warp.io.writing import WRITERS
 from egs_warp.locomotion.solvers import QpSolver
+from egs_warp.locomotion.strategies import Strategy
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.style import PRESETS
 from egs_warp.pipelines.render_run import Show
@@ -237,6 +238,7 @@ def test_choices_of_flags_are_those_of_the_library() -> None:
 
     assert choices("convert", "--to") == set(WRITERS) == choices("export", "--to") - {"usd", "bundle"}
     assert choices("animate", "--qp") == choices("live", "--qp") == {solver.value for solver in QpSolver}
+    assert choices("animate", "--strategy") == choices("live", "--strategy") == {each.value for each in Strategy}
     assert choices("render", "--show") == {show.value for show in Show}
     assert choices("segment", "--straddling") == {method.value for method in StraddlingPolicy}
     assert NAME == CONFIG

@@ -12,7 +12,7 @@ from egs_warp.commands.config import NAME, add_config_flag, changed_capture, wri
 from egs_warp.commands.flags import (
     Commands,
     add_inpainter_flags,
-    add_qp_flag,
+    add_planning_flags,
     chosen_inpainter,
     guessed_up,
     named_path,
@@ -141,7 +141,7 @@ def add_parser(commands: Commands) -> None:
     run = animate.add_argument_group("run and solver")
     add_overwrite_flag(run, "--out")
     add_config_flag(run)
-    add_qp_flag(run)
+    add_planning_flags(run)
     run.add_argument("--seed", type=int, help="seed written to the report (0); no motion uses random numbers")
     animate.set_defaults(run=_animate, parser=animate, resume=False)
 
@@ -355,6 +355,6 @@ def _options(args: argparse.Namespace) -> AnimateOptions:
         gravity_up=parse_direction("gravity-up", args.gravity_up) if args.gravity_up is not None else None,
         muscles_file=args.muscles,
         solids=read_terrain(args.terrain) if args.terrain else (),
-        settings=LocomotionSettings(qp_solver=args.qp),
+        settings=LocomotionSettings(qp_solver=args.qp, strategy=args.strategy),
     )
     return replace(options, creature=creature)

@@ -23,6 +23,8 @@ SPLAT_FILES = ("ply", "compressed-ply", "spz", "spz4", "sog", "splat", "glb")
 """Keys of ``egs_warp.io.writing.WRITERS``, repeated here because that module is slow to import."""
 QP_SOLVERS = ("osqp", "admm", "daqp")
 """Values of ``egs_warp.locomotion.solvers.QpSolver``, repeated here because that module is slow to import."""
+STRATEGIES = ("modes", "paper")
+"""Values of ``egs_warp.locomotion.strategies.Strategy``, repeated here because that module is slow to import."""
 _FLAGS = {"muscles_file": "--muscles", "solids": "--terrain"}
 """Flags of the library arguments whose names differ."""
 
@@ -47,12 +49,19 @@ def seed(text: str) -> int:
     return number
 
 
-def add_qp_flag(parser: argparse._ActionsContainer) -> None:
-    """Add the flag for ``LocomotionSettings.qp_solver``."""
+def add_planning_flags(parser: argparse._ActionsContainer) -> None:
+    """Add the flags for ``LocomotionSettings.strategy`` and ``LocomotionSettings.qp_solver``."""
+    parser.add_argument(
+        "--strategy",
+        choices=STRATEGIES,
+        default="modes",
+        help="search for the contact modes of a step: modes, with the exact friction cone (default); paper, as in"
+        " EnliveningGS, with a friction pyramid",
+    )
     parser.add_argument(
         "--qp",
         choices=QP_SOLVERS,
-        help="QP solver of a step: osqp on the host; admm, with its iterations on --device; daqp, if installed"
+        help="QP solver of a step: osqp on the host; admm, the whole search on --device; daqp, if installed"
         " (default: osqp on cpu, admm on cuda:0)",
     )
 

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egs_warp.commands.flags import Commands, add_qp_flag, guessed_up, named_path, parse_direction, parse_up
+from egs_warp.commands.flags import Commands, add_planning_flags, guessed_up, named_path, parse_direction, parse_up
 from egs_warp.commands.scene_flags import print_note, start_device
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def add_parser(commands: Commands) -> None:
         "--out", type=named_path, default=Path("out/live"), help="folder for recorded takes: take-1, ... (out/live)"
     )
     live.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
-    add_qp_flag(live)
+    add_planning_flags(live)
     body = live.add_argument_group("body and ground")
     body.add_argument("--up", help="axis that points up: x, y, z, -x, -y or -z, as --up=-y (default: estimated)")
     body.add_argument(
@@ -149,7 +149,7 @@ def _session(
         ground=ground_of(args.plane, flat=False),
         front=front,
         muscles_file=args.muscles,
-        settings=LocomotionSettings(qp_solver=args.qp),
+        settings=LocomotionSettings(qp_solver=args.qp, strategy=args.strategy),
         nodes=_nodes(args),
     )
     with preparation_bar() as update_bar:

@@ -7,6 +7,7 @@ GPU is ``device_search``. See docs/concepts/locomotion.md#modes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,7 +16,7 @@ import warp as wp
 
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.kernels.locomotion import mode_region as kernels
-from egs_warp.launching import Device, launch_cached, thread_local_cache, zeros
+from egs_warp.launching import launch_cached, thread_local_cache, zeros
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
 from egs_warp.precision import real
 
@@ -72,6 +73,18 @@ class CoulombProgram:
 
 
 @dataclass(frozen=True)
+class PredictedContact:
+    """Predicted contact of a step (Eq. 12) in the units of the QP."""
+
+    activations: np.ndarray
+    """(M,) as fractions of their bounds."""
+    forces: np.ndarray
+    """(n, 3) body weights: normal and two tangential components of each contact."""
+    velocities: np.ndarray
+    """(n, 3) in sqrt(g H), contact velocities at the predicted end."""
+
+
+@dataclass(frozen=True)
 class ContactModes:
     """Contact mode of each contact: free, stick, or slide in a direction."""
 
@@ -97,10 +110,12 @@ class ModeRegionOptimum:
     x: np.ndarray
     """(m + 3n,)."""
     objective: float
-    next_modes: ContactModes | None
-    """Modes of the region past all active mode constraints; None if none is active."""
-    next_modes_single: ContactModes | None
-    """Modes past the active constraint with the largest multiplier alone; None unless several are active."""
+    contact: np.ndarray
+    """(k,) contact of each active mode constraint that raises the objective."""
+    transition: np.ndarray
+    """(k,) transition of that contact past the constraint, as in ``ModeRegion``."""
+    multiplier: np.ndarray
+    """(k,) multiplier of the constraint, positive."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +139,6 @@ def search_modes(
     *,
     qp_limit: int,
     solver: QpSolver | str,
-    device: Device = None,
 ) -> ModeSearchResult:
     """Search over contact modes: solve the QP of a region, go to the region past its active mode constraints, and
     repeat while the objective falls.
@@ -140,14 +154,14 @@ def search_modes(
         modes: modes in which the search begins.
         qp_limit: maximum number of QPs.
         solver: QP solver, see ``quadratic_program``.
-        device: device of the solver ``admm``.
     """
     best: ModeRegionOptimum | None = None
+    single: ContactModes | None = None
     count = infeasible = 0
     sliding_modes, modes = modes, ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
     while count < qp_limit:
         count += 1
-        solution = solve_mode_region(program, start, modes, solver, device=device, warm_start=best is not None)
+        solution = solve_mode_region(program, start, modes, solver, warm_start=best is not None)
         if solution is None:
             infeasible += 1
             if best is not None or infeasible > 1 or (sliding_modes.kind != SLIDE).all():
@@ -156,23 +170,21 @@ def search_modes(
             continue
         if best is not None and solution.objective >= best.objective:
             # All transitions at once raised the objective; that with the largest multiplier alone may still lower it.
-            if best.next_modes_single is None or modes is best.next_modes_single:
+            if single is None or modes is single:
                 break
-            modes = best.next_modes_single
+            modes = single
             continue
         is_small_gain = best is not None and best.objective - solution.objective < kernels.MIN_GAIN_FRACTION * abs(
             best.objective
         )
         best, start = solution, solution.x
-        if solution.next_modes is None or is_small_gain:
+        if not len(solution.contact) or is_small_gain:
             break
-        modes = solution.next_modes
+        modes, single = _next_modes(program, modes, solution)
     return ModeSearchResult(best.x if best else None, best.objective if best else float("inf"), count, infeasible)
 
 
-def solve_relaxed(
-    program: CoulombProgram, solver: QpSolver | str, *, device: Device = None
-) -> tuple[np.ndarray, float] | None:
+def solve_relaxed(program: CoulombProgram, solver: QpSolver | str) -> tuple[np.ndarray, float] | None:
     """Solve the relaxed QP over activations and forces: forces within the friction cone, and no complementarity, so
     that a force may act where nothing touches. Its optimum is a lower bound on the objective in every mode region.
 
@@ -189,10 +201,33 @@ def solve_relaxed(
     lower = np.concatenate([program.lower, np.zeros(n * (1 + kernels.CONE_FACES)), -program.offset[::3]])
     upper = np.concatenate([program.upper, np.full(len(lower) - m, np.inf)])
     P = program.P + kernels.DELASSUS_REGULARIZATION * program.P.diagonal().mean() * np.eye(len(program.P))
-    relaxed = quadratic_program(P, program.q, A, solver=solver, device=device).solve(lower, upper)
+    relaxed = quadratic_program(P, program.q, A, solver=solver).solve(lower, upper)
     if not relaxed.usable:
         return None
     return np.clip(relaxed.x[:m], program.lower, program.upper), relaxed.objective + program.constant
+
+
+@dataclass(frozen=True)
+class FrictionDirections:
+    """Directions that stand in for the friction cone in a mode region."""
+
+    sides: np.ndarray
+    """(faces, 3), coefficients of mu f_n and of both tangential forces in the distance of a sticking contact's force to
+    each face of a pyramid; it is positive inside."""
+    sector: float
+    """Largest angle in radians between the slip of a sliding contact and the direction that its friction opposes."""
+
+    @classmethod
+    def pyramid(cls, directions: int, first: float, sector: float) -> FrictionDirections:
+        """Return a pyramid inside the cone with ``directions`` faces, of which the first is at the angle ``first`` in
+        radians."""
+        angles = [first + 2.0 * math.pi * face / directions for face in range(directions)]
+        width = math.cos(math.pi / directions)
+        return cls(np.array([(width, -math.cos(angle), -math.sin(angle)) for angle in angles]), sector)
+
+
+CONE = FrictionDirections.pyramid(kernels.CONE_FACES, 0.0, kernels.SLIDE_SECTOR)
+"""The friction cone: a sticking contact stays inside a pyramid, a sliding one has any direction."""
 
 
 @dataclass(frozen=True)
@@ -222,17 +257,18 @@ class ModeRegion:
     ``TO_OTHER_DIRECTION`` or ``TO_TOUCHING``."""
 
     @classmethod
-    def of(cls, program: CoulombProgram, modes: ContactModes) -> ModeRegion | None:
+    def of(cls, program: CoulombProgram, modes: ContactModes, friction: FrictionDirections = CONE) -> ModeRegion | None:
         """Return the region of ``modes``, or None if the equations of its contact forces are singular."""
+        faces = len(friction.sides)
         m, n = program.activation_count, program.contact_count
         stick, slide, free = (np.flatnonzero(modes.kind == kind) for kind in (STICK, SLIDE, FREE))
-        contact = np.concatenate([stick, slide, np.tile(stick, kernels.CONE_FACES), slide, slide, free])
+        contact = np.concatenate([stick, slide, np.tile(stick, faces), slide, slide, free])
         transitions = np.repeat(
             [kernels.TO_FREE, kernels.TO_SLIDE, kernels.TO_OTHER_DIRECTION, kernels.TO_TOUCHING],
-            [len(stick) + len(slide), kernels.CONE_FACES * len(stick), 2 * len(slide), len(free)],
+            [len(stick) + len(slide), faces * len(stick), 2 * len(slide), len(free)],
         )
         inputs = [np.ascontiguousarray(each) for each in (program.P, program.q, program.rows, program.offset)]
-        inputs += [modes.kind.astype(np.int32), np.ascontiguousarray(modes.slip)]
+        inputs += [modes.kind.astype(np.int32), np.ascontiguousarray(modes.slip), np.ascontiguousarray(friction.sides)]
         row_count, padded_m = m + len(contact), kernels.padded(m)
         shapes = (3 * n, padded_m), 3 * n, (m, padded_m), m, (row_count, padded_m), row_count
         slope, offset, P, q, rows, rows_offset = outputs = [np.empty(shape) for shape in shapes]
@@ -240,7 +276,10 @@ class ModeRegion:
         launch_cached(
             kernels.mode_region_kernel,
             1,
-            inputs=[m, n, program.friction, *_addresses(inputs), workspace.numbers, workspace.scratch, row_count],
+            inputs=[
+                *(m, n, program.friction, *_addresses(inputs), faces, math.sin(friction.sector)),
+                *(math.cos(friction.sector), workspace.numbers, workspace.scratch, row_count),
+            ],
             outputs=[*_addresses(outputs), workspace.is_valid_array],
             device=workspace.device,
         )
@@ -285,33 +324,32 @@ def solve_mode_region(
     modes: ContactModes,
     solver: QpSolver | str,
     *,
-    device: Device = None,
+    friction: FrictionDirections = CONE,
+    max_violation: float = kernels.MAX_START_VIOLATION,
     warm_start: bool = False,
 ) -> ModeRegionOptimum | None:
     """Solve the QP of the activations in the region of ``modes``.
 
-    Mode constraints that ``start`` violates by up to ``BROKEN`` may stay violated by as much.
+    Mode constraints that ``start`` violates by up to ``max_violation`` may stay violated by as much.
 
     Args:
         program: the QP of the step.
         start: (m + 3n,) point from which the solver starts.
         modes: modes of the region.
         solver: QP solver, see ``quadratic_program``.
-        device: device of the solver ``admm``.
+        friction: directions that stand in for the friction cone.
+        max_violation: body weights, or speed in sqrt(g H).
         warm_start: True if another region of the step has been solved; skips operator splitting (``SplittingProgram``).
 
     Returns:
         The optimum, or None without a solution.
     """
-    m, region = program.activation_count, ModeRegion.of(program, modes)
+    m, region = program.activation_count, ModeRegion.of(program, modes, friction)
     if region is None:
         return None
     b = region.rows_offset[m:]
-    lower = (
-        np.minimum(-b, np.maximum(region.rows[m:] @ start[:m], -b - kernels.MAX_START_VIOLATION))
-        - kernels.START_ROUNDING
-    )
-    optimum = quadratic_program(region.P, region.q, region.rows, solver=solver, device=device).solve(
+    lower = np.minimum(-b, np.maximum(region.rows[m:] @ start[:m], -b - max_violation)) - kernels.START_ROUNDING
+    optimum = quadratic_program(region.P, region.q, region.rows, solver=solver).solve(
         np.concatenate([program.lower, lower]),
         np.concatenate([program.upper, np.full(len(lower), np.inf)]),
         start[:m],
@@ -324,17 +362,21 @@ def solve_mode_region(
     objective = program.objective(x)
     multipliers = -optimum.multipliers[m:]
     active = np.flatnonzero(multipliers > kernels.MIN_MULTIPLIER * max(abs(objective), 1e-9))
-    next_all = next_single = None
-    if len(active):
-        contact, transitions, multipliers = region.contact[active], region.transitions[active], multipliers[active]
-        neighbours = _NextModes(program, modes, x)
-        next_all = neighbours.after_transitions(contact, transitions, multipliers)
-        if len(active) > 1:
-            strongest = [int(np.argmax(multipliers))]
-            next_single = neighbours.after_transitions(
-                contact[strongest], transitions[strongest], multipliers[strongest]
-            )
-    return ModeRegionOptimum(x, objective, next_all, next_single)
+    return ModeRegionOptimum(x, objective, region.contact[active], region.transitions[active], multipliers[active])
+
+
+def _next_modes(
+    program: CoulombProgram, modes: ContactModes, optimum: ModeRegionOptimum
+) -> tuple[ContactModes, ContactModes | None]:
+    """Return the modes past all active constraints of ``optimum``, in the region of ``modes``, and those past the
+    constraint with the largest multiplier alone; the latter are None if there is only one."""
+    neighbours = _NextModes(program, modes, optimum.x)
+    constraints = optimum.contact, optimum.transition, optimum.multiplier
+    strongest = [int(np.argmax(optimum.multiplier))]
+    return (
+        neighbours.after_transitions(*constraints),
+        neighbours.after_transitions(*(each[strongest] for each in constraints)) if len(optimum.contact) > 1 else None,
+    )
 
 
 class _NextModes:

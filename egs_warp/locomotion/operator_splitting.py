@@ -1,21 +1,20 @@
-"""OSQP's operator splitting behind one interface: the package OSQP on the host, or kernels (``admm``).
+"""Operator splitting (ADMM) by the package OSQP. The only module that imports it.
 
-The only module that imports OSQP.
+See docs/concepts/locomotion.md#solvers.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Any, Protocol
+from enum import Enum
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import osqp
 import scipy.sparse as sparse
-import warp as wp
 
-from egs_warp.launching import Device, thread_local_cache
-from egs_warp.locomotion.admm import AdmmPrograms, AdmmResult, AdmmStatus, AdmmWarmStart, DenseQp
+from egs_warp.launching import thread_local_cache
 
 SCALING_PASSES = 4
 """Number of equilibration passes."""
@@ -32,20 +31,41 @@ _ROW_MULTIPLE = 8
 _CODES: Any = osqp.SolverStatus
 
 
-class SplittingRun(Protocol):
-    """Iterations on one QP, set up once."""
+class QpStatus(Enum):
+    """Status of a solved QP; the value names the cause and what to do."""
 
-    def run(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> AdmmResult:
-        """Iterate with bounds ``lower``, ``upper`` (m,) from ``start`` (n,); None starts from the previous result."""
-        ...
+    SOLVED = "solved"
+    INEXACT = "solved to a lower accuracy; the best point found is used"
+    ITERATION_LIMIT = "the iteration limit was reached near the bounds; the last point is used"
+    INFEASIBLE = "no point satisfies the bounds; choose other contact states"
+    FAILED = "the solver gave up; scale the problem"
+
+    @property
+    def usable(self) -> bool:
+        """True if the point of the solve may be used."""
+        return self in (QpStatus.SOLVED, QpStatus.INEXACT, QpStatus.ITERATION_LIMIT)
 
 
-class OperatorSplitting(Protocol):
+@dataclass(frozen=True)
+class SplittingResult:
+    """Result of the iterations on one QP."""
+
+    status: QpStatus
+    x: np.ndarray
+    """(n,)."""
+    multipliers: np.ndarray
+    """(m,) positive at an active upper bound."""
+
+
+class OsqpSplitting:
     """Operator splitting for QPs with the same P and q."""
+
+    def __init__(self, P: np.ndarray, q: np.ndarray, *, accuracy: float) -> None:
+        self._P, self._q, self._accuracy = P, q, accuracy
 
     def warm_start(
         self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None
-    ) -> AdmmResult:
+    ) -> SplittingResult:
         """Run ``WARM_START_ITERATIONS`` iterations on a whitened QP: min 1/2 z^T z subject to lower <= R z <= upper.
 
         Args:
@@ -54,23 +74,6 @@ class OperatorSplitting(Protocol):
             upper: (m,).
             start: (n,); None starts from 0.
         """
-        ...
-
-    def full_run(self, A: np.ndarray, iterations: int) -> SplittingRun:
-        """Set up iterations on the QP with rows ``A`` (m, n), at most ``iterations`` in each run."""
-        ...
-
-
-class OsqpSplitting:
-    """``OperatorSplitting`` by the package OSQP."""
-
-    def __init__(self, P: np.ndarray, q: np.ndarray, *, accuracy: float) -> None:
-        self._P, self._q, self._accuracy = P, q, accuracy
-
-    def warm_start(
-        self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None
-    ) -> AdmmResult:
-        """Run a few iterations on the whitened QP, see ``OperatorSplitting.warm_start``."""
         return _osqp_warm_start(-(-len(units) // _ROW_MULTIPLE) * _ROW_MULTIPLE, units.shape[1]).run(
             units, lower, upper, start
         )
@@ -91,7 +94,7 @@ class OsqpSplitting:
 
 
 class OsqpIterations:
-    """``SplittingRun`` by the package OSQP.
+    """Iterations on one QP, set up once.
 
     Args:
         options: arguments of ``osqp.OSQP.setup``, except for the bounds and the options that all QPs share.
@@ -101,7 +104,7 @@ class OsqpIterations:
         self._options = options
         self._solver: osqp.OSQP | None = None
 
-    def run(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> AdmmResult:
+    def run(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> SplittingResult:
         """Iterate with bounds ``lower``, ``upper`` (m,) from ``start`` (n,); None starts from the previous result."""
         if self._solver is None:
             self._solver = osqp.OSQP(algebra="builtin")
@@ -124,16 +127,16 @@ class OsqpIterations:
         return _convert_result(_run_osqp(self._solver))
 
 
-def _convert_result(result: Any) -> AdmmResult:
+def _convert_result(result: Any) -> SplittingResult:
     """Convert a result of OSQP."""
     status = {
-        _CODES.OSQP_SOLVED: AdmmStatus.SOLVED,
-        _CODES.OSQP_SOLVED_INACCURATE: AdmmStatus.INEXACT,
-        _CODES.OSQP_MAX_ITER_REACHED: AdmmStatus.LIMIT,
-        _CODES.OSQP_PRIMAL_INFEASIBLE: AdmmStatus.INFEASIBLE,
-        _CODES.OSQP_PRIMAL_INFEASIBLE_INACCURATE: AdmmStatus.INFEASIBLE_INEXACT,
-    }.get(result.info.status_val, AdmmStatus.FAILED)
-    return AdmmResult(status, result.x, result.y, result.info.iter)
+        _CODES.OSQP_SOLVED: QpStatus.SOLVED,
+        _CODES.OSQP_SOLVED_INACCURATE: QpStatus.INEXACT,
+        _CODES.OSQP_MAX_ITER_REACHED: QpStatus.ITERATION_LIMIT,
+        _CODES.OSQP_PRIMAL_INFEASIBLE: QpStatus.INFEASIBLE,
+        _CODES.OSQP_PRIMAL_INFEASIBLE_INACCURATE: QpStatus.INFEASIBLE,
+    }.get(result.info.status_val, QpStatus.FAILED)
+    return SplittingResult(status, result.x, result.y)
 
 
 class OsqpWarmStart:
@@ -161,8 +164,8 @@ class OsqpWarmStart:
             verbose=False,
         )
 
-    def run(self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> AdmmResult:
-        """Run a few iterations on the whitened QP with rows ``units`` (m, n), see ``OperatorSplitting.warm_start``."""
+    def run(self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> SplittingResult:
+        """Run a few iterations on the whitened QP with rows ``units`` (m, n), see ``OsqpSplitting.warm_start``."""
         m, n = units.shape
         self._units[:, :m], self._units[:, m:] = units.T, 0.0
         # Padding rows have bounds too, because OSQP factors again when finite bounds are added or removed.
@@ -184,49 +187,3 @@ def _run_osqp(solver: osqp.OSQP) -> Any:
         # OSQP handles Ctrl-C itself while it runs and returns its current point.
         raise KeyboardInterrupt
     return result
-
-
-class AdmmSplitting:
-    """``OperatorSplitting`` by kernels."""
-
-    def __init__(self, P: np.ndarray, q: np.ndarray, *, accuracy: float, device: Device) -> None:
-        self._P, self._q, self._accuracy, self._device = P, q, accuracy, device
-
-    def warm_start(
-        self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None
-    ) -> AdmmResult:
-        """Run a few iterations on the whitened QP, see ``OperatorSplitting.warm_start``."""
-        rows = -(-len(units) // _ROW_MULTIPLE) * _ROW_MULTIPLE
-        return _admm_warm_start(rows, units.shape[1], str(wp.get_device(self._device))).run(units, lower, upper, start)
-
-    def full_run(self, A: np.ndarray, iterations: int) -> AdmmIterations:
-        """Set up the kernels with rows ``A`` (m, n), at most ``iterations`` in each run."""
-        programs = AdmmPrograms(
-            [DenseQp(self._P, self._q, A)], device=self._device, scaling=SCALING_PASSES, adapt=RHO_UPDATE_INTERVAL
-        )
-        return AdmmIterations(programs, self._accuracy, iterations)
-
-
-_admm_warm_start = thread_local_cache(16)(
-    partial(
-        AdmmWarmStart,
-        accuracy=_WARM_START_ACCURACY,
-        iterations=WARM_START_ITERATIONS,
-        adapt=RHO_UPDATE_INTERVAL,
-        rho=RHO,
-    )
-)
-
-
-@dataclass(frozen=True)
-class AdmmIterations:
-    """``SplittingRun`` by kernels."""
-
-    programs: AdmmPrograms
-    accuracy: float
-    iterations: int
-
-    def run(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> AdmmResult:
-        """Iterate with bounds ``lower``, ``upper`` (m,) from ``start`` (n,); None starts from the previous result."""
-        (end,) = self.programs.solve([lower], [upper], [start], accuracy=self.accuracy, iterations=self.iterations)
-        return end

@@ -13,12 +13,12 @@ import numpy as np
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.contact_modes import CoulombProgram
+from egs_warp.locomotion.contact_modes import CoulombProgram, PredictedContact
 from egs_warp.locomotion.linear_step import LinearStep, PredictedStep, StepLinearizer
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.step_cost import EffortModel, QuadraticCost, effort_cost, objectives_cost
-from egs_warp.locomotion.strategies import PredictedContact, search_program
+from egs_warp.locomotion.strategies import search_program
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import shortening

@@ -21,13 +21,12 @@ class LocomotionSettings:
     push_out_cap: float = 0.05
     """Largest speed at which points that are deeper are pushed out."""
     qp_limit: int = 12
-    """Maximum number of QPs in a step; all strategies but ``modes`` may use ``strategies.RESTART_BUDGET`` times as many
-    while the result is far from the lower bound."""
+    """Maximum number of QPs in a search; a restart has its own."""
     qp_solver: QpSolver | str | None = None
     """QP solver; None selects ``osqp``, or ``admm`` if the body is on a GPU."""
     strategy: Strategy | str = Strategy.MODES
     directions: int = 4
-    """n_d, number of edges of the friction pyramid. The strategy ``modes`` uses the exact cone instead."""
+    """n_d, number of edges of the friction pyramid of the strategy ``paper``. ``modes`` uses the exact cone instead."""
     activation_weight: float = 2e-4
     """Weight of squared activations for a step of sqrt(H / g) / 19 and a muscle of 4 body weights. It scales with the
     square of the step size, because shorter steps change velocities by less, and with the force of the muscle."""

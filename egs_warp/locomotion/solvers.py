@@ -12,10 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from egs_warp.errors import UserError, did_you_mean
-from egs_warp.launching import Device
 from egs_warp.locomotion.active_set import WhitenedQp, solve_from_guess
-from egs_warp.locomotion.admm import AdmmStatus
-from egs_warp.locomotion.operator_splitting import AdmmSplitting, OperatorSplitting, OsqpSplitting, SplittingRun
+from egs_warp.locomotion.operator_splitting import OsqpIterations, OsqpSplitting, QpStatus
 
 MAX_VIOLATION = 3e-3
 """Largest violation of its bounds up to which a point at the iteration limit is used."""
@@ -26,36 +24,20 @@ _EQUALITY_WIDTH = 1e-12
 """A row whose bounds are closer than this is an equality."""
 
 
-class QpStatus(Enum):
-    """Status of a solved QP; the value names the cause and what to do."""
-
-    SOLVED = "solved"
-    INEXACT = "solved to a lower accuracy; the best point found is used"
-    ITERATION_LIMIT = "the iteration limit was reached near the bounds; the last point is used"
-    INFEASIBLE = "no point satisfies the bounds; choose other contact states"
-    FAILED = "the solver gave up; scale the problem"
-
-
-_STATUS = {
-    AdmmStatus.SOLVED: QpStatus.SOLVED,
-    AdmmStatus.INEXACT: QpStatus.INEXACT,
-    AdmmStatus.LIMIT: QpStatus.ITERATION_LIMIT,
-    AdmmStatus.INFEASIBLE: QpStatus.INFEASIBLE,
-    AdmmStatus.INFEASIBLE_INEXACT: QpStatus.INFEASIBLE,
-    AdmmStatus.FAILED: QpStatus.FAILED,
-}
-"""QP status for each status of operator splitting."""
-
-
 class QpSolver(Enum):
     """QP solver, selected by name."""
 
     OSQP = "osqp"
     """A few OSQP iterations on the host, then the active-set method."""
     ADMM = "admm"
-    """The same iterations and active-set method as kernels on the device."""
+    """The whole mode search as one kernel on the device, with the same iterations and active-set method."""
     DAQP = "daqp"
     """DAQP, a dual active-set method on the host; an optional package."""
+
+    @property
+    def on_host(self) -> QpSolver:
+        """The solver of single QPs on the host: OSQP in place of ``admm``."""
+        return QpSolver.OSQP if self is QpSolver.ADMM else self
 
     @classmethod
     def _missing_(cls, value: object) -> QpSolver:
@@ -77,7 +59,7 @@ class QpSolution:
     @property
     def usable(self) -> bool:
         """True if ``x`` may be used."""
-        return self.status in (QpStatus.SOLVED, QpStatus.INEXACT, QpStatus.ITERATION_LIMIT)
+        return self.status.usable
 
 
 class QuadraticProgram(Protocol):
@@ -105,9 +87,8 @@ def quadratic_program(
     *,
     solver: QpSolver | str = QpSolver.OSQP,
     accuracy: float = 3e-5,
-    device: Device = None,
 ) -> QuadraticProgram:
-    """Set up the QP for ``solver`` (or its name).
+    """Set up the QP for ``solver`` (or its name), ``osqp`` or ``daqp``.
 
     Args:
         P: (n, n).
@@ -115,16 +96,10 @@ def quadratic_program(
         A: (m, n).
         solver: solver.
         accuracy: accuracy of operator splitting, absolute and relative.
-        device: device of the kernels of ``admm``.
     """
-    solver = QpSolver(solver)
-    if solver is QpSolver.DAQP:
+    if QpSolver(solver) is QpSolver.DAQP:
         return DaqpProgram(P, q, A)
-    if solver is QpSolver.ADMM:
-        splitting = AdmmSplitting(P, q, accuracy=accuracy, device=device)
-    else:
-        splitting = OsqpSplitting(P, q, accuracy=accuracy)
-    return SplittingProgram(P, q, A, splitting, accuracy=accuracy)
+    return SplittingProgram(P, q, A, accuracy=accuracy)
 
 
 class SplittingProgram:
@@ -136,15 +111,13 @@ class SplittingProgram:
     the unconstrained minimum violates are a guess from which the active-set method is as quick.
     """
 
-    def __init__(
-        self, P: np.ndarray, q: np.ndarray, A: np.ndarray, splitting: OperatorSplitting, *, accuracy: float = 3e-5
-    ) -> None:
+    def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, *, accuracy: float = 3e-5) -> None:
         self._P, self._q, self._A = P, q, A
-        self._splitting = splitting
+        self._splitting = OsqpSplitting(P, q, accuracy=accuracy)
         # A region that is a single point has unbounded multipliers, so bounds are widened, within the accuracy.
         self._padding = _BOUND_PADDING * accuracy
         self._rows = WhitenedQp.of(P, q, A)
-        self._full_run: SplittingRun | None = None
+        self._full_run: OsqpIterations | None = None
         self._start: np.ndarray | None = None
 
     def solve(
@@ -171,10 +144,7 @@ class SplittingProgram:
         )
         z = None if start is None else rows.whiten(start)
         result = self._splitting.warm_start(rows.unit_rows[index], below[index], above[index], z)
-        if (
-            result.status not in (AdmmStatus.SOLVED, AdmmStatus.INEXACT, AdmmStatus.LIMIT)
-            or not np.isfinite(result.x).all()
-        ):
+        if not result.status.usable or not np.isfinite(result.x).all():
             # The active-set method decides whether the QP is feasible: OSQP returns x = 2e9 where it is uncertain.
             return self._solve_from_minimum(lower, upper, start)
         multipliers = np.zeros(len(lower))
@@ -212,7 +182,7 @@ class SplittingProgram:
         if self._full_run is None:
             self._full_run = self._splitting.full_run(self._A, _MAX_ITERATIONS)
         result = self._full_run.run(lower, upper, start)
-        status = _STATUS[result.status]
+        status = result.status
         if status is QpStatus.ITERATION_LIMIT:
             rows = self._A @ result.x
             violation = max(float((lower - rows).max()), float((rows - upper).max()))

@@ -16,7 +16,9 @@ from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import ffmpeg_program
 from egs_warp.locomotion.ledger import energy_balance
+from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolver
+from egs_warp.locomotion.strategies import Strategy
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.request import MAX_TARGET, MAX_TURN
 from egs_warp.motions.script import Script
@@ -104,7 +106,7 @@ class AnimateOptions:
 
     def to_json(self, *, up: np.ndarray | None = None, plane: Plane | None = None) -> dict[str, JsonValue]:
         """Return ``asked`` of the report, with ``up`` and ``plane`` of the run; what was not given is null."""
-        creature, solver = self.creature, self.creature.settings and self.creature.settings.qp_solver
+        creature, settings = self.creature, self.creature.settings or LocomotionSettings()
         view_from = self.directions_to_camera()
         return {
             **self.targets(),
@@ -125,7 +127,8 @@ class AnimateOptions:
             "beats": self.beats or None,
             "style": self.style or None,
             "muscles": None if creature.muscles_file is None else Path(creature.muscles_file).name,
-            "qp": None if solver is None else QpSolver(solver).value,
+            "strategy": Strategy(settings.strategy).value,
+            "qp": None if settings.qp_solver is None else QpSolver(settings.qp_solver).value,
             "solids": len(creature.solids),
         }
 

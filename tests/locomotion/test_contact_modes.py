@@ -13,12 +13,13 @@ from egs_warp.locomotion.contact_modes import (
     ContactModes,
     CoulombProgram,
     ModeRegion,
+    PredictedContact,
     search_modes,
     solve_mode_region,
     solve_relaxed,
 )
 from egs_warp.locomotion.solvers import QpSolver
-from egs_warp.locomotion.strategies import RESTART_COST, PredictedContact, Strategy, search_program
+from egs_warp.locomotion.strategies import RESTART_COST, Strategy, search_program
 
 FRICTION = 0.6
 CONTACTS = 3

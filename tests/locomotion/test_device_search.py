@@ -21,13 +21,14 @@ from egs_warp.locomotion.contact_modes import (
     ContactModes,
     CoulombProgram,
     ModeSearchResult,
+    PredictedContact,
     search_modes,
     solve_relaxed,
 )
 from egs_warp.locomotion.device_search import ModeSearchWorkspace, RelaxationWorkspace, search_modes_device
 from egs_warp.locomotion.operator_splitting import OsqpSplitting
 from egs_warp.locomotion.solvers import QpSolver
-from egs_warp.locomotion.strategies import PredictedContact, Strategy, search_program
+from egs_warp.locomotion.strategies import Strategy, search_program
 from egs_warp.precision import real
 from tests.support.kernels import algebra_kernel, iterate_kernel
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from egs_warp.locomotion.complementarity import SEPARATE, ContactLayout
+from benchmarks.contact_states.complementarity import SEPARATE, ContactLayout
+from benchmarks.contact_states.pyramid_program import PyramidProgram
 from egs_warp.locomotion.contact_modes import CoulombProgram
-from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
 
 FRICTION = 0.8
@@ -19,13 +19,13 @@ FRICTION = 0.8
 class SmallProblem:
     """A program and its mechanics; units of weight and speed are 1."""
 
-    pieces: CoulombProgram
-    program: ContactProgram
+    coulomb: CoulombProgram
+    pyramid: PyramidProgram
     shift: np.ndarray
 
     def velocities(self, y: np.ndarray) -> np.ndarray:
         """(n, 3) contact velocities at the solution ``y``."""
-        velocities = (self.pieces.rows @ self.program.forces_of(y) + self.pieces.offset).reshape(-1, 3)
+        velocities = (self.coulomb.rows @ self.pyramid.forces_of(y) + self.coulomb.offset).reshape(-1, 3)
         velocities[:, 0] -= self.shift
         return velocities
 
@@ -58,11 +58,11 @@ def small_problem(
     P[m, m] += 1e-3
     offset = frame @ base
     offset[::3] += shift
-    pieces = CoulombProgram(
+    coulomb = CoulombProgram(
         *(P, 2.0 * rows.T @ gap, float(gap @ gap), frame @ response, offset, FRICTION),
         *(-np.ones(activations), np.ones(activations)),
     )
-    return SmallProblem(pieces, ContactProgram.of(pieces, directions), shift)
+    return SmallProblem(coulomb, PyramidProgram.of(coulomb, directions), shift)
 
 
 def all_states(layout: ContactLayout) -> list[np.ndarray]:
@@ -71,7 +71,7 @@ def all_states(layout: ContactLayout) -> list[np.ndarray]:
     return [np.array(states) for states in itertools.product(choices, repeat=layout.contacts)]
 
 
-def optimum_of_each(program: ContactProgram) -> dict[tuple[int, ...], tuple[float, np.ndarray]]:
+def optimum_of_each(program: PyramidProgram) -> dict[tuple[int, ...], tuple[float, np.ndarray]]:
     """Return objective and y of every feasible choice of states."""
     qp = quadratic_program(program.P, program.q, program.A, solver=QpSolver.DAQP)
     optima = {}

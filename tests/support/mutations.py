@@ -95,14 +95,14 @@ EQUATIONS: dict[int, Mutation] = {
             "contact/test_coupled_step.py::test_predicted_forces_obey_coulombs_law",
         ),
         (
-            *(12, "the direction of the slip", "locomotion/complementarity.py"),
-            *("slide = np.argmin(velocities @ table.T", "slide = np.argmax(velocities @ table.T"),
-            "locomotion/test_complementarity.py::test_states_from_prediction",
+            *(12, "the direction of the slip", "locomotion/paper_strategy.py"),
+            *("slide = np.argmin(predicted.velocities", "slide = np.argmax(predicted.velocities"),
+            "locomotion/test_paper_strategy.py::test_predicted_modes",
         ),
         (
-            *(13, "the pair of the slip and the cone", "locomotion/complementarity.py"),
-            *("[states != STATIC] = 0.0", "[states == STATIC] = 0.0"),
-            "locomotion/test_complementarity.py::test_every_state_satisfies_the_complementarity_conditions",
+            *(13, "the width of the friction pyramid", "locomotion/contact_modes.py"),
+            *("width = math.cos(math.pi / directions)", "width = 1.0"),
+            "locomotion/test_paper_strategy.py::test_a_region_is_the_program_with_complementarity_in_the_same_states",
         ),
         (
             *(14, "the mean of F+ and F-", "kernels/deformation/deformer.py"),

@@ -40,8 +40,6 @@ START_ROUNDING = 1e-6
 """Amount by which rows are relaxed, for a start that is the only point of its region, as where contacts repeat each
 other."""
 _NO_PIVOT = 1e-14
-_ANGLES = [2.0 * math.pi * face / CONE_FACES for face in range(CONE_FACES)]
-_NORMALS = ", ".join(f"{math.cos(math.pi / CONE_FACES)}, {-math.cos(angle)}, {-math.sin(angle)}" for angle in _ANGLES)
 
 
 def padded(count: int) -> int:
@@ -62,18 +60,15 @@ def scratch_size(activations: int, contacts: int) -> int:
     on_cpu(
         ROW_ELIMINATION
         + f"""
-    constexpr int FREE = {FREE}, STICK = {STICK}, SLIDE = {SLIDE}, FACES = {CONE_FACES};
+    constexpr int FREE = {FREE}, STICK = {STICK}, SLIDE = {SLIDE};
     constexpr double SINGULAR = {DELASSUS_REGULARIZATION}, NO_PIVOT = {_NO_PIVOT};
-    constexpr double WEDGE_SINE = {math.sin(SLIDE_SECTOR)}, WEDGE_COSINE = {math.cos(SLIDE_SECTOR)};
-    // Coefficients of the normal force (times the friction) and of the tangential force in the distance to each face.
-    const double sides[3 * FACES] = {{{_NORMALS}}};
 """
         + """
     const int m = activations, n = contacts, N = m + 3 * n, wide = (m + 8) & ~7, plain = (m + 7) & ~7;
     const double *const P = (const double*)cost, *const q = (const double*)slope_of_cost;
     const double *const W = (const double*)rows, *const w = (const double*)offset;
     const int* const kinds = (const int*)kind;
-    const double* const slips = (const double*)slip;
+    const double *const slips = (const double*)slip, *const faces = (const double*)sides;
     double* free_scratch = scratch.data;
     auto take = [&](int count) { double* const block = free_scratch; free_scratch += count; return block; };
     int *const held = numbers.data, *const touching = held + 3 * n, *const pivots = touching + 3 * n;
@@ -176,11 +171,11 @@ def scratch_size(activations: int, contacts: int) -> int:
     for (int mode = STICK; mode <= SLIDE; ++mode)
         for (int i = 0; i < n; ++i)
             if (kinds[i] == mode) { write(1.0, S + place[i] * wide); next(); }
-    for (int face = 0; face < FACES; ++face)
+    for (int face = 0; face < face_count; ++face)
         for (int i = 0; i < n; ++i)
             if (kinds[i] == STICK) {
                 const double* const from = S + place[i] * wide;
-                const double* const side = sides + 3 * face;
+                const double* const side = faces + 3 * face;
                 write(friction * side[0], from);
                 write(side[1], from + wide);
                 write(side[2], from + 2 * wide);
@@ -202,8 +197,8 @@ def scratch_size(activations: int, contacts: int) -> int:
             if (kinds[i] == SLIDE) {
                 const double d0 = slips[2 * i], d1 = slips[2 * i + 1];
                 speeds(3 * i + 1, 2);
-                write(WEDGE_SINE * d0 - side * WEDGE_COSINE * d1, V);
-                write(WEDGE_SINE * d1 + side * WEDGE_COSINE * d0, V + wide);
+                write(sector_sine * d0 - side * sector_cosine * d1, V);
+                write(sector_sine * d1 + side * sector_cosine * d0, V + wide);
                 next();
             }
     for (int i = 0; i < n; ++i)
@@ -223,6 +218,10 @@ def mode_region_native(
     offset: wp.uint64,
     kind: wp.uint64,
     slip: wp.uint64,
+    sides: wp.uint64,
+    face_count: wp.int32,
+    sector_sine: real,
+    sector_cosine: real,
     numbers: wp.array[wp.int32],
     scratch: wp.array[real],
     total: wp.int32,
@@ -250,6 +249,10 @@ def mode_region_kernel(
     offset: wp.uint64,
     kind: wp.uint64,
     slip: wp.uint64,
+    sides: wp.uint64,
+    face_count: wp.int32,
+    sector_sine: real,
+    sector_cosine: real,
     numbers: wp.array[wp.int32],
     scratch: wp.array[real],
     total: wp.int32,
@@ -277,6 +280,9 @@ def mode_region_kernel(
         rows, offset: (3n, m + 3n) and (3n,), affine map to the contact velocities.
         kind: (n,) int32 mode of each contact.
         slip: (n, 2) slip direction of sliding contacts.
+        sides: (face_count, 3) faces of the pyramid of sticking contacts, see ``FrictionDirections.sides``.
+        face_count: number of faces.
+        sector_sine, sector_cosine: of half the sector of a sliding contact's slip.
         numbers: (10n,) int32 scratch.
         scratch: (``scratch_size``,) scratch.
         total: number of rows of ``bounds``.
@@ -286,6 +292,6 @@ def mode_region_kernel(
         is_solvable: (1,) 1, or 0 if the forces cannot be solved for.
     """
     is_solvable[0] = mode_region_native(
-        activations, contacts, friction, cost, slope_of_cost, rows, offset, kind, slip, numbers, scratch, total, forces,
-        forces_offset, region_cost, region_slope, bounds, bounds_offset,
+        activations, contacts, friction, cost, slope_of_cost, rows, offset, kind, slip, sides, face_count, sector_sine,
+        sector_cosine, numbers, scratch, total, forces, forces_offset, region_cost, region_slope, bounds, bounds_offset,
     )  # fmt: skip

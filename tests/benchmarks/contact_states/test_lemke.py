@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.locomotion.lemke import lemke
+from benchmarks.contact_states.lemke import lemke
 from tests.support.contact_programs import small_problem
 
 
 def contact_lcp(seed: int, contacts: int, freedoms: int) -> tuple[np.ndarray, np.ndarray]:
-    program = small_problem(seed, contacts=contacts, freedoms=freedoms).program
+    program = small_problem(seed, contacts=contacts, freedoms=freedoms).pyramid
     layout = program.layout
     rows, offset = program.A[layout.variables :], program.offset[layout.variables :]
     a = np.random.default_rng(seed).uniform(-1, 1, layout.activations)

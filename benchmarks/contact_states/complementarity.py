@@ -1,6 +1,6 @@
 """Contact states of the QP and changes of state (Eq. 9, 13; pivoting after Tan, Turk and Liu 2012).
 
-See docs/concepts/locomotion.md#contact-states.
+See docs/benchmarks/contact.md#searches.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from egs_warp.contact.detection import tangent_directions
+from egs_warp.locomotion.contact_modes import FREE, STICK, ContactModes
 
 SEPARATE = -2
 STATIC = -1
@@ -110,7 +111,7 @@ class Pairs:
 
     @classmethod
     def of(cls, layout: ContactLayout, x: np.ndarray, w: np.ndarray) -> Pairs:
-        """Split ``x`` and ``w`` (pairs,), as returned by ``ContactProgram.pairs``."""
+        """Split ``x`` and ``w`` (pairs,), as returned by ``PyramidProgram.pairs``."""
         n, nd = layout.contacts, layout.directions
         middle = slice(n, n + n * nd)
         return cls(x[:n], x[middle].reshape(n, nd), x[middle.stop :], w[:n], w[middle].reshape(n, nd), w[middle.stop :])
@@ -123,27 +124,15 @@ class Pairs:
         return np.maximum(np.maximum(normal, slip), np.minimum(self.friction, self.drift).max(axis=1))
 
 
-def states_from_prediction(
-    normal_forces: np.ndarray, tangential: np.ndarray, velocities: np.ndarray, friction: float, directions: int
-) -> np.ndarray:
-    """Return the predicted states (n,) (Eq. 12).
-
-    Args:
-        normal_forces: (n,) predicted normal forces.
-        tangential: (n, 2) predicted friction forces, same unit.
-        velocities: (n, 2) predicted tangential velocities.
-        friction: Coulomb coefficient.
-        directions: number of friction directions n_d.
-    """
-    table = tangent_directions(directions)
-    static = np.linalg.norm(tangential, axis=1) < 0.999 * friction * normal_forces
-    slide = np.argmin(velocities @ table.T, axis=1)
-    return np.where(normal_forces <= 0.0, SEPARATE, np.where(static, STATIC, slide)).astype(int)
+def states_of_modes(modes: ContactModes, directions: int) -> np.ndarray:
+    """Return the states (n,) of ``modes`` whose sliding contacts slip along one of ``directions``."""
+    slide = np.argmin(modes.slip @ tangent_directions(directions).T, axis=1)
+    return np.where(modes.kind == FREE, SEPARATE, np.where(modes.kind == STICK, STATIC, slide)).astype(int)
 
 
 def states_of_pairs(layout: ContactLayout, x: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Return the states (n,) in which the larger side of each pair is free, for ``x`` and ``w`` (pairs,) of
-    ``ContactProgram.pairs``."""
+    ``PyramidProgram.pairs``."""
     pairs, nd = Pairs.of(layout, x, w), layout.directions
     side = pairs.friction - pairs.drift
     first = np.argmax(side, axis=1)
@@ -166,15 +155,15 @@ def proposed_pivots(
     *,
     zero: float = 1e-4,
 ) -> list[Pivot]:
-    """Propose changes of state from the multipliers, best first (docs/concepts/locomotion.md#moves).
+    """Propose changes of state from the multipliers, best first (docs/benchmarks/contact.md#moves).
 
     Only states that the point itself satisfies are proposed, so no proposal is infeasible, even several at once.
 
     Args:
         layout: layout of unknowns and rows.
         states: (n,) current states.
-        x: (pairs,) of ``ContactProgram.pairs``.
-        w: (pairs,) of ``ContactProgram.pairs``.
+        x: (pairs,) of ``PyramidProgram.pairs``.
+        w: (pairs,) of ``PyramidProgram.pairs``.
         multipliers: (rows,) of the rows, of which those fixed to zero count.
         zero: accuracy of x, w and the multipliers.
     """

@@ -6,23 +6,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.contact.detection import tangent_directions
-from egs_warp.locomotion.complementarity import (
+from benchmarks.contact_states.complementarity import (
     SEPARATE,
     STATIC,
     ContactLayout,
     Pivot,
     plain_pivots,
     proposed_pivots,
-    states_from_prediction,
+    states_of_modes,
     states_of_pairs,
 )
-from egs_warp.locomotion.program import ContactProgram
+from benchmarks.contact_states.pyramid_program import PyramidProgram
+from egs_warp.contact.detection import tangent_directions
+from egs_warp.locomotion.contact_modes import FREE, SLIDE, STICK, ContactModes
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
 from tests.support.contact_programs import FRICTION, optimum_of_each, small_problem
 
 
-def obeys(program: ContactProgram, y: np.ndarray, states: np.ndarray) -> bool:
+def obeys(program: PyramidProgram, y: np.ndarray, states: np.ndarray) -> bool:
     """Return True if ``y`` is a feasible point of these states."""
     lower, upper = program.bounds(states)
     rows = program.A @ y
@@ -34,7 +35,7 @@ def test_rows_are_the_terms_of_the_lcp() -> None:
     order.
     """
     problem = small_problem(0, contacts=3, directions=6)
-    program, layout = problem.program, problem.program.layout
+    program, layout = problem.pyramid, problem.pyramid.layout
     y = np.random.default_rng(1).standard_normal(layout.variables)
     rows = program.A @ y + program.offset
     u, table = problem.velocities(y), tangent_directions(6)
@@ -58,10 +59,10 @@ def test_every_state_satisfies_the_complementarity_conditions() -> None:
     feasible = between = 0
     for seed in range(8):
         problem = small_problem(seed)
-        layout, table = problem.program.layout, tangent_directions(4)
-        for states, (_, y) in optimum_of_each(problem.program).items():
+        layout, table = problem.pyramid.layout, tangent_directions(4)
+        for states, (_, y) in optimum_of_each(problem.pyramid).items():
             feasible += 1
-            x, w = problem.program.pairs(y)
+            x, w = problem.pyramid.pairs(y)
             assert x.min() > -1e-6 and w.min() > -1e-6 and np.abs(x * w).max() < 1e-5
             u, f_t = problem.velocities(y), y[layout.tangent].reshape(-1, 4) @ table
             f_n = y[layout.normal]
@@ -81,15 +82,10 @@ def test_every_state_satisfies_the_complementarity_conditions() -> None:
     assert feasible > 100 and between > 20
 
 
-def test_states_from_prediction() -> None:
-    """Eq. (12): a contact without force separates, one with friction within the cone sticks, any other slides along the
-    nearest -D_k."""
-    normal = np.array([0.0, 1.0, 1.0, 1.0, 1.0])
-    tangential = np.array([[0, 0], [0.3, 0.2], [-0.8, 0], [0, 0.8], [0.8, 0.0]])
-    slip = np.array([[1.0, 0], [0.1, 0.1], [2.0, 0.3], [0.1, -3.0], [-1.0, 0.9]])
-    states = states_from_prediction(normal, tangential, slip, FRICTION, 4)
-    # D_0 = +x, D_1 = +y, D_2 = -x, D_3 = -y; "slide k" slips along -D_k.
-    assert states.tolist() == [SEPARATE, STATIC, 2, 1, 0]
+def test_states_of_modes() -> None:
+    """A contact that slips along -D_k has the state k."""
+    modes = ContactModes(np.array([FREE, STICK, SLIDE, SLIDE]), -tangent_directions(4)[[0, 0, 1, 2]])
+    assert states_of_modes(modes, 4).tolist() == [SEPARATE, STATIC, 1, 2]
 
 
 def test_states_of_pairs_admit_the_point() -> None:
@@ -97,7 +93,7 @@ def test_states_of_pairs_admit_the_point() -> None:
     with."""
     read = same = 0
     for seed in range(8):
-        program = small_problem(seed).program
+        program = small_problem(seed).pyramid
         for states, (_, y) in optimum_of_each(program).items():
             found = states_of_pairs(program.layout, *program.pairs(y))
             assert obeys(program, y, found)
@@ -115,7 +111,7 @@ def test_moves_are_feasible_and_almost_always_better() -> None:
     """
     proposed = solved = better = plain = plain_lost = 0
     for seed in range(12):
-        program = small_problem(seed, directions=6 if seed % 2 else 4).program
+        program = small_problem(seed, directions=6 if seed % 2 else 4).pyramid
         qp = quadratic_program(program.P, program.q, program.A, solver=QpSolver.DAQP)
         values = optimum_of_each(program)
         for states, (value, _) in values.items():

@@ -1,6 +1,6 @@
 """QP of a step as the paper writes it: contact as complementarity of pyramid forces and slip velocities (Eq. 9, 13).
 
-See docs/concepts/locomotion.md#contact-states.
+See docs/benchmarks/contact.md#searches.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sparse
 
+from benchmarks.contact_states.complementarity import ContactLayout
 from egs_warp.contact.detection import tangent_directions
-from egs_warp.locomotion.complementarity import ContactLayout
 from egs_warp.locomotion.contact_modes import CoulombProgram
 
 _REGULARIZATION = 1e-7
@@ -19,7 +19,7 @@ _REGULARIZATION = 1e-7
 
 
 @dataclass(frozen=True)
-class ContactProgram:
+class PyramidProgram:
     """QP min 1/2 y^T P y + q^T y + constant over y = (a, f_n, f_t, lambda), subject to the pairs of Eq. (9).
 
     The rows A y + offset are those of ``ContactLayout``; contact states change only their bounds. Units: activations
@@ -44,7 +44,7 @@ class ContactProgram:
     """(M,) upper bounds of the activations."""
 
     @classmethod
-    def of(cls, program: CoulombProgram, directions: int) -> ContactProgram:
+    def of(cls, program: CoulombProgram, directions: int) -> PyramidProgram:
         """Return the QP of ``program`` with a friction pyramid of ``directions`` edges instead of the cone."""
         layout = ContactLayout(program.activation_count, program.contact_count, directions)
         spread = _spread(layout)

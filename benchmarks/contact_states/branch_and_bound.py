@@ -9,8 +9,8 @@ from itertools import count as counter
 
 import numpy as np
 
-from egs_warp.locomotion.complementarity import SEPARATE, Pairs, states_of_pairs
-from egs_warp.locomotion.program import ContactProgram
+from benchmarks.contact_states.complementarity import SEPARATE, Pairs, states_of_pairs
+from benchmarks.contact_states.pyramid_program import PyramidProgram
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, quadratic_program
 
 
@@ -81,7 +81,7 @@ class ExactResult:
 
 
 def exact_states(
-    program: ContactProgram,
+    program: PyramidProgram,
     *,
     starts: tuple[np.ndarray, ...] = (),
     qp_limit: int = 20000,
@@ -154,7 +154,7 @@ def exact_states(
     return ExactResult(best[1], best[2], best[0] + program.constant, bound + program.constant, solved)
 
 
-def _bounds(program: ContactProgram, branches: tuple[_Branch, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(program: PyramidProgram, branches: tuple[_Branch, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return lower and upper bounds of all rows, where undecided pairs are only non-negative."""
     layout = program.layout
     n, nd = layout.contacts, layout.directions
@@ -183,7 +183,7 @@ def _bounds(program: ContactProgram, branches: tuple[_Branch, ...]) -> tuple[np.
     return lower, upper
 
 
-def _most_violated(program: ContactProgram, branches: tuple[_Branch, ...], y: np.ndarray) -> int | None:
+def _most_violated(program: PyramidProgram, branches: tuple[_Branch, ...], y: np.ndarray) -> int | None:
     """Return the undecided contact whose pairs are furthest from complementary; None if all are complementary."""
     worst = Pairs.of(program.layout, *program.pairs(y)).violation
     worst[[branch.decided in _LEAVES for branch in branches]] = 0.0

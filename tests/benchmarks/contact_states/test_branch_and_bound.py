@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.locomotion.branch_and_bound import ExactResult, exact_states
-from egs_warp.locomotion.complementarity import STATIC
+from benchmarks.contact_states.branch_and_bound import ExactResult, exact_states
+from benchmarks.contact_states.complementarity import STATIC
 from tests.support.contact_programs import optimum_of_each, small_problem
 
 
@@ -17,7 +17,7 @@ def test_the_optimum_equals_brute_force(contacts: int, directions: int, seeds: i
     """
     best_states = set()
     for seed in range(seeds):
-        program = small_problem(seed, contacts=contacts, directions=directions).program
+        program = small_problem(seed, contacts=contacts, directions=directions).pyramid
         tried = optimum_of_each(program)
         best = min(value for value, _ in tried.values())
         best_states |= {states for states, (value, _) in tried.items() if value == best}
@@ -35,7 +35,7 @@ def test_the_optimum_equals_brute_force(contacts: int, directions: int, seeds: i
 
 def test_starts_change_only_the_number_of_qps() -> None:
     """A good start prunes; a bad one is discarded."""
-    program = small_problem(5, contacts=3).program
+    program = small_problem(5, contacts=3).pyramid
     plain = exact_states(program)
     assert plain is not None
     good = exact_states(program, starts=(plain.states,))
@@ -47,7 +47,7 @@ def test_starts_change_only_the_number_of_qps() -> None:
 
 def test_a_limited_search_is_not_a_proof() -> None:
     """If the search reaches its limit, it reports a lower bound on the optimum."""
-    program = small_problem(5, contacts=3).program
+    program = small_problem(5, contacts=3).pyramid
     whole = exact_states(program)
     assert whole is not None
     cut = exact_states(program, starts=(whole.states,), qp_limit=6)
@@ -60,7 +60,7 @@ def test_a_limited_search_is_not_a_proof() -> None:
 def test_the_bound_of_a_limited_search_is_valid() -> None:
     """At any limit, the bound is below the optimum; it does not decrease as the limit grows."""
     for seed in range(5, 9):
-        program = small_problem(seed, contacts=3).program
+        program = small_problem(seed, contacts=3).pyramid
         whole = exact_states(program)
         assert whole is not None
         bounds = []
