@@ -297,7 +297,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # If one motion has too few programs, the next ones make up for it.
         share = -(-(count - len(programs)) // (len(MOTIONS) - i))
         programs += recorded(body, nodes, text, limit=share, seed=options.seed)
-        print(f"{body.__name__} {text}: {len(programs)} programs by now", flush=True)
+        print(f"{body.__name__} {text}: {len(programs)} programs so far", flush=True)
     rows = [*full(programs, options.device), few(programs, options.device), whole(programs, options.device)]
     table = Table(
         **{"kind": "<6s", "motion": "<14s", "programs": "d", "unlike": "d", "worst": ".1e"},

@@ -137,7 +137,7 @@ class AdmmPrograms:
             if not np.isfinite(x).all() or not np.isfinite(y).all():
                 ending = AdmmStatus.FAILED
             if ending in (AdmmStatus.INFEASIBLE, AdmmStatus.INFEASIBLE_INEXACT, AdmmStatus.FAILED):
-                # Iterates that diverged are no warm start.
+                # Iterates that diverged are not used as a warm start.
                 self._x[i], self._y[i], self._rho[i] = 0.0, 0.0, self._first
             results.append(AdmmResult(ending, x, y, int(count[i])))
         return results

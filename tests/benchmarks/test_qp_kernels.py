@@ -28,9 +28,9 @@ def programs(benchmark: ModuleType) -> list[Any]:
 
 @pytest.mark.slow
 def test_recorded_programs_end_as_in_osqp(benchmark: ModuleType, programs: list[Any], device: str) -> None:
-    """Both solvers end with the same status and |x - x'| at most 1e-6 of the largest |x|.
+    """Both solvers end with the same status, and their solutions differ by at most 1e-6 of the largest |x|.
 
-    This holds by iterations alone, after 50 iterations, and solved as in the engine.
+    This holds for ADMM run to full accuracy, for 50 iterations, and for the complete solve of the engine.
     """
     assert (
         len(programs) == 14
@@ -40,7 +40,7 @@ def test_recorded_programs_end_as_in_osqp(benchmark: ModuleType, programs: list[
     everything, alone = benchmark.full(programs, device)
     assert everything["programs"] == everything["solved"] == alone["programs"] == 14 and alone["motion"] == "pawn jump"
     assert not everything["unlike"] and 0.0 < everything["worst"] <= 1e-6
-    # Rounding accumulates over some ten thousand iterations.
+    # Rounding accumulates over tens of thousands of iterations.
     assert everything["same_iterations"] >= 13
     for row in (benchmark.few(programs, device), benchmark.whole(programs, device)):
         assert not row["unlike"] and row["worst"] <= 1e-6

@@ -109,8 +109,8 @@ def test_infeasible_bounds_are_detected_and_leave_no_warm_start(device: str) -> 
 
 
 def test_certificates_equal_those_of_osqp(device: str) -> None:
-    """Two rows are nearly parallel, so that their multipliers grow together for many iterations. They are a
-    contradiction for OSQP exactly if their bounds cross, by however little."""
+    """Two rows are nearly parallel, so that their multipliers grow together for many iterations. OSQP reports
+    infeasibility exactly if their bounds cross, however slightly."""
     for crossed, ending in ((-5e-5, AdmmStatus.SOLVED), (5e-5, AdmmStatus.INFEASIBLE)):
         program = DenseQp(np.eye(2), np.array([0.0, 100.0]), np.array([[1.0, 0.0], [1.0, 3e-5]]))
         bounds = np.array([-np.inf, 1.0 + crossed]), np.array([1.0, np.inf])
