@@ -57,7 +57,7 @@ def gradient_energy(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> f
 
 
 def moved_floor_scores(truth: np.ndarray, known: np.ndarray, hole: np.ndarray) -> list[tuple[float, float]]:
-    """Score true floor that is moved into the hole from half a side to a side away.
+    """Score copies of the true floor, taken half a side to a full side of the hole away, in place of an inpainting.
 
     Args:
         truth: (rows, columns, 3) colours of the floor.

@@ -296,7 +296,7 @@ def summary(
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Draw ms over nodes, by stage."""
+    """Draw ms against nodes, by stage."""
     axes = figure.subplots()
     whole = [row for row in rows if row["contacts"] == "all"]
     for name in whole[0]["stages"]:

@@ -1,4 +1,4 @@
-"""Steps per second of many worlds in parallel on one device, over the number of worlds.
+"""Steps per second of many worlds in parallel on one device, against the number of worlds.
 
 python benchmarks/many_worlds.py [--quick] [--worlds B ...] [--nodes N ...] [--steps N] [--alone N] [--panel N]
     [--chunk-bytes N] [--matrices B] [--device cuda:0] [--json PATH] [--plot PATH]

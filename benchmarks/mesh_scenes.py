@@ -164,7 +164,7 @@ def surface_points(mesh: PaintedMesh, count: int, seed: int) -> np.ndarray:
 
 
 def surface_cloud(mesh: PaintedMesh, count: int, *, device: str) -> GaussianCloud:
-    """Return small opaque round Gaussians, uniformly distributed over the surface."""
+    """Return small opaque isotropic Gaussians, uniformly distributed over the surface."""
     points = surface_points(mesh, count, seed=0)
     return GaussianCloud.from_numpy(
         points,

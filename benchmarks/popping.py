@@ -90,7 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     embedding = embed_gaussians(cloud, locator)
 
     def frame(time: float) -> np.ndarray:
-        """Return the nodes bent forward and twisted, up to 60 degrees each, and back; the vertical axis is y."""
+        """Return the nodes at ``time`` (0 to 1): bent forward and twisted about y by angles that rise from 0 to 60
+        degrees and fall back to 0."""
         amount = np.radians(60.0) * np.sin(np.pi * time) ** 2
         local = cage.nodes - middle
         height = local[:, 1] / extent

@@ -1,4 +1,4 @@
-"""Steps per second of `simulate_many`, over the number of processes.
+"""Steps per second of `simulate_many`, against the number of processes.
 
 python benchmarks/process_scaling.py [--quick] [--workers N ...] [--nodes N ...] [--frames N] [--jobs N] [--device cpu]
     [--json PATH] [--plot PATH]

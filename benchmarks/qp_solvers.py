@@ -1,4 +1,4 @@
-"""OSQP and DAQP on the engine's quadratic programs, over the number of contacts.
+"""OSQP and DAQP on the engine's quadratic programs, against the number of contacts.
 
 python benchmarks/qp_solvers.py [--quick] [--device cpu] [--seed 0] [--body pawn] [--json PATH] [--plot PATH]
 
@@ -140,7 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Draw milliseconds, and the largest violation of a bound, over the number of contacts."""
+    """Draw milliseconds, and the largest violation of a bound, against the number of contacts."""
     left, right = figure.subplots(1, 2)
     for solver, colour in zip(SOLVERS, ("tab:orange", "tab:blue"), strict=True):
         own = [row for row in rows if row["solver"] == solver.value]

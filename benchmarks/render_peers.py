@@ -229,7 +229,7 @@ def _splax_ms(scene: Scene, camera: Camera) -> float:
 
 
 def _taichi_splatting_ms(scene: Scene, camera: Camera) -> float | None:
-    """None: on a CPU the import already fails."""
+    """Return None; the package cannot be imported on a CPU."""
     importlib.import_module("taichi_splatting")
     return None
 

@@ -118,7 +118,7 @@ def _without_driver_warning() -> Iterator[None]:
         finally:
             os.dup2(stderr, 2)
             captured.seek(0)
-            # A full or closed stream is no error of the device.
+            # A full or closed stream is not an error of the device.
             with suppress(OSError):
                 os.write(2, b"".join(line for line in captured if _NO_DRIVER not in line))
 

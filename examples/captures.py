@@ -18,7 +18,7 @@ def main(arguments: list[str] | None = None) -> None:
         egs.write_ply(folder / f"{name}.ply", made.object)
         egs.write_ply(folder / f"{name}_in_room.ply", made.whole()[0])
     names = ", ".join(egs.BUILT_IN_SCENES)
-    print(f"wrote {names} as NAME.ply and NAME_in_room.ply into {folder}; z is up, 1 is their height")
+    print(f"wrote {names} as NAME.ply and NAME_in_room.ply to {folder}; z is up, 1 is their height")
 
 
 if __name__ == "__main__":

@@ -81,7 +81,7 @@ def main() -> None:
             [egs.psnr(np.clip(egs.render_gaussians(cloud, v.camera).colour.numpy(), 0, 1), v.image) for v in views]
         )
         print(f"{label:>18}: {quality:6.2f} dB")
-    print(f"wrote finetune.png into {arguments.out}")
+    print(f"wrote finetune.png to {arguments.out}")
 
 
 if __name__ == "__main__":

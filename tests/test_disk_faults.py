@@ -182,8 +182,8 @@ def test_each_file_operation_fails_once(
 def test_a_clock_that_jumps_changes_nothing(
     command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At each reading the clock jumps by a day forward or back, beside a file of a killed process with a date in the
-    future: the run finishes, none of its files is removed, and the remnant is.
+    """The clock jumps forward or back by a day at each reading, and a killed process has left a file with a date in the
+    future. The run finishes and removes that file but none of its own.
     """
     left = tmp_path / ".egs-0123456789abcdef.ply"
     left.write_text("half")

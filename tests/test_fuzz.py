@@ -46,7 +46,7 @@ def test_recorded_failures(found: Path, tmp_path: Path) -> None:
 
 
 def test_slow_means_slow_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pause of the machine is no failure, a slow reader is."""
+    """A pause of the machine is not a failure, a slow reader is."""
     monkeypatch.setattr(readers, "MAX_SECONDS", 0.1)
     times: list[float] = []
 

@@ -37,7 +37,7 @@ def test_each_task_is_done_once() -> None:
 
 
 def test_tasks_run_concurrently() -> None:
-    """Each of two tasks waits for the other, which neither could do in sequence."""
+    """Two tasks wait for each other, so they would time out if they ran in sequence."""
     first, second = threading.Event(), threading.Event()
 
     def work() -> bool:

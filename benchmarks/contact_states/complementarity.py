@@ -162,10 +162,10 @@ def proposed_pivots(
     Args:
         layout: layout of unknowns and rows.
         states: (n,) current states.
-        x: (pairs,) of ``PyramidProgram.pairs``.
-        w: (pairs,) of ``PyramidProgram.pairs``.
-        multipliers: (rows,) of the rows, of which those fixed to zero count.
-        zero: accuracy of x, w and the multipliers.
+        x: (pairs,) left sides of Eq. (9), from ``PyramidProgram.pairs``.
+        w: (pairs,) right sides of Eq. (9), from ``PyramidProgram.pairs``.
+        multipliers: (rows,) multipliers of all rows; only those of rows fixed to zero are used.
+        zero: values of x, w and the multipliers up to this count as zero.
     """
     point, multiplier = Pairs.of(layout, x, w), _multipliers(layout, multipliers)
     pivots: list[Pivot] = []

@@ -71,8 +71,8 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_colour(text: str) -> tuple[float, float, float] | None:
-    """Return (r, g, b), each 0 to 1, from ``r,g,b``, ``#rrggbb`` or the name of a CSS colour that is no file; None for
-    other texts.
+    """Return (r, g, b), each 0 to 1, from ``r,g,b``, ``#rrggbb`` or the name of a CSS colour that is not a file; None
+    for other texts.
 
     Raises ``UserError`` for numbers outside of 0 to 1.
     """

@@ -186,7 +186,7 @@ class _Stream:
         try:
             return self._stream.write(text)
         except UnicodeEncodeError as error:
-            # For example the name of a folder, at the end of hours of work.
+            # The encoding lacks a character, for example of a folder's name; this must not end hours of work.
             return self._stream.write(text.encode(error.encoding, "backslashreplace").decode(error.encoding))
         except self._ignored:
             self._silence()

@@ -113,7 +113,7 @@ def _parse_location(text: str, posed: Sequence[PosedImage] | None, view: str | N
     try:
         numbers = np.array([float(part) for part in text.split(",")])
     except ValueError:
-        raise UserError(f"{flag} {text}: no such file, and not numbers; {_HELP}") from None
+        raise UserError(f"{flag} {text}: neither a file nor numbers; {_HELP}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
         raise UserError(f"{flag} {text}: {len(numbers)} numbers; {_HELP}")
     if np.abs(numbers).max() > MAX_COORDINATE:
@@ -132,7 +132,7 @@ def _pixel(text: str, cloud: GaussianCloud, posed: Sequence[PosedImage] | None, 
     try:
         finite = np.isfinite([float(u), float(v)]).all()
     except ValueError:
-        raise UserError(f"{flag} {text}: no such file, and not numbers; {_HELP}") from None
+        raise UserError(f"{flag} {text}: neither a file nor numbers; {_HELP}") from None
     if not finite:
         raise UserError(f"{flag} {text}: not two numbers; {_HELP}")
     if not posed:
@@ -164,7 +164,7 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str) -> Pos
     if view is None:
         if len(posed) == 1:
             return posed[0]
-        raise UserError(f"--object {what}: {len(posed)} cameras; choose one by --view NAME or NUMBER")
+        raise UserError(f"--object {what}: {len(posed)} cameras; choose one with --view NAME or NUMBER")
     # isdecimal excludes superscript digits, and the limit numbers of thousands of digits; int() rejects both.
     if view.isdecimal() and len(view) < _MAX_DIGITS and int(view) < len(posed):
         return posed[int(view)]
@@ -224,7 +224,7 @@ def _camera_of(file: Path, posed: Sequence[PosedImage], view: str | None) -> Pos
         return posed[0]
     raise UserError(
         f"{file}: no photo has the name {file.stem} (photos are {stems[0][0]}, {stems[-1][0]}, ...); "
-        "rename the mask, or choose its camera by --view"
+        "rename the mask, or choose its camera with --view"
     )
 
 

@@ -61,12 +61,12 @@ def _plane(args: argparse.Namespace) -> int:
         picture = plane_picture(scene.cloud, result.planes, cameras, centre=result.centre, size=result.size)
         result.write(run.file("plane.json"))
         write_png(run.file("plane.png"), picture)
-        wrote = "plane.json, plane.png"
+        wrote = "plane.json and plane.png"
         if not scene.posed:
             write_ring(run, scene.cloud, result.planes[0], result.centre, result.size)
-            wrote += ", cameras.json and images/ for masks"
+            wrote += ", with cameras.json and images/ for masks,"
         run.finish()
     first = result.planes[0]
     print("plane: " + ",".join(f"{x:.6g}" for x in (*first.normal, first.offset)))
-    print(f"wrote {wrote} into {args.out}")
+    print(f"wrote {wrote} to {args.out}")
     return 0

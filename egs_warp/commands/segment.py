@@ -73,5 +73,5 @@ def _segment(args: argparse.Namespace) -> int:
         write_png(run.file("segment.png"), picture)
         run.finish()
     print(f"object: {scene.object.count} Gaussians, background: {scene.background.count}")
-    print(f"wrote object.ply, background.ply, plane.json, segment.png into {args.out}")
+    print(f"wrote object.ply, background.ply, plane.json and segment.png to {args.out}")
     return 0

@@ -19,7 +19,7 @@ MAX_NEWTON_STEPS = 60
 
 @dataclass(frozen=True)
 class ConvergenceState:
-    """State and tolerances of one Newton loop (round). Residuals are over dt x weight."""
+    """State and tolerances of one Newton loop (round). Residuals are divided by dt x weight."""
 
     tolerance: float
     """Residual at which the loop ends."""

@@ -1,5 +1,5 @@
-"""Terrain beside the ground plane: solids that a body can touch (steps, walls, tilted floors), each an intersection
-of half spaces.
+"""Terrain in addition to the ground plane: solids that a body can touch (steps, walls, tilted floors), each an
+intersection of half spaces.
 """
 
 from __future__ import annotations

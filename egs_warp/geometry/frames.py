@@ -47,7 +47,8 @@ def orthonormal_basis(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cross_matrices(arms: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) matrices with columns e_k x arm: the derivative of ``arms`` (n, 3) by a rotation about axis k."""
+    """(n, 3, 3) matrices with columns e_k x arm: the derivative of ``arms`` (n, 3) with respect to a rotation about
+    axis k."""
     matrices = np.zeros((len(arms), 3, 3))
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3

@@ -83,7 +83,7 @@ class GaussianCloud:
             # Only the direction of a quaternion counts.
             limit = {"log_scales": MAX_LOG_SCALE, "rotations": np.inf}.get(name, MAX_VALUE)
             floor = -np.inf if name == "log_scales" else -limit
-            # Both are NaN if any value is. The first faulty Gaussian is only searched if there is one.
+            # Both are NaN if any value is. The search for the first faulty Gaussian runs only if there is one.
             lowest, highest = np.min(values, initial=0.0), np.max(values, initial=0.0)
             if np.isfinite(lowest) and np.isfinite(highest) and floor <= lowest and highest <= limit:
                 continue
@@ -163,7 +163,7 @@ class GaussianCloud:
         """
         means = self.means.numpy()[chosen]
         if len(means) == 0:
-            raise UserError(f"selection: it holds none of the {self.count} Gaussians; select at least one")
+            raise UserError(f"selection: it contains none of the {self.count} Gaussians; select at least one")
         return GaussianCloud.from_numpy(
             means,
             self.rotations.numpy()[chosen],

@@ -171,7 +171,7 @@ def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
         raise UserError(f"{name}: the mask is empty; mark the object in it")
     shadows = [_on_plane(plane, view.camera, view.mask) for view in views]
     if any(len(shadow) == 0 for shadow in shadows):
-        raise UserError("inpaint: the floor is not in sight inside a mask; the hole is off the plane, check the plane")
+        raise UserError("inpaint: no pixel of a mask sees the plane, so the hole is not on it; check the plane")
     # The common floor lies inside the bounds of every shadow; the smallest shadow has the finest window.
     smallest = min(shadows, key=lambda shadow: float(np.ptp(shadow, axis=0).max()))
     middle = 0.5 * (smallest.min(axis=0) + smallest.max(axis=0))

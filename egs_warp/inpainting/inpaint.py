@@ -228,13 +228,13 @@ def _in_hole(
 def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the hole with adjacent gaps and enclosed islands of floor, and the known floor; both (rows, columns)
     bool."""
-    # Pinholes between splats are no gaps.
+    # Pinholes between splats are not gaps.
     closed: Any = ndimage.binary_closing(np.pad(alpha > _KNOWN, 4, mode="edge"), iterations=2)
     solid = np.asarray(closed[4:-4, 4:-4])
     near = distance_to(mask) < _GAP_REACH * _TEXELS_ACROSS
     gaps, _ = connected_parts(mask | (~solid & near & ~_void(~solid & ~mask)))
     touching = np.isin(gaps, np.unique(gaps[mask])) & ~mask
-    # Where the floor becomes thin, it is stained.
+    # The floor is stained where it becomes thin, next to a gap.
     hole = mask | (distance_to(touching) < _GAP_EDGE if touching.any() else touching)
     parts, count = connected_parts(~hole)
     sizes = np.bincount(parts.ravel(), minlength=count + 1)

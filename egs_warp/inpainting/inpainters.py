@@ -130,7 +130,7 @@ class TorchScriptInpainter:
             with torch.no_grad():
                 answer = network(torch.from_numpy(picture).to(self.device), torch.from_numpy(missing).to(self.device))
             values = np.asarray(answer.detach().cpu().numpy(), np.float32)
-        # TorchScript raises plain RuntimeErrors of many lines, and AttributeError if the output is no tensor.
+        # TorchScript raises plain RuntimeErrors of many lines, and AttributeError if the output is not a tensor.
         except (RuntimeError, AttributeError, TypeError) as error:
             raise _failed(self.path, error, "LaMa's TorchScript file") from error
         return _answer(self.path, values, image, hole, missing.shape[2:])

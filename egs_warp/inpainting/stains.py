@@ -25,10 +25,10 @@ _SHADE, _SHADE_BLUR = 0.1, 4.0
 _END = 4.0
 """Texels from the floor's end. The shadow of what stood in the hole does not reach there."""
 _UNUSUAL = 3.0
-"""Standard deviations (robust) of the floor far from the hole; a pattern is no stain."""
+"""Standard deviations (robust) of the floor far from the hole; a pattern is not a stain."""
 _ALIKE, _COMMON = 0.1, 0.02
-"""Natural logarithm, in all channels: closer colours are the same. A colour that this fraction of the floor far from
-the hole has is part of a pattern, as the blue of a checked cloth is."""
+"""Largest difference of the natural logarithm, in every channel, between colours that count as the same; and the
+fraction of the floor far from the hole that has a colour of a pattern, such as the blue of a checked cloth."""
 _SAMPLE = 2000
 """Texels of the floor from which common colours are determined."""
 _MIN_BRIGHTNESS = 0.02

@@ -84,7 +84,7 @@ def result_folder(path: Path | str) -> Iterator[Path]:
     created = []
     try:
         created = [parent for parent in (folder, *folder.parents) if not parent.exists()]
-    # Such as a name that is too long, which writable_folder reports.
+    # writable_folder reports the cause, such as a name that is too long.
     except (OSError, ValueError):
         pass
     try:

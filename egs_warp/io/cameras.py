@@ -31,7 +31,7 @@ def read_posed_images(path: Path | str) -> PosedImages:
     The formats are COLMAP sparse models (text or binary), INRIA's ``cameras.json``, the ``transforms.json`` of
     NeRF-synthetic and nerfstudio, the camera parameters of RealityScan (.csv) and the cameras of Metashape (.xml).
     ``path`` is the file, the folder of a COLMAP model, or a folder that contains one of these; of several COLMAP models
-    the one with most photos is read. Poses stay in the file's world frame, except that the offset of georeferenced
+    the one with the most photos is read. Poses stay in the file's world frame, except that the offset of georeferenced
     cameras of RealityScan and Metashape is subtracted; nerfstudio's ``applied_transform`` is not undone.
 
     Raises ``UserError`` for missing or malformed files, and if no pose is valid.

@@ -169,7 +169,7 @@ def _intrinsics(path: Path, number: int, camera: _Camera) -> _Intrinsics:
     if names is None or len(camera.parameters) != len(names):
         raise UserError(
             f"{where} of model {camera.model} with {len(camera.parameters)} parameters is unknown; undistort the photos"
-            f" by `colmap image_undistorter`, or give one of {', '.join(_PARAMETERS)}"
+            f" with `colmap image_undistorter`, or give one of {', '.join(_PARAMETERS)}"
         )
     values = dict(zip(names, camera.parameters, strict=True))
     fx, fy = values.get("fx", values.get("f", 0.0)), values.get("fy", values.get("f", 0.0))
@@ -307,7 +307,7 @@ def _binary_cameras(data: bytes, path: Path) -> dict[int, _Camera]:
         number, model, width, height = cursor.take("iiQQ")
         if model not in _MODELS:
             raise UserError(
-                f"{path}: camera {number} has model {model}, which is unknown; undistort the photos by"
+                f"{path}: camera {number} has model {model}, which is unknown; undistort the photos with"
                 f" `colmap image_undistorter`, or give one of {', '.join(_PARAMETERS)}"
             )
         name = _MODELS[model][0]

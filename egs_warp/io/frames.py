@@ -33,7 +33,7 @@ class Frame:
 def select_sharp_frames(video: Path, count: int) -> Iterator[Frame]:
     """Yield the sharpest frame of each of ``count`` equal parts of the ``video``; all frames if it has fewer.
 
-    Raises ``UserError`` for a file that is no video.
+    Raises ``UserError`` for a file that is not a video.
     """
     _check(video)
     length = _length(video)
@@ -53,7 +53,7 @@ def select_sharp_frames(video: Path, count: int) -> Iterator[Frame]:
 
 
 def _check(video: Path) -> None:
-    """Reject files that are no videos by their first bytes: a playlist could open other files and addresses."""
+    """Reject files whose first bytes are not those of a video: a playlist could open other files and addresses."""
     if not video.is_file():
         raise UserError(f"{video}: no such file; give a video or a folder of photos")
     try:
@@ -64,7 +64,7 @@ def _check(video: Path) -> None:
     # QuickTime and MPEG-4 begin with a size and a name, Matroska and RIFF with a magic number, transport streams with a
     # G.
     if not (start[4:8] in _BOXES or start[:4] in _MARKS or start[:1] == b"G" or start[4:5] == b"G"):
-        raise UserError(f"{video}: no video that can be read; give an .mp4 or .mov, or a folder of photos")
+        raise UserError(f"{video}: not a readable video; give an .mp4 or .mov, or a folder of photos")
 
 
 def _frames(video: Path) -> Iterator[np.ndarray]:
@@ -89,7 +89,7 @@ def _length(video: Path) -> int:
     finally:
         reader.release()
     if length == 0:
-        raise UserError(f"{video}: no video that can be read; give an .mp4 or .mov, or a folder of photos")
+        raise UserError(f"{video}: not a readable video; give an .mp4 or .mov, or a folder of photos")
     return length
 
 

@@ -35,8 +35,8 @@ _EXPORT = "export the cameras again as XML"
 def read_metashape(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], list[ExcludedPhoto], list[str]]:
     """Read the aligned cameras of a .xml, find their photos and masks in ``files``, and return notes for the user.
 
-    Of several chunks, that with most aligned cameras is read. Raises ``UserError`` for a file that is malformed or has
-    no valid camera.
+    Of several chunks, the one with the most aligned cameras is read. Raises ``UserError`` for a file that is malformed
+    or has no valid camera.
     """
     data = read_bytes(source, at_most=MAX_TEXT_BYTES)
     # A document type can define entities that expand to any size.
@@ -52,7 +52,9 @@ def read_metashape(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], l
     notes = []
     chunk = max(chunks, key=lambda one: sum(camera.find("transform") is not None for camera in one.iter("camera")))
     if len(chunks) > 1:
-        notes.append(f"chunk {chunk.get('label', '')!r} is used, the one of {len(chunks)} with most aligned cameras")
+        notes.append(
+            f"chunk {chunk.get('label', '')!r} is used, the one of {len(chunks)} with the most aligned cameras"
+        )
     cameras = list(chunk.iter("camera"))
     names = [camera.get("label") or f"camera {camera.get('id')}" for camera in cameras]
     places = files.locate(names, (source.parent / "images", source.parent))

@@ -16,7 +16,7 @@ from egs_warp.io.limits import MAX_COORDINATE, MIN_LOG_SCALE
 from egs_warp.io.raw import RawCapture, property_names
 
 MAX_DISTANCE_RATIO = 1e4
-"""Maximum distance from the capture's middle, in sizes of the capture: skies are some hundred sizes away."""
+"""Maximum distance from the capture's middle, in sizes of the capture: skies are hundreds of sizes away."""
 MAX_SCALE_RATIO = 1e2
 """Maximum standard deviation of a Gaussian, in sizes of the capture."""
 MAX_SH = 1e3

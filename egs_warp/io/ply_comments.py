@@ -39,7 +39,7 @@ def up_of(comments: Sequence[str]) -> tuple[np.ndarray | None, int | None]:
     """Return the up direction (3,), unit, that ``comments`` state, or None; and the vertical axis if its sign is not
     reliable, or None.
 
-    Brush writes ``Vertical axis: y`` into every file without an axis of its own, also if -y is up.
+    Brush writes ``Vertical axis: y`` into every file without an axis of its own, even if -y is up.
     """
     up, axis = None, None
     for comment in comments:

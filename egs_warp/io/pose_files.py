@@ -37,7 +37,8 @@ class PoseSource:
 
 
 def find_poses(source: Path) -> PoseSource:
-    """Find the poses that ``source`` is or contains: of several COLMAP models of one kind, the one with most photos.
+    """Find the poses that ``source`` is or contains: of several COLMAP models of one kind, the one with the most
+    photos.
 
     Raises ``UserError`` if there are none.
     """
@@ -102,7 +103,7 @@ def _folders(source: Path) -> Iterator[Path]:
 
 
 def _largest(models: list[Path], source: Path) -> tuple[Path, str]:
-    """Return the folder of the model with most photos, and a note; empty if there is only one model."""
+    """Return the folder of the model with the most photos, and a note; empty if there is only one model."""
     if len(models) == 1:
         return models[0], ""
     counts: dict[Path, int] = {}

@@ -42,7 +42,7 @@ def parse_pose_json(source: Path) -> Any:
     try:
         return json.loads(text, parse_int=whole_number)
     except (ValueError, RecursionError) as error:
-        # Numbers that JSON does not have: only their photos are invalid.
+        # Replace numbers that JSON does not define by NaN, so that only the photos that use them are invalid.
         repaired = _TOKEN.sub(lambda token: token[0] if token[0].startswith('"') else "NaN", text)
         if repaired != text:
             try:
@@ -260,7 +260,7 @@ class _Record:
         return int(value)
 
     def text(self, key: str) -> str:
-        """Return a name."""
+        """Return the nonempty text of ``key``."""
         value = self.fields.get(key)
         if not isinstance(value, str) or not value or "\0" in value:
             raise self._wrong(key, "a name")

@@ -53,7 +53,7 @@ _SIZES = f"""
 ROW_ELIMINATION = """
     // Gaussian elimination with row exchanges of a matrix of `unknowns` rows and columns, followed by right-hand sides,
     // in all a multiple of four columns. Returns the rank, and the column of each pivot in `pivots`. A candidate of at
-    // most `singular` times the largest pivot so far is no pivot.
+    // most `singular` times the largest pivot so far is not a pivot.
     auto eliminate_rows = [&](double* M, int stride, int unknowns, int columns, double singular, int* pivots) {
         #pragma clang fp contract(fast)
         int rank = 0, chosen[BLOCK];

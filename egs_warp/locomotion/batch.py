@@ -82,8 +82,8 @@ class BatchStep(BatchedRecord):
         return self.after.worlds
 
     def reports(self) -> list[StepReport]:
-        """Download the step; return one report for each of ``worlds``, as a single step makes it but without
-        milliseconds."""
+        """Download the step; return one report for each of ``worlds``, like that of a single stepper but without
+        timings."""
         state, contacts = self.after, self.contacts
         host = [
             each.cpu().numpy()
@@ -153,7 +153,8 @@ class BatchStepper:
             frictions: (B,) Coulomb coefficient of each world.
             settings: options of the stepper.
             panel: number of columns that are factored at a time.
-            chunk_bytes: bound on the matrices that are factored at a time; some times as much is needed beside them.
+            chunk_bytes: bound on the size of the matrices that are factored at a time; several times as much
+                temporary memory is needed in addition.
             stages: context manager that times each stage.
 
         Raises:

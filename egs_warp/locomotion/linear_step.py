@@ -66,10 +66,10 @@ class LinearStep:
     unknowns."""
 
     velocities: Any
-    """(3N, k + 1) m/s: derivative of the end velocity by each of x, and in the last column v(0), without muscles and
-    contact."""
+    """(3N, k + 1) m/s: derivative of the end velocity with respect to x, and in the last column v(0), without muscles
+    and contact."""
     torques: np.ndarray
-    """(3, k) kg m^2/s: derivative of the angular momentum by each of x."""
+    """(3, k) kg m^2/s: derivative of the angular momentum with respect to x."""
 
     @property
     def count(self) -> int:
@@ -78,7 +78,7 @@ class LinearStep:
 
     @property
     def columns(self) -> np.ndarray:
-        """(3N, k) m/s, derivative of the end velocity by x."""
+        """(3N, k) m/s, derivative of the end velocity with respect to x."""
         return self.velocities[:, :-1]
 
     @property
@@ -151,7 +151,7 @@ class HostStepLinearizer:
 
 
 def torques_of(problem: StepProblem, contacts: ContactSet, m: int) -> np.ndarray:
-    """Return (3, m + 3n) kg m^2/s, derivative of the angular momentum by x: zero for ``m`` activations, and the torque
-    of a body weight in each direction of each contact."""
+    """Return (3, m + 3n) kg m^2/s, derivative of the angular momentum with respect to x: zero for ``m`` activations,
+    and the torque of a body weight in each direction of each contact."""
     torques = problem.dt * problem.body.weight * contacts.contact_velocities(problem.rotation_modes).T
     return np.hstack([np.zeros((3, m)), torques])

@@ -1,8 +1,8 @@
 """Objectives of a motion on the end of a step: weighted squares of functions linear in it (docs/concepts/motions.md).
 
 ``Objective`` is linear in the end velocity, by ``rows``. The other kinds are linear in the unknowns x of the QP, by
-``slopes`` (j, k), the derivative by each of k unknowns, whose angular momenta are ``torques`` (3, k). ``residual`` (j,)
-is the value at one end of the step. Slopes and residuals are in units of ``speed``, sqrt(g H) in m/s.
+``slopes`` (j, k), the derivative with respect to each of k unknowns, whose angular momenta are ``torques`` (3, k).
+``residual`` (j,) is the value at one end of the step. Slopes and residuals are in units of ``speed``, sqrt(g H) in m/s.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ class AngularMomentumObjective:
     weight: float
 
     def slopes(self, problem: StepProblem, contacts: ContactSet, torques: np.ndarray, speed: float) -> np.ndarray:
-        """Return (3, k), the derivative of the residual by the unknowns, whose ``torques`` are (3, k) kg m^2/s."""
+        """Return (3, k), the derivative of the residual with respect to the unknowns, whose ``torques`` are (3, k) kg
+        m^2/s."""
         return torques / self._unit(problem, speed)
 
     def residual(

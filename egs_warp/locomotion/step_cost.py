@@ -112,7 +112,7 @@ class EffortModel:
     energy: float
     """J, elastic energy and damping potential at ``positions``."""
     gradient: np.ndarray
-    """(3N,) N, derivative of the energy by positions."""
+    """(3N,) N, derivative of the energy with respect to positions."""
     stiffness_entries: Any
     """(nnz,) N/m, upper entries of the projected (positive semidefinite) element Hessian, on the device of
     ``factors``."""

@@ -100,7 +100,7 @@ def check_trajectory(t: Trajectory) -> None:
     if np.abs(t.body_axes @ t.body_axes.T - np.eye(3)).max() > 1e-6:
         raise ValueError("body_axes are not orthonormal")
     if abs(np.linalg.norm(t.front) - 1.0) > 1e-6 or abs(t.front[2]) > 1e-6:
-        raise ValueError("front is no unit vector along the ground")
+        raise ValueError("front is not a unit vector along the ground")
 
 
 def _extents(t: Trajectory) -> dict[str, int]:

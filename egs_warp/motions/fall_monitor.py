@@ -77,7 +77,7 @@ class FallMonitor:
         if isinstance(motion, GetUp):
             self._check_recovery(motion, elapsed)
             return
-        # A body that bounces on its side has not come to its feet in between.
+        # A body in the air may be bouncing on its side, so the lying time is not reset.
         if report.forces[:, 0].sum() <= 0.0:
             return
         lies = self._lying_note(state, report) if not tips_body(self.sequence.done[-1].motion) else None

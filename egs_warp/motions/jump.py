@@ -221,7 +221,7 @@ class Jump:
         return self._land(state, measurement, dt)
 
     def _advance_phase(self, measurement: Measurement, time: float, dt: float) -> None:
-        # Contacts while the body still rises are no landing.
+        # Contacts while the body still rises are not a landing.
         measurement = replace(measurement, in_contact=measurement.in_contact and measurement.velocity[2] < 0.0)
         elapsed, plan = time - self._entered + 1e-9, self.plan
         following = {
@@ -277,7 +277,7 @@ class Jump:
         measured position to its position at touch-down."""
         plan = self.plan
         position, velocity = plan.thrust(self._start_com, elapsed)
-        # No faster upward than free flight to the requested height needs.
+        # Limit the upward speed to the one that free flight to the requested height needs.
         up = min(self._following(measurement, position, velocity, dt)[2], self._sufficient_speed(measurement, dt))
         left = max((plan.speed_up - measurement.velocity[2]) / plan.speed_up * plan.thrust_time, dt)
         landing = self._landing_com(position)

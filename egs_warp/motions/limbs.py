@@ -30,7 +30,7 @@ _MAX_MERGED_HEIGHT = 0.1
 """Body heights, or a mean edge length of the mesh if that is more: limbs that are connected on the ground over a larger
 height are one base."""
 _MAX_GAP = 0.5
-"""Gap between two limbs in body heights: a connection across a larger gap, however thin, is no flaw of a capture."""
+"""Gap between two limbs in body heights: a connection across a larger gap, however thin, is not a flaw of a capture."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class StepLimits:
-    """Largest change of a body's planar pose in one step. A step that turns leaves less for the displacement."""
+    """Largest change of a body's planar pose in one step. The larger the rotation of a step, the shorter its
+    displacement."""
 
     length: float
     """Metres."""

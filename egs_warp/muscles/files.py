@@ -98,7 +98,7 @@ def _fibres(
     """Return the fibres of one entry with their mirror images, and their stiffness in N/m, NaN if it gives none."""
     where = f"{path}: fibre {index + 1}"
     if not isinstance(entry, dict):
-        raise UserError(f"{where} is no object; write {{...}} with a name and a kind")
+        raise UserError(f"{where} is not an object; write {{...}} with a name and a kind")
     name = entry.get("name")
     if not isinstance(name, str) or not name:
         raise UserError(f'{where} has no name; give it a "name"')

@@ -162,7 +162,7 @@ def _run(
     )
     starts = [creature.start] * len(batch)
     is_unsolvable = [False] * len(batch)
-    # On its own ground the creature already stands.
+    # With its own friction, the creature is already at rest.
     if any(one.job.friction is not None for one in batch):
         settled, failed = stepper.settle()
         has_friction = [one.job.friction is not None for one in batch]

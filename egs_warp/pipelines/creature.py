@@ -83,7 +83,7 @@ class CreatureOptions:
     """(3,) Direction against gravity, or an axis; None is the normal of the ground, other directions make it a slope.
     """
     solids: tuple[Solid, ...] = ()
-    """Steps and walls beside the ground."""
+    """Steps and walls in addition to the ground."""
     settings: LocomotionSettings | None = None
     """Solver settings, such as the contact strategy and the QP solver; None is the default."""
 
@@ -167,9 +167,9 @@ def make_creature(
 
     Args:
         cloud: The capture.
-        up: (3,) Up, or an axis such as ``"-y"``; without a ``plane``, the ground is the base of the object, orthogonal
-            to ``up``. Without ``plane``, ``up`` and ``options.ground``, up is that of the file, else estimated
-            (``guess_up``), with a note.
+        up: (3,) Up direction, or an axis such as ``"-y"``; without a ``plane``, the ground is the base of the object,
+            orthogonal to ``up``. Without ``plane``, ``up`` and ``options.ground``, up is that of the file, else
+            estimated (``guess_up``), with a note.
         plane: Ground plane.
         options: Body, muscles, ground and solver; None is the default.
         progress: Called with the name of each stage as it starts.
@@ -231,7 +231,8 @@ def make_creature(
 
 
 def estimated_up(cloud: GaussianCloud, *, advice: str) -> tuple[np.ndarray, str]:
-    """Return up (3,) of a capture, from its file or estimated, and a note that ends with ``advice`` for the user."""
+    """Return the up direction (3,) of a capture, from its file or estimated, and a note for the user that ends with
+    ``advice``."""
     file_up, vertical_axis = (cloud.up, cloud.vertical_axis) if isinstance(cloud, Capture) else (None, None)
     up, reason = guess_up(cloud, file_up, vertical_axis=vertical_axis)
     axis = int(np.argmax(np.abs(up)))
@@ -248,7 +249,7 @@ def plane_below(cloud: GaussianCloud, ground: HeightField) -> Plane:
     means = cloud.means.numpy()[cloud.opacities() > 0.3].astype(np.float64)
     heights = ground.heights(means)
     if len(means) == 0 or not (heights > 0.0).any():
-        raise ArgumentError("ground", "nothing of the object lies above it; check the plane", check=("plane",))
+        raise ArgumentError("ground", "no part of the object lies above it; check the plane", check=("plane",))
     low = means[(heights > 0.0) & (heights < _FOOT_HEIGHT * float(np.quantile(heights, 0.99)))]
     lift = float(ground.ground_height(low).min()) if len(low) else 0.0
     return Plane(ground.normal, ground.plane.offset - lift)

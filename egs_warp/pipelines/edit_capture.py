@@ -21,7 +21,7 @@ from egs_warp.segmentation.connectivity import connected_parts
 Y_UP = np.array([0.0, 1.0, 0.0])
 """Up in the formats and viewers that define it."""
 _CELLS = 128
-"""Cells of the grid that connects Gaussians, over the size of a capture."""
+"""Number of cells, along the size of a capture, of the grid that connects Gaussians."""
 _FLOATER_SHARE = 0.01
 """A part with less than this share of the opacity of the largest part is a floater."""
 

@@ -29,7 +29,7 @@ class State(Enum):
     GOT_UP = "got up"
     """The body fell, which ended it, and has got up."""
     NOT_AS_REQUESTED = "not as requested"
-    """It ended upright, but missed its target or its time limit, or its feet slid."""
+    """The body ended upright, but missed its target or its time limit, or its feet slid."""
     FALLEN = "fallen"
     STOPPED = "stopped"
     """A step could not be solved."""

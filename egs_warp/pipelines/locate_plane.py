@@ -291,7 +291,7 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everyw
     searched, least_share = cloud, 0.3
     if spec.box is not None:
         if not spec.box.holds(means).any():
-            raise UserError("object: the box holds nothing of the capture; give it in the capture's units")
+            raise UserError("object: the box contains no Gaussian of the capture; give it in the capture's units")
         middle, half = 0.5 * (spec.box.low + spec.box.high), 0.5 * (spec.box.high - spec.box.low)
         around = np.all(np.abs(means - middle) < 1.5 * half, axis=1)
         if not around.any():
@@ -314,7 +314,7 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everyw
         )
     if plane is None:
         raise UserError(
-            "plane: none in sight under the object: nothing flat and level lies below it; give the plane",
+            "plane: none found under the object: nothing flat and level lies below it; give the plane",
             check=("plane", "up"),
         )
     return plane
@@ -333,7 +333,7 @@ def _low_point(cloud: GaussianCloud, spec: ObjectSpec, means: np.ndarray, up: np
     votes = votes_of_masks(cloud, spec.masks)
     inside = votes.inside * (votes.share_inside() > 0.5) * (votes.share_seen() > 0.02)
     if inside.sum() <= 0.0:
-        raise UserError("object: nothing of the capture shows inside the masks; check masks and cameras")
+        raise UserError("object: no part of the capture is visible inside the masks; check masks and cameras")
     order = np.argsort(means @ up)
     share = np.cumsum(inside[order]) / inside.sum()
     return means[order[int(np.searchsorted(share, 0.3))]]

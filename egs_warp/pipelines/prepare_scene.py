@@ -135,7 +135,7 @@ def prepare_scene(
         spec: Specification of the object.
         cameras: Cameras of the capture, if known.
         photographs: Photos of the whole scene for the fine-tuning at the plane; None uses renders of the capture.
-        up: (3,) Approximate up, or an axis such as ``"-y"``; None is that of the file, else estimated.
+        up: (3,) Approximate up direction, or an axis such as ``"-y"``; None is that of the file, else estimated.
         plane: The ground plane; None finds it.
         options: Options; None is the default.
         progress: Called with the name of a stage and its finished fraction.

@@ -112,7 +112,7 @@ class RayPool:
         return events
 
     def close(self) -> None:
-        """End all workers, whatever they do."""
+        """Terminate all workers, even busy ones."""
         for actor in self._actors.values():
             with contextlib.suppress(Exception):
                 self._ray.kill(actor)

@@ -75,7 +75,7 @@ class WorkerPool(Protocol):
         ...
 
     def close(self) -> None:
-        """End all workers, whatever they do."""
+        """Terminate all workers, even busy ones."""
         ...
 
 
@@ -171,7 +171,7 @@ class ProcessPool:
                 return [event]
 
     def close(self) -> None:
-        """End all workers, whatever they do."""
+        """Terminate all workers, even busy ones."""
         while self._running:
             self._end(self._running.popitem()[1])
 

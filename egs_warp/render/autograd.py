@@ -67,7 +67,8 @@ def render_torch(
     Args:
         rotation: (3, 3), replaces the camera's; its gradient is by the nine entries, taken as independent.
         translation: (3,), replaces the camera's; given together with ``rotation`` or not at all.
-        screen: (n, 2), any values; receives the gradient by the screen positions in pixels, which densification uses.
+        screen: (n, 2), any values; receives the gradient with respect to the screen positions in pixels, which
+            densification uses.
         background, antialiased, threads: as for ``render_gaussians``.
         mask: as for ``render_gaussians``; tiles that it leaves out contribute no gradient.
 
@@ -254,7 +255,7 @@ class _Render(torch.autograd.Function):
                     threads=ctx.task.threads,
                     onto=_cloud_of(by_attributes),
                 )
-            # The gradient by the pose is the sum over the Gaussians.
+            # The gradient with respect to the pose is the sum over the Gaussians.
             by_pose = (
                 None if part is None else wp.to_torch(part).sum(dim=0)
                 for part in (gradients.pose_rotation, gradients.pose_translation)

@@ -1,4 +1,4 @@
-"""Backward pass of the renderer: gradients by pixels to gradients by Gaussians and by the camera pose."""
+"""Backward pass of the renderer: from gradients of the pixels to those of the Gaussians and the camera pose."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from egs_warp.render.tiles import TileLists
 
 @dataclass(frozen=True)
 class CloudGradients:
-    """Gradient of a scalar loss by all inputs of the image."""
+    """Gradient of a scalar loss with respect to all inputs of the image."""
 
     means: wp.array
     """(n,) vec3."""
@@ -33,9 +33,10 @@ class CloudGradients:
     sh: wp.array
     """(n, K) vec3."""
     screen: wp.array | None
-    """(n,) vec2, by the screen position in pixels; None if not requested."""
+    """(n,) vec2, with respect to the screen position in pixels; None if not requested."""
     pose_rotation: wp.array | None
-    """(n,) mat33, each Gaussian's part of the gradient by the camera's rotation matrix; None if not requested."""
+    """(n,) mat33, each Gaussian's part of the gradient with respect to the camera's rotation matrix; None if not
+    requested."""
     pose_translation: wp.array | None
     """(n,) vec3, likewise for the translation."""
 
@@ -56,17 +57,17 @@ def backward(
     threads: int,
     onto: GaussianCloud | None = None,
 ) -> CloudGradients:
-    """Compute the gradients by the Gaussians.
+    """Compute the gradients with respect to the Gaussians.
 
     Args:
         cloud, view, projected, lists, image: inputs and results of the forward pass.
-        colour_gradient: (H, W) vec3, gradient by ``image``'s colour; None for zero.
+        colour_gradient: (H, W) vec3, gradient with respect to ``image``'s colour; None for zero.
         alpha_gradient, depth_gradient: (H, W) float32, likewise.
         antialiased: as in the forward pass.
-        want_pose: also compute the gradient by the camera pose.
-        want_screen: also compute the gradient by the screen positions.
+        want_pose: also compute the gradient with respect to the camera pose.
+        want_screen: also compute the gradient with respect to the screen positions.
         threads: CPU threads.
-        onto: cloud whose arrays receive the gradients by the attributes; default: new arrays.
+        onto: cloud whose arrays receive the gradients with respect to the attributes; default: new arrays.
     """
     device, count = cloud.device, cloud.count
     (moments,) = empty_pooled(device, ((grow_capacity(projected.slot_count), 3), wp.vec4))

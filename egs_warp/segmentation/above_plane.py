@@ -27,7 +27,7 @@ _GAP = 2.0 / CELLS
 _MAX_CHAIN = 4
 """Maximum number of detached parts in a chain, as leaves next to leaves next to leaves."""
 _HEAVY, _LIGHT = 0.05, 0.01
-"""Fractions of the object's opacity mass. A detached part above the first is no stray; one below the second supports
+"""Fractions of the object's opacity mass. A detached part above the first is not a stray; one below the second supports
 nothing."""
 _MAX_DETACHED_GAP, _MIN_GAP_RATIO = 0.2, 2.0
 """Fraction of the object's size up to which a part of it may be detached, as a robot's hands are, if any other possible

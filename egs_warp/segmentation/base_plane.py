@@ -22,7 +22,7 @@ _SEARCHED_SHARE = 0.15
 _BANDWIDTH = 0.01
 """Fraction of the height. Undersides this close belong to one support."""
 _MAX_GAUSSIANS = 300_000
-"""Maximum number of Gaussians, spread evenly, from which up is estimated."""
+"""Maximum number of Gaussians, spread evenly, from which the up direction is estimated."""
 _MAX_MASS_BELOW = 0.015
 """Maximum share of the opacity mass below the plane: half of what contact may exclude."""
 
@@ -152,10 +152,10 @@ def guess_up(
     tilted: bool = True,
     vertical_axis: int | None = None,
 ) -> tuple[np.ndarray, str]:
-    """Return up (3,), unit, and the reason, for the user: the file's own up if it has one, else the best of the six
-    axes, or with ``tilted`` another direction if the object surely rests in it.
+    """Return the up direction (3,), a unit vector, and the reason for the user: that of the file if it has one, else
+    the best of the six axes, or with ``tilted`` another direction in which the object clearly rests.
 
-    Of a known ``vertical_axis`` it is the positive direction, unless the other is clearly better.
+    If the ``vertical_axis`` is known, it is its positive direction, unless the negative one is clearly better.
 
     An object rests on the side where its support is wide, level, and well below its weight. The score of a direction is
     the sum of three numbers: the area of the support polygon as a fraction of the silhouette seen along it, the
@@ -221,7 +221,8 @@ class _Support:
     level: float
     """Fraction of the low columns that end at the support's level."""
     depth: float
-    """Distance of the centre of opacity from the polygon's edge over the radius of the disc of its area; 0 outside."""
+    """Distance of the centre of opacity from the polygon's edge, divided by the radius of a disc of the same area; 0
+    outside."""
 
     @property
     def score(self) -> float:

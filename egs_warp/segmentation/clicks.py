@@ -25,7 +25,7 @@ means what is behind it."""
 _MAX_DEPTH_DIFFERENCE = 0.03
 """Fraction of the distance. Gaussians farther than this before or behind the clicked surface belong to another one."""
 _SURE = 0.5
-"""Score by distance above which a Gaussian's colour is assigned to its side."""
+"""Absolute score from distances alone above which a Gaussian's colour counts as a colour of its side."""
 _ALIKE = 8
 """Number of nearest colours that measure how common a colour is on a side."""
 _BY_COLOUR = 0.5

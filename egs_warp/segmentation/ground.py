@@ -27,7 +27,7 @@ REACH = 2.5
 _SPACING = 0.025
 """Fraction of the object's size: distance between nodes."""
 _BAND = 0.25
-"""Fraction of the object's size. Points farther from the plane are no ground."""
+"""Fraction of the object's size. Points farther from the plane are not ground."""
 _MIN_VIEWS = 3
 """Minimum number of views that must show a node."""
 _MAX_VIEW_DIFFERENCE = 0.02
@@ -189,8 +189,8 @@ def _one_patch(mask: np.ndarray) -> np.ndarray:
 
 
 def _medians(points: np.ndarray, axes: np.ndarray, origin: np.ndarray, spacing: float, count: int) -> np.ndarray:
-    """(count, count) median height of those of ``points`` (n, 3) that are nearest to each node; NaN if there is
-    none."""
+    """Return (count, count), for each node the median height of the ``points`` (n, 3) that are nearest to it; NaN if
+    there are none."""
     away = (points - origin) @ axes.T
     column, row = np.rint(away[:, :2] / spacing).astype(int).T
     inside = (column >= 0) & (column < count) & (row >= 0) & (row < count)

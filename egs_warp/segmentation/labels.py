@@ -32,7 +32,7 @@ def labels_of_votes(votes: Votes, *, background_bias: float = 0.0) -> tuple[np.n
     seen = votes.share_seen() >= _MIN_VISIBLE_SHARE
     claimed = seen & (votes.share_inside() > 0.5 * (1.0 + background_bias))
     if not claimed.any():
-        raise UserError("object: nothing of the capture shows inside the masks; check masks and cameras")
+        raise UserError("object: no part of the capture is visible inside the masks; check masks and cameras")
     return claimed, ~seen
 
 

@@ -20,7 +20,7 @@ from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
 from egs_warp.segmentation.votes import votes_of_masks
 
 _NOTHING_ABOVE = (
-    "object: nothing of it lies above the plane; mark it by other masks, a box or a point, or give its plane"
+    "object: no part of it lies above the plane; mark it with other masks, a box or a point, or give its plane"
 )
 _MAX_FLOATER_MASS = 0.01
 """Fraction of the object's opacity mass. A smaller connected part is a floater."""
@@ -100,7 +100,7 @@ def segment(
 def _nothing_left(reason: str, count: int) -> str:
     """Message for an object of ``count`` Gaussians of which segmentation leaves none."""
     return (
-        f"segment: none of the object's {count} Gaussians is left: {reason}; mark the object by masks, or click on"
+        f"segment: none of the object's {count} Gaussians is left: {reason}; mark the object with masks, or click on"
         " more of it"
     )
 

@@ -54,10 +54,11 @@ class Segmentation:
     object_mask: np.ndarray
     """(n,) bool, the object; its means lie above the plane."""
     buried_mask: np.ndarray
-    """(n,) bool, hidden Gaussians of the object or under its foot, with means near or below the plane. They belong to
-    neither object nor background."""
+    """(n,) bool, Gaussians under the object's foot or claimed as its parts, with means near or below the plane, mostly
+    hidden. They belong to neither object nor background."""
     floater_mask: np.ndarray
-    """(n,) bool, similar to the object but detached from it. They belong to neither."""
+    """(n,) bool, similar to the object but detached from it. They belong to neither
+    object nor background."""
     size: float
     """Diagonal of the object's bounding box, scene units."""
 

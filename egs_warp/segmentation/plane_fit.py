@@ -78,9 +78,9 @@ def fit_plane(views: Sequence[PlaneView], *, start: Plane | None = None, seed: i
     inside = residual < _TUKEY * max(scale, _MIN_NOISE)
     if scale > 0.1 or inside.mean() < 0.4:
         errors, share = (f"{100.0 * value:.0f} %" for value in (scale, inside.mean()))
-        fault = f"leaves depth errors of {errors}" if scale > 0.1 else f"explains only {share} of what is"
+        fault = f"leaves depth errors of {errors}" if scale > 0.1 else f"explains only {share} of the pixels"
         raise UserError(
-            f"plane: none in sight: the best one {fault} in the masks; mark a flat part of what the object stands on"
+            f"plane: none fits the masks: the best one {fault}; mark a flat part of what the object stands on"
         )
     if plane.heights(pixels.origins[0]) < 0.0:
         plane = Plane(-plane.normal, -plane.offset)
@@ -228,6 +228,6 @@ def _scale(residual: np.ndarray) -> float:
 
 
 def _tukey(z: np.ndarray) -> np.ndarray:
-    """Tukey's biweight for ``least_squares``: value and two derivatives by z = (residual / scale)^2."""
+    """Tukey's biweight for ``least_squares``: value and two derivatives with respect to z = (residual / scale)^2."""
     left = np.clip(1.0 - z, 0.0, None)
     return np.stack([(1.0 - left**3) / 3.0, left**2, -2.0 * left])

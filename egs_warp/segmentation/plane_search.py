@@ -166,9 +166,7 @@ def refine_plane(
     surfaces = _surfaces(cloud, plane, cameras, radius, object_mask)
     views = _masked(surfaces, plane, centre, radius, _BAND * radius)
     if not views:
-        raise UserError(
-            "plane: none in sight: no camera sees it around the object; give other cameras, or leave them out"
-        )
+        raise UserError("plane: no camera sees it around the object; give other cameras, or leave them out")
     fit = fit_plane(views)
     # Heights over a plane that is already nearly aligned.
     realigned = _masked(surfaces, fit.plane, centre, radius, _BAND * radius)
@@ -189,7 +187,7 @@ def plane_views(
 
     The masks are the pixels whose rendered point (``SeenSurface``) lies within ``band`` (default 3 % of ``radius``) of
     the plane and within ``radius`` of ``centre`` along it, without those of ``object_mask`` (n,) bool Gaussians.
-    Cameras below the plane, and those that see nothing of it, are ignored; of more than eight, some are picked evenly.
+    Cameras below the plane, and those that do not see it, are ignored; of more than eight, some are picked evenly.
     """
     surfaces = _surfaces(cloud, plane, cameras, radius, object_mask)
     return _masked(surfaces, plane, centre, radius, band or _BAND * radius)
@@ -202,7 +200,7 @@ def _surfaces(
     # The object is removed from the picture only if it is known: its foot would bend the plane upwards.
     if object_mask is not None and object_mask.all():
         raise UserError(
-            f"segment: all {cloud.count} Gaussians of the capture are the object, so no plane is in sight; give the"
+            f"segment: all {cloud.count} Gaussians of the capture are the object, so no plane is visible; give the"
             " plane, or mark less of the capture"
         )
     bare = cloud if object_mask is None else cloud.subset(~object_mask)

@@ -179,7 +179,7 @@ def _innermost(mask: np.ndarray, count: int) -> np.ndarray:
 
 
 def _in_sight(cloud: GaussianCloud, points: Sequence[np.ndarray], camera: Camera) -> np.ndarray:
-    """(k, 2) pixels of those of the ``points`` (3,) that ``camera`` sees."""
+    """Return (k, 2), the pixels of the ``points`` (3,) that are visible to ``camera``."""
     if not points:
         return np.zeros((0, 2))
     depth = SeenSurface.of(cloud, camera).depth

@@ -17,7 +17,7 @@ from egs_warp.segmentation.plane_search import find_planes, lies_along
 _LEVELS = 4
 """Number of halvings of the capture's half diagonal, the radius about a point in which planes are searched."""
 _MIN_SUPPORT = 0.1
-"""Minimum share of the level surface near a point; a plane with less is no table."""
+"""Minimum share of the level surface near a point; a plane with less is not a table."""
 _THICKNESS = 0.02
 """Thickness of a plane, as a fraction of the search radius."""
 _LEVEL_DEGREES = 5.0

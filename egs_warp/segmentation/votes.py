@@ -56,9 +56,9 @@ class Votes:
 def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
     """Sum the blending weight of each Gaussian over the pixels inside and outside the masks.
 
-    A Gaussian's blending weight in a pixel is the derivative of the pixel's colour by the Gaussian's own. So the votes
-    are the colour gradient of a picture that weights masked pixels in red and the others in green, computed by the
-    renderer's backward kernels. Raises ``UserError`` for masks of another size than their cameras.
+    A Gaussian's blending weight in a pixel is the derivative of the pixel's colour with respect to the Gaussian's own.
+    So the votes are the colour gradient of a picture that weights masked pixels in red and the others in green,
+    computed by the renderer's backward kernels. Raises ``UserError`` for masks of another size than their cameras.
     """
     sums = np.zeros((cloud.count, 3))
     # The same grey for all: colours are not clipped, and SH bands above 0 are not needed.
@@ -82,7 +82,7 @@ def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
         raise UserError(f"{masks[0].name}: the mask is empty; mark the object in it")
     votes = blending_votes(cloud, marked)
     if not (votes.inside + votes.outside > 0.0).any():
-        raise UserError("object: the masks' cameras see nothing of the capture; check that both share one frame")
+        raise UserError("object: the masks' cameras see no part of the capture; check that both share one frame")
     return votes
 
 

@@ -90,7 +90,7 @@ class FinetuneOptions:
     exclude_outliers: bool = False
     """Exclude views during the training that do not fit the others."""
     antialiased: bool | None = None
-    """Render with antialiasing, for which the result is then marked. None: as the cloud is marked."""
+    """Render with antialiasing, and mark the result as trained with it. None: as the cloud is marked."""
     seed: int = 0
     threads: int | None = None
 

@@ -34,8 +34,8 @@ def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
 def initial_cloud(
     views: Sequence[TrainingView], *, count: int, sh_degree: int, seed: int = 0, device: str | None = None
 ) -> GaussianCloud:
-    """Create ``count`` round Gaussians, spread evenly over the region that most cameras see, in the colours they see
-    there.
+    """Create ``count`` isotropic Gaussians, spread evenly over the region that most cameras see, in the colours they
+    see there.
 
     Of many random points, those on whose colour the views agree best are chosen. If all views have alpha, only points
     inside all silhouettes are used: a rough visual and photometric hull.
@@ -79,7 +79,7 @@ def initial_cloud(
 def cloud_from_points(
     points: SparsePoints, *, count: int | None, sh_degree: int, seed: int = 0, device: str | None = None
 ) -> GaussianCloud:
-    """Create round Gaussians at ``points``, at most ``count`` of them, each as large as the distance to its three
+    """Create isotropic Gaussians at ``points``, at most ``count`` of them, each as large as the distance to its three
     nearest neighbours."""
     positions, colours = points.positions, points.colours
     if count is not None and len(positions) > count:

@@ -36,7 +36,7 @@ def is_object_black(images: Sequence[PosedImage]) -> bool:
     """Return True if the masks of ``images`` show the object in black, on sure evidence: the surroundings, along the
     borders, are white, and the black regions are the silhouettes of one body that all cameras see.
 
-    Black regions that move from photo to photo, such as people to be left out, are no silhouettes of one body.
+    Black regions that move from photo to photo, such as people to be left out, are not silhouettes of one body.
     """
     masked = [one for one in images if one.mask is not None]
     if len(masked) < _MIN_MASKS:

@@ -86,7 +86,7 @@ def read_views(posed: Path | str, *, max_side: int | None = None, inverted_masks
         raise UserError(f"{posed}: none of its {len(left_out)} photos can be used; the first: {left_out[0].reason}")
     masked = sum(view.alpha is not None for view in views)
     if masked:
-        # Beside photos with a cut-out, an opaque alpha channel is a photo that the object fills.
+        # If other photos have a cut-out, a photo with an opaque alpha channel is one that the object fills.
         for number in opaque:
             image = views[number].image
             views[number] = replace(views[number], alpha=np.ones(image.shape[:2], np.float32))

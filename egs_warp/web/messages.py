@@ -176,10 +176,10 @@ def read_message(message: Mapping[str, Any], *, height: float, node_count: int) 
 def _read_script(message: Mapping[str, Any], max_distance: float, node_count: int) -> Message:
     text = message.get("text")
     if not isinstance(text, str) or len(text) > MAX_TEXT_LENGTH:
-        raise ValueError(f"text: give motions in at most {MAX_TEXT_LENGTH} characters, as jump 0.5 0.2")
+        raise ValueError(f"text: give motions in at most {MAX_TEXT_LENGTH} characters, such as jump 0.5 0.2")
     # Scripts and key frames are files of this machine, which a page must not read.
     if not _MOTIONS.fullmatch(text) or re.search(r"\.(json|csv)", text, re.IGNORECASE):
-        raise ValueError("text: give motions by name and number, as hop x3, twist 90")
+        raise ValueError("text: give motions by name and number, such as hop x3, twist 90")
     script = motion(text)
     if any(request.file is not None for request in script.requests):
         raise ValueError("text: motions that need a file are not available here; use egs-warp animate")

@@ -16,13 +16,13 @@ GPU_NODES = 500
 MIN_CHOSEN, MAX_CHOSEN = 120, 500
 """Smallest and largest number that is chosen; limbs of most bodies need the former, and ``animate`` uses the latter."""
 _PROBE_TIME = 0.3
-"""s, for which the speed is measured. Other processes then take their usual share."""
+"""Duration of the speed measurement, s: long enough for other processes to take their usual share of the cores."""
 _MIN_SPEED = 0.5
-"""Fraction of real time that the chosen number shall reach."""
+"""Fraction of real time that the chosen number should reach."""
 _PROBE_SIZE, _PROBE_COLUMNS = 300, 60
 _STEP_TIME_PER_PROBE = 20.5
-"""Mean time of a step of a jumping pawn with ``_STEP_NODES`` nodes, relative to one pass of the probe beside it (160 ms
-and 7.8 ms on two busy cores of a Xeon)."""
+"""Mean time of a step of a jumping pawn with ``_STEP_NODES`` nodes, relative to one pass of the probe run at the same
+time (160 ms and 7.8 ms on two busy cores of a Xeon)."""
 _STEP_NODES, _STEP_EXPONENT = 250, 0.54
 """Requested number of nodes of that step, and the power of it with which the time grows (97 ms and 7.0 ms with 120)."""
 

@@ -197,7 +197,7 @@ async def _receive_messages(page: WebSocket, feed: FrameFeed) -> None:
 
 
 class _SameOriginOnly:
-    """Middleware that rejects requests of other sites in the user's browser.
+    """Middleware that rejects requests that other sites send through the user's browser.
 
     It compares the host and the origin of each request with the address of this server.
     """

@@ -119,7 +119,7 @@ def test_a_run_that_is_killed_repeatedly(tmp_path: Path, capsys: pytest.CaptureF
     assert coarse_main(again) == 0
     assert bits(out) == bits(whole)
     capsys.readouterr()
-    # As a run leaves it that is killed at its very end.
+    # The folder is now as after a kill at the very end of the run.
     parts.mkdir()
     (out / ".egs-run.lock").touch()
     assert coarse_main(again) == 0 and bits(out) == bits(whole)

@@ -32,7 +32,7 @@ def test_further_planes_are_level_patches_in_their_own_colours() -> None:
 
 
 def test_a_capture_with_nothing_flat_has_one_plane() -> None:
-    """For round Gaussians on a grid, the given plane is the only one."""
+    """For isotropic Gaussians on a grid, the given plane is the only one."""
     x, y = (values.ravel() for values in np.meshgrid(np.linspace(-1.0, 1.0, 40), np.linspace(-1.0, 1.0, 40)))
     means = np.stack([x, y, np.zeros_like(x)], axis=1)
     box = (np.abs(x) < 0.2) & (np.abs(y) < 0.2)

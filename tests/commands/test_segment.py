@@ -102,7 +102,7 @@ def test_a_mask_of_the_plane_is_called_by_its_flag(
 ) -> None:
     flags = ["--plane-mask", "gone.png", "--cameras", str(folder / "cameras.json"), "--out", str(tmp_path / "out")]
     assert main(["plane", str(folder / "scene.ply"), *flags]) == 2
-    assert "--plane-mask gone.png: no such file, and not numbers; give a mask.png" in capsys.readouterr().err
+    assert "--plane-mask gone.png: neither a file nor numbers; give a mask.png" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -113,15 +113,18 @@ def test_a_mask_of_the_plane_is_called_by_its_flag(
             ["--object", "0,0,0.5", "--plane", "{tmp}/no.json"],
             "no.json: no such file or folder; make it with",
         ),
-        (["--object", "0,0,0.5", "--plane", "0,0,1,-5"], "nothing of it lies above the plane"),
+        (["--object", "0,0,0.5", "--plane", "0,0,1,-5"], "no part of it lies above the plane"),
         (["--object", "0,0,0.5", "--plane", "0,0,1,0.9"], "it does not touch the plane: its lowest part is"),
         (["--object", "0,0,0.5", "--cameras", "{folder}/away.json"], "no camera sees it around the object"),
-        (["--object", "{folder}/photo1.png", "--cameras", "{folder}/away.json"], "the masks' cameras see nothing"),
+        (["--object", "{folder}/photo1.png", "--cameras", "{folder}/away.json"], "the masks' cameras see no part"),
         (
             ["--object", "{folder}/empty/photo1.png", "--cameras", "{folder}/cameras.json"],
             "the mask is empty; mark the",
         ),
-        (["--object", "{folder}/sky/photo1.png", "--cameras", "{folder}/cameras.json"], "nothing of the capture shows"),
+        (
+            ["--object", "{folder}/sky/photo1.png", "--cameras", "{folder}/cameras.json"],
+            "no part of the capture is visible",
+        ),
         (
             ["--object", "{folder}/short/photo1.png", "--cameras", "{folder}/cameras.json"],
             "give a mask of the photo's size",
@@ -134,7 +137,7 @@ def test_a_mask_of_the_plane_is_called_by_its_flag(
             ["--object", "{folder}/inverted/photo1.png", "--cameras", "{folder}/cameras.json"],
             "most of the mask lies on the floor, not on an object",
         ),
-        (["--object", "5,5,5,6,6,6"], "the box holds nothing of the capture"),
+        (["--object", "5,5,5,6,6,6"], "the box contains no Gaussian of the capture"),
     ],
 )
 def test_mistakes_are_one_line(

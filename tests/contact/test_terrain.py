@@ -208,8 +208,8 @@ def drop() -> tuple[Trajectory, LocomotionStepper, int]:
 
 
 def test_a_body_dropped_onto_waves_comes_to_rest_in_balance() -> None:
-    """It comes to rest on several slopes; forces carry the weight, and without slip their torque about the centre is
-    zero."""
+    """The body comes to rest on several slopes; forces carry the weight, and without slip their torque about the centre
+    is zero."""
     t, stepper, _ = drop()
     speed = np.linalg.norm(t.velocities[-1], axis=1).max()
     assert speed < 2e-3 * np.sqrt(9.81)

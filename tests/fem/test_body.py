@@ -84,7 +84,7 @@ def test_best_fit_rotation_recovers_a_rotation(body: SoftBody) -> None:
 def test_a_height_that_no_body_has_is_refused(scale: float) -> None:
     mesh = block_mesh()
     with pytest.raises(
-        UserError, match=r"metres_per_unit: the body is .* m high; choose it so that this is from 0.001"
+        UserError, match=r"metres_per_unit: the body is .* m high; choose it so that the height is 0.001"
     ):
         make_body(TetMesh(mesh.nodes * scale, mesh.tets), FLOOR, device="cpu")
 

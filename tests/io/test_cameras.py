@@ -329,8 +329,8 @@ def test_transforms_without_a_size(tmp_path: Path) -> None:
 def test_bad_colmap(tmp_path: Path) -> None:
     colmap_text(tmp_path, camera="3 EQUIRECTANGULAR 640 480 640 480")
     assert message(tmp_path).startswith(
-        "cameras.txt: camera 3 (line 2) of model EQUIRECTANGULAR with 2 parameters is unknown; undistort the photos by"
-        " `colmap image_undistorter`, or give one of SIMPLE_PINHOLE, PINHOLE, "
+        "cameras.txt: camera 3 (line 2) of model EQUIRECTANGULAR with 2 parameters is unknown; undistort the photos"
+        " with `colmap image_undistorter`, or give one of SIMPLE_PINHOLE, PINHOLE, "
     )
     colmap_text(tmp_path, camera="4 PINHOLE 640 480 500 510 320 240")
     assert (

@@ -14,7 +14,7 @@ from tests.support.captures import assert_same_bits, make_cloud
 
 
 def test_a_pair_becomes_the_gaussian_with_its_moments() -> None:
-    """Equal weights one unit apart along x: the variances add up to that of the means, 1/4."""
+    """Equal weights one unit apart along x: the variance of the means, 1/4, is added to that of the Gaussians."""
     pair = GaussianCloud.from_numpy(
         np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
         np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),

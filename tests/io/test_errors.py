@@ -213,7 +213,7 @@ def test_bad_splat(tmp_path: Path) -> None:
     )
 
 
-# Whatever the bytes --------------------------------------------------------------------------------------------------
+# Arbitrary bytes -----------------------------------------------------------------------------------------------------
 
 
 def assert_capture_or_one_line(name: str, data: bytes) -> None:

@@ -403,7 +403,7 @@ def test_damaged_packing_is_one_line(tmp_path: Path) -> None:
 
 
 def test_scales_of_the_review_draft(tmp_path: Path) -> None:
-    """It defined them as logarithms."""
+    """The draft defined scales as logarithms."""
     cloud = make_cloud(20)
     write_glb(tmp_path / "a.glb", cloud)
     tree, binary = _parts(tmp_path / "a.glb")

@@ -85,7 +85,7 @@ def test_values_beyond_single_precision_are_reported(tmp_path: Path) -> None:
 
 
 def test_a_wide_capture_keeps_its_sky(tmp_path: Path) -> None:
-    """Skies are some hundred sizes away, and their Gaussians are as large as the scene."""
+    """Skies are hundreds of sizes away, and their Gaussians are as large as the scene."""
     path = spoiled(tmp_path / "a.ply", [1, 2], means=800.0, log_scales=3.0)
     capture = read_capture(path, device="cpu")
     assert capture.cloud.count == 50 and capture.notes == ()

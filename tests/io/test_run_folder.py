@@ -192,7 +192,8 @@ def test_remnants_of_a_run_killed_at_its_end(tmp_path: Path) -> None:
 
 
 def test_a_resumed_run(tmp_path: Path) -> None:
-    """It keeps its files, does not write its initial files again, and removes its folders when it finishes."""
+    """A resumed run keeps its files, does not write its initial files again, and removes its folders when it
+    finishes."""
     with pytest.raises(UserError, match="no run has written here"), run_folder(tmp_path, resume=True):
         raise AssertionError("must not come here")
     with run_folder(tmp_path) as run:

@@ -119,7 +119,7 @@ def test_a_contact_force_across_a_gap_is_detected() -> None:
 
 
 def test_wrong_contact_velocities_are_detected() -> None:
-    """An error of 1 mm/s across, in one step."""
+    """The velocities of one step have a lateral error of 1 mm/s."""
     t = slide().trajectory()
     velocities = t.velocities.copy()
     velocities[t.contact_step[0] + 1] += [0.0, 1e-3, 0.0]

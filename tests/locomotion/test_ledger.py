@@ -203,7 +203,7 @@ def test_stored_energies_are_those_of_the_body(trajectory: Trajectory, books: En
 
 @pytest.mark.parametrize("crushed", [0.5, 0.02, 1e-4])
 def test_the_loss_of_a_step_is_exact_for_crushed_elements(crushed: float) -> None:
-    """Psi(F0) - Psi(F1) + P(F1) : (F1 - F0), with energy and stress of one element written out (Eq. 5), also if the
+    """Psi(F0) - Psi(F1) + P(F1) : (F1 - F0), with energy and stress of one element written out (Eq. 5), even if the
     straight path between the two states would invert it."""
     mu, lam = 3.0, 7.0
     element = module._Elements(np.zeros((1, 4), int), np.eye(3)[None], np.ones(1), mu, lam, 0.0)
@@ -224,7 +224,7 @@ def test_the_loss_of_a_step_is_exact_for_crushed_elements(crushed: float) -> Non
 
 
 def test_the_energy_balance_shares_no_code_with_the_solver() -> None:
-    """It imports NumPy, SciPy and the trajectory that it reads, which imports nothing of bodies, muscles or contact."""
+    """The modules import only NumPy, SciPy and the trajectory, which does not depend on bodies, muscles or contact."""
     for path in (Path(module.__file__), Path(module.__file__).with_name("audit.py")):
         assert imported(path) <= {"numpy", "scipy", "egs_warp.locomotion.trajectory", "egs_warp.locomotion.ledger"}
     rooms = {name.split(".")[1] for name in imported(Path(module.__file__).with_name("trajectory.py")) if "." in name}

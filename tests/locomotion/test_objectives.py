@@ -65,7 +65,7 @@ def test_centre_of_mass_rows_are_the_rate_of_the_centre_of_mass() -> None:
 
 
 def test_node_rows_measure_the_mass_weighted_distance_from_the_target() -> None:
-    """|rows v - target|^2 = sum m_i |v_i - target_i|^2 / m, and its gradient by differences."""
+    """|rows v - target|^2 = sum m_i |v_i - target_i|^2 / m, and its gradient by finite differences."""
     rng = np.random.default_rng(1)
     v, target, along = rng.standard_normal((3, *BODY.mesh.nodes.shape))
     objective = node_velocities(BODY, target, 1.0)
@@ -119,8 +119,8 @@ def place(part: BodyPart, frame: Coordinates, positions: np.ndarray) -> np.ndarr
 @by_part
 @by_frame
 def test_part_rows_are_the_rate_of_the_part_s_centre(part: BodyPart, frame: Coordinates) -> None:
-    """Velocity, position and acceleration of a part: rows by differences; a velocity that meets the target gives the
-    requested motion."""
+    """Velocity, position and acceleration of a part: rows by finite differences; a velocity that meets the target gives
+    the requested motion."""
     state, dt = shaken_state(), 0.01
     v = np.random.default_rng(4).standard_normal(state.positions.shape)
     rate = rate_of(lambda x: place(part, frame, x), state, v)
@@ -173,8 +173,8 @@ def test_rotation_rows_are_the_rate_of_the_best_fit_rotation(part: BodyPart) -> 
 
 
 def test_area_rows_are_the_rate_of_the_area_of_the_base() -> None:
-    """dA/dt of the convex hull of the base, projected along a tilted up direction, by differences; the target closes
-    the gap at the requested rate.
+    """The rows equal, by finite differences, dA/dt of the convex hull of the base projected along a tilted up
+    direction; the target closes the gap at the requested rate.
     """
     part, state, up = BodyPart.base(BODY, HEIGHTS), shaken_state(), TURNED[2]
     v = np.random.default_rng(6).standard_normal(state.positions.shape)

@@ -74,7 +74,7 @@ def moved_on(problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, tim
 
 
 def test_effort_is_the_future_energy_and_convex() -> None:
-    """Value, gradient and curvature about the predicted end, by differences of the energy."""
+    """Value, gradient and curvature about the predicted end, by finite differences of the energy."""
     problem, linear, foreseen = example()
     horizon = 0.16
     time = horizon * np.sqrt(BODY.height / 9.81)

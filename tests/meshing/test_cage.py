@@ -32,7 +32,7 @@ _FLOOR = Plane(_UP, 0.0)
 
 
 def _cloud(points: np.ndarray, sigma: float, opacity: float = 0.9, device: str | None = None) -> GaussianCloud:
-    """Round Gaussians."""
+    """Return isotropic Gaussians."""
     count = len(points)
     return GaussianCloud.from_numpy(
         points,

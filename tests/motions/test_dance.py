@@ -48,7 +48,7 @@ def check_that_it_keeps_time(dance: Dance, trajectory: Trajectory) -> None:
     asked = np.array([event.asked for event in reached.events]).reshape(-1, 2)
     found = np.array(flights(trajectory, level_flight(0.5 * MIN_HEIGHT, 1.0, 9.81)))
     assert len(found) == len(asked) > 1
-    # A motion receives complete steps, also if a step was repeated with smaller ones.
+    # A motion receives complete steps, even if a step was repeated with smaller ones.
     step = trajectory.dt.max()
     found = step * np.column_stack([np.floor(found[:, 0] / step + 1e-6), np.ceil(found[:, 1] / step - 1e-6)])
     np.testing.assert_allclose([event.reached for event in reached.events], found.ravel(), atol=1e-9)

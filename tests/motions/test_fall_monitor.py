@@ -1,4 +1,4 @@
-"""Falls by tilt and by contacts; flights, landings and intended tilts are no falls."""
+"""Falls by tilt and by contacts; flights, landings and intended tilts are not falls."""
 
 from __future__ import annotations
 

@@ -53,8 +53,8 @@ def test_the_progress_of_the_body_is_that_of_its_feet(feet: int) -> None:
 
 
 def test_a_swinging_foot_leaves_and_lands_at_rest() -> None:
-    """Height and progress are checked by differences at both ends. The foot only moves forward, and is lifted before it
-    moves far.
+    """Height and progress are checked by finite differences at both ends. The foot only moves forward, and is lifted
+    before it moves far.
     """
     near = 1e-4
     for end in (0.0, 1.0):

@@ -34,7 +34,7 @@ def test_the_landing_frame_is_that_of_the_landed_body(place: Stance) -> None:
 
 @pytest.mark.parametrize(("distance", "lean"), [(0.0, 0.0), (0.3, 0.045), (2.0, 0.07)])
 def test_the_lean_follows_the_distance_up_to_a_limit(place: Stance, distance: float, lean: float) -> None:
-    """0.15 of the distance, at most 0.35 of the 0.2 metres to the front of the feet."""
+    """The lean is 0.15 of the distance, at most 0.35 of the 0.2 metres to the front of the feet."""
     assert Jump(place, JumpTarget(distance, 0.3)).plan.lean == pytest.approx(lean)
 
 

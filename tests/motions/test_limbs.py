@@ -143,7 +143,7 @@ def test_legs_on_runners_stand_on_the_runners(length: float, count: int) -> None
 
 
 def test_a_raised_tail_carries_nothing() -> None:
-    """It rises from the same slab as the trunk."""
+    """The tail rises from the same slab as the trunk."""
     mesh = mesh_of(
         lambda p: (
             (p[:, 2] < 0.1)

@@ -109,7 +109,7 @@ def test_a_step_across_the_path_is_refused() -> None:
 
 @pytest.mark.slow
 def test_a_ball_rolls_to_its_target_without_slipping() -> None:
-    """It ends within 0.03 of the target, has rotated by distance over radius, and does not count as fallen."""
+    """The ball ends within 0.03 of the target, has rotated by distance over radius, and does not count as fallen."""
     done = rolled()
     local = done.roll.ground.local(done.end.positions)
     com = done.roll.body.centre_of_mass(local)

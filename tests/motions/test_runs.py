@@ -65,7 +65,7 @@ def test_a_coarse_run_ends_at_rest_with_all_motions_done(coarse_run: Run) -> Non
 
 
 def test_a_coarse_block_jumps_on_waves() -> None:
-    """It starts and lands on waves with an amplitude of 1.5 % of its height; the audit recomputes the ground."""
+    """The block starts and lands on waves with an amplitude of 1.5 % of its height; the audit recomputes the ground."""
     field = wavy_ground(0.015)
     base = np.stack(np.meshgrid(*[np.linspace(-0.25, 0.25, 11)] * 2, [0.0]), axis=-1)
     run = coarse_block_run("jump 0.4 0.2", field.moved(np.array([0.0, 0.0, -float(field.ground_height(base).max())])))

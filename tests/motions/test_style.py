@@ -121,7 +121,7 @@ def test_a_dance_uses_the_crouch_time_of_its_style(place: Stance) -> None:
 
 
 def test_a_jump_of_a_script_may_have_its_own_style(place: Stance, tmp_path: Path) -> None:
-    """It takes precedence over the style of the run, which the other jumps have."""
+    """The style of a jump takes precedence over the style of the run, which the other jumps have."""
     (tmp_path / "s.json").write_text(
         '[{"motion": "jump", "repeat": 2, "style": "squash=2"}, {"motion": "jump"},'
         ' {"motion": "jump", "style": "light"}]'

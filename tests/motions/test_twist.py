@@ -61,8 +61,8 @@ def test_a_twist_requests_the_remaining_spin_from_friction(turn: float) -> None:
 
 
 def test_a_twist_spins_up_with_the_upward_speed(place: Stance) -> None:
-    """The friction follows the load: for a body at rest, the target is the whole spin times the ratio of the step to
-    the thrust; for a body that rises at half the speed, twice that."""
+    """The target of a step is proportional to the whole spin and to the ratio of the step size to the remaining time
+    of the thrust, so a body that rises at half of the take-off speed gets twice the target of a body at rest."""
     shares = []
     for risen in (0.0, 0.5):
         jump = twist(place, JumpTarget(0.0, 0.2), 1.0)

@@ -111,7 +111,7 @@ def test_a_coarse_stool_takes_a_step(slope: float, landings: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("route", [straight_route(0.12), turn_route(np.radians(20.0))], ids=["ahead", "turn"])
 def test_a_biped_keeps_its_balance(route: Route) -> None:
-    """It makes two steps ahead, or turns on the spot, and reaches its target upright."""
+    """The biped makes two steps ahead, or turns on the spot, and reaches its target upright."""
     done = walked(strong(biped()), route, 0.06)
     assert isinstance(done.walk._posture, LeggedPosture) and len(done.walk.feet) == 2
     reached, place = measure(done.trajectory), done.walk.planar_poses[-1]
@@ -123,7 +123,7 @@ def test_a_biped_keeps_its_balance(route: Route) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("route", [straight_route(0.04), pytest.param(turn_route(0.2), marks=pytest.mark.slow)])
 def test_a_block_waddles(route: Route) -> None:
-    """It alternately lifts one side of its base and turns about the other, and reaches its target upright."""
+    """The block alternately lifts one side of its base and turns about the other, and reaches its target upright."""
     done = walked(strong(block_mesh()), route, 0.04)
     body, reached, place = done.creature.place.body, measure(done.trajectory), done.walk.planar_poses[-1]
     assert reached.distance * body.height == pytest.approx(place[0], abs=0.2 * 0.04)

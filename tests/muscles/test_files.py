@@ -86,7 +86,7 @@ def test_stiffness_strain_units_groups_and_partners(tmp_path: Path) -> None:
             {"fibres": [STRAIGHT], "mirror_plane": {"point": [0, 0, 0], "normal": [0, 0, 0]}},
             'mirror_plane: "normal" is zero; give a direction',
         ),
-        ({"fibres": [3]}, "fibre 1 is no object"),
+        ({"fibres": [3]}, "fibre 1 is not an object"),
         ({"fibres": [STRAIGHT, {"kind": "radial"}]}, 'fibre 2 has no name; give it a "name"'),
         ({"fibres": [{"name": "a", "kind": "round"}]}, 'fibre "a" has the kind "round"; give "kind" as one of'),
         ({"fibres": [{**STRAIGHT, "radius": 1}]}, 'fibre "back": "radius" is not known here'),

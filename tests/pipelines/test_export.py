@@ -82,7 +82,7 @@ def test_a_file_has_the_ending_of_its_kind_and_one_frame(
 def test_an_interrupted_run_is_resumed_and_not_exported(
     run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Whatever files it has: the film may be what is missing."""
+    """The files in its folder do not matter: the film may be the missing one."""
     folder = tmp_path / "run"
     shutil.copytree(run.folder, folder)
     manifest = json.loads((folder / MANIFEST).read_text()) if (folder / MANIFEST).is_file() else {"files": {}}

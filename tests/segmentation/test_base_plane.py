@@ -181,7 +181,7 @@ def test_a_sheet_has_no_support_along_its_normal() -> None:
 
 
 def opaque(means: np.ndarray, opacities: np.ndarray | float = 0.98) -> GaussianCloud:
-    """Small round Gaussians at ``means`` (n, 3)."""
+    """Small isotropic Gaussians at ``means`` (n, 3)."""
     logits = np.broadcast_to(np.log(opacities / (1.0 - np.asarray(opacities))), len(means))
     return GaussianCloud.from_numpy(
         means, np.tile([1.0, 0, 0, 0], (len(means), 1)), np.full((len(means), 3), -5.0), logits,

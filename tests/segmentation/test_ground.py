@@ -216,5 +216,5 @@ def test_a_capture_that_is_all_object_has_no_ground() -> None:
     message = rf"^segment: all {cloud.count} Gaussians of the capture are the object, so "
     with pytest.raises(UserError, match=message + "there is no ground to measure"):
         measure_ground(cloud, everything, LEVEL, centre=np.zeros(3), size=1.0)
-    with pytest.raises(UserError, match=message + "no plane is in sight"):
+    with pytest.raises(UserError, match=message + "no plane is visible"):
         plane_views(cloud, LEVEL, [], centre=np.zeros(3), radius=1.0, object_mask=everything)

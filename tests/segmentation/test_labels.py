@@ -42,7 +42,7 @@ def test_a_bias_makes_the_object_leaner_or_fuller() -> None:
     votes = Votes(inside, 10.0 - inside, np.full(6, 10.0))
     for bias, least in ((-0.5, 2.5), (0.0, 5.0), (0.5, 7.5)):
         np.testing.assert_array_equal(labels_of_votes(votes, background_bias=bias)[0], inside > least)
-    with pytest.raises(UserError, match="nothing of the capture shows inside the masks"):
+    with pytest.raises(UserError, match="no part of the capture is visible inside the masks"):
         labels_of_votes(Votes(np.zeros(6), np.ones(6), np.ones(6)))
 
 
@@ -69,7 +69,7 @@ def test_rough_masks_of_three_views_segment_a_stool() -> None:
     assert overlap((wanted | unknown)[nodes]) < 0.9
     assert overlap(smoothed_labels(cloud, votes, nodes, views=3)) > 0.97
     found = segment(cloud, made.plane, ObjectSpec(masks=tuple(masks)))
-    # 0.9999; with the labels of the votes alone, 0.9985, because connected parts compensate.
+    # It is 0.9999. The labels of the votes alone give 0.9985, because the connected parts correct most of their errors.
     assert overlap((found.object_mask | found.floater_mask)[nodes]) > 0.999
 
 

@@ -129,15 +129,15 @@ def test_impossible_masks_are_reported() -> None:
     for view, message in (
         (MaskedView(camera, mask[:50], "m.png"), "m.png: the mask is 96 x 50 pixels, its camera 96 x 96"),
         (MaskedView(camera, np.zeros_like(mask), "m.png"), "m.png: the mask is empty; mark the object in it"),
-        (MaskedView(camera, sky), "nothing of the capture shows inside the masks"),
-        (MaskedView(away, mask), "the masks' cameras see nothing of the capture"),
-        (MaskedView(camera, floor_only), "nothing of it lies above the plane"),
+        (MaskedView(camera, sky), "no part of the capture is visible inside the masks"),
+        (MaskedView(away, mask), "the masks' cameras see no part of the capture"),
+        (MaskedView(camera, floor_only), "no part of it lies above the plane"),
     ):
         with pytest.raises(UserError, match=message):
             segment(cloud, FLOOR, ObjectSpec(masks=(view,)))
     with pytest.raises(UserError, match="nothing solid above the plane within"):
         segment(cloud, FLOOR, ObjectSpec(point=np.array([9.0, 9.0, 0.5])))
-    with pytest.raises(UserError, match="nothing of it lies above the plane"):
+    with pytest.raises(UserError, match="no part of it lies above the plane"):
         segment(cloud, FLOOR, ObjectSpec(box=Box(np.array([5.0, 5.0, 0.0]), np.array([6.0, 6.0, 1.0]))))
     hovering, _ = ball_on_floor(lift=0.6)
     with pytest.raises(UserError, match=r"it does not touch the plane: its lowest part is 0\.\d+ of its size above"):
@@ -151,7 +151,7 @@ def test_plane_and_object_from_a_click_alone() -> None:
     assert located.plane.normal[2] > np.cos(np.radians(0.3))
     assert abs(located.plane.offset) < 0.02
     assert 1400 < located.segmentation.object_mask.sum() < 1521
-    with pytest.raises(UserError, match="plane: none in sight"):
+    with pytest.raises(UserError, match="plane: none found under the object"):
         locate_plane(cloud.subset(cloud.means.numpy()[:, 2] > 0.2), ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
 
 
@@ -181,12 +181,12 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     assert clicked is not None
     np.testing.assert_allclose(np.linalg.norm(clicked - [0.0, 0.0, 0.5]), 0.5, atol=0.04)
     for text, given, view, message in (
-        ("nothing.png", posed, None, "--object nothing.png: no such file, and not numbers"),
+        ("nothing.png", posed, None, "--object nothing.png: neither a file nor numbers"),
         ("1,2,3,4", posed, None, "--object 1,2,3,4: 4 numbers"),
         ("1e300,2,3", posed, None, "--object 1e300,2,3: further than 1e.12 units from the origin"),
         ("1,2,3,1,5,6", posed, None, "the box is flat"),
         ("5,5", [], None, "a pixel needs cameras"),
-        ("5,5", posed, None, "3 cameras; choose one by --view"),
+        ("5,5", posed, None, "3 cameras; choose one with --view"),
         ("5,5", posed, "\u00b2", "--view \u00b2: no such camera; the 3 cameras are"),
         ("+5,5@" + "1" * 5000, posed, None, "no such camera; the 3 cameras are"),
         ("5,5", posed, "nobody", "--view nobody: no such camera; the 3 cameras are"),

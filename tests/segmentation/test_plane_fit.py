@@ -113,7 +113,7 @@ def test_views_that_cannot_be_fitted_are_reported() -> None:
     with pytest.raises(UserError, match="there are no views"):
         fit_plane([])
     noise = np.random.default_rng(0).uniform(0.5, 20.0, depth.shape)
-    with pytest.raises(UserError, match=r"plane: none in sight: the best one leaves depth errors of [3-9]\d %"):
+    with pytest.raises(UserError, match=r"plane: none fits the masks: the best one leaves depth errors of [3-9]\d %"):
         fit_plane([PlaneView(camera, noise, np.ones_like(depth, bool))])
     # A few wide splats exactly on one plane, and haze everywhere else: their residual is zero, and no other plane fits.
     random = np.random.default_rng(0)

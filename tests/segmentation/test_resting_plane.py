@@ -26,7 +26,7 @@ BOX = np.array([1.0, 0.6, 0.5])
 
 
 def leaning(degrees: float) -> np.ndarray:
-    """Return up (3,), rotated about y."""
+    """Return the up direction (3,), rotated about y."""
     angle = np.radians(degrees)
     return np.array([np.sin(angle), 0.0, np.cos(angle)])
 
@@ -156,7 +156,7 @@ def test_haze_is_not_filled() -> None:
 
 
 def test_haze_within_an_object_is_dropped() -> None:
-    """It does not belong to the object, and in the background it would look like a ghost of the object."""
+    """Haze does not belong to the object, and in the background it would look like a ghost of the object."""
     cloud, truth = ball_on_floor()
     where = np.array([[0.0, 0.1, 0.6], [0.1, 0.0, 0.4]])
     haze = round_ones(where, 0.2)

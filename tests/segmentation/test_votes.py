@@ -77,7 +77,8 @@ def test_a_mask_of_another_size_is_refused() -> None:
 
 
 def test_gaussians_outside_the_image_have_no_weight() -> None:
-    """Gaussians behind the camera or far to the side have none, whatever hides them; one in a single tile counts."""
+    """Gaussians behind the camera or far to the side have none, regardless of what hides them; one in a single tile
+    counts."""
     means = np.array([[0.0, 0.0, 0.0], [0.0, -9.0, 0.0], [40.0, 0.0, 0.0]])
     cloud = GaussianCloud.from_numpy(
         means, np.tile([1.0, 0, 0, 0], (3, 1)), np.full((3, 3), -4.0), np.full(3, 2.0), np.zeros((3, 1, 3))

@@ -21,7 +21,7 @@ RENAMING = ("egs_warp.io.atomic", "egs_warp.pipelines.pose_photos")
 def largest_file(size: int) -> Iterator[None]:
     """Limit files to ``size`` bytes, as on a full disk; started programs inherit the limit.
 
-    No bytecode is written: that of a library that is first imported meanwhile would be truncated, and stay so.
+    Python writes no bytecode meanwhile: a library imported for the first time would leave a truncated file behind.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     with pytest.MonkeyPatch.context() as patch:

@@ -75,7 +75,7 @@ class Mutant:
     def text(self) -> str:
         """Return the text of the changed file."""
         changed = _changed((ROOT / self.file).read_text(), self.operator, self.occurrence)
-        assert changed is not None, f"{self.key} is no change"
+        assert changed is not None, f"{self.key} is not a change"
         return changed
 
 

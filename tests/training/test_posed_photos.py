@@ -68,7 +68,7 @@ def test_invalid_poses_are_left_out_of_the_photos(tmp_path: Path) -> None:
 
 
 def test_opaque_alpha_channels(tmp_path: Path) -> None:
-    """Without a cut-out in any photo they have no information; beside one, the object fills the photo."""
+    """Without a cut-out in any photo they have no information; if another photo has one, the object fills the photo."""
     names = [name.replace(".jpg", ".png") for name in NAMES]
     write_transforms(tmp_path, frames(names))
     rgba = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)

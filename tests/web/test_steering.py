@@ -129,7 +129,7 @@ def test_navigation_without_progress_is_abandoned():
 
 
 def test_a_body_with_feet_walks_there():
-    """It walks towards the point, ahead and sideways, by at most the length of a leg at once."""
+    """The body walks towards the point, ahead and sideways, by at most the length of a leg at once."""
     place = coarse_creature(
         stool(), forward=np.array([0.9, 0.3, 0.0]), sag=0.01, strength=20.0, settle_first=False
     ).place

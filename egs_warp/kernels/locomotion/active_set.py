@@ -304,7 +304,7 @@ def solve_active(program: Program, search: ActiveSetState):
 
 @wp.func
 def drop_wrong_sign(program: Program, search: ActiveSetState, count: int):
-    """Deactivate rows whose multiplier has the wrong sign or that miss their bound; return their number."""
+    """Deactivate rows whose multiplier has the wrong sign or whose value is off its bound; return their number."""
     max_multiplier = real(0.0)
     for i in range(count):
         max_multiplier = wp.max(max_multiplier, wp.abs(search.multipliers[i]))

@@ -188,7 +188,7 @@ def write_inverse(state: ActiveSet, count: int):
 
 @wp.func
 def drop_wrong_sign(rows: UnitConstraints, state: ActiveSet, count: int):
-    """Deactivate rows whose multiplier has the wrong sign or that miss their bound; return their number."""
+    """Deactivate rows whose multiplier has the wrong sign or whose value is off its bound; return their number."""
     lane = lane_of_block()
     most = real(0.0)
     for i in range(lane, count, wp.block_dim()):

@@ -388,7 +388,7 @@ def mode_search_kernel(
         elif solved.ended == INFEASIBLE:
             infeasible += 1
             if has_point == 0 and infeasible == 1 and sliding > real(0.0):
-                # Retry with the slipping contacts free to slip.
+                # The start's slipping contacts were first tried as sticking; retry with its modes unchanged.
                 for i in range(lane, n, wp.block_dim()):
                     workspace.kinds[_CURRENT, i] = int(packed[begin + m + i])
                 sync_block()

@@ -132,7 +132,7 @@ class Studio:
 
 @wp.func
 def line_strength(across: wp.vec2, cell: wp.float32, pixel: wp.float32) -> wp.float32:
-    """Return 1 on the lines of a grid, 0 beside them; lines that come closer than some pixels are blended out."""
+    """Return 1 on the lines of a grid, 0 between them; lines less than a few pixels apart fade out."""
     nearest = wp.float32(1e30)
     for axis in range(2):
         cell_position = across[axis] / cell + 0.5

@@ -2,7 +2,7 @@
 camera pose.
 
 Every sum has one thread and a fixed order: there are no atomics, and every run gives the same bits. The equations are
-those of ``projection`` in reverse order; ``by_x`` is the gradient of the loss by x. Host code:
+those of ``projection`` in reverse order; ``by_x`` is the gradient of the loss with respect to x. Host code:
 ``egs_warp/render/backward.py``.
 """
 
@@ -23,7 +23,8 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class SplatGradient:
-    """Gradient by a splat on the screen, whose -ln(alpha / opacity) = a u^2 + v dy^2 with u = dx + shear dy."""
+    """Gradient with respect to a splat on the screen, whose -ln(alpha / opacity) = a u^2 + v dy^2 with u = dx + shear
+    dy."""
 
     log_opacity: wp.float32
     a: wp.float32
@@ -36,7 +37,7 @@ class SplatGradient:
 
 @wp.struct
 class CameraSpaceGradient:
-    """Gradient by a Gaussian in camera space."""
+    """Gradient with respect to a Gaussian in camera space."""
 
     screen: wp.vec2
     log_opacity: wp.float32
@@ -86,8 +87,8 @@ def splat_gradient(
 
 @wp.func
 def covariance_gradient(covariance: ScreenCovariance, by: SplatGradient, antialiased: wp.int32) -> wp.vec3:
-    """Return the gradient by xx, yy and xy, through a = yy / (2 det), shear = -xy / yy, v = 1 / (2 yy) and the opacity
-    factor of the low-pass."""
+    """Return the gradient with respect to xx, yy and xy, through a = yy / (2 det), shear = -xy / yy, v = 1 / (2 yy) and
+    the opacity factor of the low-pass."""
     inv_det = 1.0 / covariance.determinant
     by_xx = -0.5 * by.a * (covariance.yy * inv_det) * (covariance.yy * inv_det)
     by_yy = (
@@ -170,7 +171,8 @@ def camera_space_gradient(
 
 @wp.func
 def quaternion_gradient(q: wp.vec4, by_rotation: wp.mat33) -> wp.vec4:
-    """Return the gradient by an unnormalised quaternion w, x, y, z, from the gradient by its rotation matrix."""
+    """Return the gradient with respect to an unnormalised quaternion w, x, y, z, from the gradient with respect to its
+    rotation matrix."""
     length = wp.length(q)
     if length == 0.0:
         return wp.vec4()
@@ -191,7 +193,7 @@ def quaternion_gradient(q: wp.vec4, by_rotation: wp.mat33) -> wp.vec4:
 
 @wp.func
 def clamp_gradient(raw: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
-    """Return the gradient by the SH sum, of which the colour is max(sum + 0.5, 0)."""
+    """Return the gradient with respect to the SH sum, of which the colour is max(sum + 0.5, 0)."""
     return wp.vec3(
         wp.where(raw[0] > -0.5, by_colour[0], 0.0),
         wp.where(raw[1] > -0.5, by_colour[1], 0.0),
@@ -201,8 +203,8 @@ def clamp_gradient(raw: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
 
 @wp.func
 def offset_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, offset: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
-    """Return the gradient by the vector from the camera's centre to the mean, through the colour, which depends on its
-    direction."""
+    """Return the gradient with respect to the vector from the camera's centre to the mean, through the colour, which
+    depends on its direction."""
     distance = wp.length(offset)
     direction = offset / distance
     by_direction = sh_direction_gradient(sh, g, direction, by_colour)
@@ -229,7 +231,7 @@ def project_backward_kernel(
     by_opacity_logit_out: wp.array[wp.float32],
     by_sh_out: wp.array2d[wp.vec3],
 ):
-    """Compute the gradient by the attributes of one Gaussian; zero where it reaches no tile."""
+    """Compute the gradient with respect to the attributes of one Gaussian; zero where it reaches no tile."""
     g = wp.tid() + first
     slot = first_slot_of(slot_end, g)
     end = wp.int32(slot_end[g])
@@ -274,7 +276,8 @@ def pose_backward_kernel(
     by_pose_rotation_out: wp.array[wp.mat33],
     by_pose_translation_out: wp.array[wp.vec3],
 ):
-    """Compute the gradient by one Gaussian's screen position, and its part of the gradient by the camera pose.
+    """Compute the gradient with respect to one Gaussian's screen position, and its part of the gradient with respect to
+    the camera pose.
 
     Outputs that are not wanted are empty arrays.
     """

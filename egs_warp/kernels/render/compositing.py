@@ -43,7 +43,7 @@ def composite_tile(
 ):
     """Blend one tile from front to back, by its thread (CPU) or block (CUDA).
 
-    Splats whose mean is deeper than ``max_depth`` of a pixel do not count there; 0 and an empty array are no limit.
+    Splats whose mean is deeper than ``max_depth`` of a pixel do not count there; 0 or an empty array means no limit.
     """
     ...
 

@@ -1,4 +1,4 @@
-"""Gradients of an image by the weighted sums of each pixel."""
+"""Gradients of an image with respect to the weighted sums of each pixel."""
 
 import warp as wp
 
@@ -16,7 +16,8 @@ def pixel_gradient(
     alpha_gradient: wp.array2d[wp.float32],
     depth_gradient: wp.array2d[wp.float32],
 ) -> tuple[wp.vec4, wp.float32]:
-    """Return the gradient by a pixel's weighted sums, and the initial remaining sum for a front-to-back traversal.
+    """Return the gradient with respect to a pixel's weighted sums, and the initial remaining sum for a front-to-back
+    traversal.
 
     With s_i = (colour_i, depth_i) . gradient, the loss is linear in the weights w_i and the final transmittance T:
     dL/dalpha_i = T_i s_i - (sum of w_j s_j over j > i + T dL/dT) / (1 - alpha_i). The remaining sum is that bracket

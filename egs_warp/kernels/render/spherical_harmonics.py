@@ -51,8 +51,8 @@ def sh_sum(sh: wp.array2d[wp.vec3], g: wp.int32, coefficients: wp.int32, d: wp.v
 
 @wp.func
 def sh_direction_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, d: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
-    """Return the gradient by the unit direction ``d`` towards Gaussian ``g``, with its three components taken as
-    independent."""
+    """Return the gradient with respect to the unit direction ``d`` towards Gaussian ``g``, with its three components
+    taken as independent."""
     x = d[0]
     y = d[1]
     z = d[2]
@@ -85,7 +85,7 @@ def sh_direction_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, d: wp.vec3, by_c
 
 @wp.func
 def write_sh_gradient(by_sh: wp.array2d[wp.vec3], g: wp.int32, d: wp.vec3, by_colour: wp.vec3):
-    """Write the gradient by the coefficients of Gaussian ``g`` to ``by_sh``."""
+    """Write the gradient with respect to the coefficients of Gaussian ``g`` to ``by_sh``."""
     x = d[0]
     y = d[1]
     z = d[2]

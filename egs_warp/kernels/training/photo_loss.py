@@ -123,8 +123,8 @@ def similarity_kernel(
     by_square_out: wp.array[wp.vec3],
     by_product_out: wp.array[wp.vec3],
 ):
-    """Compute the loss (1 - w) L1 + w (1 - SSIM) of a pixel, and the derivative of its SSIM by the blurred mean, square
-    and product."""
+    """Compute the loss (1 - w) L1 + w (1 - SSIM) of a pixel, and the derivative of its SSIM with respect to the blurred
+    mean, square and product."""
     p = first_row + wp.tid()
     row = p // width
     mean_a = wp.vec3(0.0)
@@ -212,7 +212,8 @@ def gradient_kernel(
     by_colour_out: wp.array[wp.vec3],
     by_alpha_out: wp.array[wp.float32],
 ):
-    """Compute the derivative of the mean loss by the transformed render, the render's colour, and its alpha."""
+    """Compute the derivative of the mean loss with respect to the transformed render, the render's colour, and its
+    alpha."""
     p = first_row + wp.tid()
     row = p // width
     mean = wp.vec3(0.0)
