@@ -56,7 +56,7 @@ def search_states(
     start = np.concatenate([predicted.activations, predicted.forces.ravel()])
     modes = predicted_modes(predicted, program.friction, directions)
     count, infeasible = 1, 0
-    best = solve_mode_region(program, start, modes, solver, friction=friction)
+    best = solve_mode_region(program, start, modes, solver, friction=friction, max_violation=0.0)
     if best is None:
         count, infeasible = 2, 1
         best = solve_mode_region(program, start, modes, solver, friction=friction, max_violation=np.inf)
@@ -71,7 +71,9 @@ def search_states(
                 continue
             visited.add(_key(trial))
             count += 1
-            optimum = solve_mode_region(program, best.x, trial, solver, friction=friction, warm_start=True)
+            optimum = solve_mode_region(
+                program, best.x, trial, solver, friction=friction, max_violation=0.0, warm_start=True
+            )
             infeasible += optimum is None
             if optimum is not None and optimum.objective < best.objective - _MIN_GAIN:
                 best, modes, improved = optimum, trial, True

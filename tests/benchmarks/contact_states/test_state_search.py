@@ -162,7 +162,7 @@ def test_states_that_contradict_each_other_are_replaced() -> None:
 
 def test_every_search_solves_the_same_program() -> None:
     """Eq. (9), Eq. (13): each search gives activations within their bounds, forces within the cone and the correct
-    objective; in a few QPs ``modes`` comes nearer to the optimum on average than ``paper``.
+    objective; in a few QPs the strategies of the engine come nearer to the optimum on average than ``qpcc``.
     """
     reached: dict[Strategy | StateSearch, list[float]] = {kind: [] for kind in (*Strategy, *StateSearch)}
     for seed in range(24):
@@ -186,7 +186,7 @@ def test_every_search_solves_the_same_program() -> None:
             assert found.objective == pytest.approx(program.objective(found.x), rel=1e-4, abs=1e-4)
             reached[kind].append(found.objective)
     means = {kind: float(np.mean(values)) for kind, values in reached.items()}
-    assert means[Strategy.MODES] < means[Strategy.PAPER] < means[StateSearch.STATIC]
+    assert max(means[Strategy.MODES], means[Strategy.PAPER]) < means[StateSearch.QPCC] < means[StateSearch.STATIC]
     assert means[StateSearch.QPCC_OUR_MOVES] < 0.9 * means[StateSearch.QPCC]
 
 
