@@ -151,7 +151,7 @@ def test_plane_and_object_from_a_click_alone() -> None:
     assert located.plane.normal[2] > np.cos(np.radians(0.3))
     assert abs(located.plane.offset) < 0.02
     assert 1400 < located.segmentation.object_mask.sum() < 1521
-    with pytest.raises(UserError, match="plane: none found under the object"):
+    with pytest.raises(UserError, match="plane: no camera sees it around the object"):
         locate_plane(cloud.subset(cloud.means.numpy()[:, 2] > 0.2), ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
 
 
