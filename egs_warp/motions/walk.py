@@ -345,7 +345,10 @@ class Walk:
         footprints, phase, swing = self._footprints.copy(), self.phase, self.swing
         for _ in range(_PLANNED_PHASES):
             count = max(round(self._duration(phase) / step), 1)
-            targets = np.array([self._com_at(self._progress(phase, swing, (k + 0.5) * step)) for k in range(count)])
+            progresses = [self._progress(phase, swing, (k + 0.5) * step) for k in range(count)]
+            targets = np.array([self._com_at(progress) for progress in progresses])
+            if phase not in (WalkPhase.GATHER, WalkPhase.REST):
+                targets += [self._lead_at(progress) for progress in progresses]
             if phase is not WalkPhase.SWING:
                 yield phase, targets
                 if phase in (WalkPhase.GATHER, WalkPhase.REST):
@@ -362,7 +365,7 @@ class Walk:
 
     def _com_at(self, progress: float) -> np.ndarray:
         """Return the planned position (2,) of the centre of mass after ``progress`` steps."""
-        return self._start_com[:2] + self._place_at(progress)[:2] + self._lead_at(progress)
+        return self._start_com[:2] + self._place_at(progress)[:2]
 
     def _lead_at(self, progress: float) -> np.ndarray:
         """Return the distance (2,) in metres by which a body with a narrow support leans in the direction of travel.
@@ -379,7 +382,7 @@ class Walk:
         ahead = step / length
         margin = float((-self._footprint @ np.array([[cosine, sine], [-sine, cosine]]) @ ahead).max())
         lead = np.clip(MIN_REAR_MARGIN * self._start_com[2] - margin, 0.0, MAX_LEAD * self.body.height)
-        return max(min(0.5 + progress, 1.0, count - progress), 0.0) * lead * ahead
+        return max(min(0.5 + progress, 1.0, 0.5 + count - progress), 0.0) * lead * ahead
 
     def _com_velocity(self, local: np.ndarray, velocity: np.ndarray, elapsed: float, dt: float) -> np.ndarray:
         """Return the target velocity (3,) in m/s of the centre of mass at the end of the time step.
