@@ -147,7 +147,8 @@ class Deformer:
         return deformed
 
     def measure_bend(self, frames: Iterable[wp.array | np.ndarray]) -> BendMeasure:
-        """Return the maximum bend of each Gaussian over ``frames``, each as ``positions`` of ``deform`` (Eq. 16)."""
+        """Return the maximum bend of each Gaussian over ``frames``; each is one ``positions`` argument of ``deform``
+        (Eq. 16)."""
         count = self.rest.count
         bend = zeros(count, wp.float32, self.rest.device)
         curl, error = (zeros(count, wp.vec3, self.rest.device) for _ in range(2))

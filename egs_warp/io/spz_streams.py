@@ -36,7 +36,8 @@ _AXES = (
 
 
 def inflate_streams(data: bytes, sizes: Sequence[int], source: Path) -> bytes:
-    """Decompress the blocks of ``sizes`` bytes, one after another. Raises ``UserError`` if the file has others.
+    """Decompress the blocks, which have ``sizes`` bytes, and concatenate them. Raises ``UserError`` if the blocks of
+    the file have other sizes.
 
     Only ``sizes`` bytes are inflated, so that a crafted file cannot fill the memory.
     """

@@ -17,13 +17,14 @@ _STEPS_PER_E = 64
 changes."""
 
 MAX_GAUSSIANS = 500_000
-"""Gaussians from which a body is measured (``representatives``)."""
+"""Maximum number of Gaussians from which a body is measured (``representatives``)."""
 _WIDE = 1.0 / 64.0
-"""Fraction of the body's size: a spacing of the lattice on which its solid is found."""
+"""Width above which all Gaussians are kept, as a fraction of the body's size: one spacing of the lattice on which its
+solid is found."""
 
 
 def centred(cloud: GaussianCloud) -> tuple[GaussianCloud, np.ndarray]:
-    """Move the capture to an origin amid its Gaussians. Returns it and the origin (3,), capture's units.
+    """Move the capture to an origin amid its Gaussians; return the moved capture and the origin (3,), capture's units.
 
     Each coordinate of the origin is one of the capture's own, so a translation that single precision represents exactly
     does not change the result.
@@ -64,9 +65,9 @@ def _increasing_bits(values: np.ndarray) -> np.ndarray:
 
 
 def representatives(cloud: GaussianCloud) -> GaussianCloud:
-    """Return at most ``MAX_GAUSSIANS`` that show the same body; the cloud itself if it has no more.
+    """Return at most ``MAX_GAUSSIANS`` Gaussians that show the same body; the cloud itself if it has no more than that.
 
-    Those that are wide, of which few show much of the surface, all remain, and an equal share of the others.
+    All wide Gaussians remain, because a few of them show much of the surface. The others are sampled evenly.
     """
     if cloud.count <= MAX_GAUSSIANS:
         return cloud

@@ -52,8 +52,8 @@ def solid_from_gaussians(cloud: GaussianCloud, *, resolution: int = 64) -> Latti
     """Return the occupied and enclosed space above z = 0: the connected part with most of the opacity mass.
 
     ``cloud`` is in its body's frame. ``resolution`` lattice spacings span the object's longest side. The outermost
-    lattice points affect only an integer, so a body that has hardly changed keeps its lattice. Raises ``UserError`` if
-    nothing opaque stands on the plane.
+    lattice points determine only the integer corner and size of the lattice, not its spacing, so a body that has hardly
+    changed keeps its lattice. Raises ``UserError`` if nothing opaque stands on the plane.
     """
     means = cloud.means.numpy().astype(np.float64)
     opacities = cloud.opacities()
@@ -82,7 +82,7 @@ def _longest_side(means: np.ndarray, opacities: np.ndarray) -> float:
 
 
 def mass_quantiles(means: np.ndarray, opacities: np.ndarray, *shares: float) -> list[np.ndarray]:
-    """Return the points (3,) below which, along each axis, these shares of the mass lie."""
+    """Return, for each of ``shares``, the point (3,) below which this share of the mass lies along each axis."""
     quantiles = np.empty((len(shares), 3))
     for axis in range(3):
         order = np.argsort(means[:, axis], kind="stable")

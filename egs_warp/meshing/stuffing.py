@@ -168,7 +168,8 @@ def _fill_tets(
     edge_is_long: np.ndarray,
     node_of_edge: np.ndarray,
 ) -> np.ndarray:
-    """Return the inside part (T', 4) of every tetrahedron, by its pattern of signs."""
+    """Return tetrahedra (T', 4) that fill the part of every tetrahedron inside the surface, according to its pattern of
+    signs."""
     order = np.argsort(-sign[tets], axis=1, kind="stable")
     tets = np.take_along_axis(tets, order, axis=1)
     signs = sign[tets]
@@ -220,7 +221,7 @@ def _prisms(
     top: np.ndarray, bottom: np.ndarray, own01: np.ndarray, own02: np.ndarray, own12: np.ndarray
 ) -> list[np.ndarray]:
     """Return three tetrahedra for each prism. The diagonal of quad ij runs from top i to bottom j where ``own_ij`` is
-    set, else from top j to bottom i. The three choices never form a cycle."""
+    set, otherwise from top j to bottom i. The three choices never form a cycle."""
     wins = np.stack([own01.astype(int) + own02, ~own01 + own12.astype(int), (~own02).astype(int) + ~own12], axis=1)
     rank = np.argsort(-wins, axis=1, kind="stable")
     p, q = np.take_along_axis(top, rank, axis=1).T, np.take_along_axis(bottom, rank, axis=1).T

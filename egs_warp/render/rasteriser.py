@@ -51,8 +51,8 @@ def render_gaussians(
         threads: CPU threads, by default the available cores; the image does not depend on it.
 
     Raises:
-        UserError: a Gaussian is not finite (the message names it), the camera is invalid, or background or mask have
-            another size.
+        UserError: a Gaussian is not finite (the message names it), the camera is invalid, or the background or mask
+            does not have the camera's size.
     """
     threads = threads or available_threads()
     arguments = {"background": background, "antialiased": antialiased, "mask": mask, "threads": threads}

@@ -48,8 +48,8 @@ class TileLists:
 def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int, guess: bool = False) -> TileLists:
     """Sort the visible Gaussians by depth and list them for every tile that they reach (exact ellipse-tile test).
 
-    With ``guess``, a GPU does not wait for the number of pairs if recent images had few; ``lists_fit`` then tells if
-    the guessed capacity was large enough.
+    With ``guess``, the host does not wait for the number of pairs if recent images had few; ``lists_fit`` then returns
+    whether the guessed capacity was large enough.
     """
     columns = -(-view.width // TILE_SIDE)
     rows = -(-view.height // TILE_SIDE)

@@ -94,8 +94,8 @@ def deform_gaussian(
     cage: CageMaps,
     plan: ArmPlan,
 ) -> DeformedGaussian:
-    """Deform a Gaussian by F = (F+ + F-)/2 (Eq. 14), or by the F of the mean's tetrahedron where det F <= 0, then Eq.
-    (15).
+    """Deform a Gaussian by F = (F+ + F-)/2 (Eq. 14), or by the F of the mean's tetrahedron where det F <= 0, and apply
+    Eq. (15).
 
     The mean follows the mean of the Gaussian's mass to second order (beyond the paper, which deforms the mean as a
     point): E[x(m + sum z_k s_k r_k)] = x(m) + sum s_k^2 x_kk / 2, where x_kk is estimated from the difference of the
@@ -174,7 +174,7 @@ def bend_frame(side: wp.mat33, scales: wp.vec3) -> wp.mat33:
     """Return an eigenframe of Sigma'+- that stays defined where scales are equal: the rotation part of [F R] S^2.
 
     It differs from the eigenframe by terms of order (s_j/s_i)^2 where s_i >> s_j, follows the long axes and not the
-    short ones, and does not spin freely in the plane of a round disc, as eigenvectors do.
+    short ones, and, unlike eigenvectors, is not arbitrary in the plane of a round disc.
     """
     longest = wp.max(scales)
     relative = scales / longest

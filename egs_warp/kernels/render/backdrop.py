@@ -112,7 +112,7 @@ def ground_kernel(
 
 @wp.struct
 class Studio:
-    """Colours of a floor that turns into its surroundings without an edge, and its grid."""
+    """Colours of a floor that blends into its surroundings without an edge, and its grid."""
 
     floor: wp.vec3
     """Floor near the camera."""
@@ -153,7 +153,8 @@ def studio_kernel(
     # Out:
     colour_out: wp.array[wp.vec3],
 ):
-    """Draw a floor with fine lines ``studio.cell`` apart and strong ones four times as far, in haze, below a sky."""
+    """Draw a sky and a floor that fades into haze, with fine lines ``studio.cell`` apart and strong lines four times as
+    far apart."""
     tid = wp.tid() + first_row
     u = wp.float32(tid % view.width) + 0.5
     v = wp.float32(tid / view.width) + 0.5
