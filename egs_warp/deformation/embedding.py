@@ -55,7 +55,7 @@ class PointEmbedding:
 
 
 class CageLocator:
-    """Locates points in the tetrahedra of a rest mesh, by bounding volume hierarchies over them and over the
+    """Locator of points in the tetrahedra of a rest mesh, with bounding volume hierarchies of the tetrahedra and of the
     surface."""
 
     def __init__(self, mesh: TetMesh, *, device: str | wp.Device | None = None) -> None:

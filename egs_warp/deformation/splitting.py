@@ -44,7 +44,7 @@ class SplitGaussians:
     """Cloud after splitting, still in the rest configuration, with its own embedding."""
 
     cloud: GaussianCloud
-    """(n',) the Gaussians that were not split, in their old order, then the children."""
+    """(n',) the Gaussians that were not split, in their original order, then the children."""
     embedding: GaussianEmbedding
     """Embedding of the n' Gaussians."""
     parents: np.ndarray
@@ -131,7 +131,8 @@ def split_bent(
         rule: rule to apply.
         parents, depths: (n,), results of an earlier call; default: no Gaussian has been split.
         max_depth: a Gaussian of this depth is not split again.
-        max_count: largest number of Gaussians; if it would be exceeded, those with the largest fit error are split.
+        max_count: largest number of Gaussians; if it would be exceeded, only those with the largest fit errors are
+            split.
     """
     count = cloud.count
     parents = np.arange(count, dtype=np.int32) if parents is None else parents

@@ -19,9 +19,9 @@ def with_logarithms(raw: RawCapture) -> RawCapture:
     """Return ``raw`` with logarithms and logits if it evidently holds activated values, with a note.
 
     All scales are then positive and all opacities within 0 to 1: as logarithms and logits, each Gaussian would be wider
-    than one unit and half transparent. If only the scales are positive, or the opacities are all the same, they are
-    activated if most Gaussians would otherwise be wider than the capture. Opacities alone are not evidence: they are
-    kept, with a note.
+    than one unit and half transparent. If the opacities are not within 0 to 1 or are all the same, positive scales
+    count as activated if most Gaussians would otherwise be wider than the capture. Opacities alone are not evidence:
+    they are kept, with a note.
     """
     few = slice(0, _SAMPLE)
     if len(raw.means) < _MIN_COUNT or (

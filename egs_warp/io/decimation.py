@@ -92,7 +92,8 @@ def _cloud(
     sh: np.ndarray,
     sources: np.ndarray,
 ) -> GaussianCloud:
-    """Return the Gaussians: those of ``cloud`` with the numbers ``sources``, and the merged ones."""
+    """Return the Gaussians of ``cloud`` with indices ``sources``, and merged Gaussians where the index is
+    ``_MERGED``."""
     merged = sources == _MERGED
     variances, axes = np.linalg.eigh(covariances[merged])
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]

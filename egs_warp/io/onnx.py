@@ -55,7 +55,7 @@ def read_onnx(path: Path) -> OnnxFile:
 
 
 class _Walk:
-    """Visits all tensors. Malformed data raise ``IndexError``."""
+    """Traversal of all tensors. Malformed data raise ``IndexError``."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

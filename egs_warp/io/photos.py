@@ -51,8 +51,7 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None, is_mask_invert
 
     The EXIF orientation is applied only if the pixels would not fit the camera otherwise. Alpha is the minimum of the
     photo's own alpha, unless that is opaque everywhere, and of its mask, in which white is opaque, or black with
-    ``is_mask_inverted``. Raises ``UserError`` for a photo that is missing, unreadable or of another shape than its
-    camera.
+    ``is_mask_inverted``. Raises ``UserError`` for a photo that is missing, unreadable or does not fit its camera.
     """
     if posed.image is None:
         raise UserError(f"{posed.name}: {posed.missing or 'the photo is not beside the poses; put it there'}")
@@ -144,7 +143,7 @@ def decoded(image: Path) -> np.ndarray:
 def _pixels(image: Path, flags: int) -> np.ndarray | None:
     """Decode a file by OpenCV; None if it cannot.
 
-    OpenCV allocates the size that a PNG chunk declares, so that is checked first.
+    OpenCV allocates the size that a PNG chunk declares, so this size is checked first.
     """
     with open(image, "rb") as file:
         left = os.fstat(file.fileno()).st_size - len(_PNG)

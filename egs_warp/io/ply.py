@@ -313,7 +313,7 @@ def _not_gaussians(header: PlyHeader, missing: list[str], source: Path) -> UserE
 
 
 def _rounding_notes(rows: np.ndarray, names: list[str]) -> list[str]:
-    """Return a note of the named fields whose values are not those of single precision."""
+    """Return a note that names the fields among ``names`` whose values change in single precision."""
     rounded = [name for name in names if not np.array_equal(rows[name], rows[name].astype(np.float32))]
     return [f"rounded to single precision: {_listed(rounded)}"] if rounded else []
 

@@ -88,7 +88,7 @@ def ffmpeg_program() -> str:
 
 
 class _AbandonedError(Exception):
-    """Marks the end of a video that failed."""
+    """Internal error that ends a video that failed."""
 
 
 _TOO_LARGE = getattr(signal, "SIGXFSZ", 0)

@@ -13,8 +13,8 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 
 _STEPS_PER_E = 64
-"""Log scales are rounded to this many steps per factor of e (1.6 %), as a file's log scales lose bits when its unit
-changes."""
+"""Number of steps per factor of e (1.6 % each) to which log scales are rounded, because those of a file lose bits when
+its unit changes."""
 
 MAX_GAUSSIANS = 500_000
 """Maximum number of Gaussians from which a body is measured (``representatives``)."""
@@ -59,7 +59,7 @@ def canonical_order(cloud: GaussianCloud) -> np.ndarray:
 
 
 def _increasing_bits(values: np.ndarray) -> np.ndarray:
-    """(n,) uint64 below 2^32 in the order of float32 ``values`` (n,); the same for 0 and -0."""
+    """(n,) uint64 below 2^32 that sort like the float32 ``values`` (n,); 0 and -0 give the same integer."""
     bits = (values + np.float32(0.0)).view(np.uint32)
     return np.where(bits >> 31 == 1, ~bits, bits | np.uint32(1 << 31)).astype(np.uint64)
 

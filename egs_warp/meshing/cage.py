@@ -36,8 +36,8 @@ _THIN_RADIUS = 0.56
 is sqrt(5)/4."""
 
 _CELL_SIZES_PER_OCTAVE = 16
-"""Cell sizes per factor of 2. Cell sizes are rounded, so that the cell does not change if a few lattice points are
-added or removed."""
+"""Number of cell sizes per factor of 2. Cell sizes are rounded to these, so that the cell does not change if a few
+lattice points are added or removed."""
 
 
 class CageMethod(Enum):
@@ -232,7 +232,7 @@ def _lattice_mesh(
     """Return nodes (lattice spacings), tetrahedra and cell of the lattice mesh with the number of nodes nearest to the
     target.
 
-    Secant steps on the cell size, starting from ``cell``, with rounded sizes.
+    The cell size is found by secant steps from ``cell`` and is rounded in each step.
     """
     best: tuple[float, np.ndarray, np.ndarray, float] | None = None
     for _ in range(6):
@@ -260,7 +260,8 @@ def _rounded_cell(cell: float) -> float:
 
 
 class _Distance:
-    """Distances of the solid and its mirror image below the plane, which do not depend on the dilation."""
+    """Distances to the surface of the solid and its mirror image below the plane; they do not depend on the
+    dilation."""
 
     def __init__(self, solid: LatticeSolid) -> None:
         self.pad = int(np.ceil(0.25 * solid.longest_side / solid.spacing))

@@ -58,7 +58,7 @@ def solid_from_gaussians(cloud: GaussianCloud, *, resolution: int = 64) -> Latti
     means = cloud.means.numpy().astype(np.float64)
     opacities = cloud.opacities()
     low, high = _robust_bounds(means, opacities)
-    # A coarse pass first, because outliers may have stretched the bounds.
+    # Start with a coarse pass, because outliers may have stretched the bounds.
     coarse = _solid_within(cloud, means, opacities, low, high, float(np.max(high - low)), min(resolution, 40))
     indices = np.argwhere(coarse.inside)
     low, high = coarse.points(indices.min(axis=0)), coarse.points(indices.max(axis=0))
@@ -130,7 +130,7 @@ def _solid_within(
     if not occupied.any():
         raise UserError(
             f"object: nothing opaque stands on the plane (of {cloud.count} Gaussians, {int(np.sum(means[:, 2] > 0))} "
-            f"are above it, most opaque {opacities.max():.2g})",
+            f"are above it; the largest opacity is {opacities.max():.2g})",
             check=("plane", "up"),
         )
     node = np.rint(means / spacing).astype(int) - corner
@@ -163,7 +163,7 @@ def _bridge(occupied: np.ndarray, radius: int) -> np.ndarray:
 
 
 def _fill(piece: np.ndarray, device: wp.Device) -> np.ndarray:
-    """Fill enclosed space. Two passes, because space filled in the first pass shields the rest."""
+    """Fill enclosed space. A second pass fills points that only the points filled in the first pass enclose."""
     solid = piece
     for _ in range(2):
         filled = wp.zeros(solid.shape, dtype=wp.uint8, device=device)

@@ -133,7 +133,7 @@ def _snap(
     ends = edges[cut]
     at = _roots(field, points[ends[:, 0]], points[ends[:, 1]], np.where(value[ends[:, 0]] < 0.0, 1, -1))
     length = np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)
-    # From a floor point straight up, the edge is half a long edge.
+    # The vertical edge of a floor point is half as long as other long edges.
     limit = np.where(edge_is_long[cut], _SNAP_LONG * length.max(initial=0.0), _SNAP_SHORT * length)
     snapped, on_surface = points.copy(), value.copy()
     end = ends.T.ravel()
@@ -141,7 +141,8 @@ def _snap(
     travel = np.linalg.norm(target - points[end], axis=1)
     close = travel < np.concatenate([limit, limit])
     end, target, travel = end[close], target[close], travel[close]
-    # The last write wins: farthest first, and for floor points the intersections along the floor last.
+    # Later writes overwrite earlier ones: the nearest intersection is written last, and for floor points the ones along
+    # the floor are written after all others.
     in_floor = is_floor[end] & (target[:, 2] == 0.0)
     order = np.lexsort((-travel, in_floor))
     for k in order:

@@ -106,7 +106,7 @@ def render_views(
     if len(backgrounds) != len(cameras) or "background" in options:
         raise UserError(
             f"render: {len(backgrounds)} backgrounds for {len(cameras)} cameras"
-            f"{' and one for all' if 'background' in options else ''}; give one for each"
+            f"{' and one background for all' if 'background' in options else ''}; give one for each"
         )
     return [
         render_gaussians(cloud, camera, background=behind, **options)

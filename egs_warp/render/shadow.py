@@ -98,7 +98,7 @@ class ContactShadow:
         """Return the shadow map (texels, texels) float32, seen from above."""
         shape = (len(_LAYERS), _MAP, _MAP)
         coverage = zeros(shape, wp.int64, self.device)
-        # One thread on a CPU, where concurrent additions to one texel are not atomic.
+        # Use one thread on a CPU, where concurrent additions to one texel are not atomic.
         launch_cached(
             kernels.coverage_kernel,
             body.count,

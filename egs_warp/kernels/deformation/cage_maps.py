@@ -60,7 +60,7 @@ class CageMaps:
     maps: wp.array[wp.vec4]
     """(3 T,) rows of F, each followed by one coordinate of x0'. Most arms read only this."""
     frames: wp.array[wp.vec4]
-    """(2 T,) x0; R_polar as a quaternion w, x, y, z."""
+    """(2 T,) x0 in the first row of each tetrahedron, R_polar as a quaternion w, x, y, z in the second."""
 
 
 @wp.kernel

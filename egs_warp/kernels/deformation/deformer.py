@@ -199,11 +199,11 @@ def measure_bend_kernel(
     error_out: wp.array[wp.vec3],
 ):
     """Update the maximum of each measure: the angle of Eq. (16) and, along each axis, the deviation of the motion from
-    affine.
+    an affine map.
 
     With arms reaching L on both sides of axis k, the second derivative of the motion along axes k and j is about (F_k+
     - F_k-) r_j / 2L. ``curl`` is the angle between the two vectors F_k+- r_j, the largest over j. ``error`` is the
-    displacement that F leaves out at one standard deviation along both axes.
+    displacement that F does not represent at one standard deviation along both axes.
     """
     row = first_row + wp.tid()
     if plan.mean_tets[row] < 0 and plan.inside_fractions[0, row] == RIGID:
@@ -232,7 +232,7 @@ def measure_bend_kernel(
             # The mixed derivative is symmetric; the longer baseline measures it better.
             if scales[j] > scales[k]:
                 axis_error = 0.0
-            # An axis too short to be visible does not count.
+            # Ignore an axis that is too short to be visible.
             if axis_error > 0.25 * error[k]:
                 curl[k] = wp.max(curl[k], angle)
             error[k] = wp.max(error[k], axis_error)

@@ -50,7 +50,8 @@ class Layers:
 
 @wp.func
 def texel_of(ground: Ground, away: wp.vec3) -> wp.vec2:
-    """Return the map position, in texels from the corner, straight below a point at ``away`` from the centre."""
+    """Return the map position, in texels from the corner, straight below a point at the offset ``away`` from the
+    centre."""
     side = 0.5 * wp.float32(TEXELS)
     across = wp.vec2(wp.dot(away, ground.first), wp.dot(away, ground.second)) / ground.reach
     return wp.vec2((across[0] + 1.0) * side, (across[1] + 1.0) * side)
@@ -287,7 +288,7 @@ def combine_layers_kernel(
     # Out:
     shade_out: wp.array2d[wp.float32],
 ):
-    """Combine the layers: each lets a part of the light pass."""
+    """Combine the layers, each of which lets a part of the light pass."""
     tid = wp.tid() + first_row
     row = tid / TEXELS
     column = tid % TEXELS
