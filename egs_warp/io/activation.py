@@ -16,7 +16,7 @@ _SAMPLE = 1000
 
 
 def with_logarithms(raw: RawCapture) -> RawCapture:
-    """Return ``raw`` with logarithms and logits if it evidently holds activated values, with a note.
+    """Return ``raw`` with logarithms and logits if it evidently contains activated values, with a note.
 
     All scales are then positive and all opacities within 0 to 1: as logarithms and logits, each Gaussian would be wider
     than one unit and half transparent. If the opacities are not within 0 to 1 or are all the same, positive scales

@@ -81,7 +81,7 @@ def _frames(video: Path) -> Iterator[np.ndarray]:
 
 
 def _length(video: Path) -> int:
-    """Return the number of frames by counting, as the header may be wrong."""
+    """Return the number of frames by counting them, because the header may be wrong."""
     reader = cv2.VideoCapture(str(video))
     try:
         length = 0
