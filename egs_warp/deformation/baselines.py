@@ -1,4 +1,4 @@
-"""The paper's deformation of Gaussians by a cage and its baselines (Table 1), behind one function."""
+"""The paper's deformation of Gaussians by a cage and its baselines (Table 1), as methods of one function."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from egs_warp.launching import empty, launch_rows
 from egs_warp.precision import Vec3
 
 LOCAL_REACH = 3.0 / np.sqrt(3.0)
-"""Distance of the corners of a Gaussian's own tetrahedron: 3 standard deviations, so that it contains the one-sigma
-ellipsoid."""
+"""Coordinate along each axis, in standard deviations, of the corners of a Gaussian's own tetrahedron. The corners are
+then 3 standard deviations from the mean, so the tetrahedron contains the one-sigma ellipsoid."""
 
 
 class DeformationMethod(Enum):
@@ -55,7 +55,7 @@ class BoundSurface:
         flat = np.flatnonzero(~(np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0.0))
         if len(self.faces) == 0 or len(flat):
             bad = f"triangle {flat[0]} has no area" if len(flat) else "it has no triangles"
-            raise UserError(f"surface: {bad}; give triangles with three corners apart")
+            raise UserError(f"surface: {bad}; give triangles with an area above zero")
 
 
 def deform_with_method(
@@ -71,7 +71,7 @@ def deform_with_method(
     max_depth: int = 3,
     max_growth: float = 4.0,
 ) -> list[GaussianCloud]:
-    """Return the cloud in each of ``frames``.
+    """Deform ``cloud`` with its cage to each of ``frames`` by one of the methods of Table 1.
 
     Args:
         cloud: Gaussians at rest.

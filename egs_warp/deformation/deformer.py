@@ -39,14 +39,15 @@ class DeformedGaussians:
 
 @dataclass(frozen=True)
 class BendMeasure:
-    """Deviation of a motion from affine across each Gaussian: the maximum of each measure over all frames."""
+    """Deviation of a motion from an affine map across each Gaussian: the maximum of each measure over all frames."""
 
     bend_degrees: np.ndarray
     """(n,) deg, theta of Eq. (16)."""
     curl_degrees: np.ndarray
     """(n, 3) deg, angle between the two ends of each axis: bending or twisting along it."""
     fit_error: np.ndarray
-    """(n, 3) m, displacement that the affine F leaves out along each axis, at one standard deviation from the mean."""
+    """(n, 3) m, displacement that the affine F does not represent, along each axis at one standard deviation from the
+    mean."""
 
 
 class CageMaps:
@@ -62,7 +63,7 @@ class CageMaps:
             self._maps.frames = empty(2 * tet_count, wp.vec4, cage.device)
 
     def update(self, positions: wp.array | np.ndarray) -> Any:
-        """Return the kernels' ``CageMaps`` for node ``positions``, as for ``Deformer.deform``."""
+        """Return the kernels' ``CageMaps`` for node ``positions``, which are given as for ``Deformer.deform``."""
         cage, device = self._cage, self._cage.device
         launch_rows(
             cage_maps.update_maps_kernel,
@@ -80,7 +81,7 @@ class CageMaps:
 
 
 class Deformer:
-    """Deforms one cloud, frame after frame, into the same output arrays."""
+    """Deformer of one cloud, which writes each frame into the same output arrays."""
 
     def __init__(self, cloud: GaussianCloud, embedding: GaussianEmbedding, *, max_stretch: float = MAX_STRETCH) -> None:
         # Kernels read whole rows in one load.
@@ -147,7 +148,8 @@ class Deformer:
         return deformed
 
     def measure_bend(self, frames: Iterable[wp.array | np.ndarray]) -> BendMeasure:
-        """Return the maximum bend of each Gaussian over ``frames``, each as ``positions`` of ``deform`` (Eq. 16)."""
+        """Return the maximum bend of each Gaussian over ``frames``; each is one ``positions`` argument of ``deform``
+        (Eq. 16)."""
         count = self.rest.count
         bend = zeros(count, wp.float32, self.rest.device)
         curl, error = (zeros(count, wp.vec3, self.rest.device) for _ in range(2))
@@ -191,7 +193,7 @@ def deform(
 
 
 def node_positions(positions: wp.array | np.ndarray, node_count: int, device: wp.Device) -> wp.array:
-    """Return (N,) vec3d on ``device`` from (N, 3) or (N,) vec3d.
+    """Convert node positions (N, 3) or (N,) vec3d to (N,) vec3d on ``device``.
 
     Raises:
         UserError: N is not ``node_count``.

@@ -18,8 +18,8 @@ UNSCENTED_GAMMA = 3.0**0.5
 """Arm length in standard deviations for which the seven points integrate cubics over the Gaussian exactly."""
 
 MIN_ARM_LENGTH = 1e-6
-"""Shortest arm, relative to the cage's diagonal: even float64 differences over a scale of e^-16 would be mostly
-rounding."""
+"""Shortest arm, relative to the cage's diagonal. With a scale of e^-16, differences of positions would be mostly
+rounding error even in float64."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class PointEmbedding:
     """Points as fixed combinations of the corners of one tetrahedron each (Eq. 2)."""
 
     tets: wp.array
-    """(P,) int32, containing tetrahedron, or the nearest one of a point outside all."""
+    """(P,) int32, index of the tetrahedron that contains the point, or of the nearest one for a point outside all."""
     nodes: wp.array
     """(P,) vec4i, node indices of its corners."""
     weights: wp.array
@@ -55,7 +55,7 @@ class PointEmbedding:
 
 
 class CageLocator:
-    """Locates points in the tetrahedra of a rest mesh, by bounding volume hierarchies over them and over the
+    """Locator of points in the tetrahedra of a rest mesh, with bounding volume hierarchies of the tetrahedra and of the
     surface."""
 
     def __init__(self, mesh: TetMesh, *, device: str | wp.Device | None = None) -> None:
@@ -82,7 +82,7 @@ class CageLocator:
         self._surface = self.local_surface(mesh.nodes, mesh.boundary_faces())
 
     def locate(self, points: wp.array) -> PointEmbedding:
-        """Embed finite ``points`` (P,) vec3d on this device, as ``embed_points``."""
+        """Embed finite ``points`` (P,) vec3d on this device, like ``embed_points``."""
         embedding = self._empty_embedding(points.shape[0])
         launch_rows(
             kernels.locate_points_kernel,
@@ -94,8 +94,8 @@ class CageLocator:
         return embedding
 
     def locate_gaussians(self, cloud: GaussianCloud, gamma: float) -> tuple[PointEmbedding, wp.array]:
-        """Embed the seven points of each Gaussian, as ``embed_gaussians``; return 7n rows and the arm lengths (n, 6),
-        m."""
+        """Embed the seven points of each Gaussian, like ``embed_gaussians``; return the embedding of 7n rows and the
+        arm lengths (n, 6), m."""
         embedding = self._empty_embedding(7 * cloud.count)
         arms = empty((cloud.count, 6), wp.float32, self.device)
         launch_rows(

@@ -20,8 +20,8 @@ MIN_OPACITY = 2.0 / 255.0
 
 SPLIT_DEGREES = 4.0
 """Smallest angle, deg, between the two ends of an axis at which it is split, for arms of sqrt 3 standard deviations.
-The paper's 15 degrees at 3 are 9 here, which gave 0.01 to 0.02 dB less on Table 1's chair, and more where finer fit
-errors are split."""
+The paper's 15 degrees for arms of 3 standard deviations correspond to 9 degrees here. On the chair of Table 1 they cost
+0.01 to 0.02 dB, and more if smaller fit errors are split."""
 
 MIN_FIT_ERROR = 7e-4
 """Smallest fit error that is split, relative to the cage's diagonal. A smaller value would follow a motion better still
@@ -29,14 +29,14 @@ MIN_FIT_ERROR = 7e-4
 
 
 class SplitRule(Enum):
-    """Rule for the Gaussians to split, the axis, and the children. Every rule keeps mass, mean and covariance
-    exactly."""
+    """Rule that selects the Gaussians to split, the axis and the children. Every rule preserves mass, mean and
+    covariance exactly."""
 
     MEASURED = "measured"
     """Three children at -s, 0, s with standard deviation s/sqrt 2 (mixture weights 1/4, 1/2, 1/4), with the opacities
-    of least image error; along the axis with the largest fit error, where that error is visible."""
+    that minimise the image error; along the axis with the largest fit error, where that error is visible."""
     PAPER = "paper"
-    """Two children of half-normal mean and variance (Eq. 17 with kappa = gamma sqrt(pi/2)), across the longest axis."""
+    """Two children of half-normal mean and variance (Eq. 17 with kappa = gamma sqrt(pi/2)), along the longest axis."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +44,11 @@ class SplitGaussians:
     """Cloud after splitting, still in the rest configuration, with its own embedding."""
 
     cloud: GaussianCloud
-    """(n',) the Gaussians that were not split, in their old order, then the children."""
+    """(n',) the Gaussians that were not split, in their original order, then the children."""
     embedding: GaussianEmbedding
     """Embedding of the n' Gaussians."""
     parents: np.ndarray
-    """(n',) int32, index of each in the first cloud."""
+    """(n',) int32, index in the first cloud of the Gaussian that each comes from."""
     depths: np.ndarray
     """(n',) int8, number of splits that led to each."""
 
@@ -59,8 +59,8 @@ class SplitGaussians:
 
 
 # Opacity of one Gaussian, and of the outer and the middle of its three children, for which the images of parent and
-# children differ least (root mean square over viewing directions spread evenly over the sphere); 1.5 to 1.9 % of the
-# opacity remain. benchmarks/splitting.py recomputes the table.
+# children differ least (root mean square over viewing directions spread evenly over the sphere). The remaining
+# difference is 1.5 to 1.9 % of the opacity. benchmarks/splitting.py recomputes the table.
 _OPACITIES = np.array(
     [
         (0.0, 0.0, 0.0),
@@ -129,9 +129,10 @@ def split_bent(
         threshold_degrees: smallest angle to split.
         min_error: m, at one standard deviation; default: ``MIN_FIT_ERROR`` times the cage's diagonal.
         rule: rule to apply.
-        parents, depths: (n,), those of an earlier call.
+        parents, depths: (n,), results of an earlier call; default: no Gaussian has been split.
         max_depth: a Gaussian of this depth is not split again.
-        max_count: largest number of Gaussians; if it would be exceeded, those with the largest fit error are split.
+        max_count: largest number of Gaussians; if it would be exceeded, only those with the largest fit errors are
+            split.
     """
     count = cloud.count
     parents = np.arange(count, dtype=np.int32) if parents is None else parents
@@ -185,12 +186,12 @@ def split_for_motion(
 ) -> SplitGaussians:
     """Split all Gaussians that any of ``frames`` bends, until none is bent too much.
 
-    A motion known in advance is split for once, before its first frame, so that no Gaussian changes during it. A few
-    frames with the extremes are enough. See ``split_bent``.
+    Call it once, before the first frame of a motion that is known in advance, so that the set of Gaussians does not
+    change during the motion. A few frames that contain the extremes are enough. ``split_bent`` describes the rules.
 
     Args:
         frames: node positions, as for ``deform``.
-        max_growth: largest ratio of the number of Gaussians after and before.
+        max_growth: largest ratio of the number of Gaussians after the split to that before it.
     """
     result = SplitGaussians(
         cloud, embedding, np.arange(cloud.count, dtype=np.int32), np.zeros(cloud.count, dtype=np.int8)

@@ -1,4 +1,4 @@
-"""Affine transformation of Gaussians, colours included: also by a reflection or a scale that is not uniform."""
+"""Affine transformation of Gaussians and their colours, including reflections and non-uniform scales."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def is_proper_similarity(matrix: np.ndarray) -> bool:
 
 
 def rotated_colours(sh: wp.array, rotation: Rotation) -> wp.array:
-    """Return the SH coefficients ``sh`` (n, K) vec3 of Gaussians that are turned by ``rotation``, in the INRIA
+    """Return the SH coefficients ``sh`` (n, K) vec3 of Gaussians that are rotated by ``rotation``, in the INRIA
     convention."""
     count, coefficients = sh.shape
     if coefficients == 1:
@@ -47,8 +47,8 @@ def transformed_shapes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return quaternions (n, 4) and log scales (n, 3) float32 of the covariances M Sigma M^T, with M the ``matrix``.
 
-    With M R S = U D V^T these are those of U and D; a similarity only turns R and scales S. A Gaussian is symmetric, so
-    the sign of an axis is free, and a reflection is exact.
+    With the singular value decomposition M R S = U D V^T, U gives the quaternions and D the scales; a similarity only
+    rotates R and scales S. A Gaussian is symmetric, so the sign of an axis is arbitrary, and a reflection is exact.
 
     Args:
         rotations: (n, 4) quaternions w, x, y, z.
@@ -68,7 +68,7 @@ def transformed_shapes(
             axes = (sign / sizes[0]) * matrix @ axes
             logs = logs + np.log(sizes[0])
         else:
-            # In units of the largest scale, as those of distant or tiny Gaussians leave the range of floats.
+            # Divide by the largest scale, because distant or tiny Gaussians can exceed the range of floats.
             largest = logs.max(axis=1, keepdims=True)
             axes, lengths, _ = np.linalg.svd(matrix @ axes * np.exp(logs - largest)[:, None])
             axes[np.linalg.det(axes) < 0.0, :, 2] *= -1.0
@@ -82,8 +82,8 @@ def transformed_shapes(
 def transformed_colours(sh: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Return (n, K, 3) float32 SH coefficients of Gaussians transformed by ``matrix`` (3, 3), not singular.
 
-    Colours follow the orthogonal factor Q of its polar decomposition. Of a reflection, -Q is a rotation, and the
-    inversion that remains negates the odd bands.
+    Colours follow the orthogonal factor Q of its polar decomposition. For a reflection, -Q is a rotation, and the
+    remaining point inversion negates the odd bands.
     """
     first, _, second = np.linalg.svd(matrix)
     orthogonal = first @ second

@@ -29,10 +29,10 @@ def connected_parts(mask: np.ndarray, *, corners: bool = False) -> tuple[np.ndar
 
     Args:
         mask: (rows, columns) bool.
-        corners: pixels that touch at a corner are connected.
+        corners: whether pixels that touch only at a corner are connected.
 
     Returns:
-        (rows, columns) int, 0 where not set and else the number of the part from 1; and the number of parts.
+        (rows, columns) int, the number of each pixel's part from 1 and 0 for unset pixels; and the number of parts.
     """
     result: Any = ndimage.label(mask, np.ones((3, 3)) if corners else None)
     return np.asarray(result[0]), int(result[1])

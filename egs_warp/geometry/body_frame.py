@@ -16,11 +16,11 @@ GROUND = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 """The ground in the body's own frame."""
 
 _REACH = 3.0
-"""Standard deviation of the Gaussian weight of points about the middle, in median distances from it. It keeps outliers
-from rotating the frame."""
+"""Standard deviation, in median distances from the middle, of the Gaussian by which points are weighted. The weights
+keep outliers from rotating the frame."""
 _ELONGATED = 0.05
-"""Second moment about up, of 1, above which a body has a long side; the direction of a rounder body is that of its
-largest moment."""
+"""Second angular moment about the up direction, from 0 to 1, above which a body has a long side; the direction of a
+rounder body is that of its largest moment."""
 _FOLDS = (1, 2, 3, 4, 5, 6)
 
 
@@ -69,11 +69,11 @@ class BodyFrame:
 def upright_frame(points: np.ndarray, weights: np.ndarray, plane: Plane) -> BodyFrame:
     """Compute the frame of a body that stands on ``plane``. It rotates, moves and scales with the body.
 
-    The origin is the foot of a robust middle: the fixed point of a mean with a wide Gaussian weight about itself. x is
-    the long principal axis about up. A body that is nearly round about up faces along the strongest of its angular
-    moments sum w r^p e^(i m angle), m = 1 to 6. Among the m directions that remain, x is the one closest to the third
-    moment (m = 1). The unit of length is the median distance from the middle. The same points in the same order give
-    the same bits.
+    The origin is the projection onto the plane of a robust middle: the fixed point of a mean with a wide Gaussian
+    weight around itself. x is the longer principal axis within the plane. If the body is nearly round about the up
+    direction, x follows the strongest of its angular moments sum w r^p e^(i m angle), m = 1 to 6. Among the m
+    directions that this leaves, x is the one closest to the moment m = 1, for which p is 3. The unit of length is the
+    median distance from the middle. The same points in the same order give the same bits.
 
     Args:
         points: (n, 3) points of the body.
@@ -83,7 +83,7 @@ def upright_frame(points: np.ndarray, weights: np.ndarray, plane: Plane) -> Body
     Raises:
         UserError: all points coincide.
     """
-    # With no opacity at all, all points count alike; the search for a body reports that error.
+    # If all weights are zero, use equal ones; the search for a body reports that nothing is opaque.
     middle, reach, near = _middle(points, weights if weights.sum() > 0.0 else np.ones(len(points)))
     first, second = orthonormal_basis(plane.normal)
     arms = (points - middle) / reach

@@ -82,15 +82,16 @@ def downscale(camera: Camera, side: int) -> Camera:
 
 
 def fitted_camera(camera: Camera, points: np.ndarray, *, sides: float, top: float, bottom: float) -> Camera:
-    """Return ``camera`` moved, without rotation, as near to ``points`` (n, 3) as it shows them all, in their middle.
+    """Return ``camera`` moved, without rotation, to the nearest position from which it shows all ``points`` (n, 3),
+    centred.
 
-    A point at the depth d below the eye is within the margins if its coordinates across are within slopes times d.
-    Each margin is thus linear in the position of the eye, and the nearest one is exact.
+    A point at depth d in front of the eye is within the margins if each of its two lateral offsets lies between fixed
+    slopes times d. Each margin is thus linear in the position of the eye, and the nearest position is computed exactly.
 
     Args:
         camera: rotation and intrinsics; its principal point is in the picture.
         points: world units.
-        sides, top, bottom: fraction of the picture from the principal point to each edge that the points may fill.
+        sides, top, bottom: fractions of the distances from the principal point to the edges that the points may fill.
     """
     across, down, along = camera.rotation @ points.T
     centre, slopes = [], []
@@ -99,7 +100,7 @@ def fitted_camera(camera: Camera, points: np.ndarray, *, sides: float, top: floa
         (down, camera.fy, top * camera.cy, bottom * (camera.height - camera.cy)),
     ):
         least, most = before / focal, after / focal
-        # The eye at e and the depth along - z: values - e is from -least (along - z) to most (along - z).
+        # For an eye at (e, z), values - e must lie between -least (along - z) and most (along - z).
         slopes.append((least, most))
         centre.append(((values - most * along).max(), (values + least * along).min()))
     depth = min((high - low) / (least + most) for (low, high), (least, most) in zip(centre, slopes, strict=True))

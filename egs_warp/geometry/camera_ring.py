@@ -10,14 +10,14 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.plane import Plane
 
 ELEVATIONS = (12.0, 30.0, 52.0)
-"""Degrees above the plane."""
+"""Elevations of the rings above the plane, degrees."""
 
 
 def ring_camera(
     direction: np.ndarray, centre: np.ndarray, radius: float, up: np.ndarray, *, size: int, vertical_fov_degrees: float
 ) -> Camera:
-    """Return the camera in ``direction`` (3,) from ``centre`` (3,) that sees the ball of ``radius`` about it. ``size``
-    is in pixels, both sides."""
+    """Return the camera, in ``direction`` (3,) from ``centre`` (3,), whose view contains the ball of ``radius`` around
+    ``centre``. ``size`` is the width and height of its image, pixels."""
     distance = radius / np.sin(np.radians(vertical_fov_degrees / 2.0))
     eye = centre + distance * direction / np.linalg.norm(direction)
     return Camera.look_at(
@@ -36,10 +36,11 @@ def ring_cameras(
     vertical_fov_degrees: float = 40.0,
     margin: float = 1.25,
 ) -> list[Camera]:
-    """Return ``count`` cameras on rings above ``plane`` that see the ball of ``radius`` about ``centre`` (3,) with a
-    margin.
+    """Return ``count`` cameras on rings above ``plane`` whose views contain the ball of ``radius`` around ``centre``
+    (3,), enlarged by the factor ``margin``.
 
-    The elevations alternate, so that neighbours differ in both angles. ``size`` is in pixels, both sides.
+    The elevations alternate, so that neighbours differ in both angles. ``size`` is the width and height of each image,
+    pixels.
     """
     first, second = plane.tangents()
     distance = margin * radius / np.sin(np.radians(vertical_fov_degrees / 2.0))

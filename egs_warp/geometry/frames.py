@@ -25,7 +25,7 @@ def axis_named(name: str) -> np.ndarray | None:
 def direction_of(direction: Direction, argument: str) -> np.ndarray:
     """Return the (3,) float64 vector of ``direction``.
 
-    Raises ``ArgumentError`` about ``argument`` for other names, and unless the numbers are finite and not all zero.
+    Raises ``ArgumentError`` about ``argument`` for any other name, and for numbers that are not finite or are all zero.
     """
     vector = axis_named(direction) if isinstance(direction, str) else None
     try:

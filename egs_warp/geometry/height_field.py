@@ -22,7 +22,8 @@ _MAX_NODES = 1 << 22
 class HeightField:
     """A biquadratic B-spline over a square grid: heights and slopes are continuous, and so is the normal.
 
-    Outside the grid, the edge continues level. Lengths are in the units of the frame that it lies in.
+    Outside the grid, the height at its edge continues unchanged. Lengths are in the units of the frame of ``axes`` and
+    ``origin``.
     """
 
     __repr__ = short_repr
@@ -119,8 +120,8 @@ class HeightField:
         return replace(self, origin=self.origin + shift)
 
     def coarser(self, spacing: float) -> HeightField:
-        """Return the ground smoothed to nodes ``spacing`` apart; itself if it is as coarse already. Features narrower
-        than two ``spacing`` are removed."""
+        """Return the ground smoothed to nodes ``spacing`` apart, or this field if it is already as coarse. Features
+        narrower than two spacings lose most of their height."""
         if spacing <= self.spacing:
             return self
         ratio = spacing / self.spacing
@@ -160,8 +161,8 @@ def check_grid(field: HeightField) -> None:
 
 
 def _weights(place: np.ndarray) -> tuple[np.ndarray, tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]]:
-    """Return the nearest node of each ``place`` (in spacings), the weights of it and its neighbours, and their
-    derivatives."""
+    """Return the nearest node of each ``place`` (in spacings), the weights of the previous, this and the next node, and
+    the derivatives of these weights."""
     nearest = np.floor(place + 0.5)
     f = place - nearest
     weights = (0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2)

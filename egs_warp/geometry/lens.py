@@ -1,8 +1,8 @@
 """Lens distortion models of camera calibration, and the undistortion of photos.
 
-Models: https://colmap.github.io/cameras.html; polynomials as in OpenCV's ``calib3d``; FOV after Devernay and Faugeras
-(2001), division after Fitzgibbon (2001), EUCM after Khomutenko, Garcia and Martinet (2016), and the fisheye with
-radial, tangential and thin prism terms after Project Aria (Fisheye624).
+Models: https://colmap.github.io/cameras.html; polynomials as in OpenCV's ``calib3d``; FOV from Devernay and Faugeras
+(2001), division from Fitzgibbon (2001), EUCM from Khomutenko, Garcia and Martinet (2016), and the fisheye with radial,
+tangential and thin prism terms from Project Aria (Fisheye624).
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ class Lens:
     field_of_view: float = 0.0
     """Angle in rad of the FOV model, used if above 0."""
     division: float = 0.0
-    """Coefficient k of the division model: the undistorted position is the distorted one over 1 + k r^2."""
+    """Coefficient k of the division model: the undistorted position is the distorted one divided by 1 + k r^2, where r
+    is the distorted radius."""
     unified: tuple[float, float] = (0.0, 1.0)
     """Parameters alpha and beta of the enhanced unified camera model (EUCM)."""
     high_radial: tuple[float, float] = (0.0, 0.0)
@@ -87,7 +88,7 @@ class Lens:
 
     @property
     def is_distorted(self) -> bool:
-        """True if a photo differs from a pinhole's."""
+        """True if the map differs from the identity, which is the map of a pinhole."""
         return replace(self, unified=(self.unified[0], 1.0)) != Lens()
 
     def distorted(self, points: np.ndarray) -> np.ndarray:
@@ -153,8 +154,8 @@ class Undistortion:
         return _undistortion(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, lens)
 
     def picture(self, pixels: np.ndarray) -> np.ndarray:
-        """Undistort the ``pixels`` (H, W) or (H, W, 3) of a photo, in their type; zero where the photo shows
-        nothing."""
+        """Return the undistorted ``pixels`` (H, W) or (H, W, 3) of a photo, of the same type; zero outside the photo's
+        view."""
         return self._remap(pixels, cv2.INTER_LINEAR)
 
     def mask(self, mask: np.ndarray) -> np.ndarray:
@@ -177,7 +178,7 @@ class Undistortion:
 
 @lru_cache(maxsize=2)
 def _undistortion(width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens) -> Undistortion:
-    # Most photos of a set share their camera.
+    # The result is cached, because most photos of a set share their camera.
     columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = np.stack([(columns - cx) / fx, (rows - cy) / fy], axis=-1)
     radius = np.linalg.norm(rays, axis=-1)

@@ -55,7 +55,7 @@ class TetMesh:
         """(B, 3) int32 node indices of the surface triangles, wound outwards; the array is read-only."""
         return self._surface
 
-    # Both are cached, as each motion requests them when it starts.
+    # Both are cached, because each motion requests them when it starts.
     @cached_property
     def _surface(self) -> np.ndarray:
         faces = self.tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
@@ -95,7 +95,7 @@ def _signed_volumes(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
 
 
 def edge_graph(mesh: TetMesh) -> sp.csr_matrix:
-    """(N, N) symmetric, entry (a, b) is the length in metres of the edge from node a to node b."""
+    """(N, N) symmetric matrix whose entry (a, b) is the length, in metres, of the edge from node a to node b."""
     pairs = mesh.tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2)
     pairs = np.unique(np.sort(pairs, axis=1), axis=0)
     lengths = np.linalg.norm(mesh.nodes[pairs[:, 0]] - mesh.nodes[pairs[:, 1]], axis=1)

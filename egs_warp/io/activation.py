@@ -1,4 +1,4 @@
-"""Files that hold activated values, scales and opacities, where their format has logarithms and logits."""
+"""Detection of files that contain activated scales and opacities where their format has logarithms and logits."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from egs_warp.io.limits import MIN_LOG_SCALE
 from egs_warp.io.raw import RawCapture, logits_from_opacities
 
 _MIN_COUNT = 20
-"""Number of Gaussians from which their values are evidence: a few may be so by chance."""
+"""Minimum number of Gaussians for a decision: the values of a few may look activated by chance."""
 _SAMPLE = 1000
-"""Number of Gaussians that exclude activated values in most files."""
+"""Number of Gaussians that are tested first, which is enough to exclude activated values in most files."""
 
 
 def with_logarithms(raw: RawCapture) -> RawCapture:
-    """Return ``raw`` with logarithms and logits if it evidently holds activated values, with a note.
+    """Return ``raw`` with logarithms and logits if it evidently contains activated values, with a note.
 
     All scales are then positive and all opacities within 0 to 1: as logarithms and logits, each Gaussian would be wider
-    than one unit and half transparent. If only the scales are positive, or the opacities are all the same, they are
-    activated if most Gaussians would otherwise be wider than the capture. Opacities alone are no evidence: they stay,
-    with a note.
+    than one unit and half transparent. If the opacities are not within 0 to 1 or are all the same, positive scales
+    count as activated if most Gaussians would otherwise be wider than the capture. Opacities alone are not evidence:
+    they are kept, with a note.
     """
     few = slice(0, _SAMPLE)
     if len(raw.means) < _MIN_COUNT or (
         bool(np.any(raw.log_scales[few, :2] < 0.0)) and not _within(raw.opacity_logits[few])
     ):
         return raw
-    # The third scale of a flat Gaussian is absent or minus infinity, and activated it is 0.
+    # The third scale of a flat Gaussian is absent or minus infinity, or 0 if the scales are activated.
     scales, opacities = raw.log_scales, raw.opacity_logits
     absent = ~(scales > MIN_LOG_SCALE)
     positive = bool((absent | (scales >= 0.0)).all() and (scales > 0.0).any())
@@ -39,7 +39,7 @@ def with_logarithms(raw: RawCapture) -> RawCapture:
             log_scales = np.where(absent, scales, np.log(np.maximum(scales, 0.0)))
         raw = replace(raw, log_scales=log_scales)
         if not within:
-            note = "all scales are positive, and as logarithms wider than the capture: read as standard deviations"
+            note = "all scales are positive, and too large to be logarithms: read as standard deviations"
             return replace(raw, notes=(*raw.notes, note))
         note = "all scales are positive and all opacities within 0 to 1: read as standard deviations and opacities"
         note += ", not as their logarithms and logits"
@@ -55,8 +55,8 @@ def _within(opacities: np.ndarray) -> bool:
 
 
 def _wider_than_capture(raw: RawCapture) -> bool:
-    """Return True if the median Gaussian is wider than the capture with its scales read as logarithms, and not as they
-    are."""
+    """Return True if the median Gaussian would be wider than the capture with scales read as logarithms, but not with
+    scales read as standard deviations."""
     means = raw.means[np.isfinite(raw.means).all(axis=1)].astype(np.float64)
     if not len(means):
         return False

@@ -22,7 +22,7 @@ except ImportError:
 _TEMPORARY = re.compile(r"\.egs-[0-9a-f]{16}(\..*)?")
 _SYSTEM_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES)
 _MIN_AGE = 2.0
-"""Seconds. A younger file may not have been locked yet."""
+"""Minimum age of a leftover file, s. A younger file may not have been locked yet."""
 
 
 @contextmanager
@@ -43,7 +43,7 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
     temporary = _temporary_name(target.parent, target.suffix)
     descriptor = None
     try:
-        # O_EXCL: never an existing file, nor a link placed by another process.
+        # O_EXCL fails for an existing file and for a link that another process has placed.
         descriptor = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
         if not _try_lock(descriptor):
             os.close(descriptor)
@@ -69,7 +69,7 @@ def writable_folder(path: Path | str) -> Path:
         probe.unlink()
     except OSError as error:
         raise UserError(f"{path}: cannot write into this folder ({_reason(error)}); choose another one") from error
-    # A path with a null byte.
+    # The path contains a null byte.
     except ValueError as error:
         raise UserError(f"{path}: cannot write into this folder ({error}); choose another one") from error
     sweep(folder)
@@ -78,8 +78,8 @@ def writable_folder(path: Path | str) -> Path:
 
 @contextmanager
 def result_folder(path: Path | str) -> Iterator[Path]:
-    """Create folder ``path``, as ``writable_folder``; if the block fails before it contains anything, remove what was
-    created."""
+    """Create folder ``path``, like ``writable_folder``; if the block fails while the folder is empty, remove the
+    folders that were created."""
     folder = Path(path)
     created = []
     try:
@@ -99,10 +99,10 @@ def result_folder(path: Path | str) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> bool:
-    """Remove files in ``folder`` that ``atomic_write`` of killed processes has left; those of running processes are
-    locked.
+    """Remove files that ``atomic_write`` of killed processes left in ``folder``; files of running processes are locked
+    and remain.
 
-    Returns True if there are files too young to be distinguished from those.
+    Returns True if some files are too young to tell whether a running process is about to lock them.
     """
     young = False
     if fcntl is None:
@@ -120,7 +120,7 @@ def sweep(folder: Path) -> bool:
                     os.unlink(entry.path)
             finally:
                 os.close(descriptor)
-        # Another process was faster, or has other permissions.
+        # Another process removed the file first, or the file belongs to another user.
         except OSError:
             continue
     return young
@@ -128,7 +128,7 @@ def sweep(folder: Path) -> bool:
 
 def sweep_all(folder: Path) -> None:
     """Call ``sweep`` until no file is too young, for a few seconds at most: a program that a killed process had
-    started, such as ffmpeg, may have written until the end."""
+    started, such as ffmpeg, may have written for a little longer."""
     deadline = time.monotonic() + 2.0 * _MIN_AGE
     while sweep(folder) and time.monotonic() < deadline:
         time.sleep(0.05 * _MIN_AGE)
@@ -150,7 +150,7 @@ def lock(path: Path) -> Iterator[bool]:
             same = False
         if same:
             break
-        # Its last holder removed it in the meantime.
+        # The last holder of the lock removed the file in the meantime.
         os.close(descriptor)
     try:
         yield True

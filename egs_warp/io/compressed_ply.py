@@ -1,9 +1,9 @@
 """PlayCanvas compressed .ply: chunks of 256 Gaussians, each value quantised between the chunk's minimum and maximum.
 
-Public description: https://blog.playcanvas.com/compressing-gaussian-splats and the SuperSplat documentation. Per chunk
-18 floats (bounds of position, log scale and colour); per Gaussian four uint32: position and scale 11-10-11 bits,
-rotation 2 bits (index of the largest component) and three of 10, colour and opacity 8-8-8-8; f_rest as uint8 over -4
-... 4.
+Public description: https://blog.playcanvas.com/compressing-gaussian-splats and the SuperSplat documentation. A chunk
+has 18 floats: the bounds of position, log scale and colour. A Gaussian has four uint32: position and scale with 11, 10
+and 11 bits, rotation with 2 bits for the index of the largest component and 10 for each of the others, and colour and
+opacity with 8 bits each. The uint8 of f_rest cover the range -4 to 4.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _SCALE_LIMIT = 20.0
 
 
 def is_compressed(header: PlyHeader) -> bool:
-    """Return True if a .ply is of this kind."""
+    """Return True if ``header`` is that of a compressed .ply."""
     vertex = header.element("vertex")
     return (
         header.element("chunk") is not None
@@ -61,7 +61,7 @@ def is_compressed(header: PlyHeader) -> bool:
 def decode_compressed_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
     """Decode the Gaussians. Raises ``UserError`` for a file that is truncated or lacks a property."""
     sh_element = header.element("sh")
-    # At degree 0, gsplat writes an element of no property, and others one without rows.
+    # At degree 0, gsplat writes an element without properties, and other programs write one without rows.
     has_rest = sh_element is not None and sh_element.count > 0 and (sh_element.dtype is None or sh_element.dtype.names)
     elements = read_elements(data, header, ["chunk", "vertex"] + (["sh"] if has_rest else []), source)
     chunk, vertex = elements.get("chunk"), elements.get("vertex")
@@ -80,7 +80,7 @@ def decode_compressed_ply(data: bytes, header: PlyHeader, source: Path) -> RawCa
     limits = np.tile(np.array([0, 0, 0, 1, 1, 1], np.float32), (len(chunk), 3))
     limits[:, : len(bounds)] = columns_as_float32(chunk, bounds)
     limits = limits.reshape(-1, 3, 2, 3)[np.arange(len(vertex)) // _CHUNK]
-    # The words of a text .ply arrive as float64, those of a big-endian one in that order; both represent the same
+    # The words of a text .ply are float64, and those of a big-endian .ply have that byte order. Both represent the same
     # integers.
     words = {name: vertex[name].astype(np.uint32) for name in _PACKED}
     means = _between(limits[:, 0], _fields(words["packed_position"], _POSITION_FIELDS))
@@ -132,11 +132,11 @@ def _decode_rest(rows: np.ndarray, count: int, source: Path) -> tuple[np.ndarray
 
 
 def write_compressed_ply(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = False) -> np.ndarray:
-    """Write ``cloud`` as a compressed .ply, about 16 bytes per Gaussian and one more for each higher SH number.
+    """Write ``cloud`` as a compressed .ply: about 16 bytes per Gaussian and one for each SH coefficient above band 0.
 
-    Lossy: positions to 1/1024 of their chunk's size, SH to 1/32, opacity to 1/255. Gaussians are sorted in space, which
-    keeps chunks small, unless ``keep_order`` is set. Returns the number (n,) in ``cloud`` of each Gaussian of the file.
-    Raises ``UserError`` if the file cannot be written.
+    The format is lossy: it rounds positions to 1/1024 of their chunk's size, SH to 1/32 and opacity to 1/255. Gaussians
+    are sorted in space, which keeps chunks small, unless ``keep_order`` is set. Returns (n,) the index in ``cloud`` of
+    each Gaussian of the file. Raises ``UserError`` if the file cannot be written.
     """
     means = cloud.means.numpy()
     order = np.arange(cloud.count) if keep_order else morton_order(means)

@@ -1,7 +1,7 @@
-"""Decimation of a capture: neighbours are merged to Gaussians with the moments of both.
+"""Decimation of a capture: neighbours are merged into Gaussians with the moments of both.
 
-Pairs are neighbours along a Morton curve; those are merged first that increase the weighted variance of positions and
-colours least (J. H. Ward, "Hierarchical grouping to optimize an objective function", 1963).
+Pairs are neighbours along a Morton curve; the first to be merged are those that increase the weighted variance of
+positions and colours least (J. H. Ward, "Hierarchical grouping to optimize an objective function", 1963).
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ _MIN_OPACITY, _MAX_OPACITY = 1e-6, 0.999
 _MERGED = -1
 _TINY = 1e-300
 _MIN_VARIANCE = 1e-14
-"""Smallest variance of a merged Gaussian, of its largest one: rounding leaves flat ones negative variances."""
+"""Smallest variance of a merged Gaussian, relative to its largest one: rounding can make the variance of a flat
+Gaussian negative."""
 _BLOCK_ROWS = 1 << 18
 
 
@@ -34,7 +35,7 @@ def decimated(cloud: GaussianCloud, count: int) -> tuple[GaussianCloud, float]:
         count: Number of Gaussians of the result, 1 to that of ``cloud``.
 
     Returns:
-        The merged capture, and the root mean square, by weight, of the distances over which Gaussians were moved, scene
+        The merged capture, and the weighted root mean square of the distances by which Gaussians were moved, scene
         units.
     """
     means, covariances = cloud.means.numpy().astype(np.float64), _covariances(cloud)
@@ -50,7 +51,7 @@ def decimated(cloud: GaussianCloud, count: int) -> tuple[GaussianCloud, float]:
         distances = np.einsum("ni,ni->n", steps, steps)
         colours = SH_BAND_0**2 * ((sh[b, 0] - sh[a, 0]) ** 2).sum(axis=1)
         cost = weights[a] * share * (distances / max(float(np.median(distances)), _TINY) + colours)
-        # Half of the pairs at most, as those left over find better partners in the next round.
+        # Merge at most half of the pairs, because the other Gaussians can find better partners in the next round.
         chosen = np.sort(np.argsort(cost, kind="stable")[: max(1, min(len(means) - count, len(a) // 2))])
         a, b, both, share, steps = a[chosen], b[chosen], both[chosen], share[chosen], steps[chosen]
         squares += float((weights[a] * share * distances[chosen]).sum())
@@ -91,7 +92,8 @@ def _cloud(
     sh: np.ndarray,
     sources: np.ndarray,
 ) -> GaussianCloud:
-    """Return the Gaussians: those of ``cloud`` with the numbers ``sources``, and the merged ones."""
+    """Return the Gaussians of ``cloud`` with indices ``sources``, and merged Gaussians where the index is
+    ``_MERGED``."""
     merged = sources == _MERGED
     variances, axes = np.linalg.eigh(covariances[merged])
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]

@@ -15,7 +15,8 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp
 _BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
 _MARKS = (b"\x1a\x45\xdf\xa3", b"RIFF")
 _SHARPNESS_SIDE = 480
-"""Longer side in pixels at which sharpness is measured; noise counts less than edges there."""
+"""Longer side in pixels to which a frame is reduced before its sharpness is measured, so that noise contributes less
+than edges."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def _frames(video: Path) -> Iterator[np.ndarray]:
 
 
 def _length(video: Path) -> int:
-    """Return the number of frames by counting, as the header may be wrong."""
+    """Return the number of frames by counting them, because the header may be wrong."""
     reader = cv2.VideoCapture(str(video))
     try:
         length = 0

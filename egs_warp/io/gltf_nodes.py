@@ -14,7 +14,7 @@ from egs_warp.errors import UserError
 
 INSTANCING = "EXT_mesh_gpu_instancing"
 _FLAT = 1e-9
-"""Smallest ratio of the singular values of a transform."""
+"""Ratio of the smallest to the largest singular value up to which a transform is flat."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def placements(
         is_wanted: returns True for the index of a mesh that is to be placed.
 
     Raises:
-        UserError: the nodes form no tree, or a transform is flat or not finite.
+        UserError: the nodes do not form a tree, or a transform is flat or not finite.
     """
     nodes, scenes = tree.get("nodes", []), tree.get("scenes", [])
     parents = {child: number for number, node in enumerate(nodes) for child in node.get("children", [])}
@@ -56,8 +56,8 @@ def placements(
 
 
 def _topmost(starts: list[int], parents: dict[int, int]) -> list[int]:
-    """Return the nodes without a parent above ``starts``: glTF demands that a scene lists only such nodes, but not all
-    files do."""
+    """Return the root nodes of the trees that contain ``starts``: glTF requires a scene to list only root nodes, but
+    some files list others."""
     found: dict[int, None] = {}
     seen: set[int] = set()
     for number in starts:
@@ -82,7 +82,7 @@ def _placed(
     while stack:
         number, above = stack.pop()
         if number in seen or number < 0:
-            raise UserError(f"{source}: its nodes form no tree: node {number} has two parents; export it again")
+            raise UserError(f"{source}: its nodes are not a tree: node {number} has two parents; export it again")
         seen.add(number)
         node = nodes[number]
         whole = above @ _transform(node)

@@ -16,7 +16,7 @@ from pathlib import Path
 from egs_warp.errors import UserError, did_you_mean
 
 MAX_TEXT_BYTES = 32 << 20
-"""Maximum size of JSON and other text in bytes; parsed, they take some thirty times as much memory."""
+"""Maximum size of JSON and other text in bytes; once parsed, it takes about thirty times as much memory."""
 MAX_PIXELS = 178_956_970
 """Maximum number of pixels of a picture or camera: Pillow's own limit."""
 MAX_SIDE = 1 << 15
@@ -26,11 +26,12 @@ MAX_SIDE = 1 << 15
 MAX_COORDINATE = 1e12
 """Maximum coordinate, scene units."""
 MIN_LOG_SCALE = -100.0
-"""Minimum logarithm of a standard deviation: below, exp gives 0 in single precision."""
+"""Minimum logarithm of a standard deviation; below it, exp is 0 in single precision."""
 FREE_GAUSSIANS = 1 << 16
 """Number of Gaussians that a packed capture of any size may declare."""
 INFLATION = 4
-"""Maximum inflation of a picture in a zip, in addition to ``FREE_BYTES``: WebP hardly deflates."""
+"""Maximum ratio of inflated to packed bytes of a picture in a zip, in addition to ``FREE_BYTES``; WebP is hardly
+compressible."""
 FREE_BYTES = 1 << 16
 
 
@@ -70,8 +71,8 @@ def picture_size(data: bytes | Path, what: str) -> tuple[int, int] | None:
 
 
 def read_bytes(path: Path | str, *, at_most: int | None = None, missing: str = "check the path") -> bytes:
-    """Return the content of a regular file. Raises ``UserError`` for anything else, as folders, pipes and devices have
-    no end.
+    """Return the content of a regular file. Raises ``UserError`` for anything else, such as a pipe or a device, which
+    may have no end.
 
     Args:
         path: the file.
@@ -79,7 +80,7 @@ def read_bytes(path: Path | str, *, at_most: int | None = None, missing: str = "
         missing: advice in the message if there is no such file.
     """
     try:
-        # O_NONBLOCK, as opening a pipe would block until its other end is opened.
+        # Without O_NONBLOCK, opening a pipe would block until its other end is opened.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
         with os.fdopen(descriptor, "rb") as file:
             status = os.fstat(descriptor)

@@ -48,13 +48,11 @@ def read_metashape(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], l
         raise UserError(f"{source}: not readable XML ({error}); {_EXPORT}") from error
     chunks = [chunk for chunk in root.iter("chunk") if chunk.find("cameras") is not None]
     if root.tag != "document" or not chunks:
-        raise UserError(f"{source}: no cameras of a chunk; {_EXPORT}")
+        raise UserError(f"{source}: it has no chunk with cameras; {_EXPORT}")
     notes = []
     chunk = max(chunks, key=lambda one: sum(camera.find("transform") is not None for camera in one.iter("camera")))
     if len(chunks) > 1:
-        notes.append(
-            f"chunk {chunk.get('label', '')!r} is used, the one of {len(chunks)} with the most aligned cameras"
-        )
+        notes.append(f"of {len(chunks)} chunks, {chunk.get('label', '')!r} is used, which has the most aligned cameras")
     cameras = list(chunk.iter("camera"))
     names = [camera.get("label") or f"camera {camera.get('id')}" for camera in cameras]
     places = files.locate(names, (source.parent / "images", source.parent))
@@ -139,7 +137,8 @@ def _intrinsics(entry: _Entry) -> tuple[dict, Lens | None]:
     }
     if not np.isfinite(list(number.values())).all() or width < 1 or height < 1:
         raise UserError(f"{entry.where} has a sensor with invalid numbers; {_EXPORT}")
-    # Until version 1.2: two focal lengths and the principal point itself, and OpenCV's order of p1 and p2.
+    # Up to version 1.2, files have two focal lengths, the principal point itself instead of its offset from the middle,
+    # and p1 and p2 in OpenCV's order.
     is_old = calibration.find("fx") is not None
     intrinsics = {
         "width": width,

@@ -8,7 +8,7 @@ _BITS = 16
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
-    """(n,) permutation that sorts ``points`` (n, 3) along a Morton curve of 2^16 cells a side; stable."""
+    """(n,) permutation that sorts ``points`` (n, 3) along a Morton curve of 2^16 cells per side; stable."""
     points = points.astype(np.float64)
     low = points.min(axis=0)
     extent = np.maximum(points.max(axis=0) - low, 1e-300)

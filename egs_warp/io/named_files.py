@@ -1,5 +1,5 @@
-"""Output files named one by one belong to one run: they are locked while it writes, and those of an earlier run are
-backed up."""
+"""Output files that are named one by one and belong to one run: they are locked while it writes them, and those of an
+earlier run are backed up."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class NamedFiles:
 
 @contextmanager
 def named_files(*paths: Path, overwrite: bool = False) -> Iterator[NamedFiles]:
-    """Lock the files ``paths`` for one run. The first one is named by the user. Missing folders are created.
+    """Lock the files ``paths`` for one run; the user has named the first one. Missing folders are created.
 
     Raises ``UserError`` if another run is writing the first file, or if one of them exists and may not be backed up
     (``overwrite``).
@@ -48,8 +48,8 @@ def named_files(*paths: Path, overwrite: bool = False) -> Iterator[NamedFiles]:
 
 
 def check_named_files(*paths: Path, overwrite: bool = False) -> None:
-    """Raise the ``UserError`` of ``named_files`` as far as it is predictable, without creating anything, before any
-    long computation."""
+    """Raise the ``UserError`` of ``named_files``, as far as it can be predicted, before any long computation and
+    without creating anything."""
     for path in paths:
         check_out(path.parent)
         if path.is_dir():

@@ -14,10 +14,10 @@ from egs_warp.errors import UserError
 from egs_warp.io.limits import read_bytes
 
 MAX_NETWORK_BYTES = 2 << 30
-"""Maximum size in bytes; protocol buffers contain no more."""
+"""Maximum size in bytes, which is the limit of protocol buffers."""
 _MAX_DEPTH = 32
 """Maximum depth of graphs in attributes of graphs."""
-# Fields of each message that contain messages which may contain tensors, by number.
+# For each kind of message, the numbers and kinds of the fields that may contain tensors.
 _MESSAGES = {
     "Model": {7: "Graph", 20: "Training", 25: "Function"},
     "Graph": {1: "Node", 5: "Tensor", 11: "Input", 15: "SparseTensor"},
@@ -33,7 +33,7 @@ _EXTERNAL_DATA, _DATA_LOCATION = 13, 14
 
 @dataclass(frozen=True)
 class OnnxFile:
-    """A network without code that needs no other file."""
+    """Inputs and bytes of a network that contains no code and refers to no other file."""
 
     data: bytes
     inputs: tuple[str, ...]
@@ -55,7 +55,7 @@ def read_onnx(path: Path) -> OnnxFile:
 
 
 class _Walk:
-    """Visits all tensors. Malformed data raise ``IndexError``."""
+    """Traversal of all tensors. Malformed data raise ``IndexError``."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -64,12 +64,12 @@ class _Walk:
 
     def message(self, data: memoryview, kind: str, depth: int) -> None:
         if depth > _MAX_DEPTH:
-            raise UserError(f"{self._path}: graphs within graphs, too deep to read; export the network again")
+            raise UserError(f"{self._path}: its graphs are nested too deeply; export the network again")
         for number, value in _fields(data):
             if kind == "Tensor":
                 if number == _EXTERNAL_DATA or (number == _DATA_LOCATION and value != 0):
                     raise UserError(
-                        f"{self._path}: some of its numbers lie in other files, which are not read; "
+                        f"{self._path}: some of its numbers are in other files, which are not read; "
                         "export the network into one file"
                     )
                 if number == 8 and depth == 2:

@@ -1,4 +1,4 @@
-"""Evaluation of a user's network on the CPU: by onnxruntime if it is installed, else by OpenCV.
+"""Evaluation of a user's network on the CPU: with onnxruntime if it is installed, otherwise with OpenCV.
 
 The file is first checked by ``read_onnx``: it contains no code, and references to other files are rejected.
 """
@@ -25,7 +25,7 @@ class OnnxNetwork:
     inputs: tuple[str, ...]
     """Names of the inputs."""
     compute: Callable[[Inputs], list[np.ndarray]]
-    """Compute all outputs, in the file's order. Raises the errors of onnxruntime or OpenCV."""
+    """Function that computes all outputs, in the file's order. It raises the errors of onnxruntime or OpenCV."""
 
     def run(self, inputs: Inputs, *, expected: str) -> list[np.ndarray]:
         """Compute all outputs, in the file's order. Raises ``UserError`` on failure; the message recommends the file

@@ -27,7 +27,7 @@ def apply_orientation(pixels: np.ndarray, turn: int) -> np.ndarray:
     """Return ``pixels`` (H, W, ...) in EXIF's orientation ``turn``."""
     if turn >= 5:
         pixels = pixels.swapaxes(0, 1)
-    # Axes that run backwards after the swap.
+    # Directions in which the axes are read after the swap.
     rows = -1 if turn in (3, 4, 7, 8) else 1
     columns = -1 if turn in (2, 3, 6, 7) else 1
     return np.ascontiguousarray(pixels[::rows, ::columns])

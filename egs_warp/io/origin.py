@@ -8,11 +8,12 @@ from __future__ import annotations
 import numpy as np
 
 MAX_ROUNDING = 2.0**-16
-"""Largest rounding of positions to single precision, in sizes of the capture, without an origin of their own."""
+"""Largest error of positions in single precision, relative to the size of the capture, up to which no origin is
+subtracted."""
 _SAMPLES = 200_000
 """Gaussians, spread evenly, from which the size of a capture is measured."""
 COARSE_STEP = 2.0**-10
-"""Steps of single precision, in sizes of the capture, that are reported."""
+"""Step of single precision, relative to the size of the capture, above which it is reported."""
 
 
 def relative_positions(means: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
@@ -22,7 +23,7 @@ def relative_positions(means: np.ndarray) -> tuple[np.ndarray, np.ndarray | None
         means: (n, 3) float32 or float64, n > 0, finite.
 
     Returns:
-        Positions (n, 3) float32; the origin (3,) float64 that was subtracted, or None; and what was rounded.
+        Positions (n, 3) float32; the origin (3,) float64 that was subtracted, or None; and the notes.
     """
     some = means[:: -(-len(means) // _SAMPLES)].astype(np.float64)
     middle = np.median(some, axis=0)

@@ -1,4 +1,4 @@
-"""Gaussians that are errors of a capture: not finite, far away, larger than everything, or brighter than any light.
+"""Erroneous Gaussians of a capture: not finite, far away, much larger than the capture, or brighter than any light.
 
 One of them is enough to stall a simulation or to overflow single precision. Outliers are found by bounds that such
 Gaussians do not affect (medians), left out, and reported.
@@ -16,7 +16,7 @@ from egs_warp.io.limits import MAX_COORDINATE, MIN_LOG_SCALE
 from egs_warp.io.raw import RawCapture, property_names
 
 MAX_DISTANCE_RATIO = 1e4
-"""Maximum distance from the capture's middle, in sizes of the capture: skies are hundreds of sizes away."""
+"""Maximum distance from the capture's middle, in sizes of the capture; a sky can be hundreds of sizes away."""
 MAX_SCALE_RATIO = 1e2
 """Maximum standard deviation of a Gaussian, in sizes of the capture."""
 MAX_SH = 1e3
@@ -110,7 +110,7 @@ def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
         notes = (*notes, f"{count} Gaussians left out that {why}")
     flat = int(np.count_nonzero((raw.log_scales < MIN_LOG_SCALE).any(axis=1) & ~out))
     if flat:
-        notes = (*notes, f"{flat} Gaussians with a log scale below {MIN_LOG_SCALE:g} read as that")
+        notes = (*notes, f"{flat} Gaussians with a log scale below {MIN_LOG_SCALE:g} read with that value")
     without_rotation = int(np.count_nonzero((raw.rotations == 0.0).all(axis=1) & ~out))
     if without_rotation:
         notes = (*notes, f"{without_rotation} Gaussians with a rotation of length 0 read as unrotated")

@@ -1,4 +1,4 @@
-"""Photos converted to those of pinhole cameras, for all files and lenses."""
+"""Reading of photos and their conversion to photos of pinhole cameras, for all file formats and lenses."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _CHUNK = 12
 """Bytes of a PNG chunk in addition to its content."""
 _MAX_SIDE_RATIO = 16
-"""Maximum side of a photo, in sides of its camera."""
+"""Maximum ratio of the side of a photo to the side of its camera's image."""
 MAX_MASK_RATIO = _MAX_SIDE_RATIO**2
-"""Maximum number of pixels of a mask, in pixels of its camera."""
+"""Maximum ratio of the number of pixels of a mask to that of its camera's image."""
 _SAME_ASPECT = 0.01
-"""Relative difference of aspect ratio up to which a photo is its camera's at another size."""
+"""Relative difference between the aspect ratios of a photo and its camera up to which the photo is a scaled one of that
+camera."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Photo:
     alpha: np.ndarray | None
     """(H, W) float32, the photo's own, or that of its mask; None without either."""
     known: np.ndarray | None
-    """(H, W) bool, False where the undistorted photo shows what the lens did not see; None if it sees everything."""
+    """(H, W) bool, False for pixels of the undistorted photo outside the view of the lens; None if there are none."""
     is_opaque: bool = False
     """True if the photo has an alpha channel that is opaque everywhere, which is not in ``alpha``: most programs write
     such a channel into photos without a cut-out."""
@@ -48,9 +49,9 @@ class Photo:
 def read_photo(posed: PosedImage, *, max_side: int | None = None, is_mask_inverted: bool = False) -> Photo:
     """Read the photo of ``posed``; one larger than ``max_side`` pixels is reduced.
 
-    The EXIF orientation is applied only if the pixels would not fit the camera otherwise. Alpha is the smaller of the
-    photo's own, unless that is opaque everywhere, and its mask, where white is opaque; with ``is_mask_inverted`` black.
-    Raises ``UserError`` for a photo that is missing, unreadable or of another shape than its camera.
+    The EXIF orientation is applied only if the pixels would not fit the camera otherwise. Alpha is the minimum of the
+    photo's own alpha, unless that is opaque everywhere, and of its mask, in which white is opaque, or black with
+    ``is_mask_inverted``. Raises ``UserError`` for a photo that is missing, unreadable or does not fit its camera.
     """
     if posed.image is None:
         raise UserError(f"{posed.name}: {posed.missing or 'the photo is not beside the poses; put it there'}")
@@ -103,7 +104,8 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None, is_mask_invert
 
 
 def at_size(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera for its photo at another size; poses are often of the full photo and images reduced."""
+    """Return the camera for its photo at another size: often the poses belong to the full photos, but the image files
+    are reduced."""
     x, y = width / camera.width, height / camera.height
     return replace(
         camera,
@@ -141,7 +143,7 @@ def decoded(image: Path) -> np.ndarray:
 def _pixels(image: Path, flags: int) -> np.ndarray | None:
     """Decode a file by OpenCV; None if it cannot.
 
-    OpenCV allocates the size that a PNG chunk declares, so that is checked first.
+    OpenCV allocates the size that a PNG chunk declares, so this size is checked first.
     """
     with open(image, "rb") as file:
         left = os.fstat(file.fileno()).st_size - len(_PNG)
@@ -183,7 +185,7 @@ def _is_scaled(size: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def _oriented_mask(path: Path, shape: tuple[int, ...], turn: int) -> np.ndarray:
-    """(H, W) float32 from the mask file of a photo of ``shape`` (height, width) as stored, which was turned by
+    """(H, W) float32 from the mask file of a photo of ``shape`` (height, width) as stored, which was rotated by
     ``turn``. A mask of another size is scaled."""
     height, width = shape
     size = picture_size(path, f"{path}: it")
@@ -200,7 +202,7 @@ def _oriented_mask(path: Path, shape: tuple[int, ...], turn: int) -> np.ndarray:
     if mask.shape != target[::-1]:
         is_larger = mask.size > width * height
         mask = cv2.resize(mask, target, interpolation=cv2.INTER_AREA if is_larger else cv2.INTER_LINEAR)
-    # A mask of the photo as stored is turned with it.
+    # A mask of the photo as stored is rotated with it.
     return apply_orientation(mask, turn) if is_stored else mask
 
 

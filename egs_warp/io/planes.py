@@ -1,4 +1,4 @@
-"""Planes on disk: ``plane.json``, which is read at each stage from a scene to an animation."""
+"""Planes on disk: ``plane.json``, which every stage from a scene to an animation reads."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class PlaneRecord:
     support: float | None = None
     """Share of the visible surface that lies on it."""
     hole: HoleOutline | None = None
-    """The region that the object has left open."""
+    """Hole that the removed object leaves in the plane; None if there is none."""
     ground: HeightField | None = None
     """Height field of the ground if it is uneven; None if the plane is the ground."""
     others: Mapping[str, Any] = field(default_factory=dict)
@@ -170,7 +170,8 @@ def write_planes(path: Path | str, planes: Sequence[PlaneRecord]) -> None:
 
 
 def read_planes(path: Path | str) -> list[PlaneRecord]:
-    """Read the planes of a ``plane.json``. Raises ``UserError`` for anything else."""
+    """Read the planes of a ``plane.json``. Raises ``UserError`` if the file is missing, is not a ``plane.json`` or has
+    no planes."""
     path = Path(path)
     try:
         data = read_bytes(path, at_most=MAX_TEXT_BYTES, missing="make it with egs-warp plane, or give nx,ny,nz,d")

@@ -37,7 +37,8 @@ _TYPES = {
     **dict.fromkeys(("float", "float32", "f4"), "f4"),
     **dict.fromkeys(("double", "float64", "f8"), "f8"),
 }
-"""Types of properties: those of G. Turk, those with their bits, those of NumPy, and halves, which Babylon.js writes."""
+"""Types of properties: the names of G. Turk, names with the number of bits, those of NumPy, and half floats, which
+Babylon.js writes."""
 _BYTE_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": None}
 _SHOWN = 5
 """Maximum number of names in a note."""
@@ -54,7 +55,7 @@ class PlyElement:
     count: int
     """Number of rows that the header declares."""
     dtype: np.dtype | None
-    """Structured type of one row, possibly without a field; None if it contains a list, so that its size is unknown."""
+    """Structured type of one row, possibly without fields; None if it contains a list, so that its size is unknown."""
 
 
 @dataclass(frozen=True)
@@ -211,8 +212,9 @@ def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
     """Decode the INRIA layout: the Gaussians are the rows of element ``vertex``, with properties in any order and of
     any numeric type.
 
-    Without ``scale_2`` they are flat, as those of 2D Gaussian Splatting. Colours may be red, green and blue instead of
-    SH coefficients, and alpha instead of the opacity's logit. Raises ``UserError`` for a file of another kind.
+    Without ``scale_2`` they are flat, like those of 2D Gaussian Splatting. Colours may be red, green and blue instead
+    of SH coefficients, and alpha instead of the opacity's logit. Raises ``UserError`` if the file does not contain
+    Gaussians in this layout.
     """
     vertex = header.element("vertex")
     kinds = vertex.dtype if vertex is not None and vertex.dtype is not None else np.dtype([])
@@ -305,19 +307,20 @@ def _not_gaussians(header: PlyHeader, missing: list[str], source: Path) -> UserE
     faces = next((element.count for element in header.elements if element.name in ("face", "tristrips")), 0)
     if faces:
         return UserError(
-            f"{lacking}; it is a mesh of {faces} faces, which cannot be animated, train or export it as Gaussians"
+            f"{lacking}; it is a mesh of {faces} faces, which cannot be animated: train or export it as Gaussians"
         )
-    return UserError(f"{lacking}; it is a point cloud, which cannot be animated, train or export it as Gaussians")
+    return UserError(f"{lacking}; it is a point cloud, which cannot be animated: train or export it as Gaussians")
 
 
 def _rounding_notes(rows: np.ndarray, names: list[str]) -> list[str]:
-    """Return a note of the named fields whose values are not those of single precision."""
+    """Return a note that names the fields among ``names`` whose values change in single precision."""
     rounded = [name for name in names if not np.array_equal(rows[name], rows[name].astype(np.float32))]
     return [f"rounded to single precision: {_listed(rounded)}"] if rounded else []
 
 
 def _omission_notes(header: PlyHeader, properties: set[str]) -> list[str]:
-    """Return notes of the other elements, and of those properties of the Gaussians."""
+    """Return notes of the elements other than ``vertex``, and of ``properties`` of the Gaussians, which are all left
+    out."""
     notes = [f"properties left out: {_listed(sorted(properties))}"] if properties else []
     elements = [element.name for element in header.elements if element.name != "vertex" and element.count]
     return [*notes, *([f"elements left out: {_listed(elements)}"] if elements else [])]

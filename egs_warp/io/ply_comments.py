@@ -1,7 +1,7 @@
 """Tags in the comments of a .ply header: training with antialiasing, and the vertical axis.
 
 Forms in use: ``SplatRenderMode: mip`` (Brush, gsplat, splat-transform), ``antialiased 1`` (Postshot), ``Vertical Axis:
-z`` (nerfstudio) and ``Vertical axis: 0 -1 0`` (Brush), in any letter case. Of several, the last one holds.
+z`` (nerfstudio) and ``Vertical axis: 0 -1 0`` (Brush), in any letter case. If there are several, the last one applies.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def up_of(comments: Sequence[str]) -> tuple[np.ndarray | None, int | None]:
                 up = None
         elif len(numbers) == 3:
             direction = np.array(numbers, float)
-            # Divided first, so that the squares neither overflow nor vanish.
+            # Divide first, so that the squares neither overflow nor vanish.
             largest = np.abs(direction).max()
             if 0.0 < largest < np.inf:
                 direction /= largest

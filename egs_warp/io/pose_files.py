@@ -15,13 +15,13 @@ _JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
 _MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap")
 """Folders of COLMAP models or of their numbered folders, in order of preference."""
 _DISTORTED = "distorted/sparse"
-"""Folder of the model before the undistortion, which has other photos."""
+"""Folder of the model before the undistortion, which belongs to the original photos."""
 _BETWEEN = ("sparse", "colmap", "distorted")
 """Names of folders between the model and the folder of the data set."""
 _MAX_DEPTH = 3
 """Depth to which other folders are searched."""
 _START_BYTES = 4096
-"""Length of the beginning by which .csv and .xml files are recognised."""
+"""Number of bytes at the beginning by which .csv and .xml files are recognised."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class PoseSource:
 
 
 def find_poses(source: Path) -> PoseSource:
-    """Find the poses that ``source`` is or contains: of several COLMAP models of one kind, the one with the most
-    photos.
+    """Find the camera poses in the file or folder ``source``. Of several COLMAP models of one kind, the one with the
+    most photos is used.
 
     Raises ``UserError`` if there are none.
     """
@@ -70,7 +70,8 @@ def _has_model(folder: Path) -> bool:
 
 
 def _model_folders(source: Path) -> list[Path]:
-    """Return the folders of COLMAP models, in order of preference; those before the undistortion only alone."""
+    """Return the folders of COLMAP models, in order of preference; those before the undistortion only if there are no
+    others."""
     places = [source, *_numbered(source)]
     for name in _MODEL_FOLDERS:
         # Numbered folders come before a model that was placed above them later.
@@ -86,7 +87,7 @@ def _numbered(folder: Path) -> list[Path]:
 
 
 def _content(folder: Path) -> list[Path]:
-    """Return what is in ``folder``; nothing if it cannot be read."""
+    """Return the entries of ``folder``; none if it cannot be read."""
     try:
         return sorted(folder.iterdir())
     except OSError:
@@ -120,7 +121,7 @@ def _largest(models: list[Path], source: Path) -> tuple[Path, str]:
     rest = [f"{names[model]} ({count} photos)" for model, count in counts.items() if model != best]
     rest += [f"{names[model]} (not readable)" for model in failed]
     return best, (
-        f"{len(models)} COLMAP models: {names[best]} with {counts[best]} photos is used, the largest;"
+        f"of {len(models)} COLMAP models, the largest is used: {names[best]} with {counts[best]} photos;"
         f" not used: {', '.join(rest)}"
     )
 
@@ -132,7 +133,7 @@ def _data_folder(model: Path, source: Path) -> Path:
         folder = folder.parent
     while folder.name in _BETWEEN:
         folder = folder.parent
-    # The user's folder, where it is the same, one above, or contains photos itself.
+    # Use the user's folder if it is the same folder or one above it, or if it contains photos itself.
     if folder.is_relative_to(source.absolute()) or has_photos(source):
         return source
     return folder

@@ -125,7 +125,7 @@ def _transform(entry: _Entry, shared: dict, size: tuple[int, int] | None) -> Pos
     """Convert a frame: ``transform_matrix`` is camera to world, y up and z backwards; intrinsics are in the frame or
     shared. ``size`` is that of the photo as stored, for a file without sizes."""
     if not isinstance(entry.fields, dict):
-        raise UserError(f"{entry.source}: {entry.where} is not a record of fields; export the poses again")
+        raise UserError(f"{entry.source}: {entry.where} is not a JSON object; export the poses again")
     record = _Record(entry.source, entry.where, {**shared, **entry.fields})
     name = record.text("file_path")
     lens = _lens(record)
@@ -175,7 +175,8 @@ def _lens(record: _Record) -> Lens | None:
 
 
 def _oriented_size(record: _Record, image: Path | None, size: tuple[int, int] | None) -> tuple[int, int]:
-    """Return the size of the photo: as stored, unless its EXIF orientation is that in which the principal point fits.
+    """Return the size of the photo: as stored, or as rotated by its EXIF orientation if the principal point fits only
+    then.
 
     Raises the error of the photo if its ``size`` is unknown.
     """
@@ -188,8 +189,8 @@ def _oriented_size(record: _Record, image: Path | None, size: tuple[int, int] | 
 
 
 def _sizes(tree: dict, places: Sequence[PhotoAndMask], source: Path) -> list[tuple[int, int] | None]:
-    """Return the size of each photo as stored, for a file without sizes. If all that can be read have one size, it is
-    that of the others, too."""
+    """Return the size of each photo as stored, for a file without sizes. If all readable photos have the same size, the
+    others get that size, too."""
     frames = [frame for frame in tree["frames"] if isinstance(frame, dict)]
     if all(key in tree or key in frame for frame in frames for key in ("w", "h")):
         return [None] * len(places)
@@ -211,7 +212,7 @@ class _Record:
         self.source = source
         self.where = where
         if not isinstance(fields, dict):
-            raise UserError(f"{source}: {where} is not a record of fields; export the poses again")
+            raise UserError(f"{source}: {where} is not a JSON object; export the poses again")
         self.fields: dict = fields
 
     def numbers(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -289,8 +290,8 @@ def _with_decimal_points(value: object) -> object:
 
 
 def write_cameras(path: Path | str, cameras: Sequence[Camera], names: Sequence[str]) -> None:
-    """Write INRIA ``cameras.json``, which ``read_cameras`` and most tools read. Principal points must be in the
-    middle."""
+    """Write INRIA ``cameras.json``, which ``read_cameras`` and most tools read. Principal points must be in the middle
+    of the image."""
     entries = [
         {
             "id": number,

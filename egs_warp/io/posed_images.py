@@ -15,9 +15,9 @@ from egs_warp.geometry.lens import Lens
 from egs_warp.io.limits import MAX_COORDINATE, check_pixels, picture_size
 
 _MAX_FOCAL = 1e3
-"""Maximum focal length in sides of the photo; the minimum is the reciprocal."""
+"""Maximum ratio of the focal length to the longer side of the photo; the minimum is its reciprocal."""
 _MAX_CENTRE = 10.0
-"""Maximum distance of the principal point, in sides of the photo."""
+"""Maximum absolute coordinate of the principal point, relative to the longer side of the photo."""
 _MAX_OFFSET = 1e3
 """Distance of the cameras from the origin, in radii of the camera path, up to which single precision is sufficient."""
 
@@ -38,7 +38,7 @@ class PosedImage:
     mask: Path | None = None
     """File of the photo's mask; None if there is none."""
     missing: str = ""
-    """Reason why the photo or the mask was not found, if there is a special one."""
+    """Reason why the photo or the mask was not found, for the user; empty if nothing specific is known."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def size_of_photo(image: Path | None, what: str) -> tuple[int, int]:
     ``what``, for a photo that is missing or not readable."""
     size = picture_size(image, f"{image}: it") if image is not None else None
     if size is None:
-        raise UserError(f"{what}: the photo cannot be read, and the poses do not contain its size; put it there")
+        raise UserError(f"{what}: the photo cannot be read, and the poses do not contain its size; add a readable copy")
     return size
 
 

@@ -1,4 +1,4 @@
-"""Common record to which all capture formats are decoded before they become a ``GaussianCloud``."""
+"""Common record into which all capture formats are decoded before they become a ``GaussianCloud``."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ class RawCapture:
     origin: np.ndarray | None = None
     """(3,) float64, file units: offset of the capture, which ``means`` do not include."""
     rows: np.ndarray | None = None
-    """(n,) numbers of these Gaussians in the file; None if they are all."""
+    """(n,) indices of these Gaussians in the file; None if they are all Gaussians of the file."""
     notes: tuple[str, ...] = ()
-    """Gaussians left out and values repaired, for the user."""
+    """Messages for the user about Gaussians that were left out and values that were repaired."""
 
 
 def property_names(coefficient_count: int) -> dict[str, list[str]]:
@@ -72,7 +72,7 @@ def bands_note(rest: int) -> tuple[str, ...]:
         return ()
     if rest == BAND_4:
         return ("SH band 4 left out (degrees 0 to 3 are rendered)",)
-    return (f"{extra} of {rest} SH coefficients above band 0 left out: they make up no complete band of degree 1 to 3",)
+    return (f"{extra} of {rest} SH coefficients above band 0 left out: they do not complete a band of degree 1 to 3",)
 
 
 def logits_from_bytes(alphas: np.ndarray) -> np.ndarray:

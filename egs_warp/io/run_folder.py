@@ -1,8 +1,8 @@
-"""A folder of results belongs to one run: it is locked while it is written, and described by a manifest that is written
-last.
+"""Folder of the results of one run: it is locked while it is written, and described by a manifest that is written last.
 
-``manifest.json`` contains ``schema``, ``version``, ``command``, ``finished`` and ``files``: size and SHA-256 of each
-file by its name, also in folders of the run; null for the files and folders of an unfinished run.
+``manifest.json`` contains ``schema``, ``version``, ``command``, ``finished`` and ``files``. ``files`` maps the name of
+each file, including those in folders of the run, to its size and SHA-256. For an unfinished run it maps the names of
+files and folders to null.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ANIMATE = "animate"
 _LOCK = ".egs-run.lock"
 _SCHEMA = 1
 _FILE_ENDINGS = (".mp4", ".mov", ".webm", ".png", ".ply", ".spz", ".splat", ".sog", ".glb", ".json", ".npz", ".yaml")
-"""Endings of files, which no folder of results has."""
+"""Endings of file names, which the name of a folder of results may not have."""
 
 
 class RunFolder:
@@ -49,8 +49,8 @@ class RunFolder:
         self._begin: Callable[[], object] | None = None
 
     def begin_with(self, begin: Callable[[], object]) -> None:
-        """Let ``begin`` write its files before any other file, so that an interrupted run has them, too. A resumed run
-        has them already."""
+        """Call ``begin``, which writes files, before any other file is written, so that an interrupted run has them. A
+        resumed run has them already, so it does not call ``begin``."""
         if not self.resumed:
             self._begin = begin
 
@@ -75,7 +75,7 @@ class RunFolder:
         return self.path / name
 
     def folder(self, name: str) -> Path:
-        """Return the path of the run's folder ``name``, as ``file``. All files in it are results."""
+        """Return the path of the run's folder ``name``, like ``file``. All files in it are results."""
         self._result_folders.add(name)
         return self.file(name)
 
@@ -156,7 +156,7 @@ def clean_up(out: Path | str, scratch: str) -> None:
             if acquired:
                 shutil.rmtree(folder / scratch, ignore_errors=True)
                 sweep(folder)
-    # Nothing is removed where there is no permission.
+    # Leftovers that the process has no permission to remove are kept.
     except OSError:
         pass
 
@@ -200,8 +200,8 @@ def has_finished(out: Path | str) -> bool:
 
 
 def check_run_folder(out: Path | str, *, overwrite: bool = False, writes: Sequence[str] = ()) -> None:
-    """Raise the ``UserError`` of ``run_folder``, and of the files that the run ``writes``, as far as it is predictable,
-    without creating anything, before any long computation."""
+    """Raise the ``UserError`` of ``run_folder``, and that of the files that the run ``writes``, as far as it can be
+    predicted, before any long computation and without creating anything."""
     check_out(out)
     if Path(out).suffix.lower() in _FILE_ENDINGS and not Path(out).is_dir():
         problem = f"the results are a folder of files; give a name without {Path(out).suffix}"
@@ -242,7 +242,7 @@ def _exists(path: Path) -> bool:
     # Names that are too long or contain null bytes.
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise UserError(f"{path}: cannot be made ({reason}); choose another place") from error
+        raise UserError(f"{path}: cannot be created ({reason}); choose another place") from error
     return True
 
 
@@ -252,15 +252,15 @@ def _occupied(out: Path | str, what: str) -> UserError:
 
 
 def _known(folder: Path) -> list[str]:
-    """Return the files of the earlier run in ``folder`` by its manifest, which comes last."""
+    """Return the files of the earlier run in ``folder`` according to its manifest, followed by the manifest itself."""
     if not (folder / MANIFEST).is_file() or _is_unfinished(folder):
         return []
     return [*_names_in(_manifest(folder)), MANIFEST]
 
 
 def _is_unfinished(folder: Path) -> bool:
-    """Return True if the manifest in ``folder`` is of a run that was killed between it and its first file. It then
-    counts as no run."""
+    """Return True if the run in ``folder`` was killed after it wrote its manifest and before it wrote any other file.
+    Such a run does not count."""
     manifest = _manifest(folder)
     names = _names_in(manifest)
     unfinished = isinstance(manifest, dict) and manifest.get("finished") is False

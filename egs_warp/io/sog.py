@@ -34,7 +34,8 @@ class SogFiles:
     source: Path
     """Name for messages."""
     read: Callable[[str], bytes]
-    """Return the bytes of a file by its name in meta.json. Raises ``UserError`` if it is missing or corrupted."""
+    """Function that returns the bytes of a file by its name in meta.json. It raises ``UserError`` if the file is
+    missing or corrupted."""
 
     def image(self, name: str, count: int) -> np.ndarray:
         """(pixels, 4) uint8 RGBA of an image of ``count`` values, row by row from the top, lossless."""
@@ -176,14 +177,14 @@ def _decode_quaternions(pixels: np.ndarray) -> np.ndarray:
     tags = pixels[:, 3].astype(np.int64) - FIRST_TAG
     three = (pixels[:, :3] / 255.0 * 2.0 - 1.0) / np.sqrt(2.0)
     quaternions = largest_restored(three, np.maximum(tags, 0))
-    # Pixels without a rotation.
+    # Pixels without a valid rotation get the identity.
     quaternions[tags < 0] = (1.0, 0.0, 0.0, 0.0)
     return quaternions
 
 
 def _decode_rest(meta: SogMeta, files: SogFiles, version: int, pixels: Callable[[str], np.ndarray]) -> np.ndarray:
-    """(n, K-1, 3) coefficients, by a palette of coefficient sets, 64 to a row of the image, and the index of each
-    Gaussian in it."""
+    """(n, K-1, 3) coefficients, from a palette of coefficient sets, 64 per row of its image, and the index of each
+    Gaussian's set in the palette."""
     centroids_name, labels_name = meta.files("shN", 2)
     centroids = files.image_rows(centroids_name, at_most=_MAX_LABELS * max(_SH_COUNTS))[:, :, :3]
     height, width = centroids.shape[:2]
@@ -206,6 +207,6 @@ def _decode_rest(meta: SogMeta, files: SogFiles, version: int, pixels: Callable[
     labels = label_pixels[:, 0] + 256 * label_pixels[:, 1]
     if len(labels) and labels.max() >= len(palette):
         raise UserError(
-            f"{files.source}: {labels_name} points at SH set {labels.max()} of {len(palette)}; export the capture again"
+            f"{files.source}: {labels_name} refers to SH set {labels.max()} of {len(palette)}; export the capture again"
         )
     return values.astype(np.float32)[palette[labels]]

@@ -25,10 +25,10 @@ _PALETTE_LEVELS = 16
 def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = False) -> np.ndarray:
     """Write ``cloud`` as a .sog, a twentieth of the size of a .ply.
 
-    Lossy: positions to 1/65535 of the extent (finer near the origin), scales, colours and SH to one of 256 values each
-    chosen for the capture, rotations and opacity to 1/255; above 65,536 Gaussians similar SH sets are merged. Gaussians
-    are sorted in space unless ``keep_order`` is set. Returns the number (n,) in ``cloud`` of each Gaussian of the file.
-    Raises ``UserError`` if the file cannot be written.
+    The format is lossy: it rounds positions to 1/65535 of the extent (finer near the origin), rotations and opacity to
+    1/255, and scales, colours and SH to 256 values each, which are chosen for the capture. Above 65,536 Gaussians,
+    similar SH sets are merged. Gaussians are sorted in space unless ``keep_order`` is set. Returns (n,) the index in
+    ``cloud`` of each Gaussian of the file. Raises ``UserError`` if the file cannot be written.
     """
     means = cloud.means.numpy().astype(np.float64)
     order = np.arange(cloud.count) if keep_order else morton_order(means)
@@ -58,7 +58,7 @@ def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = Fals
         "sh0": {"codebook": colour_book.tolist(), "files": ["sh0.webp"]},
     }
     if cloud.antialiased:
-        # The entry of the description, and that of splat-transform.
+        # ``antialias`` is the entry of the format's description, ``model`` that of splat-transform.
         meta |= {"antialias": True, "model": "antialiased"}
     if cloud.sh_degree > 0:
         palette, labels = _palette(sh[:, 1:].reshape(len(sh), -1))
@@ -107,7 +107,7 @@ def _code_book(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _palette(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return at most 65,536 vectors (p, m) that represent ``vectors`` (n, m), and the index of each.
 
-    Cells are split at their mean, across the direction of largest variance, until there are enough.
+    Cells are split at their mean, perpendicular to the direction of largest variance, until there are enough.
     """
     count, width = vectors.shape
     if count <= 1 << _PALETTE_LEVELS:

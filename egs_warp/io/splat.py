@@ -1,7 +1,7 @@
 """.splat: 32 bytes per Gaussian and no header.
 
-Public description: https://github.com/antimatter15/splat. Position and scale as three float32 each, colour and opacity
-as four uint8, rotation as four uint8 (w x y z, (b - 128) / 128). There is no magic number and no SH beyond band 0.
+Public description: https://github.com/antimatter15/splat. Position and scale are three float32 each, colour and opacity
+four uint8, and the rotation four uint8 (w x y z, (b - 128) / 128). There is no magic number and no SH beyond band 0.
 """
 
 from __future__ import annotations

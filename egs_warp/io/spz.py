@@ -47,7 +47,8 @@ _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 _MAX_EXTENSION_BYTES = 1 << 20
 _MAX_FRACTIONAL_BITS = 24
 _SH_COUNTS = (*SH_COUNTS, BAND_4)
-# Precision of higher SH numbers, as in the reference writer: finer steps would only increase the gzip size.
+# Quantisation steps of SH coefficients above band 0, as in the reference writer: finer steps would only increase the
+# gzip size.
 _BAND1_STEP, _REST_STEP = 8, 16
 
 
@@ -70,7 +71,7 @@ class _Layout:
 
 
 def decode_spz(data: bytes, source: Path) -> RawCapture:
-    """Decode a .spz, gzipped or not. Raises ``UserError`` for a corrupt, truncated or too new one."""
+    """Decode a .spz, gzipped or not. Raises ``UserError`` if it is corrupt, truncated or of an unknown version."""
     # Only the size that the header declares is inflated, so that a crafted file cannot fill the memory.
     inflate = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     gzipped = data[:2] == b"\x1f\x8b"
@@ -201,9 +202,9 @@ def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> No
 
     Versions 3 and 4 contain the same numbers; files of version 4 are smaller, and fewer programs read them.
 
-    Lossy: positions to 2^-13 units, or 2^-13 of the size of a small capture (to fewer bits if the capture reaches so
-    far that they do not fit); log scales to 1/32 within -10 ... 5.9; opacity and colour to 1/255. Raises ``UserError``
-    if the file cannot be written, or most Gaussians are too small or too large for it.
+    The format is lossy: positions are rounded to 2^-13 units, or 2^-13 of the size of a small capture (to fewer bits if
+    the capture reaches so far that they do not fit), log scales to 1/32 within -10 ... 5.9, and opacity and colour to
+    1/255. Raises ``UserError`` if the file cannot be written, or most Gaussians are too small or too large for it.
     """
     if version not in (2, 3, 4):
         raise UserError(f"{path}: .spz version {version} cannot be written; choose 2, 3 or 4")
@@ -245,7 +246,7 @@ def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> No
 
 def _fractional_bits(means: np.ndarray, reach: float) -> int:
     """Return the fractional bits of positions: enough for the size of the capture (the median distance from its middle,
-    in each direction), if the farthest at ``reach`` fits."""
+    in each direction), if the farthest position, at ``reach``, fits."""
     size = 2.0 * float(np.median(np.abs(means - np.median(means, axis=0)).max(axis=1)))
     bits = _FRACTIONAL_BITS
     if 0.0 < size < _SMALL:
@@ -256,7 +257,7 @@ def _fractional_bits(means: np.ndarray, reach: float) -> int:
 
 
 def _check_sizes(log_scales: np.ndarray, path: Path | str) -> None:
-    """Raise ``UserError`` if most Gaussians have another size than the format can store."""
+    """Raise ``UserError`` if most Gaussians are smaller or larger than the format can store."""
     high = _MIN_LOG_SCALE + 255.0 / _LOG_SCALE_STEPS
     typical = float(np.median(log_scales.max(axis=1)))
     if not _MIN_LOG_SCALE - 0.5 / _LOG_SCALE_STEPS <= typical <= high + 0.5 / _LOG_SCALE_STEPS:

@@ -36,7 +36,8 @@ _AXES = (
 
 
 def inflate_streams(data: bytes, sizes: Sequence[int], source: Path) -> bytes:
-    """Decompress the blocks of ``sizes`` bytes, one after another. Raises ``UserError`` if the file has others.
+    """Decompress the blocks, which have ``sizes`` bytes, and concatenate them. Raises ``UserError`` if the blocks of
+    the file have other sizes.
 
     Only ``sizes`` bytes are inflated, so that a crafted file cannot fill the memory.
     """
@@ -66,7 +67,7 @@ def inflate_streams(data: bytes, sizes: Sequence[int], source: Path) -> bytes:
 
 
 def deflate_streams(header: bytes, blocks: Sequence[bytes]) -> list[bytes]:
-    """Return the parts of a file of ``blocks``; empty ones are left out, as the format requires.
+    """Return the parts of a file that contains ``blocks``; empty blocks are left out, as the format requires.
 
     ``header`` is that of version 3, with another version number; the part after its flags is replaced.
     """

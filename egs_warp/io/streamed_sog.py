@@ -29,7 +29,7 @@ def decode_streamed_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
     ranges: dict[int, list[tuple[int, int]]] = {}
     for file, start, count in _leaves(tree, files):
         if file >= len(names):
-            raise UserError(f"{files.source}: lod-meta.json points at file {file} of {len(names)}; export it again")
+            raise UserError(f"{files.source}: lod-meta.json refers to file {file} of {len(names)}; export it again")
         ranges.setdefault(file, []).append((start, start + count))
     if not ranges:
         raise UserError(f"{files.source}: it has no Gaussians; export it again from the tool that made it")
@@ -64,7 +64,7 @@ def _part(files: SogFiles, name: str, ranges: list[tuple[int, int]]) -> RawCaptu
     part = decode_sog(files.read(name), SogFiles(files.source, lambda file: files.read(str(folder / file))))
     if max(end for _, end in ranges) > len(part.means):
         raise UserError(f"{files.source}: truncated: {name} has {len(part.means)} Gaussians; export the capture again")
-    # Before indices are allocated: overlapping leaves may be many.
+    # Check this before indices are allocated: there may be many overlapping leaves.
     if sum(end - start for start, end in ranges) > len(part.means):
         raise UserError(f"{files.source}: leaves of {name} overlap in lod-meta.json; export the capture again")
     chosen = np.concatenate([np.arange(start, end) for start, end in ranges])

@@ -15,7 +15,7 @@ _EXACT_DIGITS = 15
 
 
 def read_text(path: Path | str) -> str:
-    """Read the text of a file. Raises ``UserError`` if there is none."""
+    """Read the text of a file. Raises ``UserError`` if it cannot be read or decoded."""
     return decode_text(read_bytes(path, at_most=MAX_TEXT_BYTES), path)
 
 

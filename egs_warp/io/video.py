@@ -88,7 +88,7 @@ def ffmpeg_program() -> str:
 
 
 class _AbandonedError(Exception):
-    """Marks the end of a video that failed."""
+    """Internal error that ends a video that failed."""
 
 
 _TOO_LARGE = getattr(signal, "SIGXFSZ", 0)
@@ -201,7 +201,8 @@ class VideoWriter:
             self._abandon()
 
     def _abandon(self) -> None:
-        """Leave the existing file at the path. The error does not concern the path, so it is not passed on."""
+        """Discard the video and leave an existing file at the path unchanged. The original error is not passed on,
+        because it does not concern the path."""
         self._files.__exit__(_AbandonedError, _AbandonedError(), None)
 
     def _failure(self) -> UserError:

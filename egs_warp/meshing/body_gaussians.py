@@ -13,17 +13,18 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 
 _STEPS_PER_E = 64
-"""Log scales are rounded to this many steps per factor of e (1.6 %), as a file's log scales lose bits when its unit
-changes."""
+"""Number of steps per factor of e (1.6 % each) to which log scales are rounded, because those of a file lose bits when
+its unit changes."""
 
 MAX_GAUSSIANS = 500_000
-"""Gaussians from which a body is measured (``representatives``)."""
+"""Maximum number of Gaussians from which a body is measured (``representatives``)."""
 _WIDE = 1.0 / 64.0
-"""Fraction of the body's size: a spacing of the lattice on which its solid is found."""
+"""Width above which all Gaussians are kept, as a fraction of the body's size: one spacing of the lattice on which its
+solid is found."""
 
 
 def centred(cloud: GaussianCloud) -> tuple[GaussianCloud, np.ndarray]:
-    """Move the capture to an origin amid its Gaussians. Returns it and the origin (3,), capture's units.
+    """Move the capture to an origin amid its Gaussians; return the moved capture and the origin (3,), capture's units.
 
     Each coordinate of the origin is one of the capture's own, so a translation that single precision represents exactly
     does not change the result.
@@ -58,15 +59,15 @@ def canonical_order(cloud: GaussianCloud) -> np.ndarray:
 
 
 def _increasing_bits(values: np.ndarray) -> np.ndarray:
-    """(n,) uint64 below 2^32 in the order of float32 ``values`` (n,); the same for 0 and -0."""
+    """(n,) uint64 below 2^32 that sort like the float32 ``values`` (n,); 0 and -0 give the same integer."""
     bits = (values + np.float32(0.0)).view(np.uint32)
     return np.where(bits >> 31 == 1, ~bits, bits | np.uint32(1 << 31)).astype(np.uint64)
 
 
 def representatives(cloud: GaussianCloud) -> GaussianCloud:
-    """Return at most ``MAX_GAUSSIANS`` that show the same body; the cloud itself if it has no more.
+    """Return at most ``MAX_GAUSSIANS`` Gaussians that show the same body; the cloud itself if it has no more than that.
 
-    Those that are wide, of which few show much of the surface, all remain, and an equal share of the others.
+    All wide Gaussians remain, because a few of them show much of the surface. The others are sampled evenly.
     """
     if cloud.count <= MAX_GAUSSIANS:
         return cloud

@@ -27,7 +27,7 @@ _MIN_DIHEDRAL_DEGREES = 8.0
 _MIN_ENCLOSED_FRACTION = 0.9993
 MIN_NODES, MAX_NODES = 50, 20_000
 _MAX_THICKENING = 2.5
-"""Objects that elements make thicker than this are refused."""
+"""Largest ``Cage.thickening`` of an object; an object that the elements make thicker is rejected."""
 _MAX_GROWTH_STEPS = 6
 _GROWTH_SAMPLE = 20000
 _REFINEMENT_PER_STEP = 0.15
@@ -36,8 +36,8 @@ _THIN_RADIUS = 0.56
 is sqrt(5)/4."""
 
 _CELL_SIZES_PER_OCTAVE = 16
-"""Cell sizes per factor of 2. Cell sizes are rounded, so that the cell does not change if a few lattice points are
-added or removed."""
+"""Number of cell sizes per factor of 2. Cell sizes are rounded to these, so that the cell does not change if a few
+lattice points are added or removed."""
 
 
 class CageMethod(Enum):
@@ -141,9 +141,9 @@ def cage_of_body(
     _check_thickness(solid)
     weights = np.where(solid.belongs, cloud.opacities(), 0.0)
     distance = _Distance(solid)
-    # Two nodes a cell inside, and about as many again on the surface.
+    # A cell has two nodes inside the solid, and the surface has about as many nodes in total as the inside.
     cell = _rounded_cell((4.0 * np.count_nonzero(solid.inside) / target_nodes) ** (1.0 / 3.0))
-    # While the cage grows, large captures are evaluated by a regular sample; the final value uses all Gaussians.
+    # While the cage grows, large captures are evaluated on a regular sample; the final value uses all Gaussians.
     sample = np.arange(0, cloud.count, max(1, cloud.count // _GROWTH_SAMPLE))
     best: tuple[float, float, TetMesh, CageMethod] | None = None
     for growth in range(_MAX_GROWTH_STEPS):
@@ -176,15 +176,15 @@ def cage_of_body(
 
 def _too_thin(why: str) -> UserError:
     return UserError(
-        f"object: it is too thin for its elements ({why}); choose a thicker object, or cut out a piece of at most 20"
-        " times its thickness",
+        f"object: it is too thin for its elements ({why}); choose a thicker object, or cut out a piece whose"
+        " longest side is at most 20 times its thickness",
         check=("plane", "up"),
     )
 
 
 def _thickening(cloud: GaussianCloud, solid: LatticeSolid, mesh: TetMesh) -> float:
-    """Return ``Cage.thickening``: extents of the object are those of the means of all but 0.2 % of its opacity, and a
-    typical standard deviation on either side."""
+    """Return ``Cage.thickening``: the extents of the object are those of the means of all but 0.2 % of its opacity,
+    plus a typical standard deviation on either side."""
     means = cloud.means.numpy()[solid.belongs].astype(np.float64)
     low, high = mass_quantiles(means, cloud.opacities()[solid.belongs], 0.001, 0.999)
     extents, sizes = (
@@ -205,7 +205,7 @@ def _share(cloud: GaussianCloud, chosen: np.ndarray) -> float:
 
 
 def _check_thickness(solid: LatticeSolid) -> None:
-    """Raise ``UserError`` for a sheet: it is at most as thick as the blur of the lattice, in every direction."""
+    """Raise ``UserError`` for a sheet, which is nowhere thicker than the blur of the lattice."""
     thickest = float(_edt(np.pad(solid.inside, 1)[:, :, 1:]).max())
     size = np.ptp(np.argwhere(solid.inside), axis=0) + 1
     if thickest < 2.0 or size.min() < 4:
@@ -232,7 +232,7 @@ def _lattice_mesh(
     """Return nodes (lattice spacings), tetrahedra and cell of the lattice mesh with the number of nodes nearest to the
     target.
 
-    Secant steps on the cell size, starting from ``cell``, with rounded sizes.
+    The cell size is found by secant steps from ``cell`` and is rounded in each step.
     """
     best: tuple[float, np.ndarray, np.ndarray, float] | None = None
     for _ in range(6):
@@ -255,12 +255,13 @@ def _lattice_mesh(
 
 
 def _rounded_cell(cell: float) -> float:
-    """Round the size of a cell."""
+    """Round ``cell`` to one of the ``_CELL_SIZES_PER_OCTAVE`` sizes per factor of 2."""
     return float(2.0 ** (np.rint(_CELL_SIZES_PER_OCTAVE * np.log2(cell)) / _CELL_SIZES_PER_OCTAVE))
 
 
 class _Distance:
-    """Distances of the solid and its mirror image below the plane, which do not depend on the dilation."""
+    """Distances to the surface of the solid and its mirror image below the plane; they do not depend on the
+    dilation."""
 
     def __init__(self, solid: LatticeSolid) -> None:
         self.pad = int(np.ceil(0.25 * solid.longest_side / solid.spacing))
@@ -271,7 +272,7 @@ class _Distance:
         self.smooth = np.asarray(ndimage.gaussian_filter(self.sharp, 0.9))
         """Smoothed signed distance, without the lattice's steps."""
         self.medial = (self.smooth < -0.2) & (self.smooth <= ndimage.minimum_filter(self.smooth, 3))
-        """Mask of its crests, as in the middle of a thin part (there is none at corners)."""
+        """Mask of the crests of the depth, which lie in the middle of thin parts (corners have none)."""
         self.longest_side = solid.longest_side / solid.spacing
         """Longest side of the object, in lattice spacings."""
         self.middle = -solid.corner[:2]
@@ -282,8 +283,8 @@ class _Field:
     """Smooth signed distance of the dilated solid, in lattice spacings; negative inside."""
 
     def __init__(self, distance: _Distance, dilation: float, *, thin_radius: float) -> None:
-        """Compute the field. ``dilation`` is in longest sides; parts thinner than ``thin_radius`` (spacings) are
-        thickened to it."""
+        """Compute the field. ``dilation`` is in units of the longest side; parts with a radius below ``thin_radius``
+        (spacings) are thickened to it."""
         # The solid is mirrored at z = 0: the nearest crest of a point above the plane lies above it.
         above = np.s_[:, :, distance.smooth.shape[2] // 2 :]
         value = np.minimum(distance.smooth[above], distance.sharp[above] + 0.3) - dilation * distance.longest_side
@@ -333,7 +334,7 @@ def _largest_part(nodes: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _enclosed_share(cloud: GaussianCloud, mesh: TetMesh, weights: np.ndarray, sample: np.ndarray) -> float:
-    """Fraction of ``weights`` (n,) inside the mesh, over the means with indices ``sample`` (m,)."""
+    """Return the fraction of ``weights`` (n,) inside the mesh, computed from the means with indices ``sample`` (m,)."""
     centre = mesh.nodes.mean(axis=0)
     size = float(np.ptp(mesh.nodes, axis=0).max())
     surface = wp.Mesh(

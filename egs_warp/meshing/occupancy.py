@@ -52,13 +52,13 @@ def solid_from_gaussians(cloud: GaussianCloud, *, resolution: int = 64) -> Latti
     """Return the occupied and enclosed space above z = 0: the connected part with most of the opacity mass.
 
     ``cloud`` is in its body's frame. ``resolution`` lattice spacings span the object's longest side. The outermost
-    lattice points affect only an integer, so a body that has hardly changed keeps its lattice. Raises ``UserError`` if
-    nothing opaque stands on the plane.
+    lattice points determine only the integer corner and size of the lattice, not its spacing, so a body that has hardly
+    changed keeps its lattice. Raises ``UserError`` if nothing opaque stands on the plane.
     """
     means = cloud.means.numpy().astype(np.float64)
     opacities = cloud.opacities()
     low, high = _robust_bounds(means, opacities)
-    # A coarse pass first, because outliers may have stretched the bounds.
+    # Start with a coarse pass, because outliers may have stretched the bounds.
     coarse = _solid_within(cloud, means, opacities, low, high, float(np.max(high - low)), min(resolution, 40))
     indices = np.argwhere(coarse.inside)
     low, high = coarse.points(indices.min(axis=0)), coarse.points(indices.max(axis=0))
@@ -82,7 +82,7 @@ def _longest_side(means: np.ndarray, opacities: np.ndarray) -> float:
 
 
 def mass_quantiles(means: np.ndarray, opacities: np.ndarray, *shares: float) -> list[np.ndarray]:
-    """Return the points (3,) below which, along each axis, these shares of the mass lie."""
+    """Return, for each of ``shares``, the point (3,) below which this share of the mass lies along each axis."""
     quantiles = np.empty((len(shares), 3))
     for axis in range(3):
         order = np.argsort(means[:, axis], kind="stable")
@@ -130,7 +130,7 @@ def _solid_within(
     if not occupied.any():
         raise UserError(
             f"object: nothing opaque stands on the plane (of {cloud.count} Gaussians, {int(np.sum(means[:, 2] > 0))} "
-            f"are above it, most opaque {opacities.max():.2g})",
+            f"are above it; the largest opacity is {opacities.max():.2g})",
             check=("plane", "up"),
         )
     node = np.rint(means / spacing).astype(int) - corner
@@ -163,7 +163,7 @@ def _bridge(occupied: np.ndarray, radius: int) -> np.ndarray:
 
 
 def _fill(piece: np.ndarray, device: wp.Device) -> np.ndarray:
-    """Fill enclosed space. Two passes, because space filled in the first pass shields the rest."""
+    """Fill enclosed space. A second pass fills points that only the points filled in the first pass enclose."""
     solid = piece
     for _ in range(2):
         filled = wp.zeros(solid.shape, dtype=wp.uint8, device=device)

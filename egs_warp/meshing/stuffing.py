@@ -133,7 +133,7 @@ def _snap(
     ends = edges[cut]
     at = _roots(field, points[ends[:, 0]], points[ends[:, 1]], np.where(value[ends[:, 0]] < 0.0, 1, -1))
     length = np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)
-    # From a floor point straight up, the edge is half a long edge.
+    # The vertical edge of a floor point is half as long as other long edges.
     limit = np.where(edge_is_long[cut], _SNAP_LONG * length.max(initial=0.0), _SNAP_SHORT * length)
     snapped, on_surface = points.copy(), value.copy()
     end = ends.T.ravel()
@@ -141,7 +141,8 @@ def _snap(
     travel = np.linalg.norm(target - points[end], axis=1)
     close = travel < np.concatenate([limit, limit])
     end, target, travel = end[close], target[close], travel[close]
-    # The last write wins: farthest first, and for floor points the intersections along the floor last.
+    # Later writes overwrite earlier ones: the nearest intersection is written last, and for floor points the ones along
+    # the floor are written after all others.
     in_floor = is_floor[end] & (target[:, 2] == 0.0)
     order = np.lexsort((-travel, in_floor))
     for k in order:
@@ -168,7 +169,8 @@ def _fill_tets(
     edge_is_long: np.ndarray,
     node_of_edge: np.ndarray,
 ) -> np.ndarray:
-    """Return the inside part (T', 4) of every tetrahedron, by its pattern of signs."""
+    """Return tetrahedra (T', 4) that fill the part of every tetrahedron inside the surface, according to its pattern of
+    signs."""
     order = np.argsort(-sign[tets], axis=1, kind="stable")
     tets = np.take_along_axis(tets, order, axis=1)
     signs = sign[tets]
@@ -220,7 +222,7 @@ def _prisms(
     top: np.ndarray, bottom: np.ndarray, own01: np.ndarray, own02: np.ndarray, own12: np.ndarray
 ) -> list[np.ndarray]:
     """Return three tetrahedra for each prism. The diagonal of quad ij runs from top i to bottom j where ``own_ij`` is
-    set, else from top j to bottom i. The three choices never form a cycle."""
+    set, otherwise from top j to bottom i. The three choices never form a cycle."""
     wins = np.stack([own01.astype(int) + own02, ~own01 + own12.astype(int), (~own02).astype(int) + ~own12], axis=1)
     rank = np.argsort(-wins, axis=1, kind="stable")
     p, q = np.take_along_axis(top, rank, axis=1).T, np.take_along_axis(bottom, rank, axis=1).T

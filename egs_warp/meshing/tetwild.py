@@ -37,7 +37,8 @@ def flat_bottomed_surface(field: SampledField) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
-    """Build a mesh of about ``target_nodes`` nodes by fTetWild, or return None if it fails. Two runs differ."""
+    """Build a mesh of about ``target_nodes`` nodes by fTetWild, or return None if it fails. Two runs give different
+    meshes."""
     vertices, faces = flat_bottomed_surface(field)
     tetrahedralize = _tetrahedralize()
     edge_length = 0.05 * (600.0 / target_nodes) ** 0.5

@@ -14,8 +14,8 @@ from egs_warp.render.compositing import PendingImage
 
 
 class AsyncRenderer:
-    """Renders images of one size, each submitted and fetched later, on a stream of its own; on a CPU ``submit``
-    blocks."""
+    """Renderer of images of one size on a stream of its own: an image is submitted, and fetched later. On a CPU
+    ``submit`` blocks until the image is finished."""
 
     def __init__(self, width: int, height: int, device: wp.Device) -> None:
         shape = (height, width, 3)
@@ -38,8 +38,8 @@ class AsyncRenderer:
             self._download(self._pending)
 
     def result(self) -> np.ndarray | None:
-        """Wait for the submitted image; return it as (H, W, 3) uint8 in memory that the next one overwrites, or None if
-        there is none."""
+        """Wait for the submitted image; return it as (H, W, 3) uint8 in memory that the next image overwrites, or None
+        if no image has been submitted."""
         pending, self._pending = self._pending, None
         if pending is None:
             return None

@@ -65,15 +65,16 @@ def render_torch(
     current stream.
 
     Args:
-        rotation: (3, 3), replaces the camera's; its gradient is by the nine entries, taken as independent.
+        rotation: (3, 3), replaces the camera's; its gradient is with respect to the nine entries, treated as
+            independent.
         translation: (3,), replaces the camera's; given together with ``rotation`` or not at all.
         screen: (n, 2), any values; receives the gradient with respect to the screen positions in pixels, which
             densification uses.
         background, antialiased, threads: as for ``render_gaussians``.
-        mask: as for ``render_gaussians``; tiles that it leaves out contribute no gradient.
+        mask: as for ``render_gaussians``; tiles that it excludes do not contribute to the gradients.
 
     Raises:
-        UserError: as ``render_gaussians``, and for tensors of another shape, type or device.
+        UserError: as for ``render_gaussians``, and if a tensor does not have the required shape, type or device.
     """
     attributes = (means, rotations, log_scales, opacity_logits, sh)
     _check_tensors(*attributes)
@@ -93,7 +94,7 @@ def render_torch(
 
 
 def _check_tensors(*attributes: torch.Tensor) -> None:
-    """Raise ``UserError`` for a tensor of another shape, type or device than ``render_torch`` takes."""
+    """Raise ``UserError`` if a tensor does not have the shape, type or device that ``render_torch`` requires."""
     means, _, _, _, sh = attributes
     count, device = means.shape[0], means.device
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, sh.shape[1], 3))

@@ -25,7 +25,7 @@ class CloudGradients:
     means: wp.array
     """(n,) vec3."""
     rotations: wp.array
-    """(n,) vec4, by the quaternion as stored; orthogonal to it, because its length has no effect."""
+    """(n,) vec4, with respect to the stored quaternion; orthogonal to it, because its length has no effect."""
     log_scales: wp.array
     """(n,) vec3."""
     opacity_logits: wp.array

@@ -72,7 +72,8 @@ class RenderedImage:
 class PendingImage:
     """Image and tile lists that are queued on the device.
 
-    A GPU would idle while the host waits for the number of pairs. So that number is guessed, and checked in ``result``.
+    A GPU would idle while the host waits for the number of (Gaussian, tile) pairs, so the number is guessed, and
+    ``result`` checks the guess.
     """
 
     def __init__(

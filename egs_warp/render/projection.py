@@ -40,7 +40,7 @@ class ProjectedGaussians:
         """Number of (Gaussian, tile) pairs. On a GPU the first access blocks.
 
         Raises:
-            UserError: names the first Gaussian with a non-finite value, or says that there are too many pairs.
+            UserError: a Gaussian has a non-finite value (the message names the first one), or there are too many pairs.
         """
         return self.count_slots()
 
@@ -154,8 +154,8 @@ def _too_many(cloud: GaussianCloud, view: Any, slot_end: np.ndarray) -> UserErro
     bad = np.flatnonzero(np.diff(slot_end, prepend=0) >= int(NOT_FINITE))
     if len(bad) == 0:
         return UserError(
-            f"render: {cloud.count} Gaussians cover {slot_end[-1]} tiles of {view.width} x {view.height} pixels, more"
-            " than 2^30; render a smaller image or fewer Gaussians"
+            f"render: {cloud.count} Gaussians form {slot_end[-1]} (Gaussian, tile) pairs at {view.width} x"
+            f" {view.height} pixels, more than 2^30; render a smaller image or fewer Gaussians"
         )
     finite = {name: bool(np.isfinite(getattr(cloud, name).numpy()[bad[0]]).all()) for name in ARRAYS}
     # Finite coefficients may still sum to a non-finite colour.

@@ -51,8 +51,8 @@ def render_gaussians(
         threads: CPU threads, by default the available cores; the image does not depend on it.
 
     Raises:
-        UserError: a Gaussian is not finite (the message names it), the camera is invalid, or background or mask have
-            another size.
+        UserError: a Gaussian is not finite (the message names it), the camera is invalid, or the background or mask
+            does not have the camera's size.
     """
     threads = threads or available_threads()
     arguments = {"background": background, "antialiased": antialiased, "mask": mask, "threads": threads}
@@ -106,7 +106,7 @@ def render_views(
     if len(backgrounds) != len(cameras) or "background" in options:
         raise UserError(
             f"render: {len(backgrounds)} backgrounds for {len(cameras)} cameras"
-            f"{' and one for all' if 'background' in options else ''}; give one for each"
+            f"{' and one background for all' if 'background' in options else ''}; give one for each"
         )
     return [
         render_gaussians(cloud, camera, background=behind, **options)

@@ -32,8 +32,8 @@ def shadow_blur_radius(body: GaussianCloud) -> float:
 class ContactShadow:
     """The ground as one camera sees it, and the shadow of a body on it.
 
-    Each Gaussian casts a shadow by its opacity and the area of its broad side; shadows of higher Gaussians are wider
-    and paler. Arrays are on ``device``, in row-major order of the pixels.
+    The shadow of a Gaussian depends on its opacity and on the area of its broad side; shadows of higher Gaussians are
+    wider and paler. Arrays are on ``device``, in row-major order of the pixels.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class ContactShadow:
             device: device of the arrays.
             blur_radius: world units, blur radius of the body, see ``shadow_blur_radius``; 0 without a body.
             height: height of the body, world units; 0 without a body.
-            depth: (H, W) z-depth of the uneven ground that receives the shadow, 0 where that is the plane.
+            depth: (H, W) z-depth of the uneven ground that receives the shadow, 0 where the plane receives it.
         """
         self.camera, self.plane, self.device = camera, plane, device
         edges = height * np.array([layer[:2] for layer in _LAYERS])
@@ -98,7 +98,7 @@ class ContactShadow:
         """Return the shadow map (texels, texels) float32, seen from above."""
         shape = (len(_LAYERS), _MAP, _MAP)
         coverage = zeros(shape, wp.int64, self.device)
-        # One thread on a CPU, where concurrent additions to one texel are not atomic.
+        # Use one thread on a CPU, where concurrent additions to one texel are not atomic.
         launch_cached(
             kernels.coverage_kernel,
             body.count,

@@ -48,8 +48,8 @@ class TileLists:
 def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int, guess: bool = False) -> TileLists:
     """Sort the visible Gaussians by depth and list them for every tile that they reach (exact ellipse-tile test).
 
-    With ``guess``, a GPU does not wait for the number of pairs if recent images had few; ``lists_fit`` then tells if
-    the guessed capacity was large enough.
+    With ``guess``, the host does not wait for the number of pairs if recent images had few; ``lists_fit`` then returns
+    whether the guessed capacity was large enough.
     """
     columns = -(-view.width // TILE_SIDE)
     rows = -(-view.height // TILE_SIDE)
@@ -80,7 +80,7 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
     by_depth[:visible_count] = gaussian_from_visible
     wp.utils.radix_sort_pairs(keys, order, visible_count)
 
-    # Near Gaussians reach more tiles than far ones: chunks have the same number of pairs, not of Gaussians.
+    # Near Gaussians reach more tiles than far ones, so chunks have equal numbers of pairs instead of Gaussians.
     chunks = min(8 + 4 * threads, max(1, visible_count // 256)) if threads > 1 else 1
     # One Gaussian in eight is a sufficient sample.
     pairs_done = np.cumsum(slot_counts[by_depth[:visible_count:8]])
@@ -172,7 +172,7 @@ _expected: dict[str, int] = {}
 
 @dataclass(frozen=True)
 class _PairBuffers:
-    """Buffers for the lists of some number of pairs, with scratch."""
+    """Buffers for the lists of a given number of pairs, and scratch space for the sort."""
 
     keys: wp.array
     scratch: wp.array

@@ -89,7 +89,7 @@ def test_gaussians_bound_to_a_surface_follow_it_and_not_the_cage(device: str) ->
 
 def test_a_surface_needs_triangles_with_area() -> None:
     corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
-    with pytest.raises(UserError, match="surface: triangle 0 has no area; give triangles with three corners apart"):
+    with pytest.raises(UserError, match="surface: triangle 0 has no area; give triangles with an area above zero"):
         BoundSurface(corners, np.array([[0, 1, 2]], dtype=np.int32))
     shifted = corners + [1.0, -2.0, 3.0]
     twice = np.array([[1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [0.0, 1.0, 0.0]])

@@ -138,7 +138,7 @@ def test_onnx_external_data_are_not_read(tmp_path: Path, monkeypatch: pytest.Mon
     (tmp_path / "secret").write_bytes(np.array([9, 9, 9], np.float32).tobytes())
     (tmp_path / "grey.onnx").write_bytes(grey_paint(external="secret"))
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match=r"grey\.onnx: some of its numbers lie in other files, which are not read"):
+    with pytest.raises(UserError, match=r"grey\.onnx: some of its numbers are in other files, which are not read"):
         inpainter_by_name("grey.onnx")
 
 

@@ -256,7 +256,7 @@ def test_missing_or_unreadable(tmp_path: Path) -> None:
         ("[", ": not readable JSON at line 1 (Expecting value); give a cameras.json or a transforms.json"),
         ("{}", ": neither a list of cameras nor frames; give a cameras.json or a transforms.json"),
         ("[]", ": it has no cameras; export the poses again"),
-        ("[1]", ": camera 0 is not a record of fields; export the poses again"),
+        ("[1]", ": camera 0 is not a JSON object; export the poses again"),
     ):
         (tmp_path / "b.json").write_text(text)
         assert message(tmp_path / "b.json") == expected

@@ -155,7 +155,7 @@ def test_the_largest_model_is_used(models: dict[str, int], expected: str, tmp_pa
     among = [folder for folder in models if folder.startswith("distorted") == expected.startswith("distorted")]
     assert len(poses.notes) == (len(among) > 1)
     for note in poses.notes:
-        assert f"{len(among)} COLMAP models: {expected} with {models[expected]} photos is used, the largest" in note
+        assert f"of {len(among)} COLMAP models, the largest is used: {expected} with {models[expected]} photos" in note
         assert all(f"{folder} ({models[folder]} photos)" in note for folder in among if folder != expected)
     if expected.startswith("work"):
         return

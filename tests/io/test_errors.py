@@ -72,7 +72,7 @@ def test_mesh_ply_names_what_is_missing(tmp_path: Path) -> None:
     mesh += b"element face 0\nproperty list uchar int vertex_indices\nend_header\n" + bytes(12)
     assert message(written(tmp_path / "mesh.ply", mesh)) == (
         "not a 3DGS capture: element vertex has no rot_0, rot_1, rot_2, rot_3, scale_0, scale_1, opacity, "
-        "f_dc_0, f_dc_1, f_dc_2; it is a point cloud, which cannot be animated, train or export it as Gaussians"
+        "f_dc_0, f_dc_1, f_dc_2; it is a point cloud, which cannot be animated: train or export it as Gaussians"
     )
 
 

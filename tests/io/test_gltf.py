@@ -332,7 +332,7 @@ def test_instances_without_attributes(tmp_path: Path) -> None:
 
 
 def test_nodes_that_form_no_tree(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="its nodes form no tree: node 2 has two parents"):
+    with pytest.raises(UserError, match="its nodes are not a tree: node 2 has two parents"):
         _with_nodes(tmp_path, make_cloud(5), [{"children": [2]}, {"children": [2]}, {"mesh": 0}])
 
 

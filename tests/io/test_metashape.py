@@ -133,7 +133,7 @@ def test_metashape_leaves_out_what_is_not_aligned(tmp_path: Path) -> None:
     ("text", "expected"),
     [
         ("<document><chunk>", "not readable XML (no element found"),
-        ("<document><chunk/></document>", "no cameras of a chunk; export the cameras again as XML"),
+        ("<document><chunk/></document>", "it has no chunk with cameras; export the cameras again as XML"),
         ("<document><chunk><cameras/></chunk></document>", "it has no cameras; export the cameras again as XML"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><document><chunk/></document>', "it has a document type, which Metashape does"),
         (

@@ -76,7 +76,7 @@ def test_values_beyond_single_precision_are_reported(tmp_path: Path) -> None:
     path = spoiled(tmp_path / "a.ply", [5, 6], log_scales=-3e38, opacity_logits=-1e30)
     capture = read_capture(path, device="cpu")
     assert capture.notes == (
-        "2 Gaussians with a log scale below -100 read as that",
+        "2 Gaussians with a log scale below -100 read with that value",
         "2 infinite opacities were read as 0 or 1",
     )
     assert capture.infinite_opacities == 2

@@ -145,9 +145,9 @@ def test_alpha_in_place_of_the_opacity(tmp_path: Path) -> None:
     ("rest", "degree", "note"),
     [
         (24, 3, "SH band 4 left out (degrees 0 to 3 are rendered)"),
-        (35, 3, "20 of 35 SH coefficients above band 0 left out: they make up no complete band of degree 1 to 3"),
-        (12, 2, "4 of 12 SH coefficients above band 0 left out: they make up no complete band of degree 1 to 3"),
-        (2, 0, "2 of 2 SH coefficients above band 0 left out: they make up no complete band of degree 1 to 3"),
+        (35, 3, "20 of 35 SH coefficients above band 0 left out: they do not complete a band of degree 1 to 3"),
+        (12, 2, "4 of 12 SH coefficients above band 0 left out: they do not complete a band of degree 1 to 3"),
+        (2, 0, "2 of 2 SH coefficients above band 0 left out: they do not complete a band of degree 1 to 3"),
         (15, 3, None),
     ],
 )
@@ -178,7 +178,7 @@ def test_a_scale_of_minus_infinity_is_flat(tmp_path: Path) -> None:
     capture = read(tmp_path, ply_of(COLUMNS | {"scale_2": scale}))
     np.testing.assert_array_equal(capture.cloud.log_scales.numpy()[:50, 2], -100.0)
     assert capture.cloud.count == 60
-    assert capture.notes == ("50 Gaussians with a log scale below -100 read as that",)
+    assert capture.notes == ("50 Gaussians with a log scale below -100 read with that value",)
 
 
 @pytest.mark.parametrize("layout", ["binary_little_endian", "ascii"])
@@ -229,9 +229,7 @@ def test_only_one_of_them_activated(tmp_path: Path) -> None:
     scales = np.exp(CLOUD.log_scales.numpy())
     wide = {f"scale_{k}": values + np.float32(2.0) for k, values in enumerate(scales.T)}
     capture = read(tmp_path, ply_of(COLUMNS | wide))
-    assert capture.notes == (
-        "all scales are positive, and as logarithms wider than the capture: read as standard deviations",
-    )
+    assert capture.notes == ("all scales are positive, and too large to be logarithms: read as standard deviations",)
     np.testing.assert_allclose(capture.cloud.log_scales.numpy(), np.log(scales + 2.0), rtol=1e-6)
     capture = read(tmp_path, ply_of(COLUMNS | {"opacity": CLOUD.opacities()}))
     assert capture.notes == ("all opacities lie within 0 to 1, as activated ones do; they were read as logits",)

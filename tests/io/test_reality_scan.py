@@ -97,7 +97,7 @@ def test_invalid_rows_are_excluded(tmp_path: Path) -> None:
     assert reasons == [
         "line 3: heading 'nan' is not a finite number; export Internal/External camera parameters again",
         "line 4: f 'wide' is not a finite number; export Internal/External camera parameters again",
-        "line 5: the photo cannot be read, and the poses do not contain its size; put it there",
+        "line 5: the photo cannot be read, and the poses do not contain its size; add a readable copy",
     ]
 
 

@@ -136,8 +136,8 @@ def test_paths_are_checked_before_the_work_and_not_created(tmp_path: Path) -> No
         ("", "out '': give the name of a folder"),
         (tmp_path / "file", r"cannot write into this folder \(.*file is a file\)"),
         (tmp_path / "file" / "deeper", r"cannot write into this folder \(.*file is a file\)"),
-        (tmp_path / ("x" * 300), "cannot be made"),
-        (f"{tmp_path}/a\0b", "cannot be made"),
+        (tmp_path / ("x" * 300), "cannot be created"),
+        (f"{tmp_path}/a\0b", "cannot be created"),
     ):
         with pytest.raises(UserError, match=said):
             check_run_folder(out)

@@ -158,5 +158,5 @@ def test_onnx_files_are_checked_before_they_are_loaded(program: str, tmp_path: P
         [onnx.value("image", [1])],
         [onnx.value("out", [1])],
     )
-    with pytest.raises(UserError, match=r"far\.onnx: some of its numbers lie in other files, which are not read"):
+    with pytest.raises(UserError, match=r"far\.onnx: some of its numbers are in other files, which are not read"):
         onnx_network.load_network(written(tmp_path / "far.onnx", data))

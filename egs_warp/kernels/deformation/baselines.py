@@ -1,4 +1,5 @@
-"""Baseline deformations of Gaussians by a cage: bound to a surface, one gradient, a small tetrahedron each.
+"""Baseline deformations of Gaussians by a cage: by the nearest surface triangle, by the gradient at the mean, and by a
+small tetrahedron around each Gaussian.
 
 Host code: ``egs_warp/deformation/baselines.py``.
 """
@@ -157,8 +158,8 @@ def deform_with_surface_kernel(
     log_scales_out: wp.array[wp.vec3],
     polar_rotations_out: wp.array[wp.vec4],
 ):
-    """Deform each Gaussian by the F of the nearest surface triangle, whose thickness does not change (SuGaR: Gaussians
-    bound to triangles)."""
+    """Deform each Gaussian by the F of the nearest surface triangle, which does not stretch along the triangle's normal
+    (SuGaR: Gaussians bound to triangles)."""
     row = first_row + wp.tid()
     f = faces[face_from_gaussian[row]]
     before = triangle_frame(rest[f[0]], rest[f[1]], rest[f[2]])

@@ -60,7 +60,7 @@ class CageMaps:
     maps: wp.array[wp.vec4]
     """(3 T,) rows of F, each followed by one coordinate of x0'. Most arms read only this."""
     frames: wp.array[wp.vec4]
-    """(2 T,) x0; R_polar as a quaternion w, x, y, z."""
+    """(2 T,) x0 in the first row of each tetrahedron, R_polar as a quaternion w, x, y, z in the second."""
 
 
 @wp.kernel
@@ -152,10 +152,11 @@ class ArmPlan:
     end_tets: wp.array2d[wp.int32]
     """(6, n) tetrahedron of each arm's end."""
     inside_fractions: wp.array2d[wp.float32]
-    """(6, n) fraction of each arm inside the tetrahedron of the mean. A negative value is minus the arm length, for a
-    longer arm that ends elsewhere, whose deformed end is needed itself."""
+    """(6, n) fraction of each arm inside the tetrahedron of the mean. A negative value is minus the length of a longer
+    arm that ends in another tetrahedron; the deformed arm is then computed from its deformed end and the deformed
+    mean."""
     smoothing_lengths: wp.array2d[wp.float32]
-    """(3, n) m, s_k^2 over the reach of both arms."""
+    """(3, n) m, s_k^2 divided by the reach of both arms."""
 
 
 @wp.kernel
@@ -175,10 +176,10 @@ def plan_arms_kernel(
 ):
     """Precompute ``ArmPlan``.
 
-    The motion is continuous and linear in each tetrahedron. So an arm that goes from the tetrahedron of the mean
-    (gradient F) through a face into the next one (gradient G) is deformed to (u F + (1 - u) G) r per length, where u is
-    the fraction before the face. This avoids a difference of positions, which for a tiny arm would be mostly rounding.
-    A longer arm that ends elsewhere gets a negative fraction.
+    The motion is continuous and linear in each tetrahedron. So an arm that crosses a face from the tetrahedron of the
+    mean (gradient F) into the next one (gradient G) is deformed to (u F + (1 - u) G) r per unit length, where u is the
+    fraction of the arm before the face. This avoids a difference of positions, which for a tiny arm would be mostly
+    rounding error. A longer arm that ends in another tetrahedron gets a negative fraction.
     """
     row = first_row + wp.tid()
     mean_tet = point_tets[7 * row]
@@ -238,7 +239,8 @@ def deform_arm(
     max_stretch: wp.float32,
     cage: CageMaps,
 ) -> wp.vec3:
-    """Return the deformed arm along ``axis``, per length: a column of D_s D_m^-1 R (Eq. 14). ``through`` is F axis.
+    """Return the deformed arm along ``axis``, per unit length: a column of D_s D_m^-1 R (Eq. 14). ``through`` is F
+    axis.
 
     An arm that bridges a gap between two limbs can be stretched far more than the material at either end, which would
     show as a spike. So its length is limited to ``max_stretch`` times the larger stretch at its two ends.

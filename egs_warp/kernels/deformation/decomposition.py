@@ -53,7 +53,7 @@ class Pair:
 
 @wp.func
 def orthogonal_pair(a: wp.vec3, b: wp.vec3, va: wp.vec3, vb: wp.vec3) -> Pair:
-    """Apply the rotation that makes ``a`` and ``b`` orthogonal to them and to ``va`` and ``vb``."""
+    """Rotate ``a`` and ``b`` so that they become orthogonal, and ``va`` and ``vb`` by the same rotation."""
     aa = wp.dot(a, a)
     bb = wp.dot(b, b)
     ab = wp.dot(a, b)
@@ -211,7 +211,7 @@ def match_columns(frame: wp.mat33, reference: wp.mat33) -> wp.vec3i:
 @wp.func
 def rotation_of(m: wp.mat33) -> wp.mat33:
     """Return the ``rotation_part`` of a matrix with det > 0, by Newton's iteration X <- (g X + X^-T / g) / 2 (Higham
-    1986) where that is safe; it takes half the work."""
+    1986), which takes half the work, where it is safe."""
     a = column(m, 0)
     b = column(m, 1)
     c = column(m, 2)

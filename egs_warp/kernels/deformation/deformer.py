@@ -94,8 +94,8 @@ def deform_gaussian(
     cage: CageMaps,
     plan: ArmPlan,
 ) -> DeformedGaussian:
-    """Deform a Gaussian by F = (F+ + F-)/2 (Eq. 14), or by the F of the mean's tetrahedron where det F <= 0, then Eq.
-    (15).
+    """Deform a Gaussian by F = (F+ + F-)/2 (Eq. 14), or by the F of the mean's tetrahedron where det F <= 0, and apply
+    Eq. (15).
 
     The mean follows the mean of the Gaussian's mass to second order (beyond the paper, which deforms the mean as a
     point): E[x(m + sum z_k s_k r_k)] = x(m) + sum s_k^2 x_kk / 2, where x_kk is estimated from the difference of the
@@ -174,7 +174,7 @@ def bend_frame(side: wp.mat33, scales: wp.vec3) -> wp.mat33:
     """Return an eigenframe of Sigma'+- that stays defined where scales are equal: the rotation part of [F R] S^2.
 
     It differs from the eigenframe by terms of order (s_j/s_i)^2 where s_i >> s_j, follows the long axes and not the
-    short ones, and does not spin freely in the plane of a round disc, as eigenvectors do.
+    short ones, and, unlike eigenvectors, is not arbitrary in the plane of a round disc.
     """
     longest = wp.max(scales)
     relative = scales / longest
@@ -199,11 +199,11 @@ def measure_bend_kernel(
     error_out: wp.array[wp.vec3],
 ):
     """Update the maximum of each measure: the angle of Eq. (16) and, along each axis, the deviation of the motion from
-    affine.
+    an affine map.
 
     With arms reaching L on both sides of axis k, the second derivative of the motion along axes k and j is about (F_k+
     - F_k-) r_j / 2L. ``curl`` is the angle between the two vectors F_k+- r_j, the largest over j. ``error`` is the
-    displacement that F leaves out at one standard deviation along both axes.
+    displacement that F does not represent at one standard deviation along both axes.
     """
     row = first_row + wp.tid()
     if plan.mean_tets[row] < 0 and plan.inside_fractions[0, row] == RIGID:
@@ -232,7 +232,7 @@ def measure_bend_kernel(
             # The mixed derivative is symmetric; the longer baseline measures it better.
             if scales[j] > scales[k]:
                 axis_error = 0.0
-            # An axis too short to be visible does not count.
+            # Ignore an axis that is too short to be visible.
             if axis_error > 0.25 * error[k]:
                 curl[k] = wp.max(curl[k], angle)
             error[k] = wp.max(error[k], axis_error)

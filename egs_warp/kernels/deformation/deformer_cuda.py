@@ -74,7 +74,8 @@ def fetch_colour(address: wp.uint64, sh: wp.array2d[wp.vec3], row: wp.int32, cou
     return result;
 """)
 def load_colour(address: wp.uint64) -> Colour:
-    """Return this thread's row of the colours fetched by ``fetch_colour``; every thread of the warp must call."""
+    """Return this thread's row of the colours fetched by ``fetch_colour``; every thread of the warp must call this
+    function."""
     ...
 
 
@@ -95,7 +96,7 @@ def load_colour(address: wp.uint64) -> Colour:
         if (32 * i + lane < limit) __stcs(target + 32 * i + lane, space[at[i % 3] + 104 * (i / 3)]);
 """)
 def store_colour(address: wp.uint64, sh: wp.array2d[wp.vec3], row: wp.int32, count: wp.int32, value: Colour):
-    """Set ``sh[row] = value``; every thread of the warp must call."""
+    """Set ``sh[row] = value``; every thread of the warp must call this function."""
     ...
 
 

@@ -64,8 +64,8 @@ def closest_on_triangle(a: Vec3, b: Vec3, c: Vec3, point: Vec3) -> Vec3:
 
 @wp.func
 def distance_to_tet(x0: Vec3, x1: Vec3, x2: Vec3, x3: Vec3, weights: Vec4, point: Vec3) -> real:
-    """Return the distance of a point outside a tetrahedron; only faces with the point on their outer side can be
-    nearest."""
+    """Return the distance between a tetrahedron and a point outside it; only faces with the point on their outer side
+    can be nearest."""
     nearest = real(1.0e300)
     if weights[0] < real(0.0):
         nearest = wp.min(nearest, wp.length(point - closest_on_triangle(x1, x2, x3, point)))
@@ -193,8 +193,8 @@ def locate_points_kernel(
 
 @wp.func
 def axes_from_quaternion(q: wp.vec4) -> Mat33:
-    """Return the rotation matrix [r1 r2 r3] of a w, x, y, z quaternion, normalised in float64, as float32 storage is
-    not exact."""
+    """Return the rotation matrix [r1 r2 r3] of a w, x, y, z quaternion, normalised in float64, because its float32
+    components are rounded."""
     d = Vec4(real(q[0]), real(q[1]), real(q[2]), real(q[3]))
     d = d / wp.length(d)
     w = d[0]

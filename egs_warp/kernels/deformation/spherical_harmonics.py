@@ -1,8 +1,9 @@
 """Rotation of the colour of Gaussians: real spherical harmonics of bands 1 to 3 in the INRIA sign convention.
 
-A rotation is decomposed into rotations about z, y and z. A rotation about y is one about z between quarter turns about
-x. About z, the coefficients of orders m and -m rotate as a pair; a quarter turn about x mixes few (Pinchon and Hoggan
-2007). This takes half the work of a full matrix for each band, and no matrix is formed.
+A rotation is decomposed into rotations about z, y and z. A rotation about y equals a rotation about z between quarter
+turns about x. A rotation about z rotates the coefficients of orders m and -m as a pair, and a quarter turn about x
+mixes only a few coefficients (Pinchon and Hoggan 2007). This takes half the work of a full matrix for each band, and no
+matrix is formed.
 """
 
 import numpy as np
@@ -24,8 +25,8 @@ S1516 = wp.constant(wp.float32(np.sqrt(15 / 16)))
 
 @wp.func
 def rotate_band_1(c: wp.mat33, turn: wp.mat33) -> wp.mat33:
-    """Return coefficients 1 to 3, one row each, after the rotation ``turn``: the linear function w.d with w = (-c3,
-    -c1, c2)."""
+    """Return coefficients 1 to 3, one row each, after the rotation ``turn``; they represent the linear function w.d
+    with w = (-c3, -c1, c2)."""
     w = wp.mat33(-c[2, 0], -c[2, 1], -c[2, 2], -c[0, 0], -c[0, 1], -c[0, 2], c[1, 0], c[1, 1], c[1, 2])
     w = turn * w
     return wp.mat33(-w[1, 0], -w[1, 1], -w[1, 2], w[2, 0], w[2, 1], w[2, 2], -w[0, 0], -w[0, 1], -w[0, 2])
@@ -42,8 +43,8 @@ class EulerAngles:
 
 @wp.func
 def euler_from_quaternion(q: wp.vec4) -> EulerAngles:
-    """Return the Euler angles of the unit quaternion w, x, y, z. Where one is arbitrary, every choice is right to
-    rounding."""
+    """Return the Euler angles of the unit quaternion w, x, y, z. Where an angle is arbitrary, every choice gives the
+    same rotation up to rounding."""
     along = wp.sqrt(q[0] * q[0] + q[3] * q[3])
     across = wp.sqrt(q[1] * q[1] + q[2] * q[2])
     half_sum = wp.vec2(1.0, 0.0)
@@ -75,8 +76,8 @@ def angle_sum(t: wp.vec2, u: wp.vec2) -> wp.vec2:
 
 @wp.func
 def band_2_about_z(c: Mat53, t: wp.vec2) -> Mat53:
-    """Return the coefficients after a rotation about z by the angle of cosine and sine ``t``: orders m and -m rotate by
-    m times it."""
+    """Return the coefficients after a rotation about z by the angle with cosine and sine ``t``: orders m and -m rotate
+    by m times the angle."""
     t2 = double_angle(t)
     result = Mat53()
     result[0] = t2[0] * c[0] + t2[1] * c[4]
@@ -89,8 +90,8 @@ def band_2_about_z(c: Mat53, t: wp.vec2) -> Mat53:
 
 @wp.func
 def rotate_band_2(c: Mat53, turns: EulerAngles) -> Mat53:
-    """Return coefficients 4 to 8, one row each, after the rotation. The rotation about y is one about z between quarter
-    turns about x."""
+    """Return coefficients 4 to 8, one row each, after the rotation. The rotation about y equals one about z between
+    quarter turns about x."""
     f = band_2_about_z(c, turns.first)
     g = Mat53()
     g[0] = f[3]
@@ -109,7 +110,7 @@ def rotate_band_2(c: Mat53, turns: EulerAngles) -> Mat53:
 
 @wp.func
 def band_3_about_z(c: Mat73, t: wp.vec2) -> Mat73:
-    """Return the coefficients of band 3 after a rotation about z, as ``band_2_about_z``."""
+    """Return the coefficients of band 3 after a rotation about z, like ``band_2_about_z``."""
     t2 = double_angle(t)
     t3 = angle_sum(t2, t)
     result = Mat73()
@@ -125,7 +126,7 @@ def band_3_about_z(c: Mat73, t: wp.vec2) -> Mat73:
 
 @wp.func
 def rotate_band_3(c: Mat73, turns: EulerAngles) -> Mat73:
-    """Return coefficients 9 to 15, one row each, after the rotation, as ``rotate_band_2``."""
+    """Return coefficients 9 to 15, one row each, after the rotation, like ``rotate_band_2``."""
     f = band_3_about_z(c, turns.first)
     g = Mat73()
     g[0] = S38 * f[5] - S58 * f[3]

@@ -50,7 +50,8 @@ class Layers:
 
 @wp.func
 def texel_of(ground: Ground, away: wp.vec3) -> wp.vec2:
-    """Return the map position, in texels from the corner, straight below a point at ``away`` from the centre."""
+    """Return the map position, in texels from the corner, straight below a point at the offset ``away`` from the
+    centre."""
     side = 0.5 * wp.float32(TEXELS)
     across = wp.vec2(wp.dot(away, ground.first), wp.dot(away, ground.second)) / ground.reach
     return wp.vec2((across[0] + 1.0) * side, (across[1] + 1.0) * side)
@@ -112,7 +113,7 @@ def ground_kernel(
 
 @wp.struct
 class Studio:
-    """Colours of a floor that turns into its surroundings without an edge, and its grid."""
+    """Colours of a floor that blends into its surroundings without an edge, and its grid."""
 
     floor: wp.vec3
     """Floor near the camera."""
@@ -153,7 +154,8 @@ def studio_kernel(
     # Out:
     colour_out: wp.array[wp.vec3],
 ):
-    """Draw a floor with fine lines ``studio.cell`` apart and strong ones four times as far, in haze, below a sky."""
+    """Draw a sky and a floor that fades into haze, with fine lines ``studio.cell`` apart and strong lines four times as
+    far apart."""
     tid = wp.tid() + first_row
     u = wp.float32(tid % view.width) + 0.5
     v = wp.float32(tid / view.width) + 0.5
@@ -286,7 +288,7 @@ def combine_layers_kernel(
     # Out:
     shade_out: wp.array2d[wp.float32],
 ):
-    """Combine the layers: each lets a part of the light pass."""
+    """Combine the layers, each of which lets a part of the light pass."""
     tid = wp.tid() + first_row
     row = tid / TEXELS
     column = tid % TEXELS

@@ -56,10 +56,10 @@ def splat_gradient(
     v: wp.float32,
     shear: wp.float32,
 ) -> SplatGradient:
-    """Sum the moments that ``composite_backward_tile_kernel`` wrote over a Gaussian's tiles.
+    """Sum, over the tiles of a Gaussian, the moments that ``composite_backward_tile_kernel`` wrote.
 
-    With k = alpha dL/dalpha, ``moments[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, by depth, 0) and (by
-    colour, 0).
+    With k = alpha dL/dalpha, ``moments[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, dL/d depth, 0) and
+    (dL/d colour, 0).
     """
     first_row = wp.vec4()
     second_row = wp.vec4()
@@ -193,7 +193,7 @@ def quaternion_gradient(q: wp.vec4, by_rotation: wp.mat33) -> wp.vec4:
 
 @wp.func
 def clamp_gradient(raw: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
-    """Return the gradient with respect to the SH sum, of which the colour is max(sum + 0.5, 0)."""
+    """Return the gradient with respect to the SH sum; the colour is max(sum + 0.5, 0)."""
     return wp.vec3(
         wp.where(raw[0] > -0.5, by_colour[0], 0.0),
         wp.where(raw[1] > -0.5, by_colour[1], 0.0),
@@ -279,7 +279,7 @@ def pose_backward_kernel(
     """Compute the gradient with respect to one Gaussian's screen position, and its part of the gradient with respect to
     the camera pose.
 
-    Outputs that are not wanted are empty arrays.
+    Outputs that are not requested are empty arrays.
     """
     g = wp.tid() + first
     slot = first_slot_of(slot_end, g)

@@ -39,7 +39,8 @@ _SHARED += """
         __builtin_memcpy(&bits, &set, 1);
         return bits;
     };
-    // Half rows are numbered down the left half, then down the right one; pixels by half rows. Bits: not yet opaque.
+    // Half rows are numbered down the left half, then down the right one; pixels by half rows. A set bit of open: the
+    // half row is not yet opaque.
     const int tile_width = width - left < 16 ? width - left : 16;
     const int tile_height = height - top < 16 ? height - top : 16;
     const unsigned inside_rows = 0xFFFFu >> (16 - tile_height);
@@ -60,7 +61,7 @@ _EACH_HALF = """
         const wp::vec4 c = colour_depth.data[id];
         const float x = e[0] - (float)left - 0.5f, y = e[1] - (float)top - 0.5f;
         const float steep = e[2] * LOG2_E, over_a = 1.0f / e[2];
-        // begins: start of each half row from the centre of the ellipse there. tops: log2 of alpha there, per row.
+        // begins: start of each half row relative to the ellipse's centre there. tops: log2 of alpha there, per row.
         alignas(32) float begins[32], tops[16], down[16];
         unsigned reached = 0;
         for (int rows = 0; rows < 16; rows += 8) {

@@ -8,7 +8,7 @@ neither ballots nor per-warp control flow; Warp compiles it at run time like eve
 
 from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP
 
-# log2(255), and alpha = exp2(log2 opacity - a u^2 - v dy^2) with a and v in units of log2 e.
+# With a and v in units of log2 e, alpha = exp2(log2 opacity - a u^2 - v dy^2).
 _SHARED = CUTOFFS_IN_CPP
 _SHARED += """
     constexpr float LOG2_E = 1.4426950408889634f;

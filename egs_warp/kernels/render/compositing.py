@@ -43,7 +43,7 @@ def composite_tile(
 ):
     """Blend one tile from front to back, by its thread (CPU) or block (CUDA).
 
-    Splats whose mean is deeper than ``max_depth`` of a pixel do not count there; 0 or an empty array means no limit.
+    A splat whose mean is deeper than the ``max_depth`` of a pixel is skipped there; 0 or an empty array means no limit.
     """
     ...
 
@@ -161,8 +161,8 @@ def composite_backward_tile_kernel(
 ):
     """Sum each splat's gradient over the pixels of one tile, by one thread.
 
-    With k = alpha dL/dalpha per pixel, ``moments_out[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, by
-    depth, 0) and (by colour, 0).
+    With k = alpha dL/dalpha per pixel, ``moments_out[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, dL/d
+    depth, 0) and (dL/d colour, 0).
     """
     tile = wp.tid() + first
     columns = (width + TILE - 1) / TILE

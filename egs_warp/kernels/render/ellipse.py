@@ -18,7 +18,8 @@ LOG_255 = wp.constant(wp.float32(-math.log(_ALPHA_CUT)))
 ALPHA_LIMIT = wp.constant(wp.float32(_ALPHA_LIMIT))
 """Largest alpha of one splat; above it no gradient flows."""
 TRANSMITTANCE_STOP = wp.constant(wp.float32(_TRANSMITTANCE_STOP))
-"""A splat that would bring the transmittance to this value or lower is not blended, and ends the pixel."""
+"""A splat that would bring the transmittance to this value or lower is not blended, and neither are the splats behind
+it."""
 TILE = wp.constant(16)
 """Side of a square tile, pixels."""
 TILE_PIXELS = wp.constant(256)
@@ -59,7 +60,8 @@ def splat_alpha(ellipse: wp.vec4, falloff: wp.vec2, pixel: wp.vec2i) -> wp.float
 
 @wp.func
 def tile_rows(ellipse: wp.vec4, falloff: wp.vec2, height: wp.int32) -> wp.vec2i:
-    """Return the first and last tile row with a pixel centre inside the ellipse's height; first > last if none."""
+    """Return the first and last tile row with a pixel centre inside the vertical extent of the ellipse; first > last if
+    there is none."""
     reach = wp.sqrt((falloff[1] + LOG_255) / falloff[0])
     first = wp.int32(wp.ceil(wp.max(ellipse[1] - reach - 0.5, 0.0)))
     last = wp.int32(wp.floor(wp.min(ellipse[1] + reach - 0.5, wp.float32(height - 1))))

@@ -22,7 +22,7 @@ def pixel_gradient(
     With s_i = (colour_i, depth_i) . gradient, the loss is linear in the weights w_i and the final transmittance T:
     dL/dalpha_i = T_i s_i - (sum of w_j s_j over j > i + T dL/dT) / (1 - alpha_i). The remaining sum is that bracket
     with all splats in the sum. The front-to-back traversal subtracts from it, so it needs no second pass and no stored
-    state. Empty arrays are zero gradients.
+    state. An empty array stands for a zero gradient.
     """
     opaque = alpha[row, column]
     by_colour = wp.vec3()

@@ -65,8 +65,8 @@ def rotation_matrix(q: wp.vec4) -> wp.mat33:
 def screen_axes(view: View, p: wp.vec3, q: wp.vec4, log_scale: wp.vec3) -> tuple[wp.vec3, wp.vec3]:
     """Return rows x and y of J W R S at the camera-space point ``p``; the screen covariance is their Gram matrix."""
     inv_z = 1.0 / p[2]
-    # As in gsplat and Kerbl et al., the Jacobian is evaluated at most 15 % outside the image, where it grows without
-    # bound.
+    # As in gsplat and Kerbl et al., the Jacobian is evaluated at most 15 % outside the image, because it grows without
+    # bound farther out.
     tx = wp.clamp(p[0] * inv_z, view.slope_low[0], view.slope_high[0])
     ty = wp.clamp(p[1] * inv_z, view.slope_low[1], view.slope_high[1])
     axes = view.rotation * rotation_matrix(q)
@@ -81,7 +81,8 @@ def screen_axes(view: View, p: wp.vec3, q: wp.vec4, log_scale: wp.vec3) -> tuple
 
 @wp.struct
 class ScreenCovariance:
-    """Screen covariance of one Gaussian, square pixels: ``sharp_`` without, the others with the low-pass added."""
+    """Screen covariance of one Gaussian, square pixels; the low-pass is added, except in the fields that begin with
+    ``sharp_``."""
 
     sharp_xx: wp.float32
     sharp_yy: wp.float32

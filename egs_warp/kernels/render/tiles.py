@@ -66,7 +66,7 @@ def count_tiles_kernel(
     tile_from_slot_out: wp.array[wp.int32],
     count_out: wp.array2d[wp.int32],
 ):
-    """Count the Gaussians of one chunk, from front to back, by tile, with one thread (CPU)."""
+    """Count the Gaussians of one chunk in each tile, from front to back, with one thread (CPU)."""
     chunk = wp.tid() + first_chunk
     columns = (width + TILE - 1) / TILE
     last = chunk_start[chunk + 1] - 1
@@ -141,7 +141,7 @@ def emit_tiles_kernel(
     g = wp.tid()
     pair_count = slot_end[slot_end.shape[0] - 1]
     fits = pair_count >= wp.int64(0) and pair_count <= wp.int64(capacity)
-    # Contiguous writes by neighbouring threads, which the loop below cannot do.
+    # Slot numbers are written here, where the writes of neighbouring threads are contiguous, and not in the loop below.
     for i in range(g, capacity, slot_end.shape[0]):
         slot_and_gaussian_out[i] = i
         if not fits or wp.int64(i) >= pair_count:
