@@ -14,7 +14,7 @@ from egs_warp.contact.coulomb import FAILURE_TOLERANCE
 from egs_warp.kernels.contact.newton_convergence import MIN_DECREASE, REFACTOR_RATIO, RESIDUAL_WINDOW
 
 MAX_NEWTON_STEPS = 60
-"""Newton steps of a round."""
+"""Maximum number of Newton steps of a round."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class ConvergenceState:
     tolerance: float
     """Residual at which the loop ends."""
     activation_residual: float
-    """Residual threshold; when the loop first falls below it, penetrating points are looked up. 0 disables this."""
+    """Residual below which the loop first searches for penetrating points; 0 disables the search."""
     coulomb_tolerance: float
     """Maximum violation of Coulomb's law, m/s."""
     steps: int = 0

@@ -101,10 +101,10 @@ class GraphStream:
             self._stream.wait_event(end)
 
     def run_captured(self, work: Callable[[], None]) -> Callable[[], None]:
-        """Return a function that runs ``work``, on a GPU by a CUDA graph.
+        """Return a function that runs ``work``, on a GPU as a CUDA graph.
 
-        The first call runs ``work`` directly, so that compilation and setup precede the capture by the second
-        call. ``work`` must not synchronize with the device.
+        The first call runs ``work`` directly, so that compilation and setup are done before the second call captures
+        it. ``work`` must not synchronize with the device.
         """
         return work if self._stream is None else _Graph(work, self)
 
@@ -143,7 +143,7 @@ class GraphStream:
     def while_graph(self, graph: torch.cuda.CUDAGraph, going: torch.Tensor) -> Callable[[], None]:
         """Return a function that replays a graph recorded with ``keep`` while ``going`` (1,) int32 is not 0.
 
-        Uses a conditional graph node if the driver supports it, else a loop on the host.
+        Uses a conditional graph node if the driver supports it, and otherwise a loop on the host.
         """
         if not wp.is_conditional_graph_supported():
 
