@@ -112,7 +112,7 @@ class BatchDetector:
             ArgumentError: for uneven ground.
         """
         if geometry.field is not None:
-            raise ArgumentError("geometry", "batched worlds need flat ground; run these jobs in processes")
+            raise ArgumentError("geometry", "batched worlds need flat ground; run these jobs in separate processes")
         self.device, self._activation_distance, self._hysteresis, self._gap_tolerance = (
             device,
             points.activation_distance,

@@ -44,8 +44,8 @@ _CACHED_CONFIGURATIONS = 4
 times, and a step ends where the next one starts.
 """
 _SLACK_FRACTION = 0.25
-"""Fraction of the grid spacing. A point that is less than this below a plane counts as lying on it, as it does after
-rounding to the grid.
+"""Fraction of the grid spacing. A point that is less than this below a plane counts as a point of the plane, where
+rounding to the grid places it.
 """
 _SQUARE_FRACTION = 0.5
 """Side of a square, in spacings of uneven ground. In each square the lowest point of each tetrahedron is retained."""

@@ -49,7 +49,7 @@ class ContactSelector:
         )
         corners = geometry.mesh.tets[geometry.tet_from_point]
         positions = np.einsum("pw,pwi->pi", geometry.weights, geometry.mesh.nodes[corners])
-        # Rounding makes points equally far from two centres go to the same cell on every machine.
+        # Rounding assigns points that are equally far from two centres to the same cell on every machine.
         positions = self.gap_tolerance * np.rint(positions / self.gap_tolerance)
         heights = geometry.ground_heights(positions)
         sole = np.flatnonzero(heights < heights.min() + 2.0 * activation_distance)

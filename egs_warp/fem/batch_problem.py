@@ -51,7 +51,7 @@ class BatchBody:
 
 @dataclass(frozen=True)
 class BatchProblem(BatchedRecord):
-    """The implicit step of c worlds; members have the names and meanings of those of ``StepProblem``."""
+    """The implicit step of c worlds; its members have the same names and meanings as in ``StepProblem``."""
 
     body: BatchBody
     dt: float

@@ -183,7 +183,7 @@ def make_body(
     displacement = _linear_sag(column, node_mass, free, -GRAVITY * plane.normal)
     # NaN or negative if the stiffness is singular.
     if not 0.0 <= displacement < _MAX_LINEAR_SAG * height:
-        raise ArgumentError("nodes", "parts of the cage are connected by a single corner or edge; give it more nodes")
+        raise ArgumentError("nodes", "parts of the cage are connected by a single corner or edge; request more nodes")
     young *= max(1.0, displacement / (MAX_SAG * height))
     undamped = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)
     frequency = _first_frequency(undamped, node_mass, free)

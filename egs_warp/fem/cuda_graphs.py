@@ -120,8 +120,8 @@ class GraphStream:
 
         All graphs share one memory pool for temporary memory: they run one after the other and leave no results there.
         The first graph is retained, since the pool is released with its last graph. No other thread may use the device
-        during a capture, as its operations would be captured too. Python's garbage collection is disabled meanwhile:
-        freeing device memory would synchronize with the device.
+        during a capture, as its operations would be captured too. Python's garbage collection is disabled during a
+        capture, since freeing device memory would synchronize with the device.
 
         Args:
             work: operations to capture.

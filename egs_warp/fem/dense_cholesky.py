@@ -142,7 +142,7 @@ class DenseCholesky:
 
     def solve(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
         """Solve for ``right``; see ``LinearSolver.solve``."""
-        assert self.is_ready, "update() comes first"
+        assert self.is_ready, "call update() first"
         with self.stream:
             plain = self._to_host(self._solve(self._to_device(right)))
         return plain if projection is None else projection.corrected(right, plain)

@@ -33,8 +33,8 @@ class StepProblem:
     Implicit Euler alone loses angular momentum: with x+ = x + dt v the momentum changes by dt sum r x f, with the lever
     arms r at the *start* of the step, about which the internal forces at its end have a torque. P^T removes that torque
     as the inertial force of a rigid rotation, M (w x r): P v is v minus the rigid rotation with v's angular momentum.
-    So L+ = L + dt sum r x (f_contact - alpha M v) holds to rounding, contact velocities are those that are solved for,
-    and ``momentum_correction`` is the angular velocity w of the removed rotation.
+    So L+ = L + dt sum r x (f_contact - alpha M v) holds up to rounding, contact velocities are those that are solved
+    for, and ``momentum_correction`` is the angular velocity w of the removed rotation.
     """
 
     body: SoftBody

@@ -134,7 +134,7 @@ def _contact_normals(t: Trajectory) -> np.ndarray:
 
 
 def _uneven_end_gaps(t: Trajectory) -> np.ndarray:
-    """Return (c,) m, distance from uneven ground of each contact with it at the end of its step."""
+    """Return (c,) m, the distance from the ground, at the end of its step, of each contact with uneven ground."""
     after = t.contact_step + 1
     ends = np.einsum("cw,cwi->ci", t.contact_weights, t.positions[after[:, None], t.contact_nodes])
     return _ground_gaps(t, ends[_on_uneven_ground(t)])

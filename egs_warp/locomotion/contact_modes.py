@@ -1,4 +1,5 @@
-"""QP of a step over the activations alone, with exact Coulomb contact, and the search over contact modes (Eq. 9, 13).
+"""QP of a step with the activations as its only unknowns, under exact Coulomb contact, and the search over contact
+modes (Eq. 9, 13).
 
 Contact forces are a function of the activations, affine in each region of fixed contact modes. ``search_modes`` solves
 one QP in each region that it visits. Its kernels are in ``egs_warp.kernels.locomotion.mode_region``, the version for a

@@ -212,8 +212,8 @@ WORLD = Coordinates(np.eye(3), False)
 def part_velocity(
     body: SoftBody, part: BodyPart, target: np.ndarray, weight: float, coordinates: Coordinates = WORLD
 ) -> Objective:
-    """Return the objective that the centre of ``part`` has velocity ``target`` (3,) m/s in ``coordinates``. For the
-    base, relative to the centre of mass, it controls a landing."""
+    """Return the objective that the centre of ``part`` has velocity ``target`` (3,) m/s in ``coordinates``. Applied to
+    the base, in coordinates relative to the centre of mass, it controls a landing."""
     shares = np.zeros(len(body.node_mass))
     shares[part.nodes] = part.masses / part.masses.sum()
     if coordinates.relative:

@@ -210,8 +210,8 @@ class LocomotionStepper:
         """Make one step of ``dt`` s; if it does not converge, repeat it as half steps.
 
         The half steps do not replan: the objectives are those of the whole step. The planned activations may be the
-        cause, so the half steps are computed twice, with the planned and with the previous activations. A result that
-        converged is preferred; otherwise the lower objective value decides.
+        cause of the failure, so the half steps are computed twice, with the planned and with the previous activations.
+        A result that converged is preferred; otherwise the lower objective value decides.
 
         Args:
             state: state at the start.
@@ -431,7 +431,7 @@ class LocomotionStepper:
         return self.detector.contact_set(self.selector.select(memory.points, loaded, gaps), problem.state.positions)
 
     def predict(self, start: StepInputs) -> PredictedStep:
-        """Predict the end of the step under the activations of ``start``, those of the previous step (Eq. 12).
+        """Predict the end of the step under the activations of the previous step, which ``start`` contains (Eq. 12).
 
         It starts from rigid motion of the whole body. One Newton step with the previous contact forces gives the
         velocities at which the tangent is factored; the plan uses this tangent. Then ``PREDICTION_ITERATIONS`` Newton

@@ -214,7 +214,7 @@ class MotionOutcome:
     height: float
     """Highest point of the centre of mass minus its height at the start."""
     heading_degrees: float
-    """Rotation about the plane's normal; full turns count."""
+    """Rotation about the plane's normal, including full turns."""
     tilt_degrees: float
     """Angle between the normal and the up axis of the body's best-fit rotation, at the end."""
     airborne_frames: float
@@ -254,7 +254,7 @@ def _best_fit(t: Trajectory, positions: np.ndarray) -> np.ndarray:
 
 
 def _headings(t: Trajectory, first: int, last: int, up: np.ndarray) -> np.ndarray:
-    """Return (n,) rad about ``up`` since ``first``, unwrapped so that full turns count."""
+    """Return (n,) rad about ``up`` since ``first``, unwrapped so that full turns are included."""
     start = _best_fit(t, t.positions[first])
     angles = []
     for positions in t.positions[first : last + 1]:

@@ -497,8 +497,8 @@ def hessian_kernel(
 ) -> None:
     """Compute ``factor`` times the upper entries of the assembled element Hessians.
 
-    If ``projected`` is nonzero, those of ``element_projected_hessians_kernel``, whose Jacobi iteration uses
-    ``tolerance`` and ``max_sweeps``; else those of ``element_hessians_kernel``.
+    The Hessians are those of ``element_projected_hessians_kernel`` if ``projected`` is nonzero, with ``tolerance`` and
+    ``max_sweeps`` for its Jacobi iteration, and otherwise those of ``element_hessians_kernel``.
     """
     if projected != 0:
         projected_hessian_native(elements, positions, starts, dt, factor, tolerance, max_sweeps, entries_out)

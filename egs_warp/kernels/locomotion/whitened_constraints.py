@@ -44,11 +44,11 @@ class WhitenedConstraints:
     has_products: wp.array[wp.int32]
     """(m,) 1 if the products of a row have been computed."""
     scratch: wp.array[real]
-    """(``room_of``,) scratch."""
+    """(``scratch_size``,) scratch."""
 
 
 def scratch_size(unknowns: int, wide: int) -> int:
-    """Return the number of float64 of scratch."""
+    """Return the size of the scratch memory in float64 numbers."""
     return 16 * wide + 512 * (wide // 16 + 1) + unknowns
 
 
@@ -253,9 +253,9 @@ def reduce_kernel(
     reduced_out: WhitenedConstraints,
     definite: wp.array[wp.int32],
 ) -> None:
-    """Whiten min 1/2 x^T P x + q^T x with constraint rows A, with one thread.
+    """Whiten the QP min 1/2 x^T P x + q^T x with constraint rows A, in one thread.
 
-    Array arguments other than the outputs are addresses, strides count numbers.
+    Array arguments other than the outputs are addresses; strides are in numbers.
 
     Args:
         hessian: P (n, n), of which the lower triangle is read.
