@@ -102,7 +102,7 @@ _workspace = thread_local_cache(32)(_CoulombWorkspace)
 
 
 def pack_contacts(delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float) -> Any:
-    """Return the kernels' ``Contacts`` on the memory of these arrays (shapes as in ``coulomb_forces``)."""
+    """Return the kernels' ``Contacts``, which share the memory of these arrays (shapes as in ``coulomb_forces``)."""
     contacts = Contacts()
     contacts.count, contacts.friction = len(shift), friction
     contacts.delassus, contacts.free_velocity, contacts.normal_bias = (

@@ -250,7 +250,7 @@ def _fraction_above(field: HeightField, means: np.ndarray, arms: np.ndarray) -> 
 
 
 def _lowest_points(tet_from_point: np.ndarray, points: np.ndarray, field: HeightField) -> np.ndarray:
-    """Return (k,) indices into ``points`` (P, 3): the lowest of each tetrahedron over each small square of the
+    """Return (k,), indices into ``points`` (P, 3): the lowest point of each tetrahedron over each small square of the
     ground.
     """
     square = np.floor((points - field.origin) @ field.axes[:2].T / (_SQUARE_FRACTION * field.spacing)).astype(np.int64)
@@ -261,7 +261,7 @@ def _lowest_points(tet_from_point: np.ndarray, points: np.ndarray, field: Height
 
 
 def _hull_points(tet_from_point: np.ndarray, places: np.ndarray, tet_count: int) -> np.ndarray:
-    """Return (k,) indices of the hull vertices of each tetrahedron's points; ``places`` (P, 3) in any affine
+    """Return (k,), the indices of the hull vertices of each tetrahedron's points; ``places`` (P, 3) are in any affine
     coordinates.
     """
     order = np.argsort(tet_from_point, kind="stable")

@@ -309,7 +309,7 @@ class NewtonWorkspace:
     ) -> None:
         """Start the Newton loop on the device, asynchronously; ``wait_newton`` blocks for its result.
 
-        Each step uses the Coulomb forces at its own start. The loop ends by the test of ``convergence``.
+        Each step uses the Coulomb forces at its own start. The test of ``convergence`` ends the loop.
 
         Args:
             problem: the step.

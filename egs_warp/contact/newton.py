@@ -300,7 +300,7 @@ def _linearization_at(iterate: NativeNewtonIterate | NumpyNewtonIterate) -> Cont
 
 
 def _elements_on_host(tangent: Tangent) -> bool:
-    """Return True if the elements are on a CPU, which implies that the factors are."""
+    """Return True if the elements are on a CPU, which implies that the factors are there too."""
     return isinstance(tangent.problem.body.assembly.elements, SimdElasticity)
 
 

@@ -72,6 +72,6 @@ class ConvergenceState:
         start = -1.0 if size is None else unit * size
         residuals = unit * np.array([self.tolerance, self.activation_residual]), unit * np.array(self.recent_residuals)
         padding = np.full(RESIDUAL_WINDOW - len(self.recent_residuals), -1.0)
-        # The loop also stops at a numerical failure of the Coulomb solve, which the host repairs.
+        # The loop also stops at a numerical failure of the Coulomb solve, which the host then repeats.
         terms = np.array([min(self.coulomb_tolerance, FAILURE_TOLERANCE), float(self.max_steps), 0.0])
         return np.concatenate([[float(self.steps), start, start], residuals[0], terms, padding, residuals[1]])

@@ -245,7 +245,7 @@ class _InverseFactor:
         self.matrix, self.inverse = torch.zeros((2, count, count), dtype=torch.float64, device=device)
         """(n, n) each: the matrix S, of which the lower triangle is read, and R, both in the order of the dissection.
         """
-        # Workspaces by the number of directions that are added at once.
+        # Keys are the numbers of directions that are added at once.
         self._small: dict[int, tuple[_TriangularInverse, _TriangularInverse]] = {}
         self._tiled = (
             TiledInverseFactor(dissection, self.matrix, self.inverse, stream) if device.type == "cuda" else None

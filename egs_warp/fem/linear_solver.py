@@ -41,7 +41,7 @@ class LinearSolver(Protocol):
         ...
 
     def add_low_rank(self, across: np.ndarray, rates: np.ndarray) -> bool:
-        """Replace S by S + U diag(r) U^T in the following solves. Succeeds at most once per ``update``.
+        """Replace S by S + U diag(r) U^T in the following solves. This succeeds at most once per ``update``.
 
         Args:
             across: (n, k) U.

@@ -67,8 +67,8 @@ class MultifrontalLdl:
 
     The symbolic analysis is done once. Results are bitwise equal on any number of cores.
 
-    There is no pivoting: definite matrices need none; of an indefinite matrix only the inertia and a sum with the
-    muscles' stiffness are used; a nearly singular matrix is reported as having no factors.
+    There is no pivoting: positive definite matrices need none; of an indefinite matrix only the inertia and a sum with
+    the muscles' stiffness are used; a nearly singular matrix is reported as having no factors.
     """
 
     is_host = True
@@ -314,7 +314,7 @@ class _ProjectionArrays:
 
 
 class _EffortWorkspace:
-    """Workspace of ``effort_quadratic`` for a number of panels."""
+    """Workspace of ``effort_quadratic`` for a given number of panels."""
 
     def __init__(self, panels: int, unknowns: int) -> None:
         self.moves, self.products = (zeros((panels, unknowns, kernels.PANEL), real, "cpu") for _ in range(2))

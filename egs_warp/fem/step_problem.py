@@ -108,7 +108,8 @@ class StepProblem:
     def rigid_guess(self) -> np.ndarray:
         """(N, 3) m/s, initial guess of the solver: the rigid motion with the momenta of the state.
 
-        It inverts no element, and it contains no velocities of stiff modes, which change completely within a step.
+        It does not invert an element, and it contains no velocities of stiff modes, which change completely within a
+        step.
         """
         positions, mass = self.state.positions, self.body.node_mass
         centre = self.body.centre_of_mass(positions)

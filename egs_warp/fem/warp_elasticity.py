@@ -1,4 +1,4 @@
-"""Elasticity on a GPU: a kernel over the elements and one that gathers their terms by node or matrix entry.
+"""Elasticity on a GPU: one kernel for the elements, and one that gathers their terms by node or matrix entry.
 
 It launches the kernels of ``egs_warp.kernels.fem.elasticity``.
 """

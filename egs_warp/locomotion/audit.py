@@ -147,8 +147,8 @@ def _ground_gaps(t: Trajectory, points: np.ndarray) -> np.ndarray:
 
 
 def _ground(t: Trajectory, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n,) m, height of uneven ground at ``points`` (n, 3), and (n, 3) its normals, by SciPy's splines and
-    finite differences."""
+    """Return (n,) m, height of uneven ground at ``points`` (n, 3), and (n, 3) its normals, computed with SciPy's
+    splines and finite differences."""
     if len(points) == 0:
         return np.zeros(0), np.zeros((0, 3))
     # The ground continues level beyond its edge.

@@ -336,8 +336,8 @@ def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float
 
 
 def no_slip_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> Objective:
-    """Return the objective that contacts do not slide, each weighted by its ``loads`` (n,), fractions of the body
-    weight."""
+    """Return the objective that contacts do not slide, each weighted by its load; ``loads`` (n,) are fractions of the
+    body weight."""
     shares = np.sqrt(np.repeat(loads, 3))
     shares[::3] = 0.0
     rows = sparse.csr_matrix(contacts.jacobian.multiply(shares[:, None]))

@@ -186,7 +186,7 @@ def part_paths(folder: Path) -> list[Path]:
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write ``arrays`` by name; the file is complete or absent."""
+    """Write ``arrays`` under their names; the file is complete or absent."""
     with atomic_write(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, schema=np.int64(SCHEMA), **arrays)  # pyright: ignore[reportArgumentType]
 

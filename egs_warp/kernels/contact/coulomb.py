@@ -45,7 +45,7 @@ _HALVINGS = wp.constant(10)
 """Maximum number of halvings of a step in the line search."""
 _MAX_SWEPT = wp.constant(MAX_SWEPT_CONTACTS)
 _MIN_PIVOT = wp.constant(real(1e-5))
-"""Pivot threshold of the elimination by blocks, which exchanges no rows. The equations have entries of about 1."""
+"""Pivot threshold of the elimination by blocks, which exchanges no rows. The entries of the equations are about 1."""
 _MIN_DECREASE = wp.constant(real(1e-4))
 """Sufficient decrease of the residual norm, per unit of the step length."""
 _REGULARIZATION, _STRONG_REGULARIZATION = wp.constant(real(1e-6)), wp.constant(real(1e-4))

@@ -13,7 +13,7 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 256
-"""Threads for each problem on a GPU."""
+"""Number of threads for each problem on a GPU."""
 MAX_SWEPT_CONTACTS = 128
 """Maximum number of contacts of ``sweep_by_block``."""
 SHARED_MEMORY_DOUBLES = 5264

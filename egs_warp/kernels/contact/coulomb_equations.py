@@ -14,7 +14,7 @@ from egs_warp.precision import Vec3, Vec4, real
 wp.set_module_options({"enable_backward": False})
 
 _ACROSS = wp.constant(32)
-"""Threads that share a row of the equations."""
+"""Number of threads that share a row of the equations."""
 _SINGULAR = wp.constant(real(1e-14))
 """Relative pivot threshold. An unknown whose pivot is smaller than this fraction of the largest so far stays zero."""
 

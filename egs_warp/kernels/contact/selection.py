@@ -8,7 +8,7 @@ from egs_warp.precision import Vec4, real
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 64
-"""Threads for each cell on a GPU."""
+"""Number of threads for each cell on a GPU."""
 
 
 @wp.kernel

@@ -11,7 +11,7 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 LANES = 4
-"""Tetrahedra of a group; the last group is filled with tetrahedra of zero volume."""
+"""Number of tetrahedra in a group; the last group is filled with tetrahedra of zero volume."""
 PAIRS = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
 """Corner pairs of the blocks of an element in the upper triangle, in the order of ``Elements.entries``."""
 

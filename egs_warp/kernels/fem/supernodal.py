@@ -36,7 +36,7 @@ class Fronts:
     first: wp.array[wp.int32]
     """(S,) first column of each block."""
     widths: wp.array[wp.int32]
-    """(S,) columns of each block."""
+    """(S,) number of columns of each block."""
     row_offsets: wp.array[wp.int32]
     """(S + 1,) offset of each front in ``rows``."""
     rows: wp.array[wp.int32]
@@ -315,7 +315,7 @@ def solve_panel_native(
         right: address of B, float64.
         row_stride: row stride of B, in numbers.
         column_stride: column stride of B, in numbers.
-        count: columns of B.
+        count: number of columns of B.
         weights: address of w (n,), or 0.
         dt_now: factor of B.
         dt_ahead: factor of the solution.

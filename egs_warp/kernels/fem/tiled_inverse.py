@@ -15,9 +15,9 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 TILE_SIDE = 64
-"""Rows and columns of a tile."""
+"""Number of rows and of columns of a tile."""
 BLOCK = 256
-"""Threads of a block."""
+"""Number of threads of a block."""
 TASK_SIZE = 16
 """Length of a task record, int32.
 

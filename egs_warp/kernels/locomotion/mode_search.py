@@ -48,7 +48,7 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 512
-"""Threads of the block on a GPU."""
+"""Number of threads of the block on a GPU."""
 HEADER_SIZE = 8
 """Number of entries before the QP in the packed input, and before the point in the packed result."""
 

@@ -236,7 +236,8 @@ def write_point(
     count: wp.int32,
     point: wp.uint64,
 ):
-    """Write x, n numbers at the address ``point``, from the ``multipliers`` of the ``active`` rows and their sides."""
+    """Write the n numbers of x to the address ``point``, given the ``multipliers`` of the ``active`` rows and their
+    sides."""
     ...
 
 
