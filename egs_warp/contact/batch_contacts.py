@@ -204,7 +204,7 @@ class BatchDetector:
     def contacts(
         self, selected: torch.Tensor, gaps: torch.Tensor, faces: torch.Tensor, order: torch.Tensor | None = None
     ) -> BatchContacts:
-        """Build the contacts of the selected points. Blocks until the device has finished.
+        """Build the contacts of the selected points, and block until the device has finished.
 
         Args:
             selected: (c, P) bool.
@@ -238,7 +238,7 @@ class BatchDetector:
     def append_contacts(
         self, contacts: BatchContacts, forces: torch.Tensor, added: BatchContacts
     ) -> tuple[BatchContacts, torch.Tensor]:
-        """Append the contacts ``added`` to ``contacts``, and zeros to ``forces`` (c, K, 3). Blocks until the device has
+        """Append the contacts ``added`` to ``contacts``, and zeros to ``forces`` (c, K, 3); block until the device has
         finished.
         """
         wide = contacts.with_capacity(max(int((contacts.counts + added.counts).max()), contacts.capacity))

@@ -218,7 +218,7 @@ class BatchSolver:
         last: bool,
     ) -> tuple[BatchResult, BatchLinearization]:
         """Run Newton's method with the contacts of ``task`` until points must be added, which never happens in the
-        ``last`` round. Returns the result and the last linearisations.
+        ``last`` round. Return the result and the last linearisations.
         """
         with self.stages("elasticity"):
             state = _NewtonState.begin(velocities, forces, *task.contact_free_residual(velocities, forces))
@@ -265,7 +265,7 @@ class BatchSolver:
     def _newton_step(
         self, task: _RoundInputs, search: _NewtonState, response: BatchLinearization, *, first: bool
     ) -> torch.Tensor:
-        """Take one Newton step in each world of ``search``, in place. Returns (c,) bool, True where the tangent must
+        """Take one Newton step in each world of ``search``, in place. Return (c,) bool, True where the tangent must
         be updated.
         """
         problem = task.problem

@@ -45,8 +45,8 @@ class DeviceContactLinearizer(StepWorkspace):
         self.current: DeviceContactLinearization | None = None
 
     def __call__(self, tangent: Tangent, contacts: ContactSet) -> DeviceContactLinearization:
-        """Linearise ``contacts`` with ``tangent`` and make the result ``current``. Blocks only if the factors are still
-        being computed.
+        """Linearise ``contacts`` with ``tangent`` and make the result ``current``. This blocks only if the factors are
+        still being computed.
         """
         assert tangent.factors is self.factors
         workspace, self.predicted_start = self.workspace_for(contacts), None

@@ -143,7 +143,7 @@ class GraphStream:
     def while_graph(self, graph: torch.cuda.CUDAGraph, going: torch.Tensor) -> Callable[[], None]:
         """Return a function that replays a graph recorded with ``keep`` while ``going`` (1,) int32 is not 0.
 
-        Uses a conditional graph node if the driver supports it, and otherwise a loop on the host.
+        The loop is a conditional graph node if the driver supports that; otherwise it runs on the host.
         """
         if not wp.is_conditional_graph_supported():
 
@@ -189,7 +189,7 @@ class PinnedUpload:
     def write(self, *parts: np.ndarray) -> None:
         """Write the concatenated ``parts``, padded with zeros, to the host buffer, for a graph that calls ``send``.
 
-        Blocks until the previous copy, marked by ``start_copy``, has finished.
+        The call blocks until the previous copy, marked by ``start_copy``, has finished.
         """
         host, at = self.host.numpy(), 0
         self.wait()

@@ -75,7 +75,7 @@ class LinearSolver(Protocol):
         """Return the quadratic model of the elastic energy in a subspace.
 
         Displacements are X = dt_now V + dt_ahead S^-1 diag(w) V, with ``reference`` subtracted from the last column.
-        Requires that no low-rank term has been added to S.
+        No low-rank term may have been added to S.
 
         Args:
             entries: (nnz,) upper entries of H, in the order of the pattern.

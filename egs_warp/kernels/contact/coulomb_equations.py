@@ -145,7 +145,7 @@ def write_row(
 @wp.func
 def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, regularization: real, newton: Newton):
     """Write the equations of a Newton step according to the state of each contact: separating, sticking or sliding.
-    Returns the number of unknowns.
+    Return the number of unknowns.
 
     Components that project to zero are known: their step is minus the residual. ``regularization`` is added to the
     diagonal of normal and sticking components.
