@@ -48,7 +48,7 @@ class BatchContacts(BatchedRecord):
 
     @property
     def valid(self) -> torch.Tensor:
-        """(c, K) bool, which entries are contacts."""
+        """(c, K) bool, True for entries that are contacts."""
         return torch.arange(self.capacity, device=self.counts.device) < self.counts[:, None]
 
     def _kernel_inputs(self) -> list[Any]:
@@ -83,7 +83,7 @@ class BatchContacts(BatchedRecord):
             launch_on(out.device, kernel, tuple(dim), inputs=[*self._kernel_inputs(), *inputs], outputs=[(out, kind)])
 
     def with_capacity(self, capacity: int) -> BatchContacts:
-        """Return the contacts padded to ``capacity``, which is not below the present one."""
+        """Return the contacts padded to ``capacity``, which is at least the current one."""
         more = capacity - self.capacity
         arrays = {name: padded(value, more) for name, value in self.batched_fields() if name != "counts"}
         return replace(self, **arrays)
@@ -95,12 +95,12 @@ def padded(values: torch.Tensor, more: int) -> torch.Tensor:
 
 
 class BatchDetector:
-    """Gaps and selection of contact points for at most ``count`` worlds, as ``ContactDetector`` and
+    """Gaps and selection of contact points for at most ``count`` worlds: the batched ``ContactDetector`` and
     ``ContactSelector``.
     """
 
     def __init__(self, geometry: ContactGeometry, points: ContactSelector, count: int, *, device: torch.device) -> None:
-        """Upload the model.
+        """Upload the points and obstacles.
 
         Args:
             geometry: the points and obstacles of one world.
@@ -112,7 +112,7 @@ class BatchDetector:
             ArgumentError: for uneven ground.
         """
         if geometry.field is not None:
-            raise ArgumentError("geometry", "batched worlds need flat ground; run these jobs in processes")
+            raise ArgumentError("geometry", "batched worlds need flat ground; run these jobs in separate processes")
         self.device, self._activation_distance, self._hysteresis, self._gap_tolerance = (
             device,
             points.activation_distance,
@@ -156,12 +156,12 @@ class BatchDetector:
     def select(
         self, previous: torch.Tensor, valid: torch.Tensor, loaded: torch.Tensor, gaps: torch.Tensor
     ) -> torch.Tensor:
-        """Select the points of the next step, as ``ContactSelector.select``.
+        """Select the points of the next step, as ``ContactSelector.select`` does.
 
         Args:
             previous: (c, K) points of the previous step.
-            valid: (c, K) bool, which entries of ``previous`` are points.
-            loaded: (c, K) bool, which of them carried load.
+            valid: (c, K) bool, True for entries of ``previous`` that are points.
+            loaded: (c, K) bool, True for points that carried load.
             gaps: (c, P) m, at the predicted end of the step.
 
         Returns:
@@ -180,8 +180,8 @@ class BatchDetector:
         )
 
     def find_deeper(self, contacts: BatchContacts, gaps: torch.Tensor, depth: float) -> torch.Tensor:
-        """Return (c, P) bool, the deepest point of each cell that is below ``-depth`` in ``gaps`` (c, P) and not in
-        ``contacts``.
+        """Return (c, P) bool, the deepest point of each cell whose gap in ``gaps`` (c, P) is below ``-depth`` and which
+        is not in ``contacts``.
         """
         deep = gaps < -depth
         active = torch.zeros_like(gaps, dtype=torch.int32)
@@ -204,7 +204,7 @@ class BatchDetector:
     def contacts(
         self, selected: torch.Tensor, gaps: torch.Tensor, faces: torch.Tensor, order: torch.Tensor | None = None
     ) -> BatchContacts:
-        """Build the contacts of the selected points. Blocks for the device.
+        """Build the contacts of the selected points, and block until the device has finished.
 
         Args:
             selected: (c, P) bool.
@@ -215,7 +215,7 @@ class BatchDetector:
         counts = selected.sum(dim=1)
         capacity = int(counts.max()) if len(counts) else 0
         columns = (selected.cumsum(dim=1) - 1).clamp(min=0)
-        # Points that are not selected go to an extra column, which is cut off.
+        # Points that are not selected are written to an extra column, which is dropped.
         points = torch.zeros((len(selected), capacity + 1), dtype=torch.int64, device=self.device)
         numbers = torch.arange(self.point_count, device=self.device).expand_as(selected)
         points.scatter_(1, torch.where(selected, columns, capacity), torch.where(selected, numbers, 0))
@@ -238,8 +238,8 @@ class BatchDetector:
     def append_contacts(
         self, contacts: BatchContacts, forces: torch.Tensor, added: BatchContacts
     ) -> tuple[BatchContacts, torch.Tensor]:
-        """Append the contacts ``added`` to ``contacts``, with zeros appended to ``forces`` (c, K, 3). Blocks for the
-        device.
+        """Append the contacts ``added`` to ``contacts``, and zeros to ``forces`` (c, K, 3); block until the device has
+        finished.
         """
         wide = contacts.with_capacity(max(int((contacts.counts + added.counts).max()), contacts.capacity))
         forces = padded(forces, wide.capacity - contacts.capacity)
@@ -254,12 +254,12 @@ class BatchDetector:
     def transfer_forces(
         self, contacts: BatchContacts, before: torch.Tensor, valid: torch.Tensor, forces: torch.Tensor
     ) -> torch.Tensor:
-        """Map contact forces of the previous step to ``contacts``; zero where a point is new.
+        """Map contact forces of the previous step to ``contacts``; they are zero for new points.
 
         Args:
             contacts: contacts of the step.
             before: (c, L) points of the previous step.
-            valid: (c, L) bool, which entries of ``before`` are points.
+            valid: (c, L) bool, True for entries of ``before`` that are points.
             forces: (c, L, 3) newtons.
 
         Returns:
@@ -280,15 +280,15 @@ def coulomb_forces_batch(
     frictions: torch.Tensor,
     start: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Compute Coulomb forces of c worlds, as ``coulomb_forces``.
+    """Compute Coulomb forces of c worlds, as ``coulomb_forces`` does in one.
 
     Args:
         counts: (c,) int32, number of contacts of each world.
         delassus: (c, 3K, 3K) m/(N s).
-        free_velocity: (c, 3K) m/s.
-        shift: (c, K) m/s.
+        free_velocity: (c, 3K) m/s without contact forces.
+        shift: (c, K) m/s, bias of the normal velocities.
         frictions: (c,).
-        start: (c, K, 3) newtons.
+        start: (c, K, 3) newtons, initial forces.
 
     Returns:
         (c, K, 3) newtons and the residuals (c,) in m/s.
@@ -321,7 +321,7 @@ def _solve(
     frictions: torch.Tensor,
     start: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Compute the forces by the kernel alone, without continuation."""
+    """Compute the forces with the kernel alone, without continuation."""
     worlds, capacity, _ = start.shape
     forces, residual, size = start.clone(), start.new_zeros(worlds), 3 * capacity
     vectors = start.new_empty((worlds, 5, size))

@@ -1,6 +1,6 @@
 """Steps with contact of many worlds in lockstep on the device (Eq. 4, 8, 9).
 
-Every world takes the decisions of ``coupled_step``; converged worlds are left out of later iterations.
+Every world makes the decisions of ``coupled_step``; converged worlds are left out of later iterations.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def no_timer(name: str) -> AbstractContextManager[object]:
 
 @dataclass(frozen=True)
 class BatchLinearization(BatchedRecord):
-    """``ContactLinearization`` of c worlds, by the tangents in their slots."""
+    """``ContactLinearization`` of c worlds, with the tangents in their slots."""
 
     momentum_projection: BatchMomentumProjection
     columns: torch.Tensor
@@ -69,7 +69,7 @@ class BatchResult(BatchedRecord):
     is_singular: torch.Tensor
     """(c,) bool, True if a tangent could not be factored (``UnsolvableStepError``)."""
     contacts_added: torch.Tensor
-    """(c,) bool, True if the round ended because points were found to add."""
+    """(c,) bool, True if the round ended because points must be added."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class BatchSolver:
     penetration_tolerance: float
     """Depth up to which a point is not pushed out, m."""
     tolerance: float
-    """Residual over dt x weight at which a world has converged."""
+    """Residual divided by dt x weight at which a world has converged."""
     stages: StageTimer = no_timer
 
     def normal_bias(self, contacts: BatchContacts, dt: float) -> torch.Tensor:
@@ -96,7 +96,7 @@ class BatchSolver:
     def linearize(
         self, problem: BatchProblem, contacts: BatchContacts, momentum_projection: BatchMomentumProjection | None = None
     ) -> BatchLinearization:
-        """Linearise ``contacts`` by the tangents in the worlds' slots; the momentum projection is computed unless it
+        """Linearise ``contacts`` with the tangents in the worlds' slots; the momentum projection is computed unless it
         is passed.
         """
         with self.stages("substitute"):
@@ -153,11 +153,11 @@ class BatchSolver:
             problem: the steps of c worlds.
             contacts: initial contacts.
             response: their linearisation.
-            tensions: (c, M) newtons of the muscles.
+            tensions: (c, M) newtons, muscle tensions.
             frictions: (c,) Coulomb coefficients.
-            velocities: (c, N, 3) m/s, the start.
-            forces: (c, K, 3) newtons, the start.
-            start_gaps: (c, P) gaps and faces at the start of the step.
+            velocities: (c, N, 3) m/s, initial velocities.
+            forces: (c, K, 3) newtons, initial forces.
+            start_gaps: (c, P) m, gaps at the start of the step, and (c, P), their faces.
 
         Returns:
             The contacts at the end, and the result.
@@ -189,7 +189,7 @@ class BatchSolver:
             new = self.detector.contacts(added[more], *(each[todo[more]] for each in start_gaps), order=ends[more])
             grown, forces = self.detector.append_contacts(active_contacts.gather(more), done.forces[more], new)
             extra = grown.capacity - contacts.capacity
-            # Copied, since the caller's contacts must not change.
+            # Copy, since the caller's contacts must not change.
             contacts = contacts.with_capacity(grown.capacity).gather(all_worlds)
             result = replace(result, forces=padded(result.forces, extra))
             todo = todo[more]
@@ -199,8 +199,8 @@ class BatchSolver:
         return contacts, result
 
     def _points_to_add(self, task: _RoundInputs, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (c, P) bool, the points that would end too deep by ``velocities`` (c, N, 3), and (c, P) m, all gaps
-        at the end.
+        """Return (c, P) bool, the points that would be too deep at the end of the step with ``velocities`` (c, N, 3),
+        and (c, P) m, all gaps at the end.
         """
         gaps, _ = self.detector.gaps(task.problem.end_positions(velocities))
         tolerance = self.penetration_tolerance
@@ -217,8 +217,8 @@ class BatchSolver:
         *,
         last: bool,
     ) -> tuple[BatchResult, BatchLinearization]:
-        """Run Newton's method with the contacts of ``task`` until points are found to add (never in the ``last``
-        round). Returns the result and the last linearisations.
+        """Run Newton's method with the contacts of ``task`` until points must be added, which never happens in the
+        ``last`` round. Return the result and the last linearisations.
         """
         with self.stages("elasticity"):
             state = _NewtonState.begin(velocities, forces, *task.contact_free_residual(velocities, forces))
@@ -254,8 +254,8 @@ class BatchSolver:
         return BatchResult(*ends), response
 
     def _check_penetration(self, task: _RoundInputs, search: _NewtonState, rows: torch.Tensor) -> None:
-        """Find points to add in the worlds of ``task``, which are the rows ``rows`` of ``search``, and end the round
-        of worlds that have some.
+        """Find points to add in the worlds of ``task``, which are the rows ``rows`` of ``search``, and end the round of
+        worlds in which there are some.
         """
         with self.stages("detect"):
             added, _ = self._points_to_add(task, search.velocities[rows])
@@ -265,7 +265,7 @@ class BatchSolver:
     def _newton_step(
         self, task: _RoundInputs, search: _NewtonState, response: BatchLinearization, *, first: bool
     ) -> torch.Tensor:
-        """Take one Newton step in each world of ``search``, in place. Returns (c,) bool, True where the tangent must
+        """Take one Newton step in each world of ``search``, in place. Return (c,) bool, True where the tangent must
         be updated.
         """
         problem = task.problem
@@ -335,8 +335,8 @@ class _RoundInputs(BatchedRecord):
     def contact_free_residual(
         self, velocities: torch.Tensor, forces: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (c, N, 3) N s, the residual without contact forces at ``velocities`` (c, N, 3), and (c,) the norm
-        of the residual with ``forces`` (c, K, 3), over dt x weight.
+        """Return (c, N, 3) N s, the residual without contact forces at ``velocities`` (c, N, 3), and (c,) the norm of
+        the residual with ``forces`` (c, K, 3), divided by dt x weight.
         """
         problem = self.problem
         free = problem.residual(velocities, self.tensions)
@@ -355,9 +355,9 @@ class _NewtonState(BatchedRecord):
     contact_free_residual: torch.Tensor
     """(c, N, 3) N s, residual without contact forces."""
     residual_norm: torch.Tensor
-    """(c,) norm of the residual with contact forces, over dt x weight."""
+    """(c,) norm of the residual with contact forces, divided by dt x weight."""
     recent_residuals: torch.Tensor
-    """(c, RESIDUAL_WINDOW) residuals after the last steps; -1 where there is none."""
+    """(c, RESIDUAL_WINDOW) residuals after the last steps; unused entries are -1."""
     coulomb_failures: torch.Tensor
     """(c,) int64, number of steps whose forces violated Coulomb's law."""
     iterations: torch.Tensor
@@ -371,9 +371,9 @@ class _NewtonState(BatchedRecord):
     is_singular: torch.Tensor
     """(c,) bool, True if a tangent could not be factored."""
     is_near_end: torch.Tensor
-    """(c,) bool, True if the last step came near enough to the end to search for points to add."""
+    """(c,) bool, True if the last step came near enough to the solution to search for points to add."""
     contacts_added: torch.Tensor
-    """(c,) bool, True if points were added in that search."""
+    """(c,) bool, True if that search found points to add."""
 
     @classmethod
     def begin(

@@ -33,8 +33,8 @@ def coulomb_forces(
     tolerance: float = TOLERANCE,
     iteration_limit: int = MAX_ITERATIONS,
 ) -> tuple[np.ndarray, float]:
-    """Compute forces f (n, 3) with 0 <= f_n, 0 <= u_n + shift, complementary, and exact Coulomb friction; u = free + G
-    f (Eq. 8, 9).
+    """Compute contact forces f (n, 3) with exact Coulomb friction and complementary f_n >= 0 and u_n + shift >= 0,
+    where u = free_velocity + G f (Eq. 8, 9).
 
     The method is semismooth Newton on the projection equations of Alart and Curnier, started from block Gauss-Seidel.
     If it fails, the problem is solved by continuation from compliant contacts (``REGULARIZATION_STEPS``).
@@ -46,7 +46,7 @@ def coulomb_forces(
         friction: Coulomb coefficient mu.
         start: (n, 3) newtons, initial forces.
         tolerance: residual at which Newton's method ends, m/s.
-        iteration_limit: steps of the first attempt.
+        iteration_limit: maximum number of Newton steps of the first attempt.
 
     Returns:
         The forces (n, 3) in newtons and the residual in m/s.
@@ -67,7 +67,7 @@ def coulomb_forces(
 
 
 class _CoulombWorkspace:
-    """Buffers for a problem of ``count`` contacts, and a recorded launch on them: preparing a new launch costs as much
+    """Buffers for a problem of ``count`` contacts, and a recorded launch on them: preparing a new launch takes as long
     as solving for ten contacts.
     """
 
@@ -91,7 +91,7 @@ class _CoulombWorkspace:
     def solve(
         self, delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        """Compute the forces by the kernel alone, without continuation (arguments as in ``coulomb_forces``)."""
+        """Compute the forces with the kernel alone, without continuation (arguments as in ``coulomb_forces``)."""
         self._delassus[0], self._free[0], self._shifts[0] = delassus, free_velocity, shift
         self._friction[0], self._forces[0] = friction, start.ravel()
         self._launch.launch()
@@ -102,7 +102,7 @@ _workspace = thread_local_cache(32)(_CoulombWorkspace)
 
 
 def pack_contacts(delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float) -> Any:
-    """Return the kernels' ``Contacts`` on the memory of these arrays (shapes as in ``coulomb_forces``)."""
+    """Return the kernels' ``Contacts``, which share the memory of these arrays (shapes as in ``coulomb_forces``)."""
     contacts = Contacts()
     contacts.count, contacts.friction = len(shift), friction
     contacts.delassus, contacts.free_velocity, contacts.normal_bias = (

@@ -20,16 +20,18 @@ from egs_warp.fem.step_problem import StepProblem
 from egs_warp.muscles.tension import MuscleEnergy
 
 MIN_STEP_LENGTH = 1e-3
-"""Length at which the line search gives up, as a fraction of a Newton step."""
+"""Step length below which the line search fails, as a fraction of a Newton step."""
 MAX_ACTIVATION_ROUNDS = 6
-"""Rounds of a step. Points may be added to the contact set after each but the last."""
+"""Maximum number of rounds of a step. Points may be added to the contact set after each round except the last."""
 PUSH_OUT_FRACTION = 0.2
 """Fraction of the depth beyond the tolerance that a step pushes a point out."""
 ACTIVATION_DEPTH = 0.6
-"""Fraction of the penetration tolerance. Points that would end deeper are added to the contact set."""
+"""Depth beyond which a point is added to the contact set if it would end there, as a fraction of the penetration
+tolerance.
+"""
 ACTIVATION_RESIDUAL = 1e-3
-"""Residual over dt x weight. When a round first falls below it, points that would end too deep are added; the end is
-known well enough by then. They are also added at the end of the round.
+"""Residual divided by dt x weight. When a round first falls below it, the end of the step is accurate enough to add the
+points that would be too deep there. They are also added at the end of the round.
 """
 MAX_SINK = 0.3
 """Fraction of the penetration tolerance by which a point that is already deep may sink in a step without being added.
@@ -39,7 +41,9 @@ MAX_CREEP = 0.02
 COULOMB_TOLERANCE = 1e-6
 """Violation of Coulomb's law at the end of a step, as a fraction of dt g, the speed that free fall gains in a step."""
 MAX_COULOMB_FAILURES = 3
-"""Newton steps of a round whose forces may violate it by more before the solve fails and the step is halved."""
+"""Maximum number of Newton steps of a round whose forces violate Coulomb's law by more than ``COULOMB_TOLERANCE``. With
+more, the solve fails and the step is halved.
+"""
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class CoupledResult:
     """(n, 3) newtons on the body: normal and two tangential components for each contact."""
     converged: bool
     residual: float
-    """Norm of the residual of the equation of motion, over dt x weight."""
+    """Norm of the residual of the equation of motion, divided by dt x weight."""
     iterations: int
     factorization_count: int
     """Number of factorisations computed in the solve."""
@@ -65,7 +69,7 @@ class CoupledResult:
 
 @dataclass(frozen=True)
 class CoupledSolver:
-    """Newton's method on velocities and contact forces at once."""
+    """Newton's method on velocities and contact forces together."""
 
     detector: ContactDetector
     points: ContactSelector
@@ -74,7 +78,7 @@ class CoupledSolver:
     penetration_tolerance: float
     """Metres. Points that would end deeper than ``ACTIVATION_DEPTH`` of it are added to the contact set."""
     tolerance: float = 1e-8
-    """Residual over dt x weight at which the solve ends."""
+    """Residual divided by dt x weight at which the solve ends."""
 
     def normal_bias(self, contacts: ContactSet, dt: float) -> np.ndarray:
         """Return the velocity bias added to each contact's normal velocity.
@@ -109,8 +113,8 @@ class CoupledSolver:
         Args:
             response: linearisation with the initial contacts, reused while it converges well.
             tension: muscle energy of the step, or None.
-            velocities: (N, 3) m/s, the start. They must invert no element.
-            forces: (n, 3) newtons, the start.
+            velocities: (N, 3) m/s, initial velocities, which must not invert an element.
+            forces: (n, 3) newtons, initial forces.
         """
         iterations = tangents = 0
         for number in range(MAX_ACTIVATION_ROUNDS):
@@ -190,7 +194,7 @@ class CoupledSolver:
                 trial = iterate.line_search_point(steps.forces, length)
             if better:
                 before, iterate = iterate, trial
-                # After a whole step the contact velocities are those that were solved for, by linearity.
+                # By linearity, the contact velocities after a full step are those of the Coulomb solve.
                 satisfies_coulomb = satisfies_coulomb and length == 1.0
                 ended = satisfies_coulomb and iterate.residual_norm <= convergence.tolerance
                 slow = (

@@ -40,12 +40,12 @@ _HULL_BULGE = 1e-7
 far below what would make another point of the grid a vertex.
 """
 _CACHED_CONFIGURATIONS = 4
-"""Number of configurations whose gaps are cached. A step ends where the next one starts, and both are requested
-several times.
+"""Number of configurations whose gaps are cached. The gaps at the start and the end of a step are requested several
+times, and a step ends where the next one starts.
 """
 _SLACK_FRACTION = 0.25
-"""Fraction of the grid spacing. A point that is no deeper below a plane counts as on it, as it does after rounding
-to the grid.
+"""Fraction of the grid spacing. A point that is less than this below a plane counts as a point of the plane, where
+rounding to the grid places it.
 """
 _SQUARE_FRACTION = 0.5
 """Side of a square, in spacings of uneven ground. In each square the lowest point of each tetrahedron is retained."""
@@ -53,7 +53,7 @@ _SQUARE_FRACTION = 0.5
 
 @dataclass(frozen=True)
 class ContactGeometry:
-    """All points of the body that can be the first of their tetrahedron to touch, and the obstacles. Constant."""
+    """All points of the body that can be the first of their tetrahedron to touch an obstacle, and the obstacles."""
 
     mesh: TetMesh
     planes: tuple[Plane, ...]
@@ -158,7 +158,7 @@ def contact_geometry(
     grid: float | None = None,
     device: str | None = None,
 ) -> ContactGeometry:
-    """Build the contact points from all T+ and T- (Eq. 3) (docs/concepts/contact.md).
+    """Build the contact points from the end points T+ and T- of all embeddings (Eq. 3, docs/concepts/contact.md).
 
     End points below an obstacle at rest are shortened to it. Only the vertices of the convex hull of each tetrahedron's
     points are stored: the deformation is affine inside a tetrahedron, so its deepest point is always one of them.
@@ -186,7 +186,7 @@ def contact_geometry(
     arms = gamma * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :] * axes
     obstacles = [Solid((plane,)) for plane in planes] + list(solids)
     grounds = planes if field is None else (field, *planes[1:])
-    # Many points of a flat base lie in the plane to rounding; they do not count as below it.
+    # Many points of a flat base lie in the plane up to rounding; they do not count as below it.
     slack = 0.0 if grid is None else _SLACK_FRACTION * grid
     above = np.all([ground.heights(means) >= -slack for ground in grounds], axis=0)
     least = MIN_OUTSIDE_FRACTION * np.count_nonzero(above)
@@ -237,8 +237,8 @@ def contact_geometry(
 
 
 def _fraction_above(field: HeightField, means: np.ndarray, arms: np.ndarray) -> np.ndarray:
-    """Return (n,) the fraction of the ``arms`` (n, 3) that stays above the ground; the ``means`` (n, 3) are above
-    it.
+    """Return (n,), the fraction of each of the ``arms`` (n, 3) that stays above the ground; the ``means`` (n, 3) are
+    above it.
     """
     low, high = np.zeros(len(arms)), np.ones(len(arms))
     low = np.where(field.heights(means + arms) >= 0.0, 1.0, low)
@@ -250,7 +250,7 @@ def _fraction_above(field: HeightField, means: np.ndarray, arms: np.ndarray) -> 
 
 
 def _lowest_points(tet_from_point: np.ndarray, points: np.ndarray, field: HeightField) -> np.ndarray:
-    """Return (k,) indices into ``points`` (P, 3): the lowest of each tetrahedron over each small square of the
+    """Return (k,), indices into ``points`` (P, 3): the lowest point of each tetrahedron over each small square of the
     ground.
     """
     square = np.floor((points - field.origin) @ field.axes[:2].T / (_SQUARE_FRACTION * field.spacing)).astype(np.int64)
@@ -261,7 +261,7 @@ def _lowest_points(tet_from_point: np.ndarray, points: np.ndarray, field: Height
 
 
 def _hull_points(tet_from_point: np.ndarray, places: np.ndarray, tet_count: int) -> np.ndarray:
-    """Return (k,) indices of the hull vertices of each tetrahedron's points; ``places`` (P, 3) in any affine
+    """Return (k,), the indices of the hull vertices of each tetrahedron's points; ``places`` (P, 3) are in any affine
     coordinates.
     """
     order = np.argsort(tet_from_point, kind="stable")
@@ -272,7 +272,7 @@ def _hull_points(tet_from_point: np.ndarray, places: np.ndarray, tet_count: int)
         if len(members) > 8:
             try:
                 members = members[ConvexHull(_bulge(places[members])).vertices]
-            except QhullError:  # all in one plane: keep each
+            except QhullError:  # all in one plane: keep every point
                 pass
         vertices.append(members)
     return np.sort(np.concatenate(vertices))
@@ -407,8 +407,8 @@ class ContactDetector:
 
 
 def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float, slop: float) -> np.ndarray:
-    """Return (n,) m/s, the constant of the normal measure c = N^T u' + max(phi, 0) / dt + max(min(phi + slop, 0) b /
-    dt, -cap) (docs/concepts/contact.md).
+    """Return (n,) m/s, the terms of the normal measure c = N^T u' + max(phi, 0) / dt + max(min(phi + slop, 0) b / dt,
+    -cap) that do not depend on the velocity u' (docs/concepts/contact.md).
 
     Args:
         gaps: (n,) phi, m.

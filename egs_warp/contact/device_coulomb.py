@@ -37,7 +37,7 @@ class CoulombWorkspace:
         )
         self.friction, self.normal_bias = self._parameters.device.split([1, capacity])
         self.counts = torch.zeros(1, dtype=torch.int32, device=device)
-        """(1,) int32, contacts of the operator. ``friction`` is (1,), ``normal_bias`` (K,) m/s."""
+        """(1,) int32, number of contacts of the operator. ``friction`` is (1,), ``normal_bias`` (K,) m/s."""
         self._regular = torch.zeros((width, width), dtype=torch.float64, device=device)
         self._vectors, self._indices = self._regular.new_zeros((1, 5, width)), self.counts.new_zeros((1, 2, width))
         self._matrices = self._regular.new_zeros((1, width, (width + 4) // 4, 4))
@@ -51,7 +51,7 @@ class CoulombWorkspace:
             self._uploaded_parameters = parameters
 
     def has_uploaded(self, shifts: np.ndarray, friction: float) -> bool:
-        """Return True if these were uploaded last."""
+        """Return True if these values were uploaded last."""
         return np.array_equal(np.array([friction, *shifts]), self._uploaded_parameters)
 
     def enqueue_operator(self, delassus: torch.Tensor) -> None:
@@ -66,7 +66,7 @@ class CoulombWorkspace:
 
         Args:
             speeds: (3K,) m/s, contact velocities without contact forces.
-            forces: (3K,) newtons, the start; overwritten with the solution.
+            forces: (3K,) newtons, initial forces; overwritten with the solution.
             violation: (1,) m/s, overwritten with the residual of Coulomb's law.
         """
         lanes = kernels.BLOCK if speeds.is_cuda else 1

@@ -45,7 +45,9 @@ class DeviceContactLinearizer(StepWorkspace):
         self.current: DeviceContactLinearization | None = None
 
     def __call__(self, tangent: Tangent, contacts: ContactSet) -> DeviceContactLinearization:
-        """Linearise ``contacts`` by ``tangent`` and make the result ``current``. Blocks only for pending factors."""
+        """Linearise ``contacts`` with ``tangent`` and make the result ``current``. This blocks only if the factors are
+        still being computed.
+        """
         assert tangent.factors is self.factors
         workspace, self.predicted_start = self.workspace_for(contacts), None
         with self.stream:
@@ -115,7 +117,7 @@ class DeviceContactLinearization(ContactLinearization):
         return self.workspace.download_delassus()[:width, :width]
 
     def with_added_contacts(self, contacts: ContactSet) -> DeviceContactLinearization:
-        """Return the linearisation of ``contacts``, which begin with the present ones, by the same tangent."""
+        """Return the linearisation of ``contacts``, of which the first are the current ones, with the same tangent."""
         return self.owner(self.tangent, contacts)
 
     def iterate_at(
@@ -189,8 +191,8 @@ class DeviceContactLinearization(ContactLinearization):
 
 
 class DeviceNewtonIterate:
-    """``NewtonIterate`` on the device. Its values may still be in flight, and its tangent only queued; the
-    properties block for them.
+    """``NewtonIterate`` on the device. Its values may still be in flight, and its tangent only queued; the properties
+    block until they are available.
     """
 
     def __init__(
@@ -210,7 +212,7 @@ class DeviceNewtonIterate:
         """Set the values that were downloaded.
 
         Args:
-            size: norm of the residual, over dt x weight.
+            size: norm of the residual, divided by dt x weight.
             speeds: (3K,) m/s, contact-free velocities of the contacts.
             penetration: penetration test, or None.
         """
@@ -224,7 +226,7 @@ class DeviceNewtonIterate:
 
     @property
     def residual_norm(self) -> float:
-        """Norm of the residual with contact forces, over dt x weight; not finite where an element is inverted."""
+        """Norm of the residual with contact forces, divided by dt x weight; not finite where an element is inverted."""
         if self._residual_norm is None:
             self._wait_values()
         assert self._residual_norm is not None
@@ -257,7 +259,7 @@ class DeviceNewtonIterate:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> bool:
-        """Return True if this is the iterate of these very arrays, with equal tensions."""
+        """Return True if this is the iterate of the same array objects, with equal tensions."""
         if self.linearization is not response or self.velocities is not velocities or self.forces is not forces:
             return False
         if tension is None or self.tension is None:
@@ -281,7 +283,7 @@ class DeviceNewtonIterate:
     def newton_steps(
         self, shift: np.ndarray, friction: float, convergence: ConvergenceState | None = None
     ) -> NewtonStepResult:
-        """Run the Newton loop on the device and block for its end (arguments as in ``NewtonIterate``).
+        """Run the Newton loop on the device and block until it ends (arguments as in ``NewtonIterate``).
 
         A loop that is already queued from this iterate with the same parameters is used. Without ``convergence`` one
         step is taken. If the Coulomb solve of the last step failed, it is repeated on the host.
@@ -365,7 +367,7 @@ class DeviceNewtonIterate:
         return iterate
 
     def _wait_values(self) -> None:
-        """Block for the values in flight. No other trial may have been started since."""
+        """Block until the values in flight have arrived. No other trial may have been started since."""
         self._wait_tangent()
         response, workspace = self.linearization, self.linearization.workspace
         assert workspace.pending_iterate is None and self is (workspace.trial_iterate or workspace.base_iterate)
@@ -380,8 +382,8 @@ class DeviceNewtonIterate:
         self.set_values(size, workspace.readback.free_contact_velocities, penetration)
 
     def _wait_tangent(self) -> None:
-        """Block for a queued tangent. If it is not definite, compute another: the sum with the muscles' stiffness
-        may be definite where the first part alone is not.
+        """Block until a queued tangent is factored. If it is not positive definite, compute another one: the sum with
+        the muscles' stiffness may be positive definite where the first part alone is not.
         """
         if not self._tangent_pending:
             return

@@ -169,7 +169,7 @@ class NewtonWorkspace:
         )
 
     def linearize(self, problem: StepProblem, contacts: ContactSet) -> None:
-        """Linearise ``contacts`` by the current factors, asynchronously."""
+        """Linearise ``contacts`` with the current factors, asynchronously."""
         self.set_contacts(contacts)
         self._run(self.enqueue_linearization, problem.dt, 1.0 + problem.dt * problem.drag)
 
@@ -196,17 +196,18 @@ class NewtonWorkspace:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> tuple[float, np.ndarray]:
-        """Take one Newton step with fixed contact forces by the current factors, and block for it.
+        """Take one Newton step with fixed contact forces and the current factors, and block until it is finished.
 
         Args:
             problem: the step.
             contacts: n contacts.
             tension: muscle energy, or None.
-            velocities: (N, 3) m/s, the start.
+            velocities: (N, 3) m/s, initial velocities.
             forces: (n, 3) newtons.
 
         Returns:
-            The norm of the internal gradient at the end, which is not finite if an element is inverted, and (3N,) m/s.
+            The norm of the internal gradient at the end, which is not finite if an element is inverted, and the
+            velocities (3N,) m/s.
         """
         with self.owner.stream:
             self.set_contacts(contacts)
@@ -290,7 +291,7 @@ class NewtonWorkspace:
         self, problem: StepProblem, *, length: float, target_forces: np.ndarray, base: float
     ) -> TrialReadback:
         """Evaluate a trial at the fraction ``length`` of the Newton step with contact forces ``target_forces`` (n,
-        3) from the slot ``base``, and block for it.
+        3) from the slot ``base``, and block until it is evaluated.
         """
         self._upload_trial(length, True, target_forces, base)
         return self._run_and_download(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
@@ -308,7 +309,7 @@ class NewtonWorkspace:
     ) -> None:
         """Start the Newton loop on the device, asynchronously; ``wait_newton`` blocks for its result.
 
-        Each step uses the Coulomb forces at its own start. The loop ends by the rule of ``convergence``.
+        Each step uses the Coulomb forces at its own start. The test of ``convergence`` ends the loop.
 
         Args:
             problem: the step.
@@ -316,7 +317,7 @@ class NewtonWorkspace:
             friction: Coulomb coefficient.
             convergence: state and tolerances of the loop.
             base: slot to start from, ``FROM_BASE`` or ``FROM_TRIAL``.
-            residual_norm: residual there over dt x weight; None reads that of the last trial.
+            residual_norm: residual there divided by dt x weight; None reads that of the last trial.
             enabled: (1,) int32 on the device; 0 skips the loop. None always runs it.
         """
         dt, ratio = problem.dt, 1.0 + problem.dt * problem.drag
@@ -399,7 +400,7 @@ class NewtonWorkspace:
         self._trial_upload.host[2] = base
 
     def reevaluate(self, *, base: float) -> None:
-        """Recompute the contact-free velocities of the contacts at the slot ``base`` by the current linearisation,
+        """Recompute the contact-free velocities of the contacts at the slot ``base`` with the current linearisation,
         asynchronously. Other values in the read-back belong to another trial.
         """
         with self.owner.stream:
@@ -412,7 +413,7 @@ class NewtonWorkspace:
     ) -> None:
         """Queue a new tangent, with its factors and linearisation, asynchronously.
 
-        The result is valid only if ``factors.is_ready`` turns out True.
+        The result is valid only if ``factors.is_ready`` is True after synchronisation.
 
         Args:
             problem: the step.
@@ -479,7 +480,7 @@ class NewtonWorkspace:
         """Compute the velocities after a Newton step.
 
         Args:
-            velocities: (3N,) m/s, the start.
+            velocities: (3N,) m/s, initial velocities.
             residual: (3N,) N s.
             end: (3N,) m/s, overwritten with the result.
         """

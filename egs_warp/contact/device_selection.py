@@ -58,7 +58,7 @@ class DeviceContactSelector:
         self._graphs = GraphCache(stream)
 
     def start_prefetch(self, positions: wp.array, ends: wp.array, before: np.ndarray) -> None:
-        """Start ``select``, asynchronously.
+        """Start the reductions for ``select``, asynchronously.
 
         Args:
             positions: (N,) start of the step, on the device.
@@ -84,8 +84,8 @@ class DeviceContactSelector:
         return self._buffers[capacity]
 
     def enqueue_prefetch(self, ends: wp.array, points: torch.Tensor) -> None:
-        """Queue ``select`` for the step that follows the current one, after ``enqueue_penetration`` at the end of
-        the current one.
+        """Queue the reductions for ``select`` in the step that follows the current one, after ``enqueue_penetration``
+        at the end of the current one.
 
         ``advance_prefetch`` makes the result valid.
 
@@ -118,11 +118,11 @@ class DeviceContactSelector:
     def select(
         self, before: np.ndarray, loaded: np.ndarray, start: np.ndarray, *, capacity: int | None = None
     ) -> ContactSet:
-        """Return the contacts of the prefetched step: those of ``ContactSelector.select``.
+        """Return the contacts of the prefetched step, the same as those of ``ContactSelector.select``.
 
         Args:
             before: (m,) contact points of the previous step.
-            loaded: (m,) bool, which of them carried load.
+            loaded: (m,) bool, True for points that carried load.
             start: (N, 3) m, start of the step.
             capacity: capacity in ``enqueue_prefetch``, whose result is already downloaded; None blocks for
                 ``start_prefetch``.
@@ -206,7 +206,7 @@ class _TransferBuffers:
         self._host_result.copy_(self._packed_result.view(-1), non_blocking=True)
 
     def result(self) -> list[np.ndarray]:
-        """Return what was downloaded: the lowest point of each cell, the previous step's points, and the deepest
+        """Return the downloaded points: the lowest point of each cell, the previous step's points, and the deepest
         penetrating point of each cell, (k, 4) each.
         """
         return np.split(self._host_result.numpy().reshape(-1, 4), np.cumsum(self._parts)[:-1])

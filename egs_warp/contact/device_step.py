@@ -1,7 +1,7 @@
 """Start and matrix of a body's step on a GPU: buffers, factorisation, momentum projection and prefetch of contacts.
 
-The kernel is in ``kernels/contact/step_start.py``. ``DeviceContactLinearizer`` in ``device_newton`` extends
-``StepWorkspace`` by the linearisations.
+The kernel is in ``kernels/contact/step_start.py``. ``DeviceContactLinearizer`` in ``device_newton`` adds the
+linearisations to ``StepWorkspace``.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class SolveEnd:
     capacity: int
 
     def capacity_if_continued(self, state: BodyState, dt: float, points: np.ndarray) -> int | None:
-        """Return the capacity if a step of ``dt`` seconds from ``state``, after ``points``, continues from this end;
-        None otherwise.
+        """Return the capacity if a step of ``dt`` seconds from ``state``, with the previous contact points ``points``,
+        continues from this end; None otherwise.
         """
         same = self.velocities is state.velocities and self.points is points and self.dt == dt
         return self.capacity if same else None
@@ -74,8 +74,8 @@ class StepWorkspace:
         self.positions, self.velocities = self._start_upload.device.split(size)
         self.lever_arms, self.rigid_guess, self.ballistic, self._next_ballistic = self.zeros(4, size)
         self.rotation_modes, self.inverse_inertia = self.zeros(size, 3), self.zeros(1, 3, 3)
-        """(3N, 3) and (1, 3, 3), as in ``StepProblem``. ``ballistic`` (3N,) m is where the nodes would end without
-        internal and contact forces.
+        """(3N, 3) and (1, 3, 3), as in ``StepProblem``. ``ballistic`` (3N,) m are the end positions of the nodes
+        without internal and contact forces.
         """
         self._ends = vectors(self.positions), vectors(self.ballistic)
         self._gravity = self.tensor(np.tile(body.gravity, len(body.mesh.nodes)))
@@ -95,7 +95,7 @@ class StepWorkspace:
         self._prefetch_capacity: int | None = None
         """Contact capacity of the solve that prefetched the contacts; None if ``start_prefetch`` did."""
         self.predicted_start: Any = None
-        """Start of the step for which a plan is in flight; None once anything else was done."""
+        """Start of the step for which a plan is in flight; None after any other work."""
         self.gaps_of: StepProblem | None = None
         """Step whose gaps at the start the selector holds."""
 
@@ -141,8 +141,8 @@ class StepWorkspace:
         self._enqueue_ballistic(self.positions, self.velocities, dt, self.ballistic)
 
     def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray) -> None:
-        """Start ``select_contacts`` for a step of ``dt`` seconds from ``state`` after the points ``before`` (m,),
-        asynchronously.
+        """Start ``select_contacts`` for a step of ``dt`` seconds from ``state``, asynchronously; ``before`` (m,) are
+        the contact points of the step that ends there.
         """
         with self.stream:
             self._cancel_prefetch()
@@ -162,7 +162,7 @@ class StepWorkspace:
         Args:
             problem: the step.
             before: (m,) contact points of the previous step.
-            loaded: (m,) bool, which of them carried load.
+            loaded: (m,) bool, True for points that carried load.
         """
         with self.stream:
             self.set_problem(problem)
@@ -178,7 +178,9 @@ class StepWorkspace:
             self.stream.wait()
 
     def enqueue_prefetch(self, ends: torch.Tensor, velocities: torch.Tensor, dt: float, points: torch.Tensor) -> None:
-        """Queue the selection for a step from ``ends`` (3N,) at ``velocities`` (3N,), after ``points`` (K,) int32."""
+        """Queue the selection for a step from ``ends`` (3N,) at ``velocities`` (3N,), given its previous contact points
+        ``points`` (K,) int32.
+        """
         self._enqueue_ballistic(ends, velocities, dt, self._next_ballistic)
         self.selector.enqueue_prefetch(vectors(self._next_ballistic), points)
 
@@ -194,8 +196,8 @@ class StepWorkspace:
         self.factors.enqueue(wp.to_torch(entries))
 
     def enqueue_stiffness(self, problem: StepProblem, tension: MuscleEnergy, velocities: np.ndarray) -> None:
-        """Add the stiffness of the muscles under ``tension``, at the end of ``velocities`` (N, 3), to the factored
-        matrix.
+        """Add the stiffness of the muscles under ``tension``, at the end positions that ``velocities`` (N, 3) lead to,
+        to the factored matrix.
         """
         segments, directions, rates = tension.hessian(problem.end_positions(velocities)).rank_one_terms(
             min_relative_stiffness=MIN_RELATIVE_STIFFNESS

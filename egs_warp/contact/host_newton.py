@@ -116,7 +116,7 @@ class HostNewtonWorkspace:
                 step to take; None evaluates ``base`` itself.
 
         Returns:
-            The state there, and the norm of the residual over dt x weight.
+            The state there, and the norm of the residual divided by dt x weight.
         """
         self._load(problem)
         elements = problem.body.assembly.elements
@@ -148,7 +148,8 @@ class HostNewtonWorkspace:
         Args:
             tangent: factored tangent.
             state: the iterate.
-            rest: use the residual of the last trial, with contact forces, instead.
+            rest: if True, use the residual of the last trial, which includes contact forces, instead of that of
+                ``state``.
         """
         factors = tangent.factors
         assert isinstance(factors, MultifrontalLdl)

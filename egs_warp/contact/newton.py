@@ -24,8 +24,8 @@ from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.muscles.tension import MuscleEnergy
 
 DELASSUS_REGULARIZATION = 1e-7
-"""Diagonal shift of the Delassus operator, as a fraction of the mean of its diagonal. The operator is singular with
-more points than the cage can resolve.
+"""Diagonal shift of the Delassus operator, as a fraction of the mean of its diagonal. The operator is singular if there
+are more points than the cage can resolve.
 """
 
 
@@ -40,7 +40,7 @@ class ContactLinearization:
 
     @classmethod
     def of(cls, tangent: Tangent, contacts: ContactSet, columns: np.ndarray | None = None) -> ContactLinearization:
-        """Linearise ``contacts`` by ``tangent``; ``columns`` are computed unless they are passed."""
+        """Linearise ``contacts`` with ``tangent``; ``columns`` are computed unless they are passed."""
         if columns is None:
             columns = tangent.solve(contacts.dense_jacobian.T)
             columns *= tangent.problem.dt
@@ -81,7 +81,7 @@ class ContactLinearization:
         return coulomb_forces(self._regular, speeds, shift, friction, start)
 
     def with_added_contacts(self, contacts: ContactSet) -> ContactLinearization:
-        """Return the linearisation of ``contacts``, which begin with the present ones, by the same tangent."""
+        """Return the linearisation of ``contacts``, of which the first are the current ones, with the same tangent."""
         new = contacts.dense_jacobian[3 * self.contacts.count :].T
         columns = np.hstack([self.columns, self.tangent.problem.dt * self.tangent.solve(new)])
         return ContactLinearization.of(self.tangent, contacts, columns)
@@ -97,7 +97,7 @@ class ContactLinearizer(Protocol):
     """Protocol of the objects that build the contact linearisations of one body."""
 
     def __call__(self, tangent: Tangent, contacts: ContactSet) -> ContactLinearization:
-        """Linearise ``contacts`` by ``tangent``."""
+        """Linearise ``contacts`` with ``tangent``."""
         ...
 
     def select_contacts(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
@@ -106,7 +106,7 @@ class ContactLinearizer(Protocol):
         Args:
             problem: the step.
             before: (m,) contact points of the previous step.
-            loaded: (m,) bool, which of them carried load.
+            loaded: (m,) bool, True for points that carried load.
 
         Returns:
             The contacts; None if the gaps are on the host.
@@ -114,8 +114,8 @@ class ContactLinearizer(Protocol):
         ...
 
     def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray) -> None:
-        """Start ``select_contacts`` for the probable next step, of ``dt`` seconds from ``state``, after the points
-        ``before`` (m,).
+        """Start ``select_contacts`` for the probable next step, of ``dt`` seconds from ``state``; ``before`` (m,) are
+        the contact points of the step that ends there.
         """
         ...
 
@@ -133,7 +133,7 @@ class ContactLinearizer(Protocol):
             tangent: factored tangent.
             contacts: n contacts.
             tension: muscle energy of the step, or None.
-            velocities: (N, 3) m/s, the start.
+            velocities: (N, 3) m/s, initial velocities.
             forces: (n, 3) newtons.
 
         Returns:
@@ -146,7 +146,7 @@ class HostContactLinearizer:
     """``ContactLinearizer`` with NumPy arrays."""
 
     def __call__(self, tangent: Tangent, contacts: ContactSet) -> ContactLinearization:
-        """Linearise ``contacts`` by ``tangent``."""
+        """Linearise ``contacts`` with ``tangent``."""
         return ContactLinearization.of(tangent, contacts)
 
     def select_contacts(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
@@ -164,8 +164,8 @@ class HostContactLinearizer:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> np.ndarray | None:
-        """Take one Newton step with fixed contact forces. It needs one right-hand side, a linearisation three for
-        each contact.
+        """Take one Newton step with fixed contact forces. This needs one right-hand side; a linearisation needs three
+        for each contact.
         """
         problem = tangent.problem
         if _elements_on_host(tangent):
@@ -224,7 +224,7 @@ class NewtonIterate(Protocol):
 
     @property
     def residual_norm(self) -> float:
-        """Norm of the residual with contact forces, over dt x weight; not finite where an element is inverted."""
+        """Norm of the residual with contact forces, divided by dt x weight; not finite where an element is inverted."""
         ...
 
     @property
@@ -292,7 +292,7 @@ def _newton_step(
 
 
 def _linearization_at(iterate: NativeNewtonIterate | NumpyNewtonIterate) -> ContactLinearization:
-    """Return the linearisation of the same contacts by the tangent at the iterate."""
+    """Return the linearisation of the same contacts with the tangent at the iterate."""
     old = iterate.linearization.tangent
     return ContactLinearization.of(
         old.problem.tangent(old.factors, iterate.velocities, iterate.tension), iterate.linearization.contacts
@@ -300,7 +300,7 @@ def _linearization_at(iterate: NativeNewtonIterate | NumpyNewtonIterate) -> Cont
 
 
 def _elements_on_host(tangent: Tangent) -> bool:
-    """Return True if the elements are on a CPU, which implies that the factors are."""
+    """Return True if the elements are on a CPU, which implies that the factors are there too."""
     return isinstance(tangent.problem.body.assembly.elements, SimdElasticity)
 
 
@@ -387,7 +387,7 @@ class NumpyNewtonIterate:
 
     @property
     def residual_norm(self) -> float:
-        """Norm of the residual with contact forces, over dt x weight; not finite where an element is inverted."""
+        """Norm of the residual with contact forces, divided by dt x weight; not finite where an element is inverted."""
         return self._residual_norm
 
     @cached_property

@@ -14,7 +14,7 @@ from egs_warp.contact.coulomb import FAILURE_TOLERANCE
 from egs_warp.kernels.contact.newton_convergence import MIN_DECREASE, REFACTOR_RATIO, RESIDUAL_WINDOW
 
 MAX_NEWTON_STEPS = 60
-"""Newton steps of a round."""
+"""Maximum number of Newton steps of a round."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class ConvergenceState:
     tolerance: float
     """Residual at which the loop ends."""
     activation_residual: float
-    """Residual threshold; when the loop first falls below it, penetrating points are looked up. 0 disables this."""
+    """Residual below which the loop first searches for penetrating points; 0 disables the search."""
     coulomb_tolerance: float
     """Maximum violation of Coulomb's law, m/s."""
     steps: int = 0
@@ -72,6 +72,6 @@ class ConvergenceState:
         start = -1.0 if size is None else unit * size
         residuals = unit * np.array([self.tolerance, self.activation_residual]), unit * np.array(self.recent_residuals)
         padding = np.full(RESIDUAL_WINDOW - len(self.recent_residuals), -1.0)
-        # The loop also stops at a numerical failure of the Coulomb solve, which the host repairs.
+        # The loop also stops at a numerical failure of the Coulomb solve, which the host then repeats.
         terms = np.array([min(self.coulomb_tolerance, FAILURE_TOLERANCE), float(self.max_steps), 0.0])
         return np.concatenate([[float(self.steps), start, start], residuals[0], terms, padding, residuals[1]])

@@ -13,7 +13,7 @@ MAX_CELLS_AT_REST = 32
 there.
 """
 _MIN_SPACING = 0.4
-"""Minimum spacing of the cells in mean edge lengths of the cage, so that small feet stand on several."""
+"""Minimum spacing of the cells in mean edge lengths of the cage, so that small feet stand on several cells."""
 GAP_TOLERANCE_FRACTION = 1e-7
 """Gap tolerance as a fraction of the activation distance. Of points whose gaps are equal within it, the one closest
 to the centre of the cell is selected. A flat sole is flat only to rounding, and rounding would select different
@@ -28,8 +28,8 @@ class ContactSelector:
     each.
 
     A cell contributes its lowest point. A selected point is dropped once its gap exceeds twice the activation distance.
-    A point without load is also dropped if its cell has a clearly lower point. Points that come and go would make the
-    load oscillate.
+    A point without load is also dropped if its cell has a clearly lower point. Without this hysteresis points would
+    alternate, and the load would oscillate.
     """
 
     def __init__(self, geometry: ContactGeometry, *, activation_distance: float, hysteresis: float) -> None:
@@ -49,7 +49,7 @@ class ContactSelector:
         )
         corners = geometry.mesh.tets[geometry.tet_from_point]
         positions = np.einsum("pw,pwi->pi", geometry.weights, geometry.mesh.nodes[corners])
-        # Rounding makes points equally far from two centres go to the same cell on every machine.
+        # Rounding assigns points that are equally far from two centres to the same cell on every machine.
         positions = self.gap_tolerance * np.rint(positions / self.gap_tolerance)
         heights = geometry.ground_heights(positions)
         sole = np.flatnonzero(heights < heights.min() + 2.0 * activation_distance)
@@ -64,7 +64,7 @@ class ContactSelector:
 
         Args:
             previous: (m,) points of the previous step.
-            loaded: (m,) bool, which of them carried load.
+            loaded: (m,) bool, True for points that carried load.
             gaps: (P,) m, at the predicted end of the step.
 
         Returns:
@@ -80,7 +80,7 @@ class ContactSelector:
 
         Args:
             previous: (m,) points of the previous step.
-            loaded: (m,) bool, which of them carried load.
+            loaded: (m,) bool, True for points that carried load.
             gaps: (m,) m, of ``previous`` at the predicted end.
             lowest: (k,) lowest point of each active cell.
             lowest_gaps: (k,) m.
@@ -97,7 +97,7 @@ class ContactSelector:
         return np.sort(np.concatenate([retained, added]))
 
     def find_deeper(self, points: np.ndarray, gaps: np.ndarray, depth: float) -> np.ndarray:
-        """Return (k,) the deepest point of each cell that ends more than ``depth`` metres deep and is not in
+        """Return (k,), the deepest point of each cell that ends more than ``depth`` metres deep and is not in
         ``points`` (n,).
         """
         deep = gaps < -depth
@@ -105,13 +105,13 @@ class ContactSelector:
         return self._lowest(deep, gaps)
 
     def order_by_gap(self, points: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """Return (n,) the order in which ``find_deeper`` lists ``points`` (n,) with ``gaps`` (n,) m, each the lowest
+        """Return (n,), the order in which ``find_deeper`` lists ``points`` (n,) with ``gaps`` (n,) m, each the lowest
         of its cell.
         """
         return np.lexsort((points, np.rint(gaps / self.gap_tolerance)))
 
     def _lowest(self, among: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """Return (k,) the lowest point of each cell in the mask ``among`` (P,), lowest first. Ties go to the point
+        """Return (k,), the lowest point of each cell in the mask ``among`` (P,), lowest first. Ties go to the point
         closest to the centre.
         """
         if not among.any():
@@ -126,7 +126,7 @@ class ContactSelector:
 
     @staticmethod
     def transfer_forces(points: np.ndarray, before: np.ndarray, forces: np.ndarray) -> np.ndarray:
-        """Map ``forces`` (m, 3) at the points ``before`` (m,) to ``points`` (n,); zero where a point is new."""
+        """Map ``forces`` (m, 3) at the points ``before`` (m,) to ``points`` (n,); they are zero for new points."""
         matched = np.zeros((len(points), 3))
         now, then = np.nonzero(points[:, None] == before)
         matched[now] = forces[then]
@@ -168,7 +168,7 @@ def _spread(positions: np.ndarray, start: int, spacing: float) -> tuple[np.ndarr
         spacing: minimum distance, m.
 
     Returns:
-        (k,) indices and (k,) the distance of each to those before it, m.
+        (k,) indices and (k,) m, the distance of each point to the nearest one before it.
     """
     columns = np.ascontiguousarray(positions.T)
     seeds, apart = [start], [np.inf]

@@ -31,7 +31,9 @@ class Surface(Protocol):
 
 @dataclass(frozen=True)
 class Solid:
-    """Convex solid behind all of its faces. One face makes a half space, such as a floor or a wall."""
+    """Convex solid, the intersection of the half spaces behind its faces. One face makes a half space, such as a floor
+    or a wall.
+    """
 
     faces: tuple[Plane, ...]
     """Faces with outward normals."""
@@ -91,7 +93,7 @@ def read_terrain(path: Path) -> tuple[Solid, ...]:
             raise UserError(f"{path}, solid {number}: {error}") from None
     count = sum(len(solid.faces) for solid in solids)
     if count > MAX_FACES:
-        raise UserError(f"{path}: {count} faces; at most {MAX_FACES} are handled")
+        raise UserError(f"{path}: {count} faces; at most {MAX_FACES} are supported")
     return tuple(solids)
 
 

@@ -73,7 +73,7 @@ class AssemblyTopology:
     entry_from_block: np.ndarray
     """(blocks, 9) int32, matrix entry of each element of a block; -1 below the diagonal."""
     upper_pattern: sparse.csc_matrix
-    """(3N, 3N) upper triangle with sorted indices and the diagonal; its values carry no meaning."""
+    """(3N, 3N) upper triangle with sorted indices and the diagonal; its values have no meaning."""
 
     @classmethod
     def of(cls, mesh: TetMesh) -> AssemblyTopology:

@@ -1,6 +1,6 @@
 """Elasticity, damping and muscles of many worlds with the same body.
 
-Launches the kernels of ``egs_warp.kernels.fem.elasticity`` over index maps that repeat the mesh once per world.
+It launches the kernels of ``egs_warp.kernels.fem.elasticity`` over index maps that repeat the mesh once per world.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 
 PANEL = 96
-"""Columns that are factored at once."""
+"""Number of columns that are factored at once."""
 CHUNK_BYTES = 2**31
 """Total size of the matrices that are processed at once, bytes; temporary memory is a small multiple of it."""
 
@@ -15,10 +15,10 @@ CHUNK_BYTES = 2**31
 class BatchCholesky:
     """Cholesky factors L of S = L L^T for several worlds, each stored in a slot.
 
-    Uses a left-looking factorization by panels: each panel is updated with all columns before it, its diagonal block is
-    factored, and the rows below are multiplied by the inverse of that factor. The inverses are stored, so that a solve
-    consists of matrix products only. CUDA's own batched factorization is designed for small matrices. Arguments named
-    ``slots`` must be ascending.
+    The factorization is left-looking and proceeds by panels: each panel is updated with all columns before it, its
+    diagonal block is factored, and the rows below are multiplied by the inverse of that factor. The inverses are
+    stored, so that a solve consists of matrix products only. CUDA's own batched factorization is designed for small
+    matrices. Arguments named ``slots`` must be ascending.
     """
 
     def __init__(
@@ -28,14 +28,14 @@ class BatchCholesky:
 
         Args:
             slots: number of worlds.
-            size: rows of each matrix.
+            size: number of rows of each matrix.
             device: device of the factors.
-            panel: columns factored at once.
+            panel: number of columns factored at once.
             chunk_bytes: total size of the matrices processed at once.
         """
         self.size, self.panel = size, panel
         self.chunk = max(1, chunk_bytes // (8 * size * size))
-        """Worlds whose matrices are processed at once."""
+        """Number of worlds whose matrices are processed at once."""
         self._starts = range(0, size, panel)
         kind = {"dtype": torch.float64, "device": device}
         self._factors = torch.zeros((slots, size, size), **kind)

@@ -51,7 +51,7 @@ class BatchBody:
 
 @dataclass(frozen=True)
 class BatchProblem(BatchedRecord):
-    """The implicit step of c worlds; members have the names and meanings of those of ``StepProblem``."""
+    """The implicit step of c worlds; its members have the same names and meanings as in ``StepProblem``."""
 
     body: BatchBody
     dt: float
@@ -69,8 +69,8 @@ class BatchProblem(BatchedRecord):
     rotation_modes: torch.Tensor
     """(c, 3N, 3) m, nodal velocities e_k x r of unit rotations about the centre of mass."""
     inverse_inertia: torch.Tensor
-    """(c, 3, 3) 1/(kg m^2), inverse inertia; not finite for a world whose inertia is singular, where an error would
-    stop all worlds."""
+    """(c, 3, 3) 1/(kg m^2), inverse inertia; not finite for a world whose inertia is singular, because an exception
+    would stop all worlds."""
 
     @classmethod
     def at(
@@ -128,7 +128,7 @@ class BatchProblem(BatchedRecord):
         return self.body.elasticity.is_inversion_free(self.end_positions(velocities))
 
     def rigid_guess(self) -> torch.Tensor:
-        """Return the rigid motion (c, N, 3) m/s that continues both momenta, the initial guess of the solver."""
+        """Return the rigid motion (c, N, 3) m/s with the momenta of the state, the initial guess of the solver."""
         arms = self.positions - self.body.centre(self.positions)
         spin = (self.inverse_inertia @ (self.momenta @ self.velocities.flatten(1)[:, :, None]))[:, :, 0]
         rotated = _rotate(self.dt * spin, arms)
@@ -154,7 +154,7 @@ class BatchProblem(BatchedRecord):
     def factor(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
         """Factor the derivative of the residual, or a positive definite approximation of it, into the worlds' slots.
 
-        Tries the same matrices in the same order as ``StepProblem.tangent``.
+        It tries the same matrices in the same order as ``StepProblem.tangent``.
 
         Args:
             velocities: (c, N, 3) m/s, linearization point.
@@ -176,7 +176,8 @@ class BatchProblem(BatchedRecord):
         factored = torch.zeros(len(end), dtype=torch.bool, device=end.device)
         remaining = torch.arange(len(end), device=end.device)
         diagonal = self.inertia_ratio * self.body.mass.repeat_interleave(3)
-        # First with the muscles' stiffness, then without it, then with the projected Hessian, which is definite.
+        # Try the matrix with the muscles' stiffness, then without it, then with the projected Hessian, which is
+        # positive definite.
         for muscles, projected in ((True, False), (False, False), (False, True)):
             if (muscles and part_tensions is None) or len(remaining) == 0:
                 continue

@@ -21,9 +21,9 @@ from egs_warp.short_repr import short_repr
 GRAVITY = 9.81
 """Gravitational acceleration, m/s^2."""
 DEFAULT_SAG = 0.05
-"""Default ratio rho g H / E of a column of height H; the column shortens by half of it."""
+"""Default ratio rho g H / E of a column of height H; the column shortens by half of this fraction."""
 MIN_HEIGHT, MAX_HEIGHT = 0.001, 1000.0
-"""Heights of a body, m; others are rejected as a probable mistake in the units."""
+"""Minimum and maximum height of a body, m; other heights are rejected as a probable mistake in the units."""
 MAX_SAG = 0.02
 """Maximum displacement of the centre of mass of the body under its weight, in body heights."""
 
@@ -183,7 +183,7 @@ def make_body(
     displacement = _linear_sag(column, node_mass, free, -GRAVITY * plane.normal)
     # NaN or negative if the stiffness is singular.
     if not 0.0 <= displacement < _MAX_LINEAR_SAG * height:
-        raise ArgumentError("nodes", "parts of the cage are connected by a single corner or edge; give it more nodes")
+        raise ArgumentError("nodes", "parts of the cage are connected by a single corner or edge; request more nodes")
     young *= max(1.0, displacement / (MAX_SAG * height))
     undamped = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)
     frequency = _first_frequency(undamped, node_mass, free)

@@ -101,10 +101,10 @@ class GraphStream:
             self._stream.wait_event(end)
 
     def run_captured(self, work: Callable[[], None]) -> Callable[[], None]:
-        """Return a function that runs ``work``, on a GPU by a CUDA graph.
+        """Return a function that runs ``work``, on a GPU as a CUDA graph.
 
-        The first call runs ``work`` directly, so that compilation and setup precede the capture by the second
-        call. ``work`` must not synchronize with the device.
+        The first call runs ``work`` directly, so that compilation and setup are done before the second call captures
+        it. ``work`` must not synchronize with the device.
         """
         return work if self._stream is None else _Graph(work, self)
 
@@ -120,8 +120,8 @@ class GraphStream:
 
         All graphs share one memory pool for temporary memory: they run one after the other and leave no results there.
         The first graph is retained, since the pool is released with its last graph. No other thread may use the device
-        during a capture, as its operations would be captured too. Python's garbage collection is disabled meanwhile:
-        freeing device memory would synchronize with the device.
+        during a capture, as its operations would be captured too. Python's garbage collection is disabled during a
+        capture, since freeing device memory would synchronize with the device.
 
         Args:
             work: operations to capture.
@@ -143,7 +143,7 @@ class GraphStream:
     def while_graph(self, graph: torch.cuda.CUDAGraph, going: torch.Tensor) -> Callable[[], None]:
         """Return a function that replays a graph recorded with ``keep`` while ``going`` (1,) int32 is not 0.
 
-        Uses a conditional graph node if the driver supports it, else a loop on the host.
+        The loop is a conditional graph node if the driver supports that; otherwise it runs on the host.
         """
         if not wp.is_conditional_graph_supported():
 
@@ -189,7 +189,7 @@ class PinnedUpload:
     def write(self, *parts: np.ndarray) -> None:
         """Write the concatenated ``parts``, padded with zeros, to the host buffer, for a graph that calls ``send``.
 
-        Blocks until the previous copy, marked by ``start_copy``, has finished.
+        The call blocks until the previous copy, marked by ``start_copy``, has finished.
         """
         host, at = self.host.numpy(), 0
         self.wait()

@@ -26,7 +26,7 @@ class DenseCholesky:
     """Dense Cholesky solver for symmetric matrices of one pattern; implements ``LinearSolver``.
 
     The inverse factor L^-1 is computed once per matrix. A triangular solve takes the same time for one right-hand side
-    as for a thousand, and a product with L^-1 takes a fiftieth of it.
+    as for a thousand, and a product with L^-1 takes a fiftieth of that time.
     """
 
     is_host = False
@@ -52,7 +52,8 @@ class DenseCholesky:
         self._entries, self._diagonal = self._energy_hessian.new_zeros(len(rows)), self._energy_hessian.new_zeros(count)
         self._uploaded_diagonal = np.zeros(count)
         self._verdict_readback, self.verdict = self.stream.pinned(2), self._energy_hessian.new_zeros(2)
-        """(2,) on the host and on the device: nonzero if the entries are finite, and if the matrix is definite."""
+        """(2,) on the host and on the device: nonzero if the entries are finite, and if the matrix is positive
+        definite."""
         self._factored = self.stream.run_captured(self._factor)
         self._effort_upload, self._effort_entries = (
             PinnedUpload(self.stream, 3 * count),
@@ -84,7 +85,7 @@ class DenseCholesky:
     def enqueue(self, entries: torch.Tensor) -> None:
         """Queue ``start_update`` with the uploaded diagonal, as part of a graph.
 
-        The caller of the graph reports its launch by ``mark_started``.
+        The caller of the graph reports its launch with ``mark_started``.
         """
         self._entries.copy_(entries)
         self._factor()
@@ -114,7 +115,8 @@ class DenseCholesky:
         self._verdict_readback.copy_(self.verdict, non_blocking=True)
 
     def add_low_rank(self, across: np.ndarray, rates: np.ndarray) -> bool:
-        """Add a low-rank term; see ``LinearSolver.add_low_rank``. If the sum is not definite, S keeps its factors."""
+        """Add a low-rank term; see ``LinearSolver.add_low_rank``. If the sum is not positive definite, S keeps its
+        factors."""
         self._finish()
         if not self._finite or not (np.isfinite(across).all() and np.isfinite(rates).all()):
             return False
@@ -140,7 +142,7 @@ class DenseCholesky:
 
     def solve(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
         """Solve for ``right``; see ``LinearSolver.solve``."""
-        assert self.is_ready, "update() comes first"
+        assert self.is_ready, "call update() first"
         with self.stream:
             plain = self._to_host(self._solve(self._to_device(right)))
         return plain if projection is None else projection.corrected(right, plain)
@@ -181,14 +183,15 @@ class DenseCholesky:
             if isinstance(vectors, torch.Tensor):
                 self._effort_graphs.run((columns.data_ptr(), count, dt_now, dt_ahead), work)
             else:
-                # Vectors of the host are uploaded to a different address each time, so no graph is captured.
+                # Vectors on the host are uploaded to a different address each time, so no graph is captured.
                 work()
             self.stream.wait()
         quadratic, linear = np.split(self._effort_readback.numpy()[: count * count + count], [count * count])
         return quadratic.reshape(count, count).copy(), linear.copy()
 
     def _effort(self, vectors: torch.Tensor, dt_now: float, dt_ahead: float) -> torch.Tensor:
-        """Return the flat quadratic and linear terms for the uploaded input; not finite if there are no factors."""
+        """Return the quadratic and linear terms for the uploaded input as one flat tensor; not finite if there are no
+        factors."""
         gradient, weights, reference = self._effort_upload.device.split([len(vectors)] * 3)
         quadratic, linear = self.enqueue_effort_quadratic(
             self._effort_entries, gradient, weights, vectors, dt_now, dt_ahead, reference
@@ -242,7 +245,7 @@ class _InverseFactor:
         self.matrix, self.inverse = torch.zeros((2, count, count), dtype=torch.float64, device=device)
         """(n, n) each: the matrix S, of which the lower triangle is read, and R, both in the order of the dissection.
         """
-        # Workspaces by the number of directions that are added at once.
+        # Keys are the numbers of directions that are added at once.
         self._small: dict[int, tuple[_TriangularInverse, _TriangularInverse]] = {}
         self._tiled = (
             TiledInverseFactor(dissection, self.matrix, self.inverse, stream) if device.type == "cuda" else None
@@ -259,7 +262,7 @@ class _InverseFactor:
         return torch.from_numpy(slots).to(self._stream.device)
 
     def factor(self) -> torch.Tensor:
-        """Compute R of ``matrix``; return a () bool tensor, True if the matrix is definite."""
+        """Compute R of ``matrix``; return a () bool tensor, True if the matrix is positive definite."""
         if self._tiled is not None:
             return self._tiled.factor()
         definite = self._whole.factor(self.matrix)
@@ -273,7 +276,7 @@ class _InverseFactor:
         Journal 6(6), 1968). Only k x k matrices are factored.
 
         Returns:
-            () bool tensor, True if the sum is definite.
+            () bool tensor, True if the sum is positive definite.
         """
         count = len(directions)
         if count not in self._small:
@@ -292,7 +295,7 @@ class _InverseFactor:
         """Compute R of ``matrix`` + U diag(r) U^T, ``across`` U (n, m), ``rates`` r (m,).
 
         Returns:
-            True if the sum is definite; else R is unchanged.
+            True if the sum is positive definite; otherwise R is unchanged.
         """
         directions = across[self.order]
         if not bool(self._whole.factor(torch.addmm(self.matrix, directions * rates, directions.T))):
@@ -318,7 +321,8 @@ class _TriangularInverse:
         self.inverse = self._out[:count, :count]
 
     def factor(self, matrix: torch.Tensor) -> torch.Tensor:
-        """Set ``inverse`` to that of the Cholesky factor of ``matrix`` (n, n); return () bool, True if definite."""
+        """Set ``inverse`` to that of the Cholesky factor of ``matrix`` (n, n); return () bool, True if that is positive
+        definite."""
         factor, info = torch.linalg.cholesky_ex(matrix)
         self.invert(factor)
         return info == 0

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import shortest_path
 
 _MAX_CUTS = 3
 _MAX_SEQUENTIAL_FRACTION = 0.8
-"""Fraction of the unknowns eliminated in sequence above which a dissection does not pay for its launches."""
+"""Fraction of the unknowns eliminated in sequence above which a dissection saves less time than its launches cost."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Dissection:
         """Dissect a matrix whose pattern has the upper triangle ``upper``.
 
         The candidates for cuts are the levels of a breadth-first search from one end of the graph. The choice minimizes
-        the unknowns of the largest part plus those of all cuts.
+        the number of unknowns of the largest part plus that of all cuts.
         """
         count = len(upper.indptr) - 1
         whole = cls([np.arange(count)], np.zeros(0, int))

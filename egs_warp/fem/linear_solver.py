@@ -41,14 +41,14 @@ class LinearSolver(Protocol):
         ...
 
     def add_low_rank(self, across: np.ndarray, rates: np.ndarray) -> bool:
-        """Replace S by S + U diag(r) U^T in the following solves. Succeeds at most once per ``update``.
+        """Replace S by S + U diag(r) U^T in the following solves. This succeeds at most once per ``update``.
 
         Args:
             across: (n, k) U.
             rates: (k,) r.
 
         Returns:
-            True if the sum is positive definite; else nothing is added.
+            True if the sum is positive definite; otherwise nothing is added.
         """
         ...
 
@@ -75,7 +75,7 @@ class LinearSolver(Protocol):
         """Return the quadratic model of the elastic energy in a subspace.
 
         Displacements are X = dt_now V + dt_ahead S^-1 diag(w) V, with ``reference`` subtracted from the last column.
-        Requires that no low-rank term has been added to S.
+        No low-rank term may have been added to S.
 
         Args:
             entries: (nnz,) upper entries of H, in the order of the pattern.
@@ -93,7 +93,7 @@ class LinearSolver(Protocol):
 
 
 def linear_solver_on(device: wp.Device, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> LinearSolver:
-    """Return a dense solver on a GPU that PyTorch can use, else a sparse solver on the host.
+    """Return a dense solver on a GPU that PyTorch can use, and otherwise a sparse solver on the host.
 
     On an H100 the inverse of a dense factor takes 0.15 ms for 568 nodes and 0.44 ms for 1,064.
     """

@@ -67,8 +67,8 @@ class MultifrontalLdl:
 
     The symbolic analysis is done once. Results are bitwise equal on any number of cores.
 
-    There is no pivoting: definite matrices need none; of an indefinite matrix only the inertia and a sum with the
-    muscles' stiffness are used; a nearly singular matrix is reported as having no factors.
+    There is no pivoting: positive definite matrices need none; of an indefinite matrix only the inertia and a sum with
+    the muscles' stiffness are used; a nearly singular matrix is reported as having no factors.
     """
 
     is_host = True
@@ -199,7 +199,7 @@ class MultifrontalLdl:
         reference: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute the quadratic model of the elastic energy with two threads; see ``LinearSolver.effort_quadratic``."""
-        assert self._ready and self._added is None, "update() comes first"
+        assert self._ready and self._added is None, "call update() first"
         count = vectors.shape[1]
         panels = -(-count // kernels.PANEL)
         if self._effort is None or len(self._effort.linear) != panels:
@@ -225,7 +225,7 @@ class MultifrontalLdl:
         return workspace.quadratic[:count, :count].copy(), workspace.linear.ravel()[:count].copy()
 
     def _solve_unprojected(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
-        assert self._ready, "update() comes first"
+        assert self._ready, "call update() first"
         right = np.asarray(right, dtype=np.float64)
         solution = np.empty(right.shape)
         panels = -(-(1 if right.ndim == 1 else right.shape[1]) // kernels.PANEL)
@@ -262,7 +262,7 @@ class MultifrontalLdl:
             The arguments for the factors and the projection; the number k of added directions and the addresses of U,
             S^-1 U and the inverse of the capacitance matrix, zeros if none are added; and the workspace.
         """
-        assert self._ready, "update() comes first"
+        assert self._ready, "call update() first"
         added = [0, 0, 0, 0]
         if self._added is not None:
             across, through, small = self._added
@@ -314,7 +314,7 @@ class _ProjectionArrays:
 
 
 class _EffortWorkspace:
-    """Workspace of ``effort_quadratic`` for a number of panels."""
+    """Workspace of ``effort_quadratic`` for a given number of panels."""
 
     def __init__(self, panels: int, unknowns: int) -> None:
         self.moves, self.products = (zeros((panels, unknowns, kernels.PANEL), real, "cpu") for _ in range(2))

@@ -27,13 +27,14 @@ class UnsolvableStepError(ArithmeticError):
 
 @dataclass(frozen=True)
 class StepProblem:
-    """M (v - v0) + dt alpha M v = dt (P^T f(x + dt v) + M g + f_contact), f of elasticity, damping and muscles.
+    """One implicit step: M (v - v0) + dt alpha M v = dt (P^T f(x + dt v) + M g + f_contact), with the forces f of
+    elasticity, damping and muscles.
 
     Implicit Euler alone loses angular momentum: with x+ = x + dt v the momentum changes by dt sum r x f, with the lever
     arms r at the *start* of the step, about which the internal forces at its end have a torque. P^T removes that torque
     as the inertial force of a rigid rotation, M (w x r): P v is v minus the rigid rotation with v's angular momentum.
-    So L+ = L + dt sum r x (f_contact - alpha M v) holds to rounding, contact velocities are those that are solved for,
-    and ``momentum_correction`` is the angular velocity w of the removed rotation.
+    So L+ = L + dt sum r x (f_contact - alpha M v) holds up to rounding, contact velocities are those that are solved
+    for, and ``momentum_correction`` is the angular velocity w of the removed rotation.
     """
 
     body: SoftBody
@@ -71,7 +72,8 @@ class StepProblem:
 
     @cached_property
     def momenta(self) -> np.ndarray:
-        """(3, 3N) kg m, maps nodal velocities to the angular momentum about the centre of mass, lever arms r."""
+        """(3, 3N) kg m, matrix that maps nodal velocities to the angular momentum about the centre of mass, with lever
+        arms r."""
         return (self.rotation_modes * np.repeat(self.body.node_mass, 3)[:, None]).T
 
     @cached_property
@@ -106,7 +108,8 @@ class StepProblem:
     def rigid_guess(self) -> np.ndarray:
         """(N, 3) m/s, initial guess of the solver: the rigid motion with the momenta of the state.
 
-        It inverts no element, and it contains no velocities of stiff modes, which change completely within a step.
+        It does not invert an element, and it contains no velocities of stiff modes, which change completely within a
+        step.
         """
         positions, mass = self.state.positions, self.body.node_mass
         centre = self.body.centre_of_mass(positions)
@@ -183,7 +186,8 @@ class StepProblem:
             raise UnsolvableStepError(UNSOLVABLE)
 
     def _factor(self, factors: LinearSolver, velocities: np.ndarray, *, projected: bool) -> bool:
-        """Factor S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``; return True if it is definite."""
+        """Factor S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``; return True if it is positive
+        definite."""
         return factors.update(*self._matrix(factors, velocities, projected=projected))
 
     def _matrix(self, factors: LinearSolver, velocities: np.ndarray, *, projected: bool) -> tuple[Any, np.ndarray]:

@@ -14,7 +14,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
 _MAX_MERGED_WIDTH, _MAX_CHILD_WIDTH = 16, 6
-"""Maximum columns of two blocks together, or of the child alone, for the larger fill tolerance."""
+"""Maximum number of columns of two blocks together, or of the child alone, for the larger fill tolerance."""
 _FILL_FRACTION = 0.3
 """Maximum fraction of zeros in a merged block of these widths; for others a third of it."""
 
@@ -88,7 +88,7 @@ class Supernodes:
 
 
 def first_of_equal_rows(full: sparse.csc_matrix) -> np.ndarray:
-    """Return (n,) bool: False for each row whose pattern equals that of the row before, as for the rows of a node.
+    """Return (n,) bool: False for each row whose pattern equals that of the row before, like the rows of one node.
 
     ``full`` is a symmetric matrix with both triangles and sorted indices.
     """

@@ -16,10 +16,10 @@ _MIN_PRODUCTS = 8
 class TileTaskGraph:
     """Tasks of ``tiled_inverse_kernel`` for a matrix in the order of its dissection.
 
-    With L the factor of S, the columns of tiles of L and, below them, of L^-T are computed one after the other: a tile
-    of S or of the identity, minus the products of the tiles to its left in its own row and in the row of its column's
-    diagonal tile, times the inverse of the diagonal factor. Parts share no rows, so all parts proceed in parallel.
-    Their contributions to the separator are summed in separate tasks meanwhile.
+    With L the factor of S, the columns of tiles of L and, below them, of L^-T are computed one after the other. A tile
+    is the tile of S or of the identity, minus the products of the tiles to its left in its own row and in the row of
+    its column's diagonal tile, times the inverse of the diagonal factor. Parts share no rows, so all parts proceed in
+    parallel. Meanwhile, separate tasks sum their contributions to the separator.
     """
 
     tasks: np.ndarray
@@ -32,7 +32,7 @@ class TileTaskGraph:
     """Number of tile columns."""
 
     def __init__(self, parts: Sequence[int], separator: int) -> None:
-        """Build the tasks for ``parts`` with the given numbers of unknowns and a ``separator`` of that size."""
+        """Build the tasks for ``parts`` and a ``separator`` with the given numbers of unknowns."""
         ends = np.cumsum([0, *parts, separator]).tolist()
         self._spans: list[tuple[int, int]] = []
         groups: list[range] = []

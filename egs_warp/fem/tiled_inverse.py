@@ -58,7 +58,8 @@ class TiledInverseFactor:
         self._blocks = min(len(tasks.tasks), max(1, int(_PROCESSOR_FRACTION * self._device.sm_count)))
 
     def factor(self) -> torch.Tensor:
-        """Queue the computation of R of ``matrix``; return a () bool tensor, True if the matrix is definite."""
+        """Queue the computation of R of ``matrix``; return a () bool tensor, True if the matrix is positive
+        definite."""
         wp.launch(
             tiled_inverse_kernel,
             (self._blocks, BLOCK),

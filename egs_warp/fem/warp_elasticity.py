@@ -1,6 +1,6 @@
-"""Elasticity on a GPU: a kernel over the elements and one that gathers their terms by node or matrix entry.
+"""Elasticity on a GPU: one kernel for the elements, and one that gathers their terms by node or matrix entry.
 
-Launches the kernels of ``egs_warp.kernels.fem.elasticity``.
+It launches the kernels of ``egs_warp.kernels.fem.elasticity``.
 """
 
 from __future__ import annotations

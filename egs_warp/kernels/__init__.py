@@ -1,4 +1,6 @@
-"""Every Warp kernel and device function, by package of the host code; imports only warp, ``precision`` and each other.
+"""All Warp kernels and device functions, by package of their host code. They import only warp, ``precision`` and each
+other.
 
-Input: Warp arrays. Output: Warp arrays: the quantities of the paper's equations, one thread or block for each element.
+Input: Warp arrays. Output: Warp arrays with the quantities of the paper's equations, computed by one thread or block
+for each element.
 """

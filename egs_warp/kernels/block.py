@@ -1,6 +1,6 @@
 """Barriers and reductions over the threads of a block on a GPU; on a CPU a block is one thread.
 
-Blocks must consist of whole warps, and all threads of a block must call.
+Blocks must consist of whole warps, and all threads of a block must call each function.
 """
 
 import warp as wp
@@ -76,5 +76,5 @@ def warp_size() -> int:
     return value;
 """)
 def warp_sum(value: real) -> real:
-    """Return the sum of ``value`` over a warp; all of its threads must call."""
+    """Return the sum of ``value`` over a warp, all of whose threads must call this function."""
     ...

@@ -5,7 +5,7 @@ fused multiply-adds to the instructions of the processor.
 """
 
 BLOCK = 16
-"""Columns eliminated at once; the factorization stores the inverse of each diagonal block of this size."""
+"""Number of columns eliminated at once; the factorization stores the inverse of each diagonal block of this size."""
 
 _PRODUCTS = """
     #pragma clang fp contract(fast)

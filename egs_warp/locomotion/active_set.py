@@ -21,15 +21,15 @@ from egs_warp.precision import Vec4, real
 _MAX_PIVOTS = 600
 """Maximum number of changes of the active set."""
 _BOUND_TOLERANCE = 1e-8
-"""Tolerance of the bounds of a row, times its norm in z if that is more than 1."""
+"""Tolerance of the bounds of a row, multiplied by the row's norm in z if that exceeds 1."""
 _INFEASIBLE_COST = 1e6
-"""Times ``WhitenedQp.objective_drop``: bounds that cost more than this are infeasible."""
+"""Factor of ``WhitenedQp.objective_drop``. Bounds that raise the objective by more count as infeasible."""
 
 
 @dataclass(frozen=True)
 class WhitenedQp:
     """The QP min 1/2 x^T P x + q^T x with rows A, in whitened coordinates z = D^1/2 L^T (x - x0), P = L D L^T, with the
-    unconstrained minimum x0: the Hessian is the identity, and the cost half the squared distance from x0."""
+    unconstrained minimum x0: the Hessian is the identity, and the cost is half the squared distance from x0."""
 
     P: np.ndarray
     """(n, n)."""
@@ -92,7 +92,7 @@ class Optimum:
 
 class _Workspace:
     """Reused memory and recorded launches for QPs of at most ``rows`` rows and ``unknowns`` unknowns; allocating them
-    takes longer than a solve. It holds the whitened rows of one QP at a time, the last that was loaded."""
+    takes longer than a solve. It holds the whitened rows of one QP, the one that was loaded last."""
 
     def __init__(self, rows: int, unknowns: int) -> None:
         padded_unknowns = -(-unknowns // 8) * 8
@@ -247,6 +247,6 @@ def solve_from_guess(
         return Optimum(np.zeros(n), multipliers, False)
     multipliers[active] = -sides * active_multipliers / qp.row_norms[active]
     values, slack = qp.rows @ x, 10.0 * qp.slack
-    # Contradicting rows have multipliers too, so the bounds are checked.
+    # Contradictory rows have multipliers too, so the bounds must be checked.
     is_feasible = bool((values > lower - slack).all() and (values < upper + slack).all())
     return Optimum(x, multipliers, True) if is_feasible else None

@@ -17,21 +17,23 @@ class Audit:
     """Largest errors over all steps, as defined in docs/guide/report.md; all but the counts are dimensionless."""
 
     momentum_residual: float
-    """Force that is missing in the balance of linear momentum, over m g."""
+    """Force that is missing from the balance of linear momentum, divided by m g."""
     angular_momentum_residual: float
-    """Torque that is missing in the balance of angular momentum, over m g H."""
+    """Torque that is missing from the balance of angular momentum, divided by m g H."""
     energy_residual: float
-    """Residual of the energy balance, over m g H."""
+    """Residual of the energy balance, divided by m g H."""
     cone_violation: float
-    """Force outside the friction cone, over m g."""
+    """Force outside the friction cone, divided by m g."""
     friction_gap: float
-    """Difference between the work of friction and that of friction at its bound against the slip, over m g H."""
+    """Difference between the work of friction and that of friction at its bound, opposed to the slip; divided by m g
+    H."""
     contact_velocity: float
-    """Difference between stored end velocities and displacements of loaded contacts, over sqrt(g H)."""
+    """Difference between the stored end velocities of loaded contacts and their displacements per time step, divided by
+    sqrt(g H)."""
     penetration: float
-    """Depth of the deepest contact point, over H."""
+    """Depth of the deepest contact point, divided by H."""
     complementarity_gap: float
-    """Normal force times gap, over m g H."""
+    """Normal force times gap, divided by m g H."""
     inverted_elements: int
     """Number of inverted elements, summed over all states."""
     newton_unconverged: int
@@ -132,7 +134,7 @@ def _contact_normals(t: Trajectory) -> np.ndarray:
 
 
 def _uneven_end_gaps(t: Trajectory) -> np.ndarray:
-    """Return (c,) m, distance from uneven ground of each contact with it at the end of its step."""
+    """Return (c,) m, the distance from the ground, at the end of its step, of each contact with uneven ground."""
     after = t.contact_step + 1
     ends = np.einsum("cw,cwi->ci", t.contact_weights, t.positions[after[:, None], t.contact_nodes])
     return _ground_gaps(t, ends[_on_uneven_ground(t)])
@@ -145,8 +147,8 @@ def _ground_gaps(t: Trajectory, points: np.ndarray) -> np.ndarray:
 
 
 def _ground(t: Trajectory, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n,) m, height of uneven ground at ``points`` (n, 3), and (n, 3) its normals, by SciPy's splines and
-    finite differences."""
+    """Return (n,) m, height of uneven ground at ``points`` (n, 3), and (n, 3) its normals, computed with SciPy's
+    splines and finite differences."""
     if len(points) == 0:
         return np.zeros(0), np.zeros((0, 3))
     # The ground continues level beyond its edge.
@@ -165,8 +167,8 @@ def _ground(t: Trajectory, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _contact_displacements(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Return (C, 3) m twice: displacement of each contact in its step by the stored end velocities, and by the
-    positions."""
+    """Return two arrays (C, 3) m: the displacement of each contact in its step, from the stored end velocities and from
+    the positions."""
     after = t.contact_step + 1
     velocities = np.einsum("cw,cwi->ci", t.contact_weights, t.velocities[after[:, None], t.contact_nodes])
     ends = np.einsum("cw,cwi->ci", t.contact_weights, t.positions[after[:, None], t.contact_nodes])

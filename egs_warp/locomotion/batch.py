@@ -129,7 +129,7 @@ class BatchStep(BatchedRecord):
 class BatchStepper:
     """Stepper of many worlds with one body, one set of muscles and one flat ground, each with its own friction.
 
-    It runs on the device of the body's assembly: a GPU that torch sees too, or, for tests, a CPU.
+    It runs on the device on which the body is assembled: a GPU that torch can use too or, in tests, a CPU.
     """
 
     def __init__(
@@ -206,7 +206,7 @@ class BatchStepper:
         )
 
     def settle(self) -> tuple[list[BodyState], torch.Tensor]:
-        """Do ``rollout.settle`` for every world.
+        """Let the body come to rest in every world, as ``settling.settle`` does in one.
 
         Returns:
             The state of each world at rest on its ground, and (B,) bool, True for worlds whose steps could not be
@@ -227,7 +227,7 @@ class BatchStepper:
         return [BodyState(end, np.zeros_like(end)) for end in ends.cpu().numpy()], any_failed
 
     def _passive_step(self, state: BatchState, dt: float) -> tuple[BatchState, torch.Tensor, torch.Tensor]:
-        """Make a step without muscles and drag; its end is at rest.
+        """Make a step without muscles and drag, and set the velocities at its end to zero.
 
         Returns:
             The state; (c,) m, largest displacement of a node along an axis; and (c,) bool, True where a tangent was not
@@ -261,7 +261,7 @@ class BatchStepper:
             dt: step size, s.
 
         Returns:
-            State of the worlds that were solved; their steps in order of time; and (c,) bool, True for worlds of
+            State of the worlds that were solved; their steps in chronological order; and (c,) bool, True for worlds of
             ``state`` for which not even a part of the step was solved.
         """
         with torch.no_grad(), torch_stream(self.device):
@@ -282,8 +282,8 @@ class BatchStepper:
     def _parts(
         self, state: BatchState, activations: torch.Tensor, dt: float, max_halvings: int
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
-        """Make a step of ``dt``, and two half steps, up to ``max_halvings`` times, for the worlds in which it does not
-        converge.
+        """Make a step of ``dt`` s. In worlds in which it does not converge, make two half steps instead; a step is
+        halved up to ``max_halvings`` times.
 
         Returns:
             State of the solved worlds, their steps, and (c,) bool, True for failed worlds.
@@ -304,8 +304,8 @@ class BatchStepper:
         return _merged(after, half), done, failed
 
     def _step(self, state: BatchState, activations: torch.Tensor, dt: float) -> tuple[BatchStep, torch.Tensor]:
-        """Make ``LocomotionStepper.step_with_activations`` for all worlds; also return (c,) bool, True where a tangent
-        was not positive definite."""
+        """Make one step of all worlds, as ``LocomotionStepper.step_with_activations`` does; also return (c,) bool, True
+        where a tangent was not positive definite."""
         frictions, tensions = self._frictions[state.worlds], self._stiffness * activations
         with self._stages("detect"):
             problem = self._problem(state, dt, self.settings.drag)
@@ -343,7 +343,7 @@ class BatchStepper:
         tensions: torch.Tensor,
         frictions: torch.Tensor,
     ) -> tuple[BatchLinearization, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Do ``LocomotionStepper.predict`` for all worlds.
+        """Predict the end of the step in all worlds, as ``LocomotionStepper.predict`` does.
 
         Returns:
             Contact linearisation, velocities (c, N, 3) m/s, forces (c, K, 3) N, and (c,) bool, True where a tangent was

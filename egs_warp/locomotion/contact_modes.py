@@ -1,4 +1,5 @@
-"""QP of a step over the activations alone, with exact Coulomb contact, and the search over contact modes (Eq. 9, 13).
+"""QP of a step with the activations as its only unknowns, under exact Coulomb contact, and the search over contact
+modes (Eq. 9, 13).
 
 Contact forces are a function of the activations, affine in each region of fixed contact modes. ``search_modes`` solves
 one QP in each region that it visits. Its kernels are in ``egs_warp.kernels.locomotion.mode_region``, the version for a
@@ -29,7 +30,7 @@ class CoulombProgram:
     a.
 
     Activations are fractions of their bounds, forces are in body weights (for each contact normal, then two tangential
-    components), speeds in sqrt(g H). Contact velocities are ``rows`` x + ``offset``, of which the normal ones include
+    components), speeds in sqrt(g H). Contact velocities are ``rows`` x + ``offset``; their normal components include
     the velocity bias.
     """
 
@@ -113,7 +114,7 @@ class ModeRegionOptimum:
     contact: np.ndarray
     """(k,) contact of each active mode constraint that raises the objective."""
     transition: np.ndarray
-    """(k,) transition of that contact past the constraint, as in ``ModeRegion``."""
+    """(k,) transition of that contact beyond the constraint, as in ``ModeRegion``."""
     multiplier: np.ndarray
     """(k,) multiplier of the constraint, positive."""
 
@@ -125,7 +126,7 @@ class ModeSearchResult:
     x: np.ndarray | None
     """(m + 3n,); None if no QP had a solution."""
     objective: float
-    """Infinite without ``x``."""
+    """Objective at ``x``; infinite if ``x`` is None."""
     qp_count: int
     """Number of QPs that were solved."""
     infeasible: int
@@ -140,10 +141,10 @@ def search_modes(
     qp_limit: int,
     solver: QpSolver | str,
 ) -> ModeSearchResult:
-    """Search over contact modes: solve the QP of a region, go to the region past its active mode constraints, and
-    repeat while the objective falls.
+    """Search over contact modes: solve the QP of a region, continue in the region beyond its active mode constraints,
+    and repeat while the objective falls.
 
-    The optimum of a region lies on the boundary to the next one, so each QP has a feasible start. The search begins
+    The optimum of a region lies on its boundary with the next one, so each QP has a feasible start. The search begins
     with the sliding contacts of ``modes`` set to stick, and with ``modes`` themselves if that region has no solution:
     feet that slide apart under load resist only in one direction each, and from there the search does not reach a
     common push-off.
@@ -169,7 +170,7 @@ def search_modes(
             modes = sliding_modes
             continue
         if best is not None and solution.objective >= best.objective:
-            # All transitions at once raised the objective; that with the largest multiplier alone may still lower it.
+            # All transitions together raised the objective; the one with the largest multiplier may still lower it.
             if single is None or modes is single:
                 break
             modes = single
@@ -209,11 +210,11 @@ def solve_relaxed(program: CoulombProgram, solver: QpSolver | str) -> tuple[np.n
 
 @dataclass(frozen=True)
 class FrictionDirections:
-    """Directions that stand in for the friction cone in a mode region."""
+    """Directions that approximate the friction cone in a mode region."""
 
     sides: np.ndarray
-    """(faces, 3), coefficients of mu f_n and of both tangential forces in the distance of a sticking contact's force to
-    each face of a pyramid; it is positive inside."""
+    """(faces, 3), for each face of a pyramid, coefficients of mu f_n and of both tangential forces. The sum of the
+    three terms is the distance of a sticking contact's force from the face, positive inside."""
     sector: float
     """Largest angle in radians between the slip of a sliding contact and the direction that its friction opposes."""
 
@@ -227,7 +228,8 @@ class FrictionDirections:
 
 
 CONE = FrictionDirections.pyramid(kernels.CONE_FACES, 0.0, kernels.SLIDE_SECTOR)
-"""The friction cone: a sticking contact stays inside a pyramid, a sliding one has any direction."""
+"""Approximation of the exact friction cone: the force of a sticking contact stays inside a pyramid, and a sliding
+contact may slide in any direction."""
 
 
 @dataclass(frozen=True)
@@ -298,7 +300,7 @@ class _Workspace:
         self.scratch, self.numbers = zeros(0, real, "cpu"), zeros(0, int, "cpu")
 
     def grown(self, scratch: int, numbers: int) -> _Workspace:
-        """Return this workspace with at least ``scratch`` floats and ``numbers`` integers."""
+        """Enlarge the buffers to at least ``scratch`` floats and ``numbers`` integers; return the workspace."""
         if self.scratch.size < scratch:
             self.scratch = zeros(scratch, real, "cpu")
         if self.numbers.size < numbers:
@@ -337,8 +339,8 @@ def solve_mode_region(
         start: (m + 3n,) point from which the solver starts.
         modes: modes of the region.
         solver: QP solver, see ``quadratic_program``.
-        friction: directions that stand in for the friction cone.
-        max_violation: body weights, or speed in sqrt(g H).
+        friction: directions that approximate the friction cone.
+        max_violation: largest violation that is tolerated, a force in body weights or a speed in sqrt(g H).
         warm_start: True if another region of the step has been solved; skips operator splitting (``SplittingProgram``).
 
     Returns:
@@ -368,8 +370,8 @@ def solve_mode_region(
 def _next_modes(
     program: CoulombProgram, modes: ContactModes, optimum: ModeRegionOptimum
 ) -> tuple[ContactModes, ContactModes | None]:
-    """Return the modes past all active constraints of ``optimum``, in the region of ``modes``, and those past the
-    constraint with the largest multiplier alone; the latter are None if there is only one."""
+    """Return the modes beyond all active constraints of ``optimum`` in the region of ``modes``, and the modes beyond
+    the constraint with the largest multiplier alone; the latter are None if only one constraint is active."""
     neighbours = _NextModes(program, modes, optimum.x)
     constraints = optimum.contact, optimum.transition, optimum.multiplier
     strongest = [int(np.argmax(optimum.multiplier))]
@@ -389,8 +391,8 @@ class _NextModes:
         self._moving = np.linalg.norm(tangents, axis=1) > kernels.ZERO_SPEED
 
     def after_transitions(self, contacts: np.ndarray, transitions: np.ndarray, multipliers: np.ndarray) -> ContactModes:
-        """Return the modes after ``contacts`` make their ``transitions``. If a contact has several, that with the
-        largest of ``multipliers`` counts."""
+        """Return the modes after ``contacts`` make their ``transitions``. If a contact has several transitions, the one
+        with the largest of ``multipliers`` is used."""
         kind, slip = self._modes.kind.copy(), self._modes.slip.copy()
         for index in np.argsort(multipliers, kind="stable"):
             i = contacts[index]

@@ -100,8 +100,8 @@ def _by_entries(objectives: Sequence[Objective]) -> tuple[list[Any], list[Any]]:
     """Split objectives by their rows.
 
     Returns:
-        Of objectives with one entry in each row: indices, entries and targets, scaled by the root of the weight. Of the
-        others: root of the weight, dense rows, and targets.
+        For objectives with one entry in each row: indices, entries and targets, scaled by the square root of the
+        weight. For the others: square root of the weight, dense rows and targets.
     """
     single, dense_rows = [], []
     for objective in objectives:
@@ -178,8 +178,8 @@ class DeviceLinearSteps:
         return DeviceLinearStep(velocities, torques, response, host_contact_velocities, *self._staging), other()
 
     def _buffers_for(self, unknowns: int, rows: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return buffers (unknowns, width) on the device and (rows, width) on the host, the same memory while its
-        capacity suffices."""
+        """Return buffers (unknowns, width) on the device and (rows, width) on the host. Their memory is reused while
+        its capacity suffices."""
         if self._buffer.numel() < unknowns * width or self._host_buffer.numel() < rows * width:
             self._buffer = self.owner.zeros(unknowns * (width + 3 * _EXTRA_CONTACTS))
             self._host_buffer = self.owner.stream.pinned((rows + 3 * _EXTRA_CONTACTS) * (width + 3 * _EXTRA_CONTACTS))
@@ -188,8 +188,8 @@ class DeviceLinearSteps:
         return velocities, self._host_buffer[: rows * width].view(rows, width)
 
     def segment_forces(self, newton: NewtonWorkspace) -> torch.Tensor:
-        """Return (M, 3) N, by which the segments pull their ends together at their bounds, where the last trial of
-        ``newton`` ends."""
+        """Return (M, 3) N, the forces with which the segments, activated at their bounds, pull their ends together at
+        the end of the last trial of ``newton``."""
         return wp.to_torch(
             self.owner.muscle_segments.enqueue_segment_forces(
                 as_warp(self._tensions, real), vectors(newton.end_positions)
@@ -202,7 +202,7 @@ class DeviceLinearSteps:
 
         Args:
             newton: workspace of the Newton loop.
-            segment_forces: (M, 3) N, of ``segment_forces``.
+            segment_forces: (M, 3) N, result of the method ``segment_forces``.
             dt: step size, s.
             velocities: (3N, k + 1) m/s, output.
         """

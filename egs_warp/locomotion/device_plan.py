@@ -89,7 +89,7 @@ class DevicePlanner:
 
         Returns:
             The contact linearisation at the predicted end, and the plan. None if a matrix is not positive definite, an
-            element is inverted, or contact forces were not found.
+            element is inverted, or the Coulomb solve failed.
         """
         if self.owner.predicted_start is not start:
             self.start(start)
@@ -253,7 +253,7 @@ class PlanWorkspace:
         self._start_solve(start, self._starts_solve)
 
     def _horizon(self, dt: float) -> float:
-        """Return the time of ``EffortModel``, s."""
+        """Return the duration of ``EffortModel``, s."""
         return max(EFFORT_HORIZON * self.body.body.time_unit, dt)
 
     def _build_plan(self, start: StepInputs, response: DeviceContactLinearization) -> Plan | None:
@@ -379,7 +379,7 @@ class PlanWorkspace:
         self._graphs.run((work.__name__, *arguments), lambda: work(*arguments))
 
     def _upload_inputs(self, start: StepInputs, activations: np.ndarray) -> None:
-        """Upload all that is known at the start of a step; the search begins at ``activations`` (M,) m."""
+        """Upload all data that are known at the start of a step. The search begins at ``activations`` (M,) m."""
         problem, planner, newton = start.problem, self.owner.planner, self.newton
         newton.coulomb.upload(start.normal_bias, start.friction)
         self.owner.factors.upload_diagonal(self.owner.masses)
@@ -449,7 +449,7 @@ class PlanWorkspace:
         self._contact_velocities.copy_(newton.contact_velocities(self._velocities))
 
     def _write_objectives(self, start: StepInputs, objectives: Sequence[AnyObjective]) -> None:
-        """Write the quadratic form of the ``objectives`` over x and 1, see ``objectives_cost``."""
+        """Write the quadratic form of the ``objectives`` in (x, 1), see ``objectives_cost``."""
         problem, m, speed = start.problem, self.m, self.body.body.speed_unit
         plain = [each for each in objectives if isinstance(each, Objective)]
         torch.mul(objective_form(self._velocities, plain, self.owner.objective_staging), 1.0 / speed**2, out=self._form)

@@ -107,7 +107,7 @@ class ModeSearchWorkspace:
 
     @cached_property
     def _host_input(self) -> wp.array:
-        """Host buffer for ``packed_qp``. It may be overwritten once the result of the previous launch was read."""
+        """Host buffer for ``packed_qp``. It may be overwritten once the result of the previous launch has been read."""
         return self.packed_qp if self._device.is_cpu else wp.zeros(self.packed_qp.shape, real, "cpu", pinned=True)
 
     @cached_property
@@ -190,8 +190,8 @@ class RelaxationWorkspace:
         self._launch.launch()
 
     def parse_result(self) -> tuple[np.ndarray, float] | None:
-        """Download the relaxed optimum, activations and objective as of ``solve_relaxed``; return None on numerical
-        failure, or if the search was accepted first."""
+        """Download the activations and the objective of the relaxed optimum, as in ``solve_relaxed``; return None on
+        numerical failure, or if the search was accepted first."""
         packed_result = self._host_result.get()
         # Large enough forces always prevent penetration, so the relaxed QP is feasible: other statuses are failures.
         return (
@@ -208,7 +208,7 @@ def _active_set(rows: int, base_rows: int, unknowns: int, cancelled: wp.array) -
         rows: row capacity.
         base_rows: number of base rows of which the rows are combinations.
         unknowns: capacity of unknowns.
-        cancelled: (1,) int32 on the device, ends the iterations when set.
+        cancelled: (1,) int32 on the device; the iterations end when it is set.
     """
     zeros = partial(wp.zeros, device=device_of(cancelled))
     units, active_set, splitting = UnitConstraints(), ActiveSet(), Splitting()

@@ -1,8 +1,8 @@
 """Energy balance of every step, from the arrays of a trajectory alone (docs/concepts/ledger.md).
 
 It shares no code with the solver: energies, damping and muscles are implemented a second time here, in NumPy, and no
-term is the remainder of others. So ``EnergyBalance.residual`` is an error of the run or of one of the two
-implementations.
+term is computed as the remainder of the others. So ``EnergyBalance.residual`` is an error of the run or of one of the
+two implementations.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class EnergyBalance:
 
     @property
     def residual(self) -> np.ndarray:
-        """(F,) change of the stored energy minus the sum of all flows, over m g H."""
+        """(F,) change of the stored energy minus the sum of all flows, divided by m g H."""
         return (np.diff(self.stored) - np.sum([getattr(self, name) for name in FLOWS], axis=0)) / self.energy_unit
 
     @property
@@ -172,8 +172,8 @@ def _flows(t: Trajectory, body: _Elements, muscles: _Muscles, step: int) -> tupl
     element_result = body.step(before, after, dt)
     muscle_result = muscles.step(t.activations[step], before, after)
     added = _spin(mass, after, t.velocities[step + 1] - velocity)
-    # Internal forces have no net torque at the end of the step, but implicit Euler applies them, with the directions of
-    # the end, at the lever arms of the start.
+    # Internal forces have no net torque at the end of the step, but implicit Euler applies them, in their directions at
+    # the end, with the lever arms at the start.
     lost_momentum = -dt * (element_result.torque + muscle_result.torque)
     inner_spin = np.linalg.solve(_inertia(mass, before), lost_momentum - _inertia(mass, after) @ added)
     friction, contact, push_out = _contacts(t, step, displacements)
@@ -211,13 +211,13 @@ def _contacts(t: Trajectory, step: int, displacements: np.ndarray) -> tuple[floa
 
 @dataclass(frozen=True)
 class _Strain:
-    """Result of the elements in a step, J."""
+    """Dissipation, losses and torque of the elements in a step. Energies are in J."""
 
     dissipated: float
     lost_elastic: float
     lost_damping: float
     torque: np.ndarray
-    """(3,) N m of elastic and damping forces at the end, with the arms of the start."""
+    """(3,) N m, torque of the elastic and damping forces at the end with the lever arms at the start."""
 
 
 @dataclass(frozen=True)
@@ -293,19 +293,19 @@ class _Elements:
 
 @dataclass(frozen=True)
 class _Pull:
-    """Result of the muscles in a step, J."""
+    """Work, positive work, loss and torque of the muscles in a step. Energies are in J."""
 
     work: float
     effort: float
     loss: float
     torque: np.ndarray
-    """(3,) N m at the end, with the arms of the start."""
+    """(3,) N m, torque of the forces at the end with the lever arms at the start."""
 
 
 @dataclass(frozen=True)
 class _Muscles:
-    """Muscle segments with a constant tension along the line between their ends, less of it where they are shorter than
-    0.7 of their rest length, and none below 0.3 (docs/concepts/muscles.md)."""
+    """Muscle segments with a constant tension along the line between their ends. The tension decreases below 0.7 of the
+    rest length and vanishes below 0.3 (docs/concepts/muscles.md)."""
 
     starts: np.ndarray
     nodes: np.ndarray
@@ -330,9 +330,9 @@ class _Muscles:
         share = 3.0 * limb**2 - 2.0 * limb**3
         work = tension * (self._pulled(long) - self._pulled(short))
         directions = end / np.maximum(short, 1e-300)[:, None]
-        # Work of the force of the end, share T u1, over the step: T (W0 - W1 + share u1.(x1 - x0)), W the length over
-        # which the full tension does the same work. The loss has two parts: rotation of the line, and the change of
-        # ``share`` of a line shorter than 0.7 of its rest length.
+        # Implicit Euler applies the force at the end, share T u1, throughout the step. The loss is T (W0 - W1 + share
+        # u1.(x1 - x0)), where W is the length over which the full tension does the same work. It has two parts: the
+        # rotation of the line, and the change of ``share`` of a line shorter than 0.7 of its rest length.
         turned = 0.5 * share * long * ((start / np.maximum(long, 1e-300)[:, None] - directions) ** 2).sum(axis=1)
         weakened = self._pulled(long) - self._pulled(short) - share * (long - short)
         torque = -np.cross(start, (tension * share)[:, None] * directions).sum(axis=0)

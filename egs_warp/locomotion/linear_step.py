@@ -46,9 +46,9 @@ class StepInputs:
     """(n,) m/s, velocity bias of each contact in the normal direction."""
     friction: float
     activations: np.ndarray
-    """(M,) m, of the previous step."""
+    """(M,) m, activations of the previous step."""
     forces: np.ndarray
-    """(n, 3) N, forces of the previous step on those of these contacts that it had; zero for the others."""
+    """(n, 3) N, contact forces of the previous step; zero for contacts that it did not have."""
 
     @classmethod
     def from_prediction(cls, predicted: PredictedStep, friction: float, activations: np.ndarray) -> StepInputs:
@@ -99,7 +99,8 @@ class LinearStep:
         device.
 
         Returns:
-            A function that blocks for G, (k + 1, k + 1) (m/s)^2; the weighted squares are 1/2 (x, 1)^T G (x, 1).
+            A function that returns G, (k + 1, k + 1) (m/s)^2, and blocks until it is available; the weighted squares
+            are 1/2 (x, 1)^T G (x, 1).
         """
         form = np.zeros((self.count + 1, self.count + 1))
         for objective in objectives:
@@ -151,7 +152,7 @@ class HostStepLinearizer:
 
 
 def torques_of(problem: StepProblem, contacts: ContactSet, m: int) -> np.ndarray:
-    """Return (3, m + 3n) kg m^2/s, derivative of the angular momentum with respect to x: zero for ``m`` activations,
-    and the torque of a body weight in each direction of each contact."""
+    """Return (3, m + 3n) kg m^2/s, derivative of the angular momentum with respect to x: zero for the ``m``
+    activations, and the angular impulse of a body weight along each axis of each contact."""
     torques = problem.dt * problem.body.weight * contacts.contact_velocities(problem.rotation_modes).T
     return np.hstack([np.zeros((3, m)), torques])

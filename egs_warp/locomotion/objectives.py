@@ -1,8 +1,9 @@
-"""Objectives of a motion on the end of a step: weighted squares of functions linear in it (docs/concepts/motions.md).
+"""Objectives of a motion: weighted squares of linear functions of the end of a step (docs/concepts/motions.md).
 
-``Objective`` is linear in the end velocity, by ``rows``. The other kinds are linear in the unknowns x of the QP, by
-``slopes`` (j, k), the derivative with respect to each of k unknowns, whose angular momenta are ``torques`` (3, k).
-``residual`` (j,) is the value at one end of the step. Slopes and residuals are in units of ``speed``, sqrt(g H) in m/s.
+``Objective`` is linear in the end velocity, with the matrix ``rows``. The other kinds are linear in the k unknowns x of
+the QP; ``slopes`` (j, k) is their derivative, computed from ``torques`` (3, k), the derivative of the angular momentum.
+``residual`` (j,) is the value at a given end of the step. Slopes and residuals are in units of ``speed``, sqrt(g H) in
+m/s.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Objective:
         angular_impulse: np.ndarray,
         speed: float,
     ) -> np.ndarray:
-        """Return (k,) at the end ``velocities`` (3N,) m/s; ``angular_impulse`` is not used."""
+        """Return the residual (k,) at the end ``velocities`` (3N,) m/s; ``angular_impulse`` is not used."""
         return (self.rows @ velocities - self.target) / speed
 
 
@@ -61,8 +62,8 @@ class AngularMomentumObjective:
     weight: float
 
     def slopes(self, problem: StepProblem, contacts: ContactSet, torques: np.ndarray, speed: float) -> np.ndarray:
-        """Return (3, k), the derivative of the residual with respect to the unknowns, whose ``torques`` are (3, k) kg
-        m^2/s."""
+        """Return (3, k), the derivative of the residual with respect to the unknowns; ``torques`` (3, k) kg m^2/s is
+        that of the angular momentum."""
         return torques / self._unit(problem, speed)
 
     def residual(
@@ -73,7 +74,7 @@ class AngularMomentumObjective:
         angular_impulse: np.ndarray,
         speed: float,
     ) -> np.ndarray:
-        """Return (3,) at the end of a step in which contact forces add ``angular_impulse`` (3,) kg m^2/s;
+        """Return the residual (3,) at the end of a step in which contact forces add ``angular_impulse`` (3,) kg m^2/s;
         ``velocities`` are not used."""
         return (problem.angular_momentum + angular_impulse - self.target) / self._unit(problem, speed)
 
@@ -129,15 +130,15 @@ def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Object
 
 
 def deformation_velocities(body: SoftBody, positions: np.ndarray, target: np.ndarray, weight: float) -> Objective:
-    """Return the objective that the body stretches and shears as ``target`` velocities do: motion towards a pose. Finer
-    deformations are left to elasticity, translation and rotation to their own objectives.
+    """Return the objective that the body stretches and shears at the rates of the ``target`` velocities, which lead to
+    a pose. Finer deformations are left to elasticity, and translation and rotation to their own objectives.
 
     The six rows are orthonormal in the mass-weighted mean, so the weight is comparable with that of
     ``node_velocities``.
 
     Args:
-        positions: (N, 3) m.
-        target: (N, 3) m/s.
+        positions: (N, 3) m, at the start of the step.
+        target: (N, 3) m/s, nodal velocities.
         weight: weight.
     """
     arms = positions - body.centre_of_mass(positions)
@@ -181,7 +182,7 @@ class BodyPart:
 
     @classmethod
     def head(cls, body: SoftBody, heights: np.ndarray) -> BodyPart:
-        """Return the top: nodes whose height (N,) m at rest is at most 0.15 H below the highest."""
+        """Return the head: nodes whose height (N,) m at rest is at most 0.15 H below the highest."""
         return cls.of(body, "head", np.flatnonzero(heights > heights.max() - 0.15 * body.height))
 
     def centre(self, points: np.ndarray) -> np.ndarray:
@@ -200,7 +201,7 @@ class Coordinates:
     """Coordinates of the target of an objective."""
 
     axes: np.ndarray
-    """(3, 3) rows are unit vectors, along which the components of a target are."""
+    """(3, 3), whose rows are the unit vectors along which the components of a target are measured."""
     relative: bool
     """True if the origin moves with the centre of mass of the whole body."""
 
@@ -211,8 +212,8 @@ WORLD = Coordinates(np.eye(3), False)
 def part_velocity(
     body: SoftBody, part: BodyPart, target: np.ndarray, weight: float, coordinates: Coordinates = WORLD
 ) -> Objective:
-    """Return the objective that the centre of ``part`` has velocity ``target`` (3,) m/s in ``coordinates``. For the
-    base, relative to the centre of mass, it controls a landing."""
+    """Return the objective that the centre of ``part`` has velocity ``target`` (3,) m/s in ``coordinates``. Applied to
+    the base, in coordinates relative to the centre of mass, it controls a landing."""
     shares = np.zeros(len(body.node_mass))
     shares[part.nodes] = part.masses / part.masses.sum()
     if coordinates.relative:
@@ -263,10 +264,10 @@ def part_angular_momentum(
     coordinates: Coordinates = WORLD,
 ) -> Objective:
     """Return the objective that ``part`` has angular momentum ``target`` (3,) kg m^2/s about its own centre; in
-    relative coordinates about the centre of mass of the body, with velocities relative to its velocity.
+    relative coordinates it is taken about the centre of mass of the body, with velocities relative to that.
 
-    Rows are in m/s: angular momentum over mass x radius of gyration. For the whole body ``AngularMomentumObjective`` is
-    exact; this one uses the lever arms at the start of the step.
+    Rows are in m/s: angular momentum divided by mass x radius of gyration. For the whole body
+    ``AngularMomentumObjective`` is exact; this one uses the lever arms at the start of the step.
     """
     if coordinates.relative:
         pivot, moving = body.centre_of_mass(state.positions), body.node_mass / body.mass
@@ -303,7 +304,7 @@ def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, w
     """Return the objective that the area of the convex hull of ``part``, projected along ``up`` (3,), approaches
     ``target`` m^2 at ``rate`` 1/s.
 
-    Rows are in m/s: dA/dt over the perimeter of the hull is the speed at which its sides move outwards.
+    Rows are in m/s: dA/dt divided by the perimeter of the hull is the speed at which its sides move outwards.
     """
     plane = np.stack(orthonormal_basis(up))
     hull = ConvexHull(state.positions[part.nodes] @ plane.T)
@@ -335,8 +336,8 @@ def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float
 
 
 def no_slip_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> Objective:
-    """Return the objective that contacts do not slide, each weighted by its ``loads`` (n,), fractions of the body
-    weight."""
+    """Return the objective that contacts do not slide, each weighted by its load; ``loads`` (n,) are fractions of the
+    body weight."""
     shares = np.sqrt(np.repeat(loads, 3))
     shares[::3] = 0.0
     rows = sparse.csr_matrix(contacts.jacobian.multiply(shares[:, None]))

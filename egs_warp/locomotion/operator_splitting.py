@@ -1,4 +1,4 @@
-"""Operator splitting (ADMM) by the package OSQP. The only module that imports it.
+"""Operator splitting (ADMM) with the package OSQP, which only this module imports.
 
 See docs/concepts/locomotion.md#solvers.
 """
@@ -19,7 +19,7 @@ from egs_warp.launching import thread_local_cache
 SCALING_PASSES = 4
 """Number of equilibration passes."""
 RHO_UPDATE_INTERVAL = 50
-"""Number of iterations after which rho may change. OSQP's interval by time would make runs irreproducible."""
+"""Number of iterations after which rho may change. OSQP's time-based interval would make runs irreproducible."""
 WARM_START_ITERATIONS = 15
 """Number of iterations of a warm start, which finds the active rows of an optimum."""
 RHO = 1.0
@@ -140,8 +140,9 @@ def _convert_result(result: Any) -> SplittingResult:
 
 
 class OsqpWarmStart:
-    """Warm starts by the package OSQP on whitened QPs of at most ``rows`` rows and ``unknowns`` unknowns. OSQP is set
-    up once and only numbers are updated. Each run starts from the given point, so it does not depend on previous runs.
+    """Warm starts with the package OSQP on whitened QPs of at most ``rows`` rows and ``unknowns`` unknowns. OSQP is set
+    up once; each run only updates its numbers. A run starts from the given point, so it does not depend on previous
+    runs.
     """
 
     def __init__(self, rows: int, unknowns: int) -> None:

@@ -42,7 +42,7 @@ def search_states(
     """Solve the QP in the predicted contact states, then change the state of one contact at a time while the objective
     falls, in the order of the multipliers of its constraints (Eq. 13; pivoting after Tan, Turk and Liu 2012).
 
-    If the predicted states have no solution, those of their constraints that the predicted activations violate may stay
+    If the QP in the predicted states has no solution, the constraints that the predicted activations violate may stay
     violated by as much.
 
     Args:
@@ -82,8 +82,8 @@ def search_states(
 
 
 def predicted_modes(predicted: PredictedContact, friction: float, directions: int) -> ContactModes:
-    """Return the predicted states as modes (Eq. 12): static where friction is inside the cone, else slide k, with
-    friction along the direction D_k that opposes the predicted slip most.
+    """Return the predicted states as modes (Eq. 12): static where friction is inside the cone, and otherwise sliding,
+    with friction along the direction D_k that opposes the predicted slip most.
 
     Args:
         predicted: predicted contact.

@@ -24,16 +24,16 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import shortening
 
 MIN_STEPS_PER_TIME_UNIT = 19.0
-"""Minimum number of steps in sqrt(H / g); with longer steps a body cannot be controlled."""
+"""Minimum number of steps per sqrt(H / g); with longer steps a body cannot be controlled."""
 _REFERENCE_STRENGTH = 4.0
-"""Body weights, force of the muscle for which ``LocomotionSettings`` gives the activation weights."""
+"""Force in body weights of the muscle for which ``LocomotionSettings`` gives the activation weights."""
 WORK_WEIGHT = 10.0
 """Weight of the squared work of a muscle in a step, in (m g H)^2. Without it, muscles that shorten act against muscles
 that they stretch: the jumps of pawn, robot and monkey take 1.64, 1.78 and 1.54 m g H instead of 1.49, 1.34 and 1.40."""
 _MAX_ACTIVATION_RATE = 7.0
-"""Maximum change of an activation in sqrt(H / g), in units of its bound."""
+"""Maximum change of an activation per sqrt(H / g), in units of its bound."""
 REGULARIZATION = 1e-7
-"""Added to the diagonal of P for the activations."""
+"""Regularisation that is added to the diagonal of P for the activations."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,8 @@ class StepPlanner:
 
         The QP is built about ``predicted`` and searched by the strategy of the settings. Of its solution only the
         activations are used: the contact forces that follow from them by Coulomb's law, and the end of the step, are
-        computed from the linear step. If that end would invert an element, the predicted velocities stand in for it. If
-        no QP has a solution, the plan keeps the previous activations.
+        computed from the linear step. If that end would invert an element, the predicted velocities are used instead.
+        If no QP has a solution, the plan keeps the previous activations.
 
         Args:
             predicted: predicted end of the step.
@@ -135,8 +135,8 @@ class StepPlanner:
         response, predicted_velocities, body = predicted.linearization, predicted.velocities, self.body
         problem, contacts = response.tangent.problem, response.contacts
         weight, speed = body.weight, body.speed_unit
-        # ``linearize`` may run both at once: only ``EffortModel`` uses the kernels of elasticity, which serve one
-        # thread.
+        # ``linearize`` may run both concurrently: only ``EffortModel`` uses the elasticity kernels, which are not
+        # thread-safe.
         linear, effort_model = self.linear_steps.linearize(
             predicted, lambda: EffortModel.of(problem, predicted_velocities, self.factors)
         )

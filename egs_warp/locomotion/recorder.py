@@ -21,7 +21,7 @@ from egs_warp.muscles.muscle_set import MuscleSet
 _MIN_STEPS_PER_PART = 10
 """Minimum number of steps in a part."""
 REPORTED = ("qp_count", "qp_infeasible", "newton_iterations", "converged", "added_spin")
-"""Fields of ``StepReport`` that are arrays of a part, one row a step."""
+"""Fields of ``StepReport`` that become arrays of a part, with one row per step."""
 
 
 class Recorder:
@@ -40,7 +40,7 @@ class Recorder:
         front: np.ndarray | None = None,
         folder: Callable[[], Path] | None = None,
     ) -> None:
-        """Write down the start of a run.
+        """Record the start of a run.
 
         Args:
             body: the body.
@@ -68,7 +68,7 @@ class Recorder:
 
         Args:
             reports: their reports, in order.
-            request_digest: ``replay.digest`` of the objectives and of ``kick``; only read where a run is continued.
+            request_digest: ``replay.digest`` of the objectives and of ``kick``; only read when a run is continued.
             kick: (N, 3) m/s, velocities that external pushes added to the nodes at the start of the step.
         """
         if kick is not None:

@@ -112,7 +112,7 @@ def digest(objectives: Sequence[AnyObjective | np.ndarray]) -> int:
             feed(sparse.csr_matrix(value).data)
         else:
             array = np.ascontiguousarray(value)
-            assert array.dtype != object, "objectives are numbers and names"
+            assert array.dtype != object, "an objective may contain only numbers, names and arrays"
             hasher.update(array.tobytes())
 
     for objective in objectives:

@@ -54,7 +54,7 @@ class RolloutResult:
 
 def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]:
     """Return the size of a solver step, s, and the number of steps in a frame. Steps are at most ``step`` s and at most
-    sqrt(H / g) / 19 (docs/concepts/conventions.md). If ``step`` is longer than a frame, a frame is as long."""
+    sqrt(H / g) / 19 (docs/concepts/conventions.md). If ``step`` is longer than a frame, a frame lasts ``step`` s."""
     max_step = body.time_unit / MIN_STEPS_PER_TIME_UNIT
     frame = max(1.0 / FRAME_RATE, step or 0.0)
     count = int(np.ceil(frame / min(max_step, step or max_step) - 1e-3))
@@ -96,7 +96,7 @@ def roll_out(
         kicks: function of time and step size, s, that returns the velocities (N, 3) m/s which external pushes add to
             the nodes in that step, or None.
         activations: (steps, M) m, prescribed activations, which replace the planned ones; the run ends with the last
-            whole frame of them.
+            whole frame that they cover.
         progress: function that receives the index of each finished frame.
     """
     dt, per_frame = solver_steps(stepper.body, step)
@@ -120,7 +120,7 @@ def roll_out(
         folder=parts,
     )
     replay = Replay(resume, recorder.start, stepper.detector) if resume is not None else None
-    # Digests take time and are only read where a run is continued.
+    # Digests take time and are only read when a run is continued.
     needs_digest = parts is not None or resume is not None
     for frame in range(frames):
         for part in range(per_frame):

@@ -1,4 +1,4 @@
-"""Rest of a body on its ground, and the unloaded shape whose rest under gravity is the captured shape."""
+"""State of rest of a body on its ground, and the unloaded shape that takes the captured shape at rest under gravity."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _ANDERSON_DEPTH = 4
 def settle(stepper: LocomotionStepper) -> BodyState:
     """Let the body come to rest on its ground: long contact steps without muscles, each started without velocity.
 
-    A body that collapses is not followed to the ground: the loop ends once a node moves by 0.2 H in one step, or the
-    centre of mass has moved by 0.1 H in all.
+    The fall of a body that collapses is not computed to its end: the loop ends once a node moves by 0.2 H in one step,
+    or the centre of mass has moved by a total of 0.1 H.
     """
     body = stepper.body
     state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
@@ -51,7 +51,7 @@ def has_settled(body: SoftBody, max_displacement: Any, centre_displacement: Any)
     Args:
         body: the body.
         max_displacement: m, largest displacement of a node along an axis in the last step, a number or an array.
-        centre_displacement: m, displacement of the centre of mass in all, a number or an array.
+        centre_displacement: m, total displacement of the centre of mass, a number or an array.
     """
     return (
         (max_displacement > 0.2 * body.height)
@@ -61,16 +61,16 @@ def has_settled(body: SoftBody, max_displacement: Any, centre_displacement: Any)
 
 
 def settle_as_captured(stepper: LocomotionStepper, state: BodyState) -> tuple[LocomotionStepper, BodyState, float]:
-    """Find the unloaded shape whose rest on the ground is the captured shape, so that the body does not sag.
+    """Find the unloaded shape that takes the captured shape at rest on the ground, so that the body does not sag.
 
     A fixed-point iteration (Sellier, "An iterative method for the inverse elasto-static problem", Journal of Fluids and
     Structures 27, 2011): the unloaded shape X becomes X - R^T u, where u are the displacements of the resting nodes
     from the captured shape and R is the best-fit rotation. Masses, material and muscles stay the same; muscles have
-    their rest lengths in the captured shape. A rigid displacement, as of a body that rocks onto its third foot, is not
-    an error of the shape, but the iteration goes on as long as it shrinks.
+    their rest lengths in the captured shape. A rigid displacement, such as that of a body that rocks onto its third
+    foot, is not an error of the shape, but the iteration continues as long as it decreases.
 
     Args:
-        stepper: stepper of the body, which takes its unloaded shape to be the captured one.
+        stepper: stepper of the body, for which the unloaded shape is the captured one.
         state: its state at rest (``settle``).
 
     Returns:
@@ -117,8 +117,8 @@ def _displacements(body: SoftBody, state: BodyState) -> tuple[np.ndarray, float,
 
 def _anderson_iterate(points: list[np.ndarray], residuals: list[np.ndarray]) -> np.ndarray:
     """Return the next iterate of x <- x - r(x) with Anderson acceleration (Walker and Ni, "Anderson acceleration for
-    fixed-point iterations", SIAM Journal on Numerical Analysis 49, 2011); ``points`` and ``residuals`` (N, 3) are the
-    last ones, the latest at the end."""
+    fixed-point iterations", SIAM Journal on Numerical Analysis 49, 2011); ``points`` and ``residuals`` are the latest
+    iterates and their residuals (N, 3), in chronological order."""
     x, r = points[-1], residuals[-1]
     if len(points) == 1:
         return x - r

@@ -1,6 +1,6 @@
 """Solvers of QPs whose bounds change while P, q and A stay the same.
 
-The only module that imports DAQP. See docs/concepts/locomotion.md#solvers.
+This is the only module that imports DAQP. See docs/concepts/locomotion.md#solvers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MAX_VIOLATION = 3e-3
 """Largest violation of its bounds up to which a point at the iteration limit is used."""
 _MAX_ITERATIONS = 4000
 _BOUND_PADDING = 0.3
-"""Bounds are widened by this times the accuracy."""
+"""Distance by which bounds are widened, in units of the accuracy."""
 _EQUALITY_WIDTH = 1e-12
 """A row whose bounds are closer than this is an equality."""
 
@@ -103,12 +103,12 @@ def quadratic_program(
 
 
 class SplittingProgram:
-    """``QuadraticProgram`` by operator splitting and the active-set method.
+    """``QuadraticProgram`` that is solved by operator splitting and the active-set method.
 
     A few iterations of operator splitting, on the rows that the unconstrained minimum violates, guess the active rows.
     From this guess ``active_set`` finds the optimum to rounding. After a numerical failure, operator splitting
-    continues with all rows to its own accuracy. With ``skip_splitting`` the iterations are skipped: the rows that
-    the unconstrained minimum violates are a guess from which the active-set method is as quick.
+    continues with all rows to its own accuracy. With ``skip_splitting`` the iterations are skipped; the active-set
+    method is then equally fast from the rows that the unconstrained minimum violates.
     """
 
     def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, *, accuracy: float = 3e-5) -> None:
@@ -132,7 +132,7 @@ class SplittingProgram:
         lower, upper = lower - self._padding, upper + self._padding
         violated = (rows.values_at_minimum < lower) | (rows.values_at_minimum > upper)
         if not violated.any():
-            # No bound is active, as in flight.
+            # No bound is active, for example in flight.
             return self._solved(rows.minimum, np.zeros(len(lower)))
         if skip_splitting:
             return self._solve_from_minimum(lower, upper, start)
@@ -193,7 +193,7 @@ class SplittingProgram:
 
 
 class DaqpProgram:
-    """``QuadraticProgram`` by DAQP (MIT); P must be positive definite."""
+    """``QuadraticProgram`` that is solved by DAQP (MIT licence); P must be positive definite."""
 
     def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray) -> None:
         self._P, self._q = np.ascontiguousarray(P), q

@@ -18,7 +18,7 @@ from egs_warp.locomotion.linear_step import LinearStep
 from egs_warp.locomotion.objectives import AnyObjective, Objective
 
 EFFORT_WEIGHT = 1.0
-"""Cost of the energy m g H, elastic and damping."""
+"""Cost of an elastic energy and damping potential of m g H in total."""
 EFFORT_HORIZON = 0.16
 """Time in sqrt(H / g) after the start of a step at which the elastic energy is evaluated. A horizon of one step is too
 short: a body that holds itself bent gains almost nothing by releasing the strain for one step."""
@@ -55,7 +55,7 @@ def objectives_cost(
         objectives: objectives of the motion.
         speed: unit of speed sqrt(g H), m/s.
     Returns:
-        A function that blocks for the cost over x.
+        A function that returns the cost as a function of x, and blocks until it is available.
     """
     squares = linear.objective_quadratic([each for each in objectives if isinstance(each, Objective)])
 

@@ -136,7 +136,7 @@ class LocomotionStepper:
         self._make_planners(linear_solver_on(body.assembly.device, body.assembly.upper_pattern))
 
     def _make_planners(self, planning_factors: LinearSolver) -> None:
-        """Build what depends on the elasticity of the body: linearizer, synergies and planners."""
+        """Build the objects that depend on the elasticity of the body: linearizer, synergies and planners."""
         body, muscles = self.body, self.muscles
         self.linearizer = _make_linearizer(self.factors, body, muscles, self.solver)
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
@@ -189,11 +189,11 @@ class LocomotionStepper:
         return constructor, (self.body, self.muscles, self.geometry)
 
     def initial_memory(self) -> WarmStart:
-        """Return the warm start of a first step: no contacts, activations of zero."""
+        """Return the warm start of a first step: no contacts and zero activations."""
         return WarmStart(np.zeros(0, int), np.zeros((0, 3)), np.zeros(self.muscles.segment_count))
 
     def passive_step(self, state: BodyState, memory: WarmStart, dt: float) -> CoupledResult:
-        """Solve a step of ``dt`` s without muscles, from the rigid motion of the body."""
+        """Solve a step of ``dt`` s without muscles; Newton's method starts at the rigid motion of the body."""
         problem = StepProblem(self.body, state, dt)
         contacts = self._detect(problem, memory)
         response = self.linearizer(problem.tangent(self.factors, problem.rigid_guess, None), contacts)
@@ -210,8 +210,8 @@ class LocomotionStepper:
         """Make one step of ``dt`` s; if it does not converge, repeat it as half steps.
 
         The half steps do not replan: the objectives are those of the whole step. The planned activations may be the
-        cause, so the half steps are computed twice, with the planned and with the previous activations. Of the two
-        results one that converged is preferred, then the one with the lower objective value.
+        cause of the failure, so the half steps are computed twice, with the planned and with the previous activations.
+        A result that converged is preferred; otherwise the lower objective value decides.
 
         Args:
             state: state at the start.
@@ -421,7 +421,7 @@ class LocomotionStepper:
 
     def _detect(self, problem: StepProblem, memory: WarmStart) -> ContactSet:
         """Select the contacts of the step: points in use and points that the ballistic motion brings close to the
-        ground. Uses the prefetched selection of the linearizer where there is one."""
+        ground. A prefetched selection of the linearizer is used if there is one."""
         loaded = memory.forces[:, 0] > 0.0
         contacts = self.linearizer.select_contacts(problem, memory.points, loaded)
         if contacts is not None:
@@ -431,7 +431,7 @@ class LocomotionStepper:
         return self.detector.contact_set(self.selector.select(memory.points, loaded, gaps), problem.state.positions)
 
     def predict(self, start: StepInputs) -> PredictedStep:
-        """Predict the end of the step under the activations of ``start``, those of the previous step (Eq. 12).
+        """Predict the end of the step under the activations of the previous step, which ``start`` contains (Eq. 12).
 
         It starts from rigid motion of the whole body. One Newton step with the previous contact forces gives the
         velocities at which the tangent is factored; the plan uses this tangent. Then ``PREDICTION_ITERATIONS`` Newton

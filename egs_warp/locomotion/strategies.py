@@ -36,7 +36,7 @@ class Strategy(Enum):
     """Search for the contact modes of a step."""
 
     MODES = "modes"
-    """From the predicted modes, all contacts at a time, with the exact friction cone (``search_modes``)."""
+    """From the predicted modes, all contacts at once, with the exact friction cone (``search_modes``)."""
     PAPER = "paper"
     """The paper's: in the predicted states, then one contact at a time, with a friction pyramid (``search_states``)."""
 
@@ -63,7 +63,7 @@ def search_program(
         predicted: predicted contact, from which the search starts.
         directions: number of edges of the friction pyramid of the strategy ``paper``.
         qp_limit: maximum number of QPs of a search.
-        solver: QP solver; ``admm`` is available to the strategy ``modes`` alone, others then use OSQP.
+        solver: QP solver; only the strategy ``modes`` supports ``admm``, and the other one uses OSQP instead.
         device: device of the solver ``admm``.
     """
     solver = QpSolver(solver)

@@ -50,7 +50,8 @@ def find_synergies(
 ) -> Synergies:
     """Group muscle segments that accelerate the body in similar directions.
 
-    Average linkage on one minus the cosine between their effects, in the norm of the kinetic energy.
+    The clustering uses average linkage, with one minus the cosine between their effects as the distance, in the norm of
+    the kinetic energy.
 
     Args:
         effects: (3N, M) m/s, nodal velocities that each segment causes at its bound.

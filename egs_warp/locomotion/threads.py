@@ -15,6 +15,6 @@ def _libraries() -> ThreadpoolController:
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """Return a context manager that limits BLAS to one thread. With more, a step takes half as long again, and ten
+    """Return a context manager that limits BLAS to one thread. With more threads a step takes 50 % longer, and ten
     times as long when other processes use the cores."""
     return _libraries().limit(limits=1, user_api="blas")

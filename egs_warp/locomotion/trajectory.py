@@ -34,7 +34,7 @@ CONTACTS = (
 KICKS = ("kick_step", "kick_velocity")
 """Arrays of one row for each step with external pushes."""
 FIRST_PART = "start.npz"
-"""File of the first part of a recording: all that is constant, and the first state."""
+"""File of the first part of a recording: all constant data, and the first state."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Trajectory:
     kick_velocity: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
     """(K, N, 3) m/s, velocities that they added to the nodes at the start of the step."""
     planned_com: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(F+1, 3) m, planned centre of mass, NaN where there was no plan; or no rows."""
+    """(F+1, 3) m, planned centre of mass, NaN where there was no plan; may have no rows."""
     body_axes: np.ndarray = field(default_factory=lambda: np.eye(3))
     """(3, 3) rows: this frame's x, y and z in the capture's axes."""
     body_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -160,7 +160,7 @@ class Trajectory:
 
     @classmethod
     def from_parts(cls, parts: Sequence[dict[str, np.ndarray]]) -> Trajectory:
-        """Concatenate the parts of a recording; the first one contains the start and all that is constant."""
+        """Concatenate the parts of a recording; the first one contains the first state and all constant data."""
         values = dict(parts[0])
         for name in (*STATES, *STEPS, *CONTACTS, *KICKS):
             values[name] = np.concatenate([part[name] for part in parts])
@@ -180,13 +180,13 @@ def part_name(number: int) -> str:
 
 
 def part_paths(folder: Path) -> list[Path]:
-    """Return the files of the steps in the ``folder`` of a recording, in order, including names of missing ones in
+    """Return the paths of the parts with steps in the ``folder`` of a recording, in order, including missing ones in
     between."""
     return [folder / part_name(number) for number in range(len(list(folder.glob("steps-*.npz"))))]
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write ``arrays`` by name; the file is complete or absent."""
+    """Write ``arrays`` under their names; the file is complete or absent."""
     with atomic_write(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, schema=np.int64(SCHEMA), **arrays)  # pyright: ignore[reportArgumentType]
 
@@ -201,7 +201,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     arrays = read_npz(path)
     schema = int(arrays.pop("schema", 1))
     if schema != SCHEMA:
-        raise ValueError(f"it is of schema {schema}, this version reads schema {SCHEMA}")
+        raise ValueError(f"its schema is {schema}, but this version reads schema {SCHEMA}")
     return arrays
 
 
@@ -214,7 +214,7 @@ class MotionOutcome:
     height: float
     """Highest point of the centre of mass minus its height at the start."""
     heading_degrees: float
-    """Rotation about the plane's normal; full turns count."""
+    """Rotation about the plane's normal, including full turns."""
     tilt_degrees: float
     """Angle between the normal and the up axis of the body's best-fit rotation, at the end."""
     airborne_frames: float
@@ -254,7 +254,7 @@ def _best_fit(t: Trajectory, positions: np.ndarray) -> np.ndarray:
 
 
 def _headings(t: Trajectory, first: int, last: int, up: np.ndarray) -> np.ndarray:
-    """Return (n,) rad about ``up`` since ``first``, unwrapped so that full turns count."""
+    """Return (n,) rad about ``up`` since ``first``, unwrapped so that full turns are included."""
     start = _best_fit(t, t.positions[first])
     angles = []
     for positions in t.positions[first : last + 1]:

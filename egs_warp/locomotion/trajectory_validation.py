@@ -46,7 +46,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "body_origin": (3,),
     "front": (3,),
 }
-"""Extents of each array by name; extents of one name are equal."""
+"""Extents of each array, as numbers or names; extents with the same name are equal."""
 _INDICES = {
     "tets": "nodes",
     "solid_from_plane": "planes",
@@ -116,7 +116,7 @@ def _extents(t: Trajectory) -> dict[str, int]:
     extents["ends"] = extents["offsets"] - 1
     is_wrong = extents["states"] != extents["steps"] + 1 or extents["planned"] not in (0, extents["states"])
     if is_wrong or min(extents[name] for name in ("nodes", "tets", "planes", "offsets")) < 1:
-        raise ValueError("its arrays do not fit each other")
+        raise ValueError("its arrays have inconsistent shapes")
     # May be absent if the run has no pushes.
     has_no_pushes = extents["kicks"] == 0 and t.kick_velocity.shape == (0, 0, 3)
     if t.kick_velocity.shape != (extents["kicks"], extents["nodes"], 3) and not has_no_pushes:

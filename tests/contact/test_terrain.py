@@ -78,7 +78,7 @@ def test_a_terrain_file(tmp_path: Path) -> None:
         (f"[[[0, 0, 1, {401 * '1'}]]]", "solid 1: plane 0,0,1,inf: give four finite numbers"),
         (f"[[[0, 0, 1, {5000 * '1'}]]]", "solid 1: plane 0,0,1,inf: give four finite numbers"),
         ("[[[1e300, 1e300, 1, 0]]]", "solid 1: plane 1e+300,1e+300,1,0: give four finite numbers"),
-        (str([[[0, 0, 1, 0]]] * 65), "65 faces; at most 64 are handled"),
+        (str([[[0, 0, 1, 0]]] * 65), "65 faces; at most 64 are supported"),
     ],
 )
 def test_mistakes_of_a_terrain_file(tmp_path: Path, text: str, message: str) -> None:

@@ -104,7 +104,7 @@ def test_a_body_hinged_at_an_edge_is_refused() -> None:
     assert len(nodes) == 2 * len(box.nodes) - 2
     tets = merged.ravel()[np.concatenate([box.tets, box.tets + len(box.nodes)])].astype(np.int32)
     with pytest.raises(
-        UserError, match="nodes: parts of the cage are connected by a single corner or edge; give it more"
+        UserError, match="nodes: parts of the cage are connected by a single corner or edge; request more"
     ):
         make_body(TetMesh(nodes, tets), FLOOR, device="cpu")
 

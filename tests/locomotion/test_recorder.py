@@ -60,7 +60,7 @@ def test_a_part_that_is_missing_or_of_another_schema_is_reported(
     with pytest.raises(FileNotFoundError):
         Trajectory.load(tmp_path)
     np.savez(tmp_path / "steps-000000.npz", time=np.zeros(1))
-    with pytest.raises(ValueError, match=f"it is of schema 1, this version reads schema {SCHEMA}"):
+    with pytest.raises(ValueError, match=f"its schema is 1, but this version reads schema {SCHEMA}"):
         Trajectory.load(tmp_path)
 
 

@@ -52,7 +52,7 @@ def _spoilt(name: str, value: float, row: int = -1) -> Any:
         (lambda t: replace(t, kick_velocity=t.kick_velocity[:, :, :2]), "kick_velocity has shape"),
         (lambda t: replace(t, kick_velocity=np.zeros((0, 0, 3))), "kick_velocity has shape"),
         (lambda t: replace(t, kick_step=t.kick_step[:0]), "kick_velocity has shape"),
-        (lambda t: replace(t, planned_com=np.zeros((2, 3))), "its arrays do not fit each other"),
+        (lambda t: replace(t, planned_com=np.zeros((2, 3))), "its arrays have inconsistent shapes"),
     ],
 )
 def test_inconsistent_trajectories_are_reported(change: Any, said: str) -> None:

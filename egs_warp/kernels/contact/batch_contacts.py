@@ -1,5 +1,5 @@
-"""Kernels of contacts of many worlds with one mesh: the products W^T, W v and W^T f with the contact Jacobian W (Eq.
-8).
+"""Kernels for the contacts of many worlds with one mesh: the products W^T, W v and W^T f with the contact Jacobian W
+(Eq. 8).
 """
 
 import warp as wp
@@ -42,7 +42,8 @@ def contact_velocities_kernel(
     # Out:
     speeds_out: wp.array3d[real],
 ):
-    """Compute the contact velocities W v (c, 3K, m) for nodal velocities v (c, 3N, m). Padding gets zero."""
+    """Compute the contact velocities W v (c, 3K, m) for nodal velocities v (c, 3N, m). The velocities of padding are
+    set to zero."""
     world, k, column = wp.tid()
     at_point = Vec3()
     if k < counts[world]:

@@ -31,7 +31,7 @@ from egs_warp.precision import Vec3, Vec4, real
 wp.set_module_options({"enable_backward": False})
 
 _FEW_SWEEPS, _MORE_SWEEPS = wp.constant(3), wp.constant(20)
-"""Sweeps before the first attempt, and before each later one."""
+"""Number of sweeps before the first attempt, and before each later one."""
 _ATTEMPTS = wp.constant(7)
 _Rates = wp.types.vector(7, real)
 _RATES = wp.constant(_Rates(1.0, 0.3, 3.0, 0.1, 10.0, 0.03, 30.0))
@@ -45,20 +45,19 @@ _HALVINGS = wp.constant(10)
 """Maximum number of halvings of a step in the line search."""
 _MAX_SWEPT = wp.constant(MAX_SWEPT_CONTACTS)
 _MIN_PIVOT = wp.constant(real(1e-5))
-"""Pivot threshold of the elimination by blocks, which exchanges no rows. The equations have entries of about 1."""
+"""Pivot threshold of the elimination by blocks, which exchanges no rows. The entries of the equations are about 1."""
 _MIN_DECREASE = wp.constant(real(1e-4))
 """Sufficient decrease of the residual norm, per unit of the step length."""
 _REGULARIZATION, _STRONG_REGULARIZATION = wp.constant(real(1e-6)), wp.constant(real(1e-4))
 """Regularisation: added to the diagonal of the normal and sticking equations, whose entries are about 1. It selects
 a short step where contacts are redundant, and limits the rounding where they nearly are. The second value is used
-in the first ``_STRONG_STEPS`` steps of all attempts but the first. Of 296 problems of jumps that 1e-9 and steps of one
-rate left at 1e-4 m/s, 1e-6 and another rate in each attempt leave 16 unsolved; the second value, and another rate
-in each step of every second attempt, leave 3.
+in the first ``_STRONG_STEPS`` steps of all attempts but the first. Without the second value, and with a constant rate
+in each attempt, 16 of 296 difficult problems of jumps stay unsolved instead of 3.
 """
 _STRONG_STEPS = wp.constant(6)
-"""Steps of an attempt with the second regularisation."""
+"""Number of steps of an attempt with the second regularisation."""
 _POLISH_STEPS = wp.constant(2)
-"""Polishing steps of the last attempt."""
+"""Number of polishing steps of the last attempt."""
 _POLISH_REGULARIZATION = wp.constant(real(1e-10))
 """Regularisation in the polishing steps, too small to change the result."""
 _POLISH_FRACTION = wp.constant(real(1e-2))
@@ -131,7 +130,8 @@ def projected_force(contacts: Contacts, i: int, forces: wp.array[real], velocity
 
 @wp.func
 def sweep(contacts: Contacts, sweeps: int, forces: wp.array[real]):
-    """Perform ``sweeps`` Gauss-Seidel sweeps: each contact takes its ``projected_force`` in turn."""
+    """Perform ``sweeps`` Gauss-Seidel sweeps, which set the force of each contact in turn to its
+    ``projected_force``."""
     for _ in range(sweeps):
         for i in range(contacts.count):
             n = 3 * i
@@ -150,7 +150,7 @@ def sweep(contacts: Contacts, sweeps: int, forces: wp.array[real]):
 @wp.func
 def projection_residual(contacts: Contacts, forces: wp.array[real], scale: real, length: real, newton: Newton):
     """Evaluate P at ``length`` of the step from ``forces``, and return its largest component and its norm, both
-    divided by the rate, in m/s. They are infinite where something is not finite.
+    divided by the rate, in m/s. They are infinite if any component is not finite.
     """
     if is_gpu() == 1:
         return residual_by_block(
@@ -239,7 +239,7 @@ def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
 
 @wp.func
 def sweep_cooperative(contacts: Contacts, sweeps: int, forces: wp.array[real], newton: Newton):
-    """Perform ``sweep`` with a block of threads. For more contacts than ``sweep_by_block`` takes, every lane
+    """Perform ``sweep`` with a block of threads. For more contacts than ``sweep_by_block`` supports, every lane
     computes each force, and each lane updates the velocities of some rows.
     """
     if is_gpu() == 0:
@@ -300,8 +300,8 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
     best_residual = real(wp.inf)
     copy_vector(contacts, forces, newton.best_forces, newton)
     for attempt in range(_ATTEMPTS + 1):
-        # The last attempt polishes the best forces, if they are within the tolerance. It shares the loop, so that a GPU
-        # has the code of a step only once.
+        # The last attempt polishes the best forces, if they are within the tolerance. It shares the loop, so that the
+        # GPU code contains the step only once.
         is_polishing = best_residual < tolerance
         if attempt == _ATTEMPTS and not is_polishing:
             copy_vector(contacts, newton.best_forces, forces, newton)
@@ -393,8 +393,8 @@ def coulomb_kernel(
     """Solve each problem for its contact forces.
 
     ``vectors`` (B, 5, 3n), ``indices`` (B, 2, 3n) and ``matrices`` are the workspace of ``Newton``. ``forces`` are the
-    start, and in the end the best forces found, projected onto the cone. ``residuals_out`` is their residual in m/s,
-    infinite where no forces were finite.
+    initial forces on entry and the best forces found, projected onto the cone, on return. ``residuals_out`` is their
+    residual in m/s, infinite where no forces were finite.
     """
     problem, lane = wp.tid()
     contacts = Contacts()

@@ -13,11 +13,11 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 256
-"""Threads for each problem on a GPU."""
+"""Number of threads for each problem on a GPU."""
 MAX_SWEPT_CONTACTS = 128
 """Maximum number of contacts of ``sweep_by_block``."""
 SHARED_MEMORY_DOUBLES = 5264
-"""Size of the shared memory of a block in doubles. It is the maximum, and the routines use it one after the other."""
+"""Size of the shared memory of a block in doubles: the maximum over the routines, which use it one after the other."""
 
 _RECIPROCALS = """
     // Reciprocal and reciprocal root to rounding, for normal numbers only.
@@ -285,6 +285,6 @@ def residual_by_block(
     values: wp.array[real],
 ) -> wp.vec2d:
     """Evaluate the projection equations into ``values`` and return the largest component and the norm, as
-    ``projection_residual``.
+    ``projection_residual`` does.
     """
     ...

@@ -14,7 +14,7 @@ from egs_warp.precision import Vec3, Vec4, real
 wp.set_module_options({"enable_backward": False})
 
 _ACROSS = wp.constant(32)
-"""Threads that share a row of the equations."""
+"""Number of threads that share a row of the equations."""
 _SINGULAR = wp.constant(real(1e-14))
 """Relative pivot threshold. An unknown whose pivot is smaller than this fraction of the largest so far stays zero."""
 
@@ -46,10 +46,10 @@ class Newton:
     """(3n,) newtons, residual of the projection equations."""
     step: wp.array[real]
     velocity_change: wp.array[real]
-    """(3n,) m/s, change of the velocities by the full step."""
+    """(3n,) m/s, change of the velocities in the full step."""
     best_forces: wp.array[real]
     unknowns: wp.array[int]
-    """(3n,) components of the step that the equations do not give directly."""
+    """(3n,) components of the step that are unknowns of the linear equations."""
     pivots: wp.array[int]
     """(3n,) pivot column of each row."""
     matrix: wp.array2d[Vec4]
@@ -136,16 +136,16 @@ def write_row(
     """Write row ``a`` of the equations, from row ``row`` of the Jacobian.
 
     ``weights`` are the coefficients of the contact's three rows of the Delassus operator, ``own`` its three additional
-    entries. Only the ``columns`` of unknowns are written; known components of the step go to the right side. On a GPU a
-    warp writes the row, thread ``place`` of ``places`` (32) every 32nd entry.
+    entries. Only the ``columns`` of unknowns are written; the contributions of known components of the step are moved
+    to the right side. On a GPU a warp writes the row, thread ``place`` of ``places`` (32) every 32nd entry.
     """
     ...
 
 
 @wp.func
 def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, regularization: real, newton: Newton):
-    """Write the equations of a Newton step, by the state of each contact: separating, sticking or sliding. Returns
-    the number of unknowns.
+    """Write the equations of a Newton step according to the state of each contact: separating, sticking or sliding.
+    Return the number of unknowns.
 
     Components that project to zero are known: their step is minus the residual. ``regularization`` is added to the
     diagonal of normal and sticking components.

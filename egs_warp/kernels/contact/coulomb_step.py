@@ -328,7 +328,7 @@ def step_by_block(
     """Compute the Newton ``step`` of ``write_equations`` and ``solve_equations``, without row exchanges.
 
     ``shared_address`` is from ``shared_memory``, ``values`` (3n,) the residual of the projection equations, ``change``
-    (3n,) scratch memory. Returns 1; or 0, with an invalid step, if a pivot is not larger than ``min_pivot`` or there
+    (3n,) scratch memory. Return 1; or 0, with an invalid step, if a pivot is not larger than ``min_pivot`` or there
     are more than 120 unknowns.
     """
     ...

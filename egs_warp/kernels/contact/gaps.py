@@ -22,11 +22,11 @@ def point_gaps_kernel(
     gaps_out: wp.array[real],
     planes_out: wp.array[int],
 ):
-    """Compute the signed distance of each embedded point to the nearest solid, and the plane of it that faces the
-    point.
+    """Compute the signed distance of each embedded point to the nearest solid, and the plane of that solid with the
+    largest signed distance.
 
-    The planes of a solid, which is their intersection, are consecutive. The largest signed distance to them is a lower
-    bound of the distance to the solid.
+    The planes of a solid, which is their intersection, are consecutive. The largest signed distance to them is taken as
+    the distance to the solid, of which it is a lower bound.
     """
     point = wp.tid()
     tet = tets[tet_from_point[point]]

@@ -58,7 +58,7 @@ def trial_kernel(
     nodes.
 
     The full step ends at ``free_velocities`` (without contact forces) plus ``force_velocities`` (their effect). At
-    length 0 these may be not finite.
+    length 0 they need not be finite.
     """
     node = wp.tid()
     velocity = velocities[node]

@@ -176,7 +176,7 @@ def add_low_rank(
 ) -> None:
     """Correct the solution of the sparse factors for low-rank terms and momentum.
 
-    ``solved`` (3N,) is the solution for ``right_side`` (3N,) by the factors alone. Woodbury's formula adds a sum of
+    ``solved`` (3N,) is the solution for ``right_side`` (3N,) with the factors alone. Woodbury's formula adds a sum of
     ``directions`` rank-one terms (see ``MultifrontalLdl.add_low_rank``); ``projection`` then restores the momentum.
     """
     ...

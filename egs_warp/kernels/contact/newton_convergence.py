@@ -1,5 +1,5 @@
-"""Convergence test of the Newton loop with contact on a GPU (Eq. 4, 8); ``egs_warp/contact/newton_convergence.py``
-has the same rules for the host.
+"""Convergence test of the Newton loop with contact on a GPU (Eq. 4, 8); ``egs_warp/contact/newton_convergence.py`` has
+the same test for the host.
 """
 
 import warp as wp
@@ -10,7 +10,7 @@ wp.set_module_options({"enable_backward": False})
 
 REFACTOR_RATIO = 0.7
 """The tangent is updated if a step leaves more than this fraction of the residual. The first step of a round is
-exempt, because it creates the forces of new contacts. A new tangent costs as much as many steps.
+exempt, because it creates the forces of new contacts. A new tangent takes as long as many steps.
 """
 MIN_DECREASE = 1e-4
 """Sufficient decrease of a full step, as a fraction of the largest recent residual."""

@@ -1,4 +1,4 @@
-"""Kernels of contact selection: reductions of the gaps of all points, where they are on a GPU (Eq. 8)."""
+"""Kernels of contact selection: reductions of the gaps of all points on a GPU (Eq. 8)."""
 
 import warp as wp
 
@@ -8,7 +8,7 @@ from egs_warp.precision import Vec4, real
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 64
-"""Threads for each cell on a GPU."""
+"""Number of threads for each cell on a GPU."""
 
 
 @wp.kernel
@@ -87,11 +87,12 @@ def penetrating_points_kernel(
     # Out:
     deep_out: wp.array[real],
 ):
-    """Count the points that penetrate too far (see ``CoupledSolver``) and are none of the first ``counts[0]``
+    """Count the points that penetrate too far (see ``CoupledSolver``) and are not among the first ``counts[0]``
     ``points``.
 
-    A point counts if it is deeper than ``depth`` metres and has sunk by more than ``max_sink``, or ``max_creep`` if it
-    is deeper than ``tolerance``, times ``tolerance``. ``deep_out`` has the gaps of these points, 0 for all others.
+    A point is counted if it is deeper than ``depth`` metres and has sunk by more than ``tolerance`` times ``max_sink``,
+    or times ``max_creep`` if it is deeper than ``tolerance``. ``deep_out`` has the gaps of these points, 0 for all
+    others.
     """
     point = wp.tid()
     gap = gaps[point]

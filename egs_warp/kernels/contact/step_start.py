@@ -8,7 +8,7 @@ from egs_warp.precision import Mat33, Vec3, real
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 256
-"""Threads of the block on a GPU."""
+"""Number of threads of the block on a GPU."""
 
 
 @wp.func

@@ -96,7 +96,8 @@ def damping_block(
 
 @wp.func
 def write_first_corner(e: int, blocks: wp.array2d[Mat33]):
-    """Complete the blocks of element ``e``: those below the diagonal by symmetry, those of corner 0 from the others.
+    """Complete the blocks of element ``e``: the blocks below the diagonal by symmetry, the blocks of corner 0 from the
+    others.
 
     By translation invariance the blocks of a row sum to zero.
     """
@@ -145,7 +146,8 @@ def element_energies_kernel(
     energies_out: wp.array[real],
     determinants_out: wp.array[real],
 ):
-    """Compute Eq. (5) plus dt times half the dissipated power (none if dt is 0) and det F of each element.
+    """Compute the energy of Eq. (5) plus dt times half the dissipated power (none if dt is 0), and det F, of each
+    element.
 
     The energy of an inverted element is infinite.
     """
@@ -215,7 +217,7 @@ def segment_forces_kernel(
     # Out:
     forces_out: wp.array[Vec3],
 ):
-    """Compute T phi u of each segment (Eq. 7), phi as in ``muscles.tension.force_length_factor``.
+    """Compute T phi u of each segment (Eq. 7), with phi as in ``muscles.tension.force_length_factor``.
 
     One warp per segment (on a CPU one thread).
     """
@@ -281,8 +283,8 @@ def element_hessians_kernel(
 ):
     """Compute the Hessian of Eq. (5) for each element.
 
-    Block (a, b) = V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T], h = F^-T g. Adds that of the
-    damping (Eq. 6) over a step of dt, if dt is not 0.
+    Block (a, b) = V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T], h = F^-T g. The Hessian of the
+    damping (Eq. 6) over a step of dt is added if dt is not 0.
     """
     e = wp.tid()
     rest_inverse = rest_inverses[e]

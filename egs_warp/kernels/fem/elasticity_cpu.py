@@ -11,7 +11,7 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 LANES = 4
-"""Tetrahedra of a group; the last group is filled with tetrahedra of zero volume."""
+"""Number of tetrahedra in a group; the last group is filled with tetrahedra of zero volume."""
 PAIRS = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
 """Corner pairs of the blocks of an element in the upper triangle, in the order of ``Elements.entries``."""
 
@@ -497,8 +497,8 @@ def hessian_kernel(
 ) -> None:
     """Compute ``factor`` times the upper entries of the assembled element Hessians.
 
-    If ``projected`` is nonzero, those of ``element_projected_hessians_kernel``, whose Jacobi iteration uses
-    ``tolerance`` and ``max_sweeps``; else those of ``element_hessians_kernel``.
+    The Hessians are those of ``element_projected_hessians_kernel`` if ``projected`` is nonzero, with ``tolerance`` and
+    ``max_sweeps`` for its Jacobi iteration, and otherwise those of ``element_hessians_kernel``.
     """
     if projected != 0:
         projected_hessian_native(elements, positions, starts, dt, factor, tolerance, max_sweeps, entries_out)

@@ -12,7 +12,8 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 PANEL, STRIP = 16, 8
-"""Vectors of a panel, which is stored row by row per unknown, and vectors that one pass over the matrix processes."""
+"""Number of vectors in a panel, which is stored with one row per unknown, and number of vectors that one pass over the
+matrix processes."""
 
 
 @wp.struct
@@ -99,7 +100,7 @@ def multiply_strip(
         values: (nnz,) entries.
         vectors: address of (n, columns) float64.
         columns: row length of the vectors and the products.
-        strip: which strip.
+        strip: index of the strip.
         products: address of (n, columns) float64.
     """
     ...
@@ -127,8 +128,8 @@ def finish_moves(
 ) -> None:
     """Finish a panel of displacements and compute its linear terms.
 
-    Subtracts ``reference`` from the last column of all panels if it is in this one, clears the columns behind it, and
-    writes X^T g.
+    The function subtracts ``reference`` from the last column of all panels if that column is in this panel, clears the
+    columns behind it, and writes X^T g.
 
     Args:
         columns: number of columns in this and the following panels.

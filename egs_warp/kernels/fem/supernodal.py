@@ -22,7 +22,7 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 PADDING = 16
-"""Numbers behind the end of an array that vector loads may read; their values do not matter."""
+"""Number of entries behind the end of an array that vector loads may read; their values do not matter."""
 
 _SIZES = f"""
     constexpr int PANEL = {PANEL};
@@ -36,7 +36,7 @@ class Fronts:
     first: wp.array[wp.int32]
     """(S,) first column of each block."""
     widths: wp.array[wp.int32]
-    """(S,) columns of each block."""
+    """(S,) number of columns of each block."""
     row_offsets: wp.array[wp.int32]
     """(S + 1,) offset of each front in ``rows``."""
     rows: wp.array[wp.int32]
@@ -68,7 +68,7 @@ class MomentumProjection:
     """Momentum projection of solutions (``egs_warp.fem.momentum_projection``)."""
 
     enabled: wp.int32
-    """0: no projection."""
+    """0 disables the projection."""
     inertia_ratio: wp.array[real]
     """(1,) 1 + dt alpha."""
     rotation_modes: wp.array[real]
@@ -302,7 +302,7 @@ def solve_panel_native(
 ) -> None:
     """Solve for one panel of right-hand sides B (n, count).
 
-    Without weights, writes S^-1 B, with the momentum projection if it is enabled. With weights w, writes
+    Without weights, the result is S^-1 B, with the momentum projection if it is enabled. With weights w, the result is
     dt_now B + dt_ahead S^-1 diag(w) B.
 
     Args:
@@ -315,7 +315,7 @@ def solve_panel_native(
         right: address of B, float64.
         row_stride: row stride of B, in numbers.
         column_stride: column stride of B, in numbers.
-        count: columns of B.
+        count: number of columns of B.
         weights: address of w (n,), or 0.
         dt_now: factor of B.
         dt_ahead: factor of the solution.
@@ -500,9 +500,9 @@ def effort_panel_kernel(
 ) -> None:
     """Compute the quadratic model of the elastic energy (``LinearSolver.effort_quadratic``).
 
-    For each panel, computes the displacements X (``moves``), their ``products`` H X and the terms ``linear`` X^T g.
-    After all panels, computes the blocks of ``quadratic`` X^T H X. Several launches may share the work by ``counters``
-    (3,): next panel, next pair of panels, and number of finished panels.
+    Each panel gives the displacements X (``moves``), their ``products`` H X and the terms ``linear`` X^T g. The blocks
+    of ``quadratic`` X^T H X follow after all panels. Several launches may share the work through ``counters`` (3,):
+    next panel, next pair of panels, and number of finished panels.
     """
     panels = moves.shape[0]
     panel = claim_next(counters, 0)

@@ -1,7 +1,7 @@
 """Tiled inverse Cholesky factor on a GPU: thread blocks take tasks from a shared counter.
 
-Tasks are taken in order and none depends on a later one, so any number of blocks makes progress, whenever each of them
-starts. Every sum has a fixed order, so results do not depend on the number of blocks. Host code:
+Tasks are taken in order and none depends on a later one, so any number of blocks makes progress, regardless of when
+each of them starts. Every sum has a fixed order, so results do not depend on the number of blocks. Host code:
 ``egs_warp.fem.tiled_inverse``; task lists: ``egs_warp.fem.tile_tasks``.
 """
 
@@ -15,9 +15,9 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 TILE_SIDE = 64
-"""Rows and columns of a tile."""
+"""Number of rows and of columns of a tile."""
 BLOCK = 256
-"""Threads of a block."""
+"""Number of threads of a block."""
 TASK_SIZE = 16
 """Length of a task record, int32.
 
@@ -287,7 +287,7 @@ def tiled_inverse_kernel(
         tiles: tiles of L and L^-T.
         triangles: inverses of the diagonal factors.
         flags: one per inverse diagonal factor and per tile; equal to the launch number when the tile is complete.
-        state: (4,) next task, number of launches, finished blocks, and 1 if the matrix is not definite.
+        state: (4,) next task, number of launches, finished blocks, and 1 if the matrix is not positive definite.
         inverse_out: (n, n) inverse factor.
         definite_out: (1,) True if the matrix is positive definite.
     """

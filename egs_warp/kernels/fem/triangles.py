@@ -9,9 +9,9 @@ wp.set_module_options({"enable_backward": False})
 MAX_ROWS = 64
 """Maximum number of rows of a triangular matrix."""
 COLUMN_THREADS = 4
-"""Threads per column on a GPU."""
+"""Number of threads per column on a GPU."""
 BLOCK = MAX_ROWS * COLUMN_THREADS
-"""Threads of a block on a GPU."""
+"""Number of threads of a block on a GPU."""
 
 
 @wp.func_native(f"""

@@ -17,15 +17,15 @@ OPTIMUM_FOUND, INFEASIBLE, NUMERICAL_FAILURE = wp.constant(0), wp.constant(1), w
 """Status of a solve: optimum found, no point satisfies the bounds, or numerical failure."""
 
 _ROUNDS = wp.constant(3)
-"""Rounds that add and drop all wrong rows at once, before rows are exchanged one at a time."""
+"""Maximum number of rounds that add and drop all wrong rows at once, before rows are exchanged one at a time."""
 REFINEMENTS = wp.constant(4)
-"""Restarts of the dual iterations with recomputed multipliers, which removes accumulated rounding."""
+"""Maximum number of restarts of the dual iterations with recomputed multipliers, which remove accumulated rounding."""
 WRONG_SIGN_TOLERANCE = wp.constant(real(1e-9))
 """A multiplier below minus this fraction of the largest multiplier has the wrong sign."""
 REDUNDANCY_TOLERANCE = wp.constant(real(1e-12))
-"""Added to the diagonal of the products of active rows, which are singular where rows repeat each other."""
+"""Shift that is added to the diagonal of the products of active rows, which are singular if rows are redundant."""
 BOUND_TOLERANCE = wp.constant(real(1e-7))
-"""Distance from its bound above which an active row counts as not satisfied, because it depends on the others."""
+"""Distance from its bound above which an active row counts as violated, because it depends on other active rows."""
 DEPENDENCE_TOLERANCE = wp.constant(real(1e-9))
 """A row depends on the active rows if its part orthogonal to them is below this fraction of its squared length."""
 
@@ -323,7 +323,7 @@ def drop_wrong_sign(program: Program, search: ActiveSetState, count: int):
 
 @wp.func
 def violation_of(program: Program, search: ActiveSetState, row: int):
-    """Return by how much ``row`` violates its bounds beyond its slack; negative if it does not."""
+    """Return the amount by which ``row`` violates its bounds beyond its slack; negative if it does not."""
     at = value_of(search, row)
     return wp.max(program.lower[row] - at, at - program.upper[row]) - program.slack[row]
 
@@ -360,7 +360,7 @@ def crash_start(program: Program, search: ActiveSetState):
 
 @wp.func
 def drop_constraint(search: ActiveSetState, count: int, place: int):
-    """Drop the active row at ``values``; Givens rotations merge its column of the factor into the others."""
+    """Drop the active row at index ``place``; Givens rotations merge its column of the factor into the others."""
     search.side[search.active[place]] = 0
     left = count - 1
     for i in range(place, left):

@@ -55,7 +55,7 @@ class UnitConstraints:
     coefficients: wp.array2d[real]
     """(m, 3) their coefficients."""
     base_values: wp.array[real]
-    """(k,) scratch: values of the base rows at some z."""
+    """(k,) scratch: values of the base rows at the point that is evaluated."""
     values_at_origin: wp.array[real]
     """(m,) row values at z = 0."""
     lower: wp.array[real]
@@ -81,7 +81,7 @@ class ActiveSet:
     active_rows: wp.array2d[real]
     """(k, n) the active rows."""
     active_columns: wp.array2d[real]
-    """(n, k) their transpose, as of the last call of ``gather_active``."""
+    """(n, k) their transpose at the last call of ``gather_active``."""
     products: wp.array2d[real]
     """(k, k) inner products of the active rows."""
     root: wp.array2d[real]
@@ -134,7 +134,7 @@ def unit_entry(rows: UnitConstraints, row: int, c: int):
 
 @wp.func
 def gather_active(rows: UnitConstraints, state: ActiveSet, count: int, added: real):
-    """Gather the active rows and compute their inner products, with ``added`` on the diagonal."""
+    """Gather the active rows and compute their inner products, with ``added`` added to the diagonal."""
     lane = lane_of_block()
     for e in range(lane, count * rows.unknowns, wp.block_dim()):
         i = e / rows.unknowns
@@ -415,7 +415,7 @@ def dual_iterations(rows: UnitConstraints, state: ActiveSet, active: int):
 
 @wp.func
 def refine(rows: UnitConstraints, state: ActiveSet, count: int):
-    """Refine the multipliers by the remaining bound residuals, then recompute z and all rows from them."""
+    """Correct the multipliers for the remaining residuals at the bounds, then recompute z and all rows from them."""
     lane = lane_of_block()
     for i in range(lane, count, wp.block_dim()):
         row = state.active[i]

@@ -196,7 +196,8 @@ def compact_indices(marks: wp.array[int], count: int, capacity: int, indices: wp
 """)
 )
 def argmax_of_block(value: real, place: int) -> wp.vec2d:
-    """Return the largest of the threads' values and its ``place``, the lowest place where several values are equal."""
+    """Return the largest of the threads' values and its index ``place``, the lowest index if several values are
+    equal."""
     ...
 
 

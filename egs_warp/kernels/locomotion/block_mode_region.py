@@ -1,5 +1,5 @@
-"""QP of one assignment of contact modes over the activations alone, and the rows that bound its region, for a thread
-block.
+"""QP of one assignment of contact modes with the activations as its only unknowns, and the rows that bound its region,
+for a thread block.
 
 These functions do what ``mode_region`` and ``whitened_constraints`` do with one CPU thread. See
 docs/concepts/locomotion.md.
@@ -34,7 +34,7 @@ wp.set_module_options({"enable_backward": False})
 CURRENT, NEXT, NEXT_SINGLE, WARM_START = 0, 1, 2, 3
 """Slots of ``Workspace.kinds`` and ``Workspace.slips``."""
 ROW_TOLERANCE = wp.constant(real(1e-8))
-"""Amount by which a row may violate its bounds, times the length of the row where that is more than 1."""
+"""Amount by which a row may violate its bounds, multiplied by the length of the row if that exceeds 1."""
 
 _CURRENT = wp.constant(CURRENT)
 _FREE, _STICK, _SLIDE = wp.constant(FREE), wp.constant(STICK), wp.constant(SLIDE)
@@ -63,8 +63,9 @@ BOUND_PADDING = wp.constant(real(9e-6))
 class Workspace:
     """Workspace for at most m activations and n contacts.
 
-    T counts force components of closed contacts and h those whose contact velocity is zero; v counts the contact
-    velocities that bound the region. The region has m rows of the activations and k of the contact modes.
+    T is the number of force components of closed contacts, h the number of those whose contact velocity is zero, and v
+    the number of contact velocities that bound the region. The region has m rows of the activations and k of the
+    contact modes.
     """
 
     held_index: wp.array[int]
@@ -81,7 +82,7 @@ class Workspace:
     """(k, 3) their coefficients."""
     contact: wp.array[int]
     transition: wp.array[int]
-    """(k,) contact of a row, and transition of that contact past the row."""
+    """(k,) contact of a row, and transition of that contact beyond the row."""
     first: wp.array[int]
     """(n,) first row of each contact."""
     next: wp.array[int]
@@ -117,8 +118,8 @@ class Workspace:
     multipliers: wp.array[real]
     """(k,) multipliers of the rows of the modes."""
     kinds: wp.array2d[int]
-    """(4, n) modes of the region being solved, past all its active bounds, past its strongest active bound only, and
-    the latter for the best region so far."""
+    """(4, n) modes of the region being solved, of the region beyond all its active bounds, of the region beyond its
+    strongest active bound only, and the last of these for the best region so far."""
     slips: wp.array3d[real]
     """(4, n, 2) slip directions."""
     start: wp.array[real]

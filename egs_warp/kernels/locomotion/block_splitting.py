@@ -1,9 +1,8 @@
-"""OSQP iterations for all threads of a block, in coordinates with Hessian 1, which guess the active set of an optimum
+"""OSQP iterations that guess the active set of an optimum, for all threads of a block (Stellato, Banjac, Goulart,
+Bemporad and Boyd 2020).
 
-(Stellato, Banjac, Goulart, Bemporad and Boyd 2020).
-
-With P = 1, each step changes z by a linear combination of rows of R, the k selected rows. The iterations therefore
-update only its coefficients: z = ``share`` z_0 + R^T ``sums``.
+The Hessian is the identity, so each step changes z by a linear combination of the k selected rows of R. The iterations
+therefore update only its coefficients: z = ``share`` z_0 + R^T ``sums``.
 """
 
 import warp as wp
@@ -23,7 +22,7 @@ wp.set_module_options({"enable_backward": False})
 
 _ITERATIONS = wp.constant(15)
 _RHO = wp.constant(real(1.0))
-"""Iterations and rho, both as in ``egs_warp/locomotion/operator_splitting.py``."""
+"""Number of iterations and rho, both as in ``egs_warp/locomotion/operator_splitting.py``."""
 _SIGMA = wp.constant(real(1e-6))
 _ALPHA = wp.constant(real(1.6))
 """sigma, and alpha, the over-relaxation factor: OSQP's defaults."""
@@ -55,8 +54,8 @@ class Splitting:
 def iterate(rows: UnitConstraints, state: ActiveSet, splitting: Splitting):
     """Replace the guess ``state.side`` by the active set after a fixed number of OSQP iterations.
 
-    The iterations consider only rows with a side. If those outnumber the unknowns or cannot be factorized, the guess
-    stays.
+    The iterations consider only rows with a side. If those outnumber the unknowns or cannot be factorized, the guess is
+    unchanged.
     """
     lane = lane_of_block()
     one = real(1.0)

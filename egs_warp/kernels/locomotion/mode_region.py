@@ -1,4 +1,5 @@
-"""QP of one assignment of contact modes over the activations alone, as native CPU code with vectors of four.
+"""QP of one assignment of contact modes with the activations as its only unknowns, as native CPU code with vectors of
+four.
 
 Host code: ``egs_warp/locomotion/contact_modes.py``.
 """
@@ -33,12 +34,12 @@ ZERO_SPEED = 1e-9
 MIN_MULTIPLIER = 1e-3
 """Smallest multiplier of a bound that is worth crossing, relative to the objective per unit of the row."""
 MIN_GAIN_FRACTION = 5e-3
-"""Smallest relative decrease of the objective for which the search goes on to the next region."""
+"""Smallest relative decrease of the objective for which the search continues in the next region."""
 MAX_START_VIOLATION = 0.02
 """Amount by which the start may violate a row of its region."""
 START_ROUNDING = 1e-6
-"""Amount by which rows are relaxed, for a start that is the only point of its region, as where contacts repeat each
-other."""
+"""Amount by which rows are relaxed, for a start that is the only point of its region, for example because contacts are
+redundant."""
 _NO_PIVOT = 1e-14
 
 
@@ -48,7 +49,7 @@ def padded(count: int) -> int:
 
 
 def scratch_size(activations: int, contacts: int) -> int:
-    """Return the maximum number of float64 that a region needs as scratch."""
+    """Return the maximum size of the scratch memory of a region, in float64 numbers."""
     wide, touches = padded(activations + 1), 3 * contacts
     row_count = activations + touches
     return (touches + 5) * wide + max(
@@ -282,7 +283,7 @@ def mode_region_kernel(
         slip: (n, 2) slip direction of sliding contacts.
         sides: (face_count, 3) faces of the pyramid of sticking contacts, see ``FrictionDirections.sides``.
         face_count: number of faces.
-        sector_sine, sector_cosine: of half the sector of a sliding contact's slip.
+        sector_sine, sector_cosine: sine and cosine of half the sector of a sliding contact's slip.
         numbers: (10n,) int32 scratch.
         scratch: (``scratch_size``,) scratch.
         total: number of rows of ``bounds``.

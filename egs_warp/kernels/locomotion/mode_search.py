@@ -48,9 +48,9 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 512
-"""Threads of the block on a GPU."""
+"""Number of threads of the block on a GPU."""
 HEADER_SIZE = 8
-"""Numbers before the QP in the packed input, and before the point in the packed result."""
+"""Number of entries before the QP in the packed input, and before the point in the packed result."""
 
 _FREE, _STICK, _SLIDE = wp.constant(FREE), wp.constant(STICK), wp.constant(SLIDE)
 _TO_FREE, _TO_SLIDE = wp.constant(TO_FREE), wp.constant(TO_SLIDE)
@@ -162,8 +162,8 @@ def apply_transition(program: Program, workspace: Workspace, contact: int, trans
 def find_next_modes(
     program: Program, workspace: Workspace, state: ActiveSet, active_count: int, mode_rows: int, objective: real
 ):
-    """Write two candidates for the next modes: those past all bounds with a significant multiplier, and those past the
-    strongest of these bounds only.
+    """Write two candidates for the next modes: those beyond all bounds with a significant multiplier, and those beyond
+    the strongest of these bounds only.
 
     Returns: number of bounds with a significant multiplier.
     """
@@ -394,7 +394,7 @@ def mode_search_kernel(
                 sync_block()
                 continues = 1
         elif has_point == 1 and solved.objective >= best:
-            # All transitions together were too many; the strongest alone may still lower the objective.
+            # All transitions together raised the objective; the one with the largest multiplier may still lower it.
             if has_several == 1 and is_single == 0:
                 copy_modes(workspace, n, _WARM_START, _CURRENT)
                 is_single = 1

@@ -59,8 +59,8 @@ class Relaxed:
 
 @wp.func
 def cone_component(friction: real, part: int):
-    """Return the coefficients of a nonnegative component of a force: the normal force for ``part`` 0, else the distance
-    to a face of the friction pyramid."""
+    """Return the coefficients of a nonnegative component of a force: the normal force for ``part`` 0, and otherwise the
+    distance to a face of the friction pyramid."""
     if part == 0:
         return wp.vec3d(real(1.0), real(0.0), real(0.0))
     return wp.vec3d(friction, -COSINES[part - 1], -SINES[part - 1])
@@ -175,7 +175,7 @@ def write_rows(program: Program, relaxed: Relaxed, rows: UnitConstraints, initia
 
 @wp.func
 def count_violations(program: Program, relaxed: Relaxed, count: int):
-    """Return the number of rows that the point ``relaxed.found`` violates."""
+    """Return the number of rows that the point ``relaxed.optimum`` violates."""
     normal_velocities(program, relaxed, relaxed.optimum)
     violations = real(0.0)
     for row in range(lane_of_block(), count, wp.block_dim()):
@@ -190,7 +190,7 @@ def count_violations(program: Program, relaxed: Relaxed, count: int):
 
 @wp.func
 def objective_at(program: Program, relaxed: Relaxed, shift: real):
-    """Return the objective at ``relaxed.found``."""
+    """Return the objective at ``relaxed.optimum``."""
     size = program.size
     multiply_at(program.packed, program.cost, size, size, size, relaxed.optimum, relaxed.values)
     total = real(0.0)

@@ -147,10 +147,10 @@ def accept_search_kernel(
     # Out:
     settled_out: wp.array[int],
 ):
-    """Write 1 to ``settled_out`` if the search result is good enough that no restart is needed, else 0.
+    """Write 1 to ``settled_out`` if no restart is needed after the search, and otherwise 0.
 
-    That is a point whose objective is below ``restart_cost``, or any point without contacts, where there is no other
-    region.
+    No restart is needed if the result is a point whose objective is below ``restart_cost``, or any point of a step
+    without contacts, which has no other region.
     """
     settled = int(0)
     if answer[0] == real(_OPTIMUM_FOUND) and answer[4] == real(1.0) and (counts[0] == 0 or answer[3] < restart_cost):

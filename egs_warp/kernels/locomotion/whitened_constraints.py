@@ -44,11 +44,11 @@ class WhitenedConstraints:
     has_products: wp.array[wp.int32]
     """(m,) 1 if the products of a row have been computed."""
     scratch: wp.array[real]
-    """(``room_of``,) scratch."""
+    """(``scratch_size``,) scratch."""
 
 
 def scratch_size(unknowns: int, wide: int) -> int:
-    """Return the number of float64 of scratch."""
+    """Return the size of the scratch memory in float64 numbers."""
     return 16 * wide + 512 * (wide // 16 + 1) + unknowns
 
 
@@ -236,7 +236,8 @@ def write_point(
     count: wp.int32,
     point: wp.uint64,
 ):
-    """Write x, n numbers at the address ``point``, from the ``multipliers`` of the ``active`` rows and their sides."""
+    """Write the n numbers of x to the address ``point``, given the ``multipliers`` of the ``active`` rows and their
+    sides."""
     ...
 
 
@@ -253,9 +254,9 @@ def reduce_kernel(
     reduced_out: WhitenedConstraints,
     definite: wp.array[wp.int32],
 ) -> None:
-    """Whiten min 1/2 x^T P x + q^T x with constraint rows A, with one thread.
+    """Whiten the QP min 1/2 x^T P x + q^T x with constraint rows A, in one thread.
 
-    Array arguments other than the outputs are addresses, strides count numbers.
+    Array arguments other than the outputs are addresses; strides are in numbers.
 
     Args:
         hessian: P (n, n), of which the lower triangle is read.
