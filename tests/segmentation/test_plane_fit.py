@@ -118,7 +118,7 @@ def test_views_that_cannot_be_fitted_are_reported() -> None:
     # A few wide splats exactly on one plane, and haze everywhere else: their residual is zero, and no other plane fits.
     random = np.random.default_rng(0)
     steps = depth * np.where(random.uniform(size=depth.shape) < 0.35, 1.0, random.uniform(0.7, 1.3, depth.shape))
-    with pytest.raises(UserError, match=r"the best one explains only 3\d % of what is in the masks"):
+    with pytest.raises(UserError, match=r"the best one explains only 3\d % of the pixels"):
         fit_plane([PlaneView(camera, steps, np.ones_like(depth, bool))])
 
 
