@@ -1,7 +1,7 @@
 """Show a bundle of ``egs-warp export RUN --to bundle`` as moving ellipsoids; run in Blender 4.5 or newer.
 
-Open it in the Scripting workspace and run it. ``read_bundle.py`` must be in the same folder; BUNDLE names the file. See
-docs/guide/export.md.
+Open this script in the Scripting workspace and run it. ``read_bundle.py`` must be in the same folder; BUNDLE names the
+file. See docs/guide/export.md.
 """
 
 from __future__ import annotations

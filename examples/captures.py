@@ -1,4 +1,4 @@
-"""Write the built-in objects and scenes as captures, to try every command on: each object alone, and in its room."""
+"""Write the built-in objects and scenes as captures to try the commands on: each object alone, and in its room."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def main(arguments: list[str] | None = None) -> None:
         egs.write_ply(folder / f"{name}.ply", made.object)
         egs.write_ply(folder / f"{name}_in_room.ply", made.whole()[0])
     names = ", ".join(egs.BUILT_IN_SCENES)
-    print(f"wrote {names} as NAME.ply and NAME_in_room.ply to {folder}; z is up, 1 is their height")
+    print(f"wrote {names} as NAME.ply and NAME_in_room.ply to {folder}; z is up, and a standing object is 1 unit tall")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The built-in bear dances, its jumps on the beats: video, contact sheet, report and trajectory."""
+"""The built-in bear dances and jumps on the beats: video, contact sheet, report and trajectory."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import egs_warp as egs
 
 
 def main(arguments: list[str] | None = None) -> egs.Report:
-    """Run the example; returns the report."""
+    """Run the example and return the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/dance"))
     parser.add_argument(
         "--beats", default="120 0.6 10", help="beats per minute, time of the first beat, number of beats; or a file"
     )
-    parser.add_argument("--frames", type=int, help="number of frames (default: until it is at rest)")
+    parser.add_argument("--frames", type=int, help="number of frames (default: until the body is at rest)")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)

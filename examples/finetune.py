@@ -1,4 +1,5 @@
-"""Torch interop: a pawn without colours gets them back from images, by gradients from pixels to Gaussians.
+"""Interoperation with PyTorch: the lost colours of a pawn are recovered from images, with gradients from pixels to
+Gaussians.
 
 The renderer is an ordinary differentiable torch function (``render_torch``); ``finetune`` is the loop around it.
 """

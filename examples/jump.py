@@ -9,7 +9,7 @@ import egs_warp as egs
 
 
 def main(arguments: list[str] | None = None) -> egs.Report:
-    """Run the example; returns the report."""
+    """Run the example and return the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/jump"))
     parser.add_argument("--frames", type=int, default=120)

@@ -26,7 +26,7 @@ class Bundle:
         carriers = np.where(a["rigid"][:, None, None], turns, gradients[tet])  # rigid: far outside the cage
         means = moved[tet, 0] + _apply(carriers, a["means"] - self.corners[tet, 0])
         stretched = carriers @ self.axes
-        through, sides = stretched[rows], np.zeros((2, len(rows), 3, 3))  # across tetrahedra: each end in its own
+        through, sides = stretched[rows], np.zeros((2, len(rows), 3, 3))  # each axis end in its own tetrahedron
         for k, (end, share) in enumerate(zip(a["arm_tets"], a["arm_shares"][:, :, None], strict=True)):
             sign = 1.0 if k < 3 else -1.0
             inner, outer = sign * through[:, :, k % 3], sign * _apply(gradients[end], self.axes[rows, :, k % 3])

@@ -9,11 +9,11 @@ import egs_warp as egs
 
 
 def main(arguments: list[str] | None = None) -> egs.Report:
-    """Run the example; returns the report."""
+    """Run the example and return the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/twist"))
     parser.add_argument("--degrees", type=float, default=180.0)
-    parser.add_argument("--frames", type=int, help="number of frames (default: until it is at rest)")
+    parser.add_argument("--frames", type=int, help="number of frames (default: until the body is at rest)")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)

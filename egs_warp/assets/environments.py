@@ -21,7 +21,7 @@ Paint = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Linear albedo (n, 3) and gloss (n,) at points (n, 3)."""
 
 SQUARE = 0.7
-"""Side of a square of the chess board, in heights of the pawn: its base fills five sixths of one."""
+"""Side of a square of the chess board, as a multiple of the pawn's height; the pawn's base is five sixths as wide."""
 
 
 def chess_board(*, squares: int = 8, seed: int = 1, device: str | None = None) -> GaussianCloud:
@@ -57,7 +57,7 @@ def chess_board(*, squares: int = 8, seed: int = 1, device: str | None = None) -
 
 
 def bedroom(*, seed: int = 1, device: str | None = None) -> GaussianCloud:
-    """Create oak planks with a woven rug on z = 0, and two walls with skirting at y = 2.4 and x = -2.6."""
+    """Create oak planks with a woven rug on z = 0, and two walls with skirting boards at y = 2.4 and x = -2.6."""
     random = np.random.default_rng(seed)
     spacing = 0.035
     floor = _level(np.array([-2.6, -2.4]), np.array([2.6, 2.4]), spacing, random)
@@ -93,7 +93,7 @@ def bedroom(*, seed: int = 1, device: str | None = None) -> GaussianCloud:
 
 
 def cloth_table(*, radius: float = 1.7, seed: int = 1, device: str | None = None) -> GaussianCloud:
-    """Create a round table under a checked cloth that hangs down in folds; its top is z = 0."""
+    """Create a round table under a checked cloth that hangs down in folds; the top is at z = 0."""
     random = np.random.default_rng(seed)
     spacing = 0.03
     top = _level(np.full(2, -radius), np.full(2, radius), spacing, random)

@@ -69,7 +69,7 @@ def scene(name: str, *, seed: int = 0, device: str | None = None) -> Scene:
     """Create the built-in scene ``name``. Equal arguments give equal bits. Raises ``UserError`` for an unknown name."""
     if name not in _SCENES:
         raise UserError(
-            f"scene {name!r} is unknown{did_you_mean(name, BUILT_IN_SCENES)}; built in are {', '.join(BUILT_IN_SCENES)}"
+            f"scene {name!r} is unknown{did_you_mean(name, BUILT_IN_SCENES)}; give one of {', '.join(BUILT_IN_SCENES)}"
         )
     make_object, make_environment, eye, target = _SCENES[name]
     built = make_object(seed=seed, device=device)

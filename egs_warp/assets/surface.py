@@ -44,9 +44,9 @@ class BakedLight:
     """Light that reaches each sample, 0 to 1, before it is multiplied by the albedo."""
 
     sky: np.ndarray
-    """(n,) Cosine-weighted fraction of the hemisphere that sees the sky."""
+    """(n,) Cosine-weighted fraction of the hemisphere in which the sky is visible."""
     ground: np.ndarray
-    """(n,) Cosine-weighted fraction of the hemisphere that sees lit ground."""
+    """(n,) Cosine-weighted fraction of the hemisphere in which lit ground is visible."""
     key: np.ndarray
     """(n,) Visible fraction of the key light times the cosine of incidence."""
 
@@ -103,7 +103,7 @@ def bake_light(
         device=device,
     )
     sky, ground, key_visible = (output.numpy().astype(np.float64) for output in outputs)
-    # Approximates light that bounces inside creases, which single rays miss.
+    # This approximates the light that bounces inside creases, which single rays miss.
     sky = 0.12 + 0.88 * sky
     return BakedLight(sky, ground, key_visible * np.clip(samples.normals @ light, 0.0, None))
 

@@ -139,8 +139,8 @@ def footprint(object_cloud: GaussianCloud, plane: Plane) -> Hole:
 
 
 def hole_under(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> Hole | None:
-    """Return the outline of the object's low part and of what was removed from under it, filled; None for an object
-    that hangs above the floor."""
+    """Return the hole within the outline of the object's low part and of the Gaussians removed from under it; None for
+    an object that hangs above the floor."""
     means = cloud.means.numpy().astype(np.float64)
     low = segmentation.buried_mask | (segmentation.object_mask & (plane.heights(means) < _LOW * segmentation.size))
     if not low.any():
@@ -157,21 +157,21 @@ def hole_under(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -
 
 
 def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
-    """Return the floor that stands behind the object in every view of it. More than half of the views must show that
-    floor.
+    """Return the floor that the object hides in every view whose picture contains it. More than half of the views must
+    contain that floor.
 
     Raises ``UserError`` if masks do not fit their cameras, all are empty, or they hide no common floor.
     """
     for view in views:
         check_size(view)
     name = views[0].name
-    # A mask is empty where the object is out of sight, and is then ignored.
+    # Ignore the empty masks of views in which the object is not visible.
     views = [view for view in views if view.mask.any()]
     if not views:
         raise UserError(f"{name}: the mask is empty; mark the object in it")
     shadows = [_on_plane(plane, view.camera, view.mask) for view in views]
     if any(len(shadow) == 0 for shadow in shadows):
-        raise UserError("inpaint: no pixel of a mask sees the plane, so the hole is not on it; check the plane")
+        raise UserError("inpaint: no pixel of a mask shows the plane, so the hole is not on it; check the plane")
     # The common floor lies inside the bounds of every shadow; the smallest shadow has the finest window.
     smallest = min(shadows, key=lambda shadow: float(np.ptp(shadow, axis=0).max()))
     middle = 0.5 * (smallest.min(axis=0) + smallest.max(axis=0))

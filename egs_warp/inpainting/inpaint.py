@@ -1,7 +1,7 @@
 """Create new floor where the object stood: flat Gaussians on the plane, coloured by a 2D inpainter in a face-on view.
 
 Paper section 3.7: the depth of the hole comes from the plane, Eq. (18); a dense cloud of flat Gaussians is placed there
-and trained for about 100 steps against the one inpainted picture. The kernels are in ``egs_warp/kernels/inpainting``.
+and trained for about 100 steps against the inpainted picture. The kernels are in ``egs_warp/kernels/inpainting``.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ _SOLID = 0.3
 _TEXELS_ACROSS = 120.0
 """Texels along the side of the hole, for any size, so that the computing time does not depend on the size."""
 _WINDOW = 3.0
-"""Side of the window, in sides of the hole. It contains the hole and the floor that may be copied."""
+"""Side of the window as a multiple of the hole's side. It contains the hole and the floor that may be copied."""
 _SHARPNESS = 0.5
-"""Spacing of the new Gaussians, in widths of the floor's fine Gaussians."""
+"""Spacing of the new Gaussians as a fraction of the width of the floor's fine Gaussians."""
 _MAX_SPACING = 3
 """Largest spacing of new Gaussians, texels."""
 _RIM = 12
@@ -51,9 +51,9 @@ _RIM = 12
 _GAP_REACH = 0.25
 """Fraction of the hole's side. Gaps in the floor are followed up to this distance from the hole."""
 _GAP_EDGE = 6.0
-"""Texels around such a gap that are not trusted either."""
+"""Width, in texels, of the floor around such a gap that is not trusted either."""
 _CHANNEL = 9.0
-"""Half width in texels up to which a gap does not count as connected to the space beyond the floor."""
+"""Half width, in texels. A narrower channel does not connect a gap to the space beyond the floor."""
 _MIN_RIM_FRACTION = 0.4
 """Minimum fraction of the hole's edge that must be floor."""
 _MAX_ISLAND_AREA = 0.15
@@ -78,7 +78,7 @@ class InpaintOptions:
         if self.steps < 0:
             raise ArgumentError("steps", "give a whole number of at least 0", value=self.steps)
         if not 0.0 <= self.margin <= 1.0:
-            raise ArgumentError("margin", "give a number from 0 to 1, of the hole's side", value=self.margin)
+            raise ArgumentError("margin", "give a fraction of the hole's side, from 0 to 1", value=self.margin)
         if self.seed < 0:
             raise ArgumentError("seed", "give a whole number of at least 0", value=self.seed)
 
@@ -184,8 +184,8 @@ def inpaint(
     clock.lap("join")
     notes = (
         f"{int(junk.sum())} Gaussians in the hole were replaced by {new.count} on the plane",
-        f"the hole is {grown.sum() * window.texel**2:.3g} square scene units, {window.texel:.3g} a texel",
-        *((f"{100 * stained:.0f} % of it was floor that the object's shadow or foot had stained",) if stained else ()),
+        f"the hole is {grown.sum() * window.texel**2:.3g} square scene units; a texel is {window.texel:.3g} wide",
+        *((f"{100 * stained:.0f} % of the hole was floor stained by the object's shadow or foot",) if stained else ()),
     )
     is_new = np.arange(cloud.count) >= retained.count
     return InpaintResult(cloud, is_new, int(junk.sum()), window, grown, before, painted, clock.seconds, notes)
@@ -215,10 +215,10 @@ def _window_around(background: GaussianCloud, hole: Hole, margin: float) -> tupl
 def _in_hole(
     background: GaussianCloud, window: PlaneWindow, mask: np.ndarray, side: float, *, depth: float = 1.0
 ) -> np.ndarray:
-    """(n,) bool, Gaussians of the floor or of haze over the hole, and those under the hole.
+    """(n,) bool, True for Gaussians of the floor or of haze over the hole, and for those under the hole.
 
-    Gaussians that hang higher are not included. Those below are included to ``depth`` times the ``side`` of the hole
-    (scene units), as they show beyond the edge of a thin floor.
+    Gaussians that hang higher are not included. Those below are included down to ``depth`` times the ``side`` of the
+    hole (scene units), because they are visible beyond the edge of a thin floor.
     """
     means = background.means.numpy()
     heights = window.plane.heights(means)

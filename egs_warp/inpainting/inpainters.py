@@ -21,7 +21,7 @@ _MAX_UNIT_OUTPUT = 4.0
 
 
 class Inpainter(Protocol):
-    """Fills a hole in a face-on picture of a plane."""
+    """An algorithm that fills a hole in a face-on picture of a plane."""
 
     def fill(
         self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
@@ -51,7 +51,7 @@ class OpenCvMethod(enum.Enum):
 
 @dataclass(frozen=True)
 class OpenCvInpainter:
-    """Inpainting by ``cv2.inpaint``: smooth, so for small holes or plain floors."""
+    """Inpainting with ``cv2.inpaint``. The result is smooth, which suits small holes and plain floors."""
 
     method: OpenCvMethod = OpenCvMethod.TELEA
     radius: float = 5.0
@@ -93,7 +93,7 @@ class OnnxInpainter:
             network.setInput(missing, mask_name)
             values = np.asarray(network.forward(), np.float32)
         except cv2.error as error:
-            raise _failed(self.path, error, "an ONNX file of LaMa with free height and width") from error
+            raise _failed(self.path, error, "an ONNX file of LaMa with variable height and width") from error
         return _answer(self.path, values, image, hole, missing.shape[2:])
 
     def _load(self) -> tuple[OnnxFile, cv2.dnn.Net]:
@@ -146,7 +146,7 @@ class TorchScriptInpainter:
             return torch, torch.jit.load(str(self.path), map_location=self.device).eval()
         except (RuntimeError, ValueError) as error:
             raise UserError(
-                f"{self.path}: not a TorchScript file; save the network with torch.jit.save and give that"
+                f"{self.path}: not a TorchScript file; save the network with torch.jit.save and give that file"
             ) from error
 
 

@@ -15,7 +15,7 @@ from egs_warp.geometry.laplace_fill import laplace_fill
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, mean_colours
 
 _WIDTH = 0.62
-"""Standard deviation along the plane, in spacings."""
+"""Standard deviation along the plane, as a fraction of the spacing."""
 _OPACITY = 0.97
 _SKIRT = 2
 """Number of spacings by which the new floor continues under the old one, so that no gap shows between them."""
@@ -24,19 +24,22 @@ _SKIRT_DROP = 0.5
 _RIM_SMOOTHING = 3.0
 """Standard deviation, in texels, of the blur of the floor's height at the rim."""
 _OUTLIER = 2.0
-"""Heights are clipped at this many deviations from the tilted plane through the rim, as for cracks and blades of grass.
+"""Heights are clipped at this many deviations from the tilted plane through the rim, to remove cracks and blades of
+grass.
 """
 _NEIGHBOURS = 512
-"""Gaussians of the old floor that a new one takes its gloss from. Few from one part of the rim could be mostly haze."""
+"""Number of Gaussians of the old floor from which a new one takes its gloss. A few from one part of the rim could be
+mostly haze."""
 _GLOSS_CELL = 4.0
 """Cell size in texels. New Gaussians in one cell have the same gloss."""
 
 
 def rim_heights(before: RectifiedImage, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """(rows, columns) height of the new floor above the plane: Laplace's equation in the hole, with the heights of its
-    rim.
+    """(rows, columns) height of the new floor above the plane: the solution of Laplace's equation in the hole, with the
+    heights of its rim as boundary values.
 
-    A real floor differs from the fitted plane; without this, its edge would be a step that shows in low views.
+    A real floor differs from the fitted plane; without this correction, the edge of the new floor would be a step that
+    is visible in low views.
     """
     ring = ndimage.binary_dilation(hole, iterations=round(3 * _RIM_SMOOTHING)) & known
     rows, columns = np.indices(hole.shape) / max(hole.shape) - 0.5
@@ -68,8 +71,8 @@ def flat_gaussians(
 ) -> GaussianCloud | None:
     """Create flat Gaussians of SH degree 0 over a hole and its known rim.
 
-    Those of the rim lie a little lower, so that they show through gaps only. None if the hole is narrower than a block
-    of ``spacing`` x ``spacing`` texels everywhere.
+    Those of the rim lie a little lower, so that they are visible only through gaps. Returns None if the hole is
+    narrower than a block of ``spacing`` x ``spacing`` texels everywhere.
 
     Args:
         window: the plane and its grid of texels.

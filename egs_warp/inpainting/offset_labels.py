@@ -1,6 +1,7 @@
-"""Choice of the offset from which each pixel of a hole is copied: few good offsets, assigned by graph cuts.
+"""Choice of the offset from which each pixel of a hole is copied: a few good offsets, assigned by graph cuts.
 
-He and Sun 2012 (statistics of offsets), Kwatra et al. 2003 (cost of a seam), Boykov, Veksler, Zabih 2001 (expansion).
+He and Sun 2012 (statistics of offsets), Kwatra et al. 2003 (cost of a seam), Boykov, Veksler, Zabih 2001 (expansion
+moves).
 """
 
 from __future__ import annotations
@@ -16,15 +17,15 @@ from egs_warp.geometry.bitmaps import connected_parts, depth_inside
 from egs_warp.inpainting.rim_colours import RimColours
 
 _PIECES = (5, 10)
-"""Radii, in pixels, of the pieces of the rim for which similar regions are searched, in addition to the whole rim."""
+"""Radii, in pixels, of the pieces of the rim that are matched to similar regions, in addition to the whole rim."""
 _RING = 6
 """Width in pixels of the ring around the hole that is compared."""
 _MIN_PIXELS = 15
 """Minimum number of pixels of a piece."""
 _OFFSETS_PER_PIXEL = 3
-"""An offset is retained if it is among this many best ones for some pixel."""
+"""Number of best offsets of each pixel; all other offsets are discarded."""
 _RIM = 3
-"""Width in pixels of the rim around the hole that a copy must also explain."""
+"""Width in pixels of the rim around the hole that a copy must also match."""
 _COST_UNIT = 2000.0
 """Capacities are integers: colour differences are counted in units of 1 / 2000."""
 _PRIOR = 0.5
@@ -56,7 +57,7 @@ def labelled_sources(
 ) -> np.ndarray:
     """Choose the source of every pixel of ``hole`` and its rim so that seams are least visible.
 
-    Pixels outside, and pixels of holes around which nothing repeats, get themselves as source.
+    Pixels outside, and pixels of holes around which nothing repeats, are their own sources.
 
     Args:
         image: (H, W, 3) float32.
@@ -83,7 +84,7 @@ def labelled_sources(
 
 def _candidates(image: np.ndarray, part: np.ndarray, hole: np.ndarray, known: np.ndarray, limit: float) -> Offsets:
     """Return the offsets under which pieces of the rim of ``part``, of several sizes, are most similar to other
-    places."""
+    regions."""
     usable = (known & ~hole).astype(np.float32)
     rim = np.argwhere(np.logical_and(ndimage.binary_dilation(part), usable > 0.0))
     found: dict[tuple[int, int], np.ndarray] = {}

@@ -26,12 +26,12 @@ _COARSEST_HALF_WIDTH = 16.0
 _STRIDES = (8, 4, 2, 1, 8, 4, 2, 1)
 """Distances of the neighbours whose sources are tried in one search, pixels."""
 _TOLERANCE = 0.5
-"""A patch that is this many median costs worse is weighted by 1 / e."""
+"""A patch whose cost is this multiple of the median cost has the weight 1 / e."""
 _MIN_LIT_FRACTION = 0.5
 """Fraction of the sources that must remain when shaded ones are excluded."""
 _SCREEN = 0.01
-"""Weight of the voted colours against the gradients of the sources. The colours dominate beyond about 1 / sqrt(weight)
-pixels."""
+"""Weight of the voted colours relative to the gradients of the sources. The colours dominate beyond about 1 /
+sqrt(weight) pixels."""
 _STRICT_TOLERANCE = 0.25
 """Tolerance of the last vote of each level, so that the result is as sharp as its sources."""
 
@@ -133,7 +133,7 @@ def _with_half_turn(
 
 
 def _start(level: _Level, shift_limit: float) -> np.ndarray:
-    """(H, W, 2) int32, a source with a whole known patch for every pixel, from the offsets that explain the rim."""
+    """(H, W, 2) int32, a source with a whole known patch for every pixel, from the offsets that match the rim."""
     sources = labelled_sources(level.image, level.hole, level.known, level.is_source, shift_limit=shift_limit)
     return _with_whole_patches(sources, level)
 
@@ -153,7 +153,7 @@ def _with_whole_patches(sources: np.ndarray, level: _Level) -> np.ndarray:
 
 
 def poisson_blend(picture: np.ndarray, hole: np.ndarray, known: np.ndarray, sources: np.ndarray) -> np.ndarray:
-    """(H, W, 3) ``picture`` (H, W, 3), in the hole with the gradients of its ``sources`` (H, W, 2).
+    """Return the ``picture`` (H, W, 3) with the gradients of its ``sources`` (H, W, 2) in the ``hole`` (H, W) bool.
 
     A screened Poisson equation (Bhat et al. 2008) joins pieces from differently lit places without a seam.
     """
@@ -240,7 +240,8 @@ class _Work:
             self._sources, self._next = self._next, self._sources
 
     def vote(self, tolerance: float) -> None:
-        """Paint the hole with the weighted mean of the overlapping patches. ``tolerance`` is in median costs."""
+        """Paint the hole with the weighted mean of the overlapping patches. ``tolerance`` is a multiple of the median
+        cost."""
         costs = self._cost.numpy()[self._targets_at[:, 0], self._targets_at[:, 1]]
         launch_rows(
             vote_kernel,

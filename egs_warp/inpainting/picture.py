@@ -11,7 +11,7 @@ from egs_warp.io.video import contact_sheet
 from egs_warp.render import render_gaussians
 
 _DISTANCE = 3.2
-"""Distance of the cameras from the hole, in sides of the hole."""
+"""Distance of the cameras from the hole, as a multiple of the hole's side."""
 
 
 def before_and_after(result: InpaintResult, *, size: int = 384) -> np.ndarray:

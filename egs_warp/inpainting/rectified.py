@@ -25,18 +25,18 @@ _SIDE_VIEWS = 8
 _PIXELS_PER_TEXEL = 1.5
 """Pixels per texel of a side view."""
 _SMOOTHING = 1.0
-"""Texels; blur of the heights onto which the side views are projected."""
+"""Standard deviation, in texels, of the blur of the heights onto which the side views are projected."""
 _DETAIL = 4.0
-"""Texels, standard deviation of a blur; finer structure is detail."""
+"""Standard deviation, in texels, of a blur; finer structure counts as detail."""
 _BLUR, _MAX_DISAGREEMENT = 2.0, 0.1
-"""Texels, and fraction of full brightness. A blurred view that differs from the median by more shows something else
-there."""
+"""Standard deviation of a blur in texels, and fraction of full brightness. Where a blurred view differs from the median
+by more than that fraction, it probably shows something other than the floor."""
 _MIN_ALPHA = 1e-3
 """Opacity below which a pixel is empty."""
 
 _CAMERA_DISTANCE = 40.0
-"""Distance of the face-on camera, in window sides: far enough that rays are parallel to 1/80, near enough for float32
-depth."""
+"""Distance of the face-on camera, as a multiple of the window's side: far enough that rays deviate from the normal by
+at most about 1/80 rad, near enough for float32 depth."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class PlaneWindow:
         )
 
     def points(self, pixels: np.ndarray) -> np.ndarray:
-        """(n, 3) points on the plane of (n, 2) columns and rows; the inverse of ``pixels``."""
+        """(n, 3) points on the plane at (n, 2) columns and rows; the inverse of the method ``pixels``."""
         first, second = self.plane.tangents()
         x, y = (np.asarray(pixels, float) - [0.5 * self.columns, 0.5 * self.rows]).T * self.texel
         return self.centre + x[:, None] * first - y[:, None] * second
@@ -167,7 +167,7 @@ def rectify(cloud: GaussianCloud, window: PlaneWindow, *, thickness: float) -> R
     """Render the Gaussians of ``cloud`` within ``thickness`` (scene units) of the window's plane, face-on.
 
     Height and opacity come from a view straight down. The colour is the mean of views from all around, each projected
-    at that height, plus the detail of the one with median contrast. Directly from above, where no photo was taken, a
+    at that height, plus the detail of the view with median contrast. Directly from above, where no photo was taken, a
     capture's threads and gaps are disordered.
     """
     shape = (window.rows, window.columns)

@@ -10,7 +10,7 @@ from egs_warp.geometry.bitmaps import connected_parts, nearest_set
 from egs_warp.geometry.laplace_fill import laplace_fill
 
 _SHADE = 0.1
-"""Colours closer to each other than this are the same."""
+"""Colours closer to each other than this count as the same."""
 _LINE = 5
 """Pixels. Structure narrower than half of this is not judged: lines cross a hole although little of its rim has their
 colour."""
@@ -25,8 +25,8 @@ _MAX_ADDED = 12
 
 
 class RimColours:
-    """Colours of a picture (H, W, 3) in shades, and the likelihood of each shade at the pixels ``domain`` (n, 2) of a
-    hole.
+    """Colours of a picture (H, W, 3), grouped into shades, and the likelihood of each shade at the pixels ``domain``
+    (n, 2) of a hole.
 
     The likelihood is the probability that a random walk from the pixel ends at a rim pixel of that shade.
     """
@@ -47,10 +47,10 @@ class RimColours:
         return np.take_along_axis(self._common, self._shade[place[..., 0], place[..., 1]], axis=1)
 
     def islands(self, place: np.ndarray) -> np.ndarray:
-        """(n,) bool, pixels of an unusual colour in an island, or in a tongue longer than it is wide.
+        """(n,) bool, True for pixels of an unusual colour in an island, or in a tongue longer than it is wide.
 
-        The pixels of the domain are painted as ``place`` (n, 2). A region that reaches the rim in two places is no
-        island.
+        The pixels of the domain are painted with the colours at ``place`` (n, 2). A region that reaches the rim in two
+        places is not an island.
         """
         rows, columns = self._domain.T
         painted = self._broad.copy()

@@ -19,30 +19,33 @@ _BLUR = 2.0
 _BROAD = 12.0
 """Texels, standard deviation of the blur for the expected brightness of the floor; light changes slowly."""
 _DARKER = 0.2
-"""Natural logarithm of brightness. Smaller darkening is not visible enough to matter."""
+"""Difference of the natural logarithm of brightness. Weaker darkening is hardly visible."""
 _SHADE, _SHADE_BLUR = 0.1, 4.0
-"""Natural logarithm of brightness, and texels. Floor that is darker after such a blur is not copied."""
+"""Difference of the natural logarithm of brightness, and standard deviation of a blur in texels. Floor that is darker
+by more after such a blur is not copied."""
 _END = 4.0
-"""Texels from the floor's end. The shadow of what stood in the hole does not reach there."""
+"""Distance from the floor's end in texels. The shadow of what stood in the hole does not extend so far."""
 _UNUSUAL = 3.0
-"""Standard deviations (robust) of the floor far from the hole; a pattern is not a stain."""
+"""Number of standard deviations (robust) of the floor far from the hole. Weaker darkening is the pattern of the
+floor."""
 _ALIKE, _COMMON = 0.1, 0.02
 """Largest difference of the natural logarithm, in every channel, between colours that count as the same; and the
 fraction of the floor far from the hole that has a colour of a pattern, such as the blue of a checked cloth."""
 _SAMPLE = 2000
-"""Texels of the floor from which common colours are determined."""
+"""Maximum number of texels of the floor from which common colours are determined."""
 _MIN_BRIGHTNESS = 0.02
 """Fraction of full brightness below which colours are not distinguished."""
 _EVERY = 3
 """Sampling step in texels."""
 _ROUNDS = 4
-"""Rounds. The floor far from the hole may be stained, too, until the stain is part of the hole."""
+"""Maximum number of rounds. The floor far from the hole may be stained too, until an earlier round has added that stain
+to the hole."""
 _FEW = 20
 """Texels. A stain that grows by fewer is complete."""
 _REACH = 60.0
 """Texels, half of the hole's side. A stain does not extend farther from the hole."""
 _MAX_AREA = 2.0
-"""Maximum area of a stain, in areas of the hole; a larger region is another part of the floor."""
+"""Maximum area of a stain, as a multiple of the hole's area; a larger region is another part of the floor."""
 
 
 def stain_around(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:
@@ -55,12 +58,12 @@ def stain_around(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.
     Args:
         hole: (rows, columns) bool.
         known: (rows, columns) bool, the visible floor.
-        colour: (rows, columns, 3) of the floor.
+        colour: (rows, columns, 3) colour of the floor, 0 to 1.
     """
     stain, away = np.zeros_like(hole), distance_to(hole)
     for _ in range(_ROUNDS):
         more = _next_to(hole | stain, known, colour) & ~stain
-        # Regions that continue beyond that are seams between planks, or another floor.
+        # Regions that extend farther are seams between planks, or another floor.
         parts, _ = connected_parts(more | stain)
         more &= ~np.isin(parts, np.unique(parts[(more | stain) & (away > _REACH)]))
         stain |= more
@@ -93,7 +96,7 @@ def shaded(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarra
     """(rows, columns) bool, the part of the ``known`` (rows, columns) floor that is darker overall than the floor
     farther from the ``hole`` (rows, columns) predicts.
 
-    It may be no stain, but copies of it would bring shadows into places that had none.
+    This need not be a stain, but copies of it would bring shadows to places that had none.
     """
     floor = known & ~hole
     if not floor.any():

@@ -1,4 +1,4 @@
-"""Closing of the underside of an object that stood on uneven or soft ground, as no view has seen it."""
+"""Closing of the underside of an object that stood on uneven or soft ground; no view shows it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SPACING = 2
 _BRIDGED = 8.0
 """Texels. Gaps in the rim up to twice as wide are bridged."""
 _REACH = 2.0
-"""Standard deviations of a splat that count as covered."""
+"""Number of standard deviations around the mean of a splat that count as covered."""
 _FOOT = 0.05
 """Fraction of the texels that the rim encloses. With fewer unseen texels there is no open underside."""
 

@@ -19,19 +19,19 @@ from egs_warp.segmentation.plane_search import lies_along
 CELLS = 64
 """Number of cells across the object, for connectivity."""
 _MIN_OPACITY = 0.1
-"""Fainter Gaussians connect nothing; they are assigned with their surroundings."""
+"""Minimum opacity of Gaussians that connect others. Fainter ones are assigned with their surroundings."""
 _MIN_DETACHED_HEIGHT = 0.1
 """Fraction of the object's size. A part whose lowest point is higher does not stand on the ground."""
 _GAP = 2.0 / CELLS
-"""Fraction of the object's size. A detached part so near to the object belongs to it."""
+"""Fraction of the object's size. A detached part this near to the object or nearer belongs to it."""
 _MAX_CHAIN = 4
-"""Maximum number of detached parts in a chain, as leaves next to leaves next to leaves."""
+"""Maximum number of detached parts in a chain, such as leaves that hang next to other detached leaves."""
 _HEAVY, _LIGHT = 0.05, 0.01
 """Fractions of the object's opacity mass. A detached part above the first is not a stray; one below the second supports
 nothing."""
 _MAX_DETACHED_GAP, _MIN_GAP_RATIO = 0.2, 2.0
-"""Fraction of the object's size up to which a part of it may be detached, as a robot's hands are, if any other possible
-support is farther than the given multiple of that distance."""
+"""Maximum distance of a detached part, such as a robot's hand, from the object, as a fraction of the object's size; any
+other possible support must be farther than the given multiple of that distance."""
 _NEAR_CLICK = 0.1
 """Fraction of the object's size. A click that hits only faint Gaussians selects the part within this distance."""
 
@@ -60,11 +60,13 @@ class SceneAbovePlane:
         return cls(cloud, plane, means, flat, plane.heights(means), opacity, opacity >= _MIN_OPACITY, level)
 
     def is_under(self, chosen: np.ndarray, height: float, size: float) -> np.ndarray:
-        """(n,) bool, within the outline, seen along the normal, of the part of ``chosen`` below ``height``."""
+        """Return (n,) bool, True for Gaussians within the outline, seen along the normal, of the ``chosen`` (n,) bool
+        ones that are lower than ``height``, for an object of ``size``; both in scene units."""
         return enclosed(self.flat, self.flat[chosen & (self.heights < height)], size / CELLS)
 
     def is_within(self, these: np.ndarray, chosen: np.ndarray, size: float) -> np.ndarray:
-        """(m,) bool, those of ``these`` (m,) that lie within ``chosen`` (n,), which the plane closes from below."""
+        """Return (m,) bool, True for Gaussians ``these`` (m,) within the shell of the ``chosen`` (n,) bool ones, which
+        the plane closes from below."""
         upright = np.column_stack([self.flat, self.heights])
         skin = upright[chosen]
         return enclosed(upright[these], np.concatenate([skin, skin * [1.0, 1.0, 0.0]]), 2.0 * size / CELLS)
@@ -76,13 +78,13 @@ def detached_parts(
     """Return the detached parts that belong to the object: they hang in the air next to the ``meant`` parts and have
     less mass.
 
-    Where a capture is coarse, leaves are separated from their twigs, and nothing else supports them. Parts that are no
+    In a coarse capture, leaves are separated from their twigs, and nothing else supports them. Parts that are not
     strays may be farther away if the object is by far the nearest possible support.
 
     Args:
         scene: the capture.
         indices: (m,) Gaussians.
-        parts: (m,) part of each.
+        parts: (m,) connected part of each Gaussian.
         meant: parts of the object.
         size: size of the object, scene units.
     """
@@ -113,8 +115,9 @@ def detached_parts(
 
 
 def _gaps(points: np.ndarray, parts: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
-    """(k,) distance of each of the parts ``these`` (k,) bool of the ``points`` (m, 3) to the nearest of the parts
-    ``those`` (k,) bool; infinite for all other parts, and if there are none."""
+    """Return (k,), the distance of each part in ``these`` (k,) bool from the nearest part in ``those`` (k,) bool;
+    infinite for all other parts, and if ``those`` is empty. ``parts`` (m,) is the part of each of the ``points`` (m,
+    3)."""
     gaps = np.full(len(these), np.inf)
     of, near = np.flatnonzero(these[parts]), np.flatnonzero(those[parts])
     if len(of) and len(near):
@@ -125,8 +128,8 @@ def _gaps(points: np.ndarray, parts: np.ndarray, these: np.ndarray, those: np.nd
 def clicked_parts(
     indices: np.ndarray, parts: np.ndarray, scene: SceneAbovePlane, clicks: Sequence[Click], size: float
 ) -> np.ndarray:
-    """Return those of the ``parts`` (m,) of the Gaussians ``indices`` (m,) that clicks on the object hit or barely
-    miss."""
+    """Return the parts that clicks on the object hit or barely miss. ``parts`` (m,) is the part of each of the
+    Gaussians ``indices`` (m,)."""
     found = []
     for click in clicks:
         if not click.inside:

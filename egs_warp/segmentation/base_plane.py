@@ -18,7 +18,7 @@ from egs_warp.segmentation.resting_directions import resting_directions
 _COLUMNS = 64
 """Columns across the longer side of the footprint."""
 _SEARCHED_SHARE = 0.15
-"""Fraction of the height, from the bottom, in which the support is searched."""
+"""Fraction of the height, from the bottom, that is searched for the support."""
 _BANDWIDTH = 0.01
 """Fraction of the height. Undersides this close belong to one support."""
 _MAX_GAUSSIANS = 300_000
@@ -29,16 +29,16 @@ _MAX_MASS_BELOW = 0.015
 
 _AXIS_NAMES = "xyz"
 _AXIS_BONUS = {1: 0.10, 2: 0.05, 0: 0.0}
-"""Bonus of each axis in the score of up: trainers and generators mostly use y (COLMAP: -y, glTF: +y), then z, hardly
-ever x."""
+"""Bonus of each axis in the score of an up direction: trainers and generators usually use y (COLMAP: -y, glTF: +y),
+then z, hardly ever x."""
 _CLEAR_MARGIN = 0.3
 _POOR_SCORE = 1.75
 """Score below which no axis fits: that of the side of an object that is tilted."""
 _SURE_LEVEL = 0.5
-"""A tilted direction replaces an axis if more of its support than this is level, less of that of the axis, and its
-score is clearly higher."""
+"""Level fraction of the support. A tilted direction replaces an axis if its own fraction is not below this, that of the
+axis is, and its score is clearly higher."""
 _FEW_GAUSSIANS, _MAX_DIRECTIONS = 20_000, 24
-"""Gaussians from which tilted directions are searched, and the maximum number of these."""
+"""Number of Gaussians used in the search for tilted directions, and maximum number of directions."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class _Underside:
     """The object seen from below."""
 
     heights: np.ndarray
-    """(n,) heights of all means along up, scene units."""
+    """(n,) heights of all means along the up direction, scene units."""
     opacities: np.ndarray
     """(n,) opacities."""
     low: float
@@ -97,7 +97,8 @@ def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
     low, high = (_mass_quantile(heights, opacities, share) for share in (0.002, 0.998))
     if not high > low:
         raise UserError(
-            f"object: its {cloud.count} Gaussians have no height along up, so no plane can be found", check=("up",)
+            f"object: its {cloud.count} Gaussians have no height along the up direction, so no plane can be found",
+            check=("up",),
         )
     first, second, _ = upright_frame(means, opacities, Plane(normal, 0.0)).axes
     across = np.stack([means @ first, means @ second], axis=1)
@@ -130,7 +131,7 @@ def _support_level(underside: _Underside) -> float:
         return underside.low
     levels = np.linspace(bottom, top, 501)
     density = np.exp(-0.5 * ((levels[:, None] - bottoms[None, :]) / (_BANDWIDTH * size)) ** 2).sum(axis=1)
-    # The lowest peak above half of the highest: a bevel above the sole may have the higher peak.
+    # Choose the lowest peak above half of the highest one: a bevel above the sole may have the higher peak.
     inner = density[1:-1]
     peaks = 1 + np.flatnonzero((inner >= density[:-2]) & (inner > density[2:]) & (inner > 0.5 * density.max()))
     mode = levels[peaks[0]] if len(peaks) else levels[int(np.argmax(density))]
@@ -152,10 +153,11 @@ def guess_up(
     tilted: bool = True,
     vertical_axis: int | None = None,
 ) -> tuple[np.ndarray, str]:
-    """Return the up direction (3,), a unit vector, and the reason for the user: that of the file if it has one, else
-    the best of the six axes, or with ``tilted`` another direction in which the object clearly rests.
+    """Return the up direction (3,), a unit vector, and the reason for this choice, for the user.
 
-    If the ``vertical_axis`` is known, it is its positive direction, unless the negative one is clearly better.
+    The direction is ``capture_format_up`` if the file defines it, otherwise the best of the six axes or, with
+    ``tilted``, another direction in which the object clearly rests better. If the ``vertical_axis`` (0 to 2) is known,
+    it is the positive direction of that axis, unless the negative one is clearly better.
 
     An object rests on the side where its support is wide, level, and well below its weight. The score of a direction is
     the sum of three numbers: the area of the support polygon as a fraction of the silhouette seen along it, the
@@ -217,7 +219,7 @@ class _Support:
     """Quality of the support on one side; each value is 0 to 1."""
 
     polygon: float
-    """Area of the support polygon over that of the silhouette."""
+    """Area of the support polygon divided by that of the silhouette."""
     level: float
     """Fraction of the low columns that end at the support's level."""
     depth: float

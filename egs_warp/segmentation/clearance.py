@@ -77,7 +77,7 @@ class StraddlingOptions:
 def plane_extents(
     cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure = ExtentMeasure.ELLIPSOID
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the height d0 of each mean over the plane and the extent eta_seg along its normal, Eq. (20).
+    """Compute the height d0 of each mean above the plane and the extent eta_seg along its normal, Eq. (20).
 
     A Gaussian straddles the plane if |d0| < eta_seg.
 
@@ -108,7 +108,7 @@ def clear_plane(
     options: StraddlingOptions | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> GaussianCloud:
-    """Treat the straddling Gaussians of ``cloud``, an object above ``plane``, by ``method``.
+    """Treat the straddling Gaussians of ``cloud``, an object above ``plane``, with ``method``.
 
     ``FINETUNE`` compares with renders of the untouched object above the plane, or with photographs of the whole scene.
     Gaussians whose means end below the plane are removed.
@@ -247,7 +247,7 @@ def _nonempty_subset(cloud: GaussianCloud, chosen: np.ndarray, reason: str) -> G
     """Return the ``chosen`` (n,) bool Gaussians. Raises ``UserError`` with the ``reason`` if there are none."""
     if not chosen.any():
         raise UserError(
-            f"clear: none of the object's {cloud.count} Gaussians is left: {reason}; clear by another method (split)",
+            f"clear: none of the object's {cloud.count} Gaussians is left: {reason}; clear with another method (split)",
             check=("plane",),
         )
     return cloud.subset(chosen)
@@ -299,7 +299,8 @@ def _finetuned(
 
 
 def straddling_loss(tensors: GaussianTensors, near: Any, normal: Any, offset: float, reach: ExtentMeasure) -> Any:
-    """L_seg of Eq. (21): the sum of eta_seg - |d0| over those of the Gaussians ``near`` (m,) that straddle the plane.
+    """L_seg of Eq. (21): the sum of eta_seg - |d0| over the Gaussians of the indices ``near`` (m,) that straddle the
+    plane.
 
     Returns a scalar tensor, scene units; ``normal`` (3,) and ``offset`` are the plane's.
     """

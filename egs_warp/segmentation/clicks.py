@@ -1,4 +1,5 @@
-"""Clicks on and beside an object: the Gaussians each one hits, and the cut between the two kinds."""
+"""Clicks on and beside an object: the Gaussians that each one hits, and the cut that separates the object from the
+rest."""
 
 from __future__ import annotations
 
@@ -18,12 +19,14 @@ _RADIUS = 0.004
 _MIN_WEIGHT_FRACTION = 0.1
 """Fraction of the largest blending weight under a click; Gaussians below it are not hit."""
 _SURFACE_FRACTION = 0.25
-"""Fraction of a click's light: the depth at which it is reached, from the front, is that of the clicked surface."""
+"""The clicked surface lies at the depth where the blending weight under the click, summed from the front, reaches this
+fraction."""
 _WIDE, _FAINT = 0.05, 0.5
-"""Fraction of the distance, for the width, and opacity. Wider and fainter Gaussians are haze in the air, and a click
-means what is behind it."""
+"""Width as a fraction of the distance, and opacity. Wider and fainter Gaussians are haze in the air, and a click
+selects what is behind them."""
 _MAX_DEPTH_DIFFERENCE = 0.03
-"""Fraction of the distance. Gaussians farther than this before or behind the clicked surface belong to another one."""
+"""Fraction of the distance. Gaussians farther than this in front of or behind the clicked surface belong to another
+one."""
 _SURE = 0.5
 """Absolute score from distances alone above which a Gaussian's colour counts as a colour of its side."""
 _ALIKE = 8
@@ -54,10 +57,10 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
     """Return the click at pixel (``u``, ``v``), from the top left corner of ``camera``'s picture; None if nothing is
     there.
 
-    Only a window about the click is rendered. The depth of the click is that of the first quarter of the window's
-    light, so that a click on foliage selects the leaves and not the wall visible between them. Haze in the air, as in
-    captures from a turntable, is ignored if there is enough light without it. The hits are the Gaussians that paint the
-    window at that depth.
+    Only a window about the click is rendered. The depth of the click is the one at which the blending weight, summed
+    from the front, reaches a quarter of its total, so that a click on foliage selects the leaves and not the wall
+    visible between them. Haze in the air, as in captures from a turntable, is ignored if the other Gaussians have
+    enough weight. The hits are the Gaussians that paint the window at that depth.
     """
     reach = max(1, round(_RADIUS * max(camera.width, camera.height)))
     left, top, side = int(u) - reach, int(v) - reach, 2 * reach + 1
@@ -80,8 +83,8 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
 
 
 def _is_haze(cloud: GaussianCloud, rows: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """(m,) bool, True for those of the ``rows`` (m,) of ``cloud`` that are wide and faint; ``depths`` (n,) are those of
-    all Gaussians."""
+    """(m,) bool, True for the Gaussians ``rows`` (m,), indices of ``cloud``, that are wide and faint; ``depths`` (n,)
+    are the depths of all Gaussians."""
     return (cloud.breadths(rows) > _WIDE * depths[rows]) & (cloud.opacities()[rows] < _FAINT)
 
 
@@ -96,9 +99,9 @@ def removed_by_clicks(
 ) -> np.ndarray:
     """(m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that ``clicks`` remove.
 
-    A click beside the object that is lower than ``low`` means something on the ground, such as a shadow: it removes
-    nothing that is more than twice as high as it, or as half of ``low``. ``heights`` (m,) are those of the nodes over
-    the ground, scene units.
+    A click beside the object that hits something lower than ``low`` selects something on the ground, such as a shadow:
+    it removes nothing that is higher than both ``low`` and twice the height of what it hits. ``heights`` (m,) are the
+    heights of the nodes above the ground, scene units.
     """
     removed = np.zeros(len(nodes), bool)
     mine = [click for click in clicks if click.inside]
@@ -121,8 +124,8 @@ def removed_by_clicks(
 def cut_by_clicks(
     cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], *, required: np.ndarray | None = None
 ) -> np.ndarray:
-    """(m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that the ``clicks`` leave.
-    ``required`` (m,) bool are always kept.
+    """(m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that the ``clicks`` leave with the
+    object. ``required`` (m,) bool Gaussians stay unless a click beside the object hits them.
 
     The score of each Gaussian prefers the clicks that are nearer along links between neighbours, which are longer the
     more their colours differ, and the side on which its colour is more common. The labels are the minimum cut. Nothing

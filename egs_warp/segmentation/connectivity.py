@@ -15,7 +15,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.unique_rows import distinct_rows
 
 _ARM = 1.5
-"""Standard deviations that a Gaussian extends to touch another, limited to four cells."""
+"""Length of a Gaussian's arms in standard deviations; arms are limited to four cells."""
 _FOURTH = 4
 """Index of the neighbour whose distance measures how sparse a capture is."""
 _MAX_GAUSSIANS = 200_000
@@ -25,7 +25,7 @@ _MAX_GAUSSIANS = 200_000
 def connected_parts(
     cloud: GaussianCloud, chosen: np.ndarray, *, cell: float, plane: Plane | HeightField, above: float
 ) -> np.ndarray:
-    """(m,) int32 part of each of the ``chosen`` (m,) indices.
+    """(m,) int32 connected part of each of the ``chosen`` (m,) Gaussians.
 
     Gaussians are connected if their centres or arms lie in the same cell of a grid.
 
@@ -38,7 +38,8 @@ def connected_parts(
     """
     points = cloud.means.numpy()[chosen].astype(np.float64)
     if len(points) > _FOURTH:
-        # Not the nearest neighbour: training that splits in place leaves many Gaussians at one point.
+        # The nearest neighbour is often at distance zero: training that splits in place leaves many Gaussians at one
+        # point.
         few = points[:: -(-len(points) // _MAX_GAUSSIANS)]
         cell = max(cell, 2.0 * float(np.median(KDTree(points).query(few, k=_FOURTH + 1)[0][:, _FOURTH])))
     lengths = np.minimum(_ARM * np.exp(cloud.log_scales.numpy()[chosen].astype(np.float64)), 4.0 * cell)
@@ -66,7 +67,7 @@ def enclosed(points: np.ndarray, shell: np.ndarray, cell: float) -> np.ndarray:
     shape = np.ceil((shell.max(axis=0) + 3.0 * cell - corner) / cell).astype(int) + 1
     grid = np.zeros(shape, bool)
     grid[tuple(np.floor((shell - corner) / cell).astype(int).T)] = True
-    # Filled while dilated, as a plain closing leaves gaps in curved shells.
+    # Holes are filled before the erosion, because a plain closing leaves gaps in curved shells.
     cube = np.ones((3,) * grid.ndim)
     swollen = ndimage.binary_fill_holes(ndimage.binary_dilation(grid, cube, iterations=2))
     filled = np.asarray(ndimage.binary_erosion(swollen, cube, iterations=2)) | grid
@@ -78,14 +79,15 @@ def enclosed(points: np.ndarray, shell: np.ndarray, cell: float) -> np.ndarray:
 
 
 def close_to(points: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray:
-    """(n,) bool, ``points`` (n, k) within ``reach`` of one of ``others`` (m, k)."""
+    """(n,) bool, True for ``points`` (n, k) within ``reach`` of one of ``others`` (m, k)."""
     if len(others) == 0:
         return np.zeros(len(points), bool)
     return KDTree(others).query(points, distance_upper_bound=reach)[0] <= reach
 
 
 def nearer_to(points: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
-    """(n,) bool, ``points`` (n, k) that are nearer to one of ``these`` (m, k) than to any of ``those`` (l, k)."""
+    """(n,) bool, True for ``points`` (n, k) that are nearer to one of ``these`` (m, k) than to any of ``those`` (l,
+    k)."""
     if len(these) == 0 or len(those) == 0:
         return np.full(len(points), len(those) == 0 < len(these))
     return KDTree(these).query(points)[0] < KDTree(those).query(points)[0]

@@ -21,8 +21,8 @@ _NEIGHBOURS = 16
 
 
 def floor_scatter_height(scene: SceneAbovePlane, chosen: np.ndarray, size: float) -> float:
-    """Return the height up to which the floor's Gaussians scatter, measured next to the object ``chosen`` (n,) bool; at
-    least 0."""
+    """Return the height, scene units, up to which the floor's Gaussians scatter, measured next to the object ``chosen``
+    (n,) bool; at least 0."""
     middle = np.median(scene.flat[chosen], axis=0)
     around = scene.is_level & scene.is_opaque & ~chosen & (np.abs(scene.heights) < 0.05 * size)
     around &= np.linalg.norm(scene.flat - middle, axis=1) < size
@@ -35,12 +35,12 @@ def floor_scatter_height(scene: SceneAbovePlane, chosen: np.ndarray, size: float
 
 
 def floor_remnants(scene: SceneAbovePlane, chosen: np.ndarray, size: float) -> np.ndarray:
-    """(n,) bool, floor remnants: wide Gaussians at the object's foot in the floor's colour. On uneven ground, Gaussians
-    that lie flat are included."""
+    """(n,) bool, True for floor remnants: wide Gaussians of the object at its foot that have the floor's colour. On
+    uneven ground, Gaussians that lie flat are included."""
     low = scene.heights < _MAX_REMNANT_HEIGHT * size
     length = np.exp(scene.cloud.log_scales.numpy().max(axis=1))
-    # Compared with the others at the foot: in a coarse capture, all Gaussians of a stand are wide, and the leaves above
-    # it are small.
+    # Compare with the other Gaussians at the foot: in a coarse capture, all Gaussians of a stand are wide, and the
+    # leaves above it are small.
     typical = float(np.median(length[chosen & low])) if (chosen & low).any() else 0.0
     wide = length > max(_MIN_REMNANT_WIDTH * size, 2.0 * typical)
     if isinstance(scene.plane, HeightField):

@@ -1,8 +1,9 @@
 """Binary graph cuts of a cloud along its weakest links: Gaussians that are close and similar stay together.
 
-A graph links each Gaussian with its nearest neighbours. A cut assigns each one of two labels at minimum cost, the sum
-of its own score against the label and of the links between neighbours with different labels (Boykov and Jolly 2001;
-over Gaussians GaussianCut, Jain et al. 2024). See docs/concepts/segmentation.md.
+A graph links each Gaussian with its nearest neighbours. A cut assigns one of two labels to each Gaussian so that the
+cost is minimal: the sum of the Gaussians' own scores against their labels and of the strengths of links between
+neighbours with different labels (Boykov and Jolly 2001; for Gaussians, GaussianCut, Jain et al. 2024). See
+docs/concepts/segmentation.md.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 
 _NEIGHBOURS = 10
 _DETOUR = 6.0
-"""Factor by which a link is longer if the colours of its ends differ by the mean difference over all links."""
+"""Relative lengthening of a link if the colours of its ends differ by the mean difference of all links."""
 _UNIT = 1000
-"""Scores are rounded to integers: one unit of score is this many."""
+"""Scores are multiplied by this number and rounded to integers."""
 _UNCUTTABLE = 1 << 28
-"""Capacity of a link that is never cut; a flow through all of them must fit 31 bits for each node."""
+"""Capacity of a link that is never cut; the flow through all such links of a node must fit in 31 bits."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +36,13 @@ class SplatGraph:
     second: np.ndarray
     """(m,) int32, index of the second end."""
     length: np.ndarray
-    """(m,) distance between the ends, in medians of all links; longer if colours differ."""
+    """(m,) distance between the ends, divided by the median of all links; longer if colours differ."""
     strength: np.ndarray
     """(m,) 0 to 1, cost of cutting the link."""
 
     @classmethod
     def of(cls, cloud: GaussianCloud, chosen: np.ndarray) -> SplatGraph:
-        """Link the ``chosen`` (n,) indices of ``cloud``."""
+        """Link the ``chosen`` (n,) Gaussians, indices of ``cloud``."""
         points = cloud.means.numpy()[chosen].astype(np.float64)
         return cls.linking(points, cloud.sh.numpy()[chosen, 0].astype(np.float64) * SH_BAND_0 + 0.5)
 

@@ -23,7 +23,7 @@ ROUGH = 0.01
 """Fraction of the object's height. Ground that differs from its plane by more than this (standard deviation) is uneven;
 half of it is the penetration that contact allows."""
 REACH = 2.5
-"""Fraction of the object's size: half side of the square about its middle in which the ground is measured."""
+"""Fraction of the object's size: half the side of the square about its middle in which the ground is measured."""
 _SPACING = 0.025
 """Fraction of the object's size: distance between nodes."""
 _BAND = 0.25
@@ -33,19 +33,19 @@ _MIN_VIEWS = 3
 _MAX_VIEW_DIFFERENCE = 0.02
 """Fraction of the object's size. Where views differ by more (standard deviation), the node is unknown."""
 _MIN_SIGNAL_TO_NOISE = 3.0
-"""Ground is uneven if it is rougher than this many times the difference between views, as reflections make bumps,
-too."""
+"""Ground is uneven if it is rougher than this many times the difference between views, because reflections also cause
+bumps."""
 _SMOOTHING = 0.7
-"""Nodes: standard deviation of the blur that removes the noise of single nodes."""
+"""Standard deviation, in nodes, of the blur that removes the noise of single nodes."""
 _ROUGHNESS_RADIUS = 1.0
 """Fraction of the object's size: radius about the object in which roughness is measured."""
 _VIEWS = 16
 _SIDE = 400
 """Longer side of a view, pixels."""
 _ELEVATIONS = (40.0, 58.0, 75.0)
-"""Degrees, if the capture's cameras are unknown."""
+"""Elevations of the views in degrees, if the capture's cameras are unknown."""
 _DEPTH_TOLERANCE = 0.005
-"""Fraction of the depth. Ground that is no nearer without the object is also visible with it."""
+"""Fraction of the depth. A pixel shows ground if its depths with and without the object differ by less than this."""
 _MAX_SLOPE = 1.2
 """Rise over run between nodes. Steeper ground is an edge, and the plane continues beyond it."""
 _MAX_GAP = 0.05
@@ -61,13 +61,13 @@ class MeasuredGround:
     """The ground about an object."""
 
     field: HeightField
-    """Scene units. Unseen ground, also under the object, is the harmonic continuation."""
+    """Scene units. Unseen ground, including the ground under the object, is the harmonic continuation."""
     known: np.ndarray
     """(rows, columns) bool, nodes that were seen."""
     roughness: float
     """Standard deviation (robust) from the best plane next to the object, scene units."""
     noise: float
-    """Median standard deviation between the views of a node there, scene units."""
+    """Median, over the nodes next to the object, of the standard deviation between views, scene units."""
 
     def is_flat(self, height: float) -> bool:
         """True if an object of ``height`` (scene units) may be placed on the plane instead."""
@@ -121,7 +121,7 @@ def measure_ground(
         size: size of the object, scene units.
 
     Raises:
-        UserError: all Gaussians are the object.
+        UserError: all Gaussians belong to the object.
     """
     spacing, count = _SPACING * size, 2 * round(REACH / _SPACING) + 1
     first, second = plane.tangents()
@@ -133,8 +133,8 @@ def measure_ground(
         above = ring_cameras(plane, middle, 1.2 * size, count=_VIEWS - 1, elevations=_ELEVATIONS, size=_SIDE)
     if object_mask.all():
         raise UserError(
-            f"segment: all {cloud.count} Gaussians of the capture are the object, so there is no ground to measure;"
-            " animate the capture itself, or mark less of it"
+            f"segment: all {cloud.count} Gaussians of the capture belong to the object, so there is no ground to"
+            " measure; animate the capture itself, or mark less of it"
         )
     bare = cloud.subset(~object_mask)
     maps = []
@@ -164,8 +164,9 @@ def measure_ground(
 
 
 def _seen_points(cloud: GaussianCloud, bare: GaussianCloud, camera: Camera, plane: Plane) -> np.ndarray:
-    """(n, 3) points of ``bare`` that are also visible in ``cloud``, with the object; through the hole that it leaves,
-    one sees below the ground. Heights over ``plane`` are those of the splats."""
+    """(n, 3) points of ``bare``, the capture without the object, that are also visible in ``cloud``, with it. Other
+    points are seen through the hole that the object leaves, and lie below the ground. The heights of the returned
+    points over ``plane`` are those of the splats (``SeenSurface``)."""
     whole, left = SeenSurface.of(cloud, camera), SeenSurface.of(bare, camera)
     same = np.abs(whole.depth - left.depth) < _DEPTH_TOLERANCE * left.depth
     return left.points(plane, left.opaque & same)
@@ -204,8 +205,8 @@ def _medians(points: np.ndarray, axes: np.ndarray, origin: np.ndarray, spacing: 
 
 
 def _roughness(heights: np.ndarray, around: np.ndarray) -> float:
-    """Standard deviation (robust) of ``heights`` (rows, columns) from their best plane, over ``around`` (rows, columns)
-    bool."""
+    """Standard deviation (robust) of ``heights`` (rows, columns) from their best plane, at the nodes ``around`` (rows,
+    columns) bool."""
     if around.sum() < 4:
         return 0.0
     rows, columns = np.nonzero(around)

@@ -1,4 +1,4 @@
-"""Labels of Gaussians by masks: a closed form over their votes and, where these are uncertain, the labels of
+"""Labels of Gaussians from masks: in closed form from their votes and, where these are uncertain, from the labels of
 neighbours."""
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from egs_warp.segmentation.graph_cut import SplatGraph
 from egs_warp.segmentation.votes import Votes
 
 _MIN_VISIBLE_SHARE = 0.02
-"""A Gaussian of which the masked views show less than this share is not labelled by their votes."""
+"""If the masked views show less than this share of a Gaussian, their votes do not label it."""
 _SURE = 4.0
 """Pixels. A Gaussian with this many votes has full confidence."""
 _SMOOTHNESS = 0.3
@@ -22,12 +22,13 @@ _SMOOTHNESS = 0.3
 
 
 def labels_of_votes(votes: Votes, *, background_bias: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) bool, Gaussians that the masks claim, and (n,) bool, Gaussians that they do not show.
+    """Return (n,) bool, True for Gaussians that the masks claim, and (n,) bool, True for Gaussians that they do not
+    show.
 
     The labels that paint the masks with the least error are a linear programme over blending weights. Each Gaussian's
-    term is independent, so it is solved by the larger of its two sums (FlashSplat, Shen et al. 2024): a Gaussian is the
-    object's if its share is above (1 + bias) / 2. ``background_bias``, -1 to 1, makes the object smaller above 0 and
-    larger below. Raises ``UserError`` if the masks claim nothing.
+    term is independent and is minimised by the label with the larger of its two sums (FlashSplat, Shen et al. 2024): a
+    Gaussian belongs to the object if its share is above (1 + bias) / 2. A ``background_bias``, -1 to 1, above 0 makes
+    the object smaller, below 0 larger. Raises ``UserError`` if the masks claim nothing.
     """
     seen = votes.share_seen() >= _MIN_VISIBLE_SHARE
     claimed = seen & (votes.share_inside() > 0.5 * (1.0 + background_bias))
@@ -45,7 +46,7 @@ def smoothed_labels(
     ``views`` the confidence grows with the root of their number, as errors of independently drawn masks average out.
     """
     pixels = (votes.inside + votes.outside)[nodes]
-    # Above full confidence, it grows with the root of the number of pixels, as for any count.
+    # Above full confidence, it grows with the root of the number of pixels, like the precision of any count.
     confidence = np.minimum(pixels / _SURE, np.sqrt(np.maximum(pixels / _SURE, 1.0)))
     score = (2.0 * votes.share_inside()[nodes] - 1.0) * confidence * np.sqrt(views)
     score[votes.share_seen()[nodes] < _MIN_VISIBLE_SHARE] = 0.0

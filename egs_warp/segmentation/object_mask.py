@@ -33,7 +33,7 @@ TOUCHING = 0.1
 FOOTPRINT_HEIGHT = 0.08
 """Fraction of the object's size. Parts below this height hide the floor."""
 _HALO = 0.1
-"""Fraction of the object's size. Floaters this near to it are its halo."""
+"""Fraction of the object's size. Floaters this near to the object are its halo."""
 _HALVINGS = 6
 """Maximum number of halvings of the first guess of an object's size, about a point in a large room."""
 _MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.3, 4.0
@@ -41,8 +41,8 @@ _MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.3, 4.0
 _HANGING = 0.5
 """Fraction of the object's size. A part that is entirely higher above the plane does not stand on it."""
 _MIN_HAZE_WIDTH, _MIN_HAZE_WIDTH_RATIO, _MAX_HAZE_OPACITY = 0.05, 4.0, 0.3
-"""Fraction of the object's size, for the width; multiple of its median width; and opacity. Wider and fainter Gaussians
-are haze about it and would move with it as a halo."""
+"""Width as a fraction of the object's size and as a multiple of the median width of its Gaussians, and opacity. Wider
+and fainter Gaussians are haze about the object and would move with it as a halo."""
 _MAX_HAZE_GAP, _MAX_COLOUR_DIFFERENCE, _NEIGHBOURS = 0.05, 0.15, 16
 """Fraction of the object's size; fraction of full brightness in each channel; number of Gaussians. Haze this near to
 the object, and this similar in colour to its nearest Gaussians, is part of the object's own haze."""
@@ -62,18 +62,18 @@ def segment(
     """Find the object that ``spec`` describes and that stands on ``plane`` or on uneven ground.
 
     Around a point, the object's size is first guessed as half of the capture's. If nothing of that size stands on the
-    plane, as in a room, the guess is halved repeatedly.
+    plane, as often in a room, the guess is halved repeatedly.
 
     Args:
         cloud: the capture.
         plane: the ground.
         spec: masks, a box or a point, and clicks.
-        size: size of the object, scene units, if known; better than the guess.
+        size: size of the object, scene units, if known; replaces the guess.
         hover: maximum height of the object above the ground, as a fraction of its size.
 
     Raises:
-        UserError: masks are empty, miss the object or have the wrong size; box or point contain nothing; the object
-            does not touch the plane; or nothing is left of it.
+        UserError: masks are empty, miss the object or have the wrong size; there is nothing in the box or near the
+            point; the object does not touch the plane; or nothing is left of it.
     """
     scene = SceneAbovePlane.of(cloud, plane)
     if spec.masks:
@@ -98,7 +98,7 @@ def segment(
 
 
 def _nothing_left(reason: str, count: int) -> str:
-    """Message for an object of ``count`` Gaussians of which segmentation leaves none."""
+    """Return the message for an object of ``count`` Gaussians of which segmentation leaves none."""
     return (
         f"segment: none of the object's {count} Gaussians is left: {reason}; mark the object with masks, or click on"
         " more of it"
@@ -106,7 +106,8 @@ def _nothing_left(reason: str, count: int) -> str:
 
 
 def _masked(scene: SceneAbovePlane, spec: ObjectSpec) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) bool, Gaussians that masks and clicks select, and (n,) bool, Gaussians without information."""
+    """Return (n,) bool, True for Gaussians that masks and clicks select, and (n,) bool, True for Gaussians that no mask
+    shows."""
     votes = votes_of_masks(scene.cloud, spec.masks)
     claimed_by_user, unknown = labels_of_votes(votes)
     standing = scene.is_opaque & (scene.heights > 0.0)
@@ -161,7 +162,7 @@ def _of_size(
     lowest = float(np.quantile(scene.heights[object_mask], 0.002))
     if lowest > hover * size:
         raise UserError(
-            f"object: it does not touch the plane: its lowest part is {lowest / size:.2f} of its size above it; "
+            f"object: it does not touch the plane: its lowest part is {lowest / size:.2f} of its size above the plane; "
             "mark all of the object, or give its plane",
             check=("plane",),
         )
@@ -188,7 +189,8 @@ def _haze_indices(scene: SceneAbovePlane, object_indices: np.ndarray, size: floa
 
 
 def _is_own_haze(scene: SceneAbovePlane, haze: np.ndarray, object_mask: np.ndarray, size: float) -> np.ndarray:
-    """(k,) bool, the ``haze`` (k,) that lies within the object ``object_mask`` (n,) bool, or near it in its colours.
+    """(k,) bool, True for the Gaussians ``haze`` (k,) within the object ``object_mask`` (n,) bool, or near it with its
+    colours.
 
     Left in the background, it would look like a ghost of the object.
     """
@@ -249,21 +251,22 @@ def _body(
     chosen &= ~removed
     if not chosen.any():
         raise UserError(_nothing_left("the clicks beside the object remove all of it", int(removed.sum())))
-    # Distant strays, connected by some huge Gaussian, would extend what follows over the whole room.
+    # Distant strays, connected by some huge Gaussian, would extend the following steps over the whole room.
     chosen &= _within(scene.means, chosen, size)
     # Loose matter inside a hollow body would stay behind as a ghost. The floor closes the body from below, and so does
     # its mirror image in the floor.
     shell = scene.means[chosen]
     if _diagonal(shell) > _MAX_SIZE_RATIO * size:
-        # Cells for a small object would fill a room.
+        # There would be too many cells: a room divided into cells for a small object.
         raise UserError(_NOTHING_ABOVE, check=("plane",))
     heights = scene.heights[chosen]
-    # An object high above the plane is not closed by the floor; the two images would span a very large grid.
+    # An object high above the plane is not closed by the floor; the shell and its mirror image would span a very large
+    # grid.
     if len(shell) and heights.min() < _HANGING * size:
         shell = np.concatenate([shell, shell - 2.0 * (heights[:, None] - foot) * scene.plane.normal])
     chosen |= enclosed(scene.means, shell, 2.0 * size / CELLS) & (scene.heights > foot)
     chosen |= lying & scene.is_under(chosen, 0.1 * size, size)
-    # Gaussians found by position are removed with their neighbours.
+    # Gaussians that were added by their position are removed if they are nearer to removed ones.
     removed |= nearer_to(scene.means, scene.means[removed], scene.means[chosen & ~removed])
     return chosen & ~removed, small_parts, removed
 
@@ -284,7 +287,8 @@ def _diagonal(points: np.ndarray) -> float:
 
 
 def _within(points: np.ndarray, chosen: np.ndarray, margin: float) -> np.ndarray:
-    """(n,) bool, in the box of nearly all that is ``chosen`` (n,) bool, enlarged by ``margin``."""
+    """(n,) bool, True for ``points`` (n, 3) in the box of nearly all ``chosen`` (n,) bool ones, enlarged by
+    ``margin``."""
     if not chosen.any():
         return chosen
     low, high = np.quantile(points[chosen], [0.005, 0.995], axis=0)

@@ -40,7 +40,8 @@ class ObjectSpec:
 
     @classmethod
     def of_clicks(cls, clicks: Sequence[Click]) -> ObjectSpec:
-        """Locate the object by the first of the ``clicks`` on it. Raises ``UserError`` if there is none."""
+        """Return the description whose point is the first of the ``clicks`` on the object. Raises ``UserError`` if
+        there is none."""
         for click in clicks:
             if click.inside:
                 return cls(point=click.point, clicks=tuple(clicks))
@@ -57,8 +58,7 @@ class Segmentation:
     """(n,) bool, Gaussians under the object's foot or claimed as its parts, with means near or below the plane, mostly
     hidden. They belong to neither object nor background."""
     floater_mask: np.ndarray
-    """(n,) bool, similar to the object but detached from it. They belong to neither
-    object nor background."""
+    """(n,) bool, Gaussians similar to the object but detached from it. They belong to neither object nor background."""
     size: float
     """Diagonal of the object's bounding box, scene units."""
 

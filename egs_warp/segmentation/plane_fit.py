@@ -17,14 +17,14 @@ _MAX_PIXELS = 20_000
 _MIN_PIXELS = 30
 _TRIALS = 300
 _TUKEY = 2.0
-"""Pixels farther off than this many standard deviations have zero weight. 4.685 would be more efficient without
-outliers, but an object is close to the plane at its foot: with 3.0, the planes
-of some of 100 scenes are tilted by a degree."""
+"""Pixels with residuals above this many standard deviations have zero weight. 4.685 would be more efficient without
+outliers, but an object is close to the plane at its foot: with 3.0, the planes of some of 100 scenes are tilted by a
+degree."""
 _MIN_NOISE = 1e-3
-"""Fraction of the depth. Points nearer than this are on the plane. If few wide splats form a floor, a plane through
-three of them has no error in half of the pixels, and the others would have zero weight."""
+"""Fraction of the depth. Points nearer to the plane than this count as lying on it. If few wide splats form a floor, a
+plane through three of them has no error in half of the pixels, and the others would have zero weight."""
 _MIN_SINE = 0.02
-"""Sine of the angle between plane and line of sight; a camera closer to the plane does not see it."""
+"""Minimum sine of the angle between plane and line of sight; at smaller angles the plane is not visible."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class PlaneView:
 
     camera: Camera
     depth: np.ndarray
-    """(H, W) expected z-depth, scene units; 0 where it is empty."""
+    """(H, W) expected z-depth, scene units; 0 where nothing is rendered."""
     mask: np.ndarray
-    """(H, W) bool, where the plane is visible."""
+    """(H, W) bool, True where the plane is visible."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,11 @@ def plane_depth(plane: Plane, camera: Camera) -> np.ndarray:
 
 
 def fit_plane(views: Sequence[PlaneView], *, start: Plane | None = None, seed: int = 0) -> PlaneFit:
-    """Fit the plane whose depth agrees with the rendered depth inside the masks, over all views together, Eq. (19).
+    """Fit the plane whose depth agrees with the rendered depth inside the masks, in all views together, Eq. (19).
 
     The residual of a pixel is its relative error in depth, D_g / D_p - 1: for one view it is linear in m = -N / (N.o +
-    d). Up to four tenths of the pixels may be outliers. The start is sampled, or computed from ``start`` (for the
-    paper, the view direction with d = 0) by reweighted least squares on inverse depth.
+    d). Up to four tenths of the pixels may be outliers. The start is sampled, or computed from ``start`` (in the paper,
+    the view direction with d = 0) by reweighted least squares on inverse depth.
 
     Raises ``UserError`` for masks of the wrong size or without depth, and if no plane explains the pixels.
     """
@@ -120,8 +120,8 @@ def _gather(views: Sequence[PlaneView], random: np.random.Generator) -> _Pixels:
         for name, values in (("depth", view.depth), ("mask", view.mask)):
             if np.shape(values) != shape:
                 raise UserError(
-                    f"plane: {name} of view {number} is {np.shape(values)[::-1]}, its camera {shape[::-1]} pixels; "
-                    "make it at the camera's size"
+                    f"plane: {name} of view {number} is {np.shape(values)[::-1]} pixels, its camera's picture"
+                    f" {shape[::-1]}; resize it to match"
                 )
         valid = view.mask & (view.depth > 0.0) & np.isfinite(view.depth)
         chosen = np.flatnonzero(valid)
@@ -134,7 +134,7 @@ def _gather(views: Sequence[PlaneView], random: np.random.Generator) -> _Pixels:
     depth = np.concatenate(depths)
     if len(depth) < _MIN_PIXELS:
         raise UserError(
-            f"plane: the masks hold {len(depth)} pixels with anything rendered, fewer than {_MIN_PIXELS}; "
+            f"plane: only {len(depth)} pixels inside the masks show anything, fewer than {_MIN_PIXELS}; "
             "mark a larger part of the plane, or check the cameras"
         )
     number = np.concatenate(first)
@@ -186,7 +186,7 @@ def _reweighted(pixels: _Pixels, start: Plane) -> Plane:
 
 
 def _refined(pixels: _Pixels, start: Plane, loss: Callable[[float], tuple], *, rounds: int) -> Plane:
-    """Robust least squares over two tilts and the offset, all views together."""
+    """Fit two tilts and the offset of the plane by robust least squares, in all views together."""
     plane = start
     for _ in range(rounds):
         first, second = plane.tangents()
@@ -218,8 +218,8 @@ def _refined(pixels: _Pixels, start: Plane, loss: Callable[[float], tuple], *, r
 def _scale(residual: np.ndarray) -> float:
     """Standard deviation of the inliers among absolute residuals; never 0.
 
-    The median alone would be 50 % too large if three tenths are outliers: it starts from a lower quantile, and is then
-    taken over residuals within two deviations (whose median is 0.638 of one).
+    The median alone would be 50 % too large if three tenths are outliers. The estimate starts from a lower quantile
+    instead, and then uses the median of the residuals within two deviations, which is 0.638 deviations.
     """
     scale = max(float(np.quantile(residual, 0.3)) / 0.566, 1e-7)
     for _ in range(10):

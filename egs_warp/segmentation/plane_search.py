@@ -26,7 +26,7 @@ disagreed by 0.8 degree, with 0.03 by 0.3."""
 _VIEWS = 8
 """Maximum number of pictures to which a plane is fitted."""
 _MIN_SUPPORT = 0.005
-"""Fraction of the visible level surface. A plane with less support is an accident."""
+"""Fraction of the visible level surface. A plane with less support is accidental."""
 _CELL = 0.1
 """Fraction of the object's size: side of the cells on which a plane must be one patch."""
 _COVERED = 0.3
@@ -61,7 +61,7 @@ def find_planes(
         cloud: the capture.
         up: (3,) up direction.
         count: maximum number of planes.
-        tilt_degrees: maximum angle to level.
+        tilt_degrees: maximum angle between the normal of a plane and ``up``.
         thickness: maximum distance of Gaussians from their plane, scene units; 1 % of the extent by default.
         seed: seed of the random numbers.
     """
@@ -159,7 +159,7 @@ def refine_plane(
     radius: float,
     object_mask: np.ndarray | None = None,
 ) -> PlaneFit:
-    """Refit ``plane`` to the depth of ``cloud`` rendered by ``cameras``, Eq. (18), (19).
+    """Refit ``plane`` to the depth of ``cloud`` rendered through ``cameras``, Eq. (18), (19).
 
     The masks are those of ``plane_views``. Raises ``UserError`` if no camera sees the plane.
     """
@@ -168,7 +168,7 @@ def refine_plane(
     if not views:
         raise UserError("plane: no camera sees it around the object; give other cameras, or leave them out")
     fit = fit_plane(views)
-    # Heights over a plane that is already nearly aligned.
+    # Repeat with heights over the fitted plane, which is already nearly aligned.
     realigned = _masked(surfaces, fit.plane, centre, radius, _BAND * radius)
     return fit_plane(realigned) if realigned else fit
 
@@ -187,7 +187,8 @@ def plane_views(
 
     The masks are the pixels whose rendered point (``SeenSurface``) lies within ``band`` (default 3 % of ``radius``) of
     the plane and within ``radius`` of ``centre`` along it, without those of ``object_mask`` (n,) bool Gaussians.
-    Cameras below the plane, and those that do not see it, are ignored; of more than eight, some are picked evenly.
+    Cameras below the plane, and those that do not see it, are ignored; of more than eight, at most eight are picked
+    evenly.
     """
     surfaces = _surfaces(cloud, plane, cameras, radius, object_mask)
     return _masked(surfaces, plane, centre, radius, band or _BAND * radius)
@@ -197,11 +198,11 @@ def _surfaces(
     cloud: GaussianCloud, plane: Plane, cameras: Sequence[Camera], radius: float, object_mask: np.ndarray | None
 ) -> list[SeenSurface]:
     above = [camera for camera in cameras if plane.heights(camera.centre) > 0.1 * radius]
-    # The object is removed from the picture only if it is known: its foot would bend the plane upwards.
+    # The object is left out of the pictures if it is known, because its foot would pull the fitted plane upwards.
     if object_mask is not None and object_mask.all():
         raise UserError(
-            f"segment: all {cloud.count} Gaussians of the capture are the object, so no plane is visible; give the"
-            " plane, or mark less of the capture"
+            f"segment: all {cloud.count} Gaussians of the capture belong to the object, so no plane is visible; give"
+            " the plane, or mark less of the capture"
         )
     bare = cloud if object_mask is None else cloud.subset(~object_mask)
     return [SeenSurface.of(bare, camera) for camera in above[:: max(1, -(-len(above) // _VIEWS))]]
@@ -223,12 +224,12 @@ def _masked(
 
 
 def near_plane(cloud: GaussianCloud, plane: Plane, thickness: float) -> np.ndarray:
-    """(n,) bool, Gaussians whose mean is within ``thickness`` (scene units) of the plane."""
+    """(n,) bool, True for Gaussians whose mean is within ``thickness`` (scene units) of the plane."""
     return np.abs(plane.heights(cloud.means.numpy())) < thickness
 
 
 def lies_along(cloud: GaussianCloud, plane: Plane | HeightField) -> np.ndarray:
-    """(n,) bool, flat Gaussians parallel to ``plane``, at any height, as a floor's are."""
+    """(n,) bool, True for flat Gaussians parallel to ``plane``, like those of a floor, at any height."""
     scales = cloud.log_scales.numpy()
     turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
     thin = np.take_along_axis(turns, scales.argmin(axis=1)[:, None, None], axis=2)[:, :, 0]
@@ -238,7 +239,7 @@ def lies_along(cloud: GaussianCloud, plane: Plane | HeightField) -> np.ndarray:
 
 def further_planes(cloud: GaussianCloud, plane: Plane, size: float, count: int) -> list[FoundPlane]:
     """Return at most ``count`` other planes parallel to ``plane``, largest support first."""
-    # Otherwise slices of walls and of the object would count, too.
+    # Without this condition, slices of walls and of the object would also count as planes.
     lying = lies_along(cloud, plane)
     if not lying.any():
         return []

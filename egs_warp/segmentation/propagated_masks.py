@@ -27,10 +27,10 @@ _PROMPTS = 3
 """Number of points inside the propagated mask that prompt the network."""
 _MIN_COVERED_FRACTION, _MAX_AREA_RATIO = 0.5, 3.0
 """Fractions: minimum share of the propagated mask that a new mask must contain, and maximum ratio of its area to that
-of every earlier mask at the object's distance. Otherwise it shows something else."""
+of every earlier mask at the object's distance. Otherwise the new mask shows something else."""
 _MAX_SALIENT_FRACTION, _MIN_OVERLAP = 0.6, 0.5
-"""Fraction of a picture, the maximum of a salient region; and the minimum overlap (intersection over union) of a mask
-with the consensus of all."""
+"""Maximum fraction of a picture that a salient region may cover; and the minimum overlap (intersection over union) of a
+mask with the consensus of all."""
 _HIDDEN = 0.03
 """Fraction of the depth. A click farther behind the surface that a view shows is not visible there."""
 
@@ -65,7 +65,7 @@ def masks_of_clicks(
             seen.setdefault(id(click.camera), (click.camera, []))[1].append(click)
     first = [(camera, own) for camera, own in seen.values() if any(click.inside for click in own)]
     if not first:
-        raise UserError("object: the network needs a click on it; click on it in a photo")
+        raise UserError("object: the network needs a click on the object; click on it in a photo")
     others = _well_apart([camera for camera, _ in first], cameras, max(0, count - len(first)))
     masks = []
     for number, (camera, own) in enumerate(first):
@@ -102,7 +102,7 @@ def salient_masks(
         views.append(MaskedView(small, model.mask(picture), f"view {number}"))
     views = [view for view in views if _MIN_VISIBLE_FRACTION < view.mask.mean() < _MAX_SALIENT_FRACTION]
     if not views:
-        raise UserError("object: nothing is salient in the pictures; click on it")
+        raise UserError("object: nothing is salient in the pictures; click on the object")
     selected, _ = labels_of_votes(votes_of_masks(cloud, views))
     projected = masks_from_selection(cloud, selected, [view.camera for view in views])
     agreeing = [
@@ -115,7 +115,8 @@ def salient_masks(
 def _propagate_mask(
     cloud: GaussianCloud, masks: Sequence[MaskedView], other_clicks: Sequence[Click], camera: Camera, model: ClickModel
 ) -> tuple[Camera, np.ndarray] | None:
-    """Return the mask of a further view, and its camera; None if it would show something else."""
+    """Return the camera and the mask of a further view; None if the object is hardly visible there or the mask shows
+    something else."""
     selected, _ = labels_of_votes(votes_of_masks(cloud, masks))
     picture, small = _picture(cloud, camera)
     projected = masks_from_selection(cloud, selected, [small])[0].mask
@@ -144,8 +145,8 @@ def _picture(cloud: GaussianCloud, camera: Camera) -> tuple[np.ndarray, Camera]:
 
 
 def _well_apart(chosen_before: Sequence[Camera], cameras: Sequence[Camera], count: int) -> list[Camera]:
-    """Return ``count`` of ``cameras``, each chosen farthest from all before, then ordered by small steps from
-    ``chosen_before``, because the mask changes little between neighbouring views."""
+    """Return ``count`` of ``cameras``, each chosen as the farthest from all earlier ones. They are ordered so that each
+    is near an earlier one or one of ``chosen_before``, because the mask changes little between neighbouring views."""
     left = [camera for camera in cameras if all(camera is not one for one in chosen_before)]
     places = [camera.centre for camera in chosen_before]
     chosen: list[Camera] = []
@@ -163,8 +164,8 @@ def _well_apart(chosen_before: Sequence[Camera], cameras: Sequence[Camera], coun
 
 
 def _innermost(mask: np.ndarray, count: int) -> np.ndarray:
-    """(k, 2) pixels: the innermost point of ``mask`` (H, W), then repeatedly the innermost of the rest, farther from it
-    than twice its depth."""
+    """(k, 2) pixels: the innermost point of ``mask`` (H, W), then repeatedly the innermost of the points farther than
+    twice the depth of each earlier one from it. At most ``count``."""
     places = []
     depth = depth_inside(np.pad(mask, 1))[1:-1, 1:-1]
     rows, columns = np.indices(mask.shape)

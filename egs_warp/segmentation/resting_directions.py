@@ -6,17 +6,18 @@ import numpy as np
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
 _NEIGHBOUR, _STRAY = 8, 3.0
-"""A point is a stray if its 8th neighbour is this many times as far as that of a typical point."""
+"""A point is a stray if its 8th neighbour is more than this many times as far away as that of a typical point."""
 _CONE = np.cos(np.radians(5.0))
 """Cosine of the angle within which facets of the hull count as one."""
 _SLABS = (0.02, 0.01, 0.006)
-"""Thicknesses, in sizes of the object, of the successive slabs of its lowest points to which a plane is fitted."""
+"""Thicknesses, as fractions of the object's size, of the successive slabs of its lowest points to which a plane is
+fitted."""
 _LOWEST_SHARE = 0.002
 _MIN_POINTS = 10
 _MIN_WIDTH_RATIO = 0.1
 """Smallest ratio of the standard deviations across a support: a body does not rest on a line."""
 _MAX_TURN = np.cos(np.radians(10.0))
-"""Cosine of the angle between the normal of a facet and that of the fitted plane."""
+"""Cosine of the maximum angle between the normal of a facet and that of the fitted plane."""
 
 
 def resting_directions(points: np.ndarray, *, at_most: int) -> np.ndarray:

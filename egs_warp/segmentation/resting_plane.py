@@ -13,16 +13,17 @@ from egs_warp.segmentation.connectivity import close_to
 from egs_warp.segmentation.object_spec import Segmentation
 
 _FINE, _VISIBLE = 0.03, 0.05
-"""Fraction of the object's size, for the width, and opacity: an object has texture and fine Gaussians; the haze about
-it has not. The Gaussians of a mouse's plain heel are up to 0.03 across, those of the desk's haze 0.045 and more."""
+"""Maximum width, as a fraction of the object's size, and minimum opacity of fine Gaussians. An object has texture and
+so has fine Gaussians; the haze about it does not. The Gaussians of a computer mouse's plain rear are up to 0.03 wide,
+those of the haze over the desk 0.045 and more."""
 _REACH = 0.05
 """Fraction of the object's size by which it may extend beyond its known outline."""
 _BELOW = 0.25
 """Fraction of the object's size by which it may extend below the plane that is known to be wrong."""
 _STRAYS = 0.005
-"""Fraction of the Gaussians that may lie below: mirror images in a glossy table, and strays."""
+"""Fraction of the Gaussians that may lie below the plane: mirror images in a glossy table, and strays."""
 _FRINGE, _FOOT, _HAZE = 0.1, 0.05, 0.1
-"""Fractions of the object's size: Gaussians this near to it, no higher above its plane and no wider are remnants at its
+"""Fractions of the object's size: maximum distance from it, height above its plane and width of the remnants at its
 foot."""
 _POINTS = 4000
 """Maximum number of points used, spread evenly."""
@@ -65,8 +66,8 @@ def resting_plane(
 
 
 def remove_foot_remnants(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> Segmentation:
-    """Return the segmentation with remnants of the object's foot, its shadow and its mirror image added to what is
-    buried.
+    """Return the segmentation with remnants of the object's foot, its shadow and its mirror image added to the buried
+    Gaussians.
 
     They lie near the object, below the ``plane`` or slightly above it. No floor is visible there that they could belong
     to.
@@ -79,8 +80,8 @@ def remove_foot_remnants(cloud: GaussianCloud, plane: Plane, segmentation: Segme
 
 
 def _lowest(points: np.ndarray, up: np.ndarray, reach: float) -> Plane:
-    """Return the plane that maximises the origin's height over it; the tangent of its angle to ``up`` is at most
-    ``reach``."""
+    """Return the plane that maximises the origin's height above the plane; the tangent of its angle to ``up`` is at
+    most ``reach``."""
     axes = np.stack(Plane(up, 0.0).tangents())
     best, step = np.zeros(2), reach / (_GRID_SIZE // 2)
     for _ in range(_ROUNDS):

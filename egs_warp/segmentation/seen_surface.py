@@ -1,8 +1,9 @@
-"""Visible surfaces of a picture, from the heights of its splats, as depths alone place floors too high.
+"""Visible surfaces in a picture, computed from the heights of splats, because depths alone place floors too high.
 
-A splat's depth is that of its mean. Of neighbouring splats of a floor, the nearer one hides the other, so that a
-pixel's depth belongs to a point nearer than its own: along the ray this point is above the floor by a fraction of a
-splat. The height of the splat at which half of the light is absorbed does not depend on which of them that is.
+A splat's depth is that of its mean. Where splats of a floor overlap, the nearer one hides the other, so the depth of a
+pixel is usually that of a mean nearer than the floor in the pixel: at this depth, the pixel's ray is still above the
+floor, by a fraction of a splat's size. The height of the splat at which half of the light is absorbed does not depend
+on which of the overlapping splats it is.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class SeenSurface:
         """Compute the surface of ``cloud`` seen through ``camera``."""
         image = render_gaussians(cloud, camera, geometry=True)
         assert image.median_depth is not None and image.median_gaussian is not None
-        # Not the expected depth, which contains depths below the floor, because some light passes through it.
+        # The expected depth would contain depths below the floor, because some light passes through it.
         middles = cloud.means.numpy().astype(np.float64)[np.asarray(image.median_gaussian.numpy(), np.int64)]
         depth = image.median_depth.numpy().astype(np.float64)
         return cls(camera, depth, middles, (image.alpha.numpy() > _OPAQUE) & (depth > 0.0))
@@ -53,7 +54,8 @@ class SeenSurface:
         return np.where(down, fall / np.where(down, -slope, 1.0), 0.0)
 
     def points(self, plane: Plane, chosen: np.ndarray) -> np.ndarray:
-        """(n, 3) points of the ``chosen`` (H, W) bool pixels by ``depth_over``, where it is positive."""
+        """(n, 3) points of the ``chosen`` (H, W) bool pixels at the depths of ``depth_over``, where these are
+        positive."""
         depth = self.depth_over(plane)
         valid = chosen & (depth > 0.0)
         return self.camera.centre + depth[valid][:, None] * camera_rays(self.camera)[valid]

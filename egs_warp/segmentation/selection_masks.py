@@ -1,4 +1,4 @@
-"""Masks of selected Gaussians, by rendering."""
+"""Rendered masks of selected Gaussians."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from egs_warp.segmentation.votes import MaskedView
 
 
 def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: Sequence[Camera]) -> list[MaskedView]:
-    """Render masks where the Gaussians ``selection`` (n,) bool make up more than half of the picture, through
-    ``cameras``."""
+    """Render masks through ``cameras``: True in the pixels of which the Gaussians ``selection`` (n,) bool make up more
+    than half."""
     sh = np.zeros((cloud.count, 1, 3), np.float32)
     sh[:, 0, :] = np.where(selection, 0.5, -0.5)[:, None] / SH_BAND_0
     painted = GaussianCloud.from_numpy(

@@ -1,5 +1,5 @@
-"""Search for the support of an object in a room whose widest plane is another one: the level surface that extends
-around it."""
+"""Search for the support of an object, the level surface that extends around it, in a room whose widest plane is
+another one."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ _NEAR = 0.03
 
 
 def planes_below(cloud: GaussianCloud, up: np.ndarray, point: np.ndarray) -> list[Plane]:
-    """Return level planes below ``point`` (3,), from the surroundings of half, a quarter, ... of the capture's size,
-    highest first."""
+    """Return level planes below ``point`` (3,), highest first. They are searched for in surroundings of half, a
+    quarter, ... of the capture's size."""
     means, opaque = cloud.means.numpy().astype(np.float64), cloud.opacities() > 0.3
     if not opaque.any():
         return []

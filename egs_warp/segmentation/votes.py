@@ -58,7 +58,7 @@ def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
 
     A Gaussian's blending weight in a pixel is the derivative of the pixel's colour with respect to the Gaussian's own.
     So the votes are the colour gradient of a picture that weights masked pixels in red and the others in green,
-    computed by the renderer's backward kernels. Raises ``UserError`` for masks of another size than their cameras.
+    computed by the renderer's backward kernels. Raises ``UserError`` for masks whose size is not that of their cameras.
     """
     sums = np.zeros((cloud.count, 3))
     # The same grey for all: colours are not clipped, and SH bands above 0 are not needed.
@@ -70,9 +70,9 @@ def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
 
 
 def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
-    """Sum the votes of all masks that are not empty: a mask is empty where the object is out of sight, and is ignored.
+    """Sum the votes of all masks. Empty masks, of views in which the object is not visible, are ignored.
 
-    Raises ``UserError`` for masks of another size than their cameras', if all are empty, and if their cameras see
+    Raises ``UserError`` for masks whose size is not that of their cameras, if all are empty, and if their cameras see
     nothing.
     """
     for view in masks:
@@ -87,12 +87,12 @@ def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
 
 
 def check_size(view: MaskedView) -> None:
-    """Raise ``UserError`` for a mask of another size than its camera's picture."""
+    """Raise ``UserError`` for a mask whose size is not that of its camera's picture."""
     height, width = view.camera.height, view.camera.width
     if view.mask.shape != (height, width):
         raise UserError(
             f"{view.name}: the mask is {view.mask.shape[1]} x {view.mask.shape[0]} pixels, its camera {width} x"
-            f" {height}; make it at the photo's size"
+            f" {height}; give a mask of the photo's size"
         )
 
 

@@ -1,4 +1,4 @@
-"""Checkpoints of a training run: its complete state in one file, written from time to time.
+"""Checkpoints of a training run: its complete state in one file, written periodically.
 
 The file is an ``.npz`` without pickled objects: arrays by name, all else as JSON under ``facts``. Python writes a float
 as the shortest text that reads back to the same bits.
@@ -67,11 +67,11 @@ class Checkpoint:
         return state
 
     def due(self) -> bool:
-        """Return True if the next checkpoint is due."""
+        """Return True if enough time has passed since the last checkpoint for the next one."""
         return time.monotonic() - self._last >= self._pause
 
     def write(self, state: State) -> None:
-        """Replace the content of the file by ``state``."""
+        """Replace the content of the file with ``state``."""
         start = time.monotonic()
         arrays = {name: value for name, value in state.items() if isinstance(value, np.ndarray)}
         others = {name: value for name, value in state.items() if name not in arrays}

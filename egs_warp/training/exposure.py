@@ -35,7 +35,7 @@ class ExposureModel:
 
     @torch.no_grad()
     def step(self, number: int, step: int) -> None:
-        """Update the map of view ``number`` by its gradient, then shift all maps so that their mean stays the
+        """Update the map of view ``number`` with its gradient, then shift all maps so that their mean stays the
         identity."""
         gradient = self._leaf.grad
         assert gradient is not None

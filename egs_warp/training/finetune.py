@@ -1,6 +1,6 @@
 """The training loop: Gaussians fitted to pictures (Kerbl et al. 2023; relocation after Kheradmand et al. 2024).
 
-Imports torch, so import it only where a training runs.
+This module imports torch; import it only where a training runs.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class TrainingView:
     alpha: np.ndarray | None = None
     """(H, W) float32; if given, ``image`` is not yet composited over a background."""
     weight: np.ndarray | None = None
-    """(H, W) float32, nonnegative weight of each pixel in the L1 loss; None weights all alike."""
+    """(H, W) float32, nonnegative weight of each pixel in the L1 loss; None weights all pixels equally."""
     name: str = ""
     """Name of the photo, for messages."""
 
@@ -82,15 +82,15 @@ class FinetuneOptions:
     """Background colour. None draws a random one in each step, which requires views with alpha."""
     densification: Densification = Densification.NONE
     max_gaussians: int | None = 100_000
-    """Number to which relocation grows the cloud. None grows it while the loss decreases by it."""
+    """Number to which relocation grows the cloud. None grows it as long as growth decreases the loss."""
     sh_steps: int = 0
     """Steps after which the next SH degree is trained; 0 trains all degrees from the start."""
     fit_exposure: bool = False
     """Optimise an exposure and a white balance for each view together with the cloud."""
     exclude_outliers: bool = False
-    """Exclude views during the training that do not fit the others."""
+    """During the training, exclude views that do not fit the others."""
     antialiased: bool | None = None
-    """Render with antialiasing, and mark the result as trained with it. None: as the cloud is marked."""
+    """Render with antialiasing, and mark the result as trained with it. None: as ``cloud.antialiased``."""
     seed: int = 0
     threads: int | None = None
 
@@ -141,7 +141,7 @@ def finetune(
     resume: bool = False,
     progress: Callable[[int, float], None] | None = None,
 ) -> FinetuneResult:
-    """Fit ``cloud`` to ``views`` by Adam, one view a step in shuffled rounds.
+    """Fit ``cloud`` to ``views`` with Adam, one view per step in shuffled rounds.
 
     Args:
         cloud: start of the training; unchanged.
@@ -157,7 +157,8 @@ def finetune(
         The new cloud, on the same device, and the losses.
 
     Raises:
-        UserError: a view does not fit its camera, the loss is not finite, or the checkpoint is of another training.
+        UserError: a view does not fit its camera, the loss is not finite, or the checkpoint belongs to another
+            training.
     """
     options = options or FinetuneOptions()
     antialiased = cloud.antialiased if options.antialiased is None else options.antialiased
@@ -280,7 +281,7 @@ def render_views(
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
     antialiased: bool | None = None,
 ) -> list[TrainingView]:
-    """Render the capture itself, as training views if there are no photos."""
+    """Render ``cloud`` through ``cameras`` as training views, which replace photos where there are none."""
     return [
         TrainingView(
             camera,
@@ -301,8 +302,8 @@ def cameras_extent(cameras: Sequence[Camera]) -> float:
 
 
 def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
-    """Return the length by which the learning rate of the means is scaled: 1.1 times the cameras' radius, or twice the
-    mean radius of the cloud if that is smaller."""
+    """Return the length by which the learning rate of the means is multiplied: 1.1 times the cameras' radius, or twice
+    the mean radius of the cloud if that is smaller."""
     centres = np.array([camera.centre for camera in cameras])
     of_cameras = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     means = cloud.means.numpy()

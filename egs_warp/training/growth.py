@@ -1,4 +1,4 @@
-"""Number of Gaussians of a scene: a given cap, or growth as long as the loss decreases by it."""
+"""Number of Gaussians of a scene: a given cap, or growth as long as it decreases the loss."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MIN_GAIN = 0.02
 _WINDOWS = 2
 """Consecutive comparisons with too small a gain after which growth ends."""
 _BYTES_EACH = 4000
-"""Memory of one Gaussian in training: parameters, gradients, Adam's moments, and the renderer's arrays."""
+"""Memory of one Gaussian in training, bytes: parameters, gradients, Adam's moments, and the renderer's arrays."""
 
 
 class Growth:

@@ -1,6 +1,6 @@
 """Initial cloud of a training from photos: Gaussians where the photos agree.
 
-Imports torch through ``egs_warp.training.finetune``, so import it only where a training runs.
+This module imports torch through ``egs_warp.training.finetune``; import it only where a training runs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from egs_warp.training.finetune import TrainingView
 MIN_POINTS = 500
 """Minimum number of triangulated points from which a training starts."""
 _SIZE_OF_POINT, _OPACITY_OF_POINT = 1.0, 0.1
-"""Initial standard deviation, in spacings, and initial opacity of a triangulated point."""
+"""Initial standard deviation, as a multiple of the spacing, and initial opacity of a triangulated point."""
 
 
 def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
@@ -34,8 +34,8 @@ def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
 def initial_cloud(
     views: Sequence[TrainingView], *, count: int, sh_degree: int, seed: int = 0, device: str | None = None
 ) -> GaussianCloud:
-    """Create ``count`` isotropic Gaussians, spread evenly over the region that most cameras see, in the colours they
-    see there.
+    """Create ``count`` isotropic Gaussians, spread evenly over the region that most cameras see, in the colours that
+    they see there.
 
     Of many random points, those on whose colour the views agree best are chosen. If all views have alpha, only points
     inside all silhouettes are used: a rough visual and photometric hull.
@@ -49,7 +49,7 @@ def initial_cloud(
     points = random.uniform(low, high, (8 * count, 3))
     visibility = _Visibility.of(points, views)
     if visibility.solid.any():
-        # The object may fill little of the cameras' common view: sample again, around the object alone.
+        # The object may fill only a small part of the cameras' common view: sample again, around the object alone.
         margin = 0.05 * (high - low)
         low, high = points[visibility.solid].min(axis=0) - margin, points[visibility.solid].max(axis=0) + margin
         points = random.uniform(low, high, (8 * count, 3))
@@ -110,9 +110,10 @@ class _Visibility:
     spread: np.ndarray
     """(n,) standard deviation of the colour."""
     often: np.ndarray
-    """(n,) bool, seen by at least half as many views as any other point."""
+    """(n,) bool, True for points seen by at least half as many views as the point seen most."""
     solid: np.ndarray
-    """(n,) bool, seen often, and inside the silhouettes; all False unless all views have alpha."""
+    """(n,) bool, True for points seen often that are inside the silhouettes of nearly all views; all False unless all
+    views have alpha."""
 
     @classmethod
     def of(cls, points: np.ndarray, views: Sequence[TrainingView]) -> _Visibility:

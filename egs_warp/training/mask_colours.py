@@ -27,14 +27,15 @@ _AREA = (0.01, 0.6)
 """Range of the mean fraction of black pixels."""
 _POINTS = 40_000
 _MIN_SEEN, _MIN_BLACK = 0.8, 0.95
-"""A point of the hull is seen by this fraction of the cameras, and black in this fraction of these."""
+"""A point of the hull is seen by at least the first fraction of the cameras, and black in at least the second fraction
+of these."""
 _MIN_COVERED = 0.7
 """Minimum fraction of the black pixels that the hull covers."""
 
 
 def is_object_black(images: Sequence[PosedImage]) -> bool:
-    """Return True if the masks of ``images`` show the object in black, on sure evidence: the surroundings, along the
-    borders, are white, and the black regions are the silhouettes of one body that all cameras see.
+    """Return True if there is clear evidence that the masks of ``images`` show the object in black: the surroundings,
+    along the borders, are white, and the black regions are the silhouettes of one body that all cameras see.
 
     Black regions that move from photo to photo, such as people to be left out, are not silhouettes of one body.
     """
@@ -54,7 +55,7 @@ def is_object_black(images: Sequence[PosedImage]) -> bool:
     hull = _hull(views, random.uniform(focus - distance, focus + distance, (_POINTS, 3)))
     if len(hull) == 0:
         return False
-    # Sampled again around the body, which may fill little of the cameras' common view.
+    # Sample again around the body, which may fill only a small part of the cameras' common view.
     margin = 2.0 * distance / _POINTS ** (1 / 3)
     hull = _hull(views, random.uniform(hull.min(axis=0) - margin, hull.max(axis=0) + margin, (_POINTS, 3)))
     return float(np.median([view.covered_by(hull) for view in views])) >= _MIN_COVERED
@@ -65,7 +66,7 @@ class _MaskView:
     """A reduced mask and its camera."""
 
     camera: Camera
-    """At the size of the mask."""
+    """Camera at the size of the reduced mask."""
     lens: Lens | None
     black: np.ndarray
     """(H, W) bool."""
@@ -105,7 +106,7 @@ class _MaskView:
         return np.where(inside, [row, column], 0).astype(int), inside
 
     def covered_by(self, hull: np.ndarray) -> float:
-        """Return the fraction of black pixels onto or beside which points of ``hull`` (n, 3) project."""
+        """Return the fraction of the black pixels onto or next to which points of ``hull`` (n, 3) are projected."""
         if not self.black.any() or len(hull) == 0:
             return 0.0
         (rows, columns), inside = self.pixels(hull)
@@ -116,7 +117,7 @@ class _MaskView:
 
 
 def _hull(views: Sequence[_MaskView], points: np.ndarray) -> np.ndarray:
-    """Return those of ``points`` (n, 3) that nearly all views see in black."""
+    """Return the ``points`` (n, 3) that nearly all views see in black."""
     seen, black = np.zeros(len(points)), np.zeros(len(points))
     for view in views:
         (rows, columns), inside = view.pixels(points)

@@ -42,11 +42,10 @@ def psnr(a: np.ndarray, b: np.ndarray, known: np.ndarray | None = None) -> float
 
 
 def match_tone(photo: np.ndarray, picture: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
-    """(H, W, 3) ``picture`` under the affine colour map that best fits it to ``photo`` over the ``known`` (H, W)
-    pixels.
+    """(H, W, 3) ``picture`` after the affine colour map that best fits it to ``photo`` in the ``known`` (H, W) pixels.
 
-    It removes differences of exposure and white balance, as is common when photos that were not trained on are
-    evaluated: twelve numbers fitted to the whole photo.
+    The map, twelve numbers fitted to the whole photo, removes differences of exposure and white balance, as is common
+    in the evaluation of held-out photos.
     """
     target, seen = (of.reshape(-1, 3) if known is None else of[known] for of in (photo, picture))
     rows = np.column_stack([seen, np.ones(len(seen))]).astype(np.float64)

@@ -10,11 +10,11 @@ import numpy as np
 from egs_warp.training.checkpoint import State
 
 _JUDGED_AT = (0.3, 0.5, 0.7)
-"""Fractions of the steps after which outliers are searched."""
+"""Fractions of the steps after which outliers are determined."""
 _LAST_VISITS = 3
 _TIMES_MEDIAN = 1.8
 _SPREADS = 3.0
-"""Robust standard deviations of the logarithm of the loss."""
+"""Minimum distance of an outlier from the median, in robust standard deviations of the logarithm of the loss."""
 _MAX_EXCLUDED_FRACTION = 0.1
 """Maximum fraction of the photos that may be excluded."""
 

@@ -31,8 +31,8 @@ _REGULARIZATION = 1e-5
 
 
 def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage]) -> list[TrainingView]:
-    """Read the photos of the cameras ``posed``, reduced to ``_PHOTO_SIDE`` pixels and in the colours of ``cloud``; none
-    without PyTorch."""
+    """Read the photos of the cameras ``posed``, reduced to ``_PHOTO_SIDE`` pixels and in the colours of ``cloud``. The
+    list is empty without PyTorch."""
     if not has_torch():
         return []
     from egs_warp.training.finetune import TrainingView

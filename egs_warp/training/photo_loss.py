@@ -59,7 +59,7 @@ class PhotoLoss:
         target: Target,
         backdrop: tuple[float, ...],
     ) -> torch.Tensor:
-        """Compute the loss () of a render.
+        """Compute the scalar loss of a render.
 
         Gradients flow to ``colour``, ``alpha`` and ``tone``. If the photo has alpha, the colour map does not apply to
         the backdrop.
@@ -74,7 +74,7 @@ class PhotoLoss:
         return _Loss.apply(colour, alpha, tone, target, backdrop, self)  # type: ignore[return-value]
 
     def scratch(self, pixels: int) -> dict[str, torch.Tensor]:
-        """Return the buffers for pictures of ``pixels``."""
+        """Return the buffers, by name, for pictures of ``pixels`` pixels."""
         if pixels not in self._scratch:
             device = self.window.device
             self._scratch[pixels] = {name: torch.empty((pixels, 3), device=device) for name in _PICTURES} | {
@@ -168,7 +168,7 @@ class _Loss(torch.autograd.Function):
                 outputs=[at["by_toned"], of(by_colour), of(by_alpha, wp.float32)],
                 **options,
             )
-        # Copied out before the buffers are used again.
+        # New tensors are made here, because the next call overwrites the buffers.
         mixing = buffers["by_toned"].T @ buffers["front"]
         shift = buffers["by_toned"].T @ (alpha.reshape(-1, 1) if cut_out else torch.ones_like(buffers["off"][:, None]))
         by_tone = torch.cat([mixing, shift], dim=1)

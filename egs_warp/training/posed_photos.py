@@ -1,6 +1,6 @@
 """Photos with poses, read as training views.
 
-Imports torch through ``egs_warp.training.finetune``, so import it only where a training runs.
+This module imports torch through ``egs_warp.training.finetune``; import it only where a training runs.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class PhotoSources:
     poses: str
     """The file of poses, or the folder of the COLMAP model."""
     total: int
-    """Number of photos in it."""
+    """Number of photos in the file of poses."""
     used: int
     folders: tuple[tuple[str, int], ...]
     """Folders of the photos, and the number of photos used from each."""
@@ -58,8 +58,8 @@ class PosedPhotos:
 def read_views(posed: Path | str, *, max_side: int | None = None, inverted_masks: bool | None = None) -> PosedPhotos:
     """Read photos and cameras (``read_photo``); photos larger than ``max_side`` pixels are reduced.
 
-    Photos that are missing, unreadable or of another shape than their camera are excluded. With ``inverted_masks``,
-    the object is black in masks; None detects it (``is_object_black``). Raises ``UserError`` if no photo can be used.
+    Photos that are missing, unreadable or not of their camera's shape are excluded. With ``inverted_masks``, the object
+    is black in masks; None detects it (``is_object_black``). Raises ``UserError`` if no photo can be used.
     """
     poses = read_posed_images(posed)
     notes = list(poses.notes)

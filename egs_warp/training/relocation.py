@@ -30,7 +30,7 @@ _GENTLE_GROWTH_END, _GROWTH_DEADLINE = 0.3, 0.5
 _MAX_GENTLE_GROWTH = 1.1
 """Growth factor above which copies are made faster than the photos can separate them."""
 _REGULARIZATION = 0.01
-"""Weight of the mean opacity and of the mean scale over the extent."""
+"""Weight of the mean opacity, and of the mean scale divided by the extent."""
 _JITTER = 5e5
 """Noise relative to the learning rate of the means."""
 _SETTLING_FROM, _FINAL_RATE = 0.5, 0.1
@@ -39,7 +39,8 @@ the end."""
 
 
 class Population:
-    """Parameter tensors with one Adam for all. ``relocate`` replaces tensors, so read ``tensors`` in each step."""
+    """Parameter tensors with one Adam optimiser for all. ``relocate`` replaces tensors, so read ``tensors`` in each
+    step."""
 
     def __init__(
         self,
@@ -49,7 +50,7 @@ class Population:
         extent: float,
         generator: torch.Generator,
     ) -> None:
-        wp.init()  # torch's tensors are handed over before any kernel is launched
+        wp.init()  # Warp receives torch's tensors before any kernel is launched
         self.tensors = tensors
         self._rates = {name: rates[name] * (extent if name == "means" else 1.0) for name in tensors}
         self._extent = extent
@@ -64,7 +65,7 @@ class Population:
     def step(self, *, done: float, settling: bool = False) -> None:
         """Take one step of Adam. The learning rate of the means falls to a hundredth as ``done`` goes from 0 to 1.
 
-        With ``settling`` the others fall to a tenth over the last part.
+        With ``settling`` the others fall to a tenth over the second half.
         """
         late = max(0.0, done - _SETTLING_FROM) / (1 - _SETTLING_FROM) if settling else 0.0
         for group in self._optimiser.param_groups:
@@ -96,8 +97,8 @@ class Population:
     def relocate(self, step: int, steps: int, growth: Growth) -> None:
         """Jitter the means; at intervals, move faint Gaussians to opaque ones and add new ones.
 
-        A given cap is reached by half time at the latest; otherwise the number grows by the minimum factor while
-        ``growth`` allows it.
+        A given cap is reached after half of the steps at the latest; otherwise the number grows by the minimum factor
+        while ``growth`` allows it.
         """
         self._jitter()
         # In the last fifth of the steps the population is fixed.

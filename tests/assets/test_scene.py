@@ -47,5 +47,5 @@ def test_board_squares() -> None:
 
 def test_unknown_scene() -> None:
     """The message lists the available names."""
-    with pytest.raises(UserError, match="scene 'castle' is unknown; built in are pawn, stool, figurine, snake"):
+    with pytest.raises(UserError, match="scene 'castle' is unknown; give one of pawn, stool, figurine, snake"):
         scene("castle")

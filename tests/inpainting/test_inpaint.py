@@ -217,7 +217,7 @@ def test_footprints_and_common_occlusion() -> None:
         unseen(PLANE, [views[1], nowhere])
     down, turn = look(0.0, 0.7), np.diag([1.0, -1.0, -1.0])
     up = replace(down, rotation=turn @ down.rotation, translation=turn @ down.translation)
-    with pytest.raises(UserError, match="no pixel of a mask sees the plane, so the hole is not on it"):
+    with pytest.raises(UserError, match="no pixel of a mask shows the plane, so the hole is not on it"):
         unseen(PLANE, [MaskedView(up, np.ones((160, 160), bool))])
 
 

@@ -118,7 +118,7 @@ def test_no_height() -> None:
         cloud.opacity_logits.numpy(),
         cloud.sh.numpy(),
     )
-    with pytest.raises(UserError, match="have no height along up, so no plane can be found; check up"):
+    with pytest.raises(UserError, match="have no height along the up direction, so no plane can be found; check up"):
         find_base_plane(flat, np.array([0.0, 0.0, 1.0]))
 
 

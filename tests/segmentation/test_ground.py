@@ -213,7 +213,7 @@ def test_medians_of_what_is_nearest_to_each_node(count: int) -> None:
 def test_a_capture_that_is_all_object_has_no_ground() -> None:
     cloud = ball()
     everything = np.ones(cloud.count, bool)
-    message = rf"^segment: all {cloud.count} Gaussians of the capture are the object, so "
+    message = rf"^segment: all {cloud.count} Gaussians of the capture belong to the object, so "
     with pytest.raises(UserError, match=message + "there is no ground to measure"):
         measure_ground(cloud, everything, LEVEL, centre=np.zeros(3), size=1.0)
     with pytest.raises(UserError, match=message + "no plane is visible"):

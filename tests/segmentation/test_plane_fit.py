@@ -106,9 +106,9 @@ def test_several_views_are_fitted_together() -> None:
 def test_views_that_cannot_be_fitted_are_reported() -> None:
     camera = camera_over(TRUTH, 0.0)
     depth = plane_depth(TRUTH, camera)
-    with pytest.raises(UserError, match=r"mask of view 0 is \(50, 40\), its camera \(120, 90\) pixels"):
+    with pytest.raises(UserError, match=r"mask of view 0 is \(50, 40\) pixels, its camera's picture \(120, 90\)"):
         fit_plane([PlaneView(camera, depth, np.ones((40, 50), bool))])
-    with pytest.raises(UserError, match="the masks hold 0 pixels with anything rendered, fewer than 30"):
+    with pytest.raises(UserError, match="only 0 pixels inside the masks show anything, fewer than 30"):
         fit_plane([PlaneView(camera, np.zeros_like(depth), np.ones_like(depth, bool))])
     with pytest.raises(UserError, match="there are no views"):
         fit_plane([])

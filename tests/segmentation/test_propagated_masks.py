@@ -122,7 +122,7 @@ def test_clicks_without_a_result_are_reported(cameras: list[Camera]) -> None:
     beside = click_at(cloud, cameras[0], *pixel_of(cameras[0], (0.5, 0.0, 0.9)), inside=False)
     on = click_at(cloud, cameras[0], *pixel_of(cameras[0], (-0.5, 0.0, 0.9)))
     assert beside is not None and on is not None
-    with pytest.raises(UserError, match="the network needs a click on it"):
+    with pytest.raises(UserError, match="the network needs a click on the object"):
         masks_of_clicks(cloud, [beside], cameras, ByTone())
 
     class Blind(ByTone):
@@ -173,7 +173,7 @@ def test_the_object_salient_in_most_views_is_selected(cameras: list[Camera]) -> 
         def mask(self, picture: np.ndarray) -> np.ndarray:
             return np.ones(picture.shape[:2], bool)
 
-    with pytest.raises(UserError, match="nothing is salient in the pictures; click on it"):
+    with pytest.raises(UserError, match="nothing is salient in the pictures; click on the object"):
         salient_masks(cloud, cameras, Nothing.__new__(Nothing))
 
 

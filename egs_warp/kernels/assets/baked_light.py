@@ -40,7 +40,7 @@ def bake_light_kernel(
         reach: length of the ambient rays, and the distance over which the object above darkens the ground.
         light_softness: tangent of the half-angle of the key light's disc.
         sky_out: cosine-weighted fraction of the hemisphere in which the sky is visible.
-        ground_out: likewise, lit ground.
+        ground_out: cosine-weighted fraction of the hemisphere in which lit ground is visible.
         light_out: visible fraction of the key light.
     """
     i = wp.tid()

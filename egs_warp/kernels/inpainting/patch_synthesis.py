@@ -83,8 +83,8 @@ def search_kernel(
 ):
     """Run one round of PatchMatch (Barnes et al. 2009).
 
-    Each target tests the matches of its neighbours at ``stride``, then random positions in windows that halve. All read
-    the results of the last round, so the output does not depend on the order.
+    Each target tests the matches of its neighbours at ``stride``, then random positions in windows of halving size. All
+    targets read the results of the previous round, so the output does not depend on their order.
     """
     i = first_row + wp.tid()
     row = targets[i][0]

@@ -22,8 +22,8 @@ def extent_kernel(
     axis_reach_out: wp.array[wp.float32],
     deviation_out: wp.array[wp.float32],
 ):
-    """Compute the height of each mean over the plane, the largest |N.(s_i r_i)| (Eq. 20 over gamma) and the standard
-    deviation along N."""
+    """Compute the height of each mean above the plane, the largest |N.(s_i r_i)| (Eq. 20 divided by gamma) and the
+    standard deviation along N."""
     row = first_row + wp.tid()
     along = wp.transpose(rotation_matrix(rotations[row])) * normal
     s = log_scales[row]
@@ -65,7 +65,7 @@ def half_space_kernel(
     w = w / sigma
     t = -(wp.dot(normal, means[g]) + offset) / sigma
     mass_fraction = 0.5 * wp.erfc(t * 0.70710678)
-    # The hazard pdf / (1 - cdf); far above the plane both tend to 0, far below to t.
+    # The hazard pdf / (1 - cdf) tends to 0 far above the plane and to t far below it.
     hazard = wp.where(t < 6.0, 0.3989422804 * wp.exp(-0.5 * t * t) / wp.max(mass_fraction, 1.0e-9), t)
     narrowed = wp.sqrt(wp.clamp(1.0 - hazard * (hazard - t), 1.0e-6, 1.0))
     mean_out[row] = means[g] + hazard * (turn * wp.cw_mul(scale, w))

@@ -47,7 +47,8 @@ def jitter_kernel(
     opacity_logits: wp.array[wp.float32],
     means_out: wp.array[wp.vec3],
 ):
-    """Move a mean by ``size`` times its covariance times ``noise``, less the more opaque it is."""
+    """Move each mean by ``size`` times its covariance times ``noise``; the more opaque the Gaussian, the smaller its
+    displacement."""
     n = first_row + wp.tid()
     gate = sigmoid(-STEEPNESS * (sigmoid(opacity_logits[n]) - faint))
     # A smaller gate has no visible effect.
