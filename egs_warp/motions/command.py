@@ -1,4 +1,4 @@
-"""Velocity commands for a live body: ``Drive``, and files of commands over time."""
+"""Velocity commands for a body: ``Drive``, and files that list commands with their times."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def read_drive(path: Path) -> DrivePlan:
     """Read a file of lines ``time,forward,sideways,turn``.
 
     Raises:
-        UserError: with the line, for a malformed file.
+        UserError: for a malformed file; the message contains the line number.
     """
     times: list[float] = []
     commands: list[Drive] = []

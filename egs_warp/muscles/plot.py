@@ -38,7 +38,7 @@ def check_picture_name(path: Path) -> None:
         UserError: the extension is not that of an image format, or the folder does not exist.
     """
     if path.suffix.lower() not in _EXTENSIONS:
-        raise UserError(f"{path}: not the name of a picture; let it end in one of {', '.join(_EXTENSIONS)}")
+        raise UserError(f"{path}: not the name of an image; let it end in one of {', '.join(_EXTENSIONS)}")
     if not path.parent.is_dir():
         raise UserError(f"{path}: its folder does not exist; create {path.parent} first")
 
@@ -94,7 +94,7 @@ def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarra
     image = np.asarray(canvas.buffer_rgba())[..., 2::-1]
     written, data = cv2.imencode(path.suffix, image)
     if not written:
-        raise UserError(f"{path}: the picture could not be encoded; give another ending")
+        raise UserError(f"{path}: the image could not be encoded; choose another extension")
     with atomic_write(path) as temporary:
         temporary.write_bytes(data.tobytes())
 
