@@ -228,7 +228,8 @@ class Dance:
         if skipped:
             named = ", ".join(skipped[:10]) + (", ..." if len(skipped) > 10 else "")
             notes.append(
-                f"{len(skipped)} of {len(self._beats)} beats skipped, too close to other beats or to the last one: {named} s"
+                f"{len(skipped)} of {len(self._beats)} beats skipped, "
+                f"too close to other beats or to the last one: {named} s"
             )
         return notes
 

@@ -46,7 +46,7 @@ def check_picture_name(path: Path) -> None:
 def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarray, front: np.ndarray) -> None:
     """Write an image of the body from the front, its left and above, with fibres coloured by kind.
 
-    The ticks are body heights from the middle of the body along the ground, and from its lowest point upwards.
+    The axes show body heights, measured along the ground from the middle of the body and upwards from its lowest point.
 
     Args:
         mesh: cage at rest.
@@ -100,7 +100,7 @@ def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarra
 
 
 class _BodyAxes:
-    """Transform of points to ahead, left and up of the body, in body heights."""
+    """Transform of points to the coordinates ahead, left and up of the body, in body heights."""
 
     def __init__(self, mesh: TetMesh, *, up: np.ndarray, front: np.ndarray) -> None:
         up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
@@ -112,7 +112,7 @@ class _BodyAxes:
         self._origin = np.append(0.5 * (low + high)[:2], low[2])
         self._height = float(high[2] - low[2])
         self.low, self.high = self(mesh.nodes).min(axis=0), self(mesh.nodes).max(axis=0)
-        """(3,) Bounds of the body."""
+        """(3,) smallest and largest coordinates of the body."""
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Transform ``points`` (..., 3)."""
@@ -120,7 +120,8 @@ class _BodyAxes:
 
 
 def _draw_view(axes: Axes, local: _BodyAxes, mesh: TetMesh, muscles: MuscleSet, directions: np.ndarray) -> None:
-    """Draw the body seen with ``directions`` (3, 3), rows right, up and towards the viewer, ahead, left and up."""
+    """Draw one view of the body. The rows of ``directions`` (3, 3) are the directions to the right, up and towards the
+    viewer in the coordinates ahead, left and up."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     # The ticks show these coordinates; one that increases to the left is drawn on an inverted axis.
