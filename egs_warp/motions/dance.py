@@ -109,7 +109,7 @@ class _Step:
     move: str
     jump: Jump
     began: float
-    """Seconds from the start of the dance."""
+    """Start of the jump, in seconds from the start of the dance."""
     start: np.ndarray
     """(3,) m, centre of mass at the time ``began``."""
 

@@ -44,7 +44,7 @@ class Gait:
     groups: tuple[tuple[int, ...], ...]
     step_count: int
     swing_time: float
-    """Seconds."""
+    """Duration of a swing, s."""
     double_time: float
     """Time for which all feet stand between two swings, s."""
     lift: float

@@ -156,7 +156,7 @@ def find_limbs(sections: Sections, nodes: np.ndarray) -> Limbs:
     for limb, base in zip(limbs, base_from_limb, strict=True):
         base_from_section[list(limb.own)] = base
     limb_from_node = base_from_section[sections.section_from_node]
-    # Feet that have merged are split half way between their limbs.
+    # Feet that have merged are split halfway between their limbs.
     shared = np.isin(sections.section_from_node, list(graph.shared_below(limbs)))
     ends = np.array([sections.centres[list(limb.lowest), :2].mean(axis=0) for limb in limbs])
     limb_from_node[shared] = base_from_limb[np.asarray(KDTree(ends).query(nodes[shared, :2])[1], int)]

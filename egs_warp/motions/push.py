@@ -43,7 +43,7 @@ class Push:
     """
 
     time: float
-    """Seconds from the start."""
+    """Time of the push, or start of the gust, in seconds from the start of the run."""
     impulse: np.ndarray
     """(3,) m sqrt(g H), forward, left and up relative to the body at the start."""
     height: float | None = None

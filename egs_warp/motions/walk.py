@@ -72,7 +72,7 @@ class Walk:
         Args:
             stance: stance at the start.
             route: route to follow.
-            step_length: step length in metres; it is shortened to what the body can do.
+            step_length: step length in metres; it is reduced to the longest step that the body can make.
             speed: relative to the nominal speed.
             control: weights and gains.
 

@@ -36,7 +36,7 @@ COUNTER_ROTATION = 1.5
 """Counter-rotation: reduction of the rotation of a node per body height above the base, relative to the rotation of the
 base. The less of the body rotates with the base, the less friction the pivot needs."""
 MIN_TURNED_INERTIA = 0.2
-"""Smallest fraction of the moment of inertia that friction is assumed to rotate, whatever the counter-rotation."""
+"""Smallest fraction of the moment of inertia that friction is assumed to rotate, for any counter-rotation."""
 MAX_SWING_FACTOR = 1.25
 """Largest factor on the swing time of a pivot that friction under one side cannot complete in the nominal time."""
 MAX_FRICTION_USE = 1.2
