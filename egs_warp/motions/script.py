@@ -85,7 +85,7 @@ class Script:
 
 
 def motion(text: str, *, beats: str | None = None, **values: float | None) -> Script:
-    """Parse motions.
+    """Parse motions into a script.
 
     Args:
         text: one motion by name (``jump``, ``hop``, ``twist``, ``walk``, ``walk to``, ``turn`` ...), several as a line
