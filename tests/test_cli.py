@@ -71,7 +71,7 @@ from egs_warp.segmentation.clearance import StraddlingPolicy
         ),
         (["--style", "floppy"], "--style: unknown word 'floppy'; give one of light, heavy, rubbery"),
         (["--style", "squash=3"], "style: squash 3: give a number of times the usual from 0.5 to 2"),
-        (["--motion", "walk", "--style", "heavy"], "--style: nothing jumps in 'walk'"),
+        (["--motion", "walk", "--style", "heavy"], "--style: no motion of 'walk' jumps"),
         (["--beats", "90"], "--beats: no motion of 'jump' takes beats; add a dance"),
         (["--motion", "dance", "--beats", "soon.csv"], "soon.csv: no such file"),
         (["--motion", "dance", "--beats", "90 soon"], "first soon: give a number of seconds from 0 to 600"),
@@ -204,7 +204,7 @@ def test_own_muscles_are_plotted(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_a_plot_needs_the_name_of_a_picture(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["muscles", str(tmp_path / "nothing.ply"), "--plot", str(tmp_path / name)]) == 2
     error = capsys.readouterr().err
-    assert f"{name}: not the name of a picture; let it end in one of .png, .jpg" in error and error.count("\n") == 1
+    assert f"{name}: not the name of an image; let it end in one of .png, .jpg" in error and error.count("\n") == 1
 
 
 def test_a_plot_needs_an_existing_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

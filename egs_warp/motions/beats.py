@@ -1,4 +1,4 @@
-"""Beats of a dance, and the choice of the two beats between which the next jump flies."""
+"""Beats of a dance, and the choice of the take-off and the touch-down of the next jump."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from egs_warp.io.text import read_text
 
 MAX_BEATS = 1000
 MAX_BEAT_TIME = 600.0
-"""Seconds."""
+"""Largest time of a beat, s."""
 _FLIGHT_TOLERANCE = 0.5
-"""Seconds: a flight that differs from the easiest one by this much costs as much as one second of waiting."""
+"""Deviation from the preferred flight time that costs as much as one second of waiting, s."""
 _MAX_DIVISION = 8
 """Largest number of parts into which the interval before a beat is divided."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """A take-off and the touch-down after it, seconds from the start of the dance."""
+    """Times of a take-off and of the touch-down after it, in seconds from the start of the dance."""
 
     take_off: float
     touch_down: float
-    """Seconds, on a beat."""
+    """Time of a beat, s."""
     parts: int = 1
     """1 if the take-off is on a beat; otherwise the take-off is at the start of the last of ``parts`` equal parts of
     the interval before the beat of the touch-down."""
 
     @property
     def flight(self) -> float:
-        """Seconds."""
+        """Flight time, s."""
         return self.touch_down - self.take_off
 
 
 def even_beats(tempo: float, first: float, count: int) -> tuple[float, ...]:
-    """Return the times in seconds of ``count`` beats, ``tempo`` a minute, from ``first`` seconds on."""
+    """Return the times in seconds of ``count`` beats at ``tempo`` beats per minute, the first at ``first`` seconds."""
     return tuple(first + 60.0 / tempo * k for k in range(count))
 
 
@@ -45,7 +45,7 @@ def read_beats(path: Path) -> tuple[float, ...]:
     """Read the times of beats, in seconds: one beat per line, in the first column.
 
     Raises:
-        UserError: with the line, for a malformed file or times that do not increase.
+        UserError: for a malformed file or times that do not increase; the message contains the line.
     """
     beats: list[float] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -59,7 +59,7 @@ def read_beats(path: Path) -> tuple[float, ...]:
         if not 0.0 <= time <= MAX_BEAT_TIME:
             raise UserError(f"{where}: give the time of a beat in seconds, from 0 to {MAX_BEAT_TIME:g}")
         if beats and time <= beats[-1]:
-            raise UserError(f"{where}: is not after {beats[-1]:g}, the beat before; give beats in increasing order")
+            raise UserError(f"{where}: is not after the previous beat, {beats[-1]:g}; give beats in increasing order")
         beats.append(time)
     if not beats:
         raise UserError(f"{path}: no beats; give one time in seconds per line")
@@ -73,7 +73,7 @@ def parse_beats(text: str) -> dict[str, str] | Path:
     file.
 
     Returns:
-        The numbers by the names of a dance's parameters, or the path.
+        A dictionary from the names of a dance's parameters to the texts of their values, or the path.
     """
     words = text.replace(",", " ").split()
     if not words:
@@ -91,15 +91,15 @@ def next_span(
     flights: tuple[float, float],
     easiest: float,
 ) -> Span | None:
-    """Return the next jump, or None if no beat can be reached any more.
+    """Return the times of the next jump, or None if no remaining beat can be reached.
 
-    The jump lands on a beat later than ``after``. It leaves the ground on a beat or, where every beat is too early for
-    that, a half, a quarter or an eighth of the interval before the landing. Of all candidates, the cost ``wait +
-    |flight - easiest| / _FLIGHT_TOLERANCE`` is the lowest.
+    The jump lands on a beat later than ``after``. It takes off on a beat or, if all earlier beats are too early, half,
+    a quarter or an eighth of the interval before the landing. The result is the candidate with the lowest cost ``wait +
+    |flight - easiest| / _FLIGHT_TOLERANCE``, where ``wait`` is the time from ``after`` to the take-off.
 
     Args:
         beats: times of the beats, increasing, s.
-        after: time after which the jump lands, s.
+        after: current time, s.
         earliest: maps a flight time to the earliest possible take-off, s.
         flights: shortest and longest flight, s.
         easiest: preferred flight, s.

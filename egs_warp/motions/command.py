@@ -1,4 +1,4 @@
-"""Velocity commands for a live body: ``Drive``, and files of commands over time."""
+"""Velocity commands for a body: ``Drive``, and files that list commands with their times."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Drive:
     """Velocity command. A body that cannot move this fast moves as fast as it can.
 
     Raises:
-        ArgumentError: for a value that is not a number or exceeds 2 in magnitude.
+        ArgumentError: for a value that is not finite or exceeds 2 in magnitude.
     """
 
     forward: float = 0.0
@@ -46,7 +46,7 @@ class DrivePlan:
     """Sequence of commands, each valid until the time of the next; the last command is zero."""
 
     times: tuple[float, ...]
-    """Seconds from the start, increasing."""
+    """Times of the commands in seconds from the start, increasing."""
     commands: tuple[Drive, ...]
 
     def __post_init__(self) -> None:
@@ -75,7 +75,7 @@ def read_drive(path: Path) -> DrivePlan:
     """Read a file of lines ``time,forward,sideways,turn``.
 
     Raises:
-        UserError: with the line, for a malformed file.
+        UserError: for a malformed file; the message contains the line number.
     """
     times: list[float] = []
     commands: list[Drive] = []

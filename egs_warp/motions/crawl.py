@@ -1,7 +1,8 @@
-"""Crawl: a long body without feet moves by a wave of strides that runs along it, as a worm does.
+"""Crawl: a long body without feet moves by a wave of strides that runs along it, like a worm.
 
 Each cross-section stands for most of a round and is then carried to its next position, shortly after the section in
-front of it. Carried nodes are unloaded; standing nodes hold the ground for them. See docs/concepts/motions.md.
+front of it. Carried nodes are unloaded; friction at the standing nodes holds the body in place. See
+docs/concepts/motions.md.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ _CARRIED_FRACTION = 0.4
 MAX_STRAIN = 0.12
 """Largest strain of the body in a stride."""
 _SIDE_STRIDE, _SIDE_ACCELERATION = 0.25, 0.3
-"""Largest sideways stride, or motion of an end in a turn, in body heights, and the acceleration in g that it may take:
-with more, a round body would roll over."""
+"""Largest sideways stride, or displacement of an end in a turn, in body heights, and largest sideways acceleration in
+g: at larger values, a round body would roll over."""
 _MAX_CURVATURE = 5.77
 """Largest second derivative of ``smooth``, the path from 0 to 1 in a time of 1."""
 _MAX_SLOPE = 1.875
@@ -127,7 +128,7 @@ class Crawl:
 
     @property
     def seconds(self) -> float:
-        """Duration of all rounds in seconds, if none slides back."""
+        """Duration of all rounds in seconds, if the body does not slide back."""
         return self._round * (len(self.planar_poses) - 1)
 
     @property
@@ -162,8 +163,8 @@ class Crawl:
         )
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
-        step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
         body, axes, control, unit = self.body, self.ground.axes, self.control, self.body.time_unit
         local = self.ground.local(state.positions)
         if not self._is_over and (self._round_start is None or state.time - self._round_start >= self._round - 1e-9):
@@ -263,14 +264,13 @@ class Crawl:
         return pose
 
     def _posed_nodes(self, planar_pose: np.ndarray) -> np.ndarray:
-        """Return the nodes (N, 3) of the resting body moved to ``planar_pose`` (3,), as in
-        ``motions.route``."""
+        """Return the nodes (N, 3) of the resting body moved to ``planar_pose`` (3,), see ``motions.route``."""
         turn = Rotation.from_rotvec([0.0, 0.0, planar_pose[2]]).as_matrix()
         moved = np.array([*planar_pose[:2], self._slope @ planar_pose[:2]])
         return self._centre + moved + (self._standing - self._centre) @ turn.T
 
     def _no_slip_objective(self, report: StepReport, swings: np.ndarray) -> Objective:
-        """Return the objective that standing contacts do not slide."""
+        """Return the objective of zero sliding velocity at standing contacts."""
         contacts = report.contacts
         stands = ~swings[contacts.nearest_nodes]
         loads = np.where(stands, report.forces[:, 0], 0.0) / self.body.weight
@@ -285,7 +285,7 @@ class Crawl:
 
 def _slices(flat: np.ndarray) -> np.ndarray:
     """Return the coordinate (N,) in metres of points (N, 2) on the ground along their longest axis. It increases
-    forward or, if the body lies across, to the left."""
+    forward or, if the body lies across the forward direction, to the left."""
     middle = flat - flat.mean(axis=0)
     axis = np.linalg.svd(middle, full_matrices=False)[2][0]
     return middle @ (axis if axis.sum() > 0.0 else -axis)

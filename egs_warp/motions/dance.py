@@ -30,11 +30,11 @@ HOP_LENGTH = 0.15
 TWIST_ANGLE = np.radians(20.0)
 """Angle of a small twist to either side of the front, in radians."""
 BEAT_TOLERANCE = 0.04
-"""Seconds: an event within this of its beat is on the beat."""
+"""Largest error in seconds of an event that counts as on the beat."""
 _MIN_DISTANCE = 0.02
-"""Body heights: a shorter distance counts as a jump on the spot."""
+"""Distance in body heights up to which a jump counts as a jump on the spot."""
 _MIN_CONTACT_FORCE = 1e-6
-"""Share of the weight that the ground supports when the body touches it."""
+"""Normal force, as a share of the weight, above which the body touches the ground."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ MOVES = (
 
 @dataclass(frozen=True)
 class Event:
-    """Take-off or touch-down; seconds from the start of the dance."""
+    """Take-off or touch-down; times in seconds from the start of the dance."""
 
     event: str
     """``take-off``, the end of the last time step with a contact force, or ``touch-down``, the end of the first one
@@ -109,9 +109,9 @@ class _Step:
     move: str
     jump: Jump
     began: float
-    """Seconds from the start of the dance."""
+    """Start of the jump, in seconds from the start of the dance."""
     start: np.ndarray
-    """(3,) m, centre of mass at that time."""
+    """(3,) m, centre of mass at the time ``began``."""
 
     def __post_init__(self) -> None:
         self._airborne: list[tuple[float, float]] = []
@@ -129,8 +129,8 @@ class _Step:
         self._left, self._touched = None, now
 
     def flight(self) -> tuple[float, float] | None:
-        """Return the times of take-off and touch-down, those of the longest flight: brushing the ground in between is
-        no landing."""
+        """Return the times of take-off and touch-down of the longest flight, because brushing the ground is not a
+        landing; None if the body has not flown."""
         return max(self._airborne, key=lambda span: span[1] - span[0], default=None)
 
     def events(self) -> list[Event]:
@@ -145,7 +145,8 @@ class _Step:
 
 
 class Dance:
-    """Stand until the next jump is due, jump so high that it lands on a beat, and plan the next jump from there."""
+    """Stand until the next jump is due, jump to the height from which the body lands on a beat, and plan the next
+    jump."""
 
     def __init__(self, stance: Stance, beats: Sequence[float]) -> None:
         """Plan the first jump; ``beats`` are times in seconds from the start of the dance, increasing.
@@ -157,7 +158,7 @@ class Dance:
         self._start_stance, self._beats, self._step = stance, tuple(beats), stance.step
         self._share = sole_shares(body, stance.ground, stance.standing)
         self._gravity = float(np.linalg.norm(body.gravity))
-        # A landing is recorded at the end of its time step.
+        # A landing is recorded at the end of its time step, on average half a step late.
         self._lead_error, self._flight_error = 0.0, 0.5 * stance.step
         self._trial_jump = self._jump(stance, _Landing("jump"), PREFERRED_HEIGHT * body.height, turn=0.0)
         self._turn = (
@@ -172,9 +173,9 @@ class Dance:
         if self._next is None:
             shortest, longest = self._flights()
             raise UserError(
-                f"dance: none of the {len(beats)} beats can be reached: before the first jump it takes "
+                f"dance: none of the {len(beats)} beats can be reached: the first take-off is possible after "
                 f"{self._lead(PREFERRED_HEIGHT * body.height):.2f} s, "
-                f"and a jump spans {shortest:.2f} to {longest:.2f} s; give later beats, or a slower tempo"
+                f"and a flight takes {shortest:.2f} to {longest:.2f} s; give later beats, or a slower tempo"
             )
         self._plan = DancePlan(
             float(len(beats)), self._beats[-1], *self._flights(), turn_degrees=float(np.degrees(self._turn))
@@ -222,18 +223,19 @@ class Dance:
             )
         between = sum(step.span.parts > 1 for step in steps)
         if between:
-            notes.append(f"{between} jumps leave the ground between two beats, which are further apart than a jump")
+            notes.append(f"{between} jumps take off between two beats that are further apart than the longest jump")
         skipped = [f"{beat:.2f}" for beat in self._skipped()]
         if skipped:
             named = ", ".join(skipped[:10]) + (", ..." if len(skipped) > 10 else "")
             notes.append(
-                f"{len(skipped)} of {len(self._beats)} beats skipped, too near to the others or the last: {named} s"
+                f"{len(skipped)} of {len(self._beats)} beats skipped, "
+                f"too close to other beats or to the last one: {named} s"
             )
         return notes
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
-        step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
         self._started = state.time if self._started is None else self._started
         now = state.time - self._started
         step = self._current_step

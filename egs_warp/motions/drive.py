@@ -1,7 +1,7 @@
 """Walk, crawl or roll under commands that can change at every time step.
 
-Each step of a walk is planned when it begins, from the command at that moment. When the command is zero, the feet close
-and the body returns to its standing pose.
+Each step of a walk is planned when it begins, from the command at that moment. When the command is zero, the feet come
+together and the body returns to its standing pose.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def integrate_command(
 
 
 def _effort(command: Drive, limits: StepLimits, height: float) -> float:
-    """Return the number of longest steps per sqrt(H / g) that a ``command`` needs."""
+    """Return the number of steps of maximum length per sqrt(H / g) that a ``command`` needs."""
     aside = command.sideways / limits.side_fraction if limits.side_fraction > 0.0 else 0.0
     return height * float(np.hypot(command.forward, aside)) / limits.length + abs(command.turn) / limits.turn
 
@@ -104,7 +104,7 @@ class DrivenWalk(Walk):
         return integrate_command(planar_pose, self.command, time, self._step_limits, unit=unit, height=height)
 
     def _speed_factor(self, time: float) -> float:
-        """Return the speed relative to the nominal one that the command needs at the longest step."""
+        """Return the speed, relative to the nominal one, at which steps of maximum length satisfy the command."""
         effort = _effort(self.command, self._step_limits, self.body.height)
         return float(np.clip(time / self.body.time_unit * effort, 1.0, _MAX_SPEED_FACTOR))
 
@@ -138,7 +138,7 @@ class DrivenRoll(Roll):
         change *= min(1.0, max_change / max(float(np.linalg.norm(change)), 1e-12))
         self._velocity = self._velocity + change
         self._target = self._target + dt * self._velocity
-        # A body that is held back does not catch up.
+        # Keep the target close, so that a body that was held back does not speed up to catch up with it.
         off = self._target - com[:2]
         self._target = com[:2] + off * min(1.0, 0.1 * self.body.height / max(float(np.linalg.norm(off)), 1e-12))
         return ProfileSample(self._target - self._start, self._velocity, change / dt)
@@ -157,7 +157,7 @@ class DrivePlanRecord:
 
 @dataclass(frozen=True)
 class DriveOutcome:
-    """Displacement during a drive: body heights forward and to the left along the ground."""
+    """Displacement along the ground during a drive, forward and to the left, in body heights."""
 
     ahead: float
     left: float
@@ -187,8 +187,8 @@ class LiveDrive:
         return []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
-        step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
         motion = self._motion
         if isinstance(motion, Stand):
             if not self.command.is_zero and motion.is_at_rest:
@@ -203,7 +203,7 @@ class LiveDrive:
 
 
 def start_drive(stance: Stance, command: Drive) -> DrivenWalk | DrivenCrawl | DrivenRoll:
-    """Return the motion of a body at ``stance`` under commands; its type depends on the support."""
+    """Return the motion of a body that starts at ``stance`` with ``command``; its type depends on the support."""
     base = stance.base()
     if base is SupportKind.LYING:
         return DrivenCrawl(stance, command)
@@ -227,7 +227,7 @@ class ScriptedDrive:
 
     @property
     def expected_time(self) -> float:
-        """Expected duration in seconds, including the time to close the feet."""
+        """Expected duration in seconds, including the time to bring the feet together."""
         return self._plan.seconds + 6.0 * self._stance.body.time_unit
 
     def plan_record(self) -> DrivePlanRecord:
@@ -249,8 +249,8 @@ class ScriptedDrive:
         return DriveOutcome(float(moved[0]) / body.height, float(moved[1]) / body.height)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
-        step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
         self._start_time = state.time if self._start_time is None else self._start_time
         elapsed = state.time - self._start_time
         self._is_done = elapsed >= self._plan.seconds - 1e-9

@@ -1,4 +1,4 @@
-"""Heading policies of a jump. ``motions.twist`` has the one that turns."""
+"""Heading policies of a jump. ``motions.twist`` contains the one that turns."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from egs_warp.motions.stance import BalanceController, Measurement
 
 
 class HeadingPolicy(Protocol):
-    """Heading policy of a jump; angles in radians about up, counterclockwise as seen from above."""
+    """Heading policy of a jump; angles in radians about the up axis, counterclockwise as seen from above."""
 
     target_heading: float
     """Heading change from the start to the landing."""
@@ -39,7 +39,7 @@ class HeadingPolicy(Protocol):
             measurement: measured body.
             upright: (3,) rotation vector to the landing pose without the heading change.
             left: time until take-off, s.
-            flight_time: time of the flight, s, at whose end the body is upright and turned.
+            flight_time: duration of the flight, s; at its end the body is upright and has turned.
         """
         ...
 
@@ -72,7 +72,7 @@ class KeepHeading:
         left: float,
         flight_time: float,
     ) -> np.ndarray:
-        """Return the angular momentum (3,) that only brings the body upright."""
+        """Return the angular momentum (3,) in kg m^2/s that brings the body upright without a turn."""
         return measurement.inertia @ (upright / flight_time)
 
     def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: float) -> np.ndarray:

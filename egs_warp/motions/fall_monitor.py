@@ -18,16 +18,16 @@ from egs_warp.motions.sequence import BodyMotion, MotionSequence, MotionTask, St
 from egs_warp.motions.stance import sole_shares
 
 FALLEN_TILT = 60.0
-"""Degrees of tilt at which a body has fallen. A body on feet of half width w with its centre of mass h above them tips
-over beyond atan(w / h). For any body narrower than 3.5 h, that is below 60 degrees."""
+"""Tilt in degrees beyond which a body has fallen. A body on feet of half width w with its centre of mass h above them
+tips over beyond atan(w / h). For any body narrower than 3.5 h, that is below 60 degrees."""
 MIN_LYING_LOAD = 0.5
-"""Share of the weight: a body that the ground supports by more than this, and not at all at its base, lies on something
-else. Smaller loads come from brushing a riser or a wall."""
+"""Share of the weight above which a body lies on another part of its surface if its base carries nothing. Smaller loads
+come from brushing against a riser or a wall."""
 MAX_RECOVERIES = 3
 """Largest number of attempts to get up in one run."""
 FALLEN_TIME = 0.5
-"""Time in sqrt(H / g) for which one of the two conditions must hold on the ground. A body falls by H / 8 in this time;
-contacts in passing during a landing are shorter."""
+"""Time in sqrt(H / g) for which a body on the ground must satisfy one of the two conditions to count as fallen. A body
+falls by H / 8 in this time; brief contacts during a landing are shorter."""
 
 
 class FallMonitor:
@@ -103,12 +103,13 @@ class FallMonitor:
             before.got_up = True
         elif not getting_up.is_up:
             description = before.fall_note if before is not None else None
-            self.fallen = description or f"the body does not get up, at {self._last_time:.2f} s"
+            self.fallen = description or f"the body has not got up at {self._last_time:.2f} s"
 
     def _lying_note(self, state: BodyState, report: StepReport) -> str | None:
         """Describe how a body on the ground lies; None if it stands."""
         loads = report.forces[:, 0] / self._body.weight
-        # Rotation from the standing pose, as ``kabsch_rotation``: moments about the centre of mass sum to zero.
+        # Best-fit rotation from the standing pose. The moments sum to zero, so the centre of mass need not be
+        # subtracted.
         turn = nearest_rotation(state.positions.T @ self._moments)
         tilt = float(np.degrees(np.arccos(np.clip(self._up @ turn @ self._up, -1.0, 1.0))))
         if tilt > FALLEN_TILT:

@@ -19,21 +19,22 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.limbs import Limbs, Sections, find_limbs
 
 _SOLE_HEIGHT = 0.02
-"""Body heights: nodes of a foot at most this far above its lowest node are its sole."""
+"""Height in body heights above the lowest node of a foot up to which its nodes form the sole."""
 _FOOT_HEIGHT = 0.1
-"""Body heights: below this height, a foot and its leg are one."""
+"""Height in body heights below which a foot is not distinguished from its leg."""
 _RIGID_FRACTION = 0.15
 """Fraction of a leg, from the ground up, that moves rigidly with the foot."""
 _LYING_RATIO = 3.0
-"""Length in body heights and in own widths beyond which a base has no feet."""
+"""Length of a base, relative to its width and to the body height, beyond which the body lies and has no feet."""
 _MAX_ROUND_SOLE, _MAX_ROUND_DEVIATION = 0.6, 0.15
-"""Largest width of a ball's sole over the ball's width, and largest standard deviation over mean of the distance from
-its centre to its surface."""
+"""Largest width of a ball's sole relative to the ball's width, and largest ratio of the standard deviation to the mean
+of the distance from its centre to its surface."""
 _SIDE_HEIGHT, _MIDDLE_FRACTION, _BLEND_FRACTION = 0.3, 0.2, 0.6
-"""A base split into two feet: body heights up to which a side moves as a foot, fraction of the half width next to the
-middle that belongs to neither foot, and fraction of the half width over which the sides blend."""
+"""Parameters of a base that is split into two feet: height in body heights up to which a side moves as a foot, fraction
+of the half width next to the middle that belongs to neither foot, and fraction of the half width over which the sides
+blend."""
 FIRST_FOOT_ANGLE = np.radians(15.0)
-"""Angle in radians: a foot this far to the right of straight ahead still counts as the first."""
+"""Largest angle in radians to the right of straight ahead at which a foot still counts as the first."""
 
 
 class SupportKind(Enum):
@@ -59,7 +60,7 @@ class Foot:
     length: float
     """Height of the top of the leg, where it joins the body, above the ground, m."""
     height: float = 0.0
-    """Height of the lowest node of the foot above that of the body, m: the leg is shorter by this."""
+    """Height of the lowest node of the foot above the lowest node of the body, m; the leg is shorter by this height."""
     is_joined: bool = False
     """True if an edge of the cage connects the foot to another foot below the height at which their legs join."""
 
@@ -114,12 +115,12 @@ def find_feet(mesh: TetMesh, heights: np.ndarray, body_height: float, limbs: Lim
 
 
 def support_kind_of(mesh: TetMesh, heights: np.ndarray, foot_count: int) -> SupportKind:
-    """Return the kind of support of a body with ``foot_count`` feet, or limbs that reach the ground.
+    """Return the kind of support of a body.
 
     Args:
         mesh: cage of the body.
         heights: (N,) heights of the nodes above the ground, m.
-        foot_count: number of feet.
+        foot_count: number of feet, or of limbs that reach the ground.
     """
     if foot_count > 1:
         return SupportKind.FEET
@@ -133,7 +134,7 @@ def support_kind_of(mesh: TetMesh, heights: np.ndarray, foot_count: int) -> Supp
     edge = 0.5 * mean_edge_length(mesh)
     sole, _ = _sides(flat[heights < heights.min() + _SOLE_HEIGHT * size])
     away = np.linalg.norm(nodes - np.average(mesh.nodes, axis=0, weights=mesh.lumped_masses(1.0)), axis=1)
-    # A coarse cage is flat where the body is round.
+    # The flat faces of a coarse cage widen the sole of a round body.
     is_ball = (
         float(away.std()) < _MAX_ROUND_DEVIATION * float(away.mean())
         and sole - edge < _MAX_ROUND_SOLE * _sides(flat)[0]
@@ -143,7 +144,7 @@ def support_kind_of(mesh: TetMesh, heights: np.ndarray, foot_count: int) -> Supp
 
 def order_counterclockwise(positions: np.ndarray) -> np.ndarray:
     """Return the order (feet,) of the feet at ``positions`` (feet, 2), forward and left: counterclockwise as seen from
-    above, from straight ahead on."""
+    above, beginning straight ahead."""
     ahead, left = (positions - positions.mean(axis=0)).T
     return np.argsort((np.arctan2(left, ahead) + FIRST_FOOT_ANGLE) % (2.0 * np.pi))
 
@@ -191,8 +192,8 @@ def foot_loads(feet: Sequence[Foot], report: StepReport | None, weight: float) -
 
 
 def _are_joined(graph: csr_matrix, limbs: Sequence[np.ndarray], above: np.ndarray) -> list[bool]:
-    """Return for each limb, given by its nodes, True if an edge connects its lower half to another limb's; ``above``
-    (N,) are heights above the ground."""
+    """Return for each limb, given by its nodes, True if an edge connects its lower half to that of another limb;
+    ``above`` (N,) are heights above the ground."""
     lower = np.full(len(above), -1)
     for limb, nodes in enumerate(limbs):
         lower[nodes[above[nodes] <= 0.5 * above[nodes].max()]] = limb
@@ -210,7 +211,7 @@ def _up(mesh: TetMesh, heights: np.ndarray) -> np.ndarray:
 
 
 def _sides(flat: np.ndarray) -> tuple[float, float]:
-    """Return the length and width of coplanar points (n, 3): of the narrowest strip that contains them."""
+    """Return the length and width in metres of coplanar points (n, 3), along their principal axes."""
     middle = flat.mean(axis=0)
     across = np.linalg.svd(flat - middle, full_matrices=False)[2][:2]
     spans = np.ptp((flat - middle) @ across.T, axis=0)
@@ -218,7 +219,7 @@ def _sides(flat: np.ndarray) -> tuple[float, float]:
 
 
 def _connected_patches(graph: csr_matrix, mask: np.ndarray) -> np.ndarray:
-    """Return the (N,) label of the connected patch of each node in the mask ``mask`` (N,), -1 for the other nodes."""
+    """Return the (N,) label of the connected patch of each node in ``mask`` (N,), -1 for the other nodes."""
     nodes = np.flatnonzero(mask)
     labels = np.full(len(mask), -1)
     labels[nodes] = connected_components(graph[nodes][:, nodes], directed=False)[1]

@@ -1,6 +1,6 @@
 """Foothold planner of a walking body: nominal and measured footholds, and the region of support.
 
-Footholds are (x, y, z, heading): metres in the ground frame of the start, radians about up.
+Footholds are (x, y, z, heading): metres in the ground frame of the start, radians about the up axis.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ LANDED_HEIGHT = 0.005
 """Height above the ground, in body heights, below which a foot at the end of its swing counts as landed even without
 load."""
 _AMBIGUOUS_FRACTION = 0.3
-"""Fraction of the distance between two feet: contact points whose distances to both differ by less belong to neither.
-"""
+"""Smallest difference between the distances of a contact point to two feet, as a fraction of the distance between the
+feet; with less, the point belongs to neither."""
 
 
 class FootholdPlanner:
@@ -107,5 +107,5 @@ class FootholdPlanner:
 
 
 def _flat(angle: float) -> np.ndarray:
-    """Return the (2, 2) rotation matrix by ``angle`` radians."""
+    """Return the matrix (2, 2) of a rotation by ``angle`` radians."""
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

@@ -15,7 +15,7 @@ _TOLERANCE = 1e-4
 def integrate_rotation(inertia: np.ndarray, spin: np.ndarray, seconds: float) -> Rotation:
     """Integrate the rotation of a free body.
 
-    The angular momentum is constant. The spin need not be: off its principal axes the body wobbles.
+    The angular momentum is constant. The spin varies, and the body wobbles, unless it rotates about a principal axis.
 
     Args:
         inertia: (3, 3) kg m^2, world axes, at the start.

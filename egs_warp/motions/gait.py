@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class GaitTiming:
-    """Timing fractions of a gait."""
+    """Timing of a gait."""
 
     swing_time: float
     """Duration of a swing, in sqrt(H / g)."""
     double_support_time: float
-    """Time that all feet stand after a swing, in sqrt(H / g)."""
+    """Time for which all feet stand after a swing, in sqrt(H / g)."""
     transfer_start: float
     """Fraction of a swing at which the foot starts to move forward."""
     transfer_fraction: float
@@ -23,8 +23,8 @@ class GaitTiming:
 def feet_in_turn(count: int) -> tuple[tuple[int, ...], ...]:
     """Return the groups of ``count`` feet, numbered round the body, that swing together.
 
-    Two and three feet swing one by one. Of an even number, every other foot swings together, so that four feet trot on
-    the diagonals. Of an odd number above three, the last foot swings alone.
+    Two and three feet swing one by one. With an even number, every other foot swings at the same time, so that four
+    feet trot diagonally. With an odd number above three, the last foot swings alone.
     """
     if count <= 3:
         return tuple((foot,) for foot in range(count))
@@ -37,15 +37,16 @@ def feet_in_turn(count: int) -> tuple[tuple[int, ...], ...]:
 class Gait:
     """Gait of groups of feet that swing in turn.
 
-    Each swing sets a group down one step ahead of the last group's position; the last swings close the feet.
+    Each swing sets a group down one step ahead of the group that swung before it; the last swings bring the feet
+    together.
     """
 
     groups: tuple[tuple[int, ...], ...]
     step_count: int
     swing_time: float
-    """Seconds."""
+    """Duration of a swing, s."""
     double_time: float
-    """Time that all feet stand between two swings, s."""
+    """Time for which all feet stand between two swings, s."""
     lift: float
     """Height to which a foot is lifted, m."""
     window: tuple[float, float]
@@ -59,7 +60,7 @@ class Gait:
             feet: number of feet.
             step_count: number of steps.
             lift: height to which a foot is lifted, m.
-            timing: timing fractions.
+            timing: timing of the gait.
             time_unit: sqrt(H / g), s.
         """
         window = (timing.transfer_start, timing.transfer_start + timing.transfer_fraction)
@@ -86,8 +87,8 @@ class Gait:
         return min(swing + 1, self.step_count)
 
     def progress(self, swing: int, elapsed: float) -> float:
-        """Return the steps that the body should have completed ``elapsed`` seconds after ``swing`` began. The progress
-        is uniform; in the middle of a swing it equals the mean progress of the feet over the swing."""
+        """Return the number of steps that the body should have completed ``elapsed`` seconds after ``swing`` began. The
+        progress is uniform; in the middle of a swing it equals the mean progress of the feet over the swing."""
         done = swing + 1.0 - 0.5 * len(self.groups)
         return done + (elapsed - 0.5 * self.swing_time) / (self.swing_time + self.double_time)
 

@@ -1,5 +1,5 @@
-"""Choose how a body moves by its support: on feet or a flat base it walks, on its length it crawls, as a ball it
-rolls."""
+"""Choose the gait of a body from its support: on feet or a flat base it walks, lying along the ground it crawls, and as
+a ball it rolls."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from egs_warp.motions.turn import Turn
 from egs_warp.motions.walk import Walk
 
 _JUMP_HEIGHT = 0.3
-"""Height in body heights of the jump in which a ball turns about up."""
+"""Height in body heights of the jump in which a ball turns about the up axis."""
 
 
 def move_along(stance: Stance, route: Route, step_length: float, *, speed: float = 1.0) -> BodyMotion:
@@ -26,7 +26,7 @@ def move_along(stance: Stance, route: Route, step_length: float, *, speed: float
         speed: relative to the nominal speed.
 
     Raises:
-        UserError: if the body cannot move, or the route leads over a step of the ground.
+        UserError: if the body cannot move, or the route leads over a step in the ground.
     """
     base = stance.base()
     if base is SupportKind.LYING:

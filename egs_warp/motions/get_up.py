@@ -33,8 +33,8 @@ from egs_warp.motions.stand import Stand
 MAX_UPRIGHT_TILT = 15.0
 """Largest tilt in degrees of a body that has got up and stands at rest."""
 _ATTEMPTS = ((1.2, 0.1), (1.6, 0.1), (1.0, 0.05), (1.3, 0.2), (2.2, 0.1), (1.6, 0.2), (3.0, 0.15), (1.0, 0.15))
-"""For each attempt: its push relative to the one that would just suffice over ``_STROKE``, and the height in body
-heights by which the centre of mass aims above the top."""
+"""For each attempt, the push relative to the smallest sufficient push over ``_STROKE``, and the height in body heights
+by which the target of the centre of mass exceeds the top of the roll."""
 _STROKE = 0.35
 """Angle of the roll in radians over which a body can push itself up."""
 _PUSH_RAMP_TIME = 0.4
@@ -44,22 +44,22 @@ _MIN_TOP_RATE = 0.25
 _MAX_BRAKING = 4.0
 """Largest deceleration of the roll, in radians per H / g."""
 _BASE_HEIGHT = 0.3
-"""Nodes at most this far above the sole of the standing body, in body heights, belong to the base."""
+"""Height in body heights above the sole of the standing body up to which nodes belong to the base."""
 _EDGE_ANGLE = 35.0
-"""Degrees: the body rolls over the nodes that would touch first if the ground were steeper by this angle, or by half of
-the tilt of its base if that is less."""
+"""Angle in degrees that determines the edge over which the body rolls: its nodes would touch first if the ground were
+steeper by this angle, or by half of the tilt of the base if that is less."""
 _LANDED_ANGLE = 20.0
 """Largest tilt in degrees of a base that has landed."""
 _CROUCH_FRACTION = 0.75
 """Fraction of the standing height of the centre of mass at which the body is held until it is at rest. A low centre of
-mass has further to go before the body tips over the other side of its base."""
+mass must rise further before the body tips over the other side of its base."""
 _MIN_PUSH_DISTANCE = 0.1
-"""Contact points at least this far behind the edge, in body heights, can push."""
+"""Distance behind the edge, in body heights, beyond which contact points can push."""
 _MAX_LIE_TIME, _MAX_ROLL_TIME, _MAX_STRAIGHTEN_TIME = 6.0, 6.0, 10.0
 """Longest times in sqrt(H / g) to wait for rest while lying, to roll, and to come to rest on the feet."""
 _FAIL_TIME, _FAIL_RATE = 0.6, 0.05
-"""Time in sqrt(H / g) after which an attempt fails if the body rolls back, and the rate above which it does, in radians
-per sqrt(H / g)."""
+"""Time in sqrt(H / g) after which an attempt fails if the body rolls back, and the rate in radians per sqrt(H / g)
+above which it counts as rolling back."""
 _MAX_BASE_TILT = 60.0
 """Tilt of the base in degrees beyond which the body does not stand."""
 
@@ -98,7 +98,7 @@ class GetUpControl:
     pose: float = 0.05
     """Weight of the standing shape while the body pushes."""
     carried: float = 0.3
-    """Weight of the current shape once the body only rolls on."""
+    """Weight of the current shape once the body rolls on without pushing."""
     follow: float = 8.0
     """Rate in sqrt(g / H) at which the shape is approached."""
 
@@ -128,7 +128,7 @@ class GetUp:
         """Create the motion.
 
         Args:
-            stance: stance of the upright body, from before it fell.
+            stance: stance of the upright body before it fell.
             control: weights of the objectives.
 
         Raises:
@@ -180,7 +180,9 @@ class GetUp:
     def notes(self) -> list[str]:
         """Return messages for the user about a body that stays on the ground."""
         return (
-            [f"the body does not get up: it lies after {self.tries} tries"] if self.phase is GetUpPhase.GIVEN_UP else []
+            [f"the body does not get up: it still lies after {self.tries} tries"]
+            if self.phase is GetUpPhase.GIVEN_UP
+            else []
         )
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> GetUpOutcome:
@@ -188,8 +190,8 @@ class GetUp:
         return GetUpOutcome(float(self.tries))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
-        step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
         roll = self._measure(state, report)
         self._advance(state, report, roll)
         if self.phase in (GetUpPhase.CATCH, GetUpPhase.STAND):
@@ -280,7 +282,7 @@ class GetUp:
 
     def _roll_objectives(self, state: BodyState, roll: _Roll, dt: float) -> list[AnyObjective]:
         """Return objectives for the centre of mass and the spin of a body that rolls about its edge as a whole, at the
-        rate that takes it over the top. Once nothing pushes it any more, the rate is that of the free roll."""
+        rate that takes it over the top. Once no contact pushes it, the rate is that of the free roll."""
         body, control, unit = self.body, self.control, self._unit
         weight = body.mass * self._gravity
         elapsed = state.time - self._entered + dt

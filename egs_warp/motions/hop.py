@@ -29,7 +29,7 @@ class HopOutcome:
 
 
 class Hop:
-    """Jump whose feet aim at a point on the ground."""
+    """Jump in which the body steers its feet to a point on the ground."""
 
     def __init__(self, stance: Stance, square: np.ndarray, height: float) -> None:
         """Create the hop of the body that stands at ``stance``.
@@ -53,7 +53,7 @@ class Hop:
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the jump is at rest."""
+        """True if the body has landed and is at rest."""
         return self.jump.is_at_rest
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
@@ -91,10 +91,10 @@ class HopTargets:
         """Create the targets.
 
         Args:
-            distance: from target to target, m.
-            height: of each jump, m.
+            distance: distance between consecutive targets, m.
+            height: height of each jump, m.
             count: number of targets.
-            values: values that the report gives.
+            values: requested values, for the report.
         """
         self.distance, self.height, self.count, self.values = distance, height, count, values
         self._first: np.ndarray | None = None
@@ -102,7 +102,7 @@ class HopTargets:
         self._clearance = 0.0
 
     def parts(self) -> list[MotionTask]:
-        """Return the hops, for a sequence."""
+        """Return the hops as tasks of a sequence."""
         return [
             MotionTask("hop", {**self.values, "square": float(k)}, lambda stance, k=k: self._begin(stance, k))
             for k in range(1, self.count + 1)

@@ -35,31 +35,33 @@ STOP_RISE_FRACTION = 0.94
 """A thrust ends when the centre of mass would reach this fraction of the requested height in free flight: one more time
 step would exceed it."""
 AIM_RISE_FRACTION = 0.99
-"""Fraction of the requested height at which a thrust aims. It exceeds ``STOP_RISE_FRACTION``, so that a speed that is
-followed almost exactly ends the thrust."""
+"""Fraction of the requested height at which a thrust aims. It exceeds ``STOP_RISE_FRACTION``, so that a thrust whose
+speed falls slightly short of its target also ends."""
 FORWARD_TIME_FRACTION = 0.7
 """Fraction of the time of a thrust in which the forward speed is reached."""
 MAX_FOOTHOLD_OFFSET = 0.4
-"""Fraction of the footprint by which the foothold may differ from the capture point for the sake of the target."""
+"""Fraction of the footprint by which the foothold may differ from the capture point to be nearer to the target."""
 NARROW_SUPPORT, WIDE_SUPPORT = np.tan(np.radians([8.0, 17.0]))
-"""Distance of the edge of the footprint, relative to the height of the centre of mass: the foothold may not differ from
-the capture point below the first, and by ``MAX_FOOTHOLD_OFFSET`` from the second on."""
+"""Distances to the edge of the footprint, relative to the height of the centre of mass: up to the first, the foothold
+must equal the capture point; from the second on, it may differ by ``MAX_FOOTHOLD_OFFSET``."""
 STEP_CLEARANCE = 0.15
 """Clearance of the feet above a step, as a fraction of its height, before they swing forward."""
 APPROACH_RATE = 2.5
-"""Rate at which the pose of the landing is approached, times the time left in the air; slow at first."""
+"""Rate at which the pose of the landing is approached, multiplied by the remaining time in the air, so that the
+approach is slow at first."""
 TOUCH_DOWN_HEIGHT = 0.06
-"""Body heights: when the centre of mass is at most this far above its standing height, the first contact counts as the
+"""Height of the centre of mass above its standing height, in body heights, below which the first contact counts as the
 landing."""
 MAX_LANDING_TIME = 9.0
 """Longest landing in sqrt(H / g); after it, the body counts as at rest."""
 LANDING_RAMP_TIME = 0.5
 """Time in sqrt(H / g) from touch-down until balance and upright objectives have their full weight."""
 LANDING_LEAN_FRACTION = 0.7
-"""Fraction of the lean of the landing that the target rotation at touch-down leaves out: the body leans by this much
-less than its feet are ahead. On its heels it would be thrown over them."""
+"""Fraction of the lean of the landing that the target rotation at touch-down omits. A body that leaned as far as its
+feet are ahead would land on its heels and be thrown over them."""
 FLAT_SOLE_SPEED = 0.1
-"""Speed in sqrt(g H) towards the feet from which on the soles must be flat; slower bodies flatten them in part."""
+"""Speed in sqrt(g H) towards the feet from which on the soles must be flat; at lower speeds, they are flattened in
+part."""
 POSE_BLEND_TIME = 0.3
 """Time in sqrt(H / g) in which the pose of a phase replaces that of the previous one."""
 TAKE_OFF_RELEASE_TIME = 0.6
@@ -69,13 +71,13 @@ URGENT_CAPTURE_MARGIN = 0.5
 is balanced with more than the usual weights."""
 SWING_WEIGHT, BASE_SWING_WEIGHT = 5.0, 1.0
 """Weights of the soles in the air, for feet on legs and for a base: the soles swing forward under a body that keeps its
-shape. From the pose alone they land 0.03 body heights short, and a body with little support in front falls over them. A
-base is stiff: with a weight of 5, a monkey's jump takes half as much work again and lands no better."""
+shape. Controlled by the pose alone, they land 0.03 body heights short, and a body with little support in front falls
+over them. A base is stiff: with a weight of 5, a monkey's jump takes 50 % more work and lands no better."""
 AIRBORNE_POSE_WEIGHT, BASE_AIRBORNE_POSE_WEIGHT = 2.0, 0.3
 """Weights of the pose in the air, where nothing else can be steered and the feet have to reach their target. The first
 is for bodies on legs and for bodies that turn in the air, whose rotation depends on their width; the second is for a
-base without a turn. With 2, the muscles of a pawn do work of 0.76 m g H in the air, with 0.3 they do 0.30, and it lands
-as well."""
+base without a turn. With a weight of 2, the muscles of a pawn do 0.76 m g H of work in the air; with 0.3, they do 0.30
+m g H, and the pawn lands equally well."""
 
 
 class Jump:
@@ -126,7 +128,7 @@ class Jump:
             BodyPart.of(body, "sole", sole) for sole in ([foot.sole for foot in feet] if on_legs else [base])
         ]
         self._time_unit = float(np.sqrt(body.height / self.gravity))
-        # Feet on legs land at their target and stay there.
+        # Feet on legs stay where they touch down while the fall is stopped.
         self._landing_time = LANDING_TIME * self._time_unit if on_legs else 0.0
         ahead = ground.axes[0] @ (stance.contact_points - body.centre_of_mass(stance.standing)).T
         self._style = stance.style
@@ -206,8 +208,8 @@ class Jump:
         return [f"{phase.value} took too long: {named[phase]}" for phase in self._overran]
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
-        step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
         measurement = self.controller.measure(state, report)
         self.facing.update(measurement.heading + (self.facing.target_heading if self.is_airborne else 0.0))
         self._advance_phase(measurement, state.time, dt)
@@ -259,7 +261,8 @@ class Jump:
         return enough or not (measurement.in_contact or measurement.sole_height <= 0.0)
 
     def _has_landed(self, measurement: Measurement) -> bool:
-        """Return True if the body stands on the ground again; the first contact alone is too little to balance on."""
+        """Return True if the body stands on the ground again. If it is still high, a contact counts only if it carries
+        more than the weight."""
         low = measurement.com[2] < self._start_com[2] + TOUCH_DOWN_HEIGHT * self.body.height
         return measurement.in_contact and measurement.velocity[2] < 0.0 and (low or measurement.normal_load > 1.0)
 
@@ -283,8 +286,8 @@ class Jump:
         landing = self._landing_com(position)
         goal = np.array([landing[0], self._start_com[1]])
         needed = (goal - measurement.com[:2] - 0.5 * left * measurement.velocity[:2]) / (plan.flight_time + 0.5 * left)
-        # The ground forces lag behind the objectives. So the forward speed leads the upward speed, and the shortfall of
-        # the last time step is added, up to doubling the change.
+        # The ground forces lag behind the objectives. Therefore the forward speed leads the upward speed, and the
+        # shortfall of the last time step is added, up to doubling the change.
         change = (needed - measurement.velocity[:2]) * dt / max(FORWARD_TIME_FRACTION * left, dt)
         short = (
             self._requested_velocity - measurement.velocity[:2] if self._requested_velocity is not None else np.zeros(2)
@@ -312,7 +315,7 @@ class Jump:
         """Return the target spin (3,) in rad/s, ``left`` seconds before take-off.
 
         It blends from the spin that keeps the body in the pose ``standing`` (3, 3) to the one that takes it to the pose
-        ``landing`` (3, 3). The spin about up grows with the speed, because friction grows with the load.
+        ``landing`` (3, 3). The spin about the up axis grows with the speed, because friction grows with the load.
         """
         up, inertia = self.ground.axes[2], measurement.inertia
         upright = self.controller.turn_towards(measurement, landing)
@@ -331,18 +334,19 @@ class Jump:
         touch_down, left = self._touch_down(measurement, dt)
         heading = self.facing.heading - self.facing.target_heading
         pose = self.controller.over_base(touch_down, self._foothold(state, measurement, touch_down, left), heading)
-        # No force turns a body in the air; a foot that lags on the ground must not push any more.
+        # The target is the current spin: no force rotates a body in the air, and a foot that is still on the ground
+        # must not push.
         spin = np.linalg.solve(measurement.inertia, measurement.angular_momentum)
         pose = self.facing.airborne_pose(pose, measurement.angular_momentum, self.ground.axes[2], left)
         velocity = measurement.velocity - np.array([0.0, 0.0, self.gravity * dt])
-        # First, the strain of the thrust is released.
+        # The weights ramp up, so that the strain of the thrust is released first.
         share = self._ramp_or_full(state.time + dt, TAKE_OFF_RELEASE_TIME)
         objectives = self._body_objectives(state, measurement, velocity, pose, spin, dt, left=left, share=share)
         return [*objectives, *self._swing_objectives(state, pose, left, share)]
 
     def _swing_objectives(self, state: BodyState, pose: np.ndarray, left: float, share: float) -> list[AnyObjective]:
-        """Return objectives that move the soles to where the ``pose`` (3, 3) of the landing has them, in ``left``
-        seconds, with the fraction ``share`` of their weight."""
+        """Return objectives that move the soles to their positions in the ``pose`` (3, 3) of the landing within
+        ``left`` seconds, with the fraction ``share`` of their weight."""
         rate = min(APPROACH_RATE / left, 6.0 / self._time_unit)
         com, about = self.body.centre_of_mass(state.positions), Coordinates(np.eye(3), True)
 
@@ -360,13 +364,13 @@ class Jump:
         acceleration[:2] = self.controller.capture_acceleration(measurement, goal[:2])
         velocity = measurement.velocity + dt * acceleration
         heading = self.facing.landed_heading(self.controller, state.positions)
-        # Upright wherever the centre of mass is now: a pose that leans with it would not return.
+        # The pose is upright wherever the centre of mass is now: a pose that leaned with it would not bring it back.
         pose = self.controller.over_base(
             np.array([*goal[:2], measurement.com[2] + dt * velocity[2]]), measurement.foot_centre, heading
         )
         # While the body still moves towards its feet, it is rotated until the soles are flat, because a body on its
-        # heels cannot brake. With an upright mean rotation while it is sheared back, its sole would point up by half of
-        # the shear.
+        # heels cannot brake. If its mean rotation were upright while it is sheared backward, its sole would be tilted
+        # up by half of the shear.
         ahead = goal[:2] - measurement.com[:2]
         closing = float(ahead @ measurement.velocity[:2]) / max(float(np.linalg.norm(ahead)), 1e-9 * self.body.height)
         approach = min(max(closing / (FLAT_SOLE_SPEED * self.body.speed_unit), 0.0), 1.0)
@@ -435,7 +439,7 @@ class Jump:
         falling = max(left * self.gravity - measurement.velocity[2], 0.0)
         capture_time = stopping_time(self.controller.standing_height, falling, self.gravity, self._landing_time)
         capture = touch_down[:2] + measurement.velocity[:2] * capture_time + self.controller.base_offset
-        # The capture point stays within this part of the feet, wherever they land.
+        # Keep the capture point within this part of the footprint.
         low, high = (
             self._max_foothold_offset(edge) for edge in (self.controller.support_low, self.controller.support_high)
         )
@@ -472,14 +476,13 @@ class Jump:
             left: time until the landing of a body in the air, s; None on the ground.
             share: fraction of the weights of balance while landing, and of the pose in the air.
         """
-        # If a phase begins with another pose than the previous one ended with, the difference is blended over some time
-        # steps.
+        # If a phase begins with a pose that differs from the last one, the poses are blended over several time steps.
         pose = self._pose_before + self._ramp(state.time + dt, POSE_BLEND_TIME) * (pose - self._pose_before)
         rate = (pose - self._last_pose) / dt
         if np.abs(rate).max() > 5.0 / self._time_unit:
             rate = np.zeros((3, 3))
         self._last_pose = pose
-        # The ground is to stop the fall: with objectives for free fall, muscles would pull the feet away.
+        # The ground must stop the fall: objectives of free fall would make the muscles pull the feet away from it.
         falling = self.phase is JumpPhase.FLIGHT and float(com_velocity[2]) < 0.0
         follow, weights = 6.0 / self._time_unit, self.weights
         if self.phase is JumpPhase.LAND or falling:

@@ -10,15 +10,16 @@ import numpy as np
 from egs_warp.motions.style import Style
 
 EXIT_SPEED_FACTOR = 2.0
-"""Forward speed at the end of a crouch, in leans per crouch time: 2 is a constant acceleration, 0 a stop."""
+"""Forward speed at the end of a crouch, in leans per crouch time: 2 corresponds to a constant acceleration, 0 to a
+stop."""
 LEAN_FRACTION = 0.15
-"""Fraction of the jump distance by which the centre of mass moves forward before take-off. Over the middle of the feet,
-a forward push would turn the body backward."""
+"""Fraction of the jump distance by which the centre of mass moves forward before take-off. From the middle of the feet,
+a forward push would rotate the body backward."""
 MAX_LEAN = 0.35
-"""Largest lean, as a fraction of the distance from below the centre of mass to the front of the feet."""
+"""Largest lean, as a fraction of the horizontal distance from the centre of mass to the front of the feet."""
 MAX_CROUCH = 0.26
-"""Deepest crouch, as a fraction of the height of the centre of mass. Deeper crouches compress elements to a fifth; a
-higher jump thrusts harder instead."""
+"""Deepest crouch, as a fraction of the height of the centre of mass. Deeper crouches would compress elements to a fifth
+of their size, so a higher jump has a harder thrust instead."""
 THRUST_ACCELERATION = 2.8
 """Mean acceleration of a thrust, in g. A harder thrust needs a shallower crouch, which strains a stiff body less."""
 FRICTION_FRACTION = 0.9
@@ -29,8 +30,8 @@ MIN_CROUCH, MAX_EXTRA_CROUCH = 0.02, 0.02
 """Smallest depth of a crouch in body heights, without the displacement of half a time step, and largest additional
 depth for the sake of friction."""
 THRUST_START_FRACTION, THRUST_RAMP_FRACTION = 0.3, 0.4
-"""Fraction of its full strength with which a thrust starts, where the crouch has left it, and fraction of its duration
-until the full strength is reached."""
+"""Fraction of its full acceleration with which a thrust starts after the crouch, and fraction of its duration until the
+full acceleration is reached."""
 
 _MAX_EXTENSION, _MAX_EXTENSION_FRACTION = 0.04, 0.25
 """Rise of the centre of mass above its standing height at take-off: in body heights, and at most this fraction of the
@@ -93,7 +94,7 @@ class JumpPlan:
     @property
     def _onset(self) -> np.ndarray:
         """(3,) m/s, velocity at the end of the crouch: at rest vertically but already moving forward, because friction
-        can give little during the thrust."""
+        can transmit little during the thrust."""
         return np.array([min(EXIT_SPEED_FACTOR * self.lean / self.crouch_time, self.speed_forward), 0.0, 0.0])
 
     def crouch(self, start: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
@@ -185,7 +186,7 @@ def stopping_time(com_height: float, fall_speed: float, gravity: float, landing_
 
 def level_flight(jump_height: float, height: float, gravity: float) -> float:
     """Return the flight time in seconds of a body of ``height`` metres whose centre of mass rises by ``jump_height``
-    metres and that lands on the level of its start."""
+    metres and that lands at the level of its start."""
     rise = jump_height - min(_MAX_EXTENSION * height, _MAX_EXTENSION_FRACTION * jump_height)
     return float(np.sqrt(8.0 * rise / gravity))
 

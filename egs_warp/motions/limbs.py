@@ -27,10 +27,10 @@ _NEAR_GROUND = 0.07
 _MIN_LIMB_HEIGHT = 0.08
 """Smallest height in body heights over which a limb is separate from all others; a shorter one is a toe."""
 _MAX_MERGED_HEIGHT = 0.1
-"""Body heights, or a mean edge length of the mesh if that is more: limbs that are connected on the ground over a larger
-height are one base."""
+"""Height in body heights, or a mean edge length of the mesh if that is more; limbs that are connected on the ground
+over a larger height form one base."""
 _MAX_GAP = 0.5
-"""Gap between two limbs in body heights: a connection across a larger gap, however thin, is not a flaw of a capture."""
+"""Largest gap between two limbs, in body heights, across which a connection may be a flaw of the capture."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Sections:
     cage."""
 
     thickness: float
-    """Metres."""
+    """Thickness of a section, m."""
     levels: np.ndarray
     """(S,) int, level of each section, counted from the ground."""
     centres: np.ndarray
@@ -51,7 +51,7 @@ class Sections:
     section_from_node: np.ndarray
     """(N,) int, section that contains each node of the cage, or the nearest one."""
     melt: float
-    """Height in metres: parts that are connected on the ground over at most this height may be separate in reality."""
+    """Largest height in metres over which parts that are connected on the ground may be separate in reality."""
 
     @classmethod
     def of_mesh(cls, mesh: TetMesh, heights: np.ndarray) -> Sections:
@@ -143,7 +143,7 @@ class Limbs:
 
 
 def find_limbs(sections: Sections, nodes: np.ndarray) -> Limbs:
-    """Find the limbs that reach the ground, of a body whose cage has ``nodes`` (N, 3), m."""
+    """Find the limbs of a body that reach the ground; ``nodes`` (N, 3), m, are those of its cage."""
     graph = _Graph(sections)
     candidates = [graph.limbs_through(crossing) for crossing in graph.crossings()]
     bases = [graph.bases(limbs) for limbs in candidates]
@@ -156,7 +156,7 @@ def find_limbs(sections: Sections, nodes: np.ndarray) -> Limbs:
     for limb, base in zip(limbs, base_from_limb, strict=True):
         base_from_section[list(limb.own)] = base
     limb_from_node = base_from_section[sections.section_from_node]
-    # Feet that have merged are split half way between their limbs.
+    # Feet that have merged are split halfway between their limbs.
     shared = np.isin(sections.section_from_node, list(graph.shared_below(limbs)))
     ends = np.array([sections.centres[list(limb.lowest), :2].mean(axis=0) for limb in limbs])
     limb_from_node[shared] = base_from_limb[np.asarray(KDTree(ends).query(nodes[shared, :2])[1], int)]
@@ -168,7 +168,7 @@ def find_limbs(sections: Sections, nodes: np.ndarray) -> Limbs:
 
 
 def _score(limbs: Sequence[_Limb], base_from_limb: np.ndarray) -> int:
-    """Return the total number of levels over which two or more feet are separate; 0 for fewer feet."""
+    """Return the number of levels over which each foot is separate, summed over the feet; 0 for fewer than two feet."""
     apart = np.zeros(int(base_from_limb.max(initial=-1)) + 1, int)
     np.maximum.at(apart, base_from_limb, [limb.apart for limb in limbs])
     return int(apart.sum()) if len(apart) > 1 else 0
@@ -210,15 +210,15 @@ class _Graph:
         self.by_level = [np.flatnonzero(self.levels == level).tolist() for level in range(int(self.levels.max()) + 1)]
         size = len(self.by_level)
         self.height = size * sections.thickness
-        """Metres."""
+        """Height of the body, m."""
         self._near = int(np.ceil(_NEAR_GROUND * size))
         self._shortest = max(2, round(_MIN_LIMB_HEIGHT * size))
         self._melt = int(np.ceil(sections.melt / sections.thickness))
         self._bar = _MAX_GAP * self.height
 
     def crossings(self) -> list[list[int]]:
-        """Return, for each level with more than one, the sections that lead down to the ground and support the body
-        together."""
+        """Return, for each level that has two or more of them, the sections that lead down to the ground and support
+        the body."""
         grounded = [level <= self._near for level in self.levels]
         for level in self.by_level:
             for section in level:
@@ -268,7 +268,8 @@ class _Graph:
         """Follow the graph from each section until it meets another section's path.
 
         Returns:
-            For each section: levels covered, sections covered, the last of these, and True if it met another.
+            For each section, the number of levels that its path covers, the sections of the path, those on its last
+            level, and True if it met another path.
         """
         count = len(crossing)
         front: list[set[int]] = [{section} for section in crossing]

@@ -1,8 +1,8 @@
 """Pushes and gusts that act on a body while it moves.
 
 A text lists pushes, separated by commas. Each gives a time in seconds, an impulse in m sqrt(g H), a direction and,
-optionally, the height in body heights around which it acts; without it, it acts on all nodes alike. ``0.5 0.1 left, 1.2
-0.3 back 0.8`` are two pushes. With a time interval it is a gust: ``0.5-1.5 0.4 left``.
+optionally, the height in body heights around which it acts; without a height, it acts on all nodes alike. ``0.5 0.1
+left, 1.2 0.3 back 0.8`` are two pushes. A push with a time interval is a gust: ``0.5-1.5 0.4 left``.
 """
 
 from __future__ import annotations
@@ -28,24 +28,28 @@ DIRECTIONS: Mapping[str, tuple[float, float, float]] = {
 MAX_IMPULSE = 10.0
 """Largest impulse, m sqrt(g H); larger values are rejected as typing errors."""
 MAX_TIME = 600.0
-"""Seconds."""
+"""Largest time or duration, s."""
 HIT_HALF_HEIGHT = 0.25
 """Half height in body heights of the region of a body that a push hits."""
-_EXAMPLE = "such as 0.5 0.1 left; append 0.8 to hit at 0.8 of the height, or write 0.5-1.5 for 0.5 for a gust"
+_EXAMPLE = "such as 0.5 0.1 left; append 0.8 to hit at 0.8 of the height, or write 0.5-1.5 instead of 0.5 for a gust"
 
 
 @dataclass(frozen=True)
 class Push:
-    """Impulse at a time, or spread evenly over an interval."""
+    """Impulse at a time, or spread evenly over an interval.
+
+    Raises:
+        ArgumentError: for a value that is negative or too large.
+    """
 
     time: float
-    """Seconds from the start."""
+    """Time of the push, or start of the gust, in seconds from the start of the run."""
     impulse: np.ndarray
     """(3,) m sqrt(g H), forward, left and up relative to the body at the start."""
     height: float | None = None
     """Height above the sole in body heights around which the push acts; None: on all nodes alike."""
     duration: float = 0.0
-    """Seconds."""
+    """Duration of a gust, s; 0 for a push at a single time."""
 
     def __post_init__(self) -> None:
         for name, value, maximum in (
@@ -61,10 +65,10 @@ class Push:
         """Return a message for the user about the part that did not act before the run ended at ``end`` s; None if all
         of it did."""
         if self.time > end - _ROUNDING:
-            return f"the push at {self.time:g} s did not act: the run ended before"
+            return f"the push at {self.time:g} s did not act: the run ended earlier"
         over = self.time + self.duration
         return (
-            f"the gust until {over:g} s did not act in full: the run ended before" if over > end + _ROUNDING else None
+            f"the gust until {over:g} s did not act in full: the run ended earlier" if over > end + _ROUNDING else None
         )
 
     def share(self, time: float, dt: float) -> float:
@@ -76,7 +80,7 @@ class Push:
 
 
 _ROUNDING = 1e-9
-"""Seconds."""
+"""Tolerance of comparisons of times, s."""
 
 
 class PushKicks:
@@ -114,7 +118,7 @@ def kick_of(stance: Stance, impulse: np.ndarray, height: float | None) -> np.nda
 
 
 def read_pushes(text: str) -> tuple[Push, ...]:
-    """Parse a text of pushes, see the module.
+    """Parse pushes such as ``0.5 0.1 left, 1.2 0.3 back 0.8`` (module docstring).
 
     Raises:
         UserError: for the first mistake.

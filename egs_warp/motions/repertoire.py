@@ -32,7 +32,7 @@ _STEP = 0.1
 _REST_FRAMES = 120
 """Frames after the requested time within which a standing body that was pushed comes to rest."""
 _CLOSING_FRAMES = 300
-"""Frames after the last command of a drive within which the body closes its feet and stands."""
+"""Frames after the last command of a drive within which the body brings its feet together and comes to rest."""
 TRAJECTORY_TAIL = 200
 """Frames after the last key of a trajectory within which the body comes to rest."""
 
@@ -44,12 +44,12 @@ class MotionKind:
     parameters: tuple[Value, ...]
     """Parameters, in the order in which numbers without names are read."""
     build_tasks: Callable[[MotionRequest, float], list[MotionTask]]
-    """Build the tasks of a request, with all repeats, for a body of a height in metres. Raises ``UserError`` for an
-    invalid file."""
+    """Build the tasks of a request, with all repeats, for a body of the given height in metres. Raises ``UserError``
+    for an invalid file."""
     frames: Callable[[MotionRequest], int]
     """Number of frames at 60 Hz within which one repeat comes to rest; a longer motion is cut off."""
     file: str | None = None
-    """File that the motion needs, for messages."""
+    """Description of the file that the motion needs, for messages; None if it needs none."""
     jumps: bool = False
     """True if the motion consists of jumps, which have a style."""
     beats: bool = False
@@ -189,10 +189,10 @@ _STEP_LENGTH = Value("step_length", _STEP, 0.0, MAX_TARGET, "body heights", is_e
 _TURN_PATH = 2.5
 """Path length in body heights that takes as long as a full turn on the spot."""
 _FULL_TURN_PATH = 10.0
-"""Path length in body heights that takes as long as a full turn in a motion that only turns: a crawl takes four times
-as long."""
+"""Path length in body heights that takes as long as a full turn in a motion that only turns. It allows for a crawl,
+which takes four times as long."""
 _MIN_STEP = 0.02
-"""Step length of a narrow base in body heights; it sets the frames of a walk."""
+"""Step length of a narrow base in body heights, from which the time limit of a walk is computed."""
 
 
 def _length(name: str, default: float, *, is_exclusive: bool = False) -> Value:
@@ -247,7 +247,7 @@ MOTIONS: Mapping[str, MotionKind] = {
         (_STEP_LENGTH, _SPEED),
         _walk_along_tasks,
         lambda request: _frames_of_walk(_path_length(_path(request)) + 2.0 * _TURN_PATH, request),
-        file="a file of points, as walk along way.csv",
+        file="a file of points, as in walk along way.csv",
     ),
     "run": MotionKind(
         (Value("distance", 1.0, -MAX_TARGET, MAX_TARGET, "body heights"),),
@@ -263,7 +263,7 @@ MOTIONS: Mapping[str, MotionKind] = {
         (),
         _drive_tasks,
         lambda request: int(np.ceil(60.0 * _commands(request).seconds)) + _CLOSING_FRAMES,
-        file="a file of speeds, as drive speeds.csv",
+        file="a file of speeds, as in drive speeds.csv",
     ),
     "stand": MotionKind(
         (Value("seconds", 2.0, 0.0, 60.0, "seconds", is_exclusive=True),),
@@ -286,7 +286,7 @@ MOTIONS: Mapping[str, MotionKind] = {
         (),
         _trajectory_tasks,
         lambda request: int(np.ceil(60.0 * max(key.time for key in _keys(request)))) + TRAJECTORY_TAIL,
-        file="a file of key frames, as trajectory keys.json",
+        file="a file of key frames, as in trajectory keys.json",
     ),
 }
 

@@ -32,8 +32,8 @@ class MotionRequest:
     keys: tuple[Key, ...] | None = None
     """Key frames of a trajectory without a file."""
     begin: Callable[[Stance], BodyMotion] | None = None
-    """Creation of a motion that is not in the registry."""
+    """Function that creates a motion that is not in the registry."""
     seconds: float = 0.0
-    """Time limit of such a motion, s."""
+    """Time limit of a motion that is not in the registry, s."""
     style: Style | None = None
     """Style of its jumps, if it differs from that of the run."""

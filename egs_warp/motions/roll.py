@@ -128,8 +128,8 @@ class Roll:
         return RollOutcome(float(np.degrees(angle)))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
-        step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
         body, axes, control = self.body, self.ground.axes, self.control
         self._start_time = state.time if self._start_time is None else self._start_time
         local = self.ground.local(state.positions)
@@ -158,8 +158,8 @@ class Roll:
         ]
 
     def _profile_sample(self, com: np.ndarray, elapsed: float, dt: float) -> ProfileSample:
-        """Return the target of the centre of mass, now at ``com`` (3,), at the end of the time step, relative to its
-        start."""
+        """Return the target of the centre of mass, now at ``com`` (3,), at the end of the time step, relative to the
+        start of the motion."""
         return self.table.at(elapsed + dt)
 
     def _is_over(self, com: np.ndarray, elapsed: float) -> bool:
@@ -172,7 +172,7 @@ class Roll:
     ) -> np.ndarray:
         """Limit a desired acceleration along the ground to what the ground can provide.
 
-        A ball that rolls without slipping gains speed and spin at once. Its weight provides m r (1 + I / (m r^2)) a,
+        A ball that rolls without slipping gains speed and spin together: m r (1 + I / (m r^2)) a equals the weight
         times the distance from the centre of pressure to the centre of mass.
 
         Args:
@@ -202,12 +202,12 @@ class Roll:
         return (com[:2] - uphill - np.clip(pressed, middle - reach, middle + reach)) * self._gravity / lever
 
     def _height_above_ground(self, com: np.ndarray) -> float:
-        """Return the height in metres of ``com`` (3,) above the ground, ground coordinates."""
+        """Return the height in metres above the ground of ``com`` (3,), given in ground coordinates."""
         return float(com[2] - self._slope @ com[:2])
 
     def _radius(self, positions: np.ndarray) -> float:
-        """Return the distance in metres from the centre of mass to the ground, of the body at rest rotated as the nodes
-        at ``positions`` (N, 3)."""
+        """Return the distance in metres from the centre of mass to the ground for the undeformed body in the
+        orientation of the nodes at ``positions`` (N, 3)."""
         turn = kabsch_rotation(self.body.node_mass, self._rest, positions - self.body.centre_of_mass(positions))
         normal, up = self.ground.surface_normal, self.ground.axes[2]
         return float(-(self._rest @ (turn.T @ normal)).min() / (normal @ up))

@@ -1,6 +1,6 @@
 """Routes: the planar pose of a body after each step.
 
-A planar pose is (x, y, heading): metres forward and to the left of the start, radians about up. See
+A planar pose is (x, y, heading): metres forward and to the left of the start, radians about the up axis. See
 docs/concepts/motions.md.
 """
 
@@ -20,7 +20,7 @@ MAX_STEPS = 400
 _MAX_GAP = 1.0
 """Largest distance in body heights between two points of a path."""
 _ROUNDING = 1e-9
-"""Metres."""
+"""Tolerance of rounding errors, in metres or steps."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class StepLimits:
     displacement."""
 
     length: float
-    """Metres."""
+    """Largest displacement, m."""
     turn: float
-    """Radians."""
+    """Largest rotation, rad."""
     side_fraction: float = 0.0
-    """Fraction of ``length`` that a step may go sideways."""
+    """Largest sideways displacement as a fraction of ``length``."""
     faces_travel: bool = True
-    """True if the body turns to the direction in which it moves; a body that rolls or crawls moves in any direction as
-    it is."""
+    """True if the body turns to the direction in which it moves; a body that rolls or crawls moves in any direction
+    without turning."""
 
 
 Route = Callable[[StepLimits], np.ndarray]
@@ -64,11 +64,11 @@ def turn_route(angle: float) -> Route:
 
 
 def path_route(points: np.ndarray) -> Route:
-    """Return the route through ``points`` (n, 2), metres, to the last. A body that faces its direction of travel turns
-    on the spot where it must.
+    """Return the route through ``points`` (n, 2), m, that ends at the last one. A body that faces its direction of
+    travel turns on the spot where necessary.
 
     Raises:
-        UserError: when called, if the path takes more than ``MAX_STEPS`` steps.
+        UserError: when the route is called, if the path takes more than ``MAX_STEPS`` steps.
     """
 
     def planar_poses(limits: StepLimits) -> np.ndarray:
@@ -107,7 +107,7 @@ def read_path(path: Path) -> np.ndarray:
         (n, 2) body heights forward and to the left of the start.
 
     Raises:
-        UserError: with the line, for a malformed file or a gap.
+        UserError: for a malformed file or a gap; the message contains the line.
     """
     points: list[Sequence[float]] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):

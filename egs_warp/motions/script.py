@@ -25,7 +25,7 @@ from egs_warp.motions.sequence import BodyMotion, MotionTask, Stance
 from egs_warp.motions.style import Style, read_style
 
 MotionFactory: TypeAlias = "Callable[[Stance], BodyMotion]"
-"""Creation of a motion from the stance of a body."""
+"""Function that creates a motion from the stance of a body."""
 MAX_MOTIONS = 100
 _MAX_SECONDS = 3600.0
 """Largest time limit of a motion of the user's own class, s."""
@@ -68,7 +68,7 @@ class Script:
         if text is None:
             return Style()
         if not any(kind_of_request(request).jumps for request in self.requests):
-            raise ArgumentError("style", f"nothing jumps in {self.name!r}; add a jump, hop, twist or dance")
+            raise ArgumentError("style", f"no motion of {self.name!r} jumps; add a jump, hop, twist or dance")
         return read_style(text)
 
     def parts(self, height: float) -> list[MotionTask]:
@@ -79,13 +79,13 @@ class Script:
         """Return the expected duration in seconds of each motion, for a body that stands at ``stance``.
 
         Raises:
-            UserError: the error that a later motion would raise when it starts.
+            UserError: if one of the motions cannot start.
         """
         return [part.begin(stance).expected_time for part in self.parts(stance.body.height)]
 
 
 def motion(text: str, *, beats: str | None = None, **values: float | None) -> Script:
-    """Parse motions.
+    """Parse motions into a script.
 
     Args:
         text: one motion by name (``jump``, ``hop``, ``twist``, ``walk``, ``walk to``, ``turn`` ...), several as a line
@@ -124,7 +124,7 @@ def drive_script(*steps: tuple[float, Drive]) -> Script:
     valid from then on; the last command is zero.
 
     Raises:
-        ArgumentError: for times that do not increase.
+        ArgumentError: for times that do not increase, and for a last command that is not zero.
     """
     plan = DrivePlan(tuple(time for time, _ in steps), tuple(command for _, command in steps))
     return Script((MotionRequest("drive", {}, drive=plan),))
@@ -134,7 +134,7 @@ def keyframe_script(*keys: Key) -> Script:
     """Return a script of one ``trajectory`` through ``keys``, in the order of their times.
 
     Raises:
-        UserError: for the first malformed key, by its number.
+        UserError: for the first malformed key; the message contains its number.
     """
     return Script((MotionRequest("trajectory", {}, keys=checked_keys(keys)),))
 
@@ -143,12 +143,14 @@ def own_script(name: str, begin: MotionFactory, *, seconds: float) -> Script:
     """Return a script of one motion of your own class.
 
     Args:
-        name: name in reports and of the video, which is not that of a built-in motion.
-        begin: returns the motion of a body from its stance; each ``BodyMotion`` has the attributes of the protocol.
-        seconds: time limit of a body of 1 m; the motion is cut off after it.
+        name: name of the motion in reports and of the video file; not that of a built-in motion.
+        begin: function that returns the motion of a body from its stance; the motion has the attributes of
+            ``BodyMotion``.
+        seconds: time limit for a body of 1 m, s; the motion is cut off after it.
 
     Raises:
-        ArgumentError: for a name that is taken or not that of a file, and for a time limit that is not positive.
+        ArgumentError: for a name that is taken or unsuitable for a file, and for a time limit that is not positive or
+            too long.
     """
     if not re.fullmatch(r"[\w -]{1,60}", name) or name in MOTIONS:
         raise ArgumentError(
@@ -191,7 +193,7 @@ def _from_words(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRe
 def _from_json(path: Path, defaults: Mapping[str, Any]) -> list[MotionRequest]:
     entries = parse_json(read_text(path), path)
     if not isinstance(entries, list) or not entries:
-        raise UserError(f'{path}: give a list of motions, as [{{"motion": "jump"}}]')
+        raise UserError(f'{path}: give a list of motions, such as [{{"motion": "jump"}}]')
     requests = []
     for number, entry in enumerate(entries, start=1):
         where = f"{path}, motion {number}"
@@ -218,9 +220,9 @@ def _own_style(text: Any, name: str, where: str) -> Style | None:
     if text is None:
         return None
     if not isinstance(text, str):
-        raise UserError(f'{where}: "style" is {json.dumps(text)}; give a text, as "heavy" or "squash=1.2"')
+        raise UserError(f'{where}: "style" is {json.dumps(text)}; give a text, such as "heavy" or "squash=1.2"')
     if not _kind(name, where).jumps:
-        raise UserError(f"{where}: {name} does not jump, and has no style; jump, hop, twist and dance do")
+        raise UserError(f"{where}: {name} does not jump, so it has no style; jump, hop, twist and dance have one")
     try:
         return read_style(text)
     except UserError as error:

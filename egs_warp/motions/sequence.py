@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 _MIN_ROLL_ANGLE = 30.0
-"""Degrees: a ball whose up axis has tilted by less than this has turned about up; otherwise it has rolled."""
+"""Tilt of the up axis of a ball, in degrees, from which on it has rolled; with less, it has turned about the up
+axis."""
 REMAINING_TIME_FRACTION = 0.03
-"""Fraction of the elapsed time that is the estimate of the remaining time of a motion that takes longer than expected.
-"""
+"""Estimated remaining time of a motion that takes longer than expected, as a fraction of the elapsed time."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,8 @@ class Stance:
         return replace(self, ground=under, standing=positions.copy(), contact_points=touching)
 
     def moved_to(self, positions: np.ndarray) -> Stance:
-        """Return the same stance, rotated about up and moved to the feet of ``positions`` (N, 3)."""
+        """Return the same stance, rotated about the up axis and moved to the feet of the nodes at ``positions`` (N,
+        3)."""
         share = sole_shares(self.body, self.ground, self.standing)
         angle = heading_between(self.standing, positions, share, self.ground)
         feet, moved = share @ self.standing, share @ positions
@@ -113,8 +114,8 @@ class Stance:
 
     def landing(self, target: JumpTarget) -> JumpTarget:
         """Return ``target`` with the rise of the surface ahead of the feet. The jump clears it by at least half of the
-        requested height. The target is unchanged without a surface, and ahead of one that is higher than the jump, such
-        as a wall or a lintel."""
+        requested height. The target is unchanged if there is no surface, or if it is higher than the jump, such as a
+        wall or a lintel."""
         feet, up = sole_shares(self.body, self.ground, self.standing) @ self.standing, self.ground.axes[2]
         ahead = surface_above(self.solids, feet + target.distance * self.ground.axes[0], up)
         rise = ahead - surface_above(self.solids, feet, up)
@@ -143,8 +144,8 @@ class BodyMotion(Protocol):
         ...
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
-        step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
         ...
 
     def plan_record(self) -> DataclassInstance:
@@ -158,7 +159,7 @@ class BodyMotion(Protocol):
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> DataclassInstance | None:
         """Return quantities of this motion beyond those measured for all motions; ``first`` and ``last`` are indices
-        into ``time``."""
+        into ``trajectory.time``."""
         ...
 
     def notes(self) -> list[str]:
@@ -190,7 +191,7 @@ class MotionTask:
 
 
 class MotionSequence:
-    """Run ``parts`` one after the other from ``stance``; itself a motion."""
+    """Sequence that starts from ``stance`` and runs the motions of ``parts`` one after the other."""
 
     def __init__(self, stance: Stance, parts: Sequence[MotionTask]) -> None:
         self._stance = stance

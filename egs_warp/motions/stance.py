@@ -27,7 +27,7 @@ SHEAR_BASIS = np.einsum("ki,j->kij", np.eye(3)[:2], np.eye(3)[2])
 _PIN_STIFFNESS = 1e6
 """Stiffness that pins a node, relative to the largest entry of the stiffness matrix."""
 SOLE_HEIGHT = 0.06
-"""Body heights: nodes at most this far above a standing body's lowest node are its sole."""
+"""Height in body heights above a standing body's lowest node up to which its nodes form the sole."""
 REST_SPEED = 0.03
 """Speed of the centre of mass, in sqrt(g H), below which a standing body counts as slow."""
 REST_TIME = 0.3
@@ -106,7 +106,7 @@ class GroundFrame:
 
         Args:
             plane: the ground.
-            forward: (3,) forward direction; it is projected to the horizontal.
+            forward: (3,) forward direction; it is projected onto the horizontal plane.
             below: (3,) m, point above the origin of the frame.
             up: (3,) unit, against gravity; None uses the normal of the plane.
         """
@@ -117,7 +117,7 @@ class GroundFrame:
         return cls(np.stack([flat, np.cross(vertical, flat), vertical]), origin, plane.normal)
 
     def rotation_about_up(self, angle: float) -> np.ndarray:
-        """Return the rotation matrix (3, 3) by ``angle`` radians about up, world axes."""
+        """Return the matrix (3, 3) of a rotation by ``angle`` radians about the up axis, world axes."""
         return Rotation.from_rotvec(angle * self.axes[2]).as_matrix()
 
     def local(self, points: np.ndarray) -> np.ndarray:
@@ -130,7 +130,7 @@ class GroundFrame:
 
 
 class RestDetector:
-    """Detector of rest: the centre of mass has been slow for long enough."""
+    """Detector of rest: the centre of mass has been slow for ``REST_TIME``."""
 
     def __init__(self, body: SoftBody) -> None:
         gravity = float(np.linalg.norm(body.gravity))
@@ -156,7 +156,8 @@ class RestDetector:
 
 
 class BalanceController:
-    """Balance controller with affine poses of the rest shape: stretch along up, bulging across it, shear by the lean.
+    """Balance controller with affine poses of the rest shape: stretch along the up axis, bulging across it, and shear
+    by the lean.
 
     See docs/concepts/motions.md.
     """
@@ -184,7 +185,7 @@ class BalanceController:
         self.base_offset = self._base(local) - body.centre_of_mass(local)[:2]
         if len(contact_points) == 0:
             raise UserError(
-                "body: no point of it is on the ground at the start; check the ground", check=("plane", "up")
+                "body: no point of the body is on the ground at the start; check the ground", check=("plane", "up")
             )
         footprint = ground.local(contact_points)[:, :2] - body.centre_of_mass(local)[:2]
         self.support_low = np.minimum(footprint.min(axis=0), -0.01 * body.height)
@@ -262,7 +263,7 @@ class BalanceController:
         return float(np.linalg.norm(self.body.gravity)) / self._com_height(measurement.com)
 
     def _capture(self, measurement: Measurement) -> np.ndarray:
-        """Return the capture point (2,): over it, the feet could bring the body to rest."""
+        """Return the capture point (2,), over which the feet could bring the body to rest."""
         return measurement.com[:2] + (measurement.velocity[:2] + measurement.angular_velocity_term) / np.sqrt(
             self._pendulum_rate2(measurement)
         )
@@ -281,7 +282,7 @@ class BalanceController:
         return (self._sole_share @ local)[:2]
 
     def measure(self, state: BodyState, report: StepReport | None) -> Measurement:
-        """Measure the body; ``report`` is of the previous time step."""
+        """Measure the body; ``report`` is that of the previous time step."""
         local = self.ground.local(state.positions)
         forces = report.forces[:, 0].sum() if report is not None else self.body.weight
         rotation = self._rotation(state.positions)
@@ -316,7 +317,7 @@ class BalanceController:
         return kabsch_rotation(self.body.node_mass, self.arms, arms)
 
     def sole_heading(self, positions: np.ndarray) -> float:
-        """Return the angle in radians about up by which the feet alone are rotated from the standing pose."""
+        """Return the angle in radians about the up axis by which the feet alone are rotated from the standing pose."""
         return heading_between(self.arms, positions, self._sole_share, self.ground)
 
     def over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
@@ -325,13 +326,13 @@ class BalanceController:
         return self._leaning(com, base, heading, SHEAR_BASIS)
 
     def bent_over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
-        """Return the pose (3, 3) of ``over_base`` for a body that bends naturally: rotated by as much as strains it
+        """Return the pose (3, 3) of ``over_base`` for a body that leans by bending, with the rotation that strains it
         least."""
         return self._leaning(com, base, heading, self._bending)
 
     def _leaning(self, com: np.ndarray, base: np.ndarray, heading: float, leans: np.ndarray) -> np.ndarray:
-        """Return the pose (3, 3), world axes: stretch along up, bulging that conserves half of the volume change,
-        ``leans`` (2, 3, 3) per unit of lean, then a rotation by ``heading`` radians."""
+        """Return the pose (3, 3), world axes: stretch along the up axis, bulging that cancels half of the volume
+        change, ``leans`` (2, 3, 3) per unit of lean, then a rotation by ``heading`` radians."""
         turn = Rotation.from_rotvec([0.0, 0.0, heading]).as_matrix()
         lean = (com[:2] - base + turn[:2, :2] @ self.base_offset) / self.standing_height
         lean = lean * min(1.0, 0.5 / max(float(np.linalg.norm(lean)), 1e-9))
@@ -431,16 +432,16 @@ def _share_in_cone(push: np.ndarray, load: np.ndarray, normal: np.ndarray, frict
 
 
 def sole_shares(body: SoftBody, ground: GroundFrame, standing: np.ndarray) -> np.ndarray:
-    """Return weights (N,), sum 1, whose mean is the centre of the feet: the mass of the nodes near the ground at
-    rest."""
+    """Return weights (N,) with sum 1 whose weighted mean of the nodes is the centre of the feet: the masses of the
+    nodes near the ground at rest."""
     heights = standing @ ground.surface_normal
     mass = body.node_mass * (heights < heights.min() + SOLE_HEIGHT * body.height)
     return mass / mass.sum()
 
 
 def heading_between(before: np.ndarray, after: np.ndarray, share: np.ndarray, ground: GroundFrame) -> float:
-    """Return the best-fit rotation angle in radians about up from points ``before`` (N, 3) to ``after`` (N, 3),
-    weighted by ``share`` (N,)."""
+    """Return the best-fit rotation angle in radians about the up axis from points ``before`` (N, 3) to ``after`` (N,
+    3), weighted by ``share`` (N,)."""
     flat_before, flat_after = ((x - share @ x) @ ground.axes[:2].T for x in (before, after))
     sine = share @ (flat_before[:, 0] * flat_after[:, 1] - flat_before[:, 1] * flat_after[:, 0])
     return float(np.arctan2(sine, share @ (flat_before * flat_after).sum(axis=1)))

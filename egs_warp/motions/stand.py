@@ -35,13 +35,13 @@ class StandOutcome:
 
 
 class Stand:
-    """Balance over the feet where they are, as after a jump, for any time."""
+    """Balance over the feet where they are, for example after a jump, for any length of time."""
 
     def __init__(self, stance: Stance, *, at_rest: bool = True, crouch: float = 1.0) -> None:
         """Create the motion of the body that stands at ``stance``.
 
         Args:
-            stance: stance.
+            stance: stance at the start.
             at_rest: True if the previous motion has ended at rest.
             crouch: target height of the centre of mass as a fraction of its standing height.
         """
@@ -65,8 +65,8 @@ class Stand:
         return []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
-        step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
         measurement = self.controller.measure(state, report)
         slow = bool(np.linalg.norm(measurement.velocity) <= REST_SPEED * np.sqrt(self._gravity * self.body.height))
         self._is_resting = self._rest_detector.update(measurement.velocity, state.time) or (self._is_resting and slow)
@@ -93,7 +93,7 @@ class Stand:
 
 
 class StandFor:
-    """Stand for some seconds, then until the body is at rest."""
+    """Stand for ``seconds`` seconds, and then until the body is at rest."""
 
     def __init__(self, stance: Stance, seconds: float) -> None:
         self.seconds, self._stand, self._stance = seconds, Stand(stance), stance
@@ -135,8 +135,8 @@ class StandFor:
         return []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
-        step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
         self._started = state.time if self._started is None else self._started
         self._is_over = state.time - self._started >= self.seconds - 1e-9
         return self._stand.objectives(state, report, dt)

@@ -14,12 +14,16 @@ MIN_FACTOR, MAX_FACTOR = 0.5, 2.0
 
 @dataclass(frozen=True)
 class Style:
-    """Factors of a jump, relative to the default."""
+    """Factors of a jump, relative to the default.
+
+    Raises:
+        ArgumentError: for a factor below 0.5 or above 2.
+    """
 
     anticipation: float = 1.0
     """Depth and duration of the crouch."""
     squash: float = 1.0
-    """Time in which a landing is stopped, and thereby its compression."""
+    """Time in which the fall is stopped on landing, which determines the compression."""
     timing: float = 1.0
     """Duration of crouch and thrust: below 1 they are quick and hard."""
 
@@ -66,4 +70,4 @@ def read_style(text: str) -> Style:
 
 
 def _usage() -> str:
-    return f"one of {', '.join(PRESETS)}, or numbers such as anticipation=1.3, of {', '.join(_NAMES)}"
+    return f"one of {', '.join(PRESETS)}, or numbers such as anticipation=1.3 for {', '.join(_NAMES)}"

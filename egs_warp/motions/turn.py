@@ -19,9 +19,10 @@ HEADING_TOLERANCE = np.radians(8.0)
 """Largest heading error in radians of a landing after which no further jump follows."""
 MAX_JUMPS = 5
 CORRECTION_RATE = 1.0 / 3.0
-"""Fraction of the largest turns whose landing misses by more than ``HEADING_TOLERANCE``, which takes another jump."""
+"""Fraction of turns of the largest size that need another jump, because the landing misses by more than
+``HEADING_TOLERANCE``."""
 PYRAMID_FRICTION_RATIO = 0.79
-"""Tangential force of a friction pyramid with four edges relative to Coulomb's cone, mean over all directions."""
+"""Tangential force of a friction pyramid with four edges relative to Coulomb's cone, averaged over all directions."""
 MAX_TURN_FRACTION = 0.8
 """Fraction of the largest possible turn that one jump requests."""
 
@@ -70,7 +71,7 @@ class Turn:
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the current jump is at rest."""
+        """True if the body has landed from the current jump and is at rest."""
         return self.jumps[-1].is_at_rest
 
     def plan_record(self) -> TurnPlan:
@@ -88,14 +89,14 @@ class Turn:
         """Return messages for the user about missed targets and the number of jumps."""
         notes = [note for jump in self.jumps for note in jump.notes()]
         if not self._one_jump:
-            notes.append(f"friction allows a turn of {np.degrees(self.max_turn_per_jump):.0f} degrees a jump")
+            notes.append(f"friction allows a turn of {np.degrees(self.max_turn_per_jump):.0f} degrees per jump")
         if len(self.jumps) > 1:
             notes.append(f"turned in {len(self.jumps)} jumps")
         return notes
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
-        step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
         result = self.jumps[-1].objectives(state, report, dt)
         jump = self.jumps[-1]
         self._remaining_after_jump = (
@@ -114,7 +115,7 @@ class Turn:
         return result
 
     def _next_turn(self) -> float:
-        """Return the turn in radians of one of the equal jumps that the remaining turn takes."""
+        """Return the turn in radians of one of the equal jumps that the remaining turn needs."""
         return self._remaining_turn / float(np.ceil(abs(self._remaining_turn) / self.max_turn_per_jump))
 
     def _next_jump(self, state: BodyState) -> Jump:
@@ -132,8 +133,8 @@ def largest_turn(jump: Jump, stance: Stance) -> float:
     """Return the largest turn in radians that friction under the feet allows in one jump as planned
     (docs/concepts/motions.md).
 
-    The friction impulse about up is mu r_eff times the impulse of the normal forces, m (v_z + g t); r_eff is the mean
-    distance of the contact points from their middle.
+    The friction impulse about the up axis is mu r_eff times the impulse of the normal forces, m (v_z + g t); r_eff is
+    the mean distance of the contact points from their middle.
     """
     plan, body, up = jump.plan, stance.body, stance.ground.axes[2]
     arms = (stance.contact_points - stance.contact_points.mean(axis=0)) @ stance.ground.axes[:2].T

@@ -20,7 +20,7 @@ SPIN_FACTOR = 1.15
 """Factor on the spin of the thrust: muscles fall short of the objective, and the wide body in the air turns more
 slowly."""
 LANDING_SLIDE_ANGLE = np.radians(5.0)
-"""Angle in radians by which the feet slide on while friction stops the spin on landing."""
+"""Angle in radians by which the feet continue to slide while friction stops the spin on landing."""
 MAX_WIDTH = 1.15
 """Largest width of the body in the air relative to standing; 1 / ``MAX_WIDTH`` is the smallest."""
 
@@ -53,7 +53,8 @@ class TurnHeading:
         """Return the angular momentum (3,) in kg m^2/s with which the body in the air turns upright and by the
         remaining heading change.
 
-        The body flies in about its standing shape, so the standing inertia applies, not that of the crouch.
+        In the air, the body has approximately its standing shape, so the standing inertia applies, not that of the
+        crouch.
         """
         up, rotation = controller.ground.axes[2], measurement.rotation
         inertia = rotation @ self._standing_inertia @ rotation.T
@@ -77,7 +78,7 @@ class TurnHeading:
         return controller.sole_heading(positions)
 
     def _remaining_turn(self) -> float:
-        """Return the remaining turn in radians until touch-down; the feet then slide on."""
+        """Return the remaining turn in radians until touch-down; the feet then continue to slide."""
         return (
             self.target_heading
             - np.sign(self.target_heading) * min(LANDING_SLIDE_ANGLE, abs(self.target_heading))

@@ -26,7 +26,7 @@ class Value:
         """Return ``value`` as a number within the bounds.
 
         Raises:
-            UserError: if it is not; the message begins with ``where``.
+            UserError: if ``value`` is not a number within the bounds; the message begins with ``where``.
         """
         try:
             number = math.nan if isinstance(value, bool) else float(value)

@@ -24,7 +24,7 @@ class ProfileSample:
 
 @dataclass(frozen=True)
 class VelocityProfile:
-    """Velocity profile over n points, from rest to rest; constant before and after."""
+    """Velocity profile over n points, from rest to rest; the position is constant before and after."""
 
     points: np.ndarray
     """(n, 2) m."""
@@ -37,7 +37,7 @@ class VelocityProfile:
     def from_path(cls, path: np.ndarray, *, speed: float, acceleration: float) -> VelocityProfile:
         """Compute the profile along a path.
 
-        Past a corner, the speed is at most ``speed`` times the cosine of the change of direction; at a right angle or
+        At a corner, the speed is at most ``speed`` times the cosine of the change of direction; at a right angle or
         more, the body stops.
 
         Args:

@@ -72,12 +72,13 @@ class Walk:
         Args:
             stance: stance at the start.
             route: route to follow.
-            step_length: step length in metres; it is shortened to what the body can do.
+            step_length: step length in metres; it is reduced to the longest step that the body can make.
             speed: relative to the nominal speed.
             control: weights and gains.
 
         Raises:
-            UserError: for a body without a foot, and for a route over a step of the ground.
+            UserError: for a body without feet or a flat base, for too little friction to turn the base, and for a route
+                over a step in the ground.
         """
         body = stance.body
         feet, posture = select_posture(stance)
@@ -185,8 +186,8 @@ class Walk:
         return footfalls(trajectory, self.feet, stride=self._stride(), first=first, last=last)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is of the previous
-        step."""
+        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is that of the
+        previous step."""
         body, axes, control = self.body, self.ground.axes, self.control
         local = self.ground.local(state.positions)
         self._advance_phase(local, report, state.time)
@@ -240,8 +241,8 @@ class Walk:
             self._enter(WalkPhase.REST, time, local)
 
     def _plan_swing(self, swing: int, local: np.ndarray) -> None:
-        """Plan ``swing``, which starts with the nodes at ``local`` (N, 3): repeat a step that slipping feet have lost.
-        A walk under commands (``motions.drive``) extends its route here."""
+        """Plan ``swing``, which starts with the nodes at ``local`` (N, 3): repeat a step that was lost because feet
+        slipped. A walk under commands (``motions.drive``) extends its route here."""
         if (
             self._repeated_steps < self._requested_steps
             and self._mean_lag(local) > MAX_LAG
@@ -299,7 +300,7 @@ class Walk:
         self._footprints[index] = self._planner.landed_foothold(index, local, planned)
 
     def _progress(self, phase: WalkPhase, swing: int, elapsed: float) -> float:
-        """Return the steps that the body should have completed ``elapsed`` seconds into a phase."""
+        """Return the number of steps that the body should have completed ``elapsed`` seconds into a phase."""
         if phase is WalkPhase.SHIFT:
             return 0.0
         if phase in (WalkPhase.GATHER, WalkPhase.REST):
@@ -388,7 +389,7 @@ class Walk:
         """Return the target velocity (3,) in m/s of the centre of mass at the end of the time step.
 
         A centre of pressure under the standing feet steers the divergent component of motion to its plan. The next
-        footprints catch the error that this leaves.
+        footprints compensate for the remaining error.
         """
         com = self.body.centre_of_mass(local)
         pressure, divergent = self._plan.at(elapsed)
@@ -427,7 +428,7 @@ class Walk:
     ) -> Objective:
         sole, part, control = self.feet[index].sole, self._parts[index], self.control
         now, then = (self._planner.sole(index, footholds[index]) for footholds in (before, after))
-        # The sole that stood is not as flat as the one that swings. Straightened in the first time step, it would drag.
+        # A loaded sole is strained, and would drag if it were straightened in the first time step.
         share = control.foot_share * self.gait.steering_progress(elapsed / self.gait.swing_time)
         velocity = (share * (now - local[sole]) + then - now) / dt
         return part_nodes(self.body, part, velocity @ self.ground.axes, self._posture.swing_weight)
@@ -439,7 +440,8 @@ class Walk:
         )
 
     def _no_slip_objectives(self, report: StepReport, elapsed: float) -> Objective:
-        """Return the objective that standing feet do not slide, nor lifted feet before they move forward."""
+        """Return the objective of zero sliding velocity at standing feet, and at lifted feet until they move
+        forward."""
         contacts = report.contacts
         ahead = self.swinging if elapsed > self.gait.transfer_start_time else ()
         stands = ~np.isin(foot_of_contact(self.feet, contacts), ahead)

@@ -34,8 +34,9 @@ class WalkPlan:
 
 @dataclass(frozen=True)
 class WalkControl:
-    """Weights of the objectives (speeds are measured in units of sqrt(g H)) and gains of the feedback. With ten times
-    the weights, muscles do three times as much work, against each other; with a tenth of them, a box falls."""
+    """Weights of the objectives (speeds are measured in units of sqrt(g H)) and gains of the feedback. With weights ten
+    times as large, muscles do three times as much work, against each other; with a tenth of the weights, a box
+    falls."""
 
     spin: float = 60.0
     pose: float = 0.1

@@ -1,6 +1,6 @@
 """Posture of a walking body: its pose as a function of its footholds and its centre of mass.
 
-Footholds are (x, y, z, heading): metres in the ground frame of the start, radians about up.
+Footholds are (x, y, z, heading): metres in the ground frame of the start, radians about the up axis.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from egs_warp.motions.stance import SHEAR_BASIS
 MAX_STEP_PER_LEG = 0.5
 """Longest step relative to the shortest leg's length."""
 MAX_SIDE_STEP = 0.5
-"""Longest sideways step of a body on legs relative to its longest step: one leg comes up to the next."""
+"""Longest sideways step of a body on legs relative to its longest step; a leg then reaches the next one at most."""
 MAX_TURN = float(np.radians(15.0))
 """Largest turn of one step on legs, in radians."""
 MAX_FOOT_LIFT = 0.03
 """Largest lift of a foot, in body heights."""
 LEGGED_TIMING, ROCKING_TIMING = GaitTiming(0.94, 0.78, 0.2, 0.6), GaitTiming(0.94, 0.55, 0.1, 0.75)
-"""Gait timing at nominal speed, on legs and on a single base. A body that pivots about its sides uses most of a swing
-for it; the less time it stands on both sides, the less it leans from one to the other."""
+"""Gait timing at nominal speed, on legs and on a single base. A body that pivots about its sides does so during most of
+a swing; the less time it stands on both sides, the less it sways from one to the other."""
 MAX_PIVOT, MAX_ROLL = 0.45, 0.05
 """Largest angles in radians by which a body on one base pivots about one side, and tips to lift the other. With larger
 angles it would throw itself off the side on which it stands."""
@@ -36,21 +36,20 @@ COUNTER_ROTATION = 1.5
 """Counter-rotation: reduction of the rotation of a node per body height above the base, relative to the rotation of the
 base. The less of the body rotates with the base, the less friction the pivot needs."""
 MIN_TURNED_INERTIA = 0.2
-"""Smallest fraction of the moment of inertia that friction is assumed to rotate, whatever the counter-rotation."""
+"""Smallest fraction of the moment of inertia that friction is assumed to rotate, for any counter-rotation."""
 MAX_SWING_FACTOR = 1.25
-"""Largest factor on the swing time for a pivot for which friction under one side does not suffice in the nominal time.
-"""
+"""Largest factor on the swing time of a pivot that friction under one side cannot complete in the nominal time."""
 MAX_FRICTION_USE = 1.2
-"""Peak torque about up of a pivot relative to the friction torque under one side; it may slip a little (measured on
-monkey and pawn)."""
+"""Peak torque about the up axis of a pivot relative to the friction torque under one side; it may slip a little
+(measured on monkey and pawn)."""
 _MAX_CURVATURE = 5.77
 """Largest second derivative of ``smooth``, the path from 0 to 1 of a foot in a time of 1."""
 MIN_LEG_LENGTH = 0.2
 """Shortest legs in body heights; with shorter ones, a body moves as on a single base."""
 MAX_SEQUENTIAL_FEET = 4
-"""Number of feet from which on several feet stand while one swings."""
+"""Number of feet from which on a body is balanced during a swing, so that short legs suffice."""
 _SOLE_HEIGHT = 0.02
-"""Body heights: nodes of a base at most this high are its sole."""
+"""Height in body heights up to which nodes of a base form its sole."""
 _MAX_LEAN = 0.5
 """Largest lean: horizontal displacement per height."""
 
@@ -112,8 +111,9 @@ class LeggedPosture:
 
 
 class RockingPosture:
-    """Posture on a single base: its two sides pivot and tip the body, as one walks a wardrobe. The body leans over
-    them, and its upper part rotates the other way, as shoulders do over hips."""
+    """Posture on a single base: its two sides alternately pivot and tip the body, like a wardrobe that is walked across
+    a floor. The body leans over them, and its upper part rotates in the opposite direction, like shoulders over
+    hips."""
 
     def __init__(self, stance: Stance, feet: Sequence[Foot]) -> None:
         """Create the posture of the body that stands at ``stance``; ``feet`` are the two sides of its base."""
@@ -134,11 +134,12 @@ class RockingPosture:
         self.lift = min(MAX_ROLL * self._width, MAX_FOOT_LIFT * body.height)
         self.capture_range = 0.0
         self.com_weight = 300.0  # if friction does not suffice for both, balance has priority over turning
-        self.swing_weight = 2.0  # half of the body swings: faster, it pushes back the rest, which falls behind its feet
-        self.stance_weight = 5.0  # what turns about a patch slides at its edges
+        self.swing_weight = 2.0  # half of the body swings; a faster swing pushes the rest back, behind its feet
+        self.stance_weight = 5.0  # a patch that rotates on the ground slides at its edges
 
     def _inertia(self, node_mass: np.ndarray) -> float:
-        """Return the angular momentum in kg m^2 about up through the centre of mass per rad/s of the base."""
+        """Return the angular momentum about the up axis through the centre of mass per rotation rate of the base, kg
+        m^2."""
         moments = node_mass * ((self._arms - self._com)[:, :2] ** 2).sum(axis=1)
         return float(max(moments @ self._turning, MIN_TURNED_INERTIA * moments.sum()))
 
@@ -172,7 +173,7 @@ class RockingPosture:
         strain[:, 2] *= 1.0 + (com[2] - upright[2]) / self._com[2]
         leant = self._arms @ strain.T
         centre = self._share @ leant
-        # Rotate less than the base, about up through the centre of mass, which is unchanged.
+        # Rotate the upper body less than the base, about the up axis through the centre of mass, which stays in place.
         less = (self._turning - 1.0) * (np.remainder(yaw - heading + np.pi, 2.0 * np.pi) - np.pi)
         cos, sin = np.cos(less)[:, None], np.sin(less)[:, None]
         level = (leant - centre)[:, :2]

@@ -18,7 +18,7 @@ _MULTIPLIER_PENALTY = 0.05
 def attachment_rows(mesh: TetMesh, points: np.ndarray, *, radius: float | None = None) -> sp.csr_matrix:
     """Attach points to the nodes around them.
 
-    The weights are a Gaussian of width ``radius`` times each node's part of the volume (so that the force density, not
+    The weights are a Gaussian of width ``radius`` times each node's share of the volume (so that the force density, not
     the force, is smooth), tilted exponentially so that the weighted centroid B p lies at the point wherever the nodes
     around it allow it (local maximum-entropy weights, Arroyo and Ortiz 2006). Distances along the mesh's edges exclude
     nodes across the gap between two limbs.
@@ -26,7 +26,7 @@ def attachment_rows(mesh: TetMesh, points: np.ndarray, *, radius: float | None =
     Args:
         mesh: cage at rest.
         points: (P, 3) m.
-        radius: distance of the attached nodes, m; default: the mean edge length.
+        radius: width of the Gaussian, m; nodes within twice this distance are attached; default: the mean edge length.
 
     Returns:
         Rows B (P, N) with B >= 0 and row sums 1.

@@ -13,12 +13,12 @@ from egs_warp.muscles.skeleton import Branch
 _RADIUS_FRACTION = 0.7
 """Distance of fibres from the branch's axis, as a fraction of the distance to the surface.
 
-Fibres near the surface bend the branch well; fibres further inside are attached well.
+Fibres near the surface bend the branch more; fibres further inside are attached better.
 """
 _MAX_FLARE = 1.6
 """Maximum distance from the axis to the assumed surface, in section radii.
 
-It keeps the fibres of a leg from spreading over the seat above it.
+It prevents the fibres of a leg from spreading into the seat above it.
 """
 
 
@@ -37,7 +37,7 @@ class FibreDensity:
     hoops: int
     """Circular fibres."""
     helices: int
-    """Oblique fibres of each hand."""
+    """Oblique fibres of each handedness."""
 
     def segment_count(self) -> int:
         """Return the number of segments of the whole branch."""
@@ -85,7 +85,7 @@ class BranchCylinder:
         self.up = up
         tangents = np.array([self.tangent(station) for station in self.stations])
         helpers = np.stack([forward, np.cross(up, forward), up])
-        # The helper most orthogonal to the branch gives the most stable frame; the margin prefers `forward`.
+        # The helper most orthogonal to the branch gives the most stable frame; the added 0.1 prefers `forward`.
         worst = np.abs(tangents @ helpers.T).max(axis=0) + np.array([0.0, 0.1, 0.1])
         self.helper = helpers[int(np.argmin(worst))]
 
@@ -145,7 +145,7 @@ class BranchCylinder:
         return centre + _RADIUS_FRACTION * reach * outwards
 
     def fibres(self, name: str) -> list[Fibre]:
-        """Return all fibres of the branch; their ``max_force`` is each one's part of the section's area, m^2."""
+        """Return all fibres of the branch; the ``max_force`` of each is its share of the section's area, m^2."""
         count = self.detail.azimuths
         middles = 0.5 * (self.stations[1:] + self.stations[:-1])
         shares = np.array([np.pi * self.radius(middle) ** 2 for middle in middles]) / count

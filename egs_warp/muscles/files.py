@@ -1,10 +1,10 @@
 """Muscles from a user's JSON file.
 
 A file is an object with ``fibres``, a list of entries. Lengths are in units of the capture. Every entry has ``name``
-and ``kind`` and, by kind,
+and ``kind`` and, depending on the kind,
 
 * ``longitudinal``: ``from``, ``to`` (points [x, y, z]) and ``segments`` (default 4): a straight fibre;
-* ``polyline``: ``points``, two or more: one segment between each two;
+* ``polyline``: ``points``, two or more: one segment between consecutive points;
 * ``circular``: ``centre``, ``axis``, ``radius`` and ``segments`` (default 8, at least 3): a closed hoop about the axis;
 * ``radial``: ``centre``, ``axis``, ``radius`` and ``count`` (default 2): diameters across the axis, one fibre each.
 
@@ -95,7 +95,8 @@ def _fibres(
     frame: BodyFrame,
     body_weight: float,
 ) -> tuple[list[Fibre], float]:
-    """Return the fibres of one entry with their mirror images, and their stiffness in N/m, NaN if it gives none."""
+    """Return the fibres of one entry with their mirror images, and their stiffness in N/m, NaN if the entry contains
+    none."""
     where = f"{path}: fibre {index + 1}"
     if not isinstance(entry, dict):
         raise UserError(f"{where} is not an object; write {{...}} with a name and a kind")

@@ -14,7 +14,8 @@ from scipy.sparse.linalg import splu
 from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 
 _BASE_FRACTION = 0.02
-"""Base: nodes lower than this fraction of the body's height above its lowest point (or 0.4 edges, if more)."""
+"""Height up to which nodes belong to the base, above the body's lowest point, as a fraction of the body's height; 0.4
+edge lengths if that is more."""
 
 
 def base_nodes(mesh: TetMesh, up: np.ndarray) -> np.ndarray:

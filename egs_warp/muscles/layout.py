@@ -47,7 +47,7 @@ def lay_fibres(
         mesh: cage at rest, m.
         skeleton: its curve skeleton.
         max_force: maximum force of a segment, N.
-        max_stress: bounds the stress of all longitudinal fibres of a section together, Pa.
+        max_stress: maximum stress of all longitudinal fibres of a section together, Pa.
         max_segments: maximum number of segments; default: 112, or 120 for a body on three legs or more.
     """
     edge = mean_edge_length(mesh)

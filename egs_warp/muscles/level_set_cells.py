@@ -43,7 +43,8 @@ class LevelSetCells:
         return cls(tet_from_cell, level_from_cell, touching, np.stack([below, below + 1], axis=1), first_cell, first)
 
     def holding(self, tets: np.ndarray, level_field: np.ndarray) -> np.ndarray:
-        """Return the cell (S,) in each of ``tets`` (S,) that contains the point of field value ``level_field``."""
+        """Return the cell (S,) in each of ``tets`` (S,) that contains the point with the field value ``level_field``
+        (S,)."""
         last_level = np.append(self.first_cell[1:], self.count) - self.first_cell + self.first_level - 1
         level = np.clip(np.floor(level_field).astype(int), self.first_level[tets], last_level[tets])
         return self.first_cell[tets] + level - self.first_level[tets]

@@ -21,7 +21,7 @@ _MIN_AUTOMATIC_EDGES = 0.25
 """Minimum segment length of an automatic fibre, in mean edges; ends of shorter segments share their nodes."""
 _MAX_STRESS, _MAX_LEG_STRESS = 2.0, 1.0
 """Maximum stress of all longitudinal fibres of a section together, in units of E, and that of a body on three legs or
-more. Slender legs collapse with more, and saturate in the thrust and on landing with 0.4."""
+more. The muscles of slender legs crush them with more than 1, and saturate in the thrust and on landing with 0.4."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def attach_fibres(
         mesh: cage at rest, m.
         fibres: at least one, with unique names.
         max_strain: s_max.
-        radius: distance of the attached nodes, m; default: the mean edge length.
+        radius: width of the attachments, m, see ``attachment_rows``; default: the mean edge length.
 
     Raises:
         UserError: there is no fibre, a name occurs twice, or the attached ends of a segment coincide.
@@ -164,7 +164,7 @@ def automatic_muscles(
 
     Args:
         mesh: cage at rest, m.
-        plane_normal: (3,) away from the ground.
+        plane_normal: (3,) normal of the ground plane, pointing to the body.
         body_weight: N.
         height: extent along the normal, m.
         strength: F_max of a segment, in body weights.

@@ -38,7 +38,7 @@ def check_picture_name(path: Path) -> None:
         UserError: the extension is not that of an image format, or the folder does not exist.
     """
     if path.suffix.lower() not in _EXTENSIONS:
-        raise UserError(f"{path}: not the name of a picture; let it end in one of {', '.join(_EXTENSIONS)}")
+        raise UserError(f"{path}: not the name of an image; let it end in one of {', '.join(_EXTENSIONS)}")
     if not path.parent.is_dir():
         raise UserError(f"{path}: its folder does not exist; create {path.parent} first")
 
@@ -46,7 +46,7 @@ def check_picture_name(path: Path) -> None:
 def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarray, front: np.ndarray) -> None:
     """Write an image of the body from the front, its left and above, with fibres coloured by kind.
 
-    The ticks are body heights from the middle of the body along the ground, and from its lowest point upwards.
+    The axes show body heights, measured along the ground from the middle of the body and upwards from its lowest point.
 
     Args:
         mesh: cage at rest.
@@ -94,13 +94,13 @@ def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarra
     image = np.asarray(canvas.buffer_rgba())[..., 2::-1]
     written, data = cv2.imencode(path.suffix, image)
     if not written:
-        raise UserError(f"{path}: the picture could not be encoded; give another ending")
+        raise UserError(f"{path}: the image could not be encoded; choose another extension")
     with atomic_write(path) as temporary:
         temporary.write_bytes(data.tobytes())
 
 
 class _BodyAxes:
-    """Transform of points to ahead, left and up of the body, in body heights."""
+    """Transform of points to the coordinates ahead, left and up of the body, in body heights."""
 
     def __init__(self, mesh: TetMesh, *, up: np.ndarray, front: np.ndarray) -> None:
         up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
@@ -112,7 +112,7 @@ class _BodyAxes:
         self._origin = np.append(0.5 * (low + high)[:2], low[2])
         self._height = float(high[2] - low[2])
         self.low, self.high = self(mesh.nodes).min(axis=0), self(mesh.nodes).max(axis=0)
-        """(3,) Bounds of the body."""
+        """(3,) smallest and largest coordinates of the body."""
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Transform ``points`` (..., 3)."""
@@ -120,7 +120,8 @@ class _BodyAxes:
 
 
 def _draw_view(axes: Axes, local: _BodyAxes, mesh: TetMesh, muscles: MuscleSet, directions: np.ndarray) -> None:
-    """Draw the body seen with ``directions`` (3, 3), rows right, up and towards the viewer, ahead, left and up."""
+    """Draw one view of the body. The rows of ``directions`` (3, 3) are the directions to the right, up and towards the
+    viewer in the coordinates ahead, left and up."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     # The ticks show these coordinates; one that increases to the left is drawn on an inverted axis.

@@ -1,4 +1,5 @@
-"""Nodal forces of muscle activations (Eq. 7): an energy for the step's equation, columns for the quadratic program.
+"""Nodal forces of muscle activations (Eq. 7): an energy for the equation of motion, and columns for the quadratic
+program.
 
 The kernel is in ``egs_warp.kernels.muscles.impulses``.
 """
@@ -36,7 +37,7 @@ def segment_vectors(rows: sparse.csr_matrix, positions: np.ndarray) -> tuple[np.
 
 
 def shortening(muscles: MuscleSet, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return by how much segments are shorter at positions ``end`` (N, 3) than at ``start`` (N, 3): (M,) m."""
+    """Return the shortening (M,) m of the segments from the positions ``start`` (N, 3) to ``end`` (N, 3)."""
     rows = muscles.difference_rows
     return segment_vectors(rows, start)[1] - segment_vectors(rows, end)[1]
 
@@ -150,7 +151,7 @@ class MuscleEnergy:
         return float((self.tensions * self.rest_lengths) @ force_length_factor(lengths / self.rest_lengths)[1])
 
     def gradient(self, positions: np.ndarray) -> np.ndarray:
-        """Return the derivative of V with respect to the positions (N, 3) N, minus the force of the muscles."""
+        """Return the gradient (N, 3) N of V with respect to the positions; its negative is the force of the muscles."""
         vectors, lengths = segment_vectors(self.rows, positions)
         share, _, _ = force_length_factor(lengths / self.rest_lengths)
         return self._ends @ ((self.tensions * share / lengths)[:, None] * vectors)

@@ -72,7 +72,7 @@ def test_skipped_beats_are_reported(danced: Run) -> None:
     dance = danced.sequence.done[0].motion
     assert isinstance(dance, Dance)
     np.testing.assert_allclose(dance.outcome_record(danced.trajectory, 0, -1).skipped, [1.7])
-    assert "1 of 5 beats skipped, too near to the others or the last: 1.70 s" in dance.notes()
+    assert "1 of 5 beats skipped, too close to other beats or to the last one: 1.70 s" in dance.notes()
     assert any(note.startswith("4 take-offs and touch-downs, the worst ") for note in dance.notes())
 
 
@@ -132,7 +132,9 @@ def test_unreachable_beats_are_left_out() -> None:
     assert span_of((0.1, 0.4)) is None
     assert span_of((1.0,)) is None
     assert span_of((1.0, 60.0)) is None
-    with pytest.raises(UserError, match=r"^dance: none of the 2 beats can be reached: before the first jump it takes"):
+    with pytest.raises(
+        UserError, match=r"^dance: none of the 2 beats can be reached: the first take-off is possible after"
+    ):
         coarse_block_run("dance 120 0 2")
 
 
@@ -151,7 +153,7 @@ def test_beats_are_read_from_the_first_column(tmp_path: Path) -> None:
         ("1\nsoon\n", "beats.csv, line 2: 'soon': give the time of a beat in seconds, from 0 to 600"),
         ("-1\n", "line 1: '-1': give the time of a beat in seconds, from 0 to 600"),
         ("1\ninf\n", "line 2: 'inf': give the time of a beat in seconds, from 0 to 600"),
-        ("1\n1\n", "line 2: '1': is not after 1, the beat before; give beats in increasing order"),
+        ("1\n1\n", "line 2: '1': is not after the previous beat, 1; give beats in increasing order"),
         ("\n".join(str(k / 10) for k in range(1001)), "1001 beats; at most 1000 are allowed"),
     ],
 )

@@ -120,7 +120,7 @@ def test_getting_up_fails_after_all_attempts() -> None:
         if get_up.is_at_rest:
             break
     assert get_up.phase is GetUpPhase.GIVEN_UP and not get_up.is_up and get_up.tries == len(_ATTEMPTS)
-    assert get_up.notes() == [f"the body does not get up: it lies after {len(_ATTEMPTS)} tries"]
+    assert get_up.notes() == [f"the body does not get up: it still lies after {len(_ATTEMPTS)} tries"]
 
 
 @cache

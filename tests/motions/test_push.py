@@ -157,8 +157,8 @@ def test_pushes_after_the_end_of_the_run_are_reported() -> None:
     pushes = read_pushes("0.5 0.1 left, 1-3 0.1 back, 2 0.1 left")
     assert [push.unapplied_note(2.0) for push in pushes] == [
         None,
-        "the gust until 3 s did not act in full: the run ended before",
-        "the push at 2 s did not act: the run ended before",
+        "the gust until 3 s did not act in full: the run ended earlier",
+        "the push at 2 s did not act: the run ended earlier",
     ]
     assert [push.unapplied_note(3.0) for push in pushes] == [None] * 3
 
@@ -170,7 +170,7 @@ def test_a_creature_is_pushed_while_it_stands_or_turns(script: str) -> None:
     creature = coarse_pawn()
     done = simulate(creature, motion(script), pushes=read_pushes("0.1 0.05 left, 0.2-0.3 0.05 back 0.8, 60 0.1 up"))
     t = done.trajectory
-    assert done.fallen is None and done.unfinished_note() == ["the push at 60 s did not act: the run ended before"]
+    assert done.fallen is None and done.unfinished_note() == ["the push at 60 s did not act: the run ended earlier"]
     momentum = np.einsum("n,kni->ki", t.node_mass, t.kick_velocity) @ done.place.ground.axes.T
     unit = 0.05 * creature.body.mass * creature.body.speed_unit
     np.testing.assert_allclose(momentum[0] / unit, [0.0, 1.0, 0.0], atol=1e-9)

@@ -64,7 +64,7 @@ def test_speeds_come_from_a_file_or_from_commands(place: Stance, tmp_path: Path)
     (part,), (other,) = read.parts(1.0), given.parts(1.0)
     assert part.asked == other.asked == {"commands": 2.0, "duration": 1.0}
     assert part.begin(place).expected_time == pytest.approx(other.begin(place).expected_time)
-    with pytest.raises(UserError, match=r"drive needs a file of speeds, as drive speeds\.csv"):
+    with pytest.raises(UserError, match=r"drive needs a file of speeds, as in drive speeds\.csv"):
         motion("drive")
 
 
@@ -95,10 +95,10 @@ def test_motions_along_paths_are_parsed(tmp_path: Path) -> None:
         ("walk 99", "('walk 99'): distance 99: give a number of body heights from -10 to 10"),
         ("walk to 1,2,3,4,5", "'5' is one value too many; walk to takes ahead, left, step_length, speed"),
         ("walk to there", "('walk to there'): ahead there: give a number of body heights"),
-        ("walk along", "('walk along'): walk along needs a file of points, as walk along way.csv"),
+        ("walk along", "('walk along'): walk along needs a file of points, as in walk along way.csv"),
         ("turn 45 9", "('turn 45 9'): speed 9: give a number of times the usual from 0.3 to 1.6"),
         ("jump speed=2", "('jump speed=2'): 'speed' is unknown; jump takes distance, height"),
-        ("trajectory", "('trajectory'): trajectory needs a file of key frames, as trajectory keys.json"),
+        ("trajectory", "('trajectory'): trajectory needs a file of key frames, as in trajectory keys.json"),
         ("hop x60, hop x60", "motion: 120 motions are given; at most 100 are allowed"),
         ("jump x2 x3", "('jump x2 x3'): 'x3' is a second number of repeats; give one"),
         ("jump x" + 5000 * "9", "repeat inf; give a whole number from 1 to 100"),
@@ -119,7 +119,7 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
     [
         ("[", "not JSON at line 1"),
         ("[" * 100_000, "its lists are nested too deeply; write fewer levels"),
-        ("{}", 'give a list of motions, as [{"motion": "jump"}]'),
+        ("{}", 'give a list of motions, such as [{"motion": "jump"}]'),
         ("[3]", f', motion 1: give an object with a "motion", one of {KNOWN}'),
         ('[{"motion": "jump", "repeat": 1.5}]', ', motion 1: "repeat" is 1.5; give a whole number'),
         ('[{"motion": "jump", "distance": true}]', "distance True: give a number of body heights from 0 to 10"),
@@ -130,12 +130,12 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
             f'[{{"motion": "jump", "distance": {401 * "1"}}}]',
             "distance inf: give a number of body heights from 0 to 10",
         ),
-        ('[{"motion": "jump", "style": 2}]', ', motion 1: "style" is 2; give a text, as "heavy"'),
+        ('[{"motion": "jump", "style": 2}]', ', motion 1: "style" is 2; give a text, such as "heavy"'),
         (
             '[{"motion": "hop"}, {"motion": "jump", "style": "floppy"}]',
             ", motion 2: style: unknown word 'floppy'; give",
         ),
-        ('[{"motion": "walk", "style": "heavy"}]', ", motion 1: walk does not jump, and has no style; jump, hop"),
+        ('[{"motion": "walk", "style": "heavy"}]', ", motion 1: walk does not jump, so it has no style; jump, hop"),
         (f'[{{"motion": "jump", "repeat": {5000 * "1"}}}]', '"repeat" is inf; give a whole number'),
     ],
 )

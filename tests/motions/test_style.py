@@ -115,7 +115,7 @@ def planned(style: Style) -> JumpPlan:
 def test_a_dance_uses_the_crouch_time_of_its_style(place: Stance) -> None:
     usual, quick = (Dance(replace(place, style=style), (1.0, 1.5)) for style in (Style(), Style(timing=0.5)))
     assert quick.expected_time == usual.expected_time
-    with pytest.raises(UserError, match="before the first jump it takes"):
+    with pytest.raises(UserError, match="the first take-off is possible after"):
         Dance(place, (0.35, 0.8))
     assert Dance(replace(place, style=Style(timing=0.5)), (0.35, 0.8)).plan_record().beats == 2.0
 
@@ -147,7 +147,7 @@ def test_presets_can_be_changed() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "style: the text is empty; give one of light, heavy, rubbery, or numbers such as anticipation=1.3, of"),
+        ("", "style: the text is empty; give one of light, heavy, rubbery, or numbers such as anticipation=1.3 for"),
         ("floppy", "style: unknown word 'floppy'; give one of light, heavy, rubbery, or numbers"),
         ("squash=1 heavy", "style: unknown word 'heavy'; give one of"),
         ("wobble=2", "style: unknown word 'wobble=2'; give one of"),
@@ -163,7 +163,7 @@ def test_a_bad_style_is_a_one_line_error(text: str, said: str) -> None:
 
 
 def test_a_style_without_a_jump_is_refused() -> None:
-    with pytest.raises(ArgumentError, match=r"^style: nothing jumps in 'walk'; add a jump, hop, twist or dance$"):
+    with pytest.raises(ArgumentError, match=r"^style: no motion of 'walk' jumps; add a jump, hop, twist or dance$"):
         motion("walk").style("heavy")
     assert motion("walk").style(None) == Style()
     with pytest.raises(ArgumentError, match=r"^squash 9: give a number from 0.5 to 2$"):

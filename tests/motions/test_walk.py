@@ -264,6 +264,6 @@ def test_missing_feet_and_obstacles_are_reported() -> None:
     walled = replace(place, solids=(*place.solids, wall))
     Walk(walled, straight_route(0.5), 0.1)
     with pytest.raises(
-        UserError, match=r"the path leads over a step, .* ahead and 0.00 to the left: .* higher; walk round"
+        UserError, match=r"the path leads over a step, .* ahead and 0.00 to the left: .* higher; walk around"
     ):
         Walk(walled, straight_route(1.2), 0.1)
