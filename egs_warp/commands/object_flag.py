@@ -22,7 +22,7 @@ from egs_warp.segmentation.propagated_masks import masks_of_clicks, salient_mask
 from egs_warp.segmentation.votes import MaskedView
 
 MAX_MASK_SIDE = 800
-"""Pixels, maximum side of a mask; larger masks are reduced to a half, a third, ... of their size."""
+"""Maximum side of a mask, pixels; larger masks are reduced to a half, a third, ... of their size."""
 _HELP = (
     "give a mask.png, a folder of masks, a point x,y,z, a box x0,y0,z0,x1,y1,z1, a pixel u,v with --view, or clicks "
     "+u,v@photo on the object and -u,v@photo next to it"

@@ -179,7 +179,7 @@ class CageFacts:
 
 @dataclass(frozen=True)
 class MuscleFacts:
-    """Numbers of muscles."""
+    """Numbers of muscle fibres and segments."""
 
     fibres: int
     segments: int
@@ -297,7 +297,7 @@ AUDIT_LIMITS = {
 
 
 def verdict(result: Audit) -> str:
-    """Return one line that says if the run satisfies its equations, with what exceeds its limit."""
+    """Return one line that says whether the run satisfies its equations, or which values exceed their limits."""
     exceeded = []
     for name, value in asdict(result).items():
         limit = AUDIT_LIMITS[name]

@@ -29,8 +29,8 @@ _WEIGHT_LENGTH = 0.5
 def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | None = None, quiet: bool = False) -> None:
     """Write ``run`` to a USD file in metres, with z up and 60 time codes per second.
 
-    Splats are a ParticleField3DGaussianSplat, which OpenUSD has since 26.03; the cage is a mesh, muscles and forces are
-    curves.
+    Splats are a ParticleField3DGaussianSplat, which OpenUSD has had since 26.03; the cage is a mesh, muscles and
+    forces are curves.
 
     Args:
         run: The run to export.
@@ -123,7 +123,7 @@ def _modules() -> tuple[Any, ...]:
     _, Usd, _, UsdVol, _ = modules
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         version = ".".join(map(str, Usd.GetVersion()))
-        raise UserError(f"usd: usd-core {version} knows no Gaussian splats; install 26.3 or newer")
+        raise UserError(f"usd: usd-core {version} does not support Gaussian splats; install 26.3 or newer")
     return modules
 
 
