@@ -31,7 +31,7 @@ class LiveFeed:
     """``FrameFeed`` of a live session."""
 
     def __init__(self, session: Session, *, scene: GaussianCloud | None = None) -> None:
-        """Create the feed of ``session``; ``scene`` is the background in the frame of the body, None for none."""
+        """Create the feed of ``session``; ``scene`` is the background in the frame of the body, or None."""
         self.session = session
         self._scene = scene
         self._name = secrets.token_hex(8)

@@ -149,11 +149,11 @@ class Session:
         return self._stillness.is_still(self.state)
 
     def _reset_clock(self) -> None:
-        """Restart the clock now, so that a pause is not caught up."""
+        """Restart the clock now, so that the session does not catch up on a pause."""
         self._due = time.perf_counter()
 
     def _wait_for_clock(self) -> None:
-        """Wait until the next step is due; a session that is late catches up on two steps at most."""
+        """Wait until the next step is due; a session that is late catches up by at most two steps."""
         self._due = max(self._due + self._dt, time.perf_counter() - 2.0 * self._dt)
         self._mailbox.wait_until(lambda: self._due - time.perf_counter())
 
