@@ -381,7 +381,7 @@ def _max_references(arrays: list[wp.array]) -> int:
 _UNREFERENCED = max(map(sys.getrefcount, [object()]))
 """Result of ``_max_references`` for objects that only one list refers to."""
 _MAX_POOLED_BYTES, _MAX_POOLED_KEYS, _MAX_POOLED_GROUPS = 2**25, 16, 4
-"""Maximum size of a reusable allocation, number of different specifications, and allocations per specification."""
+"""Maximum size of a reusable allocation, bytes; number of different specifications; allocations per specification."""
 
 
 class _FreeList(threading.local):

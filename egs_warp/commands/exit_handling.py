@@ -25,7 +25,7 @@ _NOT_PERMITTED = (errno.EROFS, errno.EACCES, errno.EPERM)
 """Error numbers of paths that the user may not read or write. Other errors are bugs and keep their traceback."""
 
 _RESEND_DELAY = 0.05
-"""Seconds after which a signal whose exception was dropped is sent again."""
+"""Delay after which a signal whose exception was dropped is sent again, s."""
 
 
 class HandledExit(SystemExit):
@@ -81,7 +81,7 @@ def one_line_errors(program: str) -> Iterator[None]:
 
 
 def _is_exhausted(cause: BaseException | None) -> bool:
-    """Return True if ``cause`` says that memory, disk space or file handles are exhausted."""
+    """Return True if ``cause`` indicates that memory, disk space or file handles are exhausted."""
     return isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in _EXHAUSTED)
 
 

@@ -26,7 +26,7 @@ QP_SOLVERS = ("osqp", "admm", "daqp")
 STRATEGIES = ("modes", "paper")
 """Values of ``egs_warp.locomotion.strategies.Strategy``, repeated here because that module is slow to import."""
 _FLAGS = {"muscles_file": "--muscles", "solids": "--terrain"}
-"""Flags of the library arguments whose names differ."""
+"""Flags whose names differ from their library arguments, by argument."""
 
 
 def flag_of(argument: str) -> str:

@@ -109,7 +109,7 @@ def _plane(text: str) -> tuple[Plane, Hole | None]:
 
 
 def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, background: Capture) -> Hole | None:
-    """Return the hole that the flags define, else the ``recorded`` one."""
+    """Return the hole that the flags define, otherwise the ``recorded`` one."""
     import numpy as np
 
     from egs_warp.commands.object_flag import read_object
@@ -132,7 +132,7 @@ def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, backgro
     if args.mask is None:
         return recorded
     if not Path(args.mask).exists():
-        raise UserError(f"--mask {args.mask}: no such file or folder; give a PNG or a folder of them")
+        raise UserError(f"--mask {args.mask}: no such file or folder; give a PNG file or a folder of PNG files")
     if args.cameras is None:
         raise UserError("--mask: a mask needs its camera; give --cameras")
     poses = read_posed_images(args.cameras).relative_to(background.origin)

@@ -209,7 +209,7 @@ def _read_masks(path: Path, posed: Sequence[PosedImage] | None, view: str | None
 
 
 def _camera_of(file: Path, posed: Sequence[PosedImage], view: str | None) -> PosedImage:
-    """Return the camera of a mask file: ``view``, else the one whose photo has a matching name, else the only one."""
+    """Return the camera of a mask file: ``view``, otherwise that of the photo with a matching name or the only one."""
     if view is not None:
         return _view_named(posed, view, str(file))
     stems = [(Path(one.name).stem, one) for one in posed]
@@ -238,7 +238,7 @@ def mask_size(path: Path) -> tuple[int, int]:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """Read a mask file as (H, W) bool: its alpha channel if it has one, else the values above half of the maximum.
+    """Read a mask file as (H, W) bool: its alpha channel if it has one, otherwise the values above half of the maximum.
 
     Raises ``UserError`` if it is not an image.
     """

@@ -1,4 +1,4 @@
-"""Estimate of the direction in which a body faces: in its best vertical mirror plane, towards the side of its face.
+"""Estimate of the direction in which a body faces: in its best vertical mirror plane, towards its face.
 
 The body is rendered from all around. A face has more detail than the back of a head, a head is in front of the feet,
 the back of a chair is behind its seat, and photos from one side only usually show the front.
@@ -29,7 +29,7 @@ _ELEVATION = 0.2
 _FOV_DEGREES = 20.0
 """Vertical field of view, narrow so that images of a mirrored body are nearly mirrored."""
 _MAX_GAUSSIANS = 50_000
-"""Number of Gaussians above which a subset of them is used, widened: small details do not matter."""
+"""Maximum number of Gaussians; a subset of more is used and widened, because small details do not matter."""
 _FINE, _SMOOTH = 0.01, 0.04
 """Standard deviations of two blurs, body heights: detail is the difference between them."""
 _OFFSETS = np.arange(-6.0, 7.0, 1.5)
@@ -46,7 +46,7 @@ _SYMMETRY, _LEAN, _PHOTOS = 2.0, 1.5, 1.0
 """Weights of the symmetric fraction of a picture, of a lean of one body height, and of photos that are all from one
 direction; the weight of detail is 1."""
 _CLEAR_MARGIN = 0.4
-"""Difference between the scores of front and back above which a result is clear: that of 1.5 times the detail."""
+"""Difference between the scores of front and back above which a result is clear; 1.5 times the detail gives it."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Front:
 def find_front(
     cloud: GaussianCloud, mesh: TetMesh, *, seen_from: np.ndarray | None = None, lengthwise: bool = False
 ) -> Front:
-    """Estimate the facing direction of a body. Equal bodies give equal bits.
+    """Estimate the facing direction of a body. Equal bodies give bitwise equal results.
 
     Args:
         cloud: Gaussians in the frame of the body.

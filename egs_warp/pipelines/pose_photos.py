@@ -274,7 +274,7 @@ def _reconstructed(
 
 
 class _DatabaseWatch:
-    """Progress of pycolmap, which does not report it, from the number of rows of its database."""
+    """Progress of pycolmap, taken from the number of rows of its database, because pycolmap does not report it."""
 
     def __init__(self, database: Path, report: Callable[[str, int, int], None]) -> None:
         self._database = database

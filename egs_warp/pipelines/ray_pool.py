@@ -14,7 +14,7 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.pipelines.worker_pool import ONE_THREAD, Event, TaskFunction, attempt
 
 DEFAULT_ADDRESS = "ray"
-"""Name for the Ray cluster that the program is connected to, else the one at ``RAY_ADDRESS``, else a temporary one."""
+"""Stands for the connected Ray cluster, otherwise for the one at ``RAY_ADDRESS``, otherwise for a temporary one."""
 _POLL_INTERVAL = 0.5
 """Interval at which the progress of the workers is read, s."""
 
@@ -89,7 +89,7 @@ class RayPool:
         for call in ready:
             if call in self._polls:
                 worker = self._polls.pop(call)
-                # A lost worker is reported by the call of its task.
+                # If the worker is lost, the call of its task reports this.
                 with contextlib.suppress(ray.exceptions.RayError):
                     messages = ray.get(call)
                     events += [Event(worker, "progress", values) for values in messages[-1:]]

@@ -72,7 +72,7 @@ class MotionReport:
     asked: Mapping[str, float]
     """Requested values; lengths in body heights."""
     planned: DataclassInstance
-    """Plan of its state machine."""
+    """Plan of the motion's state machine."""
     reached: MotionOutcome
     """Measured values that all motions have."""
     state: State

@@ -43,7 +43,7 @@ class CameraMove(StrEnum):
     """Built-in camera motion."""
 
     AUTO = "auto"
-    """``follow`` if that shows the creature notably larger and there is no scene around it, else ``fixed``."""
+    """``follow`` if that shows the creature notably larger and there is no scene, otherwise ``fixed``."""
     FIXED = "fixed"
     FOLLOW = "follow"
     ORBIT = "orbit"

@@ -105,7 +105,7 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
 
 @contextmanager
 def _system_errors() -> Iterator[None]:
-    """Convert errors of USD that are caused by the system to those of Python."""
+    """Raise Python's error for a USD error that the operating system has caused, such as a full disk."""
     try:
         yield
     except RuntimeError as error:

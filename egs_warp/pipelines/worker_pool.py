@@ -149,7 +149,7 @@ class ProcessPool:
         self.size = size
         self._work = pickle.dumps(work)
         main = sys.modules["__main__"]
-        # Functions that a script defines exist in another process only after the script was run there as a module.
+        # A function that a script defines exists in another process only after the script has run there as a module.
         self._script = getattr(main, "__file__", None) if b"__main__" in self._work else None
         self._running: dict[int, _Running] = {}
         self._events: queue.SimpleQueue[tuple[int, Event]] = queue.SimpleQueue()

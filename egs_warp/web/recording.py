@@ -143,9 +143,9 @@ def _edges(faces: np.ndarray) -> np.ndarray:
 
 
 def _arms(deformer: Deformer) -> np.ndarray:
-    """Return (n', 15) float32: six tetrahedra, six inside fractions and three smoothing lengths.
+    """Return (n', 15) float32: tetrahedra and inside fractions of the six axis ends, and three smoothing lengths.
 
-    One row for each of the n' Gaussians that extend over several tetrahedra, in their order.
+    There is one row for each of the n' Gaussians that extend over several tetrahedra, in their order.
     """
     plan = deformer.plan
     rows = plan.mean_tets.numpy() < 0

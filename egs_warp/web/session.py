@@ -110,7 +110,8 @@ class Session:
     def subscribe(self, wake: Callable[[], object]) -> None:
         """Subscribe a page and continue the simulation.
 
-        ``wake`` is called from the thread of the session when ``take_news`` has something new, first the current frame.
+        ``wake`` is called from the thread of the session when ``take_news`` has something new. The first news is the
+        current frame.
         """
         self._mailbox.subscribe(wake, self._frame)
 
