@@ -306,7 +306,7 @@ def warp_stream(stream: Any) -> wp.Stream:
 
 
 def device_of(array: wp.array) -> wp.Device:
-    """Return the device of ``array``. Its type in Warp also allows None, which occurs only in annotations."""
+    """Return the device of ``array``; Warp declares that it may be None, but it is None only in annotations."""
     device: Any = array.device
     return device
 

@@ -45,7 +45,7 @@ def add_camera_flags(
 
 
 def shot_of(args: argparse.Namespace) -> tuple[Shot, str | None]:
-    """Return the shot that the flags describe, and the background capture or None if ``--background`` names none."""
+    """Return the shot that the flags describe, and the background capture that ``--background`` names, or None."""
     from egs_warp.pipelines.shot import Shot
 
     colour = parse_colour(args.background) if args.background is not None else None

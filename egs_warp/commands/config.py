@@ -93,7 +93,7 @@ def changed_capture(config: str, capture: str) -> bool:
 
 
 def write_config(path: Path, args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Write all flags of a run, including defaults, to ``path``; a run with this file gives the same bits."""
+    """Write all flags of a run, including defaults, to ``path``; a run with this file gives bitwise equal results."""
     import yaml
 
     from egs_warp.io.atomic import atomic_write

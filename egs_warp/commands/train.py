@@ -102,7 +102,7 @@ def _train(args: argparse.Namespace) -> int:
             " again"
         )
     outputs = (args.out, sheet, report_path)
-    # With --resume, existing outputs belong to the interrupted training, or it was already allowed to move them.
+    # With --resume, existing outputs belong to the interrupted training, or its flags allowed it to move them.
     overwrite = args.overwrite or (args.resume and checkpoint.exists())
     check_named_files(*outputs, overwrite=overwrite)
     import warp as wp

@@ -113,7 +113,7 @@ def find_front(
         reasons.append(f"it was photographed from {'the front' if photos[best] > 0.0 else 'behind'}")
     ahead = float(score[best] - score[(best + _VIEWS) % len(score)])
     sure = "clearly" if ahead > _CLEAR_MARGIN else "narrowly"
-    why = f"guessed: {', '.join(reasons)}; {sure} better than the opposite; if it is wrong, give front"
+    why = f"guessed: {', '.join(reasons)}; {sure} better than the opposite; if it is wrong, give the front"
     return Front(np.array([np.cos(angle), np.sin(angle), 0.0]), why)
 
 

@@ -76,7 +76,7 @@ def simulate_many(
 ) -> tuple[JobResult, ...]:
     """Run all ``jobs`` of one ``creature``, several at a time.
 
-    In a worker process, a job gives the same bits as ``Job.run`` on a machine of the same kind. In a batch, its node
+    In a worker process, a job gives the same bits as ``Job.run`` on a machine of the same kind. In a batch, the node
     positions differ from those of ``Job.run`` by less than 1e-9 body heights in the first 30 steps.
 
     Each worker receives the creature once and uses one core. A job whose worker is lost is run again, at most twice. A

@@ -48,7 +48,7 @@ def segmentation_warnings(
         warnings.append(f"rests on nothing: its lowest part is {percent:.0f} % of its size above the ground")
     share = _floor_share(cloud, located.plane, segmentation.object_mask, located.centre, segmentation.size)
     if share > _MAX_FLOOR_SHARE:
-        warnings.append(f"includes floor: {100 * share:.0f} % of the floor around it")
+        warnings.append(f"includes {100 * share:.0f} % of the floor around it")
     return warnings
 
 

@@ -100,7 +100,7 @@ def ended_tasks(pool: WorkerPool, tasks: Sequence[Any], progress: Callable[..., 
                     continue
                 del busy[event.worker]
                 if event.kind == "lost" and runs[number] < MAX_ATTEMPTS:
-                    # Retry it before the tasks that have not been started.
+                    # Retry this task before those that have not been started.
                     waiting.appendleft(number)
                 elif event.kind == "lost":
                     reason = f"its worker was lost {MAX_ATTEMPTS} times, finally: {event.value}"
