@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Errors and signals print one line (``commands.exit_handling``).
     """
-    # The matrices of a step are small: threads cost more than they gain, and ten times as much on a loaded machine.
+    # The matrices of a step are small: BLAS threads cost more time than they save, tenfold on a loaded machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         with one_line_errors("egs-warp"):
@@ -46,7 +46,7 @@ class _Parser(argparse.ArgumentParser):
     """Argument parser that reports an error in one line, without the usage, and suggests the nearest name."""
 
     complete_help: Callable[[argparse.ArgumentParser], None] | None = None
-    """Completes the help texts that a module makes from a registry, which is slow to import."""
+    """Completes the help texts that depend on a registry, which is slow to import; None if none do."""
 
     def format_help(self) -> str:
         """Return the text of ``--help``."""
@@ -68,7 +68,7 @@ class _Parser(argparse.ArgumentParser):
 def _check_flags(words: Sequence[str], command: argparse.ArgumentParser) -> None:
     """End with an error for the first unknown flag in ``words``.
 
-    argparse would first report required flags that are missing, of which the unknown one may be a misspelling.
+    argparse would first report a missing required flag, of which the unknown flag may be a misspelling.
     """
     known = list(command._option_string_actions)
     for word in words:

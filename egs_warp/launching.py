@@ -42,7 +42,7 @@ _ALIGNMENT = 256
 """Alignment of pooled arrays, bytes: that of the widest loads of a GPU."""
 
 _LAST_CHUNKS_PER_THREAD = 24
-"""The smallest chunk is this part of a thread's share; it bounds the idle time of a thread at the end."""
+"""Ratio of a thread's share to the smallest chunk, which bounds the idle time of a thread at the end."""
 
 
 def available_threads() -> int:
@@ -70,7 +70,7 @@ def reserve_core() -> Iterator[None]:
         _reserved -= 1
 
 
-# Warp's default prints seven lines when it starts. A level that the user has set before, or sets later, stays.
+# By default, Warp prints seven lines when it starts. A level that the user has set before, or sets later, is kept.
 if wp.config.log_level == wp.LOG_INFO:
     wp.config.log_level = wp.LOG_WARNING
 
@@ -180,7 +180,7 @@ def launch_rows(
     try:
         launch_chunks()
     finally:
-        # Tasks that have not started have no chunks left; waiting cancels them.
+        # No chunks are left for tasks that have not started; ``wait`` cancels them.
         for task in tasks:
             task.wait()
     for task in tasks:
@@ -212,7 +212,7 @@ def launch_cached(
         # Warp returns None for an empty launch.
         if command is None:
             return
-        # Release the arguments that the recorded launch holds besides the packed ones.
+        # Release the arguments that the recorded launch holds in addition to the packed ones.
         command.fwd_args = None  # pyright: ignore[reportAttributeAccessIssue]  # guessed from a list
         arguments = [_UNKNOWN] * (len(inputs) + len(outputs))
         launches[kernel, device.alias] = command, dim, arguments
@@ -266,7 +266,7 @@ def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[
 def thread_local_cache(max_entries: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """Return a decorator that caches a function's results in a per-thread LRU cache of ``max_entries``.
 
-    Per thread, because the cached objects are writable buffers.
+    Each thread has its own cache, because the cached objects are writable buffers.
     """
 
     def decorate(make: Callable[..., T]) -> Callable[..., T]:
@@ -306,7 +306,7 @@ def warp_stream(stream: Any) -> wp.Stream:
 
 
 def device_of(array: wp.array) -> wp.Device:
-    """Return the device of ``array``. Warp's type also admits None, which only annotations have."""
+    """Return the device of ``array``; Warp declares that it may be None, but it is None only in annotations."""
     device: Any = array.device
     return device
 
@@ -314,7 +314,7 @@ def device_of(array: wp.array) -> wp.Device:
 def empty(shape: Shape, dtype: Any, device: Device, *, pinned: bool = False) -> wp.array:
     """Return an uninitialized array; ``pinned`` makes host memory page-locked.
 
-    Warp's own stub admits only Python's ``float`` as a type.
+    This function exists because Warp's stub accepts only Python's ``float`` as ``dtype``.
     """
     return wp.empty(shape, dtype=dtype, device=device, pinned=pinned)
 
@@ -381,7 +381,7 @@ def _max_references(arrays: list[wp.array]) -> int:
 _UNREFERENCED = max(map(sys.getrefcount, [object()]))
 """Result of ``_max_references`` for objects that only one list refers to."""
 _MAX_POOLED_BYTES, _MAX_POOLED_KEYS, _MAX_POOLED_GROUPS = 2**25, 16, 4
-"""Maximum size of a reusable allocation, number of different specifications, and allocations per specification."""
+"""Maximum size of a reusable allocation, bytes; number of different specifications; allocations per specification."""
 
 
 class _FreeList(threading.local):
@@ -406,7 +406,7 @@ def grow_capacity(count: int) -> int:
 
 
 def copy_into(target: wp.array, values: np.ndarray) -> None:
-    """Copy ``values`` of the same shape and type into ``target``; on a CPU by NumPy, as that is faster."""
+    """Copy ``values`` of the same shape and type into ``target``; on a CPU with NumPy, which is faster."""
     if device_of(target).is_cpu:
         np.copyto(target.numpy(), values)
     else:

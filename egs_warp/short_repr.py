@@ -13,9 +13,9 @@ _MAX_ITEMS = 4
 
 
 def short_repr(self: Any) -> str:
-    """Return ``Class(field=value, ...)`` of a dataclass: of arrays the type and shape, of other records the class.
+    """Return ``Class(field=value, ...)`` for a dataclass, with the type and shape of arrays and the class of records.
 
-    A dataclass takes it as its method: ``__repr__ = short_repr``.
+    To use it, assign it in the body of the dataclass: ``__repr__ = short_repr``.
     """
     values = ", ".join(f"{field.name}={_short(getattr(self, field.name))}" for field in fields(self) if field.repr)
     return f"{type(self).__name__}({values})"

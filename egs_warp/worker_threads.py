@@ -1,6 +1,6 @@
 """Worker threads for short, frequent tasks.
 
-An interrupt of the caller never leaves a lock held that a worker needs next.
+A KeyboardInterrupt in the caller never leaves a lock acquired that a worker needs for its next task.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class Task(Generic[T]):
 
     def __init__(self, work: Callable[[], T]) -> None:
         self._work = work
-        # Plain locks: a KeyboardInterrupt between any two lines can leave a lock of this task held, on which no thread
-        # blocks any more, but no lock that a worker needs for the next task.
+        # Plain locks: a KeyboardInterrupt between any two lines can leave a lock of this task acquired, on which no
+        # thread blocks any more, but never a lock that a worker needs for the next task.
         self._started, self._done = threading.Lock(), threading.Lock()
         self._done.acquire()
         self._result: Any = None
@@ -66,8 +66,8 @@ class Task(Generic[T]):
 class WorkerThreads:
     """Pool of at most ``max_threads`` threads, which start one by one with the first tasks.
 
-    ``ThreadPoolExecutor`` is not used: a KeyboardInterrupt within its ``submit`` can leave a lock held on which its
-    threads block, and with them the exit of the process.
+    ``ThreadPoolExecutor`` is not used: a KeyboardInterrupt within its ``submit`` can leave a lock acquired, on
+    which its threads, and therefore the exit of the process, would block.
     """
 
     def __init__(self, max_threads: int) -> None:

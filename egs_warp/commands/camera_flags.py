@@ -39,13 +39,13 @@ def add_camera_flags(
     parser.add_argument("--fps", type=float, default=60.0, help="video frames per second of motion (60)")
     parser.add_argument(
         "--background",
-        help="background of the creature: a capture, a colour (r,g,b from 0 to 1, #rrggbb or its name in CSS), or "
+        help="background of the creature: a capture, a colour (r,g,b from 0 to 1, #rrggbb or a CSS name), or "
         "transparent (the shadow stays)",
     )
 
 
 def shot_of(args: argparse.Namespace) -> tuple[Shot, str | None]:
-    """Return the shot that the flags describe, and the background capture if ``--background`` names one, else None."""
+    """Return the shot that the flags describe, and the background capture that ``--background`` names, or None."""
     from egs_warp.pipelines.shot import Shot
 
     colour = parse_colour(args.background) if args.background is not None else None
@@ -66,7 +66,7 @@ def parse_size(text: str) -> tuple[int, int]:
     """Return (width, height) from ``512`` or ``640x360``. Raises ``UserError`` for other texts."""
     match = re.fullmatch(r"(\d{1,6})(?:x(\d{1,6}))?", text.strip().lower())
     if match is None:
-        raise UserError(f"--size {text}: give pixels, as 512 or 640x360")
+        raise UserError(f"--size {text}: give pixels, such as 512 or 640x360")
     return int(match[1]), int(match[2] or match[1])
 
 
@@ -74,7 +74,7 @@ def parse_colour(text: str) -> tuple[float, float, float] | None:
     """Return (r, g, b), each 0 to 1, from ``r,g,b``, ``#rrggbb`` or the name of a CSS colour that is not a file; None
     for other texts.
 
-    Raises ``UserError`` for numbers outside of 0 to 1.
+    Raises ``UserError`` for numbers outside the range 0 to 1.
     """
     if text.isalpha() and not os.path.lexists(text):
         text = _colour_names().get(text.lower(), text)

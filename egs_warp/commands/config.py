@@ -37,7 +37,7 @@ def add_config_flag(parser: argparse._ActionsContainer) -> None:
 
 
 def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> list[str]:
-    """Return ``arguments`` of ``parser`` preceded by those of the file that ``--config`` names; unchanged without it.
+    """Return ``arguments`` of ``parser`` preceded by those of the file that ``--config`` names, if any.
 
     Raises ``UserError`` for an unreadable file, unknown keys, and values that are not a text, number or boolean.
     """
@@ -93,7 +93,7 @@ def changed_capture(config: str, capture: str) -> bool:
 
 
 def write_config(path: Path, args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Write all flags of a run, including defaults, to ``path``; a run with this file has the same bits."""
+    """Write all flags of a run, including defaults, to ``path``; a run with this file gives bitwise equal results."""
     import yaml
 
     from egs_warp.io.atomic import atomic_write
@@ -125,7 +125,7 @@ def _read(path: Path) -> dict[Any, Any]:
     from egs_warp.io.text import read_text
 
     class Plain(yaml.SafeLoader):
-        """YAML loader without aliases: a few lines of nested aliases expand to more than any memory holds."""
+        """YAML loader without aliases: a few lines of nested aliases can expand beyond the memory of any machine."""
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
@@ -140,7 +140,7 @@ def _read(path: Path) -> dict[Any, Any]:
             raise
         raise UserError(f"{path}: not YAML ({' '.join(str(error).split())}); correct it") from error
     if not isinstance(tree, dict):
-        raise UserError(f"{path}: no keys and values; write one flag per line, as motion: jump")
+        raise UserError(f"{path}: no keys and values; write one flag per line, such as motion: jump")
     return tree
 
 

@@ -25,7 +25,7 @@ _NOT_PERMITTED = (errno.EROFS, errno.EACCES, errno.EPERM)
 """Error numbers of paths that the user may not read or write. Other errors are bugs and keep their traceback."""
 
 _RESEND_DELAY = 0.05
-"""Seconds after which a signal whose exception was dropped is sent again."""
+"""Delay after which a signal whose exception was dropped is sent again, s."""
 
 
 class HandledExit(SystemExit):
@@ -40,7 +40,7 @@ class _TerminatedError(BaseException):
 def one_line_errors(program: str) -> Iterator[None]:
     """Context manager that turns errors and signals into one line on stderr and an exit status.
 
-    Invalid input gives status 2, or 1 if its cause is an exhausted machine; the message names flags. The first Ctrl-C
+    Invalid input gives status 2, or 1 if an exhausted machine has caused it; the message names flags. The first Ctrl-C
     or SIGTERM unwinds the stack, a second one ends the process at once. A closed pipe only silences the output. See
     ``docs/reliability.md``.
 
@@ -74,14 +74,14 @@ def one_line_errors(program: str) -> Iterator[None]:
             if error.errno not in (*_EXHAUSTED, *_NOT_PERMITTED, errno.ENAMETOOLONG):
                 raise
             if error.errno == errno.ENAMETOOLONG:
-                # Path.exists of Python raises this error.
+                # Path.exists raises this error instead of returning False.
                 end(2, f"{str(error.filename)[:60]}...: no such file or folder, the name is too long; check the path")
             path = f"{error.filename}: " if error.filename else ""
             end(1 if _is_exhausted(error) else 2, f"{path}{error.strerror}; free some space, or choose another folder")
 
 
 def _is_exhausted(cause: BaseException | None) -> bool:
-    """Return True if ``cause`` says that memory, disk space or file handles are exhausted."""
+    """Return True if ``cause`` indicates that memory, disk space or file handles are exhausted."""
     return isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in _EXHAUSTED)
 
 
@@ -159,9 +159,9 @@ def _tolerant_streams() -> Iterator[None]:
 
 
 def _open_standard_files() -> None:
-    """Open the standard file descriptors that the shell has closed on the null device.
+    """Open the null device on the standard file descriptors that the shell has closed.
 
-    Otherwise the next opened file gets their number, and libraries print into it.
+    Otherwise the next opened file would get one of their numbers, and libraries would print into it.
     """
     for number in range(3):
         try:
@@ -200,14 +200,14 @@ class _Stream:
             self._silence()
 
     def settle(self) -> None:
-        """Flush; if that fails, drop the buffered output so that Python does not write it at its end."""
+        """Flush; if that fails, drop the buffered output so that Python does not write it at exit."""
         try:
             self._stream.flush()
         except OSError:
             self._silence()
 
     def _silence(self) -> None:
-        # Redirect to the null device: the buffered output is dropped now and at the end of Python.
+        # Redirect to the null device: the buffered output is dropped now and when Python exits.
         with contextlib.suppress(OSError, ValueError):
             null = os.open(os.devnull, os.O_WRONLY)
             os.dup2(null, self._stream.fileno())

@@ -26,7 +26,7 @@ QP_SOLVERS = ("osqp", "admm", "daqp")
 STRATEGIES = ("modes", "paper")
 """Values of ``egs_warp.locomotion.strategies.Strategy``, repeated here because that module is slow to import."""
 _FLAGS = {"muscles_file": "--muscles", "solids": "--terrain"}
-"""Flags of the library arguments whose names differ."""
+"""Flags whose names differ from their library arguments, by argument."""
 
 
 def flag_of(argument: str) -> str:
@@ -42,7 +42,7 @@ def named_path(text: str) -> Path:
 
 
 def seed(text: str) -> int:
-    """Return ``text`` as a seed of random numbers. Raises ``ArgumentTypeError`` outside of 0 to 2^32 - 1."""
+    """Return ``text`` as a seed of random numbers. Raises ``ArgumentTypeError`` outside the range 0 to 2^32 - 1."""
     number = int(text)
     if not 0 <= number < 1 << 32:
         raise argparse.ArgumentTypeError(f"{text}: give a whole number from 0 to {(1 << 32) - 1}")
@@ -120,7 +120,7 @@ def parse_direction(flag: str, text: str) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
         length = float(np.linalg.norm(direction))
     if len(direction) != 3 or not np.isfinite(length) or length == 0.0:
-        raise UserError(f"--{flag} {text}: give three numbers x,y,z or an axis as -y")
+        raise UserError(f"--{flag} {text}: give three numbers x,y,z or an axis such as -y")
     return direction / length
 
 

@@ -13,18 +13,18 @@ EXAMPLES = ("pawn.ply", "chair.ply --up=-y --plot info.png", "toy.spz --front 0,
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     info = commands.add_parser(
-        "info", help="report up, front, feet, size and muscles of a capture, and its possible motions"
+        "info", help="report the up direction, front, feet, size, muscles and possible motions of a capture"
     )
     info.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
     info.add_argument("--plot", type=named_path, help="image (.png) of the detected frame, feet and muscles")
-    info.add_argument("--up", help="axis that points up: x, y, z, -x, -y or -z, as --up=-y (default: estimated)")
+    info.add_argument("--up", help="axis that points up: x, y, z, -x, -y or -z, such as --up=-y (default: estimated)")
     info.add_argument(
         "--plane",
         help="ground plane n.x + d = 0 as nx,ny,nz,d in the capture's units, or a plane.json (default: estimated)",
     )
     info.add_argument(
         "--front",
-        help="direction in which the body faces and moves: x,y,z or an axis, as --front=-x (default: estimated)",
+        help="direction in which the body faces and moves: x,y,z or an axis, such as --front=-x (default: estimated)",
     )
     info.add_argument(
         "--metres-per-unit", type=float, help="scale of the capture (default: such that the body is 1 m tall)"

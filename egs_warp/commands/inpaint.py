@@ -39,7 +39,7 @@ def add_parser(commands: Commands) -> None:
     inpaint.add_argument(
         "--picture",
         type=named_path,
-        help="image of before, after and depth, .png (default: --out with the ending .png)",
+        help="image of the floor before and after, and of its depth, .png (default: --out with the ending .png)",
     )
     add_overwrite_flag(inpaint, "--out and --picture")
     add_inpainter_flags(inpaint, default="patch")
@@ -82,7 +82,7 @@ def _inpaint(args: argparse.Namespace) -> int:
     inpainter = chosen_inpainter(args, seed=args.seed)
     background = read_capture(args.background, device=args.device)
     hole = _hole(args, plane, recorded, background)
-    assert hole is not None, "one of them was given"
+    assert hole is not None, "the flags define a hole"
     with named_files(args.out, picture, overwrite=args.overwrite) as files:
         with scene_bar({"inpaint": options.steps > 0}) as show_progress:
             painted = lambda done: show_progress("inpaint", done)  # noqa: E731
@@ -109,7 +109,7 @@ def _plane(text: str) -> tuple[Plane, Hole | None]:
 
 
 def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, background: Capture) -> Hole | None:
-    """Return the hole that the flags define, else the ``recorded`` one."""
+    """Return the hole that the flags define, otherwise the ``recorded`` one."""
     import numpy as np
 
     from egs_warp.commands.object_flag import read_object
@@ -132,7 +132,7 @@ def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, backgro
     if args.mask is None:
         return recorded
     if not Path(args.mask).exists():
-        raise UserError(f"--mask {args.mask}: no such file or folder; give a PNG or a folder of them")
+        raise UserError(f"--mask {args.mask}: no such file or folder; give a PNG file or a folder of PNG files")
     if args.cameras is None:
         raise UserError("--mask: a mask needs its camera; give --cameras")
     poses = read_posed_images(args.cameras).relative_to(background.origin)

@@ -1,4 +1,4 @@
-"""``egs-warp live``: simulate a creature and control it in the browser by keys, clicks and sliders."""
+"""``egs-warp live``: simulate a creature and control it in the browser with keys, clicks and sliders."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def add_parser(commands: Commands) -> None:
     live.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
     add_planning_flags(live)
     body = live.add_argument_group("body and ground")
-    body.add_argument("--up", help="axis that points up: x, y, z, -x, -y or -z, as --up=-y (default: estimated)")
+    body.add_argument("--up", help="axis that points up: x, y, z, -x, -y or -z, such as --up=-y (default: estimated)")
     body.add_argument(
         "--plane",
         help="ground plane n.x + d = 0 as nx,ny,nz,d in the capture's units, or a plane.json (default: estimated)",
@@ -44,7 +44,8 @@ def add_parser(commands: Commands) -> None:
     body.add_argument(
         "--nodes",
         type=int,
-        help="approximate number of cage nodes; fewer are faster (default: 120 to 500 by the speed of the machine)",
+        help="approximate number of cage nodes; fewer are faster (default: 120 to 500, depending on the speed of the "
+        "machine)",
     )
     body.add_argument("--friction", type=float, default=0.8, help="initial Coulomb friction coefficient (0.8)")
     body.add_argument(
@@ -53,7 +54,7 @@ def add_parser(commands: Commands) -> None:
     body.add_argument("--muscles", type=named_path, help="JSON file with muscle fibres (docs/motions/muscles.md)")
     body.add_argument(
         "--front",
-        help="direction in which the body faces and moves: x,y,z or an axis, as --front=-x (default: estimated)",
+        help="direction in which the body faces and moves: x,y,z or an axis, such as --front=-x (default: estimated)",
     )
     page = live.add_argument_group("page")
     page.add_argument("--background", type=named_path, help="background capture, for example background.ply of a run")
@@ -77,7 +78,7 @@ def _live(args: argparse.Namespace) -> int:
     from egs_warp.web.preview import PreviewFeed, preview_of
     from egs_warp.web.server import PageServer, check_port
 
-    # Errors that can be detected before any long work.
+    # Report errors that can be detected before any long work.
     page_text()
     check_port(args.port)
     check_out(args.out)
@@ -121,7 +122,7 @@ def _wait(thread: threading.Thread) -> None:
     """Wait until ``thread`` ends or Ctrl-C."""
     with suppress(KeyboardInterrupt):
         while thread.is_alive():
-            # A wait without limit cannot be interrupted on Windows.
+            # On Windows, a wait without a timeout cannot be interrupted.
             thread.join(timeout=0.5)
 
 
@@ -168,7 +169,7 @@ def _session(
 
 
 def _nodes(args: argparse.Namespace) -> int:
-    """Return the number of nodes: the given one, or one for the speed of the device, with a note."""
+    """Return ``--nodes``, or else a number that suits the speed of the device, and print it as a note."""
     from egs_warp.web.node_choice import GPU_NODES, choose_nodes
 
     if args.nodes is not None:

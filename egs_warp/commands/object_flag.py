@@ -22,7 +22,7 @@ from egs_warp.segmentation.propagated_masks import masks_of_clicks, salient_mask
 from egs_warp.segmentation.votes import MaskedView
 
 MAX_MASK_SIDE = 800
-"""Pixels, maximum side of a mask; larger masks are reduced to a half, a third, ... of their size."""
+"""Maximum side of a mask, pixels; larger masks are reduced to a half, a third, ... of their size."""
 _HELP = (
     "give a mask.png, a folder of masks, a point x,y,z, a box x0,y0,z0,x1,y1,z1, a pixel u,v with --view, or clicks "
     "+u,v@photo on the object and -u,v@photo next to it"
@@ -209,7 +209,7 @@ def _read_masks(path: Path, posed: Sequence[PosedImage] | None, view: str | None
 
 
 def _camera_of(file: Path, posed: Sequence[PosedImage], view: str | None) -> PosedImage:
-    """Return the camera of a mask file: ``view``, else the one whose photo has a matching name, else the only one."""
+    """Return the camera of a mask file: ``view``, otherwise that of the photo with a matching name or the only one."""
     if view is not None:
         return _view_named(posed, view, str(file))
     stems = [(Path(one.name).stem, one) for one in posed]
@@ -238,7 +238,7 @@ def mask_size(path: Path) -> tuple[int, int]:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """Read a mask file as (H, W) bool: its alpha channel if it has one, else the values above half of the maximum.
+    """Read a mask file as (H, W) bool: its alpha channel if it has one, otherwise the values above half of the maximum.
 
     Raises ``UserError`` if it is not an image.
     """

@@ -8,7 +8,7 @@ import shlex
 from egs_warp.commands.flags import Commands, named_path
 
 _GAUSSIANS = 6000
-"""Number of Gaussians of the object alone; its jump takes about half as long as that of the full pawn."""
+"""Number of Gaussians of the object alone; ``animate`` takes about half as long as for the full pawn."""
 
 
 EXAMPLES = ("out/samples",)

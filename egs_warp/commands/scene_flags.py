@@ -9,7 +9,7 @@ from egs_warp.commands.flags import named_path
 
 
 def add_object_flags(parser: argparse._ActionsContainer, *, common: argparse._ActionsContainer | None = None) -> None:
-    """Add the flags that select the object of a scene; ``--object`` goes to ``common`` if it is given."""
+    """Add the flags that select the object of a scene; ``--object`` is added to ``common`` if it is given."""
     (common or parser).add_argument(
         "--object",
         action="append",
@@ -38,7 +38,7 @@ def add_flat_flag(parser: argparse._ActionsContainer) -> None:
 
 
 def add_overwrite_flag(parser: argparse._ActionsContainer, where: str) -> None:
-    """Add the flag that allows an earlier run to be moved; ``where`` names its flag for the help."""
+    """Add the flag that allows an earlier run to be moved; ``where`` names the output flag in the help."""
     parser.add_argument(
         "--overwrite",
         action="store_true",
@@ -53,7 +53,7 @@ def add_scene_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, type=named_path, help="folder for the result and its image")
     add_overwrite_flag(parser, "--out")
     parser.add_argument(
-        "--up", help="axis that points roughly up: x, y, z, -x, -y or -z, as --up=-y (default: estimated)"
+        "--up", help="axis that points roughly up: x, y, z, -x, -y or -z, such as --up=-y (default: estimated)"
     )
     parser.add_argument(
         "--plane", help="ground plane: plane.json of an earlier step, or nx,ny,nz,d (default: estimated)"

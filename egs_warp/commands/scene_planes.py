@@ -41,7 +41,7 @@ class ScenePlanes:
 
     @property
     def planes(self) -> list[Plane]:
-        """Planes without their records."""
+        """The planes alone, in the order of ``known``."""
         return [one.plane for one in self.known]
 
     def write(self, path: Path) -> None:
@@ -53,7 +53,7 @@ def planes_of_scene(scene: SceneInput, *, plane_mask: str | None, view: str | No
     """Find the requested plane and up to ``count`` - 1 other wide planes parallel to it.
 
     Args:
-        scene: the scene; without ``plane_mask`` it has an object.
+        scene: the scene; without ``plane_mask`` it must contain the selection of an object.
         plane_mask: mask file or folder of masks to which the plane is fitted; None for the plane under the object.
         view: name or number of the camera of a single mask.
         count: maximum number of planes, at least 1.

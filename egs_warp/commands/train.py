@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _SHEET_PHOTOS = 6
 """Maximum number of photos in the comparison sheet."""
 _DEFAULTS = {"cpu": (2000, 20_000, 360), "cuda": (7000, None, 1600)}
-"""Iterations, maximum number of Gaussians and longer side in pixels: a preview on two cores, a capture on a GPU."""
+"""Iterations, maximum number of Gaussians, longer side of photos in pixels: preview on two cores, capture on a GPU."""
 
 
 EXAMPLES = (
@@ -57,8 +57,8 @@ def add_parser(commands: Commands) -> None:
     )
     train.add_argument(
         "--background",
-        help="background colour: r,g,b from 0 to 1, #rrggbb or a name of CSS (default: white for photos with "
-        "alpha, else the colour of "
+        help="background colour: r,g,b from 0 to 1, #rrggbb or a CSS name (default: white for photos with "
+        "alpha, otherwise the colour of "
         "their borders)",
     )
     train.add_argument(
@@ -98,11 +98,11 @@ def _train(args: argparse.Namespace) -> int:
         return 0
     if checkpoint.exists() and not (args.resume or args.overwrite):
         raise UserError(
-            f"--out {args.out}: an interrupted training is here; give --resume to continue it, or --overwrite to start"
+            f"--out {args.out}: its training was interrupted; give --resume to continue it, or --overwrite to start"
             " again"
         )
     outputs = (args.out, sheet, report_path)
-    # With --resume, existing outputs belong to the interrupted training, or the user allowed it to move them.
+    # With --resume, existing outputs belong to the interrupted training, or its flags allowed it to move them.
     overwrite = args.overwrite or (args.resume and checkpoint.exists())
     check_named_files(*outputs, overwrite=overwrite)
     import warp as wp
@@ -160,7 +160,7 @@ def _train(args: argparse.Namespace) -> int:
         write(args.out, result.cloud)
         report.write(report_path)
         write_png(sheet, comparison)
-        # Only needed to resume.
+        # The checkpoint is needed only to resume.
         checkpoint.unlink(missing_ok=True)
     wrote = f"wrote {args.out} ({result.cloud.count} Gaussians), {stem}.sheet.png, {stem}.report.json"
     print(*report.summary(), wrote, sep="\n")
@@ -177,7 +177,7 @@ class _Progress:
         self._before = 0
         self._shown = 0.0
         self.frames_per_second = 0.0
-        """Training steps per second, without the first."""
+        """Training steps per second, not counting the first step."""
 
     def say(self, stage: str) -> None:
         """Report the start of ``stage``."""
@@ -206,7 +206,7 @@ class _Progress:
 
 
 def _sheet(result: TrainResult) -> np.ndarray:
-    """Return (H, W, 3) uint8, photos next to renders, of held-out photos if there are any."""
+    """Return the sheet (H, W, 3), uint8: photos, held-out ones if there are any, next to their renders."""
     import numpy as np
 
     from egs_warp.io.video import contact_sheet

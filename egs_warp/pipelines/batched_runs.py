@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from egs_warp.locomotion.batch import BatchStepper
 
 MAX_WORLDS = 1024
-"""Jobs in one batch: larger batches are hardly faster, and their results stay in memory until they end."""
+"""Maximum number of jobs in a batch: larger ones are hardly faster, and their results stay in memory until they end."""
 _MEMORY_FRACTION = 0.4
 """Fraction of the free memory of a GPU that matrix factors may use."""
 _MIN_JOBS_PER_CORE = 2
-"""Jobs for each core of the machine above which a batch is faster than worker processes: on an H100, eight worlds of
-253 nodes make 101 steps a second, one process makes 21."""
+"""Number of jobs per core of the machine above which a batch is faster than worker processes: on an H100, eight worlds
+of 253 nodes make 101 steps per second in total, and one process makes 21."""
 
 
 def choose_batch_size(creature: Creature, jobs: int) -> int:
@@ -63,13 +63,13 @@ def run_batched(
     worlds: int,
     progress: Callable[[dict[int, tuple[int, int]]], object],
 ) -> Iterator[TaskResult]:
-    """Run jobs in batches and yield each result when its batch ends. Jobs of one step size share batches.
+    """Run jobs in batches and yield each result when its batch ends. A batch contains only jobs of the same step size.
 
     Args:
         creature: The creature of all jobs.
         jobs: Number and job, in any order.
         worlds: Maximum number of jobs in a batch.
-        progress: Called after each frame with, for each running job, its number and the frames done and expected.
+        progress: Called after each frame with the frames done and expected, by the number of each running job.
     """
     batch_jobs: list[_BatchJob] = []
     for number, job in jobs:
@@ -97,7 +97,7 @@ class _BatchJob:
     per_frame: int
     """Steps in a frame."""
     activations: np.ndarray
-    """(steps, M) m, for a whole number of frames."""
+    """(steps, M) m, prescribed activations for a whole number of frames."""
 
 
 def _make_batch_job(creature: Creature, number: int, job: Job, _: ProgressCallback) -> _BatchJob:
@@ -123,7 +123,7 @@ def _run_batch(
         run = _run(creature, batch, progress)
     except torch.OutOfMemoryError as error:
         memory_error = " ".join(str(error).split())
-    # Outside the except block, whose traceback keeps the memory of the failed attempt allocated.
+    # Retry outside the except block, whose traceback keeps the memory of the failed attempt allocated.
     if run is None and len(batch) == 1:
         why = f"out of GPU memory with a single world; set worlds=0 to use worker processes: {memory_error}"
         yield TaskResult(batch[0].number, None, why, 1)
@@ -141,7 +141,7 @@ def _run_batch(
 
 @dataclass(frozen=True)
 class _Run:
-    """Results of one batch, one entry a job."""
+    """Results of one batch, one entry per job."""
 
     creatures: list[Creature]
     """The creature on the ground of each job."""

@@ -11,9 +11,10 @@ from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 MIN_GAUSSIANS = 100
 """Number of Gaussians below which most of the body's shape is extrapolated."""
 _DETACHED_DISTANCE = 0.15
-"""Body heights from the cage, at least one cage edge: floaters that the cage excludes are nearer."""
+"""Distance from the cage beyond which a Gaussian is detached, body heights; at least one edge of the cage. Floaters
+that the cage excludes are nearer."""
 _MIN_DETACHED_SHARE = 0.01
-"""Fraction of the opacity that must be detached for a warning."""
+"""Fraction of the opacity in detached Gaussians above which there is a warning."""
 
 _MAX_THICKENING = 1.3
 """Thickening of the cage above which there is a warning."""
@@ -30,7 +31,7 @@ def capture_warnings(cloud: GaussianCloud, cage: TetMesh, height: float, *, thic
         notes.append(f"only {cloud.count} Gaussians: most of the body is guessed")
     if thickening > _MAX_THICKENING:
         notes.append(
-            f"the body is {thickening:.2g} times as thick as what is visible of it: it is too thin for its elements"
+            f"the body is {thickening:.2g} times as thick as the visible object, which is too thin for the elements"
         )
     distance, _ = KDTree(cage.nodes).query(cloud.means.numpy().astype(np.float64))
     opacity = cloud.opacities()
@@ -39,6 +40,6 @@ def capture_warnings(cloud: GaussianCloud, cage: TetMesh, height: float, *, thic
     if share > _MIN_DETACHED_SHARE:
         notes.append(
             f"{100 * share:.0f} % of the capture lies apart from the body, up to {distance.max() / height:.2g} body"
-            " heights away, and moves with it as if they were one; cut other objects away first"
+            " heights away, and moves as if it were attached; remove other objects first"
         )
     return tuple(notes)

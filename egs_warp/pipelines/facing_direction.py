@@ -1,7 +1,7 @@
-"""Estimate of the direction in which a body faces: in its best vertical mirror plane, towards the side of its face.
+"""Estimate of the direction in which a body faces: in its best vertical mirror plane, towards its face.
 
-The body is rendered from all around. A face has more detail than the back of a head, a head is ahead of the feet, the
-back of a chair is behind its seat, and photos from one side only usually show the front.
+The body is rendered from all around. A face has more detail than the back of a head, a head is in front of the feet,
+the back of a chair is behind its seat, and photos from one side only usually show the front.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.render.rasteriser import render_gaussians
 
 _VIEWS = 24
-"""Number of views, evenly around; mirror planes are tested at half their angular spacing."""
+"""Number of views, evenly spaced around the body; mirror planes are tested at half their angular spacing."""
 _SIDE, _COARSE_SIDE = 128, 64
 """Side of the pictures, pixels, for detail and for symmetry."""
 _ELEVATION = 0.2
-"""Vertical over horizontal component of the direction from the body to the camera."""
+"""Ratio of the vertical to the horizontal component of the direction from the body to the camera."""
 _FOV_DEGREES = 20.0
 """Vertical field of view, narrow so that images of a mirrored body are nearly mirrored."""
 _MAX_GAUSSIANS = 50_000
-"""Number of Gaussians above which they are subsampled and widened: small details do not matter."""
+"""Maximum number of Gaussians; a subset of more is used and widened, because small details do not matter."""
 _FINE, _SMOOTH = 0.01, 0.04
 """Standard deviations of two blurs, body heights: detail is the difference between them."""
 _OFFSETS = np.arange(-6.0, 7.0, 1.5)
@@ -39,14 +39,14 @@ _OPAQUE = 0.8
 _SILHOUETTE = 0.5
 """Weight of the coverage relative to the colours, 0 to 1."""
 _HIGH, _LOW = 0.7, 0.3
-"""Body heights above which is the head, and below which are the feet."""
+"""Heights above which the head is, and below which the feet are, body heights."""
 _MAX_HEAD_ASPECT = 2.7
 """Ratio of width to depth above which a head is taken for the back of a chair."""
 _SYMMETRY, _LEAN, _PHOTOS = 2.0, 1.5, 1.0
 """Weights of the symmetric fraction of a picture, of a lean of one body height, and of photos that are all from one
 direction; the weight of detail is 1."""
 _CLEAR_MARGIN = 0.4
-"""Difference of score between front and back for a clear result: that of a face with 1.5 times the detail."""
+"""Difference between the scores of front and back above which a result is clear; 1.5 times the detail gives it."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Front:
 def find_front(
     cloud: GaussianCloud, mesh: TetMesh, *, seen_from: np.ndarray | None = None, lengthwise: bool = False
 ) -> Front:
-    """Estimate the facing direction of a body. Equal bodies give equal bits.
+    """Estimate the facing direction of a body. Equal bodies give bitwise equal results.
 
     Args:
         cloud: Gaussians in the frame of the body.
@@ -103,17 +103,17 @@ def find_front(
         # The maximum of a parabola through the best score and its neighbours.
         before, at, after = score[best - 1], score[best], score[(best + 1) % len(score)]
         angle = angles[best] + 0.5 * (before - after) / min(before - 2.0 * at + after, -1e-12) * np.pi / _VIEWS
-    alike = f"the body is {100.0 * mirrored[best % _VIEWS]:.0f} % alike when mirrored along it"
+    symmetric = f"the body is {100.0 * mirrored[best % _VIEWS]:.0f} % symmetric about this direction"
     reasons = [
-        "the body lies along it" if lengthwise else alike,
-        f"has {np.exp(richer[best]):.2f} times the detail of behind",
-        f"leans {lean[best]:+.2f} of its height ahead",
+        "the body lies along this direction" if lengthwise else symmetric,
+        f"its front has {np.exp(richer[best]):.2f} times the detail of its back",
+        f"its head is {lean[best]:+.2f} of its height in front of its feet",
     ]
     if abs(photos[best]) > 0.05:
-        reasons.append(f"was photographed from {'there' if photos[best] > 0.0 else 'behind'}")
+        reasons.append(f"it was photographed from {'the front' if photos[best] > 0.0 else 'behind'}")
     ahead = float(score[best] - score[(best + _VIEWS) % len(score)])
     sure = "clearly" if ahead > _CLEAR_MARGIN else "narrowly"
-    why = f"guessed: {', '.join(reasons)}; {sure} ahead of the back; if not, say which way is front"
+    why = f"guessed: {', '.join(reasons)}; {sure} better than the opposite; if it is wrong, give the front"
     return Front(np.array([np.cos(angle), np.sin(angle), 0.0]), why)
 
 
@@ -204,7 +204,7 @@ def _detail(picture: np.ndarray, height: float) -> float:
 def _lean(mesh: TetMesh) -> np.ndarray:
     """Return the horizontal offset (2,) of the head from the feet, body heights.
 
-    If the upper part is a thin plate, such as the back of a chair, its offset counts backwards.
+    If the upper part is a thin plate, such as the back of a chair, return only the offset across the plate, negated.
     """
     middles, volumes, height = mesh.nodes[mesh.tets].mean(axis=1), mesh.volumes(), float(mesh.nodes[:, 2].max())
 

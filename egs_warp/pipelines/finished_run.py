@@ -87,7 +87,7 @@ class FinishedRun:
         creature = RenderData.load(folder / render_data.FILE, node_count=len(trajectory.rest_positions))
         if len(creature.muscle_bounds) != trajectory.activations.shape[1]:
             advice = "run egs-warp animate again, which writes both"
-            raise UserError(f"{folder / render_data.FILE}: has other muscles than trajectory.npz; {advice}")
+            raise UserError(f"{folder / render_data.FILE}: its muscles differ from those of trajectory.npz; {advice}")
         report = parse_json(read_text(folder / "report.json"), folder / "report.json")
         if not isinstance(report, dict):
             raise UserError(f"{folder / 'report.json'}: is not a report; run egs-warp animate again, which writes it")

@@ -10,9 +10,9 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 
 _GROUND_DISTANCE = 0.05
-"""Body heights from the ground within which nodes stand on it and Gaussians belong to it."""
+"""Distance from the ground within which nodes stand on it and Gaussians belong to it, body heights."""
 _COVER_DISTANCE = 0.03
-"""Body heights: a node is over ground if a ground Gaussian is nearer, or nearer than twice its own width."""
+"""A node is over ground if a ground Gaussian is within this distance, body heights, or within twice its own width."""
 _MIN_SHARE = 0.5
 """Fraction of the standing nodes that must be over ground."""
 _MIN_OPACITY = 0.3
@@ -47,7 +47,10 @@ def share_over_ground(nodes: np.ndarray, scene: GaussianCloud, ground: Surface, 
 def ground_coverage_warning(
     nodes: np.ndarray, scene: GaussianCloud | None, ground: Surface, height: float
 ) -> tuple[str, ...]:
-    """Return a warning if a body with the final ``nodes`` is not over captured ground; arguments as above."""
+    """Return a warning if a body with the final ``nodes`` is not over captured ground.
+
+    The arguments are those of ``share_over_ground``; ``scene`` is None without a background.
+    """
     if scene is None or share_over_ground(nodes, scene, ground, height) >= _MIN_SHARE:
         return ()
     return (

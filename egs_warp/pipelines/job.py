@@ -80,7 +80,7 @@ class Job:
         return report, simulation.frames, simulation.trajectory
 
     def _requested_options(self) -> dict[str, JsonValue]:
-        """Return ``asked`` of the report."""
+        """Return the requested options, ``asked`` of the report."""
         return {
             "friction": self.friction,
             "frames": self.frames,

@@ -22,15 +22,15 @@ from egs_warp.launching import available_threads
 from egs_warp.pipelines.report import MECHANICS, installed_version, versions
 
 OPTIONAL = {
-    "torch": ("training, fine-tuning where it straddles the ground", "egs-warp[torch]"),
+    "torch": ("training, and fine-tuning of Gaussians that straddle the ground", "egs-warp[torch]"),
     "pycolmap": ("egs-warp pose", "egs-warp[pose]"),
     "usd-core": ("exports to USD", "egs-warp[usd]"),
-    "ray": ("runs over the hosts of a cluster", "egs-warp[ray]"),
+    "ray": ("runs on the hosts of a cluster", "egs-warp[ray]"),
 }
 """Purpose of each optional package, and the extra that installs it."""
 _ENCODERS = {"libx264": "mp4", "prores_ks": "ProRes 4444", "libvpx-vp9": "WebM with alpha"}
 _MIN_FREE_MEMORY = 2**31
-"""Bytes that a scene of half a million Gaussians and its body need."""
+"""Memory that a scene of half a million Gaussians and its body need, bytes."""
 _BLOCK_SIZE = 256
 """Warp's default on a GPU; a kernel file with another block size defines ``BLOCK``."""
 
@@ -81,7 +81,7 @@ class Machine:
         lines.append(f"versions {', '.join(f'{name} {number}' for name, number in self.versions.items())}")
         optional = [f"{name} {number}" if number else f"no {name}" for name, number in self.optional.items()]
         lines.append(f"optional {', '.join(optional)}")
-        driver = f"serves CUDA {self.driver}" if self.driver else "none"
+        driver = f"supports CUDA {self.driver}" if self.driver else "none"
         lines.append(f"driver   NVIDIA: {driver}; Warp was built with CUDA {self.toolkit}")
         for device in self.devices:
             memory = f"{_gib(device.free)} of {_gib(device.total)} GiB free"
@@ -100,7 +100,7 @@ def inspect_machine() -> Machine:
     optional = {name: installed_version(name) for name in OPTIONAL}
     problems, advice = [], []
     if not os.access(cache, os.W_OK):
-        problems.append(f"kernel cache {cache}: cannot be written; set WARP_CACHE_PATH to a folder that can be")
+        problems.append(f"kernel cache {cache}: is not writable; set WARP_CACHE_PATH to a writable folder")
     ffmpeg, encoders = None, ()
     try:
         ffmpeg = ffmpeg_program()
@@ -108,7 +108,7 @@ def inspect_machine() -> Machine:
     except UserError as error:
         problems.append(error.format_message())
     if len(devices) == 1:
-        advice.append("everything runs on the CPU; for device cuda:0 give this machine an NVIDIA GPU and its driver")
+        advice.append("everything runs on the CPU; the device cuda:0 needs an NVIDIA GPU and its driver")
     for device in devices:
         if device.free is not None and device.free < _MIN_FREE_MEMORY:
             advice.append(f"{device.alias} has little free memory: end other programs, or give smaller captures")

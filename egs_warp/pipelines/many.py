@@ -60,7 +60,7 @@ class JobResult:
     def trajectory(self) -> Trajectory:
         """All solver steps, read from ``file`` if they are not in memory. Raises ``UserError`` if the job failed."""
         if self.in_memory_trajectory is None and self.file is None:
-            raise UserError(f"job: it has no trajectory: {self.error}")
+            raise UserError(f"job: it has no trajectory, because it failed: {self.error}")
         return self.in_memory_trajectory if self.in_memory_trajectory is not None else Trajectory.load(self.file)  # pyright: ignore[reportArgumentType]
 
 
@@ -76,8 +76,8 @@ def simulate_many(
 ) -> tuple[JobResult, ...]:
     """Run all ``jobs`` of one ``creature``, several at a time.
 
-    In a worker process, a job gives the same bits as alone (``Job.run``) on a machine of the same kind. In a batch, its
-    nodes differ by less than 1e-9 body heights in the first 30 steps.
+    In a worker process, a job gives the same bits as ``Job.run`` on a machine of the same kind. In a batch, the node
+    positions differ from those of ``Job.run`` by less than 1e-9 body heights in the first 30 steps.
 
     Each worker receives the creature once and uses one core. A job whose worker is lost is run again, at most twice. A
     job that fails has an error in its result; the others continue.
@@ -85,7 +85,7 @@ def simulate_many(
     Args:
         creature: The creature of all jobs.
         jobs: The jobs.
-        workers: Number of processes on this machine; None is its number of cores; ``"ray"`` or the address of a Ray
+        workers: Number of processes on this machine; None uses its number of cores; ``"ray"`` or the address of a Ray
             cluster uses the cores of the cluster (docs/guide/many.md).
         worlds: Batch size, in this process on the creature's device, of the jobs that have prescribed activations and
             no pushes. None uses batches of up to 1,024 on a GPU if there are at least two such jobs for each core of
@@ -183,7 +183,7 @@ class _RunJob:
 
     def __init__(self, creature: Creature) -> None:
         self._device = str(creature.cloud.device)
-        # A single Gaussian in place of the capture, which no motion uses.
+        # Send a single Gaussian in place of the capture, which no motion uses.
         dot = [np.zeros((1, *shape)) for shape in ((3,), (4,), (3,), (), (1, 3))]
         cloud = GaussianCloud.from_numpy(*dot, device=self._device)
         # Unpickled in the worker after ``use_device``, which makes Warp quiet.
@@ -200,7 +200,7 @@ class _RunJob:
 
 
 class _FrameCounter:
-    """Count of the frames of all jobs, done and expected; jobs not yet started count with the mean of the others."""
+    """Count of the frames of all jobs, done and expected; a job not yet started counts with the mean of the others."""
 
     def __init__(self, jobs: int, progress: Callable[[int, int], object]) -> None:
         self._jobs, self._progress = jobs, progress

@@ -22,7 +22,7 @@ _LINE = 22
 
 
 def picture_cameras(plane: Plane, centre: np.ndarray, size: float, cameras: Sequence[Camera] = ()) -> list[Camera]:
-    """Return four cameras: of the capture's ``cameras`` above the plane, evenly chosen, otherwise on a ring."""
+    """Return four of the ``cameras`` above the plane, evenly chosen; if there are fewer, four cameras on a ring."""
     above = [camera for camera in cameras if plane.heights(camera.centre) > 0.0]
     if len(above) >= 4:
         return [downscale(above[len(above) * k // 4], _SIDE) for k in range(4)]

@@ -30,7 +30,7 @@ _FLOWS = {
     "contact and push-out": ("contact", "push_out"),
     "air": ("drag",),
     "lost by the integrator": ("lost_inertia", "lost_elastic", "lost_muscle", "lost_damping"),
-    "spin given back": ("spin_inside", "spin_after"),
+    "restored spin": ("spin_inside", "spin_after"),
 }
 _COLOUR_PERCENTILE = 99.0
 """Percentile of the tensions at the end of the colour scale."""
@@ -60,7 +60,7 @@ def _draw_stored(axes: Axes, t: Trajectory, energy: EnergyBalance) -> None:
     for name, label in _STORED.items():
         values = getattr(energy, name)
         axes.plot(t.time, (values - (values[0] if name == "potential" else 0.0)) / energy.energy_unit, label=label)
-    axes.set_title("Energy in the body, over m g H")
+    axes.set_title("Energy in the body, divided by m g H")
     axes.legend(fontsize="small")
 
 
@@ -72,7 +72,7 @@ def _draw_flows(axes: Axes, t: Trajectory, energy: EnergyBalance) -> None:
         axes.plot(t.time, flow / energy.energy_unit, label=f"{label} {flow[-1] / energy.energy_unit:+.2f}")
     axes.plot(t.time, total / energy.energy_unit, "k", linewidth=2.0, label="sum")
     axes.plot(t.time, (energy.stored - energy.stored[0]) / energy.energy_unit, "w--", linewidth=1.0, label="gained")
-    axes.set_title("Energy given and taken since the start, over m g H")
+    axes.set_title("Energy flows since the start, divided by m g H")
     axes.legend(fontsize="small", facecolor="0.85", ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.14))
 
 
@@ -113,7 +113,7 @@ def _draw_centre(axes: Axes, t: Trajectory) -> None:
 
 def _draw_muscles(axes: Axes, t: Trajectory) -> None:
     pull = (t.activations * t.muscle_stiffness).T / (t.node_mass.sum() * np.linalg.norm(t.gravity))
-    axes.set_title("Pull of the muscle segments, body weights")
+    axes.set_title("Tension of the muscle segments, body weights")
     axes.set_ylabel("segment")
     if pull.size == 0:
         return

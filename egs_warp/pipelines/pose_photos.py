@@ -29,7 +29,7 @@ _PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 _MAX_EXHAUSTIVE = 400
 """Number of photos above which they are matched only with their neighbours in the order of their names."""
 _NEIGHBOURS = 20
-"""Neighbours of a photo for sequential matching."""
+"""Number of neighbours with which a photo is matched."""
 _MIN_PHOTOS = 3
 _CAMERA_MODEL = "SIMPLE_RADIAL"
 _WRITES = ("images", "sparse")
@@ -51,7 +51,7 @@ class PoseResult:
     without_pose: tuple[str, ...]
     """Names of the photos without a pose."""
     unreadable: tuple[str, ...]
-    """Reasons why files could not be read, one a file."""
+    """Reasons why files could not be read, one per file."""
     points: int
     """Number of triangulated points."""
     error: float
@@ -82,7 +82,7 @@ def pose_photos(
         seed: Seed of COLMAP.
         overwrite: Move an earlier run in ``out`` aside.
         stage: Called with a description of each stage as it starts.
-        progress: Called with the name of a stage, its finished and its total number of items.
+        progress: Called with the name of a stage, the number of its finished items, and their total number.
 
     Raises:
         UserError: pycolmap is not installed, ``out`` has an earlier run or photos or cannot be written, or fewer than
@@ -110,13 +110,13 @@ def pose_photos(
             say(f"left out {reason}")
         names = sorted(path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
         if len(names) < _MIN_PHOTOS:
-            raise UserError(f"{source}: {len(names)} photos that can be read; give at least {_MIN_PHOTOS}")
+            raise UserError(f"{source}: {len(names)} readable photos; give at least {_MIN_PHOTOS}")
         try:
             model = _reconstructed(
                 pycolmap, work, names, in_order=is_video, max_side=max_side, seed=seed, say=say, report=report
             )
         except RuntimeError as error:
-            # An error of its database, for example if the disk is full.
+            # COLMAP raises this error if its database fails, for example on a full disk.
             reason = next(iter(str(error).splitlines()), "no reason given")
             raise UserError(f"pose: COLMAP cannot continue ({reason}); is there free space in {out}?") from error
         _write_model(model, work / "sparse" / "0", out)
@@ -211,7 +211,7 @@ def _reconstructed(
         max_side: Longer side of the images in which features are detected, pixels.
         seed: Seed of COLMAP.
         say: Called with a description of each stage.
-        report: Called with the name of a stage, its finished and its total number of items.
+        report: Called with the name of a stage, the number of its finished items, and their total number.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     pycolmap.set_random_seed(seed)
@@ -274,7 +274,7 @@ def _reconstructed(
 
 
 class _DatabaseWatch:
-    """Progress of pycolmap, which does not report it, from the number of rows of its database."""
+    """Progress of pycolmap, taken from the number of rows of its database, because pycolmap does not report it."""
 
     def __init__(self, database: Path, report: Callable[[str, int, int], None]) -> None:
         self._database = database

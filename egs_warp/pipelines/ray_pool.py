@@ -14,7 +14,7 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.pipelines.worker_pool import ONE_THREAD, Event, TaskFunction, attempt
 
 DEFAULT_ADDRESS = "ray"
-"""Address of the Ray that this program is connected to, else that of ``RAY_ADDRESS``, else of a temporary one."""
+"""Stands for the connected Ray cluster, otherwise for the one at ``RAY_ADDRESS``, otherwise for a temporary one."""
 _POLL_INTERVAL = 0.5
 """Interval at which the progress of the workers is read, s."""
 
@@ -40,7 +40,7 @@ class RayWorker:
 
 
 class RayPool:
-    """Worker pool of a Ray cluster, one core a worker; a Ray instance that it has started ends with it."""
+    """Worker pool of a Ray cluster, one core per worker; a Ray instance that the pool has started ends with it."""
 
     def __init__(self, work: TaskFunction, max_workers: int, address: str = DEFAULT_ADDRESS) -> None:
         """Connect to Ray.
@@ -66,7 +66,7 @@ class RayPool:
                     "workers", f"no Ray cluster answers at this address ({line})", value=address
                 ) from error
         self.size = max(1, min(max_workers, int(ray.cluster_resources().get("CPU", 1))))
-        # Two concurrent calls: the task, and the one that reads its progress.
+        # Two calls run concurrently: one runs the task, the other reads its progress.
         self._actor_class = ray.remote(num_cpus=1, max_restarts=0, max_concurrency=2)(RayWorker)
         self._work = ray.put(pickle.dumps(work))
         self._actors: dict[int, Any] = {}
@@ -74,7 +74,7 @@ class RayPool:
         self._polls: dict[Any, int] = {}
 
     def begin(self, worker: int, task: Any) -> None:
-        """Give a free worker a task; a worker that does not exist, or was lost, is started."""
+        """Give an idle worker a task; a worker that does not exist, or was lost, is started."""
         if worker not in self._actors:
             self._actors[worker] = self._actor_class.remote(self._work)
         actor = self._actors[worker]
@@ -89,7 +89,7 @@ class RayPool:
         for call in ready:
             if call in self._polls:
                 worker = self._polls.pop(call)
-                # A lost worker is reported by the call of its task.
+                # If the worker is lost, the call of its task reports this.
                 with contextlib.suppress(ray.exceptions.RayError):
                     messages = ray.get(call)
                     events += [Event(worker, "progress", values) for values in messages[-1:]]

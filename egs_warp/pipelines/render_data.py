@@ -102,7 +102,7 @@ class RenderData:
             data = cls(
                 GaussianCloud.from_numpy(
                     *(arrays[name] for name in ARRAYS),
-                    # Runs of earlier versions do not have it.
+                    # Runs of earlier versions do not contain this field.
                     antialiased=bool(arrays.get("antialiased", False)),
                     device=device,
                 ),

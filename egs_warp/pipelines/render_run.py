@@ -50,7 +50,7 @@ def render_run(
         out: Video (.mp4, .mov, .webm); a name without an ending is a folder of PNGs.
         shot: Camera, size, frame rate and background.
         show: Quantity to show.
-        hold: Show this frame at 60 Hz alone, while the camera moves around it once; None shows the motion.
+        hold: Freeze this frame, counted at 60 Hz, while the camera moves around it once; None shows the motion.
         shadow: Draw a shadow on the ground.
         quiet: Show no progress bar.
 
@@ -65,7 +65,7 @@ def render_run(
     if not folder:
         check_no_file_of_a_run(out)
     if shot.transparent and (show is not Show.COLOUR or (not folder and out.suffix.lower() == ".mp4")):
-        advice = "give a .mov, a .webm or a folder" if show is Show.COLOUR else "leave out what to show besides colour"
+        advice = "give a .mov, a .webm or a folder" if show is Show.COLOUR else "show colour instead of depth or alpha"
         raise ArgumentError("background", f"H.264, depth and alpha have no transparency; {advice}", value="transparent")
     t = run.trajectory
     if hold is None:

@@ -72,7 +72,7 @@ class MotionReport:
     asked: Mapping[str, float]
     """Requested values; lengths in body heights."""
     planned: DataclassInstance
-    """Plan of its state machine."""
+    """Plan of the motion's state machine."""
     reached: MotionOutcome
     """Measured values that all motions have."""
     state: State
@@ -179,7 +179,7 @@ class CageFacts:
 
 @dataclass(frozen=True)
 class MuscleFacts:
-    """Numbers of muscles."""
+    """Numbers of muscle fibres and segments."""
 
     fibres: int
     segments: int
@@ -297,7 +297,7 @@ AUDIT_LIMITS = {
 
 
 def verdict(result: Audit) -> str:
-    """Return one line that says if the run satisfies its equations, with what exceeds its limit."""
+    """Return one line that says whether the run satisfies its equations, or which values exceed their limits."""
     exceeded = []
     for name, value in asdict(result).items():
         limit = AUDIT_LIMITS[name]

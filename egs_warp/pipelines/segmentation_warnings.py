@@ -14,13 +14,14 @@ from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_search import lies_along
 
 _MIN_EDGE_SHARE = 0.02
-"""Fraction of a picture's shorter side: a smaller part of the object at the edge may be a floater."""
+"""Length of the object along a picture's edge above which there is a warning, as a fraction of the shorter side; a
+shorter part may be a floater."""
 _MAX_GAP = 0.03
-"""Fraction of the object's size: with a larger distance to the ground, its foot is missing."""
+"""Distance of the object to the ground above which its foot is missing, as a fraction of its size."""
 _FLOOR_DISTANCE = 0.03
-"""Fraction of the object's size within which flat Gaussians at the plane belong to the floor."""
+"""Distance to the plane within which flat Gaussians belong to the floor, as a fraction of the object's size."""
 _MAX_FLOOR_SHARE = 0.05
-"""Fraction of the floor around the object: a smaller fraction is the object's own underside."""
+"""Fraction of the floor around the object above which there is a warning; a smaller one is the object's underside."""
 
 
 def segmentation_warnings(
@@ -47,7 +48,7 @@ def segmentation_warnings(
         warnings.append(f"rests on nothing: its lowest part is {percent:.0f} % of its size above the ground")
     share = _floor_share(cloud, located.plane, segmentation.object_mask, located.centre, segmentation.size)
     if share > _MAX_FLOOR_SHARE:
-        warnings.append(f"taken along: {100 * share:.0f} % of the floor about it")
+        warnings.append(f"includes {100 * share:.0f} % of the floor around it")
     return warnings
 
 
@@ -58,7 +59,7 @@ def _touches_edge(object_cloud: GaussianCloud, camera: Camera) -> bool:
 
 
 def _floor_share(cloud: GaussianCloud, plane: Plane, object_mask: np.ndarray, centre: np.ndarray, size: float) -> float:
-    """Return the fraction of the flat area at ``plane``, within ``size`` of ``centre`` (3,), that the object has."""
+    """Return the fraction of the flat area at ``plane``, within ``size`` of ``centre`` (3,), that is in the object."""
     means = cloud.means.numpy().astype(np.float64)
     heights = plane.heights(means)
     arms = means - centre

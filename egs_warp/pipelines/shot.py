@@ -43,7 +43,7 @@ class CameraMove(StrEnum):
     """Built-in camera motion."""
 
     AUTO = "auto"
-    """``follow`` if the creature is then notably larger and has no scene around it, else ``fixed``."""
+    """``follow`` if that shows the creature notably larger and there is no scene, otherwise ``fixed``."""
     FIXED = "fixed"
     FOLLOW = "follow"
     ORBIT = "orbit"
@@ -68,10 +68,10 @@ class Shot:
     def __post_init__(self) -> None:
         if self.size is not None and not all(MIN_SIDE <= side <= MAX_SIDE for side in self.size):
             text = "x".join(map(str, self.size))
-            advice = f"give pixels from {MIN_SIDE} to {MAX_SIDE}, as 512 or 640x360"
+            advice = f"give pixels from {MIN_SIDE} to {MAX_SIDE}, such as 512 or 640x360"
             raise ArgumentError("size", advice, value=text)
         if not 1.0 <= self.fps <= MAX_FPS:
-            raise ArgumentError("fps", f"give a number of frames a second from 1 to {MAX_FPS:g}", value=self.fps)
+            raise ArgumentError("fps", f"give a number of frames per second from 1 to {MAX_FPS:g}", value=self.fps)
         if self.camera not in list(CameraMove) and not self.camera.endswith(".json"):
             near = did_you_mean(self.camera, CameraMove)
             raise ArgumentError("camera", f"give {', '.join(CameraMove)} or a path.json", value=f"{self.camera}{near}")
@@ -148,7 +148,7 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 def around(camera: Camera, positions: np.ndarray, *, count: int | None = None) -> list[Camera]:
     """Return cameras on a circle around the vertical axis through the centre of ``positions`` (f, N, 3).
 
-    They are as near as they can be while each shows all positions. There are ``count`` cameras, by default f.
+    They are as near as possible while each shows all positions. There are ``count`` cameras, by default f.
     """
     points = positions.reshape(-1, 3)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -167,7 +167,7 @@ def around(camera: Camera, positions: np.ndarray, *, count: int | None = None) -
 
 
 def framed(camera: Camera, points: np.ndarray) -> Camera:
-    """Return ``camera`` at the distance, and beside the ``points`` (n, 3), from which they fill its picture."""
+    """Return ``camera`` moved, without a rotation, to where the ``points`` (n, 3) fill its picture."""
     return fitted_camera(camera, points, sides=_SIDES, top=_TOP, bottom=_BOTTOM)
 
 

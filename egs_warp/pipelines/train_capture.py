@@ -25,7 +25,7 @@ from egs_warp.training.posed_photos import PhotoSources, backdrop_colour, laid_o
 _HOLD_OUT_EVERY = 8
 """Every eighth photo is used for evaluation and not for training, as in published methods."""
 _SH_STAGES = 10
-"""The SH degree is increased after each tenth of the iterations, until it is complete."""
+"""The SH degree is increased after each tenth of the iterations, up to the requested one."""
 _FIRST_GAUSSIANS = 30_000
 """Initial number of Gaussians if there are no triangulated points and no maximum."""
 
@@ -37,11 +37,12 @@ class PhotoScore:
     name: str
     held_out: bool
     psnr: float
-    """dB, of the render in the photo's exposure and white balance (one affine map of colours, fitted to the photo)."""
+    """Peak signal-to-noise ratio, dB, of the render in the photo's exposure and white balance: one affine map of
+    colours, fitted to the photo."""
     ssim: float
     """Mean structural similarity of the same render, 11 x 11 Gaussian window."""
     plain_psnr: float
-    """dB, of the render without that map."""
+    """Peak signal-to-noise ratio, dB, of the render without that map."""
     plain_ssim: float
     """Mean structural similarity of the render without that map."""
     is_outlier: bool = False
@@ -118,7 +119,8 @@ def train(
         background: Background colour, 0 to 1; None is white for photos with alpha, otherwise the mean colour at the
             borders of the photos, so that no Gaussians are used for a plain background.
         max_side: Larger photos are downscaled to this side, pixels; None keeps their size.
-        inverted_masks: True if the object is black in masks; None decides on the masks, False if they are not clear.
+        inverted_masks: True if the object is black in masks; None decides from the masks, False if they are not
+            clear.
         seed: Seed of the training.
         device: Warp device; None is the current one.
         threads: Number of threads; None is the default.
@@ -164,7 +166,7 @@ def train(
     )
     say(f"training on {len(chosen)} photos (the first run compiles kernels: up to a minute)")
     result = finetune(start, chosen, options=options, checkpoint=checkpoint, resume=resume, progress=progress)
-    say("judging every photo")
+    say("scoring every photo")
     scores = [
         score_photo(result.cloud, view, background, held_out=out, threads=threads)
         for view, out in zip(views, held_out, strict=True)

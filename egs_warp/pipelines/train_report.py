@@ -41,7 +41,7 @@ class TrainReport:
     """Score of each photo."""
     seconds: float
     frames_per_second: float
-    """Optimiser steps per second, without the first."""
+    """Optimiser steps per second, not counting the first step."""
     device: str
     seed: int
     sh_degree: int

@@ -29,8 +29,8 @@ _WEIGHT_LENGTH = 0.5
 def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | None = None, quiet: bool = False) -> None:
     """Write ``run`` to a USD file in metres, with z up and 60 time codes per second.
 
-    Splats are a ParticleField3DGaussianSplat, which OpenUSD has since 26.03; the cage is a mesh, muscles and forces are
-    curves.
+    Splats are a ParticleField3DGaussianSplat, which OpenUSD has had since 26.03; the cage is a mesh, muscles and
+    forces are curves.
 
     Args:
         run: The run to export.
@@ -105,7 +105,7 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
 
 @contextmanager
 def _system_errors() -> Iterator[None]:
-    """Convert errors of USD that are caused by the system to those of Python."""
+    """Raise Python's error for a USD error that the operating system has caused, such as a full disk."""
     try:
         yield
     except RuntimeError as error:
@@ -123,7 +123,7 @@ def _modules() -> tuple[Any, ...]:
     _, Usd, _, UsdVol, _ = modules
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         version = ".".join(map(str, Usd.GetVersion()))
-        raise UserError(f"usd: usd-core {version} knows no Gaussian splats; install 26.3 or newer")
+        raise UserError(f"usd: usd-core {version} does not support Gaussian splats; install 26.3 or newer")
     return modules
 
 

@@ -27,7 +27,7 @@ ONE_THREAD: dict[str, str] = dict.fromkeys(
 )
 """Environment of a worker, which uses one core."""
 ProgressCallback = Callable[..., object]
-"""Function by which a task reports its progress."""
+"""Function with which a task reports its progress."""
 TaskFunction = Callable[[Any, ProgressCallback], Any]
 """Function that runs a task; like tasks and results, it is picklable. It is sent to each worker once."""
 _WINDOWS, _NEW_GROUP = sys.platform == "win32", 0x200
@@ -67,7 +67,7 @@ class WorkerPool(Protocol):
     """Number of workers."""
 
     def begin(self, worker: int, task: Any) -> None:
-        """Give a free worker a task; a worker that does not exist, or was lost, is started."""
+        """Give an idle worker a task; a worker that does not exist, or was lost, is started."""
         ...
 
     def wait(self) -> Sequence[Event]:
@@ -100,7 +100,7 @@ def ended_tasks(pool: WorkerPool, tasks: Sequence[Any], progress: Callable[..., 
                     continue
                 del busy[event.worker]
                 if event.kind == "lost" and runs[number] < MAX_ATTEMPTS:
-                    # Before all tasks that have not been started.
+                    # Retry this task before those that have not been started.
                     waiting.appendleft(number)
                 elif event.kind == "lost":
                     reason = f"its worker was lost {MAX_ATTEMPTS} times, finally: {event.value}"
@@ -116,7 +116,7 @@ def attempt(work: TaskFunction, task: Any, progress: ProgressCallback) -> bytes:
     try:
         return pickle.dumps((kind, value))
     except Exception as error:
-        return pickle.dumps(("failed", f"what it returns cannot be sent: {error}"))
+        return pickle.dumps(("failed", f"its result cannot be sent: {error}"))
 
 
 def run_task(work: TaskFunction, task: Any, progress: ProgressCallback) -> tuple[str, Any]:
@@ -142,20 +142,20 @@ class _Running:
 class ProcessPool:
     """Pool of Python processes on this machine, one thread each.
 
-    They do not receive Ctrl-C, and end with this process, however it ends.
+    The processes do not receive Ctrl-C, and they end when this process ends, even if it is killed.
     """
 
     def __init__(self, work: TaskFunction, size: int) -> None:
         self.size = size
         self._work = pickle.dumps(work)
         main = sys.modules["__main__"]
-        # Functions that a script defines exist in another process only after the script was run there as a module.
+        # A function that a script defines exists in another process only after the script has run there as a module.
         self._script = getattr(main, "__file__", None) if b"__main__" in self._work else None
         self._running: dict[int, _Running] = {}
         self._events: queue.SimpleQueue[tuple[int, Event]] = queue.SimpleQueue()
 
     def begin(self, worker: int, task: Any) -> None:
-        """Give a free worker a task; a worker that does not exist, or was lost, is started."""
+        """Give an idle worker a task; a worker that does not exist, or was lost, is started."""
         if worker not in self._running:
             self._start(worker)
         self._running[worker].messages.put(pickle.dumps(task))
@@ -181,7 +181,7 @@ class ProcessPool:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, **ONE_THREAD},
-            # In a separate process group, Ctrl-C of the terminal does not reach it.
+            # A separate process group does not receive Ctrl-C from the terminal.
             process_group=None if _WINDOWS else 0,
             creationflags=_NEW_GROUP if _WINDOWS else 0,
         )

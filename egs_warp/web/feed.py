@@ -31,7 +31,7 @@ class LiveFeed:
     """``FrameFeed`` of a live session."""
 
     def __init__(self, session: Session, *, scene: GaussianCloud | None = None) -> None:
-        """Create the feed of ``session``; ``scene`` is the background in the frame of the body, None for none."""
+        """Create the feed of ``session``; ``scene`` is the background in the frame of the body, or None."""
         self.session = session
         self._scene = scene
         self._name = secrets.token_hex(8)
@@ -90,7 +90,7 @@ class LiveFeed:
 
 
 def live_camera(creature: Creature, *, size: int = 512) -> Camera:
-    """Return the initial camera of the page: the direction of the video, with space around the creature."""
+    """Return the initial camera of the page, with the direction of the video's camera and space around the creature."""
     nodes, height = creature.start.positions, creature.body.height
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
     direction = np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM) @ initial_stance(creature).ground.axes

@@ -10,9 +10,9 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.sequence import Stance
 
 _MAX_STILL_SPEED = 2e-3
-"""sqrt(g H), root mean square speed of the nodes below which an idle body is still; a still body is not simulated."""
+"""Root mean square speed of the nodes below which an idle body is still, sqrt(g H); a still body is not simulated."""
 _MIN_STILL_TIME = 0.3
-"""Seconds for which the speed must be below the limit."""
+"""Time for which the speed must be below that limit, s."""
 
 
 class RelaxMuscles:

@@ -19,11 +19,11 @@ from egs_warp.motions.style import MAX_FACTOR, MIN_FACTOR, Style
 MAX_TEXT_LENGTH = 200
 """Maximum number of characters of the motions in one message."""
 MAX_DISTANCE = 100.0
-"""Body heights, maximum distance from the start of goals and pulls."""
+"""Maximum distance of goals and pulls from the start, body heights."""
 MIN_SAG, MAX_SAG = 0.01, 0.1
-"""Sag rho g H / E of a column: stiffest and softest."""
+"""Limits of the sag rho g H / E of a column: the stiffest and the softest body."""
 MAX_FRICTION = 2.0
-"""Coulomb coefficient."""
+"""Maximum Coulomb coefficient."""
 STYLE_NAMES = tuple(field.name for field in fields(Style))
 """Names of the style factors."""
 _MOTIONS = re.compile(r"[A-Za-z0-9_=+\-., ]+")
@@ -56,7 +56,7 @@ class Steer:
 
 @dataclass(frozen=True)
 class Pull:
-    """Pull a node by a spring until ``Release``."""
+    """Pull a node with a spring until ``Release``."""
 
     node: int
     """Index of the cage node."""
@@ -74,9 +74,9 @@ class PushOnce:
     """Push the body in the next step."""
 
     impulse: tuple[float, float, float]
-    """(x, y, z) m sqrt(g H), frame of the body."""
+    """(x, y, z), units of body mass x sqrt(g H), frame of the body."""
     height: float | None = None
-    """Body heights above the sole of the standing body, around which the push acts; None: equally on all nodes."""
+    """Height around which the push acts, body heights above the standing body's sole; None pushes all nodes equally."""
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ def _read_number(message: Mapping[str, Any], name: str, minimum: float, maximum:
 
 
 _Reader: TypeAlias = Callable[[Mapping[str, Any], float, int], Message]
-"""Reader of one type of message, with the maximum distance in metres and the number of nodes."""
+"""Function that reads one type of message; it also receives the maximum distance, m, and the number of nodes."""
 _READERS: dict[str, tuple[tuple[str, ...], _Reader]] = {
     "motion": (("text",), _read_script),
     "go": (("x", "y"), _read_go),

@@ -12,40 +12,41 @@ from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.threads import one_blas_thread
 
 GPU_NODES = 500
-"""Number on a GPU, where a step of it takes less than 1 / 60 s (docs/benchmarks/step.md)."""
+"""Number of nodes on a GPU, where a step takes less than 1 / 60 s (docs/benchmarks/step.md)."""
 MIN_CHOSEN, MAX_CHOSEN = 120, 500
-"""Smallest and largest number that is chosen; limbs of most bodies need the former, and ``animate`` uses the latter."""
+"""Limits of the chosen number: limbs of most bodies need the smaller one, and ``animate`` uses the larger one."""
 _PROBE_TIME = 0.3
 """Duration of the speed measurement, s: long enough for other processes to take their usual share of the cores."""
 _MIN_SPEED = 0.5
-"""Fraction of real time that the chosen number should reach."""
+"""Speed that the chosen number should reach, as a fraction of real time."""
 _PROBE_SIZE, _PROBE_COLUMNS = 300, 60
 _STEP_TIME_PER_PROBE = 20.5
 """Mean time of a step of a jumping pawn with ``_STEP_NODES`` nodes, relative to one pass of the probe run at the same
 time (160 ms and 7.8 ms on two busy cores of a Xeon)."""
 _STEP_NODES, _STEP_EXPONENT = 250, 0.54
-"""Requested number of nodes of that step, and the power of it with which the time grows (97 ms and 7.0 ms with 120)."""
+"""Requested number of nodes of that step, and the exponent with which the step time grows with it (97 ms and 7.0 ms
+with 120 nodes)."""
 
 
 @dataclass(frozen=True)
 class NodeChoice:
-    """Chosen number of nodes and the speed that is expected from it."""
+    """Chosen number of nodes and the expected speed of the simulation."""
 
     nodes: int
     speed: float
-    """Expected fraction of real time, at most 1."""
+    """Expected speed as a fraction of real time, at most 1."""
 
     def description(self) -> str:
         """Return one line for the user."""
-        speed = "real time" if self.speed >= 1.0 else f"{self.speed:.1g} of real time"
+        speed = "real-time speed" if self.speed >= 1.0 else f"{self.speed:.1g} of real-time speed"
         return (
-            f"a body of about {self.nodes} nodes is built, which this machine now simulates in about {speed};"
+            f"a body of about {self.nodes} nodes is built, which this machine now simulates at about {speed};"
             " give the number of nodes to choose another"
         )
 
 
 def choose_nodes(seconds: float | None = None) -> NodeChoice:
-    """Choose the largest number of nodes that the CPU simulates in at least half of real time, within limits.
+    """Choose the largest number of nodes, within limits, that the CPU simulates at half of real-time speed or faster.
 
     Args:
         seconds: Time of one pass of the probe, s; None measures it (``probe_seconds``).
@@ -57,7 +58,7 @@ def choose_nodes(seconds: float | None = None) -> NodeChoice:
 
 
 def probe_seconds() -> float:
-    """Return the mean wall-clock time of a dense factorisation and solve, with the load of the machine, s."""
+    """Return the mean wall-clock time of a dense factorisation and solve, under the current load of the machine, s."""
     random = np.random.default_rng(0)
     half = random.standard_normal((_PROBE_SIZE, _PROBE_SIZE))
     matrix = half @ half.T + _PROBE_SIZE * np.eye(_PROBE_SIZE)

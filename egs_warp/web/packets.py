@@ -41,7 +41,7 @@ class Frame:
     index: int
     """Number of the frame."""
     time: float
-    """s."""
+    """Simulated time, s."""
     positions: np.ndarray
     """(N, 3) m, nodes of the cage."""
     activations: np.ndarray

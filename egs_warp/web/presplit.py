@@ -19,7 +19,7 @@ from egs_warp.pipelines.creature import Creature
 MODE_COUNT = 6
 """Number of modes."""
 MODE_AMPLITUDE = 0.3
-"""Body heights, largest nodal displacement of a mode."""
+"""Largest nodal displacement of a mode, body heights."""
 
 
 def presplit_gaussians(creature: Creature) -> GaussianCloud:

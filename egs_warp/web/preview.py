@@ -21,7 +21,7 @@ from egs_warp.web.recording import splat_arrays
 from egs_warp.web.server import FrameFeed
 
 _OUTLIERS = 0.5
-"""Percentage of the opaque Gaussians at each end of an axis that the size of the still capture ignores."""
+"""Percentage of the opaque Gaussians that are ignored at each end of an axis for the size of the still capture."""
 _OPAQUE = 0.3
 """Opacity above which a Gaussian counts for the size."""
 _FOV_DEGREES = 30.0
@@ -46,8 +46,8 @@ def preview_of(
     Args:
         cloud: The capture.
         title: Title of the page.
-        up: (3,) up in the capture's frame; may be None if there is a plane.
-        plane: Ground plane in the capture's frame; None takes a plane below the capture.
+        up: (3,) up direction in the capture's frame; may be None if there is a plane.
+        plane: Ground plane in the capture's frame; None for a plane below the capture.
     """
     means, opacities = cloud.means.numpy().astype(np.float64), cloud.opacities()
     opaque = means[opacities > _OPAQUE] if (opacities > _OPAQUE).any() else means
@@ -138,7 +138,7 @@ class PreviewFeed:
         self._send({"type": "failed", "text": text})
 
     def start(self, session: FrameFeed) -> None:
-        """Send the frames of ``session`` from now on; a page that shows the preview loads itself again."""
+        """Send the frames of ``session`` from now on; a page that shows the preview reloads itself."""
         self._session = session
         self._send({"type": "ready"})
 
@@ -174,7 +174,10 @@ class PreviewFeed:
             self._wake = lambda: None
 
     def receive(self, message: dict[str, object]) -> None:
-        """Pass a message of the page to the session. Raises ``ValueError`` if there is none or it is invalid."""
+        """Pass a message of the page to the session.
+
+        Raises ``ValueError`` if there is no session yet or the message is invalid.
+        """
         if self._session is None:
             raise ValueError("the creature is being prepared")
         self._session.receive(message)

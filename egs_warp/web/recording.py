@@ -32,7 +32,7 @@ class Recording(FinishedRun):
     """A finished run that is encoded as packets."""
 
     def header(self) -> bytes:
-        """Return the header: everything that is constant over the frames."""
+        """Return the header: all data that are constant over the frames."""
         t, report = self.trajectory, self.report
         facts = {
             "title": self.title,
@@ -93,10 +93,10 @@ def creature_header(
         facts: JSON values of the run; those of the muscles and the camera are added.
         render_data: Gaussians, muscles, feet and camera.
         mesh: cage at rest.
-        node_mass: (N,) kg.
+        node_mass: (N,) kg, mass of each node.
         planes: (P, 4) rows n, d of the ground planes.
         deformer: embedding of the Gaussians in the cage.
-        scene: background; None for none.
+        scene: background, or None.
         more: further arrays by name.
     """
     camera = render_data.camera
@@ -143,9 +143,9 @@ def _edges(faces: np.ndarray) -> np.ndarray:
 
 
 def _arms(deformer: Deformer) -> np.ndarray:
-    """Return (n', 15) float32: six tetrahedra, six inside fractions and three smoothing lengths.
+    """Return (n', 15) float32: tetrahedra and inside fractions of the six axis ends, and three smoothing lengths.
 
-    One row for each of the n' Gaussians that extend over several tetrahedra, in their order.
+    There is one row for each of the n' Gaussians that extend over several tetrahedra, in their order.
     """
     plan = deformer.plan
     rows = plan.mean_tets.numpy() < 0

@@ -74,7 +74,7 @@ class SessionRecording:
 
         Args:
             reports: reports of the steps; more than one if a step was repeated with a smaller step size.
-            kick: (N, 3) m/s, velocities that pulls and pushes of the user added before the first step; None for none.
+            kick: (N, 3) m/s, velocities that pulls and pushes of the user added before the first step, or None.
         """
         self.reports += reports
         self._recorder.add(reports, kick=kick)

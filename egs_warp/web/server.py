@@ -1,6 +1,6 @@
 """Local server of the page, its runs, and a socket that sends frames of a live session.
 
-Only this machine can connect, and only pages of this server.
+Only programs on this machine can connect, and only pages that this server has sent.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from egs_warp.web.page import page_text
 HOST = "127.0.0.1"
 """Address that the server binds."""
 MAX_MESSAGE_BYTES = 65_536
-"""Bytes, maximum size of a message; a larger one closes the socket."""
+"""Maximum size of a message, bytes; a larger one closes the socket."""
 _HOST_NAMES = frozenset({"127.0.0.1", "localhost"})
 """Host names that requests may use."""
 _HEADERS = {
@@ -77,7 +77,7 @@ class PageServer:
         Args:
             runs: functions that return the bytes of each run; each is called once.
             port: port to bind; 0 selects a free one.
-            feed: source of a live session, sent to one client at a time; None for none.
+            feed: source of a live session, sent to one client at a time, or None.
             token: secret part of the address; None for a random one.
 
         Raises:

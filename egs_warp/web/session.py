@@ -110,7 +110,8 @@ class Session:
     def subscribe(self, wake: Callable[[], object]) -> None:
         """Subscribe a page and continue the simulation.
 
-        ``wake`` is called from the thread of the session when ``take_news`` has something new, first the current frame.
+        ``wake`` is called from the thread of the session when ``take_news`` has something new. The first news is the
+        current frame.
         """
         self._mailbox.subscribe(wake, self._frame)
 
@@ -149,11 +150,11 @@ class Session:
         return self._stillness.is_still(self.state)
 
     def _reset_clock(self) -> None:
-        """Restart the clock now, so that a pause is not caught up."""
+        """Restart the clock now, so that the session does not catch up on a pause."""
         self._due = time.perf_counter()
 
     def _wait_for_clock(self) -> None:
-        """Wait until the next step is due; a session that is late catches up on two steps at most."""
+        """Wait until the next step is due; a session that is late catches up by at most two steps."""
         self._due = max(self._due + self._dt, time.perf_counter() - 2.0 * self._dt)
         self._mailbox.wait_until(lambda: self._due - time.perf_counter())
 

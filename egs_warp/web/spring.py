@@ -1,4 +1,4 @@
-"""Damped spring by which the user pulls a body."""
+"""Damped spring with which the user pulls a body."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 from egs_warp.fem.body import BodyState, SoftBody
 
 STIFFNESS = 3.0
-"""Body weights per body height of extension."""
+"""Stiffness, body weights per body height of extension."""
 MAX_FORCE = 1.5
-"""Body weights, maximum force."""
+"""Maximum force, body weights."""
 GRIP_RADIUS = 0.25
-"""Body heights, radius around the node at rest in which the force acts."""
+"""Radius around the node at rest within which the force acts, body heights."""
 
 
 class Spring:
@@ -25,10 +25,10 @@ class Spring:
         shares = np.maximum(1.0 - distance_ratio**2, 0.0) ** 2
         self._body = body
         self._shares = shares / (body.node_mass @ shares)
-        """(N,) 1/kg, acceleration of each node for a force of 1 N."""
+        """(N,) acceleration of each node divided by the force, 1/kg."""
         self._stiffness = STIFFNESS * body.weight / body.height
         self._damping = float(np.sqrt(self._stiffness * body.mass))
-        """N s/m, half of the critical damping of the whole body."""
+        """Half of the critical damping of the whole body, N s/m."""
 
     def force(self, state: BodyState) -> np.ndarray:
         """Return the (3,) force on the body in N."""
@@ -38,5 +38,5 @@ class Spring:
         return force * min(1.0, MAX_FORCE * self._body.weight / max(size, 1e-12))
 
     def kick(self, state: BodyState, dt: float) -> np.ndarray:
-        """Return the (N, 3) m/s that the spring adds to the nodal velocities in a step of ``dt`` s from ``state``."""
+        """Return the velocities (N, 3), m/s, that the spring adds to the nodes in a step of ``dt`` s from ``state``."""
         return dt * self._shares[:, None] * self.force(state)

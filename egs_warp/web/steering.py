@@ -33,21 +33,21 @@ from egs_warp.motions.walk_posture import select_posture
 from egs_warp.web.idle import RelaxMuscles, tilt_degrees
 
 ARRIVAL_DISTANCE = 0.12
-"""Body heights, distance from the centre of the feet to the goal at which the goal is reached."""
+"""Distance between the centre of the feet and the goal at which the goal is reached, body heights."""
 MAX_HEADING_ERROR = 15.0
-"""Degrees; if the direction to the goal differs more from the heading, the body turns first."""
+"""Angle between the heading and the direction to the goal above which the body turns first, degrees."""
 _MIN_TURN_DISTANCE = 0.25
-"""Body heights; for shorter distances to the goal the body does not turn."""
+"""Distance to the goal below which the body does not turn, body heights."""
 _MAX_JUMP_DISTANCE, _JUMP_HEIGHT = 0.5, 0.2
-"""Body heights, maximum length and height of a jump towards the goal."""
+"""Maximum length and height of a jump towards the goal, body heights."""
 _MAX_WALK_DISTANCE = 0.8
-"""Body heights, maximum length of a walk before the next is planned."""
+"""Maximum length of a walk before the next one is planned, body heights."""
 _MAX_FAILED_LEGS = 3
 """Number of consecutive legs without progress after which navigation stops."""
 FALLEN_TILT = 60.0
-"""Degrees from upright beyond which a body counts as fallen."""
+"""Tilt from upright beyond which a body counts as fallen, degrees."""
 _FALL_TIME = 1.0
-"""sqrt(H / g), time for which a body must be tilted to count as fallen."""
+"""Time for which a body must be tilted to count as fallen, sqrt(H / g)."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class _ActiveMotion:
     """The active motion."""
 
     name: str
-    """Name that the user reads."""
+    """Name that is shown to the user."""
     motion: _SchedulableMotion
     """The motion itself."""
     posture: BodyStatus
@@ -144,7 +144,7 @@ class PointNavigation:
 
 
 class MotionScheduler:
-    """Runs the motions of a body one after the other; is itself a motion."""
+    """Motion that runs the requested motions of a body one after the other."""
 
     def __init__(self, place: Stance, send_line: Callable[[str], object]) -> None:
         """Stand at ``place``; ``send_line`` sends one line of text to the user."""
@@ -254,7 +254,7 @@ class MotionScheduler:
         self.cancel()
 
     def _begin_next(self, state: BodyState, report: StepReport | None) -> None:
-        """Start the next motion: queued, navigation, drive or, without any, stand."""
+        """Start the next motion: a queued one, a leg of the navigation, driving or, without any of these, standing."""
         place = replace(self.place.next_stance(state.positions, report), style=self.style)
         if self._is_ball:
             self.place = place

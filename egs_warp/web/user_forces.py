@@ -48,7 +48,7 @@ class UserForces:
         self._pushes.clear()
 
     def kick(self, place: Stance, state: BodyState, dt: float) -> np.ndarray | None:
-        """Return the (N, 3) m/s that pull and pushes add to the nodal velocities; None if there are none.
+        """Return the velocities (N, 3), m/s, that the pull and pushes add to the nodes; None if there are none.
 
         Args:
             place: stance of the body, for the height at which a push acts.

@@ -53,7 +53,7 @@ def test_ctrl_c_prints_how_to_continue(
     assert sorted(os.listdir(out.parent)) == ["a.training.npz"]
     assert main(line(posed, out)) == 2
     assert capsys.readouterr().err == (
-        f"egs-warp: --out {out}: an interrupted training is here; give --resume to continue it, or --overwrite to start"
+        f"egs-warp: --out {out}: its training was interrupted; give --resume to continue it, or --overwrite to start"
         " again\n"
     )
     assert main([*line(posed, out), "--resume"]) == 0

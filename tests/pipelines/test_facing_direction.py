@@ -60,7 +60,7 @@ def test_a_figurine_faces_its_face_and_a_stool_away_from_its_back(
     told = found.description(standing.frame)
     x, y, z = standing.frame.axes.T @ found.direction
     assert told.startswith(f"front is taken to be {x:.2f},{y:.2f},{z:.2f} (guessed: the body is ")
-    assert "times the detail of behind" in told and told.endswith("if not, say which way is front)")
+    assert "times the detail of its back" in told and told.endswith("if it is wrong, give the front)")
 
 
 def plain_box(width: float, depth: float) -> Lying:

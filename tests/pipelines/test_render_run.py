@@ -209,10 +209,10 @@ def test_a_turntable_shows_one_frame(run: FinishedRun, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--size", "10"], "--size 10x10: give pixels from 16 to 4096, as 512 or 640x360"),
-        (["--size", "wide"], "--size wide: give pixels, as 512 or 640x360"),
-        (["--fps", "0"], "--fps 0.0: give a number of frames a second from 1 to 1000"),
-        (["--fps", "nan"], "--fps nan: give a number of frames a second"),
+        (["--size", "10"], "--size 10x10: give pixels from 16 to 4096, such as 512 or 640x360"),
+        (["--size", "wide"], "--size wide: give pixels, such as 512 or 640x360"),
+        (["--fps", "0"], "--fps 0.0: give a number of frames per second from 1 to 1000"),
+        (["--fps", "nan"], "--fps nan: give a number of frames per second"),
         (["--camera", "sideways"], "--camera sideways: give auto, fixed, follow, orbit or a path.json"),
         (["--camera", "none.json"], "none.json: no such file"),
         (["--camera", "{tmp}/bad.json"], "bad.json: key 0 needs time, eye [x, y, z] and target [x, y, z], finite"),

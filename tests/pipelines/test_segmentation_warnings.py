@@ -60,14 +60,14 @@ def test_a_floor_that_came_along(located_ball: tuple[GaussianCloud, LocatedPlane
     (line,) = segmentation_warnings(
         cloud, changed(located, kept), cloud.subset(located.segmentation.object_mask), CAMERAS
     )
-    assert line.startswith("taken along: ") and line.endswith(" % of the floor about it")
-    assert 45 <= int(line.split()[2]) <= 55
+    assert line.startswith("includes ") and line.endswith(" % of the floor around it")
+    assert 45 <= int(line.split()[1]) <= 55
 
 
 def test_the_warnings_are_in_the_image(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
     cloud, located = located_ball
     thing = cloud.subset(located.segmentation.object_mask)
-    plain, told = (segmentation_picture(cloud, thing, cloud, CAMERAS[:2], words) for words in ((), ("taken along",)))
+    plain, told = (segmentation_picture(cloud, thing, cloud, CAMERAS[:2], words) for words in ((), ("includes floor",)))
     np.testing.assert_array_equal(told[: len(plain)], plain)
     strip = told[len(plain) :]
     assert strip.shape[0] < 40 and (strip < 60).any() and strip[:, -20:].min() == 255

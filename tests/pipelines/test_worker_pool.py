@@ -57,7 +57,7 @@ def test_each_task_ends_once_and_an_error_is_its_own(workers: int | str) -> None
     errors = [one.error for one in ended]
     assert errors[:3] == [None] * 3 and errors[6:] == [None] * 2
     assert errors[3] == "task 3: give another" and errors[5] == "ZeroDivisionError: five lines"
-    assert errors[4] is not None and errors[4].startswith("what it returns cannot be sent: ")
+    assert errors[4] is not None and errors[4].startswith("its result cannot be sent: ")
     # Ray is polled only from time to time.
     if workers == 2:
         assert sorted(told) == [(number, number, 2 * number) for number in given]

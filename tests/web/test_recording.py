@@ -137,7 +137,10 @@ _MUSCLES = ("muscle_segments", "muscle_bounds", "fibre_from_segment")
         (lambda folder: (folder / "trajectory.npz").write_bytes(b"PK\x03\x04 no zip"), "is not a valid trajectory"),
         (lambda folder: (folder / "creature.npz").unlink(), "creature.npz: is missing; run egs-warp animate again"),
         (lambda folder: np.savez(folder / "creature.npz", means=np.zeros((2, 3))), "creature.npz: cannot be read"),
-        (lambda folder: _shorten(folder / "creature.npz", *_MUSCLES, end=-1), "has other muscles than trajectory.npz"),
+        (
+            lambda folder: _shorten(folder / "creature.npz", *_MUSCLES, end=-1),
+            "its muscles differ from those of trajectory.npz",
+        ),
         (lambda folder: _shorten(folder / "creature.npz", "foot_from_node", end=0), "foot_from_node has shape"),
         (
             lambda folder: _shorten(folder / "trajectory.npz", "tets", end=0),

@@ -100,7 +100,7 @@ export class LiveClock {
   }
 }
 
-/** Return true if the creature was moved to another place between two frames: no step moves it that far. */
+/** Return true if the creature was reset to another position between two frames: no step moves it that far. */
 function isDiscontinuous(before: Frame, after: Frame): boolean {
   const [a, b] = [before.positions, after.positions];
   let low = Infinity;

@@ -6,7 +6,7 @@ import type { Viewer } from "./viewer";
 
 export type Action = "forward" | "back" | "left" | "right" | "jump" | "leap" | "hop";
 
-/** Return the motion of an action; a body that can walk walks, another one hops. */
+/** Return the motion of an action; a body that can walk walks, any other body hops. */
 export function motionText(action: Action, walks: boolean): string {
   return {
     forward: walks ? "walk 0.2" : "hop 0.4 0.2",

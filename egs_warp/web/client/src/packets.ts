@@ -24,11 +24,11 @@ export interface Facts {
   motion: { name: string; reached?: Record<string, number> }[];
   notes: string[];
   degree: { splats: number; scene: number };
-  /** The capture was trained with antialiasing. */
+  /** True if the capture was trained with antialiasing. */
   antialiased: boolean;
   /** True for the still capture that is shown while its creature is prepared. */
   preparing?: boolean;
-  /** Only of live sessions: identifier of the session and limits of its sliders. */
+  /** Only for live sessions: identifier of the session and limits of its sliders. */
   session?: string;
   limits?: { friction: [number, number]; sag: [number, number]; style: [number, number] };
   /** Named styles. */

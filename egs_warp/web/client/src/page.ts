@@ -48,7 +48,7 @@ const HELP: [string[], string][] = [
 export class Page {
   readonly viewers: Viewer[] = [];
   readonly player: Player;
-  /** Only of live sessions. */
+  /** Only for live sessions. */
   readonly live: Live | undefined;
   private readonly charts: Charts;
   private readonly legend: Legend;
@@ -160,7 +160,7 @@ export class Page {
       opened.hidden = !opened.hidden;
       other.hidden = true;
     };
-    const what = this.live === undefined ? "Record a video of the whole run" : "Record a video of what is seen";
+    const what = this.live === undefined ? "Record a video of the whole run" : "Record a video of this view";
     const record = button("record", what, () => this.record(record));
     return element(
       "nav",

@@ -28,8 +28,8 @@ function wideSample(k: number): string {
 
 export const SHADOW_GLSL = /* glsl */ `
 /* Fraction of light at uv of a shadow map. Its red channel is the part of the sky that the body hides, its green
-   channel marks what is close to the ground. The shadow at what touches the ground is spread over the radius
-   softness. Coarser levels of the map make its few samples smooth. */
+   channel marks the parts of the body close to the ground. The shadow around a contact is spread over the radius
+   softness. Coarser levels of the map smooth the few samples. */
 float egsShade(sampler2D shade, vec2 uv, float softness) {
   float near = 0.0, wide = 0.0;
   ${Array.from({ length: NEAR_SAMPLES }, (_, k) => nearSample(k)).join("\n  ")}

@@ -57,7 +57,7 @@ void main() {
   vec3 p = renderToViewBasis * mean + renderToViewPos;
   vec4 clip = projectionMatrix * vec4(p, 1.0);
   if (-clip.w > clip.z || clip.w <= 0.0) return;
-  // The Jacobian grows without bound outside the image, so it is evaluated at most 15 % of the image size beyond.
+  // Outside the image the Jacobian grows without bound: evaluate it at most 15 % of the image size beyond the edge.
   vec2 focal = 0.5 * renderSize * vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
   vec2 slope = clamp(p.xy / -p.z, -0.65 * renderSize / focal, 0.65 * renderSize / focal);
   vec3 right = vec3(focal.x, 0.0, focal.x * slope.x) / -p.z;

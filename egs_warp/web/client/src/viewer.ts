@@ -14,11 +14,11 @@ import { deformedSplats, type DeformedSplats } from "./splats";
 export const BACKGROUND = 0xb9bec6;
 /** Fraction of the picture that the body or its run fills in the views front, side and top. */
 const FILL = 0.86;
-/** Depth below which the floor hides splats, in body heights; a body may press its soles in by a part of it. */
+/** Depth below which the floor hides splats, in body heights; pressed soles may be below the ground by a part of it. */
 const FLOOR_DEPTH = 0.015;
 /** Height by which the ground must change before a following camera changes its height, in body heights. */
 const GROUND_CHANGE = 0.02;
-/** Fraction of a change of the ground's height that a following camera makes in one image. */
+/** Fraction of a change of the ground's height by which a following camera moves in one image. */
 const RISE_PER_FRAME = 0.1;
 /** Half of the height that a view of the body alone shows, in body heights. */
 const HALF_VIEW_HEIGHT = 1;
@@ -134,7 +134,7 @@ export class Viewer {
     if (frame.contacts.length > 0) {
       let lowest = Infinity;
       for (let k = 2; k < this.positions.length; k += 3) lowest = Math.min(lowest, this.positions[k]!);
-      // Pressed soles and small bumps are no change of the ground.
+      // Pressed soles and small bumps do not count as a change of the ground's height.
       const rise = lowest - this.groundHeight;
       const threshold = GROUND_CHANGE * this.source.header.facts.height;
       moved.z = RISE_PER_FRAME * Math.sign(rise) * Math.max(Math.abs(rise) - threshold, 0);
@@ -256,7 +256,7 @@ export class Viewer {
     return this.splatRenderer.spark.sorting;
   }
 
-  /** Draw if something has changed; return true if so. */
+  /** Draw if something has changed; return true if an image was drawn. */
   draw(): boolean {
     this.controls.update();
     if (!this.dirty) return false;
