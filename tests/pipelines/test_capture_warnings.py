@@ -35,4 +35,4 @@ def test_another_object_is_reported() -> None:
     both = cloud_at(np.concatenate([block(300), block(100, shift=2.0)]))
     (note,) = capture_warnings(both, block_mesh(), 1.0)
     assert note.startswith("25 % of the capture lies apart from the body, up to ")
-    assert note.endswith("cut other objects away first")
+    assert note.endswith("remove other objects first")

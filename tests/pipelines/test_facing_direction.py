@@ -95,7 +95,7 @@ def test_photos_from_one_side_determine_the_front() -> None:
         ]
         found, front = front_of(standing, seen_from=mean_view(cameras, np.zeros(3)))
         assert degrees(front, way) < 15.0
-        assert "was photographed from there" in str(found.reason)
+        assert "it was photographed from the front" in str(found.reason)
 
 
 def test_cameras_all_around_determine_no_front() -> None:

@@ -89,7 +89,7 @@ def test_a_lying_body_has_no_feet_and_is_drawn(tmp_path: Path) -> None:
     assert info.feet == () and info.base is SupportKind.LYING
     assert "stands   on its length: it crawls" in info.lines()
     assert info.motions()["walk"] is None and info.motions()["turn"] is None
-    assert abs(info.front.direction[0]) > 0.99 and "the body lies along it" in str(info.front.reason)
+    assert abs(info.front.direction[0]) > 0.99 and "the body lies along this direction" in str(info.front.reason)
     draw_info(tmp_path / "info.png", info)
     assert (tmp_path / "info.png").stat().st_size > 20_000
 
