@@ -24,6 +24,7 @@ from egs_warp.motions.pendulum import nearest_in_hull
 from egs_warp.motions.route import Route, path_route, straight_route, turn_route
 from egs_warp.motions.script import motion
 from egs_warp.motions.walk import MAX_LEAD, MIN_REAR_MARGIN, Walk
+from egs_warp.motions.walk_plan import WalkPhase
 from egs_warp.motions.walk_posture import LeggedPosture
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.simulated_run import simulate
@@ -216,7 +217,7 @@ def test_the_planned_pressure_is_under_the_standing_feet(mesh: Callable[[], TetM
 
 def test_a_narrow_body_leans_in_the_direction_of_travel() -> None:
     """The rear edge of the support gets a minimum distance from the centre of mass, once the body has turned to walk to
-    its left; nothing changes at rest."""
+    its left; nothing changes for a wide support, and the body ends upright."""
     place = block_place(biped())
     com = place.body.centre_of_mass(place.ground.local(place.standing))
     narrow = replace(place, contact_points=0.35 * place.contact_points)
@@ -225,7 +226,10 @@ def test_a_narrow_body_leans_in_the_direction_of_travel() -> None:
     missing = MIN_REAR_MARGIN * com[2] - float((com[0] - narrow.ground.local(narrow.contact_points)[:, 0]).max())
     assert 0.0 < missing < MAX_LEAD * place.body.height
     np.testing.assert_allclose(walk._lead_at(last - 1.5), [0.0, missing], atol=1e-6)
-    np.testing.assert_allclose(walk._lead_at(float(last)), 0.0)
+    np.testing.assert_allclose(walk._lead_at(float(last)), [0.0, 0.5 * missing], atol=1e-6)
+    walk.phase = WalkPhase.GATHER
+    ((_, gathered),) = walk._pressures(0.05)
+    np.testing.assert_allclose(gathered[-1], walk._com_at(float(last)))
     np.testing.assert_allclose(wide._lead_at(2.0), 0.0)
 
 

@@ -144,7 +144,7 @@ _MUSCLES = ("muscle_segments", "muscle_bounds", "fibre_from_segment")
         (lambda folder: _shorten(folder / "creature.npz", "foot_from_node", end=0), "foot_from_node has shape"),
         (
             lambda folder: _shorten(folder / "trajectory.npz", "tets", end=0),
-            "is not a valid trajectory (its arrays do not fit",
+            "is not a valid trajectory (its arrays have inconsistent shapes",
         ),
         (lambda folder: (folder / "report.json").write_text("[]"), "report.json: is not a report"),
     ],

@@ -25,8 +25,8 @@ LOCOMOTION = [
     ),
     Survivor(
         "locomotion/contact_modes.py",
-        "if len(optimum.contact) > 1 else None",
-        "if len(optimum.contact) > 2 else None",
+        "neighbours.after_transitions(*(each[strongest] for each in constraints)) if len(optimum.contact) > 1 else None,",
+        "neighbours.after_transitions(*(each[strongest] for each in constraints)) if len(optimum.contact) > 2 else None,",
         "one neighbour fewer is tested",
     ),
     Survivor(
