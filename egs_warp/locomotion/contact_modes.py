@@ -374,11 +374,11 @@ def _next_modes(
     the constraint with the largest multiplier alone; the latter are None if only one constraint is active."""
     neighbours = _NextModes(program, modes, optimum.x)
     constraints = optimum.contact, optimum.transition, optimum.multiplier
+    after_all = neighbours.after_transitions(*constraints)
+    if len(optimum.contact) == 1:
+        return after_all, None
     strongest = [int(np.argmax(optimum.multiplier))]
-    return (
-        neighbours.after_transitions(*constraints),
-        neighbours.after_transitions(*(each[strongest] for each in constraints)) if len(optimum.contact) > 1 else None,
-    )
+    return after_all, neighbours.after_transitions(*(each[strongest] for each in constraints))
 
 
 class _NextModes:

@@ -24,12 +24,6 @@ LOCOMOTION = [
         "an equality is passed to the solver as two bounds instead of one row",
     ),
     Survivor(
-        "locomotion/contact_modes.py",
-        "neighbours.after_transitions(*(each[strongest] for each in constraints)) if len(optimum.contact) > 1 else None,",
-        "neighbours.after_transitions(*(each[strongest] for each in constraints)) if len(optimum.contact) > 2 else None,",
-        "one neighbour fewer is tested",
-    ),
-    Survivor(
         "locomotion/operator_splitting.py",
         "verbose=False,",
         "verbose=True,",
