@@ -59,12 +59,10 @@ def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[Se
     for kind in SEARCHES:
         figures = []
         for frame in frames:
-            given = frame.program, kind, frame.predicted
-            search, milliseconds = (
-                timed(search_program, *given, **options)
-                if isinstance(kind, Strategy)
-                else timed(search_pyramid, *given, **options)
-            )
+            if isinstance(kind, Strategy):
+                search, milliseconds = timed(search_program, frame.program, kind, frame.predicted, **options)
+            else:
+                search, milliseconds = timed(search_pyramid, frame.program, kind, frame.predicted, **options)
             x = search.x
             objectives = (
                 (np.inf, np.inf)
