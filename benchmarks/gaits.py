@@ -230,7 +230,7 @@ def summary(rows: list[Row], *, whole: bool) -> dict[str, Any]:
     bodies = {row["body"] for row in rows}
     # The held-out bodies are judged by themselves.
     is_complete = whole and (len(bodies) >= 14 or bodies == set(UNSEEN))
-    why = "" if is_complete else "some cells of the 14 bodies, or of the unseen ones, were not run"
+    why = "" if is_complete else "not all cells of 14 bodies, or of the unseen ones, were run"
     aims = {
         "succeed_90": rate >= 0.9 if is_complete else None,
         "slip": (max(slips) <= 0.03 if slips else None) if is_complete else None,

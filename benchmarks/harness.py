@@ -182,7 +182,7 @@ def record(
 
     Args:
         options: parsed flags of the benchmark.
-        rows: figures of the benchmark.
+        rows: records of the benchmark.
         aims: whether each aim is met; None if it was not measured.
         why_null: reason for each None.
         packages: packages whose versions are recorded.

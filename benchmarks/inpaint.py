@@ -13,8 +13,8 @@ quantifies this with both PSNRs on the plane for our inpainting, for one colour,
 into the hole.
 
 Aims: ``beats_cv2_by_3db``, ``beats_no_prior_by_3db``, ``inpaint_beats_rectified_cv2`` (mean PSNR over the cases),
-``seconds_on_gpu`` (every case at most 20 s), ``hole_size_independent`` (the times for two holes, one with
-four times the area of the other, differ by at most a factor of 1.5).
+``seconds_on_gpu`` (every case at most 20 s), ``hole_size_independent`` (the times for two holes, one with four
+times the area of the other, differ by at most a factor of 1.5).
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def damaged(truth: GaussianCloud, hole: Hole) -> GaussianCloud:
 
 
 def cameras_around(hole: Hole, size: int) -> list[Camera]:
-    """Return eight cameras on two rings; the first one takes the image that is inpainted."""
+    """Return eight cameras on two rings; the first one takes the single image that the baseline trains on."""
     middle, side = hole.bounds()
     first, second = hole.plane.tangents()
     cameras = []

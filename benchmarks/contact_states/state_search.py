@@ -98,7 +98,10 @@ class _Search:
     """States that were tried."""
 
     def try_states(self, states: np.ndarray) -> bool:
-        """Solve the QP of ``states`` unless it was tried or the limit is reached; return True if it is the best."""
+        """Solve the QP of ``states`` unless it was tried before or the limit is reached.
+
+        Return True if its solution is the best so far.
+        """
         limit = self.limit if self.is_good_enough else RESTART_BUDGET * self.limit
         if self.count >= limit or states.tobytes() in self.visited:
             return False
@@ -114,8 +117,10 @@ class _Search:
         return True
 
     def try_activations(self, activations: np.ndarray) -> bool:
-        """Solve the QP of the states that follow from ``activations`` (M,), which is always feasible; return False if
-        the contact response to the activations was not found."""
+        """Solve the QP of the states that follow from ``activations`` (M,); this QP is always feasible.
+
+        Return False if the contact response to the activations was not found.
+        """
         y = contact_response(self.program, activations)
         if y is None:
             return False
