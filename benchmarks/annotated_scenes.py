@@ -43,6 +43,7 @@ class DrawnScene:
     capture: Path | None
     """Path of the capture; None if a capture has to be trained from photos first."""
     photos: Path | None
+    """Path of the posed photos; None if the scene has only a capture."""
     views: tuple[DrawnView, ...]
 
     @property
@@ -53,7 +54,7 @@ class DrawnScene:
 
 
 def read_drawn(name: str) -> DrawnScene:
-    """Read the annotations of the scene ``name``; there are no views if its data are missing."""
+    """Read the annotations of the scene ``name``; ``views`` is empty if the scene's data are not on this machine."""
     tree = json.loads((FOLDER / f"{name}.json").read_text())
     capture, photos = (None if tree[key] is None else data_folder() / tree[key] for key in ("capture", "photos"))
     scene = DrawnScene(name, capture, photos, ())
@@ -76,7 +77,7 @@ def read_drawn(name: str) -> DrawnScene:
 
 
 def _mask(view: dict[str, Any]) -> np.ndarray:
-    """(H, W) bool: mask of the outlines; an outline inside an outline is a hole."""
+    """Return the mask (H, W) bool of the outlines; an outline inside an outline is a hole."""
     mask = np.zeros((view["height"], view["width"]), np.uint8)
     cv2.fillPoly(mask, [np.array(outline, np.int32).reshape(-1, 2) for outline in view["outline"]], 1)
     return mask > 0

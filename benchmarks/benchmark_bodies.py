@@ -36,7 +36,7 @@ class Body:
     cloud: GaussianCloud
     plane: Plane
     origin: str
-    """Source of its Gaussians."""
+    """Source of the Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class _Textured:
     """A triangle mesh with textures."""
 
     vertices: np.ndarray
-    """(V, 3) float64, z up, 1 high, on z = 0."""
+    """(V, 3) float64, z up, of height 1, standing on z = 0."""
     faces: np.ndarray
     """(F, 3) int32."""
     places: np.ndarray
@@ -71,8 +71,9 @@ def _obj(path: Path, picture_of_material: dict[str, str]) -> _Textured:
     """Read a Wavefront OBJ file.
 
     Args:
-        path: the OBJ file. picture_of_material: texture files, relative to the folder of ``path``; "" is the key of
-            faces without a material.
+        path: the OBJ file.
+        picture_of_material: texture file of each material, relative to the folder of ``path``; "" is the key of faces
+            without a material.
     """
     vertices: list[list[float]] = []
     texture: list[list[float]] = []
@@ -188,7 +189,7 @@ def _of_scene(file: str, on_it: tuple[float, float, float], plane: Plane | None 
 
 
 def _playbot(name: str) -> Body:
-    """Read the robot without its tile. It hovers over the tile, so its support plane is its own base."""
+    """Read the robot without its tile; the support plane is that of its own base, because it hovers above the tile."""
     cloud = read_capture(data_folder() / "scenes" / "playbot", device="cpu").cloud
     tile = Plane(np.array([0.0, -1.0, 0.0]), -0.019)
     above = cloud.subset(tile.heights(cloud.means.numpy()) > 0.13)
@@ -232,7 +233,7 @@ NAMES = tuple(_MAKERS)
 
 
 def body(name: str) -> Body:
-    """Return the body ``name``.
+    """Read or build the body ``name``, one of ``NAMES``.
 
     Raises:
         OSError: its file is missing.

@@ -23,15 +23,18 @@ from harness import timed
 CLICKED, JUDGED = slice(0, None, 2), slice(1, None, 2)
 """Views of a scene whose outlines may be used for clicks, and views whose outlines judge the result."""
 VISIBLE = 0.01
-"""Minimum depth of a region of errors, relative to the shorter side of the image; shallower ones are not clicked on."""
+"""Minimum depth of a region of wrong pixels (largest distance from its edge), relative to the image's shorter side; no
+click is made on a shallower region."""
 
 
 def overlap(cloud: GaussianCloud, object_cloud: GaussianCloud, view: DrawnView) -> tuple[float, np.ndarray, np.ndarray]:
     """Compare ``object_cloud``, rendered alone, with the outline of a view.
 
+    Pixels at which neither ``cloud``, the whole scene, nor the object is opaque are ignored.
+
     Returns:
-        IoU; (H, W) bool, pixels of the outline that the object lacks; (H, W) bool, pixels of the object outside the
-    outline.
+        IoU; (H, W) bool, pixels inside the outline that the object lacks; (H, W) bool, pixels of the object outside the
+            outline.
     """
     alone, whole = (render_gaussians(one, view.camera).alpha.numpy() > 0.5 for one in (object_cloud, cloud))
     counts = whole | alone
@@ -41,7 +44,7 @@ def overlap(cloud: GaussianCloud, object_cloud: GaussianCloud, view: DrawnView) 
 
 
 def innermost(mask: np.ndarray) -> tuple[float, tuple[float, float]]:
-    """Return the largest distance of a pixel of ``mask`` (H, W) from its edge, in pixels, and that pixel's (u, v)."""
+    """Return the largest distance of a pixel in ``mask`` (H, W) from the mask's edge, pixels, and its (u, v)."""
     depth = depth_inside(np.pad(mask, 1))[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
     return float(depth[row, column]), (column + 0.5, row + 0.5)
@@ -67,7 +70,7 @@ def found_by(
 def clicked(
     annotated: DrawnScene, cloud: GaussianCloud, cameras: Sequence[Camera], count: int
 ) -> tuple[ObjectSpec, list[str]]:
-    """Simulate a user who makes ``count`` clicks, each on the largest error that the clicks before have left.
+    """Simulate a user who makes ``count`` clicks, each on the largest error that the previous clicks have left.
 
     Returns:
         the object's description, and the clicks in the notation of the command line.
@@ -84,7 +87,7 @@ def clicked(
             try:
                 object_cloud = found_by(cloud, spec, cameras, {})[1]
             except UserError as error:
-                # A user would see one line of error; the next click goes on the object.
+                # A user would see a one-line error and, without any object so far, would click on the object again.
                 print(f"{annotated.name}: {number} clicks: {error}")
             if object_cloud is not None:
                 _, missing, more = overlap(cloud, object_cloud, view)

@@ -1,4 +1,4 @@
-"""Frames for the solver benchmarks: an animation with known activations, each step as a Coulomb program."""
+"""Input of the solver benchmarks: the steps of an animation with known activations, each as a Coulomb program."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from egs_warp.segmentation.base_plane import find_base_plane
 from harness import data_folder
 
 CAPTURES = {"monkey": ("monkey.ply", (0.0, 1.0, 0.0)), "plush dog": ("plush_dog.ply", (0.0, -1.0, 0.0))}
-"""File and up axis of the real captures in the data folder."""
+"""File and up direction of the real captures in the data folder."""
 
 
 @dataclass(frozen=True)
@@ -80,18 +80,25 @@ def body_named(name: str, device: str, *, nodes: int = 300) -> BenchBody:
 
 
 def grouped_segments(muscles: MuscleSet, nodes: np.ndarray, groups: int, seed: int) -> Synergies:
-    """Group neighbouring muscle segments of similar direction; each group acts as one. ``nodes``: (N, 3) m, at rest."""
+    """Group neighbouring muscle segments of similar direction; the segments of a group share one activation.
+
+    Args:
+        muscles: muscles with their segments.
+        nodes: (N, 3) m, rest positions.
+        groups: number of groups.
+        seed: seed of the clustering.
+    """
     ends = muscles.end_points(nodes)
     first, second = ends[muscles.segments[:, 0]], ends[muscles.segments[:, 1]]
     upright = np.abs(second - first)[:, 2] / np.linalg.norm(second - first, axis=1)
     features = np.column_stack([0.5 * (first + second), 0.5 * upright * np.ptp(nodes, axis=0).max()])
-    # scipy 1.15 renamed the argument, with other random numbers under the new name.
+    # SciPy 1.15 renamed the argument ``seed``; under the new name the random numbers differ.
     _, group = kmeans2(features, groups, minit="++", seed=seed)  # pyright: ignore[reportCallIssue]
     return Synergies(group.astype(np.int32))
 
 
 def spread_points(bench: BenchBody, count: int) -> np.ndarray:
-    """(count,) indices of contact points on the ground at rest, chosen far apart (farthest-point sampling)."""
+    """Return (count,) indices of points on the ground at rest that are far apart (farthest-point sampling)."""
     gaps, _ = bench.stepper.detector.gaps(bench.start.positions)
     near = np.flatnonzero(gaps < 0.01 * bench.stepper.body.height)
     nodes = bench.stepper.geometry.mesh.tets[bench.stepper.geometry.tet_from_point[near]]
@@ -104,7 +111,7 @@ def spread_points(bench: BenchBody, count: int) -> np.ndarray:
 
 
 def known_activations(count: int, frames: int, strength: float, seed: int) -> np.ndarray:
-    """(frames + 1, count) smooth signals in [-strength, strength] that start at 0."""
+    """Return (frames + 1, count) smooth signals in [-strength, strength] that start at 0."""
     random = np.random.default_rng(seed)
     time = np.arange(frames + 1)[:, None, None]
     periods = random.uniform(5.0, 25.0, (1, count, 3))
@@ -124,15 +131,18 @@ def animation_frames(
 ) -> list[Frame]:
     """Simulate an animation with known activations of muscle groups and exact contact at a few points.
 
-    The objectives of a step are the animation's own end velocities: of the centre of mass, the angular momentum and the
-    pose. The engine's planner builds the program of each step.
+    The objectives of a step are the animation's own values at its end: the velocity of the centre of mass, the angular
+    momentum and the node velocities. The engine's planner builds the program of each step.
+
+    Raises:
+        RuntimeError: a step did not converge.
     """
     body, muscles = bench.stepper.body, bench.stepper.muscles
     stepper = LocomotionStepper(body, muscles, bench.stepper.geometry, device=bench.device)
     synergies = grouped_segments(muscles, body.mesh.nodes, activations, seed)
     steps = make_step_linearizer(stepper.linearizer, muscles, synergies)
     stepper.planner = replace(stepper.planner, synergies=synergies, linear_steps=steps)
-    # No point is added to the chosen ones, however deep it penetrates.
+    # Only the chosen points are in contact, however deeply others penetrate.
     stepper.solver = replace(stepper.solver, penetration_tolerance=np.inf)
     points = spread_points(bench, contacts)
     known = known_activations(activations, frames, strength, seed)
@@ -152,7 +162,7 @@ def animation_frames(
             forces=prospect.forces,
         )
         if not result.converged:
-            raise RuntimeError(f"the animation failed at frame {len(animation)}; use less strength")
+            raise RuntimeError(f"the animation did not converge at frame {len(animation)}; use a smaller strength")
         after = BodyState(problem.end_positions(result.velocities), result.velocities, state.time + dt)
         objectives = [
             centre_of_mass_velocity(body, body.centre_of_mass(after.velocities), weights.com),

@@ -25,13 +25,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BYTES_READ = 12 + 16 + 12 + 4
-"""Mean, rotation, scales and tetrahedron of the mean; the deformed cage stays in cache and is not counted."""
+"""Bytes of a Gaussian's mean, rotation, scales and tetrahedron; the deformed cage stays in cache and is not counted."""
 BYTES_READ_ACROSS = 6 * (4 + 4) + 3 * 4
-"""Tetrahedron and share of each arm and weight of each axis, for Gaussians that extend into several tetrahedra."""
+"""Further bytes of a Gaussian that extends into several tetrahedra: tetrahedron and share of each arm, weight of each
+axis."""
 BYTES_WRITTEN = 12 + 16 + 12 + 16
-"""Mean, rotation, scales, rotation of the colour."""
+"""Bytes of a Gaussian's deformed mean, rotation and scales and of its colour rotation."""
 BYTES_OF_COLOUR = 192 + 192
-"""16 SH coefficients, read and written."""
+"""Bytes of a Gaussian's 16 SH coefficients, read and written."""
 
 
 def random_cloud(count: int, seed: int, device: str) -> GaussianCloud:
@@ -73,7 +74,7 @@ def _basis_3(d: torch.Tensor) -> torch.Tensor:
 
 
 class TorchTwin:
-    """The same deformation in vectorised PyTorch, on whole arrays."""
+    """The deformation of ``Deformer`` in vectorised PyTorch, on whole arrays."""
 
     def __init__(self, cloud: GaussianCloud, embedding: GaussianEmbedding) -> None:
         points = embedding.points
@@ -149,7 +150,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     bytes_moved = count * (BYTES_READ + BYTES_WRITTEN + BYTES_OF_COLOUR) + across * BYTES_READ_ACROSS
     source = wp.zeros(bytes_moved // 32, dtype=wp.vec4, device=device)
     target = wp.empty_like(source)
-    # The copy reads half of the bytes and writes the other half, so it moves as many. The faster of two copies counts.
+    # The copy reads half of the bytes and writes the other half, so it moves as many as the deformation. The faster of
+    # two copies counts.
     calls["copy"] = lambda: wp.copy(target, source)
     calls["copy_kernel"] = lambda: wp.launch(copy_kernel, len(source), inputs=[source], outputs=[target], device=device)
     if device.is_cuda:
@@ -186,7 +188,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = Table(call="<20", ms="10.3f")
     for name, ms in times.items():
         table.row(name, ms)
-    print(f"{row['times_copy']:.2f} times the copy of its bytes, {row['twin_over_ours']:.1f} times as fast as PyTorch")
+    print(f"{row['times_copy']:.2f} times the time of a copy, {row['twin_over_ours']:.1f} times as fast as PyTorch")
     print(f"difference from PyTorch: {off}")
 
     def draw(figure: Figure) -> None:

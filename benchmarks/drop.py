@@ -1,4 +1,4 @@
-"""A soft body dropped on the floor: the simulated deformation of Table 1's fall."""
+"""A soft body dropped on the floor: the simulated deformation of the fall in Table 1."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TIME_STEP = 1.0 / 120.0
 """Step size, s."""
 
 NEAREST = 12
-"""Number of nodes that the displacement of a point is fitted to."""
+"""Number of nodes to which the displacement of a point is fitted."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Drop:
         from_centre, to_centre = (np.einsum("pk,pki->pi", weights, x)[:, None] for x in (before, after))
         moments = np.einsum("pk,pki,pkj->pij", weights, before - from_centre, before - from_centre)
         mixed = np.einsum("pk,pki,pkj->pij", weights, after - to_centre, before - from_centre)
-        # Coplanar nodes do not determine the gradient across their plane; the regularisation bounds it.
+        # Coplanar nodes do not determine the gradient normal to their plane; the regularisation bounds it.
         spread = np.einsum("pii->p", moments)[:, None, None] * np.eye(3)
         gradient = mixed @ np.linalg.inv(moments + 1e-3 * spread)
         return to_centre[:, 0] + np.einsum("pij,pj->pi", gradient, points - from_centre[:, 0])
@@ -60,9 +60,17 @@ class Drop:
 def simulated_drop(
     mesh: TetMesh, cloud: GaussianCloud, *, sag: float, height: float, tilt_degrees: float, seconds: float
 ) -> Drop:
-    """Drop ``mesh``, which stands on z = 0, tilted from ``height`` m; record ``seconds`` from just before impact.
+    """Tilt ``mesh``, drop it from ``height`` m above the floor z = 0 and record ``seconds`` s from just before impact.
 
-    Young's modulus is E = rho g H / ``sag``: from a ``sag`` of 0.1 on, the body crumples.
+    With a ``sag`` of 0.1 or more, the body crumples.
+
+    Args:
+        mesh: cage of the body, m, standing on z = 0.
+        cloud: Gaussians of the body, from which its contact points are taken.
+        sag: ratio rho g H / E, which sets Young's modulus E.
+        height: height of the fall, m.
+        tilt_degrees: tilt about x; the tilt about y is 0.6 times as large.
+        seconds: duration of the recording.
     """
     plane = Plane.from_coefficients(0.0, 0.0, 1.0, 0.0)
     density, body_height = 1000.0, float(np.ptp(mesh.nodes[:, 2]))
@@ -78,7 +86,7 @@ def simulated_drop(
     rotated = mesh.nodes @ Rotation.from_euler("xy", [tilt_degrees, 0.6 * tilt_degrees], degrees=True).as_matrix().T
     rotated[:, 2] += height - rotated[:, 2].min()
     state = BodyState(rotated, np.tile(np.sqrt(2.0 * GRAVITY * height) * gravity / GRAVITY, (len(rotated), 1)))
-    # The flight deforms nothing, so start just above the floor at the impact velocity.
+    # Free flight does not deform the body, so start just above the floor at the impact velocity.
     state.positions[:, 2] -= height - 0.01 * body_height
     memory = stepper.initial_memory()
     frames, energies = [state.positions], [0.0]

@@ -2,11 +2,11 @@
 
 python benchmarks/effort.py [--quick] [--workers 2] [--device cpu] [--seed 0] [--json PATH] [--join PATH] [--plot PATH]
 
-Every body of the sweep does every motion, at the command's default settings. All figures are in m g H and body
-weights. Work is the sum over segments and steps of the work that muscles do while they shorten. A reversal is a step
-at which the ground's normal load changes in the opposite direction than in the step before, both times by more than
-0.02 body weights; steps before lift-off are counted, or all of them if the body never lifts off. Aims, for the standard
-jump of every body: ``work`` (at most 1.5), ``internal_energy`` (kinetic energy of deformation at most 0.25),
+Every body of the sweep performs every motion with default settings. Energies are in m g H, loads in body weights. Work
+is the sum over segments and steps of the work that muscles do while they shorten. A reversal is a step in which the
+ground's normal load changes in the opposite direction to the step before, by more than 0.02 body weights in both; only
+steps before lift-off are counted, or all steps if the body never lifts off. Aims, for the standard jump of every body:
+``work`` (at most 1.5), ``internal_energy`` (kinetic energy of deformation at most 0.25),
 ``chatter`` (reversals in at most 15 % of steps, none above 0.3 body weights); for every run: ``ledger_closes`` (energy
 balance to 1e-6 a step).
 """
@@ -43,7 +43,7 @@ MIN_CHANGE = 0.02
 
 
 def load(trajectory: Trajectory) -> np.ndarray:
-    """(F,) body weights, the ground's normal load in every step."""
+    """Return the ground's normal load (F,) in every step, body weights."""
     t = trajectory
     normal = np.einsum("ci,ci->c", t.contact_force, t.contact_normal)
     weight = float(t.node_mass.sum() * np.linalg.norm(t.gravity))
@@ -51,7 +51,7 @@ def load(trajectory: Trajectory) -> np.ndarray:
 
 
 def before_lift_off(loads: np.ndarray) -> int:
-    """Number of steps before the longest flight; all steps if no flight lasts three steps."""
+    """Return the number of steps before the longest flight; all steps if no flight lasts three steps."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], loads <= 0.0, [0]])))
     starts, ends = edges[::2], edges[1::2]
     longest = int(np.argmax(ends - starts)) if len(starts) else 0
@@ -59,7 +59,7 @@ def before_lift_off(loads: np.ndarray) -> int:
 
 
 def reversals(loads: np.ndarray) -> np.ndarray:
-    """(F-2,) body weights, reversal of the load at each inner step.
+    """Return the reversal of the load (F-2,) at each inner step, body weights.
 
     A reversal is the smaller of two consecutive changes of opposite sign; 0 if the signs agree.
     """
@@ -69,7 +69,7 @@ def reversals(loads: np.ndarray) -> np.ndarray:
 
 
 def run(body: str, name: str, *, device: str, seed: int, frames: int | None = None) -> Row:
-    """Simulate one motion of one body."""
+    """Simulate one motion of one body and return its row; ``stopped`` is the reason if the motion failed."""
     judged, milliseconds = timed(_run, body, name, device=device, seed=seed, frames=frames)
     return {"body": body, "motion": name, **judged, "seconds": 1e-3 * milliseconds}
 
@@ -107,7 +107,7 @@ def _run(body: str, name: str, *, device: str, seed: int, frames: int | None) ->
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run all bodies and motions."""
-    parser = flags(__doc__, quick="the pawn's jump", device="cpu", seed="of the Gaussians of the built-in bodies")
+    parser = flags(__doc__, quick="the pawn's jump", device="cpu", seed="seed of the Gaussians of the built-in bodies")
     workers_flag(parser)
     parser.add_argument("--join", type=Path, help="JSON of an earlier run of the same code: its rows are not run again")
     options = parser.parse_args(arguments)
@@ -138,7 +138,7 @@ def summary(rows: list[Row]) -> dict[str, Any]:
         "internal_energy": all(row["peak_deformation"] <= MAX_INTERNAL for row in jumps),
         "chatter": all(row["reversed"] <= MAX_REVERSED and row["largest_reversal"] <= MAX_REVERSAL for row in jumps),
     }
-    missing = "the standard jump of every body was not run"
+    missing = "the standard jump was not run for every body"
     return {
         "rows": rows,
         "aims": {name: value if whole else None for name, value in aims.items()}

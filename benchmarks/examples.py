@@ -25,7 +25,7 @@ EXAMPLES = ("jump", "twist", "hop", "walk")
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the examples and tabulate their reports."""
     options = flags(
-        __doc__, quick="six frames of each", device="cpu", seed="not used: nothing here is random"
+        __doc__, quick="six frames of each example", device="cpu", seed="not used: nothing here is random"
     ).parse_args(arguments)
     rows = []
     for name in EXAMPLES:
@@ -57,7 +57,7 @@ def example(name: str) -> ModuleType:
 
 
 def row_of(name: str, summary: Row, contacts: np.ndarray) -> Row:
-    """Return one row of the table; ``contacts`` (F,) is the number of contacts in each step."""
+    """Return one row of the table, from an example's report and the number of ``contacts`` (F,) in each step."""
     return {
         "example": name,
         "nodes": summary["cage"]["nodes"],
@@ -75,12 +75,12 @@ def row_of(name: str, summary: Row, contacts: np.ndarray) -> Row:
 
 
 def stages_of(rows: list[Row]) -> list[str]:
-    """Return the stages that occur in any example; replanning, for one, does not occur in all of them."""
+    """Return the stages that occur in at least one example; replanning, for example, does not occur in all of them."""
     return list(dict.fromkeys(stage for row in rows for stage in row["milliseconds"]))
 
 
 def print_rows(rows: list[Row]) -> None:
-    """Print the table: maxima per step or frame in brackets, stages in ms per frame."""
+    """Print the table, with maxima per step or frame in brackets and stages in ms per frame."""
     stages = stages_of(rows)
     columns = {"example": "<8", "nodes": "d", "tets": "d", "fibres": "d", "segments": "d"}
     table = Table(**columns, contacts="10s", QPs="10s", **dict.fromkeys(stages, "8.1f"))
@@ -91,7 +91,7 @@ def print_rows(rows: list[Row]) -> None:
             f"{row['qps_a_frame']:.1f} ({row['qps_worst']})",
             *(row["milliseconds"].get(stage, 0.0) for stage in stages),
         )
-    print("in brackets the maximum of a step or frame; stages in ms a frame")
+    print("maxima per step or frame are in brackets; stages are in ms per frame")
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:

@@ -1,9 +1,9 @@
 """Error of the front that ``egs-warp`` guesses, for eleven bodies and the stool.
 
-The truth was written down from images of each body from eight sides before the guess was first run on them, by eye
-and thus to about 15 degrees. For the fox, whose head is turned, it is the front of its body. The guess's weights were
-then chosen on these bodies, so they are not held out. ``--plot`` draws each body from its guessed front. Aims:
-``right_9_of_11`` (within 30 degrees; the stool does not count).
+The truth was written down from images of each body from eight sides before the guess was first run on them. It was
+judged by eye, to about 15 degrees. For the fox, whose head is turned, it is the front of its body. The guess's weights
+were then chosen on these bodies, so they are not held out. ``--plot`` draws each body from its guessed front. Aim:
+``right_9_of_11`` (at least 9 of the 11 guesses are within 30 degrees of the truth; the stool does not count).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ TRUTH = {
     "figurine": (0.0, -1.0, 0.0),
     "stool": (0.0, -1.0, 0.0),
 }
-"""Front in the axes of the capture; meshes are rotated to z up."""
+"""True front of each body in the axes of its capture; meshes are rotated to z up."""
 MAX_ERROR = 30.0
 """Maximum error, degrees."""
 MIN_BODIES, MIN_RIGHT = 11, 9
@@ -60,7 +60,7 @@ def row(one: Body, standing: PlacedCage) -> Row:
 
 
 def picture(standing: PlacedCage, front: np.ndarray, *, size: int = 240) -> np.ndarray:
-    """(size, size, 3): render the body from its guessed front, from slightly above."""
+    """Render an image (size, size, 3) of the body from ``front`` (3,) and slightly above."""
     nodes = standing.cage.mesh.nodes
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
     direction = front + 0.2 * GROUND.normal

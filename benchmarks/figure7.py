@@ -1,15 +1,16 @@
 """Figure 7: an object segmented from a real scene, by four methods side by side.
 
-``hard assignment`` is what Gaussian Grouping does: each Gaussian belongs to the group that most of its pixels show, so
-to the object if more than half of its blending weight lies in the object's masks of 18 views; the plane is not used.
+``hard assignment`` is what Gaussian Grouping does: each Gaussian belongs to the group that most of its pixels show. It
+belongs to the object if more than half of its blending weight lies in the object's masks of 18 views; the plane is not
+used.
 The other methods are those of Table 3: Gaussians that straddle the plane are removed (``remove``), cut at the plane
 (``static split``), or trained until they are clear of it (``L_seg``).
 
-The measure is that of Table 3, with cameras in the plane: the residual is the sum of the pixels below the plane over
-the sum above it; PSNR and SSIM compare the upper half with the hard assignment, which has everything that the masks
-show. Aim: ``figure7_best``: in every scene L_seg leaves at most 0.002 below the plane, the paper's figure, and no
-other method with so small a residual has a higher PSNR of the upper half. ``whole dB``, which no aim judges, combines
-both: PSNR of the whole image against that upper half over an empty lower half.
+The measure is that of Table 3, with cameras in the plane: the residual is the sum of the pixels below the plane
+divided by the sum above it; PSNR and SSIM compare the upper half with the hard assignment, which contains everything
+that the masks show. Aim: ``figure7_best``: in every scene L_seg has a residual of at most 0.002, as in the paper, and
+no other method with so small a residual has a higher PSNR of the upper half. ``whole dB``, which has no aim, combines
+both: the PSNR of the whole image, whose target is the hard assignment's upper half above an empty lower half.
 
 The image (``--plot``) has one row for each scene, seen from just above the plane at the object's foot: the whole
 scene, then the four methods.
@@ -34,7 +35,7 @@ HARD, OURS = "hard assignment", "L_seg"
 CLEARINGS = {"remove": StraddlingPolicy.REMOVE, "static split": StraddlingPolicy.SPLIT, OURS: StraddlingPolicy.FINETUNE}
 MAX_RESIDUAL = 0.002
 VIEW_ELEVATION = 8.0
-"""Angle of the view from above the plane, degrees."""
+"""Elevation of the camera above the plane, degrees."""
 
 
 def rows_of(name: str, device: str, side: int, seed: int, table: Table) -> tuple[list[Row], np.ndarray]:
@@ -77,7 +78,7 @@ def close_by(parts: table3.Parts, clouds: Mapping[str, GaussianCloud], size: int
 
 
 def judge(rows: Sequence[Row], missing: Sequence[str]) -> tuple[dict[str, bool | None], dict[str, str]]:
-    """Return the aim from the rows."""
+    """Return the aim, from the rows, and the reason if it is None."""
     if missing:
         return {"figure7_best": None}, {"figure7_best": f"without {', '.join(missing)}; set EGS_WARP_DATA"}
     verdicts = []
@@ -110,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     for name in SCENES:
         if name in missing:
-            print(f"{name}: not here; set EGS_WARP_DATA")
+            print(f"{name}: not on this machine; set EGS_WARP_DATA")
             continue
         more, picture = rows_of(name, options.device, side, options.seed, table)
         rows += more

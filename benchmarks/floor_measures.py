@@ -18,7 +18,7 @@ SHIFTS = np.array([(r * np.cos(t), r * np.sin(t)) for r in (0.5, 0.75, 1.0) for 
 
 
 def similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(H, W) structural similarity of two images: Gaussian window of 11 x 11, sigma 1.5, mean over channels."""
+    """Return the SSIM (H, W) of two images: Gaussian window of 11 x 11, sigma 1.5, mean over channels."""
 
     def blur(values: np.ndarray) -> np.ndarray:
         return cv2.GaussianBlur(values.astype(np.float64), (11, 11), 1.5)
@@ -33,7 +33,7 @@ def similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def coarse_psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """PSNR (dB) in ``mask`` (H, W) of two images (H, W, 3) after a blur that uses only pixels of the mask."""
+    """Return the PSNR (dB) in ``mask`` (H, W) of two images (H, W, 3) after a blur within the mask."""
     sigma = COARSE * np.sqrt(mask.sum())
 
     def blurred(picture: np.ndarray) -> np.ndarray:
@@ -46,7 +46,10 @@ def coarse_psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float
 
 
 def gradient_energy(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """Ratio of mean squared gradients in ``mask`` (H, W) without the seam; below 1 is too smooth, above it too busy."""
+    """Return the mean squared gradient of ``image`` in ``mask`` (H, W), divided by that of ``truth``.
+
+    The seam, a rim of three pixels, is left out. Below 1 the image is too smooth, above 1 too busy.
+    """
     inner = np.asarray(ndimage.binary_erosion(mask, iterations=3), dtype=bool)
 
     def energy(picture: np.ndarray) -> float:

@@ -1,19 +1,20 @@
-"""Cost of a step by stage, over the nodes of the cage and the contacts of the step.
+"""Cost of a step by stage, as a function of the number of nodes of the cage and of contacts of the step.
 
 python benchmarks/frame.py [--quick] [--nodes N ...] [--frames N] [--old FOLDER] [--json PATH] [--plot PATH]
 
-The pawn jumps with cages of about 250 to 4,000 nodes; each of the first steps is a record of its stages, its nodes and
-its contacts. The model t = c nodes^p contacts^q is fitted to all records of a stage (steps with contact, least squares
-of the logarithms). ``--old`` is a checkout of commit 3848750. Its own example is timed in the same run; the jumps of
-the available captures (plush dog, monkey, robot) are timed with both versions, each with its own number of nodes. Give
-it two idle cores (``taskset -c 0,1``).
+The pawn jumps with cages of about 250 to 4,000 nodes; for each of the first steps, the times of its stages and its
+numbers of nodes and contacts are recorded. The model t = c nodes^p contacts^q is fitted to all records of a stage
+(steps with contact, least squares of the logarithms). ``--old`` is a checkout of commit 3848750. The jump example of
+that commit is timed in the same run; the jumps of the available captures (plush dog, monkey, robot) are timed with both
+versions, each with its own number of nodes. Run the benchmark on two idle cores (``taskset -c 0,1``).
 
-On a GPU the jump is timed once more with 1,000,000 Gaussians on about 1,000 nodes, if ``--nodes`` has that cage: each
-step, then its image of 1920 x 1080, which is rendered during the next step and downloaded after it.
+On a GPU the jump is timed once more with 1,000,000 Gaussians on about 1,000 nodes, if ``--nodes`` includes that cage:
+each step, then its image of 1920 x 1080, which is rendered during the next step and downloaded after it.
 
-Aims on a CPU: ``cpu_541`` (mean at most 60 ms, worst step at most 5 times the mean), ``cpu_10x`` (a tenth of the old
-commit's time, for the pawn and each capture), ``cpu_250_realtime`` (16.7 ms). On a GPU: ``gpu_541`` (mean 8 ms, worst
-step 16), ``gpu_1000`` (14 and 28), ``gpu_frame_60hz`` (mean of a step and its image within 16.7 ms).
+Aims on a CPU: ``cpu_541`` (mean at most 60 ms, worst step at most 5 times the mean), ``cpu_10x`` (at most a tenth of
+the old commit's time, for the pawn and each capture), ``cpu_250_realtime`` (mean at most 16.7 ms). On a GPU:
+``gpu_541`` (mean at most 8 ms, worst step at most 16 ms), ``gpu_1000`` (14 ms and 28 ms), ``gpu_frame_60hz`` (mean of a
+step and its image at most 16.7 ms).
 """
 
 from __future__ import annotations
@@ -48,12 +49,12 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.creature import Creature
 
 REQUESTED_NODES = (175, 500, 800, 1700, 3500)
-"""``--nodes`` that give the pawn cages of about 250, 541, 1,000, 2,000 and 4,000 nodes."""
+"""Values of ``--nodes`` that give the pawn cages of about 250, 541, 1,000, 2,000 and 4,000 nodes."""
 BINS = ((1, 8), (9, 16), (17, 32), (33, 64))
 """Ranges of the number of contacts of a step."""
 OLD_STAGES = ("detect", "predict", "linearise", "qp", "correct", "audit")
 CAPTURES = {"plush dog": ("plush_dog.ply", "-y"), "monkey": ("monkey.ply", "y"), "robot": ("robot.spz", "y")}
-"""Captures that are also timed with the old commit: file and up axis."""
+"""Captures that are also timed with the old commit: file and up direction."""
 _ANIMATE = "from egs_warp.cli import main; main()"
 _PICTURELESS = ("--no-shadow", "--size", "64")
 
@@ -63,9 +64,9 @@ GAUSSIANS, SIZE = 1_000_000, (1920, 1080)
 
 
 def measure(nodes_requested: int, frames: int, *, device: str, seed: int) -> list[Row]:
-    """Record each step of the first ``frames`` of a jump.
+    """Measure each step of the first ``frames`` frames of a jump.
 
-    Kernels are compiled and loaded before, and the GPU graphs are recorded.
+    Kernels are compiled and loaded, and GPU graphs are recorded, before the measurement.
     """
     scene = pawn(seed=seed, device=device)
     creature = make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=nodes_requested))
@@ -80,7 +81,7 @@ def measure_pictures(nodes_requested: int, frames: int, *, device: str, seed: in
 
     Returns:
         ms per frame in total ("frame") and by stage: the step ("step"), the wait for the bytes of the previous image
-        ("bytes"), the start of this one ("picture").
+            ("bytes") and the start of the new image ("picture").
     """
     scene = pawn(gaussian_count=GAUSSIANS, seed=seed, device=device)
     plain = make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=nodes_requested))
@@ -141,7 +142,7 @@ def _steps(creature: Creature, frames: int, *, before: int = 2) -> list[Row]:
 
 
 def by_contacts(records: list[Row]) -> list[Row]:
-    """Return means over the steps of one cage: over all of them, and over each range of contacts."""
+    """Return the means over all steps of one cage, and over the steps in each range of the number of contacts."""
     rows = []
     for low, high in ((0, 10**6), *BINS):
         chosen = [one for one in records if low <= one["contacts"] <= high]
@@ -181,7 +182,7 @@ def exponents(records: list[Row]) -> dict[str, list[float]]:
 
 
 def old_step(folder: Path, frames: int, *capture: str) -> float:
-    """Return the ms per step of a jump by the code in ``folder``, from its report.
+    """Return the ms per step of a jump with the code in ``folder``, from its report.
 
     Args:
         folder: checkout of the old commit.
@@ -216,16 +217,16 @@ def old_captures(folder: Path, frames: int, *, device: str) -> list[Row]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = flags(__doc__, quick="250 nodes, 20 frames", device="cpu", seed="of the pawn's Gaussians")
-    parser.add_argument("--nodes", type=int, nargs="*", default=list(REQUESTED_NODES), help="requested, of each cage")
-    parser.add_argument("--frames", type=int, default=60, help="of each jump (default 60)")
+    parser = flags(__doc__, quick="250 nodes, 20 frames", device="cpu", seed="seed of the pawn's Gaussians")
+    parser.add_argument("--nodes", type=int, nargs="*", default=list(REQUESTED_NODES), help="nodes requested of a cage")
+    parser.add_argument("--frames", type=int, default=60, help="frames of each jump (default 60)")
     parser.add_argument("--old", type=Path, help="checkout of commit 3848750")
     options = parser.parse_args(arguments)
     frames, chosen = (20, list(REQUESTED_NODES[:1])) if options.quick else (options.frames, options.nodes)
     old = old_step(options.old.resolve(), frames) if options.old else None
     captures: list[Row] = []
     if old is not None:
-        print(f"3848750: {old:.1f} ms a step")
+        print(f"commit 3848750: {old:.1f} ms a step")
         captures = old_captures(options.old.resolve(), frames, device=options.device)
     records: list[Row] = []
     table: Table | None = None
@@ -279,7 +280,7 @@ def summary(
         "gpu_1000": None if host else within(large, 14.0, 28.0),
         "gpu_frame_60hz": pictures["frame"] <= 1e3 / 60.0 if pictures else None,
     }
-    elsewhere = "not on this device, or no such cage"
+    elsewhere = "not measured on this device, or no cage of this size"
     nulls = dict.fromkeys(aims, elsewhere) | {
         "cpu_10x": f"{elsewhere}, or no --old",
         "gpu_frame_60hz": elsewhere,

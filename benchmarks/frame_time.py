@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NODES = 800
-"""``--nodes`` that give the pawn a cage of about 1,000 nodes."""
+"""Value of ``--nodes`` that gives the pawn a cage of about 1,000 nodes."""
 SIZES = ((512, 512), (1920, 1080))
 FRAME = 1e3 / 60.0
 
@@ -56,7 +56,7 @@ class Studio:
         return self._deformer.deform(nodes).cloud
 
     def enqueue(self, cloud: GaussianCloud) -> PendingImage:
-        """Queue the rendering of ``cloud``; returns at once."""
+        """Queue the rendering of ``cloud`` and return at once."""
         behind = self.behind
         return enqueue_image(cloud, self.camera, background=behind.background(cloud), max_depth=behind.floor_depth)
 
@@ -85,7 +85,7 @@ def measure(creature: Creature, size: tuple[int, int], *, repeats: int) -> Row:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    options = flags(__doc__, quick="22,000 Gaussians", seed="of the Gaussians").parse_args(arguments)
+    options = flags(__doc__, quick="22,000 Gaussians", seed="seed of the Gaussians").parse_args(arguments)
     counts = (22_000,) if options.quick else (22_000, 180_000, 1_000_000)
     table = Table(
         **{"Gaussians": "9d", "width": "5d", "height": "6d"},
@@ -109,13 +109,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
             axes.barh([f"{row['gaussians']}, {row['width']} x {row['height']}" for row in rows], durations, left=left)
             left += durations
         axes.axvline(FRAME, color="0.5")
-        axes.set_xlabel("milliseconds a picture: carry, shadow, draw, bytes")
+        axes.set_xlabel("milliseconds per image: carry, shadow, draw, bytes")
 
     report(
         options,
         rows,
         aims={"picture_60hz": largest <= FRAME if on_gpu and largest is not None else None},
-        why_null={} if on_gpu else {"picture_60hz": "measured on a GPU with 1,000,000 Gaussians only"},
+        why_null={} if on_gpu else {"picture_60hz": "only measured on a GPU with 1,000,000 Gaussians"},
         draw=draw,
     )
 

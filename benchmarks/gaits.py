@@ -5,12 +5,13 @@ python benchmarks/gaits.py [--quick] [--workers 2] [--nodes 500] [--bodies NAME 
 
 A cell is one body with one motion. A walk succeeds if it ends upright within 0.1 body heights and 10 degrees of the
 target, within 60 sqrt(H/g); a twist if it ends within 10 degrees after at most two jumps; a standard jump if it is
-within 15 %. A body that stands and is pushed by 0.1 m sqrt(g H) from the side succeeds if it ends upright and no sole
-was ever 0.1 body heights from its initial place. A body that is pushed by 1 m sqrt(g H) at 0.8 of its height succeeds
-if it stands at the end, possibly after getting up. Slip is the displacement of a foot while it is on the ground, over
-the stride; cost of transport is the muscles' work over m g times the distance.
+within 15 % of the requested height and distance. A body that stands and is pushed by 0.1 m sqrt(g H) from the side
+succeeds if it ends upright and no sole was ever more than 0.1 body heights from its initial position. A body that is
+pushed by 1 m sqrt(g H) at 0.8 of its height succeeds if it stands at the end, possibly after getting up. Slip is the
+displacement of a foot while it is on the ground, divided by the stride; cost of transport is the
+muscles' work divided by m g times the distance.
 
-A body that refuses a motion with an error counts as a failure; getting up is counted separately and has no aim. A ball
+A motion that is refused with an error counts as a failure; getting up is counted separately and has no aim. A ball
 is judged by its position and, if it does not roll, by its heading. Captures are used if they are on this machine.
 ``--unseen`` runs five bodies that were not used while the motions were developed, ``--captures`` those of a folder
 written by ``trained_bodies.py``.
@@ -136,7 +137,7 @@ def _body(name: str, captures: Path | None) -> Body:
 
 
 def creature_of(one: Body, nodes: int) -> Creature:
-    """Build the creature, with twice the nodes if the cage of ``nodes`` nodes falls apart."""
+    """Build the creature, with a cage of ``nodes`` nodes or, if none can be built, of twice as many."""
     try:
         return make_creature(one.cloud, plane=one.plane, options=CreatureOptions(nodes=nodes))
     except ArgumentError:
@@ -144,7 +145,7 @@ def creature_of(one: Body, nodes: int) -> Creature:
 
 
 def _moved(performance: SimulatedRun) -> np.ndarray:
-    """(3,) displacement of the centre of mass ahead and to the left, body heights, and rotation, degrees."""
+    """Return (3,), displacement of the centre of mass ahead and to the left, body heights, and rotation, degrees."""
     trajectory, place, body_ = performance.trajectory, performance.place, performance.creature.body
     first, last = (body_.centre_of_mass(place.ground.local(trajectory.positions[k])) for k in (0, -1))
     return np.array([*((last - first)[:2] / body_.height), measure(trajectory).heading_degrees])
@@ -167,7 +168,7 @@ def _get_up_failure(performance: SimulatedRun, reached: dict[str, Any]) -> str |
     if reached["tilt_degrees"] >= MAX_RISEN_TILT:
         return f"leans: tilt {reached['tilt_degrees']:.0f} degrees"
     rose = all(entry.got_up for entry in performance.sequence.done if entry.fall_note is not None)
-    return None if rose and performance.sequence.is_finished else "it has not got up in time"
+    return None if rose and performance.sequence.is_finished else "it did not get up in time"
 
 
 def _push_failure(reached: dict[str, Any]) -> str | None:
@@ -185,10 +186,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = flags(__doc__, quick="three bodies, short distances", device="cpu")
     workers_flag(parser)
     parser.add_argument("--nodes", type=int, default=500, help="approximate number of nodes of the cages")
-    parser.add_argument("--bodies", nargs="*", help="only these")
-    parser.add_argument("--unseen", action="store_true", help="only the five held-out bodies")
-    parser.add_argument("--captures", type=Path, metavar="FOLDER", help="only the bodies NAME.ply in it, z up")
-    parser.add_argument("--cells", nargs="*", help=f"only these of {', '.join(CELLS)}")
+    parser.add_argument("--bodies", nargs="*", help="run only these bodies")
+    parser.add_argument("--unseen", action="store_true", help="run only the five held-out bodies")
+    parser.add_argument("--captures", type=Path, metavar="FOLDER", help="run only its bodies NAME.ply, z up")
+    parser.add_argument("--cells", nargs="*", help=f"run only these cells of {', '.join(CELLS)}")
     parser.add_argument("--join", type=Path, help="JSON of an earlier run of the same code: its rows are not run again")
     options = parser.parse_args(arguments)
     rows: list[Row] = json.loads(options.join.read_text())["rows"] if options.join else []
@@ -196,7 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     default = ["pawn", "stool", "biped"] if options.quick else names()
     captured = sorted(path.stem for path in options.captures.glob("*.ply")) if options.captures else []
     if options.captures and not captured:
-        parser.error(f"--captures {options.captures}: no NAME.ply there; trained_bodies.py writes some")
+        parser.error(f"--captures {options.captures}: contains no NAME.ply; trained_bodies.py writes such files")
     chosen = options.bodies or captured or (list(UNSEEN) if options.unseen else default)
     cells = [
         (name, cell, text)

@@ -2,7 +2,7 @@
 
 python benchmarks/get_up.py [--quick] [--workers 2] [--nodes 150] [--bodies NAME ...] [--json PATH]
 
-A body starts at rest, lying just over the ground, with the motion ``get up``. It succeeds if it ends at rest within 15
+A body starts at rest, lying just above the ground, with the motion ``get up``. It succeeds if it ends at rest within 15
 degrees of upright. Work is the muscles' work over all tries, in m g H; time counts from the start, in sqrt(H/g).
 """
 
@@ -34,7 +34,7 @@ from sweep import bounds_broken
 BODIES = ("pawn", "bottle", "biped", "box", "stool")
 DEGREES = (80.0, 90.0, 95.0)
 SIDES = {"front": 1, "side": 0}
-"""Axis of the ground that the body is tilted about: its left, its front."""
+"""Index of the ground axis about which the body is tilted: 1 points to its left, 0 to its front."""
 MAX_TIME = 60.0
 """Maximum time, sqrt(H / g)."""
 MAX_MEDIAN_WORK = 10.0
@@ -42,7 +42,7 @@ MAX_MEDIAN_WORK = 10.0
 
 
 def run(name: str, degrees: float, side: str, nodes: int) -> Row:
-    """Lay one body down and simulate whether it gets up."""
+    """Lay one body down, simulate ``get up`` and return the row of the result."""
     wp.config.log_level = wp.LOG_WARNING
     outcome, milliseconds = timed(_run, name, degrees, side, nodes)
     return {"body": name, "degrees": degrees, "side": side, **outcome, "seconds": 1e-3 * milliseconds}
@@ -98,8 +98,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = flags(__doc__, quick="three bodies, tilted by 90 degrees", device="cpu")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--nodes", type=int, default=150, help="approximate number of nodes of the cages")
-    parser.add_argument("--bodies", nargs="*", help="only these")
-    parser.add_argument("--degrees", nargs="*", type=float, help="only these")
+    parser.add_argument("--bodies", nargs="*", help="run only these bodies")
+    parser.add_argument("--degrees", nargs="*", type=float, help="run only these tilts")
     options = parser.parse_args(arguments)
     chosen = options.bodies or (BODIES[:3] if options.quick else BODIES)
     angles = options.degrees or ((90.0,) if options.quick else DEGREES)

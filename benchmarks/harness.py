@@ -2,8 +2,8 @@
 
 A benchmark takes ``--quick`` (under ten minutes on two cores), ``--device``, ``--seed``, ``--json PATH`` and
 ``--plot PATH``, prints a table, and writes JSON with ``rows`` (the figures), ``environment`` (device, versions and
-settings of the measurement), ``aims`` (true or false by the rows, or null if this device cannot measure it) and
-``why_null`` (the reason of each null).
+settings of the measurement), ``aims`` (true or false according to the rows, or null if not measured) and ``why_null``
+(the reason for each null).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 T = TypeVar("T")
 Row = dict[str, Any]
-"""One record of figures by name."""
+"""One record: values by name."""
 
 
 def flags(
@@ -55,8 +55,8 @@ def flags(
     parser.add_argument("--quick", action="store_true", help=quick)
     parser.add_argument("--device", default=device, help=f"{device} by default")
     parser.add_argument("--seed", type=int, default=0, help=seed)
-    parser.add_argument("--json", type=Path, help="file for the figures")
-    parser.add_argument("--plot", type=Path, help=plot or "file for the picture")
+    parser.add_argument("--json", type=Path, help="JSON file for the result")
+    parser.add_argument("--plot", type=Path, help=plot or "image file for the plot")
     return parser
 
 
@@ -178,10 +178,16 @@ def record(
     conditions: Mapping[str, Any] | None = None,
     **more: Any,
 ) -> dict[str, Any]:
-    """Return the result, and write it to ``--json`` if given.
+    """Return the result as a dictionary and write it to the file of ``--json``, if given.
 
     Args:
-        conditions: further entries of its environment.
+        options: parsed flags of the benchmark.
+        rows: records of the benchmark.
+        aims: whether each aim is met; None if it was not measured.
+        why_null: reason for each None.
+        packages: packages whose versions are recorded.
+        conditions: further entries of ``environment``.
+        more: further entries of the result.
 
     Raises:
         ValueError: an aim is null without a reason.
@@ -211,11 +217,11 @@ def report(
     size: tuple[float, float] = (7.0, 3.5),
     **result: Any,
 ) -> None:
-    """Write the final result: ``record``, the aims as text, and the image of ``--plot``.
+    """Write the final result: the JSON of ``record``, the aims as text, and the image for ``--plot``.
 
     Args:
         draw: function that draws into an empty figure of ``size`` inches.
-        picture: (H, W, 3) image instead, uint8 or floats from 0 to 1.
+        picture: (H, W, 3) image that is written instead of a drawing, uint8 or floats from 0 to 1.
     """
     result_record = record(options, rows, **result)
     print(json.dumps({name: result_record[name] for name in ("aims", "why_null")}, indent=1))

@@ -1,18 +1,20 @@
 """Inpainting of the floor under an object, compared with the known floor.
 
 Cases: the three built-in scenes (the floor under the object is removed and replaced by dark haze, as in a capture) and
-holes cut into visible floor of real captures. Held-out cameras compare the hole's pixels with the original floor. Rows:
-this package; the same with ``cv2.inpaint`` on the plane seen face-on in place of patch synthesis (same flat Gaussians,
-same training); ``cv2.inpaint`` in every image (the better of its two methods, both times); training without the plane:
-the same number of Gaussians, scattered where the object stood, against the same single inpainted image.
+holes cut into visible floor of real captures. In held-out views, the hole's pixels are compared with the original
+floor. Rows: this package; the same with ``cv2.inpaint`` on the plane seen face-on in place of patch synthesis (same
+flat Gaussians, same training); ``cv2.inpaint`` in every image (the better of its two methods, both times); training
+without the plane: the same number of Gaussians, scattered where the object stood, against the same single inpainted
+image.
 
-Besides PSNR and SSIM there are PSNR after a blur (``coarse_psnr``) and the gradient energy over the truth's
-(``detail``, 1 is right), because PSNR favours a blur where the true pixels cannot be known. ``face_on`` quantifies
-that: both PSNRs on the plane for our inpainting, for one colour, and for the true floor itself, shifted into the hole.
+In addition to PSNR and SSIM, the rows have PSNR after a blur (``coarse_psnr``) and the gradient energy relative to the
+truth's (``detail``; 1 is ideal), because PSNR favours a blur where the true pixels cannot be known. ``face_on``
+quantifies this with both PSNRs on the plane for our inpainting, for one colour, and for the true floor itself, shifted
+into the hole.
 
 Aims: ``beats_cv2_by_3db``, ``beats_no_prior_by_3db``, ``inpaint_beats_rectified_cv2`` (mean PSNR over the cases),
-``seconds_on_gpu`` (every case at most 20 s), ``hole_size_independent`` (seconds vary at most 1.5 times over a fourfold
-area of the hole).
+``seconds_on_gpu`` (every case at most 20 s), ``hole_size_independent`` (the times for two holes, one with four
+times the area of the other, differ by at most a factor of 1.5).
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ class Case:
     name: str
     truth: GaussianCloud
     damaged: GaussianCloud
-    """Background as segmentation leaves it: no floor in the hole, haze instead."""
+    """Background as after segmentation: haze instead of the floor in the hole."""
     hole: Hole
     is_real: bool
 
@@ -87,7 +89,7 @@ def real(name: str, device: str) -> Case | None:
 def damaged(truth: GaussianCloud, hole: Hole) -> GaussianCloud:
     """Remove the Gaussians in the hole and add a little dark haze around the plane there.
 
-    No camera of a capture could have contradicted such haze.
+    Captures contain such haze, because no camera sees the floor under the object.
     """
     _, side = hole.bounds()
     means = truth.means.numpy()
@@ -109,7 +111,7 @@ def damaged(truth: GaussianCloud, hole: Hole) -> GaussianCloud:
 
 
 def cameras_around(hole: Hole, size: int) -> list[Camera]:
-    """Return eight cameras on two rings; the image is inpainted for the first one."""
+    """Return eight cameras on two rings; the first one takes the single image that the baseline trains on."""
     middle, side = hole.bounds()
     first, second = hole.plane.tangents()
     cameras = []
@@ -126,7 +128,7 @@ def cameras_around(hole: Hole, size: int) -> list[Camera]:
 
 
 def hole_pixels(result: InpaintResult, camera: Camera) -> np.ndarray:
-    """(H, W) bool: pixels whose ray meets the plane inside the hole."""
+    """Return (H, W) bool, True where the pixel's ray meets the plane inside the hole."""
     depth = plane_depth(result.window.plane, camera)
     points = camera.centre + depth[..., None] * camera_rays(camera)
     return (result.window.sample(result.hole, points.reshape(-1, 3)).reshape(depth.shape)) & (depth > 0.0)
@@ -139,7 +141,7 @@ def picture(cloud: GaussianCloud, camera: Camera) -> tuple[np.ndarray, np.ndarra
 
 
 def best_by_opencv(image: np.ndarray, mask: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Inpaint ``image`` by the OpenCV method that is closer to ``truth`` in the mask; all (H, W, 3)."""
+    """Inpaint ``mask`` (H, W) in ``image`` (H, W, 3) with the OpenCV method whose result is closer to ``truth``."""
     wide = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
     coded = np.rint(255 * image).astype(np.uint8)
     filled = (cv2.inpaint(coded, wide, 5, flag) / np.float32(255.0) for flag in (cv2.INPAINT_TELEA, cv2.INPAINT_NS))
@@ -149,7 +151,7 @@ def best_by_opencv(image: np.ndarray, mask: np.ndarray, truth: np.ndarray) -> np
 def without_plane(
     case: Case, result: InpaintResult, camera: Camera, target: np.ndarray, steps: int, seed: int
 ) -> GaussianCloud:
-    """Train as many Gaussians as ours, scattered over the volume of the object, against one image."""
+    """Train as many Gaussians as our inpainting adds, scattered over the volume of the object, against one image."""
     _, side = case.hole.bounds()
     remaining = result.cloud.subset(~result.is_new)
     count = int(result.is_new.sum())
@@ -200,7 +202,7 @@ def judge_case(case: Case, options: argparse.Namespace, table: Table) -> tuple[l
     views: list[tuple[np.ndarray, ...]] = []
     for camera in cameras[1:]:
         truth, true_depth = picture(case.truth, camera)
-        # Objects in front of the floor are the same in every image.
+        # Exclude objects in front of the floor, which are the same in every image.
         ahead = true_depth - plane_depth(case.hole.plane, camera)
         mask = hole_pixels(result, camera) & (np.abs(ahead) < 0.25 * case.hole.bounds()[1])
         if mask.sum() < 100:
@@ -298,7 +300,7 @@ def sheet(colours: list[np.ndarray], depths: list[np.ndarray], name: str) -> np.
 
 
 def size_rows(options: argparse.Namespace) -> list[Row]:
-    """Time a round hole in the table cloth and one of four times its area, interleaved."""
+    """Time, in turn, the inpainting of a round hole in the table cloth and of one with four times its area."""
     built = scene("figurine", device=options.device)
     holes = {radius: disc(built.plane, np.array([0.1, 0.2, 0.0]), radius) for radius in (0.16, 0.32)}
     clouds = {radius: damaged(built.background, hole) for radius, hole in holes.items()}
@@ -331,7 +333,7 @@ def judge(rows: list[Row], *, on_gpu: bool) -> tuple[dict[str, bool | None], dic
         "seconds_on_gpu": max(ours) <= 20.0 if on_gpu else None,
         "hole_size_independent": max(sizes) <= 1.5 * min(sizes),
     }
-    why = {} if on_gpu else {"seconds_on_gpu": "no GPU on this machine; run the script on one"}
+    why = {} if on_gpu else {"seconds_on_gpu": "only measured on a GPU"}
     return aims, why
 
 
@@ -341,7 +343,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--cases", nargs="+", default=["pawn", "stool", "figurine", *REAL])
     parser.add_argument("--size", type=int, help="width and height of the images, pixels (default 400)")
     parser.add_argument("--baseline-steps", type=int, help="training steps without the plane (default 5000)")
-    parser.add_argument("--join", type=Path, help="JSON of an earlier run with other cases, judged together with this")
+    parser.add_argument("--join", type=Path, help="JSON of an earlier run with other cases, judged with this run")
     parser.add_argument("--repeat", type=int, help="timed runs (default 4, the first is not counted)")
     options = parser.parse_args(arguments)
     options.size = options.size or (256 if options.quick else 400)

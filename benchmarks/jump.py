@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for row in rows:
         table.row(row["stage"], row["mean"], row["worst"])
     print(
-        f"{frames} frames at {settings.size} x {settings.size}: {seconds:.1f} s in all, peak memory {gibibytes:.2f} GiB"
+        f"{frames} frames at {settings.size} x {settings.size}: {seconds:.1f} s total, peak memory {gibibytes:.2f} GiB"
     )
     full = not options.quick
 
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         axes = figure.subplots()
         axes.barh([row["stage"] for row in rows], [row["mean"] for row in rows])
         axes.invert_yaxis()
-        axes.set_xlabel("milliseconds a frame, mean")
+        axes.set_xlabel("milliseconds per frame, mean")
 
     report(
         options,

@@ -89,7 +89,7 @@ def arithmetic_kernel(
 #endif
 """)
 def vector_chains(row: wp.int32, start: wp.float32, factor: wp.float32, sum_out: wp.array[wp.float32]):
-    """``arithmetic_kernel`` in vectors of eight, like compositing on a CPU."""
+    """Compute the chains of ``arithmetic_kernel`` in vectors of eight numbers, like compositing on a CPU."""
     ...
 
 
@@ -158,8 +158,8 @@ def trace_kernel(
     """Intersect each sample ray of each pixel with the mesh.
 
     Outputs are the hit point at rest, the light there, which multiplies the paint, and the gloss, which is added
-    (Phong). Lamps rotate with each face (``rest_from_world``), because a capture has no lamps, only colour by
-    direction. Faces are two-sided.
+    (Phong). Lamps rotate with each face (``rest_from_world``), because a capture has no lamps, only colours
+    that depend on the direction. Faces are two-sided.
     """
     pixel, sample = wp.tid()
     x = float(pixel % width) + (float(sample % samples) + 0.5) / float(samples)

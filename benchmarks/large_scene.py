@@ -1,13 +1,14 @@
 """Memory and time of each stage from capture to film, for a scene of millions of Gaussians.
 
-A real capture (``--scene``) is repeated side by side along its plane until it has ``--gaussians``, with colours of
-degree 3, the highest degree of a capture. The object is that of the original copy, clicked as in ``scene_quality.py``.
-Stages: ``load`` reads the scene from a file, ``plane`` finds the support plane, ``object`` segments the object,
-``hole`` inpaints the floor, ``body`` builds the creature, ``film`` renders ``--frames`` frames of it in the scene.
+A real capture (``--scene``) is repeated side by side along its plane until it has ``--gaussians`` Gaussians, with
+colours of degree 3, the highest degree of a capture. The object is that of the original copy, clicked as in
+``scene_quality.py``. Stages: ``load`` reads the scene from a file, ``plane`` finds the support plane, ``ground``
+measures the ground, ``object`` segments the object, ``hole`` inpaints the floor, ``body`` builds the creature,
+``animate`` simulates ``--frames`` frames of a jump, ``film`` renders them in the scene.
 ``peak`` is the peak resident memory of the whole process during the stage: the operating system's own count (VmHWM),
 reset before each stage, so it is measured on Linux only.
 
-Aims: ``memory`` (every stage within 16 GiB), ``three_minutes`` (all stages but ``animate`` together; on a GPU).
+Aims: ``memory`` (every stage within 16 GiB), ``three_minutes`` (all stages except ``animate`` together; only on a GPU).
 """
 
 from __future__ import annotations
@@ -134,8 +135,8 @@ def _write_scene(annotated: DrawnScene, place: Path, options: argparse.Namespace
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = flags(__doc__, quick="200,000 Gaussians", device="cpu", plot="the film's frames")
-    parser.add_argument("--scene", choices=NAMES[:-1], default="koala", help="the capture that is repeated")
+    parser = flags(__doc__, quick="200,000 Gaussians", device="cpu", plot="image file for the film's frames")
+    parser.add_argument("--scene", choices=NAMES[:-1], default="koala", help="scene whose capture is repeated")
     parser.add_argument("--gaussians", type=int, default=3_000_000)
     parser.add_argument("--nodes", type=int, default=250, help="approximate number of nodes of the cage")
     parser.add_argument("--frames", type=int, default=2, help="frames of the film")
@@ -153,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "memory": max(row["peak_gib"] for row in stages.rows) <= MEMORY_GIB,
             "three_minutes": seconds <= SECONDS if on_gpu else None,
         },
-        why_null={} if on_gpu else {"three_minutes": "measured on a GPU only"},
+        why_null={} if on_gpu else {"three_minutes": "only measured on a GPU"},
         packages=["torch"],
     )
 

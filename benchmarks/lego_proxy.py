@@ -27,7 +27,7 @@ REACH = 3
 
 
 def lego(*, gaussians: int, iterations: int, seed: int, device: str, cache: Path | None) -> PaintedMesh:
-    """Build the proxy; if ``cache`` is a file it is read from it, otherwise it is written to it."""
+    """Read the proxy from ``cache`` if that file exists; otherwise build it and write it to ``cache``, if given."""
     if cache is not None and cache.exists():
         with np.load(cache) as arrays:
             return _painted(**arrays)
@@ -67,7 +67,7 @@ def _painted(vertices: np.ndarray, faces: np.ndarray, voxels: np.ndarray, low: n
 
 
 def _largest_part(faces: np.ndarray, count: int) -> np.ndarray:
-    """(F,) bool: triangles of the largest connected component."""
+    """Return (F,) bool, True for triangles of the largest connected component."""
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
     graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
     _, part = connected_components(graph, directed=False)

@@ -1,13 +1,13 @@
 """Frame rate and latency of ``egs-warp live``, with a page in Chromium on the same machine.
 
 A built-in pawn of 20,000 Gaussians, with cages of about 250 and 541 nodes, jumps and turns on key presses, in a page of
-640 x 360 pixels. In motion: solver steps and images per second, bytes per frame, speed of its time relative to real
-time, and the fraction of images that show no new moment (stalls). From rest: the latency from a key press to the first
-pixel that differs by more than 4 of 255, over several jumps.
+640 x 360 pixels. Measured in motion: solver steps and images per second, bytes per frame, speed of the page's clock
+relative to real time, and the fraction of images that show no new moment (stalls). Measured from rest: the latency from
+a key press to the first pixel that differs by more than 4 of 255, for several jumps and turns.
 
 Chromium without a GPU renders in software, on the cores that the solver needs. Aims, for about 250 nodes:
-``solver_fps`` (at least 10 steps a second; 60 on a GPU), ``page_fps`` (25 images; 60), ``latency`` (median at most
-150 ms; 60 ms). Set EGS_WARP_BROWSER if Chromium has another name.
+``solver_fps`` (at least 10 steps per second; 60 on a GPU), ``page_fps`` (at least 25 images per second; 60 if Chromium
+has a GPU), ``latency`` (median at most 150 ms; 60 ms on a GPU). Set EGS_WARP_BROWSER if Chromium has another name.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 GAUSSIANS = 20_000
 WINDOW = {"width": 640, "height": 360}
 REQUESTED_NODES = {250: 175, 541: 400}
-"""``--nodes`` that gives the pawn a cage of about the number of nodes in the key."""
+"""Value of ``--nodes`` that gives the pawn a cage of about as many nodes as the key."""
 
 MOVE = """(seconds) => new Promise((resolve) => {
     const viewer = egs.viewers[0], { source } = viewer, { clock } = egs.live;
@@ -54,7 +54,7 @@ MOVE = """(seconds) => new Promise((resolve) => {
     };
     look();
 })"""
-"""Script that counts the frames that arrive and the images that are drawn within some seconds."""
+"""Script that counts the frames that arrive and the images that are drawn within ``seconds``."""
 WAIT_FOR_PIXEL = """() => {
     const viewer = egs.viewers[0], { canvas } = viewer, copy = document.createElement("canvas");
     copy.width = canvas.width; copy.height = canvas.height;
@@ -68,7 +68,7 @@ WAIT_FOR_PIXEL = """() => {
     let before, pressed;
     document.addEventListener("keydown", (event) => { pressed = event.timeStamp; }, { once: true, capture: true });
     const draw = viewer.draw.bind(viewer);
-    // The resolution must be the same before and after.
+    // The resolution must be the same before and after the key press.
     viewer.setResolution = () => {};
     viewer.draw = () => {
         if (!draw()) return false;
@@ -94,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     seconds, presses = (10.0, 3) if options.quick else (30.0, 9)
     browser = os.environ.get("EGS_WARP_BROWSER") or shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
-        parser.error("no Chromium; install it, or set EGS_WARP_BROWSER")
+        parser.error("Chromium was not found; install it, or set EGS_WARP_BROWSER")
     rows: list[Row] = []
     table = Table(
         nodes="5d",
@@ -144,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def measured(address: str, browser: str, seconds: float, presses: int) -> Row:
-    """Measure the session at ``address``."""
+    """Open the page at ``address`` and measure ``seconds`` s of motion and the latencies of ``presses`` key presses."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as started:

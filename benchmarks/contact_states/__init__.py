@@ -1,1 +1,1 @@
-"""Searches over contact states as in the literature, to which ``table2.py`` compares the engine's."""
+"""Searches over contact states from the literature, with which ``table2.py`` compares the engine's."""

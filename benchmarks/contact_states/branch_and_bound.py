@@ -31,7 +31,7 @@ _LEAVES = (_Decided.SEPARATE, _Decided.STATIC, _Decided.SLIDE)
 
 @dataclass(frozen=True)
 class _Branch:
-    """Decision about one contact. A contact that slides does so in the directions ``first`` to ``last`` of the ring."""
+    """Decision about one contact; if it slides, ``first`` to ``last`` are its possible directions in the ring."""
 
     decided: _Decided = _Decided.NOTHING
     first: int = 0
@@ -76,7 +76,7 @@ class ExactResult:
 
     @property
     def proved(self) -> bool:
-        """True if the search ended before its limit, so that no contact states have a lower objective."""
+        """True if the objective equals its lower bound to within 1e-6, so that no contact states have a lower one."""
         return self.objective - self.bound <= 1e-6 * (1.0 + abs(self.objective))
 
 
@@ -96,8 +96,8 @@ def exact_states(
         program: the QP with a friction pyramid.
         starts: states (n,) that are tried first; good ones prune most of the tree.
         qp_limit: maximum number of QPs.
-        relative_gap: the search ends when no node is better by more than 1e-7, or by this fraction of the best
-            objective.
+        relative_gap: the search ends when no node can lower the best objective by more than 1e-7 or, if that is larger,
+            by more than this fraction of it.
 
     Returns:
         The optimum; None if no contact states are feasible, or none were found within ``qp_limit``.

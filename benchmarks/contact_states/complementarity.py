@@ -15,8 +15,8 @@ from egs_warp.locomotion.contact_modes import FREE, STICK, ContactModes
 
 SEPARATE = -2
 STATIC = -1
-"""A state is ``SEPARATE``, ``STATIC``, or slide k: for 0 <= k < n_d friction along +D_k and slip along -D_k; for n_d +
-k friction between D_k and D_(k+1) and slip midway."""
+"""A state is ``SEPARATE``, ``STATIC`` or slide k: for 0 <= k < n_d, friction acts along +D_k and the slip is along
+-D_k; in state n_d + k, friction acts between D_k and D_(k+1) and slip is midway between -D_k and -D_(k+1)."""
 
 
 class Pivot(NamedTuple):
@@ -94,7 +94,7 @@ class ContactLayout:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Both sides of Eq. (9) by contact, 0 <= x and 0 <= w of which one is zero; or the multipliers of their rows."""
+    """Both sides of the pairs of Eq. (9), 0 <= x and 0 <= w with x w = 0, by contact; or their rows' multipliers."""
 
     normal: np.ndarray
     """(n,) x: f_n."""
@@ -118,8 +118,10 @@ class Pairs:
 
     @property
     def violation(self) -> np.ndarray:
-        """(n,) largest complementarity violation of each contact, the smaller side of a pair; zero where Eq. (9)
-        holds."""
+        """(n,) complementarity violation of each contact: the smaller side of a pair, maximum over the contact's pairs.
+
+        Zero where Eq. (9) holds.
+        """
         normal, slip = np.minimum(self.normal, self.gap), np.minimum(self.slip, self.cone)
         return np.maximum(np.maximum(normal, slip), np.minimum(self.friction, self.drift).max(axis=1))
 
@@ -157,7 +159,7 @@ def proposed_pivots(
 ) -> list[Pivot]:
     """Propose changes of state from the multipliers, best first (docs/benchmarks/contact.md#moves).
 
-    Only states that the point itself satisfies are proposed, so no proposal is infeasible, even several at once.
+    Only states that the current point satisfies are proposed, so each proposal is feasible, and so are several at once.
 
     Args:
         layout: layout of unknowns and rows.
@@ -244,8 +246,9 @@ def plain_pivots(
     *,
     zero: float = 1e-4,
 ) -> list[Pivot]:
-    """Propose changes of state as a QPCC pivots, for the baseline: each multiplier alone decides. Arguments as for
-    ``proposed_pivots``.
+    """Propose changes of state like the pivots of a QPCC, as the baseline: each multiplier is judged alone.
+
+    The arguments are those of ``proposed_pivots``.
 
     A contact whose free side is zero changes to the state in which the row of the multiplier is free: static to
     separate or slide k, slide k to static, separate or slide j, separate to static.
@@ -259,7 +262,7 @@ def plain_pivots(
         elif state == STATIC:
             gains = [(multiplier.gap[i], SEPARATE)] if point.normal[i] <= zero else []
             if point.cone[i] <= zero:
-                # Raising lambda frees the row of every direction; friction stays where it is largest.
+                # A positive lambda frees the row of every direction; friction remains only where it is largest.
                 gains.append((max(multiplier.slip[i], multiplier.drift[i].max()), int(np.argmax(point.friction[i]))))
         else:
             gains = [(multiplier.cone[i], STATIC)] if point.slip[i] <= zero else []

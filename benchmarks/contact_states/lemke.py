@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.blas import dger  # pyright: ignore[reportAttributeAccessIssue]  # compiled: no stub names it
+from scipy.linalg.blas import dger  # pyright: ignore[reportAttributeAccessIssue]  # compiled: not in the stubs
 
 
 def lemke(matrix: np.ndarray, q: np.ndarray, *, pivot_limit: int = 2000) -> np.ndarray | None:
@@ -56,8 +56,7 @@ def _solution(tableau: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def _smallest_ratio(tableau: np.ndarray, column: np.ndarray, rows: np.ndarray, basis: np.ndarray, cover: int) -> int:
-    """Return the row of the smallest ratio. In a tie the covering variable leaves first, else the lexicographic
-    minimum."""
+    """Return the row of the smallest ratio; in a tie, that of the covering variable, else the lexicographic minimum."""
     count = len(tableau)
     for index in (-1, *range(count)):
         ratios = tableau[rows, index] / column[rows]

@@ -1,4 +1,4 @@
-"""QP of a step as the paper writes it: contact as complementarity of pyramid forces and slip velocities (Eq. 9, 13).
+"""QP of a step in the paper's form: contact as complementarity of pyramid forces and slip velocities (Eq. 9, 13).
 
 See docs/benchmarks/contact.md#searches.
 """
@@ -33,7 +33,7 @@ class PyramidProgram:
     q: np.ndarray
     """(variables,)."""
     constant: float
-    """Completes the objective to the sum of weighted squares, which is never negative."""
+    """Constant that completes the objective to the sum of weighted squares, which is never negative."""
     A: np.ndarray
     """(rows, variables)."""
     offset: np.ndarray
@@ -68,7 +68,7 @@ class PyramidProgram:
         return rows[self.layout.activations : self.layout.variables], rows[self.layout.variables :]
 
     def objective(self, y: np.ndarray) -> float:
-        """Return the objective at ``y`` (variables,), with the constant."""
+        """Return the objective at ``y`` (variables,), including the constant."""
         return float(0.5 * y @ self.P @ y + self.q @ y + self.constant)
 
     def forces_of(self, y: np.ndarray) -> np.ndarray:
@@ -77,7 +77,7 @@ class PyramidProgram:
 
 
 def _spread(layout: ContactLayout) -> sparse.csr_matrix:
-    """Return (M + 3n, variables), which maps y to activations and contact forces (normal and two tangential)."""
+    """Return the matrix (M + 3n, variables) from y to activations and contact forces (normal and two tangential)."""
     m, n, nd = layout.activations, layout.contacts, layout.directions
     spread = np.zeros((m + 3 * n, layout.variables))
     spread[np.arange(m), np.arange(m)] = 1.0

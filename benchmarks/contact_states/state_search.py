@@ -1,4 +1,4 @@
-"""Searches over contact states with a friction pyramid, to which the engine's strategies are compared (Eq. 13).
+"""Searches over contact states with a friction pyramid, with which the engine's strategies are compared (Eq. 13).
 
 See docs/benchmarks/contact.md#searches.
 """
@@ -34,12 +34,12 @@ RESTART_GAP = 1.2
 """A search restarts from other states, with ``RESTART_BUDGET`` times as many QPs, if the objective exceeds its lower
 bound by more than this factor."""
 NEGLIGIBLE_GAIN = 0.01
-"""No restart if less than this fraction of the cost of doing nothing (no muscle and no contact force) could be
-gained."""
+"""Fraction of the cost of doing nothing (no muscle and no contact forces); a search that could gain less does not
+restart."""
 LOADED_FORCE = 1e-3
-"""Body weights, normal force from which a contact counts as loaded."""
+"""Normal force from which a contact counts as loaded, body weights."""
 RESTART_BUDGET = 3
-"""Factor on the number of QPs for restarts: sliding feet have many states of similar cost."""
+"""Factor by which restarts raise the limit of QPs, because sliding feet have many states of similar cost."""
 
 
 class StateSearch(Enum):
@@ -48,11 +48,11 @@ class StateSearch(Enum):
     STATIC = "static"
     """All contacts static: one QP."""
     QPCC = "qpcc"
-    """From all contacts static, one contact at a time by its multipliers (after Tan, Turk and Liu 2012)."""
+    """Start with all contacts static; change one contact at a time by its multipliers (Tan, Turk and Liu 2012)."""
     QPCC_OUR_MOVES = "qpcc-our-moves"
     """``qpcc`` with the moves of ``relaxed``, to measure the moves alone."""
     RELAXED = "relaxed"
-    """From the contact response to the activations of the relaxed optimum, several contacts at a time."""
+    """Start from the contact response to the relaxed optimum's activations; change several contacts at a time."""
     EXACT = "exact"
     """Global optimum by branch and bound, for small problems."""
 
@@ -62,13 +62,13 @@ class SearchResult:
     """Result of a search over contact states."""
 
     y: np.ndarray | None
-    """(variables,), satisfies Eq. (9) to the QP solver's accuracy; None if no QP had a solution."""
+    """(variables,) solution, which satisfies Eq. (9) to the QP solver's accuracy; None if no QP had a solution."""
     relaxed: bool
     """True if no states were feasible: ``y`` then only satisfies 0 <= x and 0 <= w."""
     states: np.ndarray
     """(n,) contact states."""
     objective: float
-    """With the QP's constant; infinite without ``y``."""
+    """Objective, including the QP's constant; infinite if ``y`` is None."""
     qp_count: int
     """Number of QPs that were solved."""
     infeasible: int
@@ -82,9 +82,9 @@ class _Search:
     program: PyramidProgram
     qp: QuadraticProgram
     limit: int
-    """Maximum number of QPs, or ``RESTART_BUDGET`` times as many while the best is far from the bound."""
+    """Maximum number of QPs; ``RESTART_BUDGET`` times as many are allowed while ``best`` is far from the bound."""
     zero: float = 1e-4
-    """Tolerance of zero in pairs and multipliers."""
+    """Values of pairs and multipliers up to this count as zero."""
     count: int = 0
     infeasible: int = 0
     relaxed: QpSolution | None = None
@@ -98,7 +98,10 @@ class _Search:
     """States that were tried."""
 
     def try_states(self, states: np.ndarray) -> bool:
-        """Solve the QP of ``states`` unless it was solved before; return True if it is the best so far."""
+        """Solve the QP of ``states`` unless it was tried before or the limit is reached.
+
+        Return True if its solution is the best so far.
+        """
         limit = self.limit if self.is_good_enough else RESTART_BUDGET * self.limit
         if self.count >= limit or states.tobytes() in self.visited:
             return False
@@ -114,8 +117,10 @@ class _Search:
         return True
 
     def try_activations(self, activations: np.ndarray) -> bool:
-        """Solve the QP of the states that follow from ``activations`` (M,), which is always feasible; return False if
-        the contact response to the activations was not found."""
+        """Solve the QP of the states that follow from ``activations`` (M,); this QP is always feasible.
+
+        Return False if the contact response to the activations was not found.
+        """
         y = contact_response(self.program, activations)
         if y is None:
             return False
@@ -128,8 +133,8 @@ class _Search:
         return True
 
     def is_within_gap(self, factor: float, share: float = 0.0) -> bool:
-        """Return True if no states can be better by more than ``factor``, or by more than a ``share`` of the cost of
-        doing nothing."""
+        """Return True if the best objective exceeds its lower bound by at most ``factor``, or by at most a ``share`` of
+        the cost of doing nothing."""
         if self.best is None or self.relaxed is None:
             return False
         constant = self.program.constant
@@ -138,11 +143,11 @@ class _Search:
 
     @property
     def is_good_enough(self) -> bool:
-        """True if the best is good enough not to restart."""
+        """True if the best objective is so close to its lower bound that no restart is needed."""
         return self.is_within_gap(RESTART_GAP, NEGLIGIBLE_GAIN)
 
     def pivots(self) -> list[Pivot]:
-        """Return the changes of state that are proposed at the best point, best first."""
+        """Return the changes of state that are proposed at the best point, largest gain first."""
         if self.best is None:
             return []
         x, w = self.program.pairs(self.best.x)
@@ -167,11 +172,11 @@ def search_pyramid(
     qp_limit: int,
     solver: QpSolver | str,
 ) -> ModeSearchResult:
-    """Find activations and contact forces of a step by ``kind``.
+    """Find activations and contact forces of a step with the search ``kind``.
 
     Args:
         program: the QP of the step.
-        kind: search.
+        kind: search to run.
         predicted: predicted contact, from which the search starts.
         directions: number of edges of the friction pyramid.
         qp_limit: maximum number of QPs; a search may use ``RESTART_BUDGET`` times as many.
@@ -193,15 +198,16 @@ def find_states(
     qp_limit: int,
     solver: QpSolver | str = QpSolver.OSQP,
 ) -> SearchResult:
-    """Find contact states and the optimum for them by ``kind``.
+    """Find contact states and the optimum of their QP with the search ``kind``.
 
     If the first states of a search have no solution, it starts from the states that follow from ``activations``,
     which always have one.
 
     Args:
         program: the QP with a friction pyramid.
+        kind: search to run.
         predicted: (n,) predicted states (Eq. 12).
-        activations: (M,) of the prediction, as fractions of their bounds.
+        activations: (M,) predicted activations, as fractions of their bounds.
         qp_limit: maximum number of QPs.
         solver: QP solver, see ``quadratic_program``.
     """
@@ -235,8 +241,11 @@ def find_states(
 
 
 def contact_response(program: PyramidProgram, activations: np.ndarray) -> np.ndarray | None:
-    """Return y (variables,), the contact response to ``activations`` (M,) that satisfies Eq. (9), by Lemke's method;
-    None if none is found. A solution always exists, so a step never fails for lack of a start."""
+    """Return y (variables,): ``activations`` (M,) and the contact response to them that satisfies Eq. (9).
+
+    The response is computed by Lemke's method. A solution always exists; the result is None if rounding or the pivot
+    limit stops the method before it finds one.
+    """
     layout = program.layout
     rows, offset = program.A[layout.variables :], program.offset[layout.variables :]
     x = lemke(rows[:, layout.activations :], offset + rows[:, : layout.activations] @ activations)
@@ -245,7 +254,8 @@ def contact_response(program: PyramidProgram, activations: np.ndarray) -> np.nda
 
 def _start_relaxed(search: _Search, predicted: np.ndarray, activations: np.ndarray) -> None:
     """Start from the contact response to the activations of the relaxed optimum, where only 0 <= x and 0 <= w hold. Its
-    objective bounds that of all states from below; its activations are mostly right, its forces are not."""
+    objective bounds that of all states from below; its activations are usually near the optimum, its forces
+    are not."""
     program, layout = search.program, search.program.layout
     lower, upper = program.bounds(np.full(layout.contacts, STATIC))
     upper[layout.activations :] = np.inf
@@ -259,8 +269,8 @@ def _start_relaxed(search: _Search, predicted: np.ndarray, activations: np.ndarr
 
 
 def _other_starts(search: _Search, predicted: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield states (n,) for restarts: contacts static where the relaxed optimum has a normal force, then where the
-    prediction has one, and the predicted states."""
+    """Yield states (n,) for restarts: contacts static where the relaxed optimum has a normal force, then static where
+    the prediction has one, and last the predicted states."""
     if search.relaxed is not None:
         layout = search.program.layout
         loaded = search.relaxed.x[layout.normal] > LOADED_FORCE
@@ -277,7 +287,8 @@ def _move(search: _Search, *, together: bool) -> None:
         pivots = search.pivots()
         trials = [_moved(search.states, [pivot]) for pivot in pivots]
         if together:
-            trials.insert(0, _moved(search.states, pivots[::-1]))  # the last move of a contact counts: its best
+            # Reversed, so that the best move of each contact is applied last.
+            trials.insert(0, _moved(search.states, pivots[::-1]))
         improved = any(search.try_states(trial) for trial in trials)
 
 
