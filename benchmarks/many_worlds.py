@@ -3,15 +3,15 @@
 python benchmarks/many_worlds.py [--quick] [--worlds B ...] [--nodes N ...] [--steps N] [--alone N] [--panel N]
     [--chunk-bytes N] [--matrices B] [--device cuda:0] [--json PATH] [--plot PATH]
 
-The pawn's jump is recorded once on each cage. Then each of the ``--worlds`` repeats its first ``--steps`` steps with
-the recorded activations, scaled by a factor of its own (0.7 to 1), and with a friction of its own (0.4 to 1.2).
-``--alone`` of them are also run by ``LocomotionStepper``: ``apart`` is the largest distance of a node between the two
+The pawn's jump is recorded once on each cage. Then each of the ``--worlds`` repeats the jump's first ``--steps`` steps
+with the recorded activations scaled by its own factor (0.7 to 1), and with its own friction coefficient (0.4 to 1.2).
+``LocomotionStepper`` also runs ``--alone`` of the worlds: ``apart`` is the largest distance of a node between the two
 runs, in body heights. Time by stage is measured over a few steps from the middle, in which every stage synchronises the
-device. ``--matrices`` also times factorisations of this number of dense matrices of each cage's size, by panels of
-several widths and by torch's own Cholesky factorisation, in ms, and solutions with 1 and 96 right-hand sides.
+device. ``--matrices`` also times, in ms, factorisations of this number of dense matrices of each cage's size,
+with panels of several widths and with torch's own Cholesky factorisation, and solutions for 1 and 96 right-hand sides.
 
-Aims of one GPU: ``many_2000``, 2,000 steps a second at 250 nodes and 600 at 541; ``many_alike``, at most 1e-9 body
-heights apart after 30 steps or more, on any device.
+Aims: ``many_2000``, on one GPU 2,000 steps a second at 250 nodes and 600 at 541; ``many_alike``, on any device at most
+1e-9 body heights apart after 30 steps or more.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Measure the stage ``name``; implements ``Stages``."""
+        """Measure the stage ``name``; implements ``StageTimer``."""
         started = self.now() if self.on else 0.0
         yield
         if self.on:
@@ -127,7 +127,7 @@ def measure(creature: Creature, jump: np.ndarray, worlds: int, *, alone: int, pa
 
 
 def _apart(creature: Creature, activations: np.ndarray, friction: float, dt: float, end: np.ndarray) -> float:
-    """Run the same steps by ``LocomotionStepper``; return its largest distance from ``end`` (N, 3), body heights."""
+    """Run the steps with ``LocomotionStepper``; return a node's largest distance from ``end`` (N, 3), body heights."""
     device = str(creature.body.assembly.device)
     geometry = replace(creature.geometry, friction=friction)
     stepper = LocomotionStepper(creature.body, creature.muscles, geometry, device=device)
@@ -177,7 +177,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--nodes", type=int, nargs="*", default=list(REQUESTED_NODES), help="requested number of nodes of each cage"
     )
     parser.add_argument("--steps", type=int, default=30, help="steps of each world (default 30)")
-    parser.add_argument("--alone", type=int, default=3, help="worlds that are also run alone (default 3)")
+    parser.add_argument("--alone", type=int, default=3, help="number of worlds that are also run alone (default 3)")
     parser.add_argument("--panel", type=int, default=96, help="columns that are factored at a time (default 96)")
     parser.add_argument(
         "--chunk-bytes",
@@ -216,14 +216,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def summary(rows: list[Row], device: str) -> dict[str, Any]:
-    """Return the aims, and the reasons of null ones."""
+    """Return the aims, and a reason for each that is None."""
     best = {
         nodes: max((row["rate"] for row in rows if abs(row["nodes"] - nodes) <= NODE_TOLERANCE * nodes), default=None)
         for nodes in AIMS
     }
     known = {nodes: rate for nodes, rate in best.items() if rate is not None}
     aims: dict[str, bool | None] = {"many_2000": None, "many_alike": None}
-    why = {"many_2000": "a GPU's aim" if device == "cpu" else "not both cages were run"}
+    why = {"many_2000": "needs a GPU" if device == "cpu" else "needs runs of both cages"}
     if device != "cpu" and len(known) == len(AIMS):
         aims["many_2000"] = all(rate >= AIMS[nodes] for nodes, rate in known.items())
     apart = [row["apart"] for row in rows if row["apart"] is not None and row["steps"] >= MIN_STEPS]
@@ -235,7 +235,7 @@ def summary(rows: list[Row], device: str) -> dict[str, Any]:
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Draw steps per second over worlds, by nodes."""
+    """Draw steps per second against the number of worlds, with one curve per number of nodes."""
     axes = figure.subplots()
     for nodes in dict.fromkeys(row["nodes"] for row in rows):
         chosen = [row for row in rows if row["nodes"] == nodes]

@@ -127,7 +127,7 @@ def photograph(
 def face_rotations(mesh: PaintedMesh, vertices: np.ndarray) -> np.ndarray:
     """(F, 3, 3) rotation of each face from rest to ``vertices`` (V, 3).
 
-    It is the polar factor of the face's deformation gradient, which maps its normal to its normal.
+    It is the polar factor of the face's deformation gradient, which maps the unit normal at rest to the deformed one.
     """
 
     def frames(points: np.ndarray) -> np.ndarray:
@@ -146,7 +146,7 @@ def face_rotations(mesh: PaintedMesh, vertices: np.ndarray) -> np.ndarray:
 
 
 def carried_vertices(mesh: PaintedMesh, cage: TetMesh, nodes: np.ndarray, device: str) -> np.ndarray:
-    """Return the vertices of the mesh, deformed by the cage with nodes at ``nodes``."""
+    """Return the vertices (V, 3) of the mesh, deformed by the cage whose nodes are at ``nodes`` (N, 3)."""
     locator = CageLocator(cage, device=device)
     places = locator.locate(wp.array(mesh.vertices, dtype=Vec3, device=device))
     return places.interpolate(wp.array(nodes, dtype=Vec3, device=device)).numpy()
@@ -195,7 +195,7 @@ def trained(
 
 def photographs(mesh: PaintedMesh, size: int, views: int, device: str) -> list[TrainingView]:
     """Render views of the mesh at rest from all around, without background."""
-    # Also from below and above: a deformation exposes what was hidden.
+    # Some views are from below and above, because a deformation exposes surfaces that are hidden at rest.
     cameras = ring(mesh.vertices, views, size, elevations=(15.0, 50.0, -15.0, 75.0, -50.0))
     photos = photograph(mesh, mesh.vertices, cameras, device)
     return [
@@ -232,7 +232,8 @@ def trained_on(
         iterations=iterations,
         densification=Densification.RELOCATION if iterations >= 1000 else Densification.NONE,
         max_gaussians=gaussians,
-        # Over white alone, white haze around the object would cost nothing, and a deformation would make it visible.
+        # On a white background alone, white haze around the object would cost nothing, but a deformation would expose
+        # it.
         background=None,
         seed=seed,
     )

@@ -1,4 +1,4 @@
-"""Bodies modelled by signed distance functions for the benchmarks: with two to six legs, one base or no feet."""
+"""Bodies modelled by signed distance functions for the benchmarks: with two to eight legs, one base or no feet."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def _ostrich(points: np.ndarray) -> np.ndarray:
 
 
 def _spider(points: np.ndarray) -> np.ndarray:
-    """A flat trunk among eight legs that extend wider than the body is high."""
+    """A flat trunk between eight legs whose span is larger than the body's height."""
     out = ellipsoid(points, np.array([0.0, 0.0, 0.42]), np.array([0.28, 0.2, 0.14]))
     for k in range(8):
         x, y = np.cos(np.pi * (k + 0.5) / 4.0), np.sin(np.pi * (k + 0.5) / 4.0)

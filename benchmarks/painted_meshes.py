@@ -15,7 +15,7 @@ from harness import data_folder
 Paint = Callable[[np.ndarray], np.ndarray]
 """Solid texture: colours (P, 3), 0 to 1, of points (P, 3) of the rest shape."""
 MAX_EDGE_LENGTH = 0.02
-"""Longest edge on an object 1 high; after a bend by 80 degrees its midpoint is off by 7e-5."""
+"""Maximum edge length on an object 1 high: a bend by 80 degrees puts an edge's midpoint 7e-5 off the true surface."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class PaintedMesh:
     """(F, 3) int32."""
     paint: Paint
     glossy: bool = False
-    """True if lit by lamps that rotate with each part of the body, which is how a capture stores light."""
+    """True if the mesh is lit by lamps that rotate with each part of the body; a capture stores light in this form."""
 
 
 def checkers(cell: float, colours: tuple[tuple[float, ...], ...]) -> Paint:
-    """Cubes of side ``cell`` in two colours, tinted with height."""
+    """Solid texture of cubes of side ``cell`` in two colours, with a tint that varies with height."""
 
     def paint(points: np.ndarray) -> np.ndarray:
         parity = np.floor(points / cell + 1e-6).astype(int).sum(axis=1) % 2
@@ -56,7 +56,7 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the first mesh of a binary glTF file of one buffer, in that mesh's own axes."""
+    """Read the first mesh of a binary glTF file with one buffer, in that mesh's own axes."""
     data = path.read_bytes()
     (length,) = struct.unpack_from("<I", data, 12)
     described, body = json.loads(data[20 : 20 + length]), data[28 + length :]
@@ -87,7 +87,7 @@ def _standing(vertices: np.ndarray) -> np.ndarray:
 def subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Subdivide edges until none is longer than ``MAX_EDGE_LENGTH``.
 
-    The deformed mesh is the truth, and a long straight edge would be wrong.
+    The deformed mesh is the truth, and a long edge would stay straight where the surface bends.
     """
     while True:
         sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)
@@ -100,7 +100,7 @@ def subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
         vertices = np.concatenate([vertices, vertices[edges].mean(axis=1)])
         count = long.sum(axis=1)
         parts = [faces[count == 0]]
-        # Rotate the corners so that the halved side is the first, or the whole one the last.
+        # Rotate the corners so that a single halved side is the first, and a single undivided side the last.
         for halved in (1, 2, 3):
             chosen = count == halved
             first = {1: long.argmax(axis=1), 2: (~long).argmax(axis=1) + 1, 3: np.zeros(len(faces), dtype=int)}[halved][
@@ -193,7 +193,7 @@ def table() -> PaintedMesh:
 
 
 def slender_chair() -> PaintedMesh:
-    """A generated chair on four legs with a thickness of a twenty-fifth of its height, its back to -x."""
+    """A generated chair with its back towards -x, on four legs whose thickness is 1/25 of its height."""
     seat, back = ((-0.22, -0.22, 0.42), (0.22, 0.22, 0.48)), ((-0.22, -0.22, 0.7), (-0.17, 0.22, 1.0))
     legs = [((x - 0.02, y - 0.02, 0.0), (x + 0.02, y + 0.02, 0.45)) for x in (-0.19, 0.19) for y in (-0.19, 0.19)]
     posts = [((-0.215, y - 0.02, 0.45), (-0.175, y + 0.02, 0.8)) for y in (-0.19, 0.19)]
@@ -222,12 +222,12 @@ def _box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, n
 
 
 def bar() -> PaintedMesh:
-    """The checkered bar of Figure 8: a quarter as thick as it is high, in long bricks, which favour long Gaussians."""
+    """The checkered bar of Figure 8: a quarter as thick as high, with long bricks, which favour long Gaussians."""
     corners, faces = _box((-0.125, -0.125, 0.0), (0.125, 0.125, 1.0))
     vertices, faces = subdivided(corners, faces)
 
     def paint(points: np.ndarray) -> np.ndarray:
-        # Faces lie on borders between cells; sample slightly inside, so that rounding does not choose their colour.
+        # Faces lie on borders between cells; sample slightly inside, so that rounding does not affect their colour.
         inside = (points - [0.0, 0.0, 0.5]) * 0.99 + [0.0, 0.0, 0.5]
         parity = np.floor(inside / [0.125, 0.125, 0.25]).astype(int).sum(axis=1) % 2
         return np.where(parity[:, None] == 0, [[0.9, 0.9, 0.85]], [[0.15, 0.2, 0.45]])

@@ -1,11 +1,12 @@
 """Reproduce every table and figure of the paper from scratch: `make paper`.
 
 Runs the scripts of the tables and figures in sequence and prints which one runs, how many there are and how long each
-took. For each, ``--out`` (``out/paper``) receives its output (``.txt``), its figures (``.json``) and its image
-(``.png``), the films of the figures with motions, and ``paper.md``: all aims, with the reason of each that this device
-cannot judge. With ``--keep`` stages whose JSON exists are skipped, so an interrupted run can be continued.
+took. ``--out`` (``out/paper``) receives the output (``.txt``), the numbers (``.json``) and the image (``.png``) of each
+script, the films of the figures that show motions, and ``paper.md``, which lists all aims, with a reason for each that
+cannot be judged on this device. With ``--keep`` stages whose JSON exists are skipped, so an interrupted run can be
+continued.
 
-The aims are those of the scripts, ``table1.split_helps`` for example; the rows give the exit status of each script.
+The aims are those of the scripts, such as ``table1.split_helps``; the rows give the exit status of each script.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Stage:
-    """One script."""
+    """A script with its arguments."""
 
     name: str
     what: str
@@ -35,7 +36,7 @@ class Stage:
     """Arguments; OUT stands for the output folder."""
     quick: tuple[str, ...] = ("--quick",)
     device: str | None = None
-    """Device it always runs on; None for that of ``--device``."""
+    """Device on which it always runs; None for that of ``--device``."""
     judges: bool = True
     """True if it takes the benchmarks' flags and writes JSON."""
 
@@ -102,7 +103,7 @@ def run_stage(stage: Stage, options: argparse.Namespace) -> Row:
 def collect_aims(
     stages: Sequence[Stage], rows: Sequence[Row], folder: Path
 ) -> tuple[dict[str, bool | None], dict[str, str]]:
-    """Return the aims of all stages as ``stage.aim``, and the reasons of null ones."""
+    """Return the aims of all stages as ``stage.aim``, and a reason for each that is None."""
     aims: dict[str, bool | None] = {}
     why: dict[str, str] = {}
     failed = {row["stage"] for row in rows if row["status"]}
@@ -135,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         quick="--quick of each script, and 24 frames of each motion",
         plot="not used: each stage writes its own image",
     )
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "paper", help="folder of all output")
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "paper", help="folder for all output")
     parser.add_argument("--only", nargs="+", choices=[stage.name for stage in STAGES], help="only these stages")
     parser.add_argument("--keep", action="store_true", help="skip stages whose JSON exists")
     options = parser.parse_args(arguments)

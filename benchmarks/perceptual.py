@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 PIXELS_PER_DEGREE = 67.0206
-"""Pixels per degree of an eye 0.7 m in front of a screen 0.7 m wide with 3840 pixels: FLIP's default."""
+"""Pixels per degree of the visual field, 0.7 m in front of a screen 0.7 m wide with 3840 columns: FLIP's default."""
 _XYZ_FROM_RGB = (
     (10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794),
     (2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897),
@@ -30,7 +30,8 @@ _KNEE, _KNEE_VALUE = 0.4, 0.95
 def flip_error(picture: torch.Tensor, target: torch.Tensor) -> float:
     """Mean FLIP (Andersson et al. 2020, low dynamic range) of two images (H, W, 3), sRGB from 0 to 1.
 
-    0 is equal, 1 is the largest difference. It predicts what a viewer sees who flips between the two.
+    0 means equal, 1 the largest difference. FLIP predicts the difference that a viewer sees when flipping between the
+    two images.
     """
     pair = [one.permute(2, 0, 1)[None].double() for one in (target, picture)]
     opponents = [_opponent(_linear(one.clamp(0.0, 1.0))) for one in pair]
@@ -60,7 +61,7 @@ def _opponent(linear: torch.Tensor) -> torch.Tensor:
 
 
 def _filtered_lab(opponent: torch.Tensor) -> torch.Tensor:
-    """(1, 3, H, W) L*, a*, b* after the contrast sensitivity filter; dark colours count less (Hunt effect)."""
+    """(1, 3, H, W) L*, a*, b* after the contrast sensitivity filter; chroma is scaled by lightness (Hunt effect)."""
     widest = max(width for terms in _SENSITIVITIES for _, width in terms)
     radius = int(np.ceil(3.0 * np.sqrt(widest / (2.0 * np.pi**2)) * PIXELS_PER_DEGREE))
     degrees = torch.arange(-radius, radius + 1, dtype=opponent.dtype, device=opponent.device) / PIXELS_PER_DEGREE
@@ -130,7 +131,7 @@ def _feature_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
 
 
 def _convolved(plane: torch.Tensor, along_x: torch.Tensor, along_y: torch.Tensor) -> torch.Tensor:
-    """(1, 1, H, W) correlated with two lines of one length; border pixels are replicated."""
+    """(1, 1, H, W) plane correlated with two line kernels of equal length; border pixels are replicated."""
     radius = len(along_x) // 2
     padded = torch.nn.functional.pad(plane, [radius] * 4, mode="replicate")
     rows = torch.nn.functional.conv2d(padded, along_x[None, None, None])
@@ -138,7 +139,7 @@ def _convolved(plane: torch.Tensor, along_x: torch.Tensor, along_y: torch.Tensor
 
 
 def lpips_distance() -> tuple[Callable[[np.ndarray, np.ndarray], float] | None, str | None]:
-    """Return the distance function of two images (H, W, 3), 0 to 1, and None; or None and why it is unavailable."""
+    """Return the distance function of two images (H, W, 3), 0 to 1, and None; or None and the reason."""
     try:
         import lpips  # pyright: ignore[reportMissingImports]
     except ImportError:

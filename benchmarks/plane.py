@@ -2,7 +2,8 @@
 
 A synthetic image is one view, 240 x 180 pixels, of a random plane with a ball that stands on it (about half of the
 outliers) and scattered wrong depths (the rest): 30 % of the masked pixels are wrong, all have 1 % noise. The extent is
-the diagonal of the visible part of the plane. Real captures: each of eight views alone against all views together.
+the diagonal of the visible part of the plane. In real captures, the fit to each of eight
+views is compared with the fit to all of them.
 
 Aims: ``normal`` (within 0.1 degree in every scene), ``offset`` (within 0.1 % of the extent in every scene),
 ``paper_start`` (the paper's start leads to the same planes), ``real_views_agree`` (each view alone within 0.5 degree of
@@ -81,7 +82,7 @@ def synthetic_view(random: np.random.Generator) -> tuple[Plane, PlaneView, float
 
 
 def degrees(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the angle between unit vectors, accurate for small angles."""
+    """Return the angle between unit vectors, degrees; it is accurate even for small angles."""
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
@@ -117,7 +118,7 @@ def real_row(name: str, click: tuple[float, float, float], radius: float, device
         segmentation = segment(cloud, coarse, ObjectSpec(point=point))
         object_mask = ~segmentation.background_mask
     except UserError:
-        object_mask = None  # The robot of playbot hovers; its tile is still a plane.
+        object_mask = None  # The robot of playbot hovers, but its tile is a plane.
     middle = point - coarse.heights(point) * coarse.normal
     cameras = ring_cameras(coarse, middle, radius, count=8, elevations=(40.0, 58.0, 75.0), size=400)
     views = plane_views(cloud, coarse, cameras, centre=middle, radius=radius, object_mask=object_mask)

@@ -1,8 +1,9 @@
 """Popping caused by splits: frame-to-frame difference after motion compensation, in an animation with bend and twist.
 
-Every frame is rendered together with the optical flow to the next frame; the next frame, warped back by it, is compared
-with this one. The residual is smooth over time unless something pops. Three clouds: unsplit; split once for the whole
-motion, as the engine does; and, as a control that has to be detected, split in each frame by that frame's bend.
+Every frame is rendered together with the optical flow to the next one, which is warped back by this flow and compared
+with the frame. The residual is smooth over time unless something pops. Three clouds are compared: unsplit; split once
+for the whole motion, as the engine does; and, as a control that has to be detected, split in every fourth frame by that
+frame's bend.
 
 A frame pops if the difference exceeds 1.3 times that of the frames around it. Aims: ``no_popping`` (split for the
 motion, no frame pops), ``control_pops`` (the measure detects the control).
@@ -70,7 +71,7 @@ def differences(camera: Camera, clouds: list[GaussianCloud], flows: list[np.ndar
 
 
 def pops(values: np.ndarray) -> np.ndarray:
-    """Return each value over the median of the six around it."""
+    """Return each value divided by the median of the six around it."""
     around = np.stack([np.roll(values, shift) for shift in (-3, -2, -1, 1, 2, 3)])[:, 3:-3]
     return values[3:-3] / np.median(around, axis=0)
 
@@ -112,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     each = []
     state = None
     for nodes in frames:
-        # Split in every fourth frame, like a solver that checks now and then.
+        # The control is split in every fourth frame.
         if len(each) % 4 == 0:
             measured, where = (cloud, embedding) if state is None else (state.cloud, state.embedding)
             state = split_bent(

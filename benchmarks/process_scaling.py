@@ -4,11 +4,11 @@ python benchmarks/process_scaling.py [--quick] [--workers N ...] [--nodes N ...]
     [--json PATH] [--plot PATH]
 
 Each of the ``--workers`` processes simulates the first ``--frames`` frames of ``--jobs`` standing jumps of the pawn,
-each of another distance. The rate is that of the middle 70 % of all frames: by then all workers have started, and none
-is out of jobs; the time that they take to load is reported separately. Each process has one thread, so a machine gives
-less to each if its cores share memory or clock.
+each with a different distance. The rate is that of the middle 70 % of all frames, when all workers have started and
+none has run out of jobs; the time that they take to load is reported separately. Each process has one thread, which is
+slower if the cores share memory bandwidth or reduce their clock rate when all are busy.
 
-It has no aim; parallel worlds on a GPU are measured by ``many_worlds.py``.
+This benchmark has no aim; ``many_worlds.py`` measures parallel worlds on a GPU.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Draw steps per second over processes, by nodes."""
+    """Draw steps per second against the number of processes, with one curve per number of nodes."""
     axes = figure.subplots()
     for nodes in dict.fromkeys(row["nodes"] for row in rows):
         chosen = [row for row in rows if row["nodes"] == nodes]

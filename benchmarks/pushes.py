@@ -2,8 +2,8 @@
 
 python benchmarks/pushes.py [--quick] [--nodes N] [--bodies NAME ...] [--pushes LINE ...] [--json PATH]
 
-A body withstands a push if it does not fall, no sole is ever 0.05 body heights from its initial place, and it ends at
-rest within 5 degrees of upright. Sizes are multiples of 0.05 m sqrt(g H), for a gust the whole impulse, up to 3.15.
+A body withstands a push if it does not fall, no sole ever moves 0.05 body heights or more, and it ends at rest within 5
+degrees of upright. Sizes are multiples of 0.05 m sqrt(g H), up to 3.15; that of a gust is its whole impulse.
 They are found by bisection, which assumes that a body that withstands a push also withstands smaller ones.
 """
 
@@ -71,11 +71,11 @@ def largest(creature: Creature, kind: str) -> tuple[float, list[Row]]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = flags(__doc__, quick="the pawn, pushed ahead alone", device="cpu", seed="not used: nothing is random")
+    parser = flags(__doc__, quick="only the pawn, only pushed ahead", device="cpu", seed="not used: nothing is random")
     parser.add_argument("--nodes", type=int, default=400, help="approximate number of nodes of the cage (default 400)")
     parser.add_argument("--bodies", nargs="*", default=["pawn", "stool"], help="built-in scenes (default pawn stool)")
     parser.add_argument(
-        "--pushes", nargs="*", default=KINDS, help=f"lines with {{}} for the size (default {', '.join(KINDS)})"
+        "--pushes", nargs="*", default=KINDS, help=f"lines with {{}} in place of the size (default {', '.join(KINDS)})"
     )
     options = parser.parse_args(arguments)
     table = Table(body="<8", push="<18", largest=".2f", runs="d", seconds=".0f", residual=".0e")

@@ -3,10 +3,10 @@
 python benchmarks/qp_solvers.py [--quick] [--device cpu] [--seed 0] [--body pawn] [--json PATH] [--plot PATH]
 
 The programs are steps of an animation (Eq. 13) with 40 muscle groups, 4 friction directions and 1 to 32 contacts.
-``first`` is set-up and solve of the program with complementarity, ``again`` a re-solve for other contact states with
-changed bounds only, ``search`` the engine's whole search of a step over contact modes, with activations as the only
-unknowns. All solvers get the same programs in turn. ``breach`` is the largest violation of a bound (forces in body
-weights, velocities in sqrt(g H)); ``objective`` is relative to DAQP's. This benchmark has no aim.
+``first`` is the set-up and solution of the program for one choice of contact states, ``again`` its solution for other
+states, which changes only bounds, and ``search`` the engine's whole search of a step over contact modes, with
+activations as the only unknowns. All solvers get the same programs in turn. ``breach`` is the largest violation of a
+bound (forces in body weights, velocities in sqrt(g H)); ``objective`` is relative to DAQP's. This benchmark has no aim.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SOLVERS = QpSolver.OSQP, QpSolver.DAQP
 
 
 def frame_figures(frame: Frame, solver: QpSolver) -> Row:
-    """Return the figures of one program."""
+    """Return times, QP count, objective, violation and number of failures of the solver for one program."""
     program = PyramidProgram.of(frame.program, DIRECTIONS)
     y = contact_response(program, frame.predicted.activations)
     separate = np.full(program.layout.contacts, SEPARATE)
@@ -82,7 +82,7 @@ def frame_figures(frame: Frame, solver: QpSolver) -> Row:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = flags(__doc__, quick="10 frames a contact count in place of 40", device="cpu")
+    parser = flags(__doc__, quick="10 frames per number of contacts instead of 40", device="cpu")
     parser.add_argument("--body", default="pawn")
     options = parser.parse_args(arguments)
     bench = body_named(options.body, options.device)

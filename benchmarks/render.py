@@ -2,9 +2,9 @@
 
 Aims: ``cuda_beats_gswarp`` (faster in every cell), ``cuda_within_1_3_of_gsplat`` (geometric mean of all cells),
 ``ahead_of_gsplat_every_cell`` (packed or not, whichever is faster), ``same_picture`` (mean difference below 1e-5, and
-below 1e-3 away from the alpha-cut boundaries), ``same_in_every_mode`` (likewise antialiased, mean depth, masked tiles,
-three cameras with a background each), ``cpu_vs_twin`` (20 times as fast as a tile-batched PyTorch rasteriser with the
-same culling), ``cpu_two_threads`` (1.7 times as fast as one thread).
+below 1e-3 away from the alpha-cut boundaries), ``same_in_every_mode`` (the same antialiased, for mean depth, with
+masked tiles, and with three cameras with a background each), ``cpu_vs_twin`` (20 times as fast as a tile-batched
+PyTorch rasteriser with the same culling), ``cpu_two_threads`` (1.7 times as fast as one thread).
 
 No other renderer that claims CPU support runs on a CPU: ``render_peers.cpu_baselines`` tries them and records why.
 """
@@ -49,7 +49,8 @@ AIMS = (
 def cuda_rows(
     points: dict[str, np.ndarray], *, cells: tuple, seed: int, repeats: int, table: Table, others: Sequence[str]
 ) -> list[Row]:
-    """Return one row per cell: forward, and forward with backward, of ours and of the installed ones in ``others``."""
+    """Return one row per cell: times of the forward pass, alone and with the backward pass, of our renderer and of the
+    installed ones in ``others``."""
     renderers: dict[str, peers.Renderer] = {"ours": peers.ours}
     for name in others:
         try:
@@ -77,8 +78,7 @@ def cuda_rows(
         for label, call in (("forward", forward), ("forward_backward", both)):
             calls = {name: (lambda call=call, name=name: call(name)) for name in renderers}
             row[label] = median_ms(calls, repeats=repeats, synchronise=torch.cuda.synchronize)
-        # At matching settings: gswarp stops every splat at three sigma and at an alpha of 0.99, without effect below
-        # 0.35.
+        # gswarp cuts splats at three sigma and limits alpha to 0.99; up to an opacity of 0.35 neither has an effect.
         fainter = replace(plain, opacities=plain.opacities.detach() * 0.35)
         faint = {name: peers.ours_scene(fainter) if name == "ours" else fainter for name in renderers}
         with torch.no_grad():
@@ -86,7 +86,7 @@ def cuda_rows(
         row["difference"] = {
             name: difference(pictures["ours"], picture) for name, picture in pictures.items() if name != "ours"
         }
-        # Last, because the other renderers share their leaves.
+        # Last, because the other renderers share leaf tensors, whose gradients they overwrite.
         for name in ("ours", "gsplat"):
             if name in renderers:
                 both(name)
@@ -101,7 +101,7 @@ def cuda_rows(
 
 
 def _gradient_differences(scenes: dict[str, peers.Scene]) -> dict[str, float]:
-    """Relative L2 difference to gsplat's gradients, converted to the parameters of captures by the chain rule."""
+    """Relative L2 difference from gsplat's gradients, converted to the parameters of captures by the chain rule."""
     if "gsplat" not in scenes:
         return {}
     own, other = scenes["ours"], scenes["gsplat"]
@@ -111,7 +111,7 @@ def _gradient_differences(scenes: dict[str, peers.Scene]) -> dict[str, float]:
         "means": (mine["means"], theirs["means"]),
         "log_scales": (mine["scales"], theirs["scales"] * other.scales.detach()),
         "opacity_logits": (mine["opacities"], theirs["opacities"] * opacity * (1 - opacity)),
-        # A colour of 0 is at our clamp; gsplat does not clamp given colours.
+        # Where our renderer clamps a colour to 0, its gradient is zero; gsplat does not clamp the colours it is given.
         "sh": (mine["colours"][:, 0], theirs["colours"] * peers.SH_BAND_0 * (mine["colours"][:, 0] != 0)),
     }
     return {name: float((one - two).norm() / two.norm()) for name, (one, two) in pairs.items()}
@@ -185,7 +185,7 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
     project_and_list = by_stage[f"project {threads}"] + by_stage[f"lists {threads}"]
     twin_times: dict[int, float] = {}
     twin = torch.empty(0)
-    # Take the better of both counts: on a busy machine PyTorch's threads block one another at every operation.
+    # Take the better of both thread counts: on a busy machine PyTorch's threads block one another at every operation.
     with torch.no_grad():
         for count in sorted({1, threads}):
             torch.set_num_threads(count)
@@ -208,7 +208,7 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
 
 
 def judge(rows: list[Row]) -> tuple[dict[str, bool | None], dict[str, str]]:
-    """Return the aims from the rows alone; None, with the reason, if this run could not measure one."""
+    """Return the aims, derived from the rows alone, and a reason for each that this run could not measure (None)."""
     aims: dict[str, bool | None] = dict.fromkeys(AIMS)
     why: dict[str, str] = {}
     cuda = [row for row in rows if row["kind"] == "cuda"]
@@ -257,14 +257,14 @@ def judge(rows: list[Row]) -> tuple[dict[str, bool | None], dict[str, str]]:
 def _same(off: dict[str, float]) -> bool:
     """Return True if two images are equal up to rounding.
 
-    A splat at its alpha cut, worth at most 1/255, may come or go with the last bit: that shows above 1e-3 in fewer than
-    one pixel in a thousand, and never as more than two such splats.
+    Rounding may decide whether a splat at its alpha cut, which contributes at most 1/255, is drawn. Therefore fewer
+    than one value in a thousand may differ by more than 1e-3, and none by as much as two such splats.
     """
     return off["mean"] < 1e-5 and off["above_1e-3"] < 1e-3 and off["largest"] < 2 / 255
 
 
 def _best(times: dict[str, float], baseline: str) -> float:
-    """Milliseconds of the renderer ``baseline``, of its fastest variant."""
+    """Return the milliseconds of the fastest variant of the renderer ``baseline``."""
     return min(ms for name, ms in times.items() if name.startswith(baseline))
 
 
@@ -294,7 +294,7 @@ def draw(figure: Figure, rows: list[Row]) -> None:
 
 
 def plot_roofline(rows: list[Row], axes: Any) -> None:
-    """Draw the percentage of the limit that each stage reaches, by cell; the letter says bandwidth or arithmetic."""
+    """Draw the percentage of the limit that each stage reaches, by cell; b or a marks bandwidth or arithmetic."""
     names = ("project", "lists", "composite", "backward")
     for index, name in enumerate(names):
         stages = [row["stages"][name] for row in rows]
@@ -314,7 +314,7 @@ def plot_roofline(rows: list[Row], axes: Any) -> None:
 
 
 def against_gsplat(rows: list[Row]) -> Row | None:
-    """Return our time over gsplat's in every cell, and a summary; None if gsplat is not installed."""
+    """Return the ratio of our time to gsplat's in every cell, and a summary; None if gsplat is not installed."""
     ratios = {
         f"{row['gaussians']} {row['width']}x{row['height']} {label}": row[label]["ours"] / _best(row[label], "gsplat")
         for row in rows
@@ -348,13 +348,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = Table(gaussians="9d", size="9s", what="<16", renderer="<12", ms="9.3f")
     if options.device.startswith("cuda"):
         cells = CELLS[:4] if options.quick else CELLS
-        # First, because the memory pool only has the peak since the process started.
+        # First, because the memory pool records only the peak since the process started.
         rows.append(memory_row(seed=options.seed))
         rows += cuda_rows(points, cells=cells, seed=options.seed, repeats=repeats, table=table, others=options.beside)
         if "gsplat" in rows[-1]["forward"]:
             rows.append(mode_row(points, seed=options.seed, repeats=repeats))
             for name, off in rows[-1]["difference"].items():
-                print(f"{name}: {off['mean']:.1e} off gsplat's in the mean, {off['largest']:.1e} at most")
+                print(f"{name}: {off['mean']:.1e} mean difference from gsplat's, {off['largest']:.1e} at most")
             for name, ms in rows[-1]["three_cameras"].items():
                 table.row(rows[-1]["gaussians"], f"{rows[-1]['width']}x{rows[-1]['height']}", "three cameras", name, ms)
         print(f"working memory of five million Gaussians: {rows[0]['working_gib']:.2f} GiB")
@@ -368,9 +368,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     aims, why_null = judge(rows)
     ratios = against_gsplat(rows)
     if ratios is not None:
-        print(
-            f"over gsplat's time: {ratios['geometric_mean']:.2f} (geometric mean), faster in {ratios['cells_faster']}"
-        )
+        print(f"time / gsplat's: {ratios['geometric_mean']:.2f} (geometric mean), faster in {ratios['cells_faster']}")
     report(
         options,
         rows,

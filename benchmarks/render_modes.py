@@ -22,7 +22,7 @@ _MIN_ALPHA = 0.01
 
 
 def difference(ours: torch.Tensor, other: torch.Tensor) -> dict[str, float]:
-    """Mean and largest absolute difference, and the fraction of pixels above 1e-3 (splats at their alpha cut)."""
+    """Mean and largest absolute difference, and the fraction of values above 1e-3 (splats at their alpha cut)."""
     off = (ours - other).abs()
     return {"mean": float(off.mean()), "largest": float(off.max()), "above_1e-3": float((off > 1e-3).float().mean())}
 
@@ -47,7 +47,7 @@ def mode_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
         return picture, alpha
 
     def their_masked(mask: np.ndarray) -> torch.Tensor:
-        """Render with masked tiles, which gsplat's low-level functions offer."""
+        """Render with masked tiles, which gsplat supports in its low-level functions."""
         with torch.no_grad():
             projection = rasterization(*values, poses[:1], intrinsics[:1], _WIDTH, _HEIGHT, packed=False)[2]
             picture, _ = rasterize_to_pixels(

@@ -78,7 +78,7 @@ Renderer = Callable[[Scene, Camera], torch.Tensor]
 
 
 def ours(scene: Scene, camera: Camera) -> torch.Tensor:
-    """Render ``scene``, already converted to ``ours_scene``, as (H, W, 3). The conversion is not timed."""
+    """Render ``scene``, already converted by ``ours_scene``, as (H, W, 3); so the conversion is not timed."""
     return render_torch(
         scene.means, scene.rotations, scene.scales, scene.opacities, scene.colours, camera, background=(0.0, 0.0, 0.0)
     ).colour
@@ -96,7 +96,7 @@ def ours_scene(scene: Scene) -> Scene:
 
 
 def _once_per_camera(make: Callable[[Camera], Any]) -> Callable[[Camera], Any]:
-    """Cache ``make`` by camera, because the other renderers take GPU tensors, whose creation is not to be timed."""
+    """Cache ``make`` by camera, because the other renderers take GPU tensors, whose creation must not be timed."""
     cache: dict[int, tuple[Camera, Any]] = {}
 
     def get(camera: Camera) -> Any:
@@ -135,7 +135,7 @@ def gsplat_renderer(*, packed: bool) -> Renderer:
 
 
 def gswarp_renderer() -> Renderer:
-    """Return gswarp 1.1; raises ImportError if it is not installed."""
+    """Return the renderer of gswarp 1.1; raises ImportError if it is not installed."""
     from gswarp import GaussianRasterizationSettings, GaussianRasterizer
 
     def settings(camera: Camera) -> GaussianRasterizationSettings:
@@ -235,7 +235,7 @@ def _taichi_splatting_ms(scene: Scene, camera: Camera) -> float | None:
 
 
 def composite_in_torch(projected: ProjectedGaussians, lists: TileLists, camera: Camera) -> torch.Tensor:
-    """Blend the tiles in plain PyTorch from the same tile lists, so that culling is the same; (H, W, 3).
+    """Blend the tiles to an image (H, W, 3) in plain PyTorch, from the same tile lists, so that culling is the same.
 
     Tiles of similar length share a batch (tiles, 256 pixels, splats), which keeps PyTorch busy with little padding.
     """
@@ -253,7 +253,7 @@ def composite_in_torch(projected: ProjectedGaussians, lists: TileLists, camera: 
     by_length = by_length[lengths[by_length] > 0]
     first = 0
     while first < len(by_length):
-        # Batches of about 100,000 pixel-splat pairs stay in the cache; forty times as many took longer.
+        # Batches of about 100,000 pixel-splat pairs fit into the cache; larger ones take longer per pair.
         longest = int(lengths[by_length[first]])
         size = max(1, 100_000 // (256 * max(longest, 1)))
         batch = by_length[first : first + size]

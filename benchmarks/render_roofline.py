@@ -22,8 +22,9 @@ from kernels import PROBE_STEPS, arithmetic_kernel, hits_kernel, vector_arithmet
 def stage_rows(cloud: GaussianCloud, camera: Camera, *, repeats: int, threads: int) -> dict[str, dict[str, Any]]:
     """Measure each stage's milliseconds, megabytes, millions of operations, and share of the device's limit.
 
-    The share is the time that the scarcer of bandwidth and arithmetic needs at full speed, over the time taken, which
-    includes the calls from Python. Both speeds are measured here: a copy of 1 GiB, and chains of multiply and add.
+    The share is the time that the data transfer or the arithmetic, whichever is slower, needs at full speed, divided by
+    the measured time, which includes the calls from Python. Both speeds are measured here: with a copy of 1 GiB, and
+    with chains of multiply and add.
     """
     device = cloud.device
     view, background = view_from_camera(camera), Background(wp.vec3())
@@ -72,7 +73,7 @@ def stage_rows(cloud: GaussianCloud, camera: Camera, *, repeats: int, threads: i
 
 
 def device_limits(device: wp.Device) -> tuple[float, float]:
-    """Bytes per second of a long copy, read and write together, and single-precision operations per second."""
+    """Bytes per second of a long copy, reads and writes together, and single-precision operations per second."""
     size = 2**30 if device.is_cuda else 2**27
     source = wp.zeros(size // 4, dtype=wp.int32, device=device)
     target = wp.empty_like(source)
@@ -94,7 +95,7 @@ def device_limits(device: wp.Device) -> tuple[float, float]:
 
 
 def arithmetic_by_threads(threads: int, sums: wp.array) -> None:
-    """Run work that scales perfectly with cores: the upper bound for ``threads`` threads of this machine."""
+    """Run work that scales perfectly with cores; its speed bounds that of ``threads`` threads of this machine."""
     launch_rows(
         arithmetic_kernel,
         len(sums),
@@ -130,17 +131,18 @@ def _counts(projected: ProjectedGaussians, lists: TileLists, view: Any) -> dict[
 def _bytes(count: int, counts: dict[str, float], pixels: int, *, cuda: bool, tiles: int) -> dict[str, float]:
     visible, pairs = counts["visible"], counts["pairs"]
     if cuda:
-        # Keys, slots and Gaussians out; each radix pass reads and writes 12 bytes a pair; starts read keys again.
+        # Keys, slots and Gaussians are written; each radix pass reads and writes 12 bytes a pair; the search for the
+        # starts of tiles reads the keys again.
         sorting = pairs * (16 + 24 * -(-(31 + tiles.bit_length()) // 8) + 20)
     else:
-        # The tile of each slot out and in, then Gaussian and slot out.
+        # The tile of each slot is written and read; then Gaussian and slot are written.
         sorting = pairs * 16 + visible * 64
     return {
-        # Attributes in; tile count out and scanned; the ellipse of the visible ones out.
+        # Attributes are read; the tile count is written and scanned; the ellipses of visible Gaussians are written.
         "project": count * (56 + 8 + 16) + visible * 40,
         "lists": count * 8 + visible * 40 + sorting,
         "composite": pairs * (4 + 40) + pixels * 20,
-        # Pairs again, their moments written, zeroed and read; attributes in, gradients out.
+        # Pairs are read again, their moments zeroed, written and read; attributes are read and gradients written.
         "backward": pairs * (8 + 40 + 3 * 48) + pixels * 60 + count * (56 + 8 + 64),
     }
 
@@ -149,9 +151,10 @@ def _operations(count: int, counts: dict[str, float]) -> dict[str, float]:
     """Operations as counted in the kernels' source: a multiply, an add and a special function are one each."""
     visible, pairs, hits = counts["visible"], counts["pairs"], counts["pixel_hits"]
     return {
-        # Rotation, product with the camera's and scales for all; ellipse and colour for the visible ones.
+        # For all Gaussians the rotation and its product with the camera's and the scales; for visible ones the ellipse
+        # and the colour.
         "project": count * 150 + visible * 120,
-        # The span of each tile row, about one row to a pair and a half; sorting is not arithmetic.
+        # The span of each tile row, about two rows for three pairs; sorting does not count as arithmetic.
         "lists": pairs * 30,
         # Alpha: 12; blend: 10.
         "composite": hits * 22,

@@ -1,9 +1,9 @@
-"""Films from photos or a capture, each stage timed: what a user does, with three clicks at most.
+"""Films from photos or a capture, made as by a user, with at most three clicks; each stage is timed.
 
 ``scene_quality.py --films FOLDER`` runs all of them, ``scene_quality.py --films FOLDER --one koala`` a single scene, in
-this process. Clicks are those of ``clicking.py`` for annotated scenes, else the ones below. The folder of a scene
-receives the film, its contact sheet ``sheet.png`` of twelve frames, the images that ``egs-warp animate`` writes of each
-stage, the trained capture, and ``row.json``.
+this process. Annotated scenes use the clicks of ``clicking.py``, other scenes those below. The folder of a scene
+receives the film, its contact sheet ``sheet.png`` of twelve frames, the images that ``egs-warp animate`` writes for
+each stage, the trained capture, and ``row.json``.
 """
 
 from __future__ import annotations

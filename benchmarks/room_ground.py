@@ -29,7 +29,7 @@ def marked_plane(cloud: GaussianCloud, views: Sequence[DrawnView], up: np.ndarra
 
 
 def _through(surfaces: Sequence[SeenSurface], views: Sequence[DrawnView], up: np.ndarray, about: Plane | None) -> Plane:
-    """Fit a plane to the marks, by depth, or by height over the plane ``about``."""
+    """Fit a plane to the marks at their rendered depth, or, with ``about``, at the height of splats over that plane."""
     places = []
     for surface, view in zip(surfaces, views, strict=True):
         depth = surface.depth if about is None else surface.depth_over(about)
@@ -53,13 +53,14 @@ def _fitted(points: np.ndarray, up: np.ndarray) -> Plane:
 
 
 def apart(first: Plane, second: Plane, foot: np.ndarray, height: float) -> tuple[float, float]:
-    """Return the degrees between two planes, and their distance at ``foot`` (3,) in heights of the object."""
+    """Return the angle between two planes, degrees, and their distance at ``foot`` (3,) in heights of the object."""
     cosine = float(np.clip(first.normal @ second.normal, -1.0, 1.0))
     return float(np.degrees(np.arccos(cosine))), abs(float(first.heights(foot) - second.heights(foot))) / height
 
 
 def real_ground(annotated: DrawnScene, cloud: GaussianCloud, located: LocatedPlane) -> Row:
-    """Compare our plane (or ground if not flat) with the mean of two markings, and those with each other."""
+    """Compare our plane (or the ground, if it is not flat) with the mean of two markings, and the markings with each
+    other."""
     plane = located.plane
     foot = located.centre - plane.heights(located.centre) * plane.normal
     height = float(np.quantile(plane.heights(cloud.means.numpy()[located.segmentation.object_mask]), 0.995))
@@ -69,7 +70,7 @@ def real_ground(annotated: DrawnScene, cloud: GaussianCloud, located: LocatedPla
     between /= np.linalg.norm(between)
     degrees, offset = apart(plane, Plane(between, float(-between @ middle)), foot, height)
     if located.ground is not None:
-        # The supporting ground is not the plane there.
+        # Ground that is not flat differs from the plane under the object.
         offset = abs(float(located.ground.heights(middle[None])[0])) / height
     markings_degrees, markings_offset = apart(even, odd, foot, height)
     row = {"scene": annotated.name, "how": "ground", "degrees": degrees, "offset": offset}

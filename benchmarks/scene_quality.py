@@ -2,22 +2,24 @@
 
 Five scenes have objects and ground annotated by hand in eight views each (``annotated_scenes.py``). ``masks``: the
 outlines of every other view are given. ``clicks``: the first click is on the innermost point of the object in the first
-view; two more are on the largest error in the third and in the fifth view, at the innermost point of what is missing or
-too much, with the object rendered alone; an error thinner than 2 % of the image is ignored. Both are judged on the
-other views by the overlap (IoU) of the outlines with the pixels where the object alone, split at its plane, has an
-opacity above 0.5; pixels where the whole capture is below that, and has holes, do not count. Bonsai's cloud is trained
-first (or read from ``--trained``, or from the films).
+view; two more correct the render of the object alone in the third and in the fifth view, each at the innermost point of
+the largest region that is missing or superfluous; regions thinner than 2 % of the image are ignored. Both are judged on
+the other views by the overlap (IoU) of the outlines with the pixels where the object alone, split at its plane, has an
+opacity above 0.5; pixels where the whole capture has a lower opacity are holes and do not count. Bonsai's cloud is
+trained first (or read from ``--trained``, or from the films).
 
-``--films FOLDER``: before that, films of bonsai, mouse and plush dog from photos, and of koala, fox, narcissus and
-playbot from a capture (``room_films.py``), ``--processes`` of them at a time; each stage is timed. The ground: planes
-of three built-in scenes against the truth; of the real ones against two markings, of the even and the odd views, by the
-angle between normals and the distance at the object's foot (``room_ground.py``).
+With ``--films FOLDER``, films of bonsai, mouse and plush dog from photos, and of koala, fox, narcissus and playbot from
+a capture (``room_films.py``) are made first, ``--processes`` of them at a time; each stage is timed. For the ground,
+the planes of three built-in scenes are compared with the truth, and those of the real scenes with two markings, one in
+the even and one in the odd views, by the angle between normals and the distance at the object's foot
+(``room_ground.py``).
 
 Aims: ``iou_masks`` (mean of each scene 0.95, of the bonsai 0.90), ``iou_click`` (0.88 with three clicks and no model;
-one click and a mask model is not measured, as none that takes clicks is available without external data), ``ground``
+one click with a mask model is not measured, because no model that takes clicks is available without external data),
+``ground``
 (built-in scenes: 1 degree and 0.5 % of the object's height; real ones: twice the difference of the markings), ``films``
-(each requested one exists and its motion is completed), ``psnr_vs_gsplat`` (held out, the same colour fit for both: at
-least equal on bonsai, mouse and plush dog; on a GPU with gsplat, with ``--peers``).
+(each requested film exists and its motion is complete), ``psnr_vs_gsplat`` (held-out PSNR with the same colour fit for
+both: at least gsplat's on bonsai, mouse and plush dog; needs a GPU with gsplat, and ``--peers``).
 """
 
 from __future__ import annotations
@@ -53,7 +55,7 @@ TRAINING_CASES = ("bonsai", "mouse", "plush_dog")
 
 
 def film_rows(options: argparse.Namespace) -> list[Row]:
-    """Return one row per film, each made by its own process; a failed one has ``messages`` in place of figures."""
+    """Return one row per film, each made by its own process; a failed one has ``messages`` in place of results."""
     threads = str(max(1, (os.cpu_count() or 1) // options.processes))
     limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
 
@@ -69,7 +71,7 @@ def film_rows(options: argparse.Namespace) -> list[Row]:
             return {"scene": name, "how": "film", "ended": "failed", "messages": messages[-1:]}
         return json.loads((out / "row.json").read_text())
 
-    # Those that train first take the longest, so they start first.
+    # Films that begin with training take the longest, so they start first.
     names = [name for name in FILMS if is_here(name) and (not options.only or name in options.only)]
     with ThreadPoolExecutor(options.processes) as pool:
         rows = list(pool.map(one, names))
@@ -77,7 +79,7 @@ def film_rows(options: argparse.Namespace) -> list[Row]:
         stages = " ".join(f"{stage} {value:.1f}" for stage, value in row.get("seconds", {}).items())
         print(f"{row['scene']}: {stages or row['messages']} ({row['ended']})", flush=True)
     if options.json:
-        # In case the run is stopped before the rest is done.
+        # Store these rows now, in case the run is stopped before the rest is done.
         options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
     return rows
 
@@ -106,7 +108,7 @@ def cloud_of(annotated: DrawnScene, options: argparse.Namespace, seconds: dict[s
 
 
 def rows_of(annotated: DrawnScene, options: argparse.Namespace, table: Table) -> tuple[list[Row], list[np.ndarray]]:
-    """Return the rows by masks, by one click and by three, and of the ground; and images of a judged view."""
+    """Return the rows for masks, one click, three clicks and the ground, and images of a judged view."""
     trained: dict[str, float] = {}
     cloud = cloud_of(annotated, options, trained)
     cameras = [one.camera for one in read_cameras(annotated.photos)] if annotated.photos else []
@@ -147,7 +149,7 @@ def rows_of(annotated: DrawnScene, options: argparse.Namespace, table: Table) ->
 
 
 def psnr_rows(options: argparse.Namespace) -> list[Row]:
-    """Return held-out figures of our training and gsplat's, measured as in ``train.py``."""
+    """Return held-out scores of our training and of gsplat's, measured as in ``train.py``."""
     from train import run_case
 
     chosen = argparse.Namespace(**vars(options), iterations=7000, gaussians=200_000, max_side=1600)
@@ -163,9 +165,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
     parser = flags(
         __doc__,
-        quick="the scenes that are clouds, no inpainting; the bonsai with --trained only",
+        quick="only scenes with a capture, without inpainting; the bonsai only with --trained",
         device="cpu",
-        plot="image of the object alone in a judged view, by masks, one click and three; red is missing, blue too much",
+        plot="image of the object alone in a judged view, from masks, one click and three; red: missing, blue: excess",
     )
     parser.add_argument("--trained", type=Path, help="folder of captures that were trained before: bonsai.ply")
     parser.add_argument("--films", type=Path, help="folder for the films, one folder a scene")

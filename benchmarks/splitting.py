@@ -1,9 +1,9 @@
-"""Visibility of a split: image error of every rule over opacity and viewing direction, and the optimal opacities.
+"""Visibility of a split: image error of every rule by opacity and viewing direction, and the optimal opacities.
 
-A round needle (thickness 0.3 of its length) is rendered whole and as children, from seven directions spread over the
-sphere; the error is the root mean square over directions and pixels, in percent of the opacity. The last columns are
-the opacities of the outer and the middle child of the MEASURED rule that minimise it: the table in
-egs_warp/deformation/splitting.py.
+A needle with a circular cross-section (thickness 0.3 of its length) is rendered whole and as children, from seven
+directions spread over the sphere; the error is the root mean square over directions and pixels, in percent of the
+opacity. The last columns are the opacities of the outer and the middle child of the MEASURED rule that minimise it: the
+table in egs_warp/deformation/splitting.py.
 
 Aims: ``table_is_optimal`` (no opacity of the table is more than 0.002 from the optimum computed here),
 ``measured_beats_paper`` (at every opacity).
@@ -29,7 +29,7 @@ ALONG, ACROSS = np.linspace(-4.0, 4.0, 81), np.linspace(0.0, 3.0, 16)
 
 
 def image_error(opacity: float, rule: SplitRule, peaks: np.ndarray, tilt: float) -> np.ndarray:
-    """Children minus parent over the opacity, on a grid (16, 81).
+    """Return the image of the children minus that of the parent, divided by the opacity, on a grid (16, 81).
 
     Args:
         opacity: peak opacity of the parent.
@@ -51,9 +51,9 @@ def image_error(opacity: float, rule: SplitRule, peaks: np.ndarray, tilt: float)
 
 
 def all_errors(opacity: float, rule: SplitRule, peaks: np.ndarray) -> np.ndarray:
-    """Errors of all directions, weighted by the square root of their share of the sphere.
+    """Return the errors of all directions, weighted by the square root of their share of the sphere.
 
-    The root of the sum of squares is the measure.
+    The error of a rule is the norm of these values.
     """
     shares = np.sin(TILTS) / np.sin(TILTS).sum()
     parts = [image_error(opacity, rule, peaks, tilt).ravel() for tilt in TILTS]
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         __doc__,
         quick="no effect: the full run takes seconds",
         device="cpu",
-        seed="not used: nothing here is random, nor runs on a device",
+        seed="not used: nothing here is random or runs on a device",
     ).parse_args(arguments)
     rows: list[Row] = []
     columns = {f"{rule.value}_{what}": "8.2%" for rule in SplitRule for what in ("rms", "side-on", "end-on")}

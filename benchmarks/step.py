@@ -2,12 +2,12 @@
 
 python benchmarks/step.py [--quick] [--device cpu] [--seed 0] [--json PATH] [--plot PATH]
 
-Three tables. Newton iterations: those of the jump, and those of steps repeated from the prediction of their own
-activations, with the true Hessian of the elements and with the projected one. Contact velocities: the error of the
-linearised velocities of a step's activations against the solved ones, with the tangent at the rigid guess and at the
-predicted end (rms and largest over the loaded contacts of all steps, m/s; the pawn is 1 m tall). Factors: a step's
-matrix factored, and solved for a right-hand side per muscle and contact row, by ours and by scipy's SuperLU. This
-benchmark has no aim.
+Three tables. Newton iterations: their number in the jump, and in the same steps repeated with the known activations,
+with the true and with the projected Hessian of the elements. Contact velocities: the difference between the velocities
+that are linearised for a step's activations and the solved ones, with the tangent at the rigid guess and at the
+predicted end (rms and largest over the loaded contacts of all steps, m/s; the pawn is 1 m tall). Factors: the time to
+factor a step's matrix and to solve for one right-hand side per muscle and contact row, with our factorisation and with
+SciPy's SuperLU. This benchmark has no aim.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ PLACES = ("ground", "flight")
 
 
 def iterations(creature: Creature, before: StepReport, step: StepReport) -> Row:
-    """Count the Newton iterations of one step by Hessian."""
+    """Count the Newton iterations of one step with each Hessian."""
 
     def repeated() -> int:
         return creature.stepper.step_with_activations(before.state, memory_of(before), step.activations, step.dt)[
@@ -86,7 +86,7 @@ def contact_errors(creature: Creature, before: StepReport, step: StepReport) -> 
 
 
 def factor_times(creature: Creature, repeats: int) -> list[Row]:
-    """Time factorisation and solution, ms, with ours and with SuperLU."""
+    """Time the factorisation and solution of a step's matrix, ms, with our factorisation and with SuperLU."""
     assembly, body = creature.body.assembly, creature.body
     entries = assembly.hessian_entries(creature.start.positions, factor=(1.0 / 60.0) ** 2)
     entries[assembly.diagonal_entries] += np.repeat(body.node_mass, 3)

@@ -3,9 +3,9 @@
 python benchmarks/sweep.py [--quick] [--workers 2] [--device cpu] [--seed 0] [--json PATH] [--join PATH] [--plot PATH]
 
 A run succeeds if the motion reaches its target (distance and height within 15 %, a twist's heading within 10 degrees
-and its drift within 0.1 body heights, a walk's distance within 10 % and its feet slipping less than 2 % of a stride),
-the body ends upright (tilt under 10 degrees) and the audit holds. Each failure has its reason. Captures are used if
-they are on this machine (``EGS_WARP_DATA``, else ../shared/data).
+and its drift within 0.1 body heights, a walk's distance within 10 % and the slip of its feet below 2 % of a stride),
+the body ends upright (tilt under 10 degrees) and the run passes the audit. Each failure is listed with its reason.
+Captures are used if they are on this machine (in ``EGS_WARP_DATA``, by default ../shared/data).
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ BOUNDS = {
 
 @dataclass(frozen=True)
 class Case:
-    """One run."""
+    """One run of the sweep."""
 
     body: str
     motion: str
@@ -217,7 +217,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # Compile the kernels once here, not in every worker.
     one = partial(run, device=options.device, seed=options.seed)
     one(Case("pawn", "jump", 0.6, 0.05, 1 / 60), frames=4)
-    print(f"{len(runs) + len(known)} runs, {len(known)} of them known")
+    print(f"{len(runs) + len(known)} runs, {len(known)} of them from --join")
     table = Table(
         **{"run": "d", "body": "<8", "motion": "<16", "friction": "g", "sag": "g", "slope": "g", "height": "g"},
         **{"step_rate": ".0f", "seconds": ".0f", "outcome": "<7"},

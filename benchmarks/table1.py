@@ -3,17 +3,19 @@
 Glossy objects with true meshes are photographed at rest by a ray caster, trained to Gaussians of SH degree 3 by the
 project's own trainer, and then bent, twisted and dropped on the floor: one displacement of the cage nodes, known or
 simulated, deforms both the mesh's vertices and the Gaussians. The gloss rotates with the surface, as in a capture, so
-the rotation of colour counts. Held-out cameras compare the two. Three objects make up the table; two more are held out,
-and three others (``--choose``) are those on which the settings of splitting were chosen, which no table shows.
+the rotation of colour counts. Held-out cameras compare the two. Three objects make up the table; two more are held out.
+The settings of splitting were chosen on three others (``--choose``), which no table shows.
 
 Rows: SuGaR (bound to a surface of the capture, and once to the cage's faces), PhysGaussian, VR-GS; ours unsplit, with
-the paper's split (Eq. 17 as corrected), and with ours. Then at equal counts: the others deform the same Gaussians that
-our split has made, and all, ours without splits, deform a capture trained with the same number.
+the paper's split (Eq. 17 as corrected), and with ours. Further rows compare equal numbers of Gaussians: the other
+methods deform the Gaussians that result from our split, and all methods, ours without splits, deform a capture trained
+with the same number.
 
 Aims, from means over objects: ``best_psnr_every_deformation`` and ``best_ssim_every_deformation`` (ours ahead of all
-rows that start from the same capture), ``margin_over_vrgs`` (by at least the paper's margins), ``split_helps`` (over
-ours unsplit, PSNR and SSIM, every deformation), ``equal_count_best`` (PSNR and SSIM, every deformation: ours over the
-others on its split, and ours unsplit over the others on the capture trained with the same number),
+rows that start from the same capture), ``margin_over_vrgs`` (by at least the paper's margins), ``split_helps`` (ours
+ahead of ours unsplit in PSNR and SSIM for every deformation), ``equal_count_best`` (in PSNR and SSIM for every
+deformation, ours ahead of the others on its split, and ours unsplit ahead of them on the capture trained with the same
+number),
 ``paper_margins_held_out`` (the paper's margins over VR-GS on the two held-out objects).
 """
 
@@ -36,18 +38,19 @@ from table1_rows import MAIN, MOTIONS, ROWS, SAME_SPLIT, SAME_TRAINING, Splittin
 OBJECTS = ("chair", "plant", "microphone")
 HELD_OUT = ("spot", "stool")
 FROM_PHOTOS = "lego"
-"""A proxy of NeRF-synthetic's model, built from its photos (``lego_proxy.py``); only on request, in no aim."""
+"""Proxy of the NeRF-synthetic model, built from its photos (``lego_proxy.py``); used only on request and in no aim."""
 CHOOSING = ("cat", "vase", "table")
 """Objects on which the settings below were chosen."""
 DEGREES, MIN_ERROR, DEPTH, GROWTH = 4.0, 7e-4, 4, 20.0
-"""Result of --choose, in images of 256 x 256 after 3000 steps: the first two are the library's defaults."""
+"""Result of --choose with images of 256 x 256 and 3000 training steps; the first two are the library's defaults."""
 SETTINGS = {
     f"{degrees:g} degrees, {error:g}": (degrees, error)
     for error, degrees in product((7e-4, 4e-4, 2e-4, 1e-4), (9.0, 4.0))
 }
 """Settings that --choose compares, the coarsest first."""
 PSNR_TOLERANCE = 0.02
-"""dB: --choose takes the coarsest setting that is this close to the best (PSNR, mean over objects and motions)."""
+"""Tolerance of --choose, dB: it selects the coarsest setting whose mean PSNR over objects and motions is this close to
+the best."""
 PAPER_MARGINS = {"bend": (0.16, 0.006), "twist": (0.36, 0.017), "fall": (0.36, 0.013)}
 """Margins of the paper's full method over its VR-GS row, PSNR (dB) and SSIM."""
 SCORES = ("psnr", "ssim", "flip")
@@ -189,7 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--gaussians", type=int, help="number of Gaussians of a capture (default 4000)")
     parser.add_argument("--iterations", type=int, help="training steps (default 7000)")
     parser.add_argument("--nodes", type=int, help="approximate number of nodes of the cage")
-    parser.add_argument("--clouds", type=Path, help="cache folder of clouds and falls")
+    parser.add_argument("--clouds", type=Path, help="cache folder for clouds and falls")
     parser.add_argument("--rows", nargs="+", type=Path, help="judge the rows in these JSON files together")
     parser.add_argument(
         "--degrees", type=float, default=DEGREES, help="minimum rotation between the ends of a Gaussian that is split"
@@ -198,7 +201,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--misfit",
         type=float,
         default=MIN_ERROR,
-        help="minimum fit error of a Gaussian that is split, over the cage's diagonal",
+        help="minimum fit error of a Gaussian that is split, as a fraction of the cage's diagonal",
     )
     parser.add_argument("--depth", type=int, default=DEPTH)
     parser.add_argument("--growth", type=float, help=f"maximum growth of the number of Gaussians (default {GROWTH:g})")

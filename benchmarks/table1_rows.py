@@ -31,15 +31,15 @@ from perceptual import flip_error, lpips_distance
 
 MOTIONS = ("bend", "twist", "fall")
 CAGE_NODES = {"plant": 2000, "microphone": 500}
-"""Number of nodes by object, otherwise 1000: enough for the cage to contain the whole mesh, thin leaves too, because
-there is no truth outside a cage.
+"""Number of cage nodes by object, otherwise 1000: enough for the cage to contain the whole mesh, including thin leaves,
+because the deformation is not defined outside the cage.
 """
 ON_LEGS, ON_LEAVES = (0.15, 0.6, 20.0), (0.3, 0.8, 150.0)
 """Sag, height (m) and tilt (degrees) of a fall; the plant falls on its leaves."""
 FLOOR = Plane.from_coefficients(0.0, 0.0, 1.0, 0.0)
 AS_TRAINED, SPLIT, PAPER_SPLIT, AS_MANY = "as trained", "our split", "the paper's split", "trained with as many"
-"""Captures: as trained, two splits of it for the motion, and one trained with as many Gaussians as our split has in the
-mean over the motions.
+"""Captures: as trained, two splits of it for the motion, and one trained with as many Gaussians as our split has on
+average over the motions.
 """
 PAPER_DEGREES = 9.0
 """The paper's 15 degrees between arms of 3 standard deviations, converted to arms of sqrt 3."""
@@ -89,7 +89,7 @@ class Splitting:
 
     degrees: float
     min_error: float
-    """Minimum fit error over the cage's diagonal."""
+    """Minimum fit error, as a fraction of the cage's diagonal."""
     depth: int
     growth: float
 
@@ -115,7 +115,8 @@ class Subject:
 
     def __init__(self, mesh: PaintedMesh, options: argparse.Namespace) -> None:
         self.mesh, self.options = replace(mesh, glossy=not options.matt), options
-        # From the surface, not from a trained cloud: the same cage, and the same fall, for every training.
+        # The cage is built from the surface, not from a trained cloud, so that it and the fall are the same for every
+        # training.
         self._surface = scenes.surface_cloud(mesh, 40_000, device="cpu")
         self.cage = build_cage(self._surface, FLOOR, target_nodes=options.nodes or CAGE_NODES.get(mesh.name, 1000)).mesh
 

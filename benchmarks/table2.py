@@ -8,13 +8,14 @@ directions, that is 60 variables and 50 complementarity pairs a frame. Each fram
 is the animation's own motion; every strategy gets the same programs. A second table has smaller problems of the same
 bodies, and random ones, compared with the optimum over all contact states (branch and bound).
 
-``modes``, the default of the engine, has the exact friction cone. All others have the pyramid, also ``exact``, so
-``modes`` may be better than it. ``modes`` and ``paper`` have activations as their only unknowns. ``objective`` is the
-program's, at the activations and forces that a strategy returns; ``true`` is the same objective with the contact forces
-of the exact cone under its activations, which is what a step then computes. ``paper`` is the paper's: the states of
-stage 1 (Eq. 12), then one contact at a time. ``qpcc`` starts from all-static and changes one contact at a time by its
-own multipliers; if all-static has no solution, it starts from the states that follow from the last activations.
-``qpcc-our-moves`` differs from it only in our rules for the moves, so that rules and start can be judged separately.
+``modes``, the default of the engine, has the exact friction cone. All others, including ``exact``, have the pyramid, so
+``modes`` may be better than ``exact``. ``modes`` and ``paper`` have activations as their only unknowns. ``objective``
+is the program's, at the activations and forces that a strategy returns; ``true`` is the same objective with the contact
+forces of the exact cone under its activations, which is what a step then computes. ``paper`` is the paper's: the states
+of stage 1 (Eq. 12), then one contact at a time. ``qpcc`` starts from all-static and changes one contact at a time by
+its own multipliers; if all-static has no solution, it starts from the states that follow from the last activations.
+``qpcc-our-moves`` differs from ``qpcc`` only in that it changes contacts by our rules, so that rules and start can be
+judged separately.
 
 The ratios of ``exact`` to ``qpcc`` are also reported; they bound the possible gain. Aims, over all frames together:
 ``qps_vs_qpcc`` (``modes`` takes at most 0.37 of qpcc's QPs) and ``objective_vs_qpcc`` (its mean objective is at most
@@ -49,7 +50,7 @@ PAPER_QPS, PAPER_OBJECTIVE = 17.01 / 46.19, 0.83 / 1.29
 QP_LIMIT = 1000
 Search: TypeAlias = Strategy | StateSearch
 SEARCHES: tuple[Search, ...] = (*Strategy, *StateSearch)
-"""Strategies of the engine, and searches to which they are compared."""
+"""Strategies of the engine, and the searches with which they are compared."""
 
 
 def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[Search, np.ndarray]:
@@ -134,7 +135,7 @@ def table_rows(table: str, body: str, results: dict[Search, np.ndarray], **more:
 
 
 def print_rows(rows: list[Row]) -> None:
-    """Print QPs and objectives (average, best, worst), milliseconds, and the objective over the exact optimum's."""
+    """Print QPs and objectives (average, best, worst), milliseconds, and the ratio of the objective to the optimum."""
     table = Table(
         **{"body": "<12", "strategy": "<14", "frames": "d"},
         **{"QPs_avg": ".2f", "QPs_best": "d", "QPs_worst": "d"},
@@ -151,7 +152,7 @@ def print_rows(rows: list[Row]) -> None:
 
 
 def pooled(parts: list[dict[Search, np.ndarray]]) -> dict[Search, np.ndarray]:
-    """Concatenate all frames."""
+    """Concatenate the frames of all parts, by strategy."""
     return {strategy: np.concatenate([part[strategy] for part in parts]) for strategy in SEARCHES}
 
 
@@ -169,7 +170,7 @@ def random_frames(count: int, seed: int) -> list[Frame]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = flags(__doc__, quick="one animation a body in place of two", device="cpu")
+    parser = flags(__doc__, quick="one animation per body instead of two", device="cpu")
     parser.add_argument("--solver", default="daqp", choices=[solver.value for solver in QpSolver])
     parser.add_argument("--bodies", nargs="+", default=["pawn", "stool", "monkey"])
     options = parser.parse_args(arguments)
@@ -211,7 +212,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     }
     for strategy, (qps, objective, true) in ratios.items():
         print(
-            f"\n{strategy.value} over qpcc: QPs {qps:.2f} (paper 0.37), objective {objective:.2f} (paper 0.64), true "
+            f"\n{strategy.value} / qpcc: QPs {qps:.2f} (paper 0.37), objective {objective:.2f} (paper 0.64), true "
             f"objective {true:.2f}; {total[strategy][:, 0].mean():.2f} QPs a frame; within 2 % of exact in "
             f"{within[strategy]:.0%} of the small problems"
         )
@@ -239,7 +240,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def draw(figure: Figure, total: dict[Search, np.ndarray], near: dict[Search, np.ndarray]) -> None:
-    """Draw QPs per frame, and the objective over the exact optimum's, over the share of frames."""
+    """Draw QPs per frame, and the cumulative distribution of the objective relative to the optimum."""
     left, *others = figure.subplots(1, 3)
     shown = [strategy for strategy in SEARCHES if strategy is not StateSearch.EXACT]
     palette = ("tab:blue", "tab:green", "tab:gray", "tab:orange", "tab:olive", "tab:purple")

@@ -3,8 +3,8 @@
 Scenes are segmented as in ``egs-warp segment``, from masks in 18 views: of the true object in the built-in scenes, and
 of the object that a click selects in real captures. ``mask only`` is everything that the masks claim, without the
 plane. Four cameras of 800 x 800 pixels lie in the plane, so that its horizon is the middle row. PSNR and SSIM compare
-the upper halves with those of ``mask only``, on black; the residual is the sum of the pixels of the lower half over
-that of the upper half.
+the upper halves with those of ``mask only``, on black; the residual is the sum of the pixels of the lower half
+divided by that of the upper half.
 
 Aims: ``residual`` (L_seg: at most 0.002 in every scene), ``psnr`` (L_seg: at least 35.3 dB in every scene). ``L_seg, no
 subdivision`` is the paper's own method; ours splits large straddling Gaussians before training, and cuts the remaining
@@ -98,7 +98,7 @@ def scores(pictures: Sequence[np.ndarray], targets: Sequence[np.ndarray] | None)
     """Return the scores of images against the upper halves ``targets``.
 
     ``targets`` is None for the images that they were taken from. ``whole_psnr`` compares the whole image with that
-    upper half over an empty lower half, so it combines residual and similarity.
+    upper half above an empty lower half, so it combines residual and similarity.
     """
     half = len(pictures[0]) // 2
     residual = float(np.mean([one[half:].sum() / one[:half].sum() for one in pictures]))

@@ -1,8 +1,8 @@
 """Accuracy of the remaining time that the progress bars of a scene and of a simulation show.
 
 The built-in pawn is segmented from its scene, and jumps, hops, twists and walks. At each update of the bar, the
-remaining time that it shows is compared with the true remaining time, if that is 5 s or more: the bar shows whole
-seconds.
+remaining time that it shows is compared with the true remaining time, if that is at least 5 s, because the bar shows
+whole seconds.
 
 python benchmarks/time_left.py [--quick] [--device cpu] [--seed 0] [--json PATH] [--plot PATH]
 """
@@ -37,7 +37,7 @@ MIN_REMAINING = 5.0
 
 
 class Watched(io.StringIO):
-    """A stream that records the time of each update of the bar, and the remaining seconds shown."""
+    """A stream that records, for each update of the bar, its time and the remaining seconds shown."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -112,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for row in rows:
             axes.plot(np.array(row["past"]) / row["seconds"], row["ratios"], label=row["run"])
         axes.axhspan(0.5, 2.0, alpha=0.1)
-        axes.set(xlabel="fraction of the run", ylabel="time left, shown over true")
+        axes.set(xlabel="fraction of the run", ylabel="time left, shown / true")
         axes.legend()
 
     every = np.concatenate([row["ratios"] for row in rows])

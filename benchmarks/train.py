@@ -1,8 +1,8 @@
-"""Captures trained from real photos by ours and by gsplat's MCMC strategy: held-out PSNR and SSIM, and time.
+"""Captures trained from real photos by our trainer and by gsplat's MCMC strategy: held-out PSNR and SSIM, and time.
 
 Both get the same photos (undistorted, every eighth held out), the same iterations and the same cap on Gaussians, and
 are judged with the same renderer: once without and once with an affine colour correction fitted to each whole held-out
-photo, the common method to remove differences in exposure. The means include every held-out photo, also one with a
+photo, the common method to remove differences in exposure. The means include every held-out photo, even one with a
 wrong pose.
 """
 
@@ -30,7 +30,7 @@ _SHOWN = (
 )
 """Columns of the table, by their keys in the rows."""
 _WARM_UP = 20
-"""Training steps of both before the first timed case, so that kernels are compiled."""
+"""Number of training steps of both trainers before the first timed case, to compile the kernels."""
 
 
 def row_of(case: str, method: str, cloud: GaussianCloud, seconds: float, scores: Sequence[PhotoScore]) -> Row:
@@ -79,7 +79,7 @@ def run_case(case: str, options: argparse.Namespace, table: Table) -> tuple[list
             seed=options.seed,
             device=options.device,
         )
-        # Each is judged over its training background: otherwise light that passes through would count against it.
+        # Each is judged on its training background: on another, the light that it transmits would count as an error.
         behind = result.background if result.cut_out else (0.0, 0.0, 0.0)
         scores = [
             score_photo(peer.cloud, view, behind, held_out=score.held_out)
@@ -134,7 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--cases", nargs="+", default=list(CASES))
     parser.add_argument("--iterations", type=int, help="training steps (default 7000)")
-    parser.add_argument("--gaussians", type=int, help="maximum number of Gaussians of both (default 200000)")
+    parser.add_argument("--gaussians", type=int, help="maximum number of Gaussians of both trainers (default 200000)")
     parser.add_argument(
         "--max-side", type=int, help="reduce the longer side of photos to this many pixels (default full size)"
     )

@@ -57,7 +57,7 @@ def train_with_gsplat(
 
     The world is scaled to the cameras; training starts from triangulated points or a random cube; the SH degree rises
     by one every 1,000 steps; the background is black. Photos with alpha are composited over a random colour in each
-    step, as in ours; SSIM is ``metrics.ssim``, because fused_ssim is a separate package.
+    step, as in our trainer; SSIM is ``metrics.ssim``, because fused_ssim is a separate package.
     """
     from gsplat import rasterization  # type: ignore[import-not-found]
     from gsplat.strategy import MCMCStrategy  # type: ignore[import-not-found]

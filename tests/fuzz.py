@@ -26,7 +26,7 @@ from tests.support.memory import peak_bytes
 
 CORPUS = Path(__file__).parent / "corpus"
 _MEMORY = 256
-"""Maximum growth of the memory of a process, MiB; its inputs have some kilobytes."""
+"""Maximum growth of the memory of a process, MiB; its inputs have a few kilobytes."""
 _MAX_BUFFER = 4096
 """Number of bytes from which Hypothesis draws one input."""
 _COUNTS: tuple[str, ...] = ("inputs", "valid", "refused", "broken")

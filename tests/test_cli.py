@@ -1,4 +1,4 @@
-"""The command: bad input is one line and exit status 2, and loses nothing."""
+"""The command line: invalid input ends in a one-line error and exit status 2, and no file is lost."""
 
 from __future__ import annotations
 
@@ -214,7 +214,7 @@ def test_a_plot_needs_an_existing_folder(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_no_flag_takes_an_empty_path() -> None:
-    """An empty path, for example of an unset variable, would be the working folder."""
+    """An empty path, for example from an unset variable, would mean the working folder."""
     taken = [action.type for command in _parsers()[1].values() for action in command._actions]
     assert named_path in taken and Path not in taken
 
@@ -313,7 +313,7 @@ def _examples() -> list[str]:
 def test_the_examples_of_the_help_are_accepted(
     example: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In an empty folder, each is only refused because its files are missing."""
+    """In an empty folder, each is rejected only because its files are missing."""
     monkeypatch.chdir(tmp_path)
     words = shlex.split(example)
     if words[0] in ("doctor", "samples"):
@@ -351,7 +351,7 @@ def test_the_commands_of_the_pages_are_accepted() -> None:
 
 
 def test_the_help_of_animate_lists_the_registry(capsys: pytest.CaptureFixture[str]) -> None:
-    """All motions and their own default values; the flags that matter first."""
+    """The help lists all motions with their own default values, and the most important flags first."""
     with pytest.raises(SystemExit):
         main(["animate", "--help"])
     text = " ".join(capsys.readouterr().out.split())

@@ -53,7 +53,7 @@ COMMANDS = {
 }
 SCENES = {"plane", "segment", "inpaint", "train"}
 SLOW = {"samples", "info", "muscles", "pictures", *SCENES}
-"""Commands that compute for long before each file, or write many files."""
+"""Commands that compute for a long time before each file, or write many files."""
 Command = Callable[[str, Path], int]
 
 
@@ -83,7 +83,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyP
 
 @pytest.fixture
 def command(capture: Path, run_folder: Path, request: pytest.FixtureRequest) -> Command:
-    """Runs a line of ``COMMANDS`` into a folder, and returns its status."""
+    """Function that runs a line of ``COMMANDS``, with output to a folder, and returns its exit status."""
 
     def run(line: str, out: Path) -> int:
         places = {"capture": capture, "run": run_folder, "out": out}
@@ -160,8 +160,8 @@ def test_each_file_operation_fails_once(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Each opening and renaming fails in turn: a one-line error, no temporary file. A last run without a fault writes
-    everything. (``tests/pipelines/test_animate.py`` tests ``animate``.)
+    """Each opening and renaming fails in turn and leaves a one-line error and no temporary file. A last run without a
+    fault writes everything. (``tests/pipelines/test_animate.py`` tests ``animate``.)
     """
     out = tmp_path / "out"
     for number in range(200):

@@ -60,7 +60,7 @@ def test_each_end_is_one_line(error: BaseException, status: int, line: str, caps
 def test_a_file_that_cannot_be_written(
     number: int, status: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A full or broken disk is not bad input; a place without write access is."""
+    """A full or broken disk is not invalid input (status 1); a folder without write access is (status 2)."""
     reason = os.strerror(number)
     with pytest.raises(HandledExit) as end, one_line_errors("prog"), atomic_write(tmp_path / "a.json"):
         raise OSError(number, reason)
@@ -133,7 +133,7 @@ def test_a_closed_pipe_only_silences() -> None:
 def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
     """Return status, output and errors of a shell command in which ``egs-warp`` stands for the program."""
     line = command.replace("egs-warp", f"{sys.executable} -m egs_warp.cli")
-    # Unbuffered output, the default of some machines, would report each error when it is written.
+    # Unbuffered output, the default on some machines, would report each error when it is written.
     environment = os.environ | {"PYTHONIOENCODING": encoding, "PYTHONUNBUFFERED": ""}
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env=environment, timeout=120)
     return done.returncode, done.stdout, done.stderr
@@ -150,20 +150,20 @@ def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
     ],
 )
 def test_closed_outputs_do_not_change_the_status(command: str, status: int) -> None:
-    """Only a command whose result is its output fails then, with status 1."""
+    """Only a command whose result is its output fails because of a closed or full output, with status 1."""
     ended, _, said = told_by(command)
     assert ended == status and "Traceback" not in said and said.count("\n") <= 1
 
 
 def test_files_do_not_get_the_numbers_of_closed_streams() -> None:
-    """Otherwise libraries would print into these files."""
+    """A file with the number of a closed stream would receive what libraries print."""
     code = "from egs_warp.commands.exit_handling import one_line_errors\nwith one_line_errors('prog'):\n"
     code += " import os, tempfile\n with tempfile.TemporaryFile() as file: os._exit(file.fileno())"
     assert told_by(f'{sys.executable} -c "$(cat <<"END"\n{code}\nEND\n)" <&- >&- 2>&-')[0] > 2
 
 
 def test_characters_outside_the_terminal_encoding(tmp_path: Path) -> None:
-    """The name of a folder is printed after everything is written."""
+    """A folder's name with such a character is printed, escaped, after all files are written."""
     status, said, error = told_by(f"egs-warp samples '{tmp_path}/é'", encoding="ascii")
     assert status == 0 and "\\xe9" in said and error == ""
 
@@ -209,7 +209,7 @@ def test_ctrl_c_converted_by_a_library_is_recognised() -> None:
 
 
 def test_an_error_after_a_handled_ctrl_c_is_reported() -> None:
-    """For example, a take cannot be saved when the live page is ended by Ctrl-C."""
+    """An example is a take that cannot be saved after Ctrl-C has ended the live page."""
     body = """
         from egs_warp.errors import UserError
         try:
@@ -226,7 +226,7 @@ def test_an_error_after_a_handled_ctrl_c_is_reported() -> None:
     "after", [0.05, 0.8, *(pytest.param(after, marks=pytest.mark.slow) for after in (0.3, 1.5, 2.5, 4.0))]
 )
 def test_ctrl_c_in_any_phase_is_one_line(after: float, tmp_path: Path) -> None:
-    """During imports, preparation, simulation and video of a short run; it leaves neither a traceback nor a
+    """Ctrl-C during imports, preparation, simulation or video of a short run leaves neither a traceback nor a
     half-written file."""
     code = """
         import numpy as np

@@ -1,5 +1,5 @@
-"""For any values of a Gaussian, it is refused by name, or images, gradients, motion, splits and training stay finite
-and all other Gaussians keep their bits.
+"""A Gaussian with arbitrary values is rejected with the attribute's name, or images, gradients, motion, splits and
+training stay finite and all other Gaussians are unchanged bit by bit.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def test_gradients_are_finite(changed: dict[str, tuple[int, float]]) -> None:
 
 @tried
 def test_a_cage_deforms_it_and_leaves_all_others_unchanged(changed: dict[str, tuple[int, float]]) -> None:
-    """Eq. (14) to (17): moved, bent, inverted and flattened cages; splits where they bend."""
+    """Eq. (14) to (17), for moved, bent, inverted and flattened cages, with splits where they bend."""
     cloud, usual = cloud_of(odd(changed)), cloud_of(ordinary())
     others = np.arange(COUNT) != ODD
     carriers = [Deformer(one, embed_gaussians(one, CAGE)) for one in (cloud, usual)]

@@ -1,4 +1,4 @@
-"""Under each deliberately wrong formula of ``tests/support/mutations.py``, the test named with it fails."""
+"""Each deliberately wrong formula of ``tests/support/mutations.py`` makes the test that is listed with it fail."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ by_formula = pytest.mark.parametrize("mutation", ALL, ids=lambda mutation: mutat
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the package and its tests to be mutated; all tests that must fail pass before."""
+    """A copy of the package and its tests to be mutated; before that, all tests that must fail pass."""
     folder = tmp_path_factory.mktemp("spoiled")
     shutil.copy(ROOT / "pyproject.toml", folder)
     for name in ("egs_warp", "tests"):
@@ -42,7 +42,7 @@ def test_every_equation_of_the_paper_is_spoiled_once() -> None:
 
 @by_formula
 def test_each_formula_occurs_once(mutation: Mutation) -> None:
-    """Otherwise another formula would be changed; the test that must fail exists."""
+    """A formula that occurs twice could be changed in the wrong place; the test that must fail exists."""
     found = (ROOT / mutation.file).read_text().count(mutation.right)
     assert found == 1, f"{mutation.file} has {found} times: {mutation.right}; rewrite the mutation with the formula"
     file, name = mutation.test.split("::")
@@ -60,4 +60,4 @@ def test_a_wrong_formula_is_detected(copy: Path, mutation: Mutation) -> None:
         run = run_tests(copy, mutation.test)
     finally:
         place.write_text(right)
-    assert run.returncode == 1 and "AssertionError" in run.stdout, f"{mutation.test} does not notice\n{run.stdout}"
+    assert run.returncode == 1 and "AssertionError" in run.stdout, f"{mutation.test} does not fail\n{run.stdout}"

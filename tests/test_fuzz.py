@@ -39,14 +39,14 @@ def test_damaged_files(reader: Reader, data: st.DataObject) -> None:
 
 @pytest.mark.parametrize("found", sorted(CORPUS.glob("*/*")), ids=lambda path: f"{path.parent.name}/{path.name}")
 def test_recorded_failures(found: Path, tmp_path: Path) -> None:
-    """Each case once broke a reader; ``make fuzz`` recorded it."""
+    """Readers handle every case that ``make fuzz`` recorded as a failure."""
     (reader,) = [reader for reader in READERS if reader.name.replace(" ", "_") == found.parent.name]
     prepare(reader, tmp_path)
     assert outcome(reader, tmp_path, found.read_bytes()) in ("valid", "refused")
 
 
 def test_slow_means_slow_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pause of the machine is not a failure, a slow reader is."""
+    """A pause of the machine is not a failure, but a slow reader is."""
     monkeypatch.setattr(readers, "MAX_SECONDS", 0.1)
     times: list[float] = []
 

@@ -97,7 +97,7 @@ def test_a_cached_launch_takes_its_new_arguments(device: str) -> None:
         outputs=[wp.zeros(1, dtype=wp.vec3, device=target)],
         device=target,
     )
-    # Warp switches to another stream while it copies: two threads at once may leave it there.
+    # Warp switches to another stream for a copy; concurrent copies in two threads may leave it on that stream.
     stream = target.stream if target.is_cuda else None
     with wp.ScopedStream(stream, sync_enter=False), ThreadPoolExecutor(2) as pool:
         for done in [pool.submit(run, seed) for seed in (1, 2)]:
@@ -113,7 +113,7 @@ def test_arrays_in_one_piece_of_memory_do_not_touch_and_keep_it(device: str) -> 
         piece.fill_(number + 1)
     one = pieces[1]
     del pieces, piece
-    # The memory of the other arrays is free only when this array is released.
+    # The memory of the other arrays is freed only when this array is released.
     others = [wp.full(64, 9.0, dtype=wp.float32, device=device) for _ in range(50)]
     assert len(others) == 50 and (one.numpy() == 2).all()
 
@@ -125,7 +125,7 @@ def test_released_arrays_are_reused(device: str) -> None:
     assert empty_pooled(device, *wanted)[0].ptr not in places
     view = first[1].numpy() if device == "cpu" else pytest.importorskip("torch").as_tensor(first[1], device="cuda")
     del first
-    # A view by another library keeps the memory, too.
+    # A view of another library keeps the memory allocated, too.
     assert empty_pooled(device, *wanted)[0].ptr not in places
     del view
     second, third = empty_pooled(device, *wanted), empty_pooled(device, *wanted)
@@ -141,7 +141,7 @@ def test_capacities_are_few_and_not_much_larger() -> None:
 
 @pytest.mark.parametrize(("told", "most"), [("1", 1), ("0", 1), ("100000", None), ("", None), ("two", None)])
 def test_the_environment_may_limit_the_threads(told: str, most: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At most the available number, and at least one."""
+    """The number of threads is at most the available one, and at least one."""
     monkeypatch.delenv(THREADS, raising=False)
     there = available_threads()
     monkeypatch.setenv(THREADS, told)

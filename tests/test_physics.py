@@ -82,8 +82,8 @@ def spin_work(problem: StepProblem, result: CoupledResult) -> float:
 
 
 def test_restored_spin_adds_energy_only_at_the_start() -> None:
-    """A soft block that spins as fast as in these tests, but is not stretched yet, stretches in its first step. The
-    spin that is restored may add more energy than that takes: less than its work, and within three steps it is gone."""
+    """A soft block that spins as fast as in these tests, but is not stretched yet, stretches in its first step. There,
+    restoring the spin may add energy, but less than the work of the correction; from then on, the energy decreases."""
     shape = Shape((3, 2, 4), (0.294, 0.392, 0.333), 1.16, sag=0.05, poisson_ratio=0.137, damping_ratio=0.05, seed=3657)
     throw = Throw((2.72, 0.0, 0.5), (0.0, 0.0186, 0.0), (0.0, 0.0, 0.0), (1.5, 0.0, -1.42), noise=0.0, seed=0)
     body = shape.body()

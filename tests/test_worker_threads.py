@@ -25,7 +25,8 @@ while time.monotonic() < began + 60.0:
 
 
 def test_each_task_is_done_once() -> None:
-    """By a worker or by the caller, with more tasks than threads; the number of threads stays within its limit."""
+    """A worker or the caller executes each task once, even with more tasks than threads; the number of threads stays
+    within its limit."""
     many, done = WorkerThreads(2), []
     before = threading.active_count()
     tasks = [many.begin(lambda number=number: done.append(number) or number) for number in range(300)]
@@ -94,7 +95,7 @@ def test_an_error_is_raised_by_result() -> None:
 
 
 def test_each_of_the_first_tasks_has_a_thread() -> None:
-    """Even if the previous ones are still running."""
+    """A task starts even if the previous ones, fewer than the limit of threads, are still running."""
     go, begun = threading.Event(), [threading.Event(), threading.Event()]
 
     def long(number: int) -> bool:
@@ -126,7 +127,7 @@ def test_a_forked_process_has_helpers_of_its_own() -> None:
 
 @pytest.mark.slow
 def test_ctrl_c_at_any_moment_ends_the_process() -> None:
-    """With ``ThreadPoolExecutor`` instead, 3 of these 200 processes never ended."""
+    """Each of 200 processes ends after Ctrl-C at a random moment; with ``ThreadPoolExecutor``, some never would."""
     moments = random.Random(7)
     for _ in range(200):
         run = subprocess.Popen([sys.executable, "-c", BUSY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

@@ -28,8 +28,8 @@ def test_the_target_rate_is_for_both_cages_on_a_gpu(many_worlds: ModuleType) -> 
     slow = many_worlds.summary([*rows[:2], row(541, 590.0)], "cuda:0")
     assert slow["aims"]["many_2000"] is False
     assert many_worlds.summary([rows[0], rows[2]], "cuda:0")["aims"]["many_2000"] is False
-    assert many_worlds.summary(rows[:2], "cuda:0")["why_null"] == {"many_2000": "not both cages were run"}
-    assert many_worlds.summary(rows, "cpu")["why_null"] == {"many_2000": "a GPU's aim"}
+    assert many_worlds.summary(rows[:2], "cuda:0")["why_null"] == {"many_2000": "needs runs of both cages"}
+    assert many_worlds.summary(rows, "cpu")["why_null"] == {"many_2000": "needs a GPU"}
 
 
 def test_all_that_were_run_alone_for_long_enough_must_be_alike(many_worlds: ModuleType) -> None:

@@ -58,7 +58,7 @@ def small_cloud() -> GaussianCloud:
 def spz_of_streams(plain: bytes, count: int, sh_bytes: int, records: bytes = b"") -> bytes:
     """Return a .spz file of version 4 (header, records, table, streams) with the content of one of version 3.
 
-    ``plain`` is without its gzip compression.
+    ``plain`` is the file of version 3 without its gzip compression.
     """
     ends = 16 + count * np.cumsum([0, 9, 1, 3, 3, 4, sh_bytes])
     blocks = [plain[start:end] for start, end in zip(ends[:-1], ends[1:], strict=True) if end > start]

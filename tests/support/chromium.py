@@ -44,7 +44,7 @@ def opened(
 ) -> tuple[Any, list[str]]:
     """Open a page and wait until it is loaded; returns the page and the list of the browser's errors and warnings.
 
-    Unless it ``plays``, a recorded run is stopped at its first frame.
+    Unless ``plays`` is true, a recorded run is stopped at its first frame.
     """
     page = chromium.new_page(viewport={"width": width, "height": height})
     if SHOTS is not None:
@@ -74,7 +74,7 @@ def _keep_shot(page: Any, folder: Path) -> None:
 def wait_until(page: Any, condition: str, *, seconds: float = 60.0) -> None:
     """Wait until the JavaScript ``condition`` holds.
 
-    Playwright's own waiting is forbidden by the page's security policy.
+    The page's security policy forbids Playwright's own function for this.
     """
     end = time.monotonic() + seconds
     while not page.evaluate(condition):

@@ -1,4 +1,4 @@
-"""Error of a second process that requests a file that the first one writes."""
+"""Error of a second process that requests a file while the first one writes it."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def small_problem(
 
 
 def all_states(layout: ContactLayout) -> list[np.ndarray]:
-    """Return every combination of separate, static, slide k and slide between k and k + 1."""
+    """Return every combination of the contact states separate, static, slide k and slide between k and k + 1."""
     choices = range(SEPARATE, 2 * layout.directions)
     return [np.array(states) for states in itertools.product(choices, repeat=layout.contacts)]
 

@@ -58,8 +58,8 @@ def coarse_creature(
 ) -> CoarseCreature:
     """Build a body of ``mesh`` on its lowest nodes, facing ``forward`` (3,); ``up`` (3,) is opposite to gravity.
 
-    With ``field`` instead of the floor it may touch the ground with all of its base, with ``all_round`` with any node
-    of its surface.
+    With a ``field`` in place of the floor, all of its base may touch the ground; with ``all_round``, any node of its
+    surface.
     """
     body = make_body(mesh, FLOOR, up=up, sag=sag, device="cpu")
     muscles = automatic_muscles(

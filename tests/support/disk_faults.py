@@ -41,7 +41,7 @@ def assert_one_line(said: str, reason: str) -> None:
 
 
 def fail_once(patch: pytest.MonkeyPatch, number: int, reason: int) -> list[Path]:
-    """Let the opening of a new file or the renaming in ``RENAMING`` with this number fail.
+    """Make the call with this ``number``, from 0, fail among openings of new files and renamings in ``RENAMING``.
 
     Returns:
         list that receives the path of the failed call.
@@ -50,14 +50,14 @@ def fail_once(patch: pytest.MonkeyPatch, number: int, reason: int) -> list[Path]
     calls = count()
 
     def failing(function: Callable[..., object], path: Path, *arguments: int) -> object:
-        # Locks are opened as well; they are not exclusive.
+        # New files are opened with O_EXCL, lock files are not.
         if (function is os.replace or (arguments and arguments[0] & os.O_EXCL)) and next(calls) == number:
             failed.append(path)
             raise OSError(reason, os.strerror(reason))
         return function(path, *arguments)
 
     class System:
-        """Replacement of the module's ``os``."""
+        """Replacement for the module's ``os``."""
 
         def __getattr__(self, name: str) -> object:
             function = getattr(os, name)

@@ -56,13 +56,13 @@ def _array(values: Any) -> np.ndarray:
     try:
         array = np.asarray(values)
     except ValueError:
-        # Rows of different lengths.
+        # NumPy rejects rows of different lengths.
         return np.zeros(0)
     return np.asarray(str(values)[:100]) if array.dtype == object else array
 
 
 def draw_run(path: Path) -> None:
-    """Read the run in the folder of ``path`` as a page and as a film do."""
+    """Read the run in the folder of ``path`` like the page and the film renderer."""
     run = Recording.read(path.parent)
     assert run.bytes()
     last = len(run.steps) - 1

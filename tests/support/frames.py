@@ -18,7 +18,7 @@ TURN = Rotation.from_rotvec([0.7, -1.1, 0.4]).as_matrix()
 
 @dataclass(frozen=True)
 class Lying:
-    """A capture with its support plane, whose normal is up."""
+    """A capture with its support plane, whose normal points up."""
 
     cloud: GaussianCloud
     plane: Plane

@@ -63,7 +63,7 @@ def furnished_room() -> GaussianCloud:
 def on_folds(amplitude: float, *, length: float = 0.8, reach: float = 2.2) -> tuple[GaussianCloud, np.ndarray]:
     """Return a ball on a folded cloth, and which of the Gaussians (n,) belong to the ball.
 
-    It touches the cloth at the highest point under it.
+    The ball touches the cloth at the highest point under it.
     """
     points = level((-reach, -reach), (reach, reach), 0.0, 0.03)
     points[:, 2] = wave(points[:, :2], amplitude, length)

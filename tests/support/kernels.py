@@ -1,4 +1,4 @@
-"""Kernels that call single device functions."""
+"""Kernels that each call single device functions."""
 
 import warp as wp
 
@@ -48,7 +48,7 @@ def algebra_kernel(
     lengths: wp.array[real],
     across: wp.array[real],
 ):
-    """Call each of the block's functions once."""
+    """Call each function of the dense algebra of a block once."""
     for e in range(algebra.lane_of_block(), unknowns * unknowns, wp.block_dim()):
         product[e / unknowns, e % unknowns] = real(0.0)
         turned[e / unknowns, e % unknowns] = real(0.0)
@@ -68,7 +68,7 @@ def algebra_kernel(
 def iterate_kernel(
     rows: UnitConstraints, holding: ActiveSet, splitting: Splitting, guessed: wp.array[int], ended: wp.array[int]
 ):
-    """Run OSQP's iterations from the sides, store these in ``guessed``, and find the optimum from there."""
+    """Run OSQP's iterations, store the sides of the constraints that they give in ``guessed``, and find the optimum."""
     iterate(rows, holding, splitting)
     for row in range(algebra.lane_of_block(), rows.count, wp.block_dim()):
         guessed[row] = holding.side[row]

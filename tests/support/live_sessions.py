@@ -59,7 +59,7 @@ class SteppedSession:
         raise AssertionError(f"not within {max_steps} steps")
 
     def until_idle(self, *, max_steps: int = 400) -> int:
-        """Step, at least once, until it stands with nothing left to do."""
+        """Step, at least once, until the creature stands and no motion is left."""
         self.step()
         return self.until(lambda: self.session.steering.idle, max_steps=max_steps)
 

@@ -1,6 +1,7 @@
 """Peak memory of this process (Linux).
 
-Not ``ru_maxrss``, because a child process starts with its parent's value, and does not exceed that of a large parent.
+``ru_maxrss`` is not used, because a child process starts with its parent's value, which exceeds the child's own peak if
+the parent is large.
 """
 
 from __future__ import annotations

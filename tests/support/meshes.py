@@ -43,7 +43,7 @@ def box_mesh(counts: tuple[int, int, int], size: tuple[float, float, float]) -> 
         [index[a : a + counts[0], b : b + counts[1], c : c + counts[2]].ravel() for a, b, c in np.ndindex(2, 2, 2)],
         axis=1,
     )
-    # Cells mirror their neighbours, so that the mesh prefers no diagonal and mirrors in x = 0 and y = 0.
+    # Adjacent cells are mirror images, so that the mesh prefers no diagonal and is symmetric about x = 0 and y = 0.
     odd = np.stack(np.meshgrid(*[np.arange(n) % 2 for n in counts], indexing="ij"), axis=-1).reshape(-1, 3) @ [4, 2, 1]
     cells = np.take_along_axis(cells, np.arange(8)[None] ^ odd[:, None], axis=1)
     paths = [(0, 1, 3, 7), (0, 1, 5, 7), (0, 2, 3, 7), (0, 2, 6, 7), (0, 4, 5, 7), (0, 4, 6, 7)]

@@ -2,7 +2,7 @@
 
 ``python -m tests.mutation --help``. Each process has its own copy of the package and of the tests, and its own kernel
 cache. Results are appended to a session file at once, so that an interrupted run can be continued; a result is valid
-while the changed file is unchanged. Survivors that are not gaps of the tests are listed with reasons in
+while the changed file is unchanged. Survivors that reveal no gap in the tests are listed with reasons in
 ``tests/support/surviving_mutants/``. Nothing is downloaded; only cosmic-ray's operators and pytest are needed.
 """
 
@@ -33,7 +33,7 @@ OUT = Path("out/mutation")
 _SEED = 20_261_123
 _FAST = "not (slow or data or example or cuda)"
 _MIN_KILLED = 0.8
-"""Minimum fraction of a package's mutants that are killed, without those that are not gaps."""
+"""Minimum fraction of a package's mutants that are killed, not counting survivors that reveal no gap in the tests."""
 _TIME_FACTOR = 4.0
 """Time limit as a factor of the duration of the package's tests; a mutant that takes longer is killed by time."""
 _HEAD_START = 60.0
@@ -46,7 +46,7 @@ class Outcome:
     """Result of one mutant."""
 
     kind: str
-    """Way in which its test failed: by an assertion, by an exception, by time; or ``survived``."""
+    """Reason for which a test failed, ``assertion``, ``exception`` or ``time`` (limit), or ``survived``."""
     seconds: float
     test: str
     """The test that failed."""
@@ -139,7 +139,7 @@ class Copy:
         paths = [str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])]
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
         own = {"PYTHONPATH": os.pathsep.join(paths), "WARP_CACHE_PATH": str(self._kernels)}
-        # No stale bytecode of a change of the same length; no GPU.
+        # Bytecode would be stale after a change of the same length; no GPU is used.
         return os.environ | threads | own | {"PYTHONDONTWRITEBYTECODE": "1", "CUDA_VISIBLE_DEVICES": ""}
 
 
@@ -174,7 +174,7 @@ def _arguments() -> argparse.Namespace:
     chosen.packages = chosen.packages.split(",")
     unknown = sorted(set(chosen.packages) - set(PACKAGES))
     if unknown:
-        parser.error(f"no such package: {', '.join(unknown)}; there are {', '.join(PACKAGES)}")
+        parser.error(f"no such package: {', '.join(unknown)}; give some of {', '.join(PACKAGES)}")
     return chosen
 
 
@@ -210,7 +210,7 @@ def _baselines(chosen: argparse.Namespace, session: Session, place: Path) -> boo
         outcomes = list(pool.map(one, packages))
     for package, outcome in outcomes:
         if outcome.kind != "survived":
-            print(f"{package}: a test fails on the code as it is: {outcome.test or outcome.kind}")
+            print(f"{package}: a test fails on the unchanged code: {outcome.test or outcome.kind}")
             return False
         shutil.copytree(place / "kernels" / package, kernels, dirs_exist_ok=True)
         session.add({"baseline": f"{package}:{state}", "seconds": round(outcome.seconds, 1)})

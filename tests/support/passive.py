@@ -1,4 +1,4 @@
-"""A body without muscle control, stepped like in the engine: contact detection, then forces and velocities."""
+"""A body without muscle control, stepped as in the engine: contact detection, then forces and velocities."""
 
 from __future__ import annotations
 
@@ -64,7 +64,8 @@ def passive_body(
 ) -> PassiveBody:
     """Place ``body`` over ``plane``, at rest unless ``state`` is given.
 
-    Contact points are at ``places`` (P, 3) of its rest shape, or a single one at its middle for a body in flight.
+    Contact points are at ``places`` (P, 3) on its rest shape; by default there is a single one at its middle, for a
+    body in flight.
     """
     nodes = body.mesh.nodes
     middle = body.mesh.nodes[body.mesh.tets[len(body.mesh.tets) // 2]].mean(axis=0)

@@ -34,7 +34,7 @@ def cameras(count: int = len(NAMES)) -> list[Camera]:
 
 
 def write_photos(folder: Path, names: Sequence[str] = NAMES, *, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
-    """Write photos of one grey each."""
+    """Write photos, each in a single shade of grey."""
     for number, name in enumerate(names):
         write_picture(folder / name, np.full((size[1], size[0], 3), 40 + 20 * number, np.uint8))
 
@@ -45,7 +45,7 @@ def write_picture(path: Path, pixels: np.ndarray) -> None:
 
 
 def image_lines(names: Sequence[str] = NAMES) -> list[str]:
-    """First lines of each image in COLMAP's ``images.txt``."""
+    """First line of each image in COLMAP's ``images.txt``."""
     lines = []
     for number, (name, camera) in enumerate(zip(names, cameras(len(names)), strict=True), start=1):
         x, y, z, w = Rotation.from_matrix(camera.rotation).as_quat()

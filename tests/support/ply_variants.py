@@ -27,7 +27,7 @@ def columns_of(cloud: GaussianCloud) -> dict[str, np.ndarray]:
 
 
 def without(columns: Mapping[str, np.ndarray], *beginnings: str) -> dict[str, np.ndarray]:
-    """Return the columns whose names do not begin so."""
+    """Return the columns whose names begin with none of ``beginnings``."""
     return {name: values for name, values in columns.items() if not name.startswith(beginnings)}
 
 

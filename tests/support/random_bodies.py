@@ -19,14 +19,14 @@ FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 
 @dataclass(frozen=True)
 class Shape:
-    """A block with a flat base on z = 0 of any size and material, wider or narrower at its top, with jittered nodes."""
+    """A block of any size and material with a flat base on z = 0, wider or narrower at its top, with jittered nodes."""
 
     counts: tuple[int, int, int]
     """Number of nodes along x, y and z."""
     size: tuple[float, float, float]
     """Size along x, y and z, m."""
     taper: float
-    """Width of the top over that of the base."""
+    """Width of the top divided by that of the base."""
     sag: float
     poisson_ratio: float
     damping_ratio: float

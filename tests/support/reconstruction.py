@@ -22,7 +22,7 @@ COLMAP_BIN = {
 
 
 def photos_of_noise(folder: Path) -> Path:
-    """Write three photos of 64 by 48 pixels, each some kilobytes."""
+    """Write three photos of 64 by 48 pixels, each a few kilobytes large."""
     folder.mkdir()
     random = np.random.default_rng(0)
     for number in range(3):
@@ -31,7 +31,7 @@ def photos_of_noise(folder: Path) -> Path:
 
 
 def model(*_: object, capacity: int | None = None, **__: object) -> SimpleNamespace:
-    """Substitute of COLMAP's reconstruction; each file is truncated to ``capacity`` bytes, as on a full disk."""
+    """Substitute for COLMAP's reconstruction; each file is truncated to ``capacity`` bytes, as on a full disk."""
 
     def write_binary(folder: str) -> None:
         for name, data in COLMAP_BIN.items():

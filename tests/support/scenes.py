@@ -59,7 +59,7 @@ def write_scene(folder: Path, *, views: int, size: int) -> np.ndarray:
 
 
 def round_ones(means: np.ndarray, radius: float, bands: int = 1) -> GaussianCloud:
-    """Return round opaque Gaussians at ``means`` (n, 3)."""
+    """Return isotropic opaque Gaussians at ``means`` (n, 3)."""
     return GaussianCloud.from_numpy(
         means,
         np.tile([1.0, 0.0, 0.0, 0.0], (len(means), 1)),
@@ -75,7 +75,7 @@ def lying(means: np.ndarray) -> GaussianCloud:
 
 
 def shell(count: int = 1500) -> np.ndarray:
-    """(n, 3) even points on a ball of diameter 1 that touches the floor at the origin (Fibonacci lattice)."""
+    """(n, 3) points of a Fibonacci lattice on a sphere of diameter 1 that touches the floor at the origin."""
     z = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
     angle = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count)
     around = np.sqrt(1.0 - z**2)

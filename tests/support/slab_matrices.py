@@ -10,7 +10,7 @@ import numpy as np
 def slab_matrix(parts: Sequence[int], between: int, *, seed: int) -> np.ndarray:
     """(n, n) random positive definite matrix with independent diagonal blocks of ``parts`` unknowns.
 
-    They are only coupled by the last ``between`` unknowns.
+    The blocks are coupled only by the last ``between`` unknowns.
     """
     count = sum(parts) + between
     half = np.random.default_rng(seed).normal(size=(count, count))

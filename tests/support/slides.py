@@ -48,7 +48,7 @@ class Slide:
 
 @cache
 def slide(*, struck: bool = False) -> Slide:
-    """Simulate 24 steps with drag; with ``struck`` a blow on one side in the ninth step, and wind from then on."""
+    """Simulate 24 steps with drag; with ``struck``, a blow hits one side in the ninth step, then wind blows."""
     creature = coarse_creature(block_mesh(), forward=FORWARD)
     body, muscles, geometry = creature.stepper.body, creature.stepper.muscles, creature.stepper.geometry
     stepper = LocomotionStepper(body, muscles, geometry, settings=LocomotionSettings(drag=0.3), device="cpu")
@@ -68,6 +68,6 @@ def slide(*, struck: bool = False) -> Slide:
             node_velocities(body, np.tile(target, (len(positions), 1)), 0.01),
         ]
         state, memory, done = stepper.advance(state.with_velocity_kick(kick), memory, objectives, DT)
-        assert len(done) == 1, "a kick is of one step"
+        assert len(done) == 1, "the velocity change of a step must not be divided into substeps"
         reports += done
     return Slide(stepper, start, tuple(reports), tuple(kicks))

@@ -28,7 +28,7 @@ def square(task: int, progress: ProgressCallback) -> int:
 
 
 class Dying:
-    """Task that kills its process the number of times given for it; it records each start in a file."""
+    """Callable that kills its process as often as ``deaths`` says for a task, and records each start in a file."""
 
     def __init__(self, folder: Path, deaths: dict[int, int]) -> None:
         self.folder, self.deaths = folder, deaths
@@ -45,7 +45,7 @@ def threads(task: Any, progress: ProgressCallback) -> dict[str, Any]:
     """Return the number of threads of a worker."""
     import numpy
 
-    # Only its import matters.
+    # NumPy is imported only because it loads BLAS.
     assert numpy is not None
     blas = [info["num_threads"] for info in threadpool_info() if info["user_api"] == "blas"]
     return {"blas": blas, "available": available_threads(), "process": os.getpid()}

@@ -72,7 +72,7 @@ def defined_names(tree: ast.AST) -> Iterator[tuple[str, int]]:
 
 
 def identifier_findings(path: str, source: str) -> Iterator[Finding]:
-    """Yield identifiers of a Python or TypeScript file that are ruled out, each name once a file."""
+    """Yield identifiers of a Python or TypeScript file that are ruled out, each name once per file."""
     if path.endswith(".ts"):
         found = MEMBER.finditer(source)
         names = [(match[1] or match[2], source.count("\n", 0, match.start()) + 1) for match in found]
@@ -118,7 +118,7 @@ def docstring_findings(path: str, tokens: list[tokenize.TokenInfo]) -> Iterator[
 
 
 def lines_of(text: str) -> str:
-    """Return only the line ends of a text, so that line numbers stay."""
+    """Return only the line ends of a text, so that line numbers do not change."""
     return "\n" * text.count("\n")
 
 

@@ -15,7 +15,7 @@ CONTACT = [
         "contact/detection.py",
         "_BISECTIONS = 40",
         "_BISECTIONS = 39",
-        "39 bisections end an arm within 2e-12 of its length of the ground, 40 within 1e-12",
+        "39 bisections end an arm within 2e-12 of its length from the ground, 40 within 1e-12",
     ),
     Survivor(
         "contact/selection.py",
@@ -39,7 +39,7 @@ CONTACT = [
         "contact/detection.py",
         "if len(members) > 8:",
         "if len(members) > 7:",
-        "the hull of eight points contains the deepest of them, as the eight do",
+        "the deepest of eight points is also a vertex of their hull",
     ),
     Survivor(
         "contact/detection.py",
@@ -51,7 +51,7 @@ CONTACT = [
         "contact/detection.py",
         "arms /= max(float(np.abs(arms).max()), 1e-300)",
         "arms /= max(float(np.abs(arms).max()), -1.0)",
-        "it avoids a division by zero, and no tetrahedron has all its points at their mean",
+        "the bound only avoids a division by zero, but no tetrahedron has all its points at their mean",
     ),
     Survivor(
         "contact/batch_contacts.py",

@@ -33,19 +33,19 @@ LOCOMOTION = [
         "kernels/locomotion/active_set.py",
         "for row in range(search.side.shape[0]):",
         "for row in range(search.side.shape[ 1]):",
-        "reached only if rounding makes the factor of a subset of rows fail that have one together",
+        "reached only if rounding lets the factorisation fail for a subset of rows that can be factored together",
     ),
     Survivor(
         "locomotion/audit.py",
         "if len(points) == 0:",
         "if len(points) <= 0:",
-        "a count is never less than nothing",
+        "a count is never negative",
     ),
     Survivor(
         "locomotion/batch.py",
         "break",
         "continue",
-        "one more iteration, which has nothing to do",
+        "one more iteration, which changes nothing",
     ),
     Survivor(
         "locomotion/solvers.py",
@@ -63,6 +63,6 @@ LOCOMOTION = [
         "locomotion/threads.py",
         "@cache",
         "",
-        "the libraries are searched again each time, in some milliseconds, with the same result",
+        "the libraries are searched again each time, in a few milliseconds, with the same result",
     ),
 ]

@@ -75,7 +75,7 @@ SEGMENTATION = [
         "segmentation/plane_fit.py",
         "if plane.heights(pixels.origins[0]) < 0.0:",
         "if plane.heights(pixels.origins[ -1]) < 0.0:",
-        "any camera gives the side of all; with cameras on both sides there is none",
+        "all cameras are on one side, which any of them gives; with cameras on both sides the side is undefined",
     ),
     Survivor(
         "segmentation/plane_fit.py",
@@ -111,7 +111,7 @@ SEGMENTATION = [
         "segmentation/clearance.py",
         "hidden = (behind > 0.0) & (depth > behind) & (alpha > 0.0)",
         "hidden = (behind > 0.0) & (depth > behind) & (alpha >= 0.0)",
-        "where alpha is 0 the depth is 0, which is behind nothing",
+        "where alpha is 0 the depth is 0, which is never behind a surface",
     ),
     Survivor(
         "segmentation/graph_cut.py",
@@ -141,7 +141,7 @@ SEGMENTATION = [
         "segmentation/mask_model.py",
         "whole = cv2.resize(masks[0, 0, best].astype(np.float32), (SIDE, SIDE))[:height, :width]",
         "whole = cv2.resize(masks[ -1, 0, best].astype(np.float32), (SIDE, SIDE))[:height, :width]",
-        "there is exactly one, or the output is rejected before",
+        "there is exactly one batch entry; any other output has already been rejected",
     ),
     Survivor(
         "segmentation/object_spec.py",
