@@ -17,12 +17,13 @@ from egs_warp.io.glb import write_glb
 from egs_warp.io.sequence import numbered_captures
 from egs_warp.io.writing import WRITERS
 from tests.support.captures import assert_same_bits, make_cloud
+from tests.support.ply_variants import columns_of, ply_of
 
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_a_capture_becomes_another(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_ply(tmp_path / "a.ply", make_cloud(400, 2))
-    out = tmp_path / f"b{WRITERS[kind][0]}"
+    out = tmp_path / f"b{WRITERS[kind].ending}"
     assert main(["convert", str(tmp_path / "a.ply"), str(out), *(["--to", kind] if kind == "spz4" else [])]) == 0
     said = capsys.readouterr().out
     assert said.startswith(f"wrote {out} (")
@@ -31,7 +32,7 @@ def test_a_capture_becomes_another(kind: str, tmp_path: Path, capsys: pytest.Cap
     assert ("viewers take +y as up" in said) == (kind in ("spz", "spz4", "glb"))
     read = read_capture(out)
     assert read.cloud.count == 400
-    if WRITERS[kind][0] == ".spz":
+    if WRITERS[kind].ending == ".spz":
         assert read.format == f".spz version {4 if kind == 'spz4' else 3}"
 
 
@@ -64,8 +65,8 @@ def test_reported_losses_are_the_actual_ones(tmp_path: Path) -> None:
 def test_each_gaussian_is_compared_with_itself(kind: str, tmp_path: Path) -> None:
     """Also where the file has another order: an outline of look-alikes would hide that all are displaced."""
     cloud = make_cloud(300)
-    path = tmp_path / f"a{WRITERS[kind][0]}"
-    order = WRITERS[kind][1](path, cloud)
+    path = tmp_path / f"a{WRITERS[kind].ending}"
+    order = WRITERS[kind](path, cloud)
     assert (order is None) == (kind not in ("compressed-ply", "sog"))
     order = np.arange(300) if order is None else order
     assert sorted(order) == list(range(300))
@@ -209,6 +210,22 @@ def test_a_sequence_is_converted_in_the_order_of_its_numbers(
     assert "frame2.ply to frame10.ply" in capsys.readouterr().out
     for number, cloud in clouds.items():
         assert_same_bits(read_capture(tmp_path / "out" / f"frame{number}.ply", device="cpu").cloud, cloud)
+
+
+def test_each_note_of_a_sequence_is_printed_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    columns = columns_of(make_cloud(8))
+    for number, bad in enumerate((None, 3, 5, 5)):
+        x = columns["x"].copy()
+        if bad is not None:
+            x[bad] = np.nan
+        (tmp_path / f"frame{number}.ply").write_bytes(ply_of(columns | {"x": x}))
+    assert main(["convert", str(tmp_path), str(tmp_path / "out"), "--to", "ply"]) == 0
+    said = capsys.readouterr().err.splitlines()
+    note = "1 Gaussians left out that have a value that is not finite (x of number {})"
+    assert [line for line in said if "left out" in line] == [
+        f"egs-warp: {tmp_path}/frame1.ply: {note.format(3)}",
+        f"egs-warp: {tmp_path}/frame2.ply: {note.format(5)} (and 1 more of the files)",
+    ]
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
