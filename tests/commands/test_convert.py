@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.cli import main
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.io import read_capture, write_ply, write_spz
+from egs_warp.io import Capture, read_capture, write_ply, write_spz
 from egs_warp.io.conversion_loss import conversion_loss
 from egs_warp.io.glb import write_glb
 from egs_warp.io.sequence import numbered_captures
 from egs_warp.io.writing import WRITERS
+from egs_warp.pipelines.edit_capture import CaptureEdits, edit_capture, merge_captures
 from tests.support.captures import assert_same_bits, make_cloud
 from tests.support.ply_variants import columns_of, ply_of
 
@@ -226,6 +228,67 @@ def test_each_note_of_a_sequence_is_printed_once(tmp_path: Path, capsys: pytest.
         f"egs-warp: {tmp_path}/frame1.ply: {note.format(3)}",
         f"egs-warp: {tmp_path}/frame2.ply: {note.format(5)} (and 1 more of the files)",
     ]
+
+
+def _capture(path: Path, *comments: str) -> Capture:
+    path.write_bytes(ply_of(columns_of(make_cloud(5)), comments=comments))
+    return read_capture(path, device="cpu")
+
+
+BRUSH = ("Exported from Brush", "Vertical axis: y")
+
+
+@pytest.mark.parametrize(
+    ("comments", "edits", "up", "vertical_axis"),
+    [
+        (("Vertical axis: z",), {}, (0, 0, 1), None),
+        (("Vertical axis: z",), {"rotation": (90, 0, 0)}, (0, -1, 0), None),
+        (("Vertical axis: z",), {"up": (0, -1, 0)}, (0, 1, 0), None),
+        (("Vertical axis: z",), {"up": (0, -1, 0), "rotation": (0, 0, 90)}, (-1, 0, 0), None),
+        ((), {"up": (0, 0, 2), "rotation": (90, 0, 0)}, (0, 0, 1), None),
+        ((), {"rotation": (90, 0, 0)}, None, None),
+        (BRUSH, {"scale": 2.0}, None, 1),
+        (BRUSH, {"rotation": (0, 0, 90)}, None, 0),
+        (BRUSH, {"rotation": (30, 0, 0)}, None, None),
+        (BRUSH, {"up": (0, -1, 0)}, (0, 1, 0), None),
+    ],
+)
+def test_up_turns_with_the_capture(
+    comments: tuple[str, ...],
+    edits: dict[str, Any],
+    up: tuple[float, ...] | None,
+    vertical_axis: int | None,
+    tmp_path: Path,
+) -> None:
+    """A given up direction is turned to +y first, then by the rotation."""
+    chosen = CaptureEdits(**{name: np.array(value) if name != "scale" else value for name, value in edits.items()})
+    capture = _capture(tmp_path / "a.ply", *comments)
+    edited, _ = edit_capture(capture, chosen)
+    assert edited.vertical_axis == vertical_axis
+    if up is None:
+        assert edited.up is None
+        return
+    np.testing.assert_allclose(edited.up, up, atol=1e-12)
+    before = capture.up if chosen.up is None else chosen.up
+    assert before is not None
+    axes = chosen.frame().axes
+    np.testing.assert_allclose(axes @ (before / np.linalg.norm(before)), up, atol=1e-12)
+    np.testing.assert_allclose(edited.means.numpy(), capture.means.numpy() @ axes.T, atol=1e-6)
+
+
+def test_merged_captures_have_a_vertical_axis_if_all_have_it(tmp_path: Path) -> None:
+    a, b = _capture(tmp_path / "a.ply", *BRUSH), _capture(tmp_path / "b.ply", *BRUSH)
+    assert merge_captures([a, b]).vertical_axis == 1
+    for other in (_capture(tmp_path / "c.ply"), _capture(tmp_path / "d.ply", "Vertical axis: y")):
+        merged = merge_captures([a, other])
+        assert (merged.up, merged.vertical_axis) == (None, None)
+        assert "the captures have different up directions" in merged.notes[-1]
+
+
+def test_the_name_of_a_vertical_axis_is_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _capture(tmp_path / "a.ply", *BRUSH)
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.ply")]) == 0
+    assert "the name of the vertical axis is lost" in capsys.readouterr().out
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
