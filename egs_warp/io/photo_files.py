@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
 
+from egs_warp.io.paths import path_inside, stays_inside
+
 UNREADABLE_SUFFIXES = (".heic", ".heif")
 """Suffixes of pictures that are found, but cannot be read."""
 _PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".jp2", ".avif", *UNREADABLE_SUFFIXES)
@@ -151,7 +153,7 @@ class PhotoFiles:
                     return FoundFile(path)
         if not self._masks:
             return FoundFile(None)
-        inside = _inside(photo, self._root)
+        inside = path_inside(photo, self._root)
         if inside is None:
             return FoundFile(None)
         parents = tuple(_key(part) for part in inside.parts[:-1])
@@ -195,10 +197,8 @@ class PhotoFiles:
         for text in dict.fromkeys((name, name.replace("\\", "/"))):
             for folder in folders:
                 path = folder / text
-                if "\0" in text:
-                    continue
-                if not _stays_inside(text):
-                    inside = _inside(path, self._root)
+                if not stays_inside(text):
+                    inside = path_inside(path, self._root)
                     if inside is None:
                         continue
                     path = self._root / inside
@@ -375,15 +375,3 @@ def _only(candidates: list[_Candidate], root: Path) -> FoundFile:
         names = " and ".join(os.path.relpath(one.path, root) for one in chosen[:2])
         return FoundFile(None, f"{len(chosen)} files fit its name, {names}; keep one, or give its folder in the poses")
     return FoundFile(chosen[0].path, by_name=True)
-
-
-def _stays_inside(name: str) -> bool:
-    """Return True if the relative path ``name`` does not leave its folder."""
-    path = PurePath(name)
-    return not path.is_absolute() and not path.drive and ".." not in path.parts
-
-
-def _inside(path: Path, folder: Path) -> Path | None:
-    """Return ``path``, with ``..`` resolved, relative to ``folder``; None if it is not inside."""
-    resolved, base = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
-    return resolved.relative_to(base) if resolved.is_relative_to(base) else None
