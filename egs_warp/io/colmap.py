@@ -52,22 +52,26 @@ _TRACK_BYTES = 8
 
 
 @dataclass(frozen=True)
-class ColmapView:
-    """One registered photo."""
-
-    name: str
+class _Intrinsics:
     width: int
     height: int
     fx: float
     fy: float
     cx: float
     cy: float
+    lens: Lens | None
+    """Distortion of the photo; None for a pinhole."""
+
+
+@dataclass(frozen=True)
+class ColmapView(_Intrinsics):
+    """One registered photo."""
+
+    name: str
     quaternion: np.ndarray
     """(4,) w x y z, world to camera, far from zero."""
     translation: np.ndarray
     """(3,) world to camera."""
-    lens: Lens | None
-    """Distortion of the photo; None for a pinhole."""
 
 
 @dataclass(frozen=True)
@@ -88,17 +92,6 @@ class SparsePoints:
     """(n, 3) float64, world units."""
     colours: np.ndarray
     """(n, 3) float64, 0 to 1."""
-
-
-@dataclass(frozen=True)
-class _Intrinsics:
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    lens: Lens | None
 
 
 @dataclass(frozen=True)
@@ -142,7 +135,7 @@ def read_colmap_model(folder: Path) -> ColmapModel:
             numbers = " ".join(f"{value:g}" for value in pose.values)
             raise UserError(f"{where} has no valid pose ({numbers}); reconstruct the scene again")
         intrinsics = _intrinsics(cameras_file, pose.camera, cameras[pose.camera])
-        return ColmapView(pose.name, quaternion=values[:4], translation=values[4:], **vars(intrinsics))
+        return ColmapView(**vars(intrinsics), name=pose.name, quaternion=values[:4], translation=values[4:])
 
     empty = f"{images_file}: it has no images; reconstruct the scene again"
     views, excluded = convert_each(((pose.name, pose) for pose in poses), view, empty)
