@@ -124,6 +124,8 @@ def read_colmap_model(folder: Path) -> ColmapModel:
     cameras = (_binary_cameras if suffix == ".bin" else _text_cameras)(_read(cameras_file), cameras_file)
     poses = (_binary_poses if suffix == ".bin" else _text_poses)(_read(images_file), images_file)
 
+    known: dict[int, _Intrinsics] = {}
+
     def view(pose: _Pose) -> ColmapView:
         where = f"{images_file}: image {pose.name}"
         if pose.camera not in cameras:
@@ -134,8 +136,9 @@ def read_colmap_model(folder: Path) -> ColmapModel:
         if not np.isfinite(values).all() or not 1e-3 < np.abs(values[:4]).max() < 1e3:
             numbers = " ".join(f"{value:g}" for value in pose.values)
             raise UserError(f"{where} has no valid pose ({numbers}); reconstruct the scene again")
-        intrinsics = _intrinsics(cameras_file, pose.camera, cameras[pose.camera])
-        return ColmapView(**vars(intrinsics), name=pose.name, quaternion=values[:4], translation=values[4:])
+        if pose.camera not in known:
+            known[pose.camera] = _intrinsics(cameras_file, pose.camera, cameras[pose.camera])
+        return ColmapView(**vars(known[pose.camera]), name=pose.name, quaternion=values[:4], translation=values[4:])
 
     empty = f"{images_file}: it has no images; reconstruct the scene again"
     views, excluded = convert_each(((pose.name, pose) for pose in poses), view, empty)

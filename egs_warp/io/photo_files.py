@@ -82,6 +82,7 @@ class PhotoFiles:
     def __init__(self, root: Path, *, preferred: Sequence[str] = ()) -> None:
         """Create the search in ``root``; ``preferred`` are names of folders that take precedence."""
         self._root = root
+        self._known_folders: dict[Path, bool] = {}
         self._known_mask_folders: dict[tuple[Path, int], list[tuple[Path, int]]] = {}
         self._order = (*preferred, *(name for name in _PHOTO_FOLDERS if name not in preferred))
 
@@ -195,10 +196,14 @@ class PhotoFiles:
     def _direct(self, name: str, folders: Sequence[Path]) -> Path | None:
         """Return the file ``name`` in the first of ``folders`` that contains it, if it is inside the data set."""
         for text in dict.fromkeys((name, name.replace("\\", "/"))):
+            stays = stays_inside(text)
             for folder in folders:
-                path = folder / text
-                if not stays_inside(text):
-                    inside = path_inside(path, self._root)
+                # Most folders do not exist, and there may be many photos.
+                if stays and not self._exists(folder):
+                    continue
+                path = os.path.join(folder, text)
+                if not stays:
+                    inside = path_inside(Path(path), self._root)
                     if inside is None:
                         continue
                     path = self._root / inside
@@ -207,6 +212,12 @@ class PhotoFiles:
                     if os.path.isfile(f"{path}{suffix}"):
                         return Path(f"{path}{suffix}")
         return None
+
+    def _exists(self, folder: Path) -> bool:
+        """Return True if ``folder`` existed when it was first asked for."""
+        if folder not in self._known_folders:
+            self._known_folders[folder] = os.path.isdir(folder)
+        return self._known_folders[folder]
 
     @cached_property
     def _files(self) -> list[tuple[Path, tuple[str, ...]]]:
