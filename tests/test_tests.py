@@ -13,6 +13,8 @@ ACROSS = {
     "io/test_by_hand.py",
     "io/test_errors.py",
     "io/test_ply_variants.py",
+    "io/test_spark.py",
+    "io/test_splat_transform.py",
     "meshing/test_body_frame.py",
     "motions/test_runs.py",
     "pipelines/test_invariance.py",

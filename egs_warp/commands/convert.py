@@ -79,7 +79,7 @@ def _convert_files(args: argparse.Namespace, stack: ExitStack) -> int:
     from egs_warp.io.limits import missing_error
     from egs_warp.io.run_folder import check_no_file_of_a_run
     from egs_warp.io.sequence import numbered_captures
-    from egs_warp.io.writing import WRITERS, is_capture_name, stored_origin, write_capture, writer_of
+    from egs_warp.io.writing import WRITERS, is_capture_name, writer_of
     from egs_warp.launching import use_device
     from egs_warp.pipelines.edit_capture import edit_capture, merge_captures
     from egs_warp.pipelines.progress import conversion_bar
@@ -98,30 +98,34 @@ def _convert_files(args: argparse.Namespace, stack: ExitStack) -> int:
         check_no_file_of_a_run(args.out)
         jobs = [(args.captures, args.out)]
     else:
-        ending, write = WRITERS[args.to]
+        write = WRITERS[args.to]
         sources = numbered_captures(first)
         if args.out.exists() and args.out.samefile(first):
             raise UserError(f"{args.out}: is the input folder; give another one")
         if is_capture_name(args.out) and not args.out.is_dir():
             raise UserError(f"{args.out}: several files are written; give the name of a folder")
         folder = stack.enter_context(result_folder(args.out))
-        jobs = [([source], folder / f"{source.name.split('.')[0]}{ending}") for source in sources]
+        jobs = [([source], folder / f"{source.name.split('.')[0]}{write.ending}") for source in sources]
     use_device("cpu")
     lines: list[str] = []
-    notes: list[str] = []
+    sources_of: dict[str, list[Path]] = {}
     for sources, target in tqdm(jobs, desc="convert", unit="file", disable=len(jobs) == 1, file=sys.stderr):
         capture = merge_captures([read_capture(source) for source in sources])
         capture, changes = edit_capture(capture, edits)
         with conversion_bar(target.name, quiet=len(jobs) > 1) as begins:
             begins("write")
-            order = write_capture(target, with_degree(capture.cloud, args.degree), write, origin=capture.origin)
+            order = write(target, with_degree(capture.cloud, args.degree), origin=capture.origin)
+            for note in capture.notes:
+                sources_of.setdefault(note, []).append(sources[0])
             if not lines:
-                notes = [note if len(sources) > 1 else f"{sources[0]}: {note}" for note in capture.notes]
                 begins("compare")
-                origin = stored_origin(write, capture.origin)
+                origin = write.stored_origin(capture.origin)
                 lines = [*changes, *conversion_loss(capture, read_capture(target), order, origin=origin)]
-    for note in notes:
-        print_note(note)
+    for note, noted in sources_of.items():
+        # Notes of merged captures name their files.
+        name = "" if len(args.captures) > 1 else f"{noted[0]}: "
+        others = f" (and {len(noted) - 1} more of the files)" if len(noted) > 1 else ""
+        print_note(f"{name}{note}{others}")
     size = sum(_size(target) for _, target in jobs)
     input_size = sum(_size(source) for sources, _ in jobs for source in sources)
     names = str(jobs[0][1]) if len(jobs) == 1 else f"{jobs[0][1]} to {jobs[-1][1].name}"

@@ -32,13 +32,13 @@ class SceneInput:
     """Scene with the user's selections, in scene units."""
 
     cloud: GaussianCloud
-    """The whole scene."""
+    """The whole scene, with the facts of its file (``Capture``)."""
     posed: Sequence[PosedImage]
     """Cameras of ``--cameras`` with their photos; empty without that flag."""
     spec: ObjectSpec | None
     """Selection of ``--object``; None without that flag."""
     up: np.ndarray | None
-    """(3,) unit vector, from ``--up`` or the capture file; None if unknown."""
+    """(3,) unit vector, from ``--up``; None without that flag."""
     plane: Plane | None
     """Plane of ``--plane``; None to estimate it."""
     notes: tuple[str, ...]
@@ -105,9 +105,7 @@ def read_scene(args: argparse.Namespace) -> SceneInput:
         raise UserError("--mask-model: it needs clicks; give --object +u,v@photo")
     if args.object is not None:
         spec = read_object(args.object, capture.cloud, posed, view=args.view, mask_model=args.mask_model)
-    if up is None and capture.up is not None:
-        up = np.asarray(capture.up, dtype=float)
     notes = capture.notes
     if poses is not None:
         notes = (*notes, *poses.messages)
-    return SceneInput(capture.cloud, posed, spec, up, plane, notes)
+    return SceneInput(capture, posed, spec, up, plane, notes)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import numpy as np
 
 from egs_warp.geometry.camera import Camera
 from egs_warp.io.colmap import ColmapView, SparsePoints, read_colmap_model, read_colmap_points
 from egs_warp.io.metashape import read_metashape
+from egs_warp.io.paths import stays_inside
 from egs_warp.io.photo_files import PhotoAndMask, PhotoFiles
 from egs_warp.io.ply import read_point_ply
 from egs_warp.io.pose_files import PoseSource, find_poses
@@ -64,16 +65,10 @@ def read_points(path: Path | str) -> SparsePoints | None:
     tree = parse_pose_json(source)
     name = tree.get("ply_file_path") if isinstance(tree, dict) else "input.ply"
     name = name.replace("\\", "/") if isinstance(name, str) else None
-    if name is None or not _is_inside(name) or not os.path.isfile(source.parent / name):
+    if name is None or not stays_inside(name) or not os.path.isfile(source.parent / name):
         return None
     positions, colours = read_point_ply(source.parent / name)
     return SparsePoints(positions, colours) if len(positions) else None
-
-
-def _is_inside(name: str) -> bool:
-    """Return True if the relative path ``name`` does not leave its folder."""
-    path = PurePath(name)
-    return "\0" not in name and not path.is_absolute() and not path.drive and ".." not in path.parts
 
 
 def _from_colmap(source: PoseSource) -> PosedImages:

@@ -18,6 +18,7 @@ from egs_warp.io.gltf import decode_glb, decode_gltf, is_glb
 from egs_warp.io.limits import FREE_BYTES, INFLATION, MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.origin import relative_positions
 from egs_warp.io.outliers import without_not_finite, without_outliers
+from egs_warp.io.paths import stays_inside
 from egs_warp.io.ply import decode_ply, read_header
 from egs_warp.io.raw import EXTREME_LOGIT, RawCapture
 from egs_warp.io.sog import SogFiles, decode_sog
@@ -230,7 +231,6 @@ def _decode_sog_or_streamed(source: Path, meta: bytes, read: Callable[[str], byt
 
 
 def _inside(name: str, source: Path) -> PurePosixPath:
-    path = PurePosixPath(name)
-    if path.is_absolute() or ".." in path.parts:
+    if not stays_inside(name):
         raise UserError(f"{source}: meta.json names {name!r}, which lies outside the capture; export it again")
-    return path
+    return PurePosixPath(name)

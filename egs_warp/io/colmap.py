@@ -52,22 +52,26 @@ _TRACK_BYTES = 8
 
 
 @dataclass(frozen=True)
-class ColmapView:
-    """One registered photo."""
-
-    name: str
+class _Intrinsics:
     width: int
     height: int
     fx: float
     fy: float
     cx: float
     cy: float
+    lens: Lens | None
+    """Distortion of the photo; None for a pinhole."""
+
+
+@dataclass(frozen=True)
+class ColmapView(_Intrinsics):
+    """One registered photo."""
+
+    name: str
     quaternion: np.ndarray
     """(4,) w x y z, world to camera, far from zero."""
     translation: np.ndarray
     """(3,) world to camera."""
-    lens: Lens | None
-    """Distortion of the photo; None for a pinhole."""
 
 
 @dataclass(frozen=True)
@@ -88,17 +92,6 @@ class SparsePoints:
     """(n, 3) float64, world units."""
     colours: np.ndarray
     """(n, 3) float64, 0 to 1."""
-
-
-@dataclass(frozen=True)
-class _Intrinsics:
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    lens: Lens | None
 
 
 @dataclass(frozen=True)
@@ -131,6 +124,8 @@ def read_colmap_model(folder: Path) -> ColmapModel:
     cameras = (_binary_cameras if suffix == ".bin" else _text_cameras)(_read(cameras_file), cameras_file)
     poses = (_binary_poses if suffix == ".bin" else _text_poses)(_read(images_file), images_file)
 
+    known: dict[int, _Intrinsics] = {}
+
     def view(pose: _Pose) -> ColmapView:
         where = f"{images_file}: image {pose.name}"
         if pose.camera not in cameras:
@@ -141,8 +136,9 @@ def read_colmap_model(folder: Path) -> ColmapModel:
         if not np.isfinite(values).all() or not 1e-3 < np.abs(values[:4]).max() < 1e3:
             numbers = " ".join(f"{value:g}" for value in pose.values)
             raise UserError(f"{where} has no valid pose ({numbers}); reconstruct the scene again")
-        intrinsics = _intrinsics(cameras_file, pose.camera, cameras[pose.camera])
-        return ColmapView(pose.name, quaternion=values[:4], translation=values[4:], **vars(intrinsics))
+        if pose.camera not in known:
+            known[pose.camera] = _intrinsics(cameras_file, pose.camera, cameras[pose.camera])
+        return ColmapView(**vars(known[pose.camera]), name=pose.name, quaternion=values[:4], translation=values[4:])
 
     empty = f"{images_file}: it has no images; reconstruct the scene again"
     views, excluded = convert_each(((pose.name, pose) for pose in poses), view, empty)

@@ -41,6 +41,8 @@ def conversion_loss(
         lines.append("the mark of training with antialiasing is lost")
     if before.up is not None and after.up is None:
         lines.append("the up direction is lost")
+    if before.vertical_axis is not None and after.up is None and after.vertical_axis is None:
+        lines.append("the name of the vertical axis is lost")
     if after.up is not None and (before.up is None or not np.allclose(before.up, after.up)):
         lines.append("the axes are unchanged, but this format's viewers take +y as up")
     if before.origin is not None and origin is None:

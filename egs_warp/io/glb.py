@@ -13,8 +13,8 @@ import numpy as np
 
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.atomic import atomic_write
+from egs_warp.io.gltf import BINARY_CHUNK, EXTENSION, JSON_CHUNK, MAGIC
 
-_EXTENSION = "KHR_gaussian_splatting"
 _FLOAT = 5126
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
@@ -33,13 +33,13 @@ def write_glb(path: Path | str, cloud: GaussianCloud, *, origin: np.ndarray | No
     attributes = {
         "POSITION": means,
         "COLOR_0": fallback,
-        f"{_EXTENSION}:ROTATION": cloud.rotations.numpy()[:, [1, 2, 3, 0]],
-        f"{_EXTENSION}:SCALE": np.exp(cloud.log_scales.numpy()),
-        f"{_EXTENSION}:OPACITY": opacities,
+        f"{EXTENSION}:ROTATION": cloud.rotations.numpy()[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": np.exp(cloud.log_scales.numpy()),
+        f"{EXTENSION}:OPACITY": opacities,
     }
     for degree in range(cloud.sh_degree + 1):
         for k in range(2 * degree + 1):
-            attributes[f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{k}"] = sh[:, degree**2 + k]
+            attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k}"] = sh[:, degree**2 + k]
     pieces = [np.ascontiguousarray(values, "<f4").tobytes() for values in attributes.values()]
     starts = np.cumsum([0, *(len(piece) for piece in pieces)]).tolist()
     accessors: list[dict[str, object]] = [
@@ -58,7 +58,7 @@ def write_glb(path: Path | str, cloud: GaussianCloud, *, origin: np.ndarray | No
     text = json.dumps(
         {
             "asset": {"version": "2.0", "generator": "egs_warp"},
-            "extensionsUsed": [_EXTENSION],
+            "extensionsUsed": [EXTENSION],
             "scene": 0,
             "scenes": [{"nodes": [0]}],
             "nodes": [node],
@@ -68,7 +68,7 @@ def write_glb(path: Path | str, cloud: GaussianCloud, *, origin: np.ndarray | No
                         {
                             "mode": 0,
                             "attributes": {name: k for k, name in enumerate(attributes)},
-                            "extensions": {_EXTENSION: splats},
+                            "extensions": {EXTENSION: splats},
                         }
                     ]
                 }
@@ -84,7 +84,7 @@ def write_glb(path: Path | str, cloud: GaussianCloud, *, origin: np.ndarray | No
     text += b" " * (-len(text) % 4)
     binary = b"".join(pieces)
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        file.write(np.array([0x46546C67, 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A], "<u4").tobytes())
+        file.write(np.array([MAGIC, 2, 28 + len(text) + len(binary), len(text), JSON_CHUNK], "<u4").tobytes())
         file.write(text)
-        file.write(np.array([len(binary), 0x004E4942], "<u4").tobytes())
+        file.write(np.array([len(binary), BINARY_CHUNK], "<u4").tobytes())
         file.write(binary)

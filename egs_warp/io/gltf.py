@@ -11,7 +11,7 @@ import base64
 import binascii
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
@@ -21,6 +21,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.affine import is_proper_similarity, transformed_colours, transformed_shapes
 from egs_warp.io.gltf_nodes import INSTANCING, placements
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
+from egs_warp.io.paths import stays_inside
 from egs_warp.io.raw import BAND_4, SH_COUNTS, RawCapture, bands_note, logits_from_opacities
 from egs_warp.io.spz import decode_spz
 from egs_warp.io.text import parse_json
@@ -36,7 +37,8 @@ _SURFACES = ("KHR_materials_", "EXT_materials_", "KHR_texture_", "EXT_texture_",
 """Beginnings of the names of extensions that change only how meshes look."""
 _MAX_COPIES = 1 << 21
 """Maximum number of Gaussians that instances add to those of the file."""
-_JSON, _BINARY = 0x4E4F534A, 0x004E4942
+MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
+"""Numbers of a .glb: its first one, and the kinds of its two chunks."""
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _HALF_TURN = np.diag([-1.0, 1.0, -1.0])
@@ -61,13 +63,13 @@ def decode_glb(data: bytes, source: Path) -> RawCapture:
             raise UserError(f"{source}: truncated: a chunk of {size} bytes extends beyond the file; copy it again")
         chunks.setdefault(kind, data[place + 8 : place + 8 + size])
         place += 8 + size
-    text = chunks.get(_JSON, b"")
+    text = chunks.get(JSON_CHUNK, b"")
     if not text or len(text) > MAX_TEXT_BYTES:
         raise UserError(f"{source}: .glb without a JSON chunk of at most {MAX_TEXT_BYTES} bytes; export it again")
 
     def read(number: int, uri: str | None) -> bytes | None:
         if uri is None:
-            return chunks.get(_BINARY, b"") if number == 0 else None
+            return chunks.get(BINARY_CHUNK, b"") if number == 0 else None
         return _buffer(uri, source)
 
     return _decode(text, source, read)
@@ -88,8 +90,8 @@ def _buffer(uri: str, source: Path) -> bytes:
             return base64.b64decode(uri.partition(",")[2], validate=True)
         except binascii.Error as error:
             raise UserError(f"{source}: a buffer is not valid base64 ({error}); export it again") from error
-    name = PurePosixPath(unquote(uri))
-    if name.is_absolute() or ".." in name.parts or ":" in uri or "\0" in str(name):
+    name = unquote(uri)
+    if not stays_inside(name) or ":" in uri:
         raise UserError(f"{source}: it names {uri!r}, which lies outside its folder; export it again")
     return read_bytes(source.parent / name)
 

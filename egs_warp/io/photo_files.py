@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
 
+from egs_warp.io.paths import path_inside, stays_inside
+
 UNREADABLE_SUFFIXES = (".heic", ".heif")
 """Suffixes of pictures that are found, but cannot be read."""
 _PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".jp2", ".avif", *UNREADABLE_SUFFIXES)
@@ -80,6 +82,7 @@ class PhotoFiles:
     def __init__(self, root: Path, *, preferred: Sequence[str] = ()) -> None:
         """Create the search in ``root``; ``preferred`` are names of folders that take precedence."""
         self._root = root
+        self._known_folders: dict[Path, bool] = {}
         self._known_mask_folders: dict[tuple[Path, int], list[tuple[Path, int]]] = {}
         self._order = (*preferred, *(name for name in _PHOTO_FOLDERS if name not in preferred))
 
@@ -151,7 +154,7 @@ class PhotoFiles:
                     return FoundFile(path)
         if not self._masks:
             return FoundFile(None)
-        inside = _inside(photo, self._root)
+        inside = path_inside(photo, self._root)
         if inside is None:
             return FoundFile(None)
         parents = tuple(_key(part) for part in inside.parts[:-1])
@@ -193,12 +196,14 @@ class PhotoFiles:
     def _direct(self, name: str, folders: Sequence[Path]) -> Path | None:
         """Return the file ``name`` in the first of ``folders`` that contains it, if it is inside the data set."""
         for text in dict.fromkeys((name, name.replace("\\", "/"))):
+            stays = stays_inside(text)
             for folder in folders:
-                path = folder / text
-                if "\0" in text:
+                # Most folders do not exist, and there may be many photos.
+                if stays and not self._exists(folder):
                     continue
-                if not _stays_inside(text):
-                    inside = _inside(path, self._root)
+                path = os.path.join(folder, text)
+                if not stays:
+                    inside = path_inside(Path(path), self._root)
                     if inside is None:
                         continue
                     path = self._root / inside
@@ -207,6 +212,12 @@ class PhotoFiles:
                     if os.path.isfile(f"{path}{suffix}"):
                         return Path(f"{path}{suffix}")
         return None
+
+    def _exists(self, folder: Path) -> bool:
+        """Return True if ``folder`` existed at its first use."""
+        if folder not in self._known_folders:
+            self._known_folders[folder] = os.path.isdir(folder)
+        return self._known_folders[folder]
 
     @cached_property
     def _files(self) -> list[tuple[Path, tuple[str, ...]]]:
@@ -375,15 +386,3 @@ def _only(candidates: list[_Candidate], root: Path) -> FoundFile:
         names = " and ".join(os.path.relpath(one.path, root) for one in chosen[:2])
         return FoundFile(None, f"{len(chosen)} files fit its name, {names}; keep one, or give its folder in the poses")
     return FoundFile(chosen[0].path, by_name=True)
-
-
-def _stays_inside(name: str) -> bool:
-    """Return True if the relative path ``name`` does not leave its folder."""
-    path = PurePath(name)
-    return not path.is_absolute() and not path.drive and ".." not in path.parts
-
-
-def _inside(path: Path, folder: Path) -> Path | None:
-    """Return ``path``, with ``..`` resolved, relative to ``folder``; None if it is not inside."""
-    resolved, base = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
-    return resolved.relative_to(base) if resolved.is_relative_to(base) else None

@@ -29,7 +29,7 @@ from egs_warp.io.text import decimal_number, decode_text
 _FILM_WIDTH = 36.0
 """Longer side for which ``f`` is given, mm."""
 _SEPARATORS = (";", "\t", ",")
-_OTHER_NAMES = {"z": "alt", "altitude": "alt", "yaw": "heading"}
+_OTHER_NAMES = {"z": "alt", "altitude": "alt"}
 _REQUIRED = ("x", "y", "alt", "heading", "pitch", "roll", "f")
 _OPTIONAL = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 _EXPORT = "export Internal/External camera parameters"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -17,41 +18,45 @@ from egs_warp.io.sog_writer import write_sog
 from egs_warp.io.splat import write_splat
 from egs_warp.io.spz import write_spz
 
-CaptureWriter = Callable[[Path, GaussianCloud], "np.ndarray | None"]
-"""Writer of a capture; returns the number (n,) in the cloud of each Gaussian of the file, or None if it keeps the
-order."""
-WRITERS: dict[str, tuple[str, CaptureWriter]] = {
-    "compressed-ply": (".compressed.ply", write_compressed_ply),
-    "ply": (".ply", write_ply),
-    "spz": (".spz", write_spz),
-    "spz4": (".spz", partial(write_spz, version=4)),
-    "sog": (".sog", write_sog),
-    "splat": (".splat", write_splat),
-    "glb": (".glb", write_glb),
+
+@dataclass(frozen=True)
+class CaptureWriter:
+    """Writer of one kind of splat file."""
+
+    ending: str
+    """Ending of the file's name."""
+    function: Callable[..., np.ndarray | None]
+    """Called with path and cloud, and with ``origin`` if the file stores it. Returns the number (n,) in the cloud of
+    each Gaussian of the file, or None if it keeps the order."""
+    stores_origin: bool = False
+    """True if the file includes the offset of a georeferenced capture (``Capture.origin``)."""
+
+    def stored_origin(self, origin: np.ndarray | None) -> np.ndarray | None:
+        """Return the ``origin`` (3,) of a capture if the file includes it, else None."""
+        return origin if self.stores_origin else None
+
+    def __call__(self, path: Path, cloud: GaussianCloud, *, origin: np.ndarray | None = None) -> np.ndarray | None:
+        """Write ``cloud``, with the ``origin`` (3,) of its capture if the file includes it; return what ``function``
+        returns."""
+        return self.function(path, cloud, origin=origin) if self.stores_origin else self.function(path, cloud)
+
+
+WRITERS: dict[str, CaptureWriter] = {
+    "compressed-ply": CaptureWriter(".compressed.ply", write_compressed_ply),
+    "ply": CaptureWriter(".ply", write_ply, stores_origin=True),
+    "spz": CaptureWriter(".spz", write_spz),
+    "spz4": CaptureWriter(".spz", partial(write_spz, version=4)),
+    "sog": CaptureWriter(".sog", write_sog),
+    "splat": CaptureWriter(".splat", write_splat),
+    "glb": CaptureWriter(".glb", write_glb, stores_origin=True),
 }
-"""Ending and writer of each kind of splat file. A longer ending comes before a shorter one that it ends in. Of two
-kinds with one ending, the first is the default."""
-
-
-def stored_origin(write: CaptureWriter, origin: np.ndarray | None) -> np.ndarray | None:
-    """Return the ``origin`` (3,) of a capture if its file includes it: only .ply and .glb do."""
-    return origin if write in (write_ply, write_glb) else None
-
-
-def write_capture(
-    path: Path, cloud: GaussianCloud, write: CaptureWriter, *, origin: np.ndarray | None
-) -> np.ndarray | None:
-    """Call ``write``, and return what it returns; ``origin`` (3,) of the capture is included if possible
-    (``stored_origin``)."""
-    if stored_origin(write, origin) is None:
-        return write(path, cloud)
-    (write_ply if write is write_ply else write_glb)(path, cloud, origin=origin)
-    return None
+"""Writer of each kind of splat file. A longer ending comes before a shorter one that it ends in. Of two kinds with one
+ending, the first is the default."""
 
 
 def is_capture_name(path: Path) -> bool:
     """Return True if ``path`` ends as a capture does; it is then the name of a file and not of a folder."""
-    return path.name.lower().endswith(tuple(ending for ending, _ in WRITERS.values()))
+    return path.name.lower().endswith(tuple(write.ending for write in WRITERS.values()))
 
 
 def writer_of(path: Path, *, kind: str | None = None) -> CaptureWriter:
@@ -59,15 +64,15 @@ def writer_of(path: Path, *, kind: str | None = None) -> CaptureWriter:
 
     Raises ``UserError`` for a folder, for a name without a known ending, and for one with the ending of another kind.
     """
-    endings = dict.fromkeys(ending for ending, _ in WRITERS.values())
+    endings = dict.fromkeys(write.ending for write in WRITERS.values())
     name = path.name.lower()
     ending = next((ending for ending in endings if name.endswith(ending) and name != ending), None)
-    allowed = list(endings) if kind is None else [WRITERS[kind][0]]
+    allowed = list(endings) if kind is None else [WRITERS[kind].ending]
     if ending not in allowed:
         near = did_you_mean(path.suffix, allowed)
         raise UserError(f"{path}: give a name that ends in {', '.join(allowed)}{near}")
     if path.is_dir():
         raise UserError(f"{path}: is a folder; give the name of a file")
     if kind is not None:
-        return WRITERS[kind][1]
-    return next(write for known, write in WRITERS.values() if known == ending)
+        return WRITERS[kind]
+    return next(write for write in WRITERS.values() if write.ending == ending)

@@ -238,7 +238,8 @@ def estimated_up(cloud: GaussianCloud, *, advice: str) -> tuple[np.ndarray, str]
     axis = int(np.argmax(np.abs(up)))
     is_axis = np.abs(up[axis]) == 1.0
     name = f"{'-' if up[axis] < 0 else '+'}{'xyz'[axis]}" if is_axis else ",".join(f"{x:.3f}" for x in up)
-    return up, f"up is estimated as {name} ({reason}); if that is wrong, {advice}"
+    verb = "is" if file_up is not None else "is estimated as"
+    return up, f"up {verb} {name} ({reason}); if that is wrong, {advice}"
 
 
 def plane_below(cloud: GaussianCloud, ground: HeightField) -> Plane:

@@ -35,9 +35,9 @@ class CaptureEdits:
     drop_floaters: bool = False
     """True to leave out small parts that are connected to nothing."""
     up: np.ndarray | None = None
-    """(3,) Direction that is turned to +y."""
+    """(3,) Direction that points up, and is turned to +y."""
     rotation: np.ndarray | None = None
-    """(3,) Angles in degrees, about the x axis first, then y, then z."""
+    """(3,) Angles in degrees, about the x axis first, then y, then z; up is turned as well."""
     scale: float = 1.0
     """Factor of all lengths, positive."""
     translation: np.ndarray | None = None
@@ -52,26 +52,34 @@ class CaptureEdits:
             raise ArgumentError("count", "give a number of at least 1", value=self.count)
 
     @property
-    def changes_nothing(self) -> bool:
-        """True for the default."""
-        return not (self.drop_floaters or self.moves) and self.box is None and self.count is None
-
-    @property
     def moves(self) -> bool:
         """True if positions change."""
         return self.scale != 1.0 or any(x is not None for x in (self.up, self.rotation, self.translation))
 
     def frame(self) -> BodyFrame:
         """Return the transform to the edited capture."""
-        turn = Rotation.identity()
-        if self.up is not None:
-            # About x if that suffices, so that y-down and z-up captures keep left and right.
-            turn = _shortest_turn(self.up)
-        if self.rotation is not None:
-            turn = Rotation.from_euler("xyz", self.rotation, degrees=True) * turn
-        axes = turn.as_matrix()
+        # About x if that suffices, so that y-down and z-up captures keep left and right.
+        upright = Rotation.identity() if self.up is None else _shortest_turn(self.up)
+        axes = (self._turn() * upright).as_matrix()
         shift = np.zeros(3) if self.translation is None else self.translation
         return BodyFrame(axes, -(shift @ axes) / self.scale, self.scale)
+
+    def _turn(self) -> Rotation:
+        """Return the turn by ``rotation``, which follows that of ``up`` to +y."""
+        if self.rotation is None:
+            return Rotation.identity()
+        return Rotation.from_euler("xyz", self.rotation, degrees=True)
+
+    def turned_up(self, up: np.ndarray | None, vertical_axis: int | None) -> tuple[np.ndarray | None, int | None]:
+        """Return the up direction (3,) and the vertical axis of the edited capture (``Capture``), from those of the
+        capture."""
+        if self.up is not None:
+            up, vertical_axis = Y_UP, None
+        turn = self._turn()
+        if vertical_axis is not None:
+            line = np.abs(turn.apply(np.eye(3)[vertical_axis]))
+            vertical_axis = int(np.argmax(line)) if line.max() > 1.0 - 1e-9 else None
+        return None if up is None else turn.apply(up), vertical_axis
 
 
 def _shortest_turn(up: np.ndarray) -> Rotation:
@@ -101,9 +109,10 @@ def merge_captures(captures: Sequence[Capture]) -> Capture:
     sh = [np.pad(cloud.sh.numpy(), ((0, 0), (0, coefficients - cloud.sh.shape[1]), (0, 0))) for cloud in clouds]
     means, origin, notes = relative_positions(np.concatenate([_file_positions(capture) for capture in captures]))
     notes = (*(f"{capture.source}: {note}" for capture in captures for note in capture.notes), *notes)
-    up, antialiased = first.up, all(capture.antialiased for capture in captures)
-    if not all(_same(capture.up, up) for capture in captures):
-        up = None
+    up, vertical_axis = first.up, first.vertical_axis
+    antialiased = all(capture.antialiased for capture in captures)
+    if not all(_same(capture.up, up) and capture.vertical_axis == vertical_axis for capture in captures):
+        up, vertical_axis = None, None
         notes = (*notes, "the captures have different up directions; they were merged in their own axes")
     if antialiased != any(capture.antialiased for capture in captures):
         notes = (*notes, "only some of the captures were trained with antialiasing; the mark is dropped")
@@ -112,7 +121,7 @@ def merge_captures(captures: Sequence[Capture]) -> Capture:
         antialiased=antialiased,
         device=str(first.cloud.device),
     )
-    return first.with_cloud(cloud, origin=origin, up=up, notes=notes, rows=None)
+    return first.with_cloud(cloud, origin=origin, up=up, vertical_axis=vertical_axis, notes=notes, rows=None)
 
 
 def _file_positions(capture: Capture) -> np.ndarray:
@@ -146,7 +155,6 @@ def edit_capture(capture: Capture, edits: CaptureEdits) -> tuple[Capture, tuple[
         stays = ~floaters(cloud)
         lines.append(f"floaters: {cloud.count - int(stays.sum())} of {cloud.count} Gaussians left out")
         cloud = cloud.subset(stays)
-    up = capture.up
     if edits.moves:
         frame = edits.frame()
         if origin is not None:
@@ -155,13 +163,13 @@ def edit_capture(capture: Capture, edits: CaptureEdits) -> tuple[Capture, tuple[
             frame = replace(frame, origin=np.zeros(3))
             origin = origin if origin.any() else None
         cloud = to_body_frame(cloud, frame)
-        up = None if up is None else frame.axes @ up
-        up = Y_UP if edits.up is not None and edits.rotation is None else up
     if edits.count is not None and edits.count < cloud.count:
         before = cloud.count
         cloud, moved = decimated(cloud, edits.count)
         lines.append(f"decimated: {before} Gaussians merged to {cloud.count}, moved by {moved:.2g} units (RMS)")
-    return capture.with_cloud(cloud, origin=origin, up=up, rows=None), tuple(lines)
+    up, vertical_axis = edits.turned_up(capture.up, capture.vertical_axis)
+    edited = capture.with_cloud(cloud, origin=origin, up=up, vertical_axis=vertical_axis, rows=None)
+    return edited, tuple(lines)
 
 
 def floaters(cloud: GaussianCloud) -> np.ndarray:

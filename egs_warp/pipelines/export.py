@@ -60,7 +60,7 @@ def export_splats(
         UserError: The run does not have ``frame``, ``out`` has other frames, or is a file of another kind, of several
             frames or of a run.
     """
-    ending, write = WRITERS[kind]
+    write = WRITERS[kind]
     frames, target = chosen_frames(run, frame=frame, every=every), Path(out)
     if is_capture_name(target) and not target.is_dir():
         if frame is None:
@@ -70,7 +70,7 @@ def export_splats(
         paths = [target]
     else:
         # Several single frames may be in one folder.
-        paths = frame_paths(target, frames, ending, alone=frame is None)
+        paths = frame_paths(target, frames, write.ending, alone=frame is None)
     deformer = run.deformer()
     place = _Y_UP if kind == "glb" else run.capture_frame
     for index, path in zip(tqdm(frames, desc="export", unit="frame", disable=quiet), paths, strict=True):

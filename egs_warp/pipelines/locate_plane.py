@@ -14,6 +14,7 @@ from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
+from egs_warp.io.capture import Capture
 from egs_warp.io.planes import PlaneRecord
 from egs_warp.segmentation.base_plane import guess_up
 from egs_warp.segmentation.ground import ROUGH, measure_ground
@@ -98,7 +99,7 @@ def locate_plane(
         cloud: The capture.
         spec: Specification of the object.
         cameras: Cameras of the capture, if known.
-        up: (3,) Approximate up; None estimates it.
+        up: (3,) Approximate up; None is that of the file (``Capture.up``), else estimated.
         plane: The plane, if known; then only the object is segmented.
 
     Raises:
@@ -109,6 +110,8 @@ def locate_plane(
         segmentation = segment(cloud, plane, spec)
         return LocatedPlane(plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, ())
     tilt = _MAX_TILT
+    if up is None and isinstance(cloud, Capture):
+        up = cloud.up
     if up is None:
         up, reason, tilt = _up_of(cloud, cameras)
         notes.append(f"up is taken to be {','.join(f'{x:.2f}' for x in up)} ({reason}); if not, say which way is up")
@@ -244,7 +247,8 @@ def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray,
         if values[0] < 0.1 * values[1]:
             axis = vectors[:, 0]
             return axis * (1.0 if axis @ ups > 0 else -1.0), "the cameras are held upright", _MAX_TILT_OF_CAMERAS
-    return *guess_up(cloud, tilted=False), _MAX_TILT
+    vertical_axis = cloud.vertical_axis if isinstance(cloud, Capture) else None
+    return *guess_up(cloud, tilted=False, vertical_axis=vertical_axis), _MAX_TILT
 
 
 def _standing(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, tilt: float) -> tuple[Plane, Segmentation]:

@@ -18,7 +18,6 @@ from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, hole_under
 from egs_warp.inpainting.underside import with_underside
-from egs_warp.io.capture import Capture
 from egs_warp.io.planes import PlaneRecord, write_planes
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder
@@ -145,8 +144,6 @@ def prepare_scene(
     """
     check_cloud(cloud)
     options = options or SceneOptions()
-    if up is None and isinstance(cloud, Capture):
-        up = cloud.up
     up = None if up is None else direction_of(up, "up")
     progress("plane", 0.0)
     located = locate_plane(cloud, spec, cameras=cameras, up=up, plane=plane)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,18 +12,20 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.cli import main
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.io import read_capture, write_ply, write_spz
+from egs_warp.io import Capture, read_capture, write_ply, write_spz
 from egs_warp.io.conversion_loss import conversion_loss
 from egs_warp.io.glb import write_glb
 from egs_warp.io.sequence import numbered_captures
 from egs_warp.io.writing import WRITERS
+from egs_warp.pipelines.edit_capture import CaptureEdits, edit_capture, merge_captures
 from tests.support.captures import assert_same_bits, make_cloud
+from tests.support.ply_variants import columns_of, ply_of
 
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_a_capture_becomes_another(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_ply(tmp_path / "a.ply", make_cloud(400, 2))
-    out = tmp_path / f"b{WRITERS[kind][0]}"
+    out = tmp_path / f"b{WRITERS[kind].ending}"
     assert main(["convert", str(tmp_path / "a.ply"), str(out), *(["--to", kind] if kind == "spz4" else [])]) == 0
     said = capsys.readouterr().out
     assert said.startswith(f"wrote {out} (")
@@ -31,7 +34,7 @@ def test_a_capture_becomes_another(kind: str, tmp_path: Path, capsys: pytest.Cap
     assert ("viewers take +y as up" in said) == (kind in ("spz", "spz4", "glb"))
     read = read_capture(out)
     assert read.cloud.count == 400
-    if WRITERS[kind][0] == ".spz":
+    if WRITERS[kind].ending == ".spz":
         assert read.format == f".spz version {4 if kind == 'spz4' else 3}"
 
 
@@ -64,8 +67,8 @@ def test_reported_losses_are_the_actual_ones(tmp_path: Path) -> None:
 def test_each_gaussian_is_compared_with_itself(kind: str, tmp_path: Path) -> None:
     """Also where the file has another order: an outline of look-alikes would hide that all are displaced."""
     cloud = make_cloud(300)
-    path = tmp_path / f"a{WRITERS[kind][0]}"
-    order = WRITERS[kind][1](path, cloud)
+    path = tmp_path / f"a{WRITERS[kind].ending}"
+    order = WRITERS[kind](path, cloud)
     assert (order is None) == (kind not in ("compressed-ply", "sog"))
     order = np.arange(300) if order is None else order
     assert sorted(order) == list(range(300))
@@ -209,6 +212,83 @@ def test_a_sequence_is_converted_in_the_order_of_its_numbers(
     assert "frame2.ply to frame10.ply" in capsys.readouterr().out
     for number, cloud in clouds.items():
         assert_same_bits(read_capture(tmp_path / "out" / f"frame{number}.ply", device="cpu").cloud, cloud)
+
+
+def test_each_note_of_a_sequence_is_printed_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    columns = columns_of(make_cloud(8))
+    for number, bad in enumerate((None, 3, 5, 5)):
+        x = columns["x"].copy()
+        if bad is not None:
+            x[bad] = np.nan
+        (tmp_path / f"frame{number}.ply").write_bytes(ply_of(columns | {"x": x}))
+    assert main(["convert", str(tmp_path), str(tmp_path / "out"), "--to", "ply"]) == 0
+    said = capsys.readouterr().err.splitlines()
+    note = "1 Gaussians left out that have a value that is not finite (x of number {})"
+    assert [line for line in said if "left out" in line] == [
+        f"egs-warp: {tmp_path}/frame1.ply: {note.format(3)}",
+        f"egs-warp: {tmp_path}/frame2.ply: {note.format(5)} (and 1 more of the files)",
+    ]
+
+
+def _capture(path: Path, *comments: str) -> Capture:
+    path.write_bytes(ply_of(columns_of(make_cloud(5)), comments=comments))
+    return read_capture(path, device="cpu")
+
+
+BRUSH = ("Exported from Brush", "Vertical axis: y")
+
+
+@pytest.mark.parametrize(
+    ("comments", "edits", "up", "vertical_axis"),
+    [
+        (("Vertical axis: z",), {}, (0, 0, 1), None),
+        (("Vertical axis: z",), {"rotation": (90, 0, 0)}, (0, -1, 0), None),
+        (("Vertical axis: z",), {"up": (0, -1, 0)}, (0, 1, 0), None),
+        (("Vertical axis: z",), {"up": (0, -1, 0), "rotation": (0, 0, 90)}, (-1, 0, 0), None),
+        ((), {"up": (0, 0, 2), "rotation": (90, 0, 0)}, (0, 0, 1), None),
+        ((), {"rotation": (90, 0, 0)}, None, None),
+        (BRUSH, {"scale": 2.0}, None, 1),
+        (BRUSH, {"rotation": (0, 0, 90)}, None, 0),
+        (BRUSH, {"rotation": (30, 0, 0)}, None, None),
+        (BRUSH, {"up": (0, -1, 0)}, (0, 1, 0), None),
+    ],
+)
+def test_up_turns_with_the_capture(
+    comments: tuple[str, ...],
+    edits: dict[str, Any],
+    up: tuple[float, ...] | None,
+    vertical_axis: int | None,
+    tmp_path: Path,
+) -> None:
+    """A given up direction is turned to +y first, then by the rotation."""
+    chosen = CaptureEdits(**{name: np.array(value) if name != "scale" else value for name, value in edits.items()})
+    capture = _capture(tmp_path / "a.ply", *comments)
+    edited, _ = edit_capture(capture, chosen)
+    assert edited.vertical_axis == vertical_axis
+    if up is None:
+        assert edited.up is None
+        return
+    np.testing.assert_allclose(edited.up, up, atol=1e-12)
+    before = capture.up if chosen.up is None else chosen.up
+    assert before is not None
+    axes = chosen.frame().axes
+    np.testing.assert_allclose(axes @ (before / np.linalg.norm(before)), up, atol=1e-12)
+    np.testing.assert_allclose(edited.means.numpy(), capture.means.numpy() @ axes.T, atol=1e-6)
+
+
+def test_merged_captures_have_a_vertical_axis_if_all_have_it(tmp_path: Path) -> None:
+    a, b = _capture(tmp_path / "a.ply", *BRUSH), _capture(tmp_path / "b.ply", *BRUSH)
+    assert merge_captures([a, b]).vertical_axis == 1
+    for other in (_capture(tmp_path / "c.ply"), _capture(tmp_path / "d.ply", "Vertical axis: y")):
+        merged = merge_captures([a, other])
+        assert (merged.up, merged.vertical_axis) == (None, None)
+        assert "the captures have different up directions" in merged.notes[-1]
+
+
+def test_the_name_of_a_vertical_axis_is_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _capture(tmp_path / "a.ply", *BRUSH)
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.ply")]) == 0
+    assert "the name of the vertical axis is lost" in capsys.readouterr().out
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from egs_warp.assets import scene
-from egs_warp.commands.scene_input import SceneInput
+from egs_warp.commands.scene_input import SceneInput, read_scene
 from egs_warp.commands.scene_planes import planes_of_scene
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture
 from egs_warp.segmentation.object_spec import ObjectSpec
-from tests.support.scenes import FLOOR
+from tests.support.ply_variants import columns_of, ply_of
+from tests.support.scenes import FLOOR, ball_on_floor
 
 
 def test_further_planes_are_level_patches_in_their_own_colours() -> None:
@@ -29,6 +33,23 @@ def test_further_planes_are_level_patches_in_their_own_colours() -> None:
     red, green, _ = np.moveaxis(picture, -1, 0)
     assert (red - green > 90).mean() > 0.01
     assert (green - red > 60).mean() > 0.002
+
+
+@pytest.mark.parametrize(
+    ("comments", "note"),
+    [
+        (["Exported from Brush", "Vertical axis: z"], "up is taken to be 0.00,0.00,1.00 (the file names the axis z"),
+        (["Vertical axis: z"], "plane "),
+    ],
+)
+def test_up_of_the_file_is_used(comments: list[str], note: str, tmp_path: Path) -> None:
+    cloud, _ = ball_on_floor()
+    (tmp_path / "a.ply").write_bytes(ply_of(columns_of(cloud), comments=comments))
+    flags = dict.fromkeys(("up", "plane", "cameras", "mask_model", "view"))
+    flags |= {"device": "cpu", "capture": str(tmp_path / "a.ply"), "object": ["0,-0.5,0.5"]}
+    found = planes_of_scene(read_scene(argparse.Namespace(**flags)), plane_mask=None, view=None, count=1)
+    assert found.notes[0].startswith(note)
+    assert found.planes[0].normal[2] > np.cos(np.radians(0.3))
 
 
 def test_a_capture_with_nothing_flat_has_one_plane() -> None:

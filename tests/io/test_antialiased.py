@@ -32,9 +32,9 @@ CAMERA = Camera.look_at(np.array([7.0, 1.0, 2.0]), np.zeros(3), np.array([0.0, 0
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_every_format_that_can_state_it_does(kind: str, tmp_path: Path) -> None:
-    ending, write = WRITERS[kind]
+    write = WRITERS[kind]
     for cloud in (CLOUD, make_cloud(40, 1)):
-        path = tmp_path / f"a{ending}"
+        path = tmp_path / f"a{write.ending}"
         write(path, cloud)
         assert read_capture(path, device="cpu").antialiased is (cloud.antialiased and kind != "splat")
 
@@ -58,7 +58,7 @@ def test_the_flag_of_spz_version_1(tmp_path: Path) -> None:
     [({"antialias": True}, True), ({"model": "antialiased"}, True), ({"model": "2dgs"}, False), ({"model": 3}, False)],
 )
 def test_entries_of_sog(entries: dict[str, object], expected: bool, tmp_path: Path) -> None:
-    WRITERS["sog"][1](tmp_path / "a.sog", replace(CLOUD, antialiased=False))
+    WRITERS["sog"](tmp_path / "a.sog", replace(CLOUD, antialiased=False))
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         archive.extractall(tmp_path / "a")
     meta = json.loads((tmp_path / "a" / "meta.json").read_text())

@@ -244,7 +244,7 @@ def test_a_text_ply_needs_little_more_memory_than_its_numbers(tmp_path: Path) ->
     assert megabytes_of(read_on_cpu, path) < 4 * 4 + 16
 
 
-@pytest.mark.parametrize("ending", [ending for ending, _ in WRITERS.values()])
+@pytest.mark.parametrize("ending", [write.ending for write in WRITERS.values()])
 def test_memory_to_read_a_valid_capture_is_bounded(tmp_path: Path, ending: str) -> None:
     """The limit is four times the size of the file plus six times the size of the cloud, 14 single-precision numbers
     per Gaussian. Packed formats are decoded in double precision."""

@@ -41,7 +41,7 @@ def _in_capture(run: FinishedRun, frame: int) -> np.ndarray:
 )
 def test_splat_files_are_in_the_frame_of_the_capture(run: FinishedRun, tmp_path: Path, kind: str, tolerance: float):
     (path,) = export_splats(run, tmp_path, kind, frame=-1, quiet=True)
-    assert path.name == f"frame0012{WRITERS[kind][0]}"
+    assert path.name == f"frame0012{WRITERS[kind].ending}"
     means = read_capture(path).cloud.means.numpy()
     expected = _in_capture(run, 12)
     assert len(means) == len(expected)
@@ -52,7 +52,7 @@ def test_splat_files_are_in_the_frame_of_the_capture(run: FinishedRun, tmp_path:
 
 @pytest.mark.parametrize("kind", ["ply", "compressed-ply", "spz4", "glb"])
 def test_a_single_frame_may_be_a_file(run: FinishedRun, tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]):
-    file = tmp_path / f"one{WRITERS[kind][0]}"
+    file = tmp_path / f"one{WRITERS[kind].ending}"
     assert main(["export", str(run.folder), "--to", kind, "--frame", "4", "--out", str(file)]) == 0
     assert file.is_file() and [path.name for path in tmp_path.iterdir()] == [file.name]
     assert capsys.readouterr().out.startswith(f"wrote {file} (")

@@ -16,7 +16,8 @@ import pytest
 import egs_warp as egs
 from egs_warp.assets import pawn
 from egs_warp.motions.sequence import Stance
-from egs_warp.pipelines.creature import PlacedCage
+from egs_warp.pipelines.creature import PlacedCage, estimated_up
+from tests.support.ply_variants import columns_of, ply_of
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +38,23 @@ def test_a_creature_is_made_of_a_capture_alone(creature: egs.Creature) -> None:
     (note,) = creature.notes
     assert note.startswith("up is estimated as +z (guessed: ") and note.endswith("; if that is wrong, give up")
     np.testing.assert_allclose(creature.frame.axes[2], [0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("comments", "note"),
+    [
+        (["Vertical axis: z"], "up is +z (the file defines it); if that is wrong, give --up"),
+        (
+            ["Exported from Brush", "Vertical axis: z"],
+            "up is estimated as +z (the file names the axis z, and its direction is guessed); if that is wrong, give"
+            " --up",
+        ),
+    ],
+)
+def test_a_file_may_define_up(comments: list[str], note: str, capture: egs.Capture, tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(ply_of(columns_of(capture), comments=comments))
+    up, said = estimated_up(egs.read_capture(tmp_path / "a.ply"), advice="give --up")
+    assert (up.tolist(), said) == ([0.0, 0.0, 1.0], note)
 
 
 @pytest.mark.parametrize("up", ["z", "+Z", " z ", [0, 0, 2], np.array([0.0, 0.0, 1.0])])

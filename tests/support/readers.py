@@ -156,12 +156,24 @@ def _capture(path: Path) -> None:
     assert np.allclose(np.linalg.norm(values["rotations"], axis=1), 1.0, atol=1e-5)
 
 
-def _cameras(path: Path) -> None:
-    for one in read_cameras(path):
+def _cameras(path: Path) -> list[PosedImage]:
+    images = read_cameras(path)
+    for one in images:
         camera = one.camera
         assert 1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE
         numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.translation, *camera.rotation.ravel()]
         assert np.isfinite(numbers).all() and min(camera.fx, camera.fy) > 0
+    return images
+
+
+def _photos(path: Path) -> None:
+    """Read the cameras, and their photos, undistorted."""
+    for one in _cameras(path):
+        if one.image is not None:
+            photo = read_photo(one, max_side=20)
+            assert photo.colour.shape == (photo.camera.height, photo.camera.width, 3)
+            assert np.isfinite(photo.colour).all()
+            assert photo.alpha is None or 0.0 <= photo.alpha.min() <= photo.alpha.max() <= 1.0
 
 
 def _colmap(path: Path) -> None:
@@ -314,9 +326,22 @@ _COLMAP = {
 }
 
 
+_LENSES = {
+    "PINHOLE": "nan 30 12 8",
+    "SIMPLE_DIVISION": "30 12 8 -0.1",
+    "DIVISION": "30 31 12 8 0.2",
+    "EUCM": "30 30 12 8 0.5 1.1",
+    "RAD_TAN_THIN_PRISM_FISHEYE": "30 30 12 8 0.1 0 0 0 0 0 0.01 0 0 0.01 0 0",
+    "FULL_OPENCV": "30 30 12 8 0.1 0 0.01 0 0 0.2 0 0",
+}
+"""Lenses of COLMAP with their numbers; no photo uses the first one."""
 _REALITY_SCAN = (
     b"#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
     b"a.png,1.5,-2,0.25,30,85,-1,35,0.001,-0.002,0.1,0,0,0,0.01,0\n"
+)
+_REALITY_SCAN_COMMAS = (
+    b"\xef\xbb\xbf#name;x;y;z;heading;pitch;roll;f;px;py;k1;k2;k3;k4;t1;t2\r\n"
+    b'"a.png";1,5;-2;0,25;30;85;-1;35;0;0;0,1;0;0;0;0;0\r\n'
 )
 _METASHAPE = b"""<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk><sensors>
 <sensor id="0" type="frame">
@@ -327,8 +352,23 @@ _METASHAPE = b"""<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"
 </cameras></chunk></document>"""
 
 
+_OLD_METASHAPE = b"""<document version="1.2.0"><chunk><sensors><sensor id="0" type="fisheye"><resolution width="24"
+height="16"/><calibration type="fisheye" class="adjusted"><resolution width="24" height="16"/><fx>30</fx><fy>31</fy>
+<cx>12</cx><cy>8</cy><k1>0.1</k1><p1>0.01</p1></calibration></sensor></sensors><cameras>
+<camera id="0" sensor_id="0" label="a.png"><transform>1 0 0 0 0 1 0 0 0 0 1 2 0 0 0 1</transform></camera>
+<camera id="1" sensor_id="0" label="b.png"></camera></cameras></chunk></document>"""
+
+
 def _adjacent_photo() -> dict[str, bytes]:
-    return {"a.png": _picture("PNG", "RGB")}
+    return {"a.png": _picture("PNG", "RGB"), "masks/a.png": _picture("PNG", "L")}
+
+
+def _colmap_of_lenses() -> dict[str, bytes]:
+    used = range(1, len(_LENSES))
+    cameras = "\ufeff" + "".join(f"{k} {name} 24 16 {numbers}\n" for k, (name, numbers) in enumerate(_LENSES.items()))
+    images = "".join(f"{k} 1 0 0 0 0 0 2 {k} {k}.png\n" for k in used)
+    photos = dict.fromkeys((f"{k}.png" for k in used), _picture("PNG", "RGB"))
+    return {"cameras.txt": cameras.encode(), "images.txt": images.encode()} | photos
 
 
 _SIZELESS = {
@@ -396,6 +436,26 @@ def _packed_glb() -> bytes:
     return np.array(words, "<u4").tobytes() + text + np.array([len(binary), 0x004E4942], "<u4").tobytes() + binary
 
 
+def _quantized_gltf() -> bytes:
+    """Return a .gltf of integers with a matrix, two nodes of one mesh, and another scene."""
+    tree = json.loads(_gltf())
+    whole = np.round(np.clip(small_cloud().means.numpy(), -3.0, 3.0) * 1000.0).astype("<i2")
+    turns = np.round(small_cloud().rotations.numpy()[:, [1, 2, 3, 0]] * 32767.0).astype("<i2")
+    data = np.pad(whole, ((0, 0), (0, 1))).tobytes() + turns.tobytes()
+    names = tree["meshes"][0]["primitives"][0]["attributes"]
+    for name, start, kind in (("POSITION", 0, "VEC3"), ("KHR_gaussian_splatting:ROTATION", len(data) // 2, "VEC4")):
+        view = {"buffer": 1, "byteOffset": start, "byteLength": len(data) // 2, "byteStride": 8}
+        tree["accessors"][names[name]] |= {"bufferView": len(tree["bufferViews"]), "componentType": 5122, "type": kind}
+        tree["bufferViews"].append(view)
+    tree["accessors"][names["KHR_gaussian_splatting:ROTATION"]]["normalized"] = True
+    uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    tree["buffers"].append({"byteLength": len(data), "uri": uri})
+    matrix = np.diag([0.001, 0.001, 0.002, 1.0]).ravel().tolist()
+    tree["nodes"] = [{"matrix": matrix, "children": [1]}, {"mesh": 0}, {"mesh": 0}]
+    tree |= {"scenes": [{"nodes": [2]}, {"nodes": [0, 2]}], "scene": 1, "extensionsUsed": ["KHR_mesh_quantization"]}
+    return _json(tree)
+
+
 def _packed_gltf() -> bytes:
     return _gltf_of(_packed_glb())
 
@@ -410,6 +470,15 @@ def _ply_variant() -> bytes:
         kinds=dict.fromkeys(columns, "f2") | dict.fromkeys(colours, "u1"),
         layout="binary_big_endian",
     )
+
+
+def _georeferenced_ply() -> bytes:
+    """Return a .ply of doubles far from its origin, with the comments of Postshot and Brush."""
+    columns = columns_of(small_cloud())
+    places = zip("xyz", (431000.0, 5403000.0, 120.0), strict=True)
+    columns |= {name: columns[name].astype(float) + place for name, place in places}
+    comments = ["antialiased 1", "Exported from Brush", "Vertical axis: y"]
+    return ply_of(columns, comments=comments, kinds=dict.fromkeys("xyz", "f8"), newline="\r\n")
 
 
 def _activated_ply() -> bytes:
@@ -516,7 +585,9 @@ READERS: tuple[Reader, ...] = (
     Reader("packed glb", "a.glb", _packed_glb, _capture),
     Reader("packed gltf", "a.gltf", _packed_gltf, _capture, json=True),
     Reader("ply of other tools", "a.ply", _ply_variant, _capture),
+    Reader("quantized gltf", "a.gltf", _quantized_gltf, _capture, json=True),
     Reader("activated ply", "a.ply", _activated_ply, _capture),
+    Reader("georeferenced ply", "a.ply", _georeferenced_ply, _capture),
     Reader("splat", "a.splat", lambda: good_bytes("a.splat"), _capture),
     Reader("sog", "a.sog", lambda: good_bytes("a.sog"), _capture),
     Reader("sog meta", "a.sog", lambda: _sog()["meta.json"], _capture, wrap=_zip_with_meta, json=True),
@@ -538,12 +609,21 @@ READERS: tuple[Reader, ...] = (
         "transforms.json without sizes",
         "transforms.json",
         lambda: _json(_SIZELESS),
-        _cameras,
+        _photos,
         _adjacent_photo,
         json=True,
     ),
-    Reader("reality scan", "cameras.csv", lambda: _REALITY_SCAN, _cameras, _adjacent_photo),
-    Reader("metashape", "cameras.xml", lambda: _METASHAPE, _cameras, _adjacent_photo),
+    Reader(
+        "colmap lenses",
+        "cameras.txt",
+        lambda: _colmap_of_lenses()["cameras.txt"],
+        lambda p: _photos(p.parent),
+        _colmap_of_lenses,
+    ),
+    Reader("reality scan", "cameras.csv", lambda: _REALITY_SCAN, _photos, _adjacent_photo),
+    Reader("reality scan with commas", "cameras.csv", lambda: _REALITY_SCAN_COMMAS, _photos, _adjacent_photo),
+    Reader("metashape", "cameras.xml", lambda: _METASHAPE, _photos, _adjacent_photo),
+    Reader("old metashape", "cameras.xml", lambda: _OLD_METASHAPE, _photos, _adjacent_photo),
     Reader("mask of a photo", "mask.png", lambda: _picture("PNG", "RGBA"), _mask),
     Reader("point ply", "input.ply", _point_ply, _points),
     Reader("plane.json", "plane.json", lambda: _json(_PLANES), _planes, json=True),
