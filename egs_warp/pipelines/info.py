@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING
@@ -18,8 +19,10 @@ from egs_warp.geometry.camera_ring import ring_camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
+from egs_warp.locomotion.objectives import BodyPart
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.motions.feet import Foot, SupportKind, order_counterclockwise, support_kind_of
+from egs_warp.motions.follow import parts_of_body
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script
@@ -73,6 +76,13 @@ class BodyInfo:
         return np.array([local[foot.sole].mean(axis=0) for foot in self.feet]).reshape(-1, 3)
 
     def motions(self) -> dict[str, str | None]:
+    @cached_property
+    def parts(self) -> tuple[BodyPart, ...]:
+        """Head and branches, which keys may name (``parts_of_body``)."""
+        return tuple(
+            part for part in parts_of_body(self.place) if part.name == "head" or part.name.startswith("branch")
+        )
+
         """Return, for each motion, the reason why the body cannot perform it; None if it can."""
         return {name: self._why_not(name) for name in MOTIONS}
 
@@ -109,6 +119,10 @@ class BodyInfo:
                 f"  foot {number}: {_describe_position(sole)}, leg {foot.length / height:.2f}{_foot_note(foot, height)}"
             )
         lines.append(
+        for part in self.parts:
+            local = self.place.ground.local(self.place.standing[part.nodes]) / height
+            span = f"{local[:, 2].min():.2f} to {local[:, 2].max():.2f} up"
+            lines.append(f"  {part.name}: {_describe_position(local.mean(axis=0))}, {span}")
             f"muscles  {self.muscles.fibre_count} fibres, {self.muscles.segment_count} segments"
             f" ({', '.join(f'{count} {kind.value}' for kind, count in kinds.items())})"
         )
@@ -221,6 +235,7 @@ _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#ff7f0e", "#9467bd", "#8c564b", "#
 
 def draw_info(path: Path, info: BodyInfo) -> None:
     """Write a picture (.png): the capture from the front and its left, its limbs, muscles and feet, and ``lines``.
+_HEAD_COLOUR, _BRANCH_COLOUR = "#f2c14e", "#9fd3c7"
 
     Raises ``UserError`` if ``path`` cannot be written.
     """
@@ -364,6 +379,9 @@ def _draw_faces(axes: Axes, info: BodyInfo, *, limbs: bool) -> None:
     axes.add_collection(
         PolyCollection(list(corners[order, :, :2]), facecolors=shade, edgecolors="0.4", linewidths=line)
     )
+    if limbs:
+        for part in info.parts:
+            colours[part.nodes] = to_rgb(_HEAD_COLOUR if part.name == "head" else _BRANCH_COLOUR)
     flat = nodes @ axis[:2].T
     axes.set_xlim(flat[:, 0].min(), flat[:, 0].max())
     axes.set_ylim(flat[:, 1].min(), flat[:, 1].max())
@@ -377,7 +395,10 @@ def _draw_cage(axes: Axes, info: BodyInfo) -> None:
     for number, foot in enumerate(info.feet):
         place = axis[:2] @ info.place.standing[foot.sole].mean(axis=0)
         _number(axes, place, number + 1, _COLOURS[number % len(_COLOURS)])
-    axes.set_title(f"cage of {len(info.place.standing)} nodes, legs coloured")
+    for part in info.parts:
+        x, y = (axis[:2] @ info.place.standing[part.nodes].mean(axis=0)).tolist()
+        axes.text(x, y, part.name, ha="center", va="center", fontsize="small", zorder=5)
+    axes.set_title(f"cage of {len(info.place.standing)} nodes: legs, head and branches")
 
 
 def _draw_muscles(axes: Axes, info: BodyInfo) -> None:
