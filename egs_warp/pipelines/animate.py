@@ -16,12 +16,14 @@ from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import ffmpeg_program
 from egs_warp.locomotion.ledger import energy_balance
+from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.request import MAX_TARGET, MAX_TURN
 from egs_warp.motions.script import Script
 from egs_warp.motions.script import motion as script
 from egs_warp.pipelines import render_data
+from egs_warp.pipelines.balance import balance_note
 from egs_warp.pipelines.capture_warnings import capture_warnings
 from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.film import draw_film
@@ -184,7 +186,7 @@ def animate(
         fronts = () if options.creature.front is not None else (creature.front.description(creature.frame),)
         cage, height = creature.cage, creature.body.height
         warnings = capture_warnings(creature.cloud, cage.mesh, height, thickening=cage.thickening)
-        notes = [*creature.notes, *fronts, *warnings]
+        notes = [*creature.notes, *fronts, *warnings, *([] if balance is None else [balance])]
         for note in notes:
             show_note(note)
         with simulation_bar(quiet=quiet) as show_progress:
@@ -200,6 +202,10 @@ def animate(
                 progress=show_progress,
             )
         # Saved first: an error while rendering does not lose the simulation.
+            balance = None
+            if options.creature.muscles_file is not None:
+                begin_stage("balance")
+                balance = balance_note(creature)
         performance.trajectory.save(run.file("trajectory.npz"))
         energy = energy_balance(performance.trajectory)
         draw_plots(run.file("plots.png"), performance.trajectory, energy)
