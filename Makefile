@@ -101,7 +101,7 @@ paper: setup
 PAGE := egs_warp/web/client
 web: egs_warp/web/page.html
 
-egs_warp/web/page.html: $(PAGE)/package-lock.json $(PAGE)/build.mjs $(PAGE)/tsconfig.json $(wildcard $(PAGE)/src/*)
+egs_warp/web/page.html: $(PAGE)/package-lock.json $(PAGE)/build.mjs $(PAGE)/tsconfig.json $(wildcard $(PAGE)/src/*) egs_warp/render/studio.json
 	@command -v npm > /dev/null || { echo "make web: npm is missing; install node 20 or newer"; exit 1; }
 	cd $(PAGE) && npm ci --no-audit --no-fund --loglevel=error && npm run --silent build
 

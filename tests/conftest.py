@@ -44,6 +44,12 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
             terminalreporter.write_line(f"add to {report.nodeid}:\n    {line}")
 
 
+@pytest.fixture(autouse=True)
+def no_scene_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Use no prepared scenes: the cache belongs to the user."""
+    monkeypatch.setenv("EGS_WARP_CACHE", "")
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """Return the folder of real captures; tests that use it have the marker ``data``."""

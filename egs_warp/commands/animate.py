@@ -70,6 +70,9 @@ def add_parser(commands: Commands) -> None:
     camera = animate.add_argument_group("video")
     add_object_flags(scene, common=common)
     add_camera_flags(camera, size="512", common=common)
+    common.add_argument(
+        "--preview", action="store_true", help="film with fewer pixels and Gaussians; the motion is the same"
+    )
     common.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
     motion.add_argument(
         "--distance",
@@ -337,6 +340,7 @@ def _options(args: argparse.Namespace) -> AnimateOptions:
     options = AnimateOptions(
         **flags("distance", "height", "heading_degrees", "beats", "style", "push", "frames", "seed"),
         shadow=not args.no_shadow,
+        preview=args.preview,
         get_up=not args.no_get_up,
         source=Path(args.capture).name,
         creature=CreatureOptions(**flags("metres_per_unit", "friction")),

@@ -42,6 +42,7 @@ def _muscles(args: argparse.Namespace) -> int:
     from egs_warp.geometry.body_frame import GROUND
     from egs_warp.io import read_capture
     from egs_warp.muscles.plot import check_picture_name, plot_muscles
+    from egs_warp.pipelines.balance import own_muscles_notes
     from egs_warp.pipelines.creature import body_muscles, check_front, choose_front, place_cage
     from egs_warp.pipelines.progress import info_bar
 
@@ -67,8 +68,14 @@ def _muscles(args: argparse.Namespace) -> int:
         begins("muscles")
         body = make_body(standing.cage.mesh, GROUND)
         muscles = body_muscles(body, args.muscles, standing.frame)
+        notes = ()
+        if args.muscles is not None:
+            begins("balance")
+            notes = own_muscles_notes(capture.cloud, standing, facing, args.muscles)
     plot_muscles(body.mesh, muscles, args.plot, up=GROUND.normal, front=facing.direction)
     if front is None:
         print_note(facing.description(standing.frame))
+    for note in notes:
+        print_note(note)
     print(f"{muscles.fibre_count} fibres, {muscles.segment_count} segments; wrote {args.plot}")
     return 0

@@ -12,7 +12,7 @@ import numpy as np
 
 from egs_warp.commands.flags import parse_plane, parse_up
 from egs_warp.commands.object_flag import read_object
-from egs_warp.commands.scene_flags import start_device
+from egs_warp.commands.scene_flags import print_note, start_device
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -57,16 +57,23 @@ class SceneInput:
         return [one.camera for one in self.posed]
 
     def prepared(self, options: SceneOptions) -> PreparedScene:
-        """Segment the scene with ``prepare_scene`` and show a progress bar.
+        """Segment the scene with ``prepare_scene`` and show a progress bar; a scene that was prepared before is read
+        from the cache (``egs_warp.pipelines.scene_cache``).
 
         Photos next to the cameras, if any, serve for fine-tuning.
         """
         from egs_warp.pipelines.prepare_scene import prepare_scene
         from egs_warp.pipelines.progress import scene_bar
+        from egs_warp.pipelines.scene_cache import cache_folder, read_scene, scene_key, write_scene
         from egs_warp.training.photo_colours import photographs_in_colours_of
 
+        key = scene_key(self.cloud, self.object, posed=self.posed, up=self.up, plane=self.plane, options=options)
+        scene = read_scene(key)
+        if scene is not None:
+            print_note(f"the scene was prepared before, and is read from {cache_folder()}")
+            return scene
         with scene_bar(options.stages) as show_progress:
-            return prepare_scene(
+            scene = prepare_scene(
                 self.cloud,
                 self.object,
                 cameras=self.cameras,
@@ -76,6 +83,10 @@ class SceneInput:
                 options=options,
                 progress=show_progress,
             )
+        note = write_scene(key, scene)
+        if note is not None:
+            print_note(note)
+        return scene
 
 
 def plane_of(text: str) -> Plane:

@@ -239,6 +239,17 @@ def hidden_below(cloud: GaussianCloud, plane: Plane, *, margin: float) -> Gaussi
     return replace(cloud, opacity_logits=wp.array(logits, dtype=wp.float32, device=cloud.device))
 
 
+def most_visible(cloud: GaussianCloud, count: int) -> GaussianCloud:
+    """Return the ``count`` Gaussians with the largest product of opacity and area, in their order; the cloud itself if
+    it has no more."""
+    if cloud.count <= count:
+        return cloud
+    log_areas = np.sort(cloud.log_scales.numpy().astype(np.float64), axis=1)[:, 1:].sum(axis=1)
+    # The logarithm of the opacity, without overflow.
+    visibility = log_areas - np.logaddexp(0.0, -cloud.opacity_logits.numpy().astype(np.float64))
+    return cloud.subset(np.sort(np.argsort(-visibility, kind="stable")[:count]))
+
+
 def with_degree(cloud: GaussianCloud, degree: int | None) -> GaussianCloud:
     """Return ``cloud`` with colour bands up to ``degree``; None keeps all of them."""
     if degree is None or degree >= cloud.sh_degree:

@@ -25,6 +25,7 @@ from egs_warp.locomotion.objectives import (
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.body_parts import find_shape_parts
 from egs_warp.motions.feet import order_counterclockwise
 from egs_warp.motions.keyframes import Channel, Key, Quantity, channels
 from egs_warp.motions.sequence import Stance
@@ -240,22 +241,37 @@ _POSE_QUANTITIES = (Quantity.POSITION, Quantity.ORIENTATION)
 
 
 def parts_of_body(stance: Stance) -> list[BodyPart]:
-    """Return the parts that keys may name: the whole body, its base, its head and its feet.
+    """Return the parts that keys may name: the whole body, its base, its head, its feet and its branches.
 
-    A single foot is the base. Several feet are numbered counterclockwise as seen from above, from straight ahead on.
+    A single foot is the base. Several feet, and the branches, are numbered counterclockwise as seen from above, from
+    straight ahead on. A body whose shape shows no head has its top as the head.
     """
     body, ground, standing = stance.body, stance.ground, stance.standing
     heights = (standing - ground.origin) @ ground.surface_normal
-    base = BodyPart.base(body, heights)
-    parts = [BodyPart.whole(body), base, BodyPart.head(body, ground.local(standing)[:, 2])]
+    shape = find_shape_parts(body.mesh, body.node_mass, ground.surface_normal)
+    base, head = BodyPart.base(body, heights), BodyPart.head(body, ground.local(standing)[:, 2])
+    if shape.head is not None:
+        head = BodyPart.of(body, "head", shape.head)
+    parts = [BodyPart.whole(body), base, head, *_feet(stance, base)]
+    if not shape.branches:
+        return parts
+    centres = np.array([ground.local(standing[nodes])[:, :2].mean(axis=0) for nodes in shape.branches])
+    order = order_counterclockwise(centres)
+    return parts + [
+        BodyPart.of(body, f"branch {number}", shape.branches[index]) for number, index in enumerate(order, start=1)
+    ]
+
+
+def _feet(stance: Stance, base: BodyPart) -> list[BodyPart]:
+    body, ground, standing = stance.body, stance.ground, stance.standing
     feet = stance.feet()
     if len(feet) < 2:
-        return [*parts, BodyPart("foot", base.nodes, base.masses)]
+        return [BodyPart("foot", base.nodes, base.masses)]
     soles = [base.nodes[foot.leg[base.nodes] > 0.0] for foot in feet]
     # A leg that is too short to reach the base stands on its own lowest nodes.
     soles = [nodes if len(nodes) else foot.sole for nodes, foot in zip(soles, feet, strict=True)]
     order = order_counterclockwise(np.array([ground.local(standing[foot.sole])[:, :2].mean(axis=0) for foot in feet]))
-    return parts + [BodyPart.of(body, f"foot {number}", soles[index]) for number, index in enumerate(order, start=1)]
+    return [BodyPart.of(body, f"foot {number}", soles[index]) for number, index in enumerate(order, start=1)]
 
 
 def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:

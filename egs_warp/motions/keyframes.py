@@ -39,8 +39,8 @@ class Quantity(Enum):
 
 PARTS = ("body", "base", "head", "foot")
 """Parts that a key may name: the whole body, whose position is that of the centre of mass, the base on the ground, the
-head at the top, and the foot of a body with one foot. Several feet are numbered, as ``foot 2``."""
-_NUMBERED_FOOT = re.compile(r"foot [1-9]\d?")
+head at the top, and the foot of a body with one foot. Several feet are numbered, as ``foot 2``, and so are branches."""
+_NUMBERED_PART = re.compile(r"(?:foot|branch) [1-9]\d?")
 MAX_TIME = 60.0
 """Seconds."""
 MIN_GAP = 0.001
@@ -217,10 +217,10 @@ def _key(entry: Mapping[str, Any], where: str) -> Key:
                 f'{where}: "{name}" is unknown{did_you_mean(name, _FIELDS)}; a key has {", ".join(_FIELDS)}'
             )
     part, quantity, value = entry["part"], entry["quantity"], entry["value"]
-    if part not in PARTS and not (isinstance(part, str) and _NUMBERED_FOOT.fullmatch(part)):
+    if part not in PARTS and not (isinstance(part, str) and _NUMBERED_PART.fullmatch(part)):
         raise UserError(
             f"{where}: part {part!r} is unknown{did_you_mean(part, PARTS)}; give one of {', '.join(PARTS)}, or of"
-            " several feet foot 1, foot 2, ..."
+            " several feet foot 1, foot 2, ..., or a branch, branch 1, ..."
         )
     names = [member.value for member in Quantity]
     if quantity not in names:

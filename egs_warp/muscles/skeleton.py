@@ -48,6 +48,9 @@ class Branch:
     """True if its last point is a tip of the body."""
     volume: float
     """Volume of its own sections, m^3."""
+    sections: tuple[tuple[int, ...], ...]
+    """K tuples, numbers of the sections of each point, also of those in junctions; none for an end point that only
+    extends the polyline."""
 
     @property
     def length(self) -> float:
@@ -63,6 +66,10 @@ class Skeleton:
     """Sorted by descending volume."""
     up: np.ndarray
     """(3,) unit vector away from the ground."""
+    samples: np.ndarray
+    """(S, 3) m, points inside the body."""
+    section_from_sample: np.ndarray
+    """(S,) int, section of each sample."""
 
 
 def skeleton(mesh: TetMesh, up: np.ndarray) -> Skeleton:
@@ -75,7 +82,10 @@ def skeleton(mesh: TetMesh, up: np.ndarray) -> Skeleton:
     graph.merge_insignificant_chains()
     branches = [graph.branch(chain) for chain in graph.joined_chains()]
     branches.sort(key=lambda branch: -branch.volume)
-    return Skeleton(tuple(branches), up)
+    section_from_sample = np.zeros(len(graph.samples), int)
+    for section, members in graph.members.items():
+        section_from_sample[members] = section
+    return Skeleton(tuple(branches), up, graph.samples, section_from_sample)
 
 
 class _SectionGraph:
@@ -176,18 +186,22 @@ class _SectionGraph:
         points = [self._middle(samples) for samples in members]
         radii = [float(np.mean([self._radius(section) for section in group])) for group in groups]
         own = [not any(self._is_junction(section) for section in group) for group in groups]
+        numbers = [tuple(group) for group in groups]
         if grounded or self._is_free(sections[0]):
             points.insert(0, self._ground_point(sections[0]) if grounded else self._tip(members[0], points[1::-1]))
             radii.insert(0, radii[0])
             own.insert(0, own[0])
+            numbers.insert(0, ())
         if ends_freely:
             points.append(self._tip(members[-1], points[-2:]))
             radii.append(radii[-1])
             own.append(own[-1])
+            numbers.append(())
         polyline = np.array(points)
         for _ in range(_SMOOTHING_PASSES):
             polyline[1:-1] = 0.25 * polyline[:-2] + 0.5 * polyline[1:-1] + 0.25 * polyline[2:]
-        return Branch(polyline, np.array(radii), np.array(own), grounded, ends_freely, self._own_volume(chain))
+        volume = self._own_volume(chain)
+        return Branch(polyline, np.array(radii), np.array(own), grounded, ends_freely, volume, tuple(numbers))
 
     def _middle(self, members: np.ndarray) -> np.ndarray:
         return np.average(self.samples[members], axis=0, weights=self.sample_volumes[members])

@@ -16,6 +16,7 @@ from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import ffmpeg_program
 from egs_warp.locomotion.ledger import energy_balance
+from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import Strategy
@@ -24,9 +25,11 @@ from egs_warp.motions.request import MAX_TARGET, MAX_TURN
 from egs_warp.motions.script import Script
 from egs_warp.motions.script import motion as script
 from egs_warp.pipelines import render_data
+from egs_warp.pipelines.balance import balance_note
 from egs_warp.pipelines.capture_warnings import capture_warnings
 from egs_warp.pipelines.creature import CreatureOptions, make_creature
-from egs_warp.pipelines.film import draw_film
+from egs_warp.pipelines.film import Film, draw_film, picture_seconds
+from egs_warp.pipelines.film_time import FilmTimeNote
 from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.ground_coverage import ground_coverage_warning
 from egs_warp.pipelines.plots import draw_plots
@@ -35,6 +38,11 @@ from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run
 from egs_warp.pipelines.shot import MAX_SIDE, MIN_SIDE, Shot
 from egs_warp.pipelines.simulated_run import check_frames, simulate
+
+PREVIEW_GAUSSIANS = 50_000
+"""Gaussians of a preview."""
+PREVIEW_SIZE = 256
+"""Width and height of a preview, pixels."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +69,11 @@ class AnimateOptions:
     frames: int | None = None
     """Frames at 60 Hz, the first at rest; None runs until the last motion has come to rest."""
     size: int = 512
-    """Width and height of the video, pixels, if ``shot`` has no size."""
+    """Width and height of the video, pixels, if ``shot`` has no size and it is no preview."""
     shadow: bool = True
     """Draw a shadow on the ground under the object."""
+    preview: bool = False
+    """Draw at most ``PREVIEW_GAUSSIANS`` Gaussians, and at most ``PREVIEW_SIZE`` pixels if ``shot`` has no size."""
     view_from: Direction | None = None
     """(3,) Direction from the object to the camera, in the capture's frame, or an axis; of several (n, 3) the best is
     chosen."""
@@ -93,6 +103,16 @@ class AnimateOptions:
             advice = f"give a number of pixels from {MIN_SIDE} to {MAX_SIDE}"
             raise ArgumentError("size", advice, value=self.size)
 
+    @property
+    def side(self) -> int:
+        """Width and height of the video, pixels, if ``shot`` has no size."""
+        return min(self.size, PREVIEW_SIZE) if self.preview else self.size
+
+    @property
+    def picture_size(self) -> tuple[int, int]:
+        """Width and height of the video, pixels."""
+        return self.shot.size or (self.side, self.side)
+
     def targets(self) -> dict[str, float | None]:
         """Return the targets by the names that ``script`` uses."""
         return {"distance": self.distance, "height": self.height, "heading_degrees": self.heading_degrees}
@@ -116,6 +136,7 @@ class AnimateOptions:
             "metres_per_unit": creature.metres_per_unit,
             "friction": creature.friction,
             "shadow": self.shadow,
+            "preview": self.preview,
             "get_up": self.get_up,
             **self.shot.to_json(),
             "up": _numbers(up),
@@ -184,13 +205,27 @@ def animate(
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
         with preparation_bar(quiet=quiet) as begin_stage:
             creature = make_creature(cloud, up=up, plane=plane, options=options.creature, progress=begin_stage)
+            balance = None
+            if options.creature.muscles_file is not None:
+                begin_stage("balance")
+                balance = balance_note(creature)
         fronts = () if options.creature.front is not None else (creature.front.description(creature.frame),)
         cage, height = creature.cage, creature.body.height
         warnings = capture_warnings(creature.cloud, cage.mesh, height, thickening=cage.thickening)
-        notes = [*creature.notes, *fronts, *warnings]
+        notes = [*creature.notes, *fronts, *warnings, *([] if balance is None else [balance])]
         for note in notes:
             show_note(note)
-        with simulation_bar(quiet=quiet) as show_progress:
+        film_note = None
+        if not options.preview and creature.cloud.count > PREVIEW_GAUSSIANS:
+            seconds = picture_seconds(creature, size=options.picture_size, shadow=options.shadow)
+            film_note = FilmTimeNote(seconds, options.shot.fps / FRAME_RATE, show_note)
+        with simulation_bar(quiet=quiet) as show_frames:
+
+            def show_progress(done: int, expected: int) -> None:
+                show_frames(done, expected)
+                if film_note is not None:
+                    film_note.update(done, expected)
+
             performance = simulate(
                 creature,
                 requested_motion,
@@ -212,11 +247,12 @@ def animate(
             performance,
             run,
             name=requested_motion.name,
-            size=options.size,
+            size=options.side,
             shot=options.shot,
             background=background,
             view_from=view_from,
             shadow=options.shadow,
+            max_gaussians=PREVIEW_GAUSSIANS if options.preview else None,
             quiet=quiet,
         )
         render_data_of_run = RenderData.of(film.splats, film.camera, creature.muscles, performance.place.feet())
@@ -226,7 +262,7 @@ def animate(
         coverage_warning = ground_coverage_warning(
             simulation.trajectory.positions[-1], placed_background, creature.solids[0], creature.body.height
         )
-        for note in (last_notes := (*performance.unfinished_note(), *coverage_warning)):
+        for note in (last_notes := (*performance.unfinished_note(), *coverage_warning, *_preview_note(options, film))):
             show_note(note)
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
@@ -255,6 +291,18 @@ def _requested(motion: Script | str, options: AnimateOptions) -> Script:
         if value is not None:
             raise ArgumentError(name, "the motion is a script with numbers of its own; give one of them", value=value)
     return motion
+
+
+def _preview_note(options: AnimateOptions, film: Film) -> tuple[str, ...]:
+    """Return a note on the Gaussians that a preview leaves out."""
+    if not options.preview:
+        return ()
+    width, height = options.picture_size
+    drawn = min(film.splats.count, PREVIEW_GAUSSIANS)
+    return (
+        f"preview: {drawn} of {film.splats.count} Gaussians at {width}x{height} pixels; egs-warp render draws the run"
+        " in full (--size sets its pixels)",
+    )
 
 
 def _recorded(run: RunFolder) -> Path | None:

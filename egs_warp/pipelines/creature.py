@@ -179,7 +179,7 @@ def make_creature(
     """
     check_cloud(cloud)
     options = options or CreatureOptions()
-    ground, sag, notes = options.ground, options.sag, ()
+    ground, notes = options.ground, ()
     gravity_up = None if options.gravity_up is None else direction_of(options.gravity_up, "gravity_up")
     front = None if options.front is None else direction_of(options.front, "front")
     up = None if up is None else direction_of(up, "up")
@@ -196,13 +196,33 @@ def make_creature(
         check_front(normal if gravity_up is None else gravity_up, front)
     progress("cage")
     standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=options.metres_per_unit, nodes=options.nodes)
+    return creature_in_cage(cloud, standing, options, notes=notes, progress=progress)
+
+
+def creature_in_cage(
+    cloud: GaussianCloud,
+    standing: PlacedCage,
+    options: CreatureOptions,
+    *,
+    notes: tuple[str, ...] = (),
+    progress: Callable[[str], object] = lambda stage: None,
+) -> Creature:
+    """Return the creature of ``make_creature`` in the cage ``standing`` that ``place_cage`` made of its capture.
+
+    Args:
+        cloud: The capture.
+        standing: Its cage.
+        options: Body, muscles, ground and solver.
+        notes: Guesses about the capture.
+        progress: Called with the name of each stage as it starts.
+    """
     progress("contact")
     device, frame, cage = str(cloud.device), standing.frame, standing.cage
     solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in options.solids)
     field = None
-    if ground is not None:
+    if options.ground is not None:
         # The cage cannot deform to ground that is finer than its own edges.
-        field = frame.height_field(ground).coarser(_GROUND_SPACING * mean_edge_length(cage.mesh))
+        field = frame.height_field(options.ground).coarser(_GROUND_SPACING * mean_edge_length(cage.mesh))
     geometry = contact_geometry(
         standing.gaussians,
         cage.mesh,
@@ -213,9 +233,13 @@ def make_creature(
         grid=_CONTACT_GRID * cage.height(GROUND),
         device=device,
     )
-    against_gravity = None if gravity_up is None else frame.axes @ gravity_up
+    gravity_up, front = options.gravity_up, options.front
+    against_gravity = None if gravity_up is None else frame.axes @ direction_of(gravity_up, "gravity_up")
     progress("front")
-    facing = choose_front(standing, front, seen_from=options.seen_from)
+    facing = choose_front(
+        standing, None if front is None else direction_of(front, "front"), seen_from=options.seen_from
+    )
+    sag = options.sag
     while True:
         progress("body and muscles")
         body = make_body(cage.mesh, GROUND, up=against_gravity, sag=sag, device=device)

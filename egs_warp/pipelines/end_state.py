@@ -76,7 +76,7 @@ class EndCause:
             return state, [f"fallen: {entry.fall_note}; it {outcome}"]
         if last and self.fallen is not None:
             return State.FALLEN, [f"fallen: {self.fallen}"]
-        has_upright = self.base not in (None, SupportKind.ROUND_BASE) and not tips_body(entry.motion)
+        has_upright = self.base is not None and has_upright_pose(self.base) and not tips_body(entry.motion)
         if has_upright and reached.tilt_degrees > MAX_END_TILT:
             return State.FALLEN, [f"fallen: at the end it is tilted by {reached.tilt_degrees:.0f} degrees"]
         missed = missed_targets(entry.asked, reached) if entry.motion.is_at_rest else []
@@ -88,6 +88,11 @@ class EndCause:
         if self.base is SupportKind.FEET and slip > MAX_SLIP:
             missed.append(f"feet slide by {100.0 * slip:.0f} % of a stride")
         return (State.NOT_AS_REQUESTED, [f"not as requested: {', '.join(missed)}"]) if missed else (State.DONE, [])
+
+
+def has_upright_pose(base: SupportKind) -> bool:
+    """Return True if a body on ``base`` has an upright pose; a ball has none."""
+    return base is not SupportKind.ROUND_BASE
 
 
 def missed_targets(requested: Mapping[str, float], reached: MotionOutcome) -> list[str]:

@@ -16,13 +16,15 @@ from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.deformation.splitting import split_for_motion
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud, hidden_below
+from egs_warp.geometry.camera_ring import ring_camera
+from egs_warp.geometry.gaussians import GaussianCloud, hidden_below, most_visible
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.io.video import VideoWriter, contact_sheet, write_png
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.pipelines.shot import Shot, nearest_steps, resized
-from egs_warp.pipelines.simulated_run import SimulatedRun
+from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.shot import Shot, framed, nearest_steps, resized
+from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, FILMED_FROM, SimulatedRun
 from egs_warp.render.backdrop import Backdrop, captured_scene, plain_colour, studio_floor
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.rasteriser import render_gaussians
@@ -46,7 +48,7 @@ class Film:
     file: str
     """Name of the video in the folder of the run."""
     splats: GaussianCloud
-    """Rendered Gaussians at rest, after splitting."""
+    """Gaussians at rest, after splitting; all of them, also if fewer were drawn."""
     camera: Camera
     """Camera of the film; for a moving camera, the fixed one that it is derived from."""
     milliseconds: dict[str, list[float]]
@@ -84,6 +86,7 @@ def draw_film(
     background: GaussianCloud | None = None,
     view_from: np.ndarray | None = None,
     shadow: bool = True,
+    max_gaussians: int | None = None,
     quiet: bool = False,
 ) -> Film:
     """Render a simulated run and write its video and ``sheet.png`` into the folder of ``run``.
@@ -98,6 +101,7 @@ def draw_film(
         view_from: (3,) direction from the object to the camera, in the capture's frame; of several (n, 3) the best is
             chosen.
         shadow: Draw a shadow on the ground.
+        max_gaussians: Draw only the most visible Gaussians of the creature, at most this many; None draws all.
         quiet: Show no progress bar.
     """
     creature, simulation = performance.creature, performance.simulation
@@ -115,9 +119,13 @@ def draw_film(
         # Haze of the captured ground, which would be seen below the creature in the air.
         cloud = hidden_below(cloud, GROUND, margin=_BELOW_GROUND * trajectory.height)
     split = split_for_motion(cloud, embedding, [trajectory.positions[step] for step in keys])
+    drawn, drawn_embedding = split.cloud, split.embedding
+    if max_gaussians is not None and drawn.count > max_gaussians:
+        drawn = most_visible(drawn, max_gaussians)
+        drawn_embedding = embed_gaussians(drawn, creature.cage.mesh)
     splitting = 1e3 * (time.perf_counter() - started)
     frames = drawn_frames(
-        Deformer(split.cloud, split.embedding),
+        Deformer(drawn, drawn_embedding),
         trajectory,
         steps,
         cameras,
@@ -179,18 +187,53 @@ def drawn_frames(
         marks = [time.perf_counter()]
         deformed = deformer.deform(trajectory.positions[step])
         marks.append(time.perf_counter())
-        cloud = deformed.cloud
         if setting is None or camera is not cameras[index - 1]:
             setting = _backdrop_of(
                 path, trajectory.height, camera, scene, shot, grain=grain, shadow=shadow, device=device
             )
-        shade = setting.shadow_opacity(cloud) if shot.transparent else None
-        backdrop = setting.background(cloud) if shade is None else (0.0, 0.0, 0.0)
-        image = render_gaussians(cloud, camera, background=backdrop, max_depth=setting.floor_depth if is_flat else None)
-        wp.synchronize_device(cloud.device)
+        image, shade = _rendered(deformed.cloud, setting, transparent=shot.transparent, has_floor=is_flat)
         marks.append(time.perf_counter())
         deforming, rendering = (1e3 * np.diff(marks)).tolist()
         yield Frame(image, shade, (deforming, rendering))
+
+
+def _rendered(
+    cloud: GaussianCloud, setting: Backdrop, *, transparent: bool, has_floor: bool
+) -> tuple[RenderedImage, wp.array | None]:
+    """Return the image of ``cloud`` over its backdrop, and the opacity of its shadow if the shot is transparent."""
+    shade = setting.shadow_opacity(cloud) if transparent else None
+    backdrop = setting.background(cloud) if shade is None else (0.0, 0.0, 0.0)
+    depth = setting.floor_depth if has_floor else None
+    image = render_gaussians(cloud, setting.shadow.camera, background=backdrop, max_depth=depth)
+    wp.synchronize_device(cloud.device)
+    return image, shade
+
+
+def picture_seconds(creature: Creature, *, size: tuple[int, int], shadow: bool = True) -> float:
+    """Return the measured time of drawing the creature at rest on a plain floor, s.
+
+    Args:
+        creature: The creature.
+        size: Width and height of the picture, pixels.
+        shadow: Draw a shadow on the ground.
+    """
+    positions, height = creature.start.positions, creature.body.height
+    middle = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
+    camera = ring_camera(
+        np.array(FILMED_FROM), middle, height, GROUND.normal, size=size[0], vertical_fov_degrees=FIELD_OF_VIEW
+    )
+    camera = framed(resized(camera, *size), positions)
+    deformer = Deformer(creature.cloud, embed_gaussians(creature.cloud, creature.cage.mesh))
+    grain, path = shadow_blur_radius(creature.cloud), creature.body.centre_of_mass(positions)[None]
+    setting = _backdrop_of(path, height, camera, None, Shot(), grain=grain, shadow=shadow, device=creature.cloud.device)
+    spent = []
+    # The first picture may compile kernels.
+    for _ in range(2):
+        started = time.perf_counter()
+        image, shade = _rendered(deformer.deform(positions).cloud, setting, transparent=False, has_floor=True)
+        Frame(image, shade, (0.0, 0.0)).picture()
+        spent.append(time.perf_counter() - started)
+    return spent[-1]
 
 
 def _writer(path: Path, camera: Camera, shot: Shot) -> VideoWriter:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING
@@ -18,8 +19,10 @@ from egs_warp.geometry.camera_ring import ring_camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
+from egs_warp.locomotion.objectives import BodyPart
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.motions.feet import Foot, SupportKind, order_counterclockwise, support_kind_of
+from egs_warp.motions.follow import parts_of_body
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script
@@ -28,6 +31,7 @@ from egs_warp.motions.stance import SOLE_HEIGHT, GroundFrame
 from egs_warp.muscles.fibres import FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.plot import FIBRE_COLOURS
+from egs_warp.pipelines.balance import own_muscles_notes
 from egs_warp.pipelines.capture_warnings import capture_warnings
 from egs_warp.pipelines.creature import PlacedCage, body_muscles, check_front, choose_front, place_cage
 from egs_warp.pipelines.facing_direction import Front
@@ -72,6 +76,13 @@ class BodyInfo:
         local = self.place.ground.local(self.place.standing)
         return np.array([local[foot.sole].mean(axis=0) for foot in self.feet]).reshape(-1, 3)
 
+    @cached_property
+    def parts(self) -> tuple[BodyPart, ...]:
+        """Head and branches, which keys may name (``parts_of_body``)."""
+        return tuple(
+            part for part in parts_of_body(self.place) if part.name == "head" or part.name.startswith("branch")
+        )
+
     def motions(self) -> dict[str, str | None]:
         """Return, for each motion, the reason why the body cannot perform it; None if it can."""
         return {name: self._why_not(name) for name in MOTIONS}
@@ -108,6 +119,10 @@ class BodyInfo:
             lines.append(
                 f"  foot {number}: {_describe_position(sole)}, leg {foot.length / height:.2f}{_foot_note(foot, height)}"
             )
+        for part in self.parts:
+            local = self.place.ground.local(self.place.standing[part.nodes]) / height
+            span = f"{local[:, 2].min():.2f} to {local[:, 2].max():.2f} up"
+            lines.append(f"  {part.name}: {_describe_position(local.mean(axis=0))}, {span}")
         lines.append(
             f"muscles  {self.muscles.fibre_count} fibres, {self.muscles.segment_count} segments"
             f" ({', '.join(f'{count} {kind.value}' for kind, count in kinds.items())})"
@@ -160,7 +175,8 @@ def inspect_capture(
     notes: tuple[str, ...] = (),
     progress: Callable[[str], object] = lambda stage: None,
 ) -> BodyInfo:
-    """Determine the properties that ``make_creature`` finds in a capture, without the simulation that lets it stand.
+    """Determine the properties that ``make_creature`` finds in a capture, without the simulation that lets it stand,
+    unless muscles of a file are checked (``balance_note``).
 
     Args:
         cloud: The capture.
@@ -213,9 +229,13 @@ def inspect_capture(
     notes = (*notes, *capture_warnings(standing.gaussians, mesh, body.height, thickening=standing.cage.thickening))
     if standing.gaussians.count < cloud.count:
         notes = (*notes, f"the body is measured from {standing.gaussians.count} of the {cloud.count} Gaussians")
+    if muscles_file is not None:
+        progress("balance")
+        notes = (*notes, *own_muscles_notes(cloud, standing, faces, muscles_file))
     return BodyInfo(source, cloud.count, standing, body, muscles, faces, base, place, feet, notes)
 
 
+_HEAD_COLOUR, _BRANCH_COLOUR = "#f2c14e", "#9fd3c7"
 _COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#ff7f0e", "#9467bd", "#8c564b", "#e377c2", "#17becf")
 
 
@@ -359,6 +379,9 @@ def _draw_faces(axes: Axes, info: BodyInfo, *, limbs: bool) -> None:
         for number, foot in enumerate(info.feet):
             share = foot.leg[:, None] > 0.0
             colours = np.where(share, to_rgb(_COLOURS[number % len(_COLOURS)]), colours)
+    if limbs:
+        for part in info.parts:
+            colours[part.nodes] = to_rgb(_HEAD_COLOUR if part.name == "head" else _BRANCH_COLOUR)
     shade = (0.65 + 0.35 * normals[order, 2:]) * colours[faces[order]].mean(axis=1)
     line = 0.3 if limbs else 0.1
     axes.add_collection(
@@ -377,7 +400,10 @@ def _draw_cage(axes: Axes, info: BodyInfo) -> None:
     for number, foot in enumerate(info.feet):
         place = axis[:2] @ info.place.standing[foot.sole].mean(axis=0)
         _number(axes, place, number + 1, _COLOURS[number % len(_COLOURS)])
-    axes.set_title(f"cage of {len(info.place.standing)} nodes, legs coloured")
+    for part in info.parts:
+        x, y = (axis[:2] @ info.place.standing[part.nodes].mean(axis=0)).tolist()
+        axes.text(x, y, part.name, ha="center", va="center", fontsize="small", zorder=5)
+    axes.set_title(f"cage of {len(info.place.standing)} nodes: legs, head and branches")
 
 
 def _draw_muscles(axes: Axes, info: BodyInfo) -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from itertools import accumulate
-from typing import NoReturn, TextIO
+from threading import Event, Thread
+from types import TracebackType
+from typing import Any, TextIO
 
 from tqdm import tqdm
 
@@ -25,6 +27,13 @@ _UNTRAINED_SHARE = 2
 _SMOOTHING = 0.05
 """Smoothing factor of the frame rate; small, because a frame in the air takes a third of the time of one on the ground,
 and both alternate."""
+_REFRESH_INTERVAL = 1.0
+"""Seconds after which a bar is drawn again, so that its times move while a stage reports nothing."""
+_MIN_LEFT = 0.3
+"""Least remaining time of a stage, as a fraction of the time that it has taken: one that takes longer than usual does
+not end at once."""
+_RELIABLE_FRACTION = 0.1
+"""Finished fraction of a stage from which its own pace counts, not its usual share."""
 
 
 @contextmanager
@@ -50,32 +59,6 @@ def conversion_bar(name: str, *, quiet: bool = False, file: TextIO | None = None
 
 
 @contextmanager
-def _stages(name: str, done: Mapping[str, int], *, quiet: bool, file: TextIO | None) -> Iterator[Callable[[str], None]]:
-    """Show a bar whose stages start at ``done`` percent of the time.
-
-    The bar appears with the first stage, so that an error before it prints only one line.
-    """
-    form = "{desc}, {elapsed}<{remaining}"
-    with ExitStack() as stack:
-        bar: tqdm[NoReturn] | None = None
-
-        def begins(stage: str) -> None:
-            nonlocal bar
-            if bar is None:
-                new_bar = tqdm(desc=name, total=100, bar_format=form, smoothing=0, disable=quiet, file=file)
-                bar = stack.enter_context(new_bar)
-            bar.set_description_str(f"{name}: {stage}", refresh=False)
-            bar.update(max(done.get(stage, 0) - bar.n, 0))
-            bar.refresh()
-
-        yield begins
-        if bar is not None:
-            bar.bar_format = "{desc}, {elapsed}"
-            bar.set_description_str(f"{name}: done", refresh=False)
-            bar.update(100 - bar.n)
-
-
-@contextmanager
 def scene_bar(
     stages: Mapping[str, bool], *, quiet: bool = False, file: TextIO | None = None
 ) -> Iterator[Callable[[str, float], None]]:
@@ -84,28 +67,119 @@ def scene_bar(
     ``stages`` are those of ``SceneOptions.stages``: the value is False for a stage without its training.
     """
     shares = {stage: _SCENE_SHARES[stage] if whole else _UNTRAINED_SHARE for stage, whole in stages.items()}
-    begins = dict(zip(shares, accumulate(shares.values(), initial=0), strict=False))
-    form = "{desc}, {elapsed}<{remaining}"
-    with tqdm(desc="scene", total=sum(shares.values()), bar_format=form, smoothing=0, disable=quiet, file=file) as bar:
-
-        def update(stage: str, done: float) -> None:
-            bar.set_description_str(f"scene: {stage}", refresh=False)
-            bar.update(max(begins[stage] + done * shares[stage] - bar.n, 0))
-            bar.refresh()
-
-        yield update
-        bar.bar_format = "{desc}, {elapsed}"
-        bar.set_description_str("scene: done", refresh=False)
-        bar.update(bar.total - bar.n)
+    with _StageBar("scene", shares, quiet=quiet, file=file) as bar:
+        yield bar.update
 
 
 @contextmanager
 def simulation_bar(*, quiet: bool = False, file: TextIO | None = None) -> Iterator[Callable[[int, int], None]]:
     """Show a bar on ``file`` (default stderr), and yield the ``progress`` argument of ``simulate``."""
-    with tqdm(desc="simulate", unit="frame", smoothing=_SMOOTHING, disable=quiet, file=file) as bar:
+    with (
+        tqdm(desc="simulate", unit="frame", smoothing=_SMOOTHING, disable=quiet, file=file) as bar,
+        _redrawn(bar.refresh, is_quiet=quiet),
+    ):
 
         def update(done: int, expected: int) -> None:
             bar.total = expected
             bar.update(done - bar.n)
 
         yield update
+
+
+@contextmanager
+def _stages(name: str, done: Mapping[str, int], *, quiet: bool, file: TextIO | None) -> Iterator[Callable[[str], None]]:
+    """Show a bar whose stages start at ``done`` percent of the time.
+
+    The bar appears with the first stage, so that an error before it prints only one line.
+    """
+    ends = [*list(done.values())[1:], 100]
+    shares = {stage: end - start for (stage, start), end in zip(done.items(), ends, strict=True)}
+    with _StageBar(name, shares, quiet=quiet, file=file) as bar:
+        yield bar.update
+
+
+@contextmanager
+def _redrawn(draw: Callable[[], object], *, is_quiet: bool) -> Iterator[None]:
+    """Call ``draw`` every ``_REFRESH_INTERVAL`` from a thread."""
+    over = Event()
+
+    def loop() -> None:
+        while not over.wait(_REFRESH_INTERVAL):
+            draw()
+
+    thread = Thread(target=loop, daemon=True)
+    if not is_quiet:
+        thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        if not is_quiet:
+            thread.join()
+
+
+class _StageBar:
+    """Line with the stage, the elapsed and the remaining time of a computation whose stages take known shares of the
+    time."""
+
+    def __init__(self, name: str, shares: Mapping[str, float], *, quiet: bool, file: TextIO | None) -> None:
+        self._name, self._shares = name, dict(shares)
+        self._starts = dict(zip(shares, accumulate(shares.values(), initial=0.0), strict=False))
+        self._total = sum(shares.values())
+        self._options: dict[str, Any] = {"bar_format": "{desc}", "disable": quiet, "file": file}
+        self._is_quiet = quiet
+        self._bar: Any = None
+        self._stage, self._stage_start, self._done = "", 0.0, 0.0
+        self._stack = ExitStack()
+
+    def __enter__(self) -> _StageBar:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    def update(self, stage: str, done: float = 0.0) -> None:
+        """Show that the fraction ``done`` of ``stage`` is finished."""
+        if self._bar is None:
+            self._bar = self._stack.enter_context(tqdm(**self._options))
+            self._stack.push(self._show_end)
+            self._stack.enter_context(_redrawn(self._draw, is_quiet=self._is_quiet))
+        if stage != self._stage:
+            self._stage, self._stage_start = stage, self._elapsed()
+        self._done = done
+        self._draw()
+
+    def _show_end(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if kind is None:
+            self._bar.set_description_str(f"{self._name}: done, {tqdm.format_interval(self._elapsed())}")
+
+    def _elapsed(self) -> float:
+        """Seconds since the bar appeared."""
+        return 0.0 if self._is_quiet else float(self._bar.format_dict["elapsed"])
+
+    def _draw(self) -> None:
+        if self._is_quiet:
+            return
+        elapsed = self._elapsed()
+        left = self._left(elapsed)
+        remaining = "?" if left is None else tqdm.format_interval(left)
+        self._bar.set_description_str(f"{self._name}: {self._stage}, {tqdm.format_interval(elapsed)}<{remaining}")
+
+    def _left(self, elapsed: float) -> float | None:
+        """Return the remaining time, s, ``elapsed`` s after the start; None if nothing is known yet.
+
+        The stages before this one, or the finished part of this one, give the time of a share. A stage that takes
+        longer than its share is expected to go on for some time.
+        """
+        share, start = self._shares.get(self._stage, 0.0), self._starts.get(self._stage, self._total)
+        spent = elapsed - self._stage_start
+        if self._done >= _RELIABLE_FRACTION:
+            stage_left = spent * (1.0 - self._done) / self._done
+        elif start > 0.0:
+            stage_left = max(self._stage_start / start * share - spent, _MIN_LEFT * spent)
+        else:
+            return None
+        rest = self._total - start - share
+        return stage_left + (elapsed + stage_left) * rest / (start + share)

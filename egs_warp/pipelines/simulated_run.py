@@ -28,6 +28,8 @@ from egs_warp.pipelines.time_estimate import RemainingFrames
 FILMED_FROM = (0.82, -0.57, 0.27)
 """Direction from the body to the camera of a film: ahead, left and up. It is 35 degrees off the face, so that the face
 is seen in three quarters and a path ahead is not foreshortened to a point."""
+FIELD_OF_VIEW = 30.0
+"""Vertical field of view of the camera of a film, degrees."""
 _MAX_GET_UP_TIME = 120.0
 """Maximum total time for getting up in one run, in units of sqrt(H / g)."""
 MIN_FRAMES = 2
@@ -126,7 +128,7 @@ class SimulatedRun:
             upwards,
             width=size,
             height=size,
-            vertical_fov_degrees=30.0,
+            vertical_fov_degrees=FIELD_OF_VIEW,
         )
         return framed(camera, self.trajectory.positions.reshape(-1, 3))
 

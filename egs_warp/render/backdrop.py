@@ -3,7 +3,9 @@ on it."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -17,15 +19,14 @@ from egs_warp.render.projection import view_from_camera
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.render.shadow import ContactShadow
 
-_FLOOR, _HORIZON, _SKY = wp.vec3(0.85, 0.85, 0.86), wp.vec3(0.95, 0.953, 0.96), wp.vec3(0.82, 0.85, 0.89)
-_LINE = wp.vec3(0.75, 0.755, 0.775)
-_CLEAR, _HAZY = 1.0, 3.5
-"""Depths at which the haze over the floor begins and is complete, relative to that of the floor in the middle of the
-picture."""
-_MIN_SLOPE = 0.1
-"""Smallest downward slope of the view from which that depth is computed."""
-_SKY_RISE = 0.5
-"""Sine of the angle above the horizon at which the sky has its own colour."""
+STUDIO_FILE = Path(__file__).with_name("studio.json")
+"""Look of the plain floor and its sky, which films and the page (``web/client/src/ground.ts``) share.
+
+Colours of the floor near the camera, of the horizon, of the sky and of the grid's lines, sRGB; ``clear`` and ``hazy``:
+depths at which the haze over the floor begins and is complete, relative to that of the floor in the middle of the
+picture; ``min_slope``: smallest downward slope of the view from which that depth is computed; ``sky_rise``: sine of the
+angle above the horizon at which the sky has its own colour.
+"""
 _MAX_BUMP_HEIGHT = 0.06
 """Height over the plane, relative to the shadow's reach, at which a surface receives the shadow at half strength. Below
 the plane the range is twice as large, because thin spots of a captured floor appear deeper."""
@@ -74,11 +75,14 @@ def studio_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> 
         shadow: False for no shadow.
     """
     camera, plane = ground.camera, ground.plane
-    depth = abs(float(plane.heights(camera.centre))) / max(float(-camera.rotation[2] @ plane.normal), _MIN_SLOPE)
+    look = json.loads(STUDIO_FILE.read_text(encoding="utf-8"))
+    slope = max(float(-camera.rotation[2] @ plane.normal), look["min_slope"])
+    depth = abs(float(plane.heights(camera.centre))) / slope
     studio = kernels.Studio()
-    studio.floor, studio.horizon, studio.sky, studio.line = _FLOOR, _HORIZON, _SKY, _LINE
-    studio.cell, studio.sky_rise = cell, _SKY_RISE
-    studio.clear_depth, studio.hazy_depth = _CLEAR * depth, _HAZY * depth
+    studio.floor, studio.horizon = wp.vec3(*look["floor"]), wp.vec3(*look["horizon"])
+    studio.sky, studio.line = wp.vec3(*look["sky"]), wp.vec3(*look["line"])
+    studio.cell, studio.sky_rise = cell, look["sky_rise"]
+    studio.clear_depth, studio.hazy_depth = look["clear"] * depth, look["hazy"] * depth
     colour = empty(len(ground.depth), wp.vec3, ground.device)
     launch_rows(
         kernels.studio_kernel,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from egs_warp.geometry.gaussians import GaussianCloud, hidden_below
+from egs_warp.geometry.gaussians import GaussianCloud, hidden_below, most_visible
 from egs_warp.geometry.plane import Plane
 
 
@@ -38,3 +38,18 @@ def test_gaussians_that_reach_far_below_a_plane_are_hidden() -> None:
     )
     hidden = hidden_below(cloud, Plane(np.eye(3)[2], 0.0), margin=0.01)
     np.testing.assert_array_equal(hidden.opacities() < 1.0 / 255.0, [False, True, True, False])
+
+
+def test_the_most_visible_are_wide_and_opaque_and_keep_their_order() -> None:
+    """A needle has a small area; a negative logit of -800 is an opacity of 0 without an overflow."""
+    scales = np.log([[0.3, 0.3, 0.01], [0.4, 0.4, 0.01], [9.0, 0.01, 0.01], [0.5, 0.5, 0.5], [1.0, 1.0, 1.0]])
+    cloud = GaussianCloud.from_numpy(
+        np.arange(15.0).reshape(5, 3),
+        np.tile([1.0, 0.0, 0.0, 0.0], (5, 1)),
+        scales,
+        np.array([9.0, 9.0, 9.0, -1.0, -800.0]),
+        np.zeros((5, 1, 3)),
+    )
+    assert most_visible(cloud, 3).means.numpy()[:, 0].tolist() == [0.0, 3.0, 6.0]
+    assert most_visible(cloud, 4).means.numpy()[:, 0].tolist() == [0.0, 3.0, 6.0, 9.0]
+    assert most_visible(cloud, 5) is cloud

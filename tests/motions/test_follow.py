@@ -129,7 +129,9 @@ def test_an_unknown_part_is_refused_with_the_known_ones(place: Stance) -> None:
     with pytest.raises(UserError) as error:
         Follow(place, [key(0.5, "foot 1", Quantity.POSITION, (0.0, 0.0, 0.1))])
     assert str(error.value) == "k.json, key 1: the body has no part 'foot 1'; it has body, base, head, foot"
-    with pytest.raises(UserError, match=r"has no part 'foot'; it has body, base, head, foot 1, foot 2$"):
+    with pytest.raises(
+        UserError, match=r"has no part 'foot'; it has body, base, head, foot 1, foot 2, branch 1, branch 2$"
+    ):
         Follow(standing_stance(figure()), [key(0.5, "foot", Quantity.POSITION, (0.0, 0.0, 0.1))])
 
 

@@ -9,19 +9,23 @@ from collections.abc import Callable
 from dataclasses import replace as replaced
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from egs_warp.assets import BuiltInObject, pawn
+from egs_warp.deformation.deformer import Deformer
 from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.run_folder import MANIFEST
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.animate import AnimateOptions, animate
 from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.finished_run import PARTS, read_trajectory
+from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import Report, verdict
 from egs_warp.pipelines.simulated_run import SimulatedRun, simulate
 from tests.support.disk_faults import fail_once
@@ -71,6 +75,29 @@ def test_a_run_contains_its_options_and_its_manifest(run: Callable[..., Report],
     energy = json.loads((tmp_path / "report.json").read_text())["energy"]
     assert energy["gained"] == pytest.approx(sum(energy["flows"].values()), abs=1e-9)
     assert energy["muscle_work"] >= energy["flows"]["muscles"] and energy["worst_residual"] < 1e-6
+
+
+def test_a_preview_is_small_and_keeps_all_gaussians_for_later(
+    performance: SimulatedRun, run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("egs_warp.pipelines.animate.PREVIEW_GAUSSIANS", 100)
+    monkeypatch.setattr("egs_warp.pipelines.animate.PREVIEW_SIZE", 24)
+    drawn: list[int] = []
+
+    def deformer(rest: GaussianCloud, *rest_of: Any) -> Deformer:
+        drawn.append(rest.count)
+        return Deformer(rest, *rest_of)
+
+    monkeypatch.setattr("egs_warp.pipelines.film.Deformer", deformer)
+    notes: list[str] = []
+    preview = replaced(OPTIONS, preview=True)
+    report = animate(thing().cloud, tmp_path, plane=thing().plane, options=preview, quiet=True, show_note=notes.append)
+    data = RenderData.load(tmp_path / "creature.npz", node_count=len(performance.creature.cage.mesh.nodes))
+    assert drawn == [100] and data.splats.count >= thing().cloud.count
+    assert (data.camera.width, data.camera.height) == (24, 24)
+    assert notes[-1] == report.notes[-1]
+    assert notes[-1].startswith(f"preview: 100 of {data.splats.count} Gaussians at 24x24 pixels; egs-warp render draws")
+    assert report.asked["preview"] is True
 
 
 def test_a_film_that_fails_leaves_the_simulation(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
+import time
 from functools import partial
 
 import pytest
 
 from egs_warp.pipelines.prepare_scene import SceneOptions
-from egs_warp.pipelines.progress import conversion_bar, info_bar, preparation_bar, scene_bar
+from egs_warp.pipelines.progress import conversion_bar, info_bar, preparation_bar, scene_bar, simulation_bar
 from egs_warp.segmentation.clearance import StraddlingPolicy
 
 
@@ -27,13 +28,13 @@ def drawn(options: SceneOptions, monkeypatch: pytest.MonkeyPatch, told: list[tup
 
 
 def test_a_scene_shows_its_stages_and_the_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the middle of the longest stage, half of the time has passed, to a few percent."""
+    """In the middle of the longest stage, half of the time has passed, to a few percent; its own pace counts."""
     told = [(0.0, "plane", 0.0), (12.0, "ground", 0.0), (27.0, "segment", 0.0), (50.0, "segment", 0.5)]
     assert drawn(SceneOptions(clearing=StraddlingPolicy.FINETUNE), monkeypatch, told) == [
         "scene: plane, 00:00<?",
         "scene: ground, 00:12<01:28",
         "scene: segment, 00:27<01:13",
-        "scene: segment, 00:50<00:47",
+        "scene: segment, 00:50<00:46",
     ]
 
 
@@ -62,3 +63,44 @@ def test_stages_show_the_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None
                 line = file.getvalue().split("\r")[-1].strip()
                 assert line == f"{name}: {stage}, {int(seconds) // 60:02}:{int(seconds) % 60:02}<{left}"
         assert file.getvalue().split("\r")[-1].startswith(f"{name}: done, ")
+
+
+def test_the_times_move_while_a_stage_reports_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stage that takes five times its share still has a remaining time, which the bar draws by itself."""
+    clock = [1000.0]
+    monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
+    monkeypatch.setattr("egs_warp.pipelines.progress._REFRESH_INTERVAL", 0.01)
+    file = io.StringIO()
+    with preparation_bar(file=file) as begins:
+        for stage, seconds in (("cage", 0.0), ("body and muscles", 68.0), ("stand", 85.0)):
+            clock[0] = 1000.0 + seconds
+            begins(stage)
+        for seconds, line in ((87.0, "01:27<00:13"), (95.0, "01:35<00:08"), (135.0, "02:15<00:22")):
+            clock[0] = 1000.0 + seconds
+            deadline = time.monotonic() + 5.0
+            while f"prepare: stand, {line}" not in file.getvalue():
+                assert time.monotonic() < deadline, file.getvalue().split("\r")[-1]
+                time.sleep(0.01)
+
+
+def test_a_simulation_is_redrawn_while_a_frame_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [1000.0]
+    monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
+    monkeypatch.setattr("egs_warp.pipelines.progress._REFRESH_INTERVAL", 0.01)
+    file = io.StringIO()
+    with simulation_bar(file=file) as update:
+        update(2, 10)
+        clock[0] = 1130.0
+        deadline = time.monotonic() + 5.0
+        while "02:10<" not in file.getvalue():
+            assert time.monotonic() < deadline, file.getvalue().split("\r")[-1]
+            time.sleep(0.01)
+
+
+def test_a_quiet_bar_writes_nothing() -> None:
+    file = io.StringIO()
+    with preparation_bar(quiet=True, file=file) as begins:
+        begins("cage")
+    with pytest.raises(KeyboardInterrupt), preparation_bar(file=file):
+        raise KeyboardInterrupt
+    assert file.getvalue() == ""

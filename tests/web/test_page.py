@@ -20,9 +20,12 @@ from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io import write_ply
+from egs_warp.render.backdrop import studio_floor
 from egs_warp.render.rasteriser import render_gaussians
+from egs_warp.render.shadow import ContactShadow
 from egs_warp.web.page import export_page
 from egs_warp.web.recording import Recording
 from tests.support.chromium import BROWSER, NEEDED, opened, wait_until
@@ -58,8 +61,8 @@ def _picture(page: Any, stage: int = 0) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB"), np.float64) / 255.0
 
 
-def _own_picture(recording: Recording, page: Any, frame: int) -> np.ndarray:
-    """Return the same frame, rendered by this package with the camera of the page."""
+def _camera(page: Any) -> Camera:
+    """Return the camera of the page's first view."""
     seen = page.evaluate(
         """() => {
             const { camera, controls, canvas } = window.egs.viewers[0];
@@ -68,9 +71,14 @@ def _own_picture(recording: Recording, page: Any, frame: int) -> np.ndarray:
     )
     eye, target, fov, width, height = seen
     up = np.array([0.0, 0.0, 1.0])
-    camera = Camera.look_at(
+    return Camera.look_at(
         np.array(eye), np.array(target), up, width=width, height=height, vertical_fov_degrees=fov, near=0.02
     )
+
+
+def _own_picture(recording: Recording, page: Any, frame: int) -> np.ndarray:
+    """Return the same frame, rendered by this package with the camera of the page."""
+    camera = _camera(page)
     t, splats = recording.trajectory, recording.creature.splats
     deformer = Deformer(splats, embed_gaussians(splats, TetMesh(t.rest_positions, t.tets)))
     cloud = deformer.deform(t.positions[recording.steps[frame]]).cloud
@@ -228,6 +236,23 @@ def test_the_floor_hides_what_is_below_it(chromium: Any, file: str):
     empty = _picture(page)
     page.evaluate("egs.setLayer('splats', true)")
     assert (np.abs(_picture(page) - empty).max(axis=-1) > 0.05).mean() > 0.01
+    assert complaints == []
+    page.close()
+
+
+def test_the_floor_is_like_that_of_a_film(chromium: Any, file: str, recording: Recording):
+    page, complaints = opened(chromium, file)
+    page.evaluate("egs.setLayer('splats', false); egs.viewers[0].preset('front')")
+    camera, height = _camera(page), page.evaluate("egs.viewers[0].source.header.facts.height")
+    splats = recording.creature.splats
+    ground = ContactShadow(
+        camera, Plane(np.array([0.0, 0.0, 1.0]), 0.0), centre=np.zeros(3), reach=2.0, device=splats.device
+    )
+    film = studio_floor(ground, cell=0.25 * height, shadow=False).background(splats).numpy()
+    difference = np.abs(_picture(page) - film).max(axis=-1)
+    # The page draws a shadow under the body, and the edges of lines differ slightly.
+    assert np.quantile(difference, 0.75) < 0.008
+    assert len(np.unique(np.rint(255.0 * film).astype(int).reshape(-1, 3), axis=0)) > 20
     assert complaints == []
     page.close()
 

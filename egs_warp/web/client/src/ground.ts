@@ -1,19 +1,24 @@
 // Floor with a grid that turns into a sky without an edge, as in the film, and the creature's soft shadow.
 
 import * as THREE from "three";
+// Explained in egs_warp/render/backdrop.py.
+import studio from "../../../render/studio.json";
 import { SHADOW_GLSL, WIDE_RADIUS } from "./shadow.glsl";
 
 const SHADOW_SIDE = 256;
 /** Radius of the contact shadow, as a fraction of the side of the shadow map. */
 const SOFTNESS = 0.014;
-/** Look of the film (egs_warp/render/backdrop.py, where the quantities are explained), sRGB. */
-const FLOOR = [0.85, 0.85, 0.86];
-const HORIZON = [0.95, 0.953, 0.96];
-const SKY = [0.82, 0.85, 0.89];
-const LINE = [0.75, 0.755, 0.775];
-const [CLEAR, HAZY] = [1, 3.5];
-const MIN_SLOPE = 0.1;
-const SKY_RISE = 0.5;
+/** GLSL literals of the floor's look. */
+const LOOK = {
+  floor: vec3(studio.floor),
+  horizon: vec3(studio.horizon),
+  sky: vec3(studio.sky),
+  line: vec3(studio.line),
+  clear: float(studio.clear),
+  hazy: float(studio.hazy),
+  minSlope: float(studio.min_slope),
+  skyRise: float(studio.sky_rise),
+};
 
 export class Ground {
   /** Shadow map and its region on the ground: centre (x, y), half its side length, body height. */
@@ -59,7 +64,6 @@ export class Ground {
     );
     this.caster.frustumCulled = false;
     this.casters.add(this.caster);
-    const colour = ([r, g, b]: number[]): string => `vec3(${r}, ${g}, ${b})`;
     const material = new THREE.ShaderMaterial({
       uniforms: {
         shade: { value: this.target.texture },
@@ -89,18 +93,18 @@ export class Ground {
         }
         void main() {
           vec3 to = normalize(ray);
-          vec3 colour = mix(${colour(HORIZON)}, ${colour(SKY)}, clamp(to.z / ${SKY_RISE.toFixed(2)}, 0.0, 1.0));
+          vec3 colour = mix(${LOOK.horizon}, ${LOOK.sky}, clamp(to.z / ${LOOK.skyRise}, 0.0, 1.0));
           // Also where there is no floor, because derivatives need all pixels of a block.
           vec2 p = eye.xy - to.xy * (eye.z / min(to.z, -1e-6));
           vec2 pixel = max(fwidth(p), 1e-9);
           if (to.z < 0.0 && eye.z > 0.0) {
             float strength = max(0.4 * line(p, pixel, cell), line(p, pixel, 4.0 * cell));
-            vec3 ground = mix(${colour(FLOOR)}, ${colour(LINE)}, strength);
+            vec3 ground = mix(${LOOK.floor}, ${LOOK.line}, strength);
             vec2 uv = 0.5 + 0.5 * (p - shadeCentre) / shadeHalf;
             if (all(greaterThan(uv, box.xy)) && all(lessThan(uv, box.zw))) ground *= egsShade(shade, uv, ${SOFTNESS});
-            float middle = eye.z / max(-forward.z, ${MIN_SLOPE.toFixed(2)}), depth = dot(vec3(p, 0.0) - eye, forward);
-            float haze = smoothstep(${CLEAR.toFixed(2)} * middle, ${HAZY.toFixed(2)} * middle, depth);
-            colour = mix(ground, ${colour(HORIZON)}, haze);
+            float middle = eye.z / max(-forward.z, ${LOOK.minSlope}), depth = dot(vec3(p, 0.0) - eye, forward);
+            float haze = smoothstep(${LOOK.clear} * middle, ${LOOK.hazy} * middle, depth);
+            colour = mix(ground, ${LOOK.horizon}, haze);
           }
           gl_FragColor = vec4(colour, 1.0);
         }`,
@@ -165,4 +169,13 @@ export class Ground {
       Math.min(at(far, centreOfMass.y) + edge, 1),
     );
   }
+}
+
+/** Return a literal of GLSL, where a number without a decimal point is an integer. */
+function float(value: number): string {
+  return Number.isInteger(value) ? value.toFixed(1) : String(value);
+}
+
+function vec3(values: number[]): string {
+  return `vec3(${values.map(float).join(", ")})`;
 }

@@ -1,0 +1,107 @@
+"""Parts of a body by its shape, which key frames may name: head and branches, from the curve skeleton."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.muscles.skeleton import Branch, Skeleton, skeleton
+
+_TOP = 0.25
+"""Depth in body heights below the highest tip within which the tip of the head lies: a raised tail may be higher."""
+_NECK = 1.15
+"""Least radius above and below a neck, relative to its own."""
+_NECK_WINDOW = 3
+"""Sections over which areas are averaged, since those of single ones depend on the mesh."""
+_MIN_MASS, _MAX_BRANCH_MASS = 0.02, 0.3
+"""Least mass of a head above a neck, and largest mass of a branch that is a part as a whole, as fractions of the
+body's: a trunk is neither a head nor a branch."""
+_BASE_HEIGHT = 0.06
+"""Height in body heights below which a node belongs to the base."""
+_MIN_NODES = 4
+"""Nodes without which a part has no inertia."""
+
+
+@dataclass(frozen=True)
+class ShapeParts:
+    """Parts of a body by its shape, as indices of nodes."""
+
+    head: np.ndarray | None
+    """(k,) what is above the neck, or a small branch at the top; None if the shape shows no head."""
+    branches: tuple[np.ndarray, ...]
+    """(k,) each: arms, tails, ears, and whatever else sticks out and does not stand on the ground."""
+
+
+def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> ShapeParts:
+    """Find the parts of a body at rest, whose lowest nodes are on the ground.
+
+    The head is what lies above the highest neck of a branch of the skeleton that ends near the top, with the branches
+    that start there, or all of a small branch without a neck; of several, the one with the largest mass. A neck is a
+    section with clearly thicker ones above and below.
+
+    Args:
+        mesh: cage at rest, m.
+        node_mass: (N,) kg.
+        up: (3,) unit vector away from the ground.
+    """
+    shape = skeleton(mesh, up)
+    heights = mesh.nodes @ shape.up
+    height, mass = float(np.ptp(heights)), float(node_mass.sum())
+    base = heights < heights.min() + _BASE_HEIGHT * height
+    section_from_node = shape.section_from_sample[np.asarray(KDTree(shape.samples).query(mesh.nodes)[1])]
+
+    def nodes_of(sections: set[int], minimum: float, maximum: float) -> np.ndarray | None:
+        """Return the nodes of ``sections``; None if they are too few, stand on the ground or have another mass."""
+        nodes = np.flatnonzero(np.isin(section_from_node, list(sections)))
+        share = float(node_mass[nodes].sum()) / mass
+        return nodes if len(nodes) >= _MIN_NODES and minimum <= share <= maximum and not base[nodes].any() else None
+
+    heads = []
+    for branch in _ending_near_the_top(shape, _TOP * height):
+        above_necks = [nodes_of(_above(shape, branch, neck), _MIN_MASS, 1.0) for neck in _necks(branch)]
+        whole = nodes_of(_own_sections(branch), _MIN_MASS, _MAX_BRANCH_MASS)
+        nodes = next((nodes for nodes in above_necks if nodes is not None), whole)
+        if nodes is not None:
+            heads.append((float(node_mass[nodes].sum()), branch, nodes))
+    _, head_branch, head = max(heads, key=lambda entry: entry[0], default=(0.0, None, None))
+    branches = [
+        nodes_of(_own_sections(branch), 0.0, _MAX_BRANCH_MASS)
+        for branch in shape.branches
+        if branch is not head_branch and not branch.starts_on_ground and (branch.ends_freely or branch.own[0])
+    ]
+    return ShapeParts(head, tuple(nodes for nodes in branches if nodes is not None))
+
+
+def _ending_near_the_top(shape: Skeleton, depth: float) -> list[Branch]:
+    """Return the branches whose tip is at most ``depth`` (m) below the highest one."""
+    tips = [float(branch.points[-1] @ shape.up) if branch.ends_freely else -np.inf for branch in shape.branches]
+    return [branch for branch, tip in zip(shape.branches, tips, strict=True) if tip >= max(tips) - depth > -np.inf]
+
+
+def _necks(branch: Branch) -> Iterator[int]:
+    """Yield the points of the necks of a branch, from its end on."""
+    areas = np.pad(branch.radii**2, _NECK_WINDOW // 2, mode="edge")
+    radii = np.sqrt(np.convolve(areas, np.full(_NECK_WINDOW, 1.0 / _NECK_WINDOW), mode="valid"))
+    for k in range(len(radii) - 2, 0, -1):
+        is_narrowest = radii[k] <= min(radii[k - 1], radii[k + 1])
+        if is_narrowest and _NECK * radii[k] <= min(radii[:k].max(), radii[k + 1 :].max()):
+            yield k
+
+
+def _above(shape: Skeleton, branch: Branch, neck: int) -> set[int]:
+    """Return the sections of ``branch`` after the point ``neck``, and those of the branches that start there."""
+    sections = {section for numbers in branch.sections[neck + 1 :] for section in numbers}
+    starting = [
+        other
+        for other in shape.branches
+        if other is not branch and not other.starts_on_ground and sections.intersection(other.sections[0])
+    ]
+    return sections.union(*(_own_sections(other) for other in starting))
+
+
+def _own_sections(branch: Branch) -> set[int]:
+    return {section for numbers, own in zip(branch.sections, branch.own, strict=True) if own for section in numbers}

@@ -1,0 +1,67 @@
+"""Check by a short stand whether the muscles of a user can balance a body."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.locomotion.planner import MIN_STEPS_PER_TIME_UNIT
+from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.locomotion.trajectory import measure
+from egs_warp.motions.push import Push
+from egs_warp.pipelines.creature import Creature, CreatureOptions, PlacedCage, creature_in_cage, initial_stance
+from egs_warp.pipelines.end_state import MAX_END_TILT, has_upright_pose
+from egs_warp.pipelines.facing_direction import Front
+from egs_warp.pipelines.simulated_run import MIN_FRAMES, simulate
+
+_STAND_TIME = 6.0
+"""Time of the stand in sqrt(H / g)."""
+_MOTION = "stand 60"
+"""Motion of the check; the number of frames ends it."""
+_IMPULSE = 0.05
+"""Impulse of the push at its start, m sqrt(g H): a body at rest on a wide base stands without muscles."""
+
+
+def own_muscles_notes(cloud: GaussianCloud, standing: PlacedCage, facing: Front, muscles_file: Path) -> tuple[str, ...]:
+    """Return the notes of ``balance_note`` for the muscles of a file on level ground.
+
+    Args:
+        cloud: The capture.
+        standing: Its cage.
+        facing: Its front.
+        muscles_file: Muscles (JSON, ``egs_warp.muscles.files``).
+    """
+    front = facing.direction @ standing.frame.axes
+    note = balance_note(creature_in_cage(cloud, standing, CreatureOptions(muscles_file=muscles_file, front=front)))
+    return () if note is None else (note,)
+
+
+def balance_note(creature: Creature) -> str | None:
+    """Return a note for the user if ``creature`` falls over in a short stand with a gentle push; None if it stands."""
+    place = initial_stance(creature)
+    if not has_upright_pose(place.base()):
+        return None
+    step = creature.body.time_unit / MIN_STEPS_PER_TIME_UNIT
+    frame = max(1.0 / FRAME_RATE, step)
+    # A stepper of its own, so that the check leaves no trace in the run that follows.
+    run = simulate(
+        replace(creature, stepper=copy(creature.stepper)),
+        _MOTION,
+        frames=max(MIN_FRAMES, 1 + int(np.ceil(_STAND_TIME * creature.body.time_unit / frame))),
+        step=step,
+        pushes=(Push(0.0, np.array([_IMPULSE, 0.0, 0.0])),),
+        get_up=False,
+    )
+    tilt = measure(run.trajectory).tilt_degrees
+    if run.fallen is None and not run.simulation.stopped and tilt <= MAX_END_TILT:
+        return None
+    end = "the next step could not be solved" if run.simulation.stopped else f"it tilts by {tilt:.0f} degrees"
+    return (
+        f"muscles: {creature.muscles.segment_count} segments cannot hold it upright: {end} after"
+        f" {run.trajectory.time[-1]:.1f} s in a short stand; give more or stronger fibres, from the base to the top on"
+        " all sides"
+    )

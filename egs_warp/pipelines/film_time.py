@@ -1,0 +1,51 @@
+"""Word to the user about a film that takes longer than its simulation, while there is time to choose a preview."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+
+from tqdm import tqdm
+
+_FIRST_FRAMES = 10
+"""Simulated frames after which the pace of the simulation is known."""
+_SETUP_FRAMES = 2
+"""Simulated frames that are not counted, because the first steps may compile kernels."""
+
+
+class FilmTimeNote:
+    """Compares the pace of a simulation with that of its film; ``update`` takes the progress of ``simulate``."""
+
+    def __init__(self, picture_seconds: float, pictures_per_frame: float, show_note: Callable[[str], object]) -> None:
+        """Create the comparison.
+
+        Args:
+            picture_seconds: Time of drawing one picture, s.
+            pictures_per_frame: Pictures of the film for each simulated frame.
+            show_note: Called with the note, at most once.
+        """
+        self._seconds = picture_seconds * pictures_per_frame
+        self._show_note = show_note
+        self._started = 0.0
+
+    def update(self, done: int, expected: int) -> None:
+        """Show the note once the pace is known, if the film will take longer.
+
+        Args:
+            done: Number of finished frames.
+            expected: Number of frames expected in total.
+        """
+        if done == _SETUP_FRAMES:
+            self._started = time.perf_counter()
+        if done != _FIRST_FRAMES:
+            return
+        simulation = (time.perf_counter() - self._started) / (_FIRST_FRAMES - _SETUP_FRAMES)
+        if self._seconds > simulation:
+            film, run = (tqdm.format_interval(each * expected) for each in (self._seconds, simulation))
+            # The line appears above the bar, which is drawn again below it.
+            with tqdm.external_write_mode(file=sys.stderr):
+                self._show_note(
+                    f"the film takes about {film}, after {run} of simulation; --preview draws it smaller and with fewer"
+                    " Gaussians"
+                )

@@ -1,0 +1,84 @@
+"""Head and branches of simple bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.motions.body_parts import ShapeParts, find_shape_parts
+from egs_warp.motions.follow import parts_of_body
+from tests.motions.test_follow import standing_stance
+from tests.support.meshes import UP, carved, column, figure, stool
+
+
+def doll() -> TetMesh:
+    """A head of half the height above a narrow neck, on a block."""
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        across, z = np.abs(c[:, :2]).max(axis=1), c[:, 2]
+        return ((z < 0.5) & (across < 0.3)) | ((z < 0.7) & (across < 0.1)) | ((z > 0.7) & (across < 0.4))
+
+    return carved((0.8, 0.8, 1.4), 0.1, keep)
+
+
+def rabbit() -> TetMesh:
+    """The same with a smaller head and two ears."""
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        (x, y), z = np.abs(c[:, :2]).T, c[:, 2]
+        across = np.maximum(x, y)
+        ears = (z > 1.0) & (x > 0.1) & (y < 0.1)
+        head = (z > 0.6) & (z < 1.0)
+        return ((z < 0.5) & (across < 0.3)) | ((z < 0.6) & (across < 0.1)) | (head & (across < 0.3)) | ears
+
+    return carved((0.6, 0.6, 1.4), 0.1, keep)
+
+
+def parts_of(mesh: TetMesh) -> ShapeParts:
+    return find_shape_parts(mesh, np.ones(len(mesh.nodes)), UP)
+
+
+def test_a_big_head_is_a_part_as_a_whole() -> None:
+    """Not only the topmost 0.15 of the height, so that a key does not crush it."""
+    mesh = doll()
+    head = parts_of(mesh).head
+    assert head is not None
+    above = np.flatnonzero(mesh.nodes[:, 2] > 0.75)
+    assert np.isin(above, head).all() and mesh.nodes[head, 2].min() > 0.55
+    parts = {part.name: part for part in parts_of_body(standing_stance(mesh))}
+    assert list(parts) == ["body", "base", "head", "foot"]
+    np.testing.assert_array_equal(parts["head"].nodes, head)
+
+
+def test_a_head_has_its_ears() -> None:
+    """Both ears end higher than the head; one of them continues its branch, the other starts there."""
+    mesh = rabbit()
+    parts = parts_of(mesh)
+    assert parts.head is not None
+    tips = np.flatnonzero(mesh.nodes[:, 2] > 1.2)
+    assert set(np.sign(mesh.nodes[tips, 0])) == {-1.0, 1.0}
+    assert np.isin(tips, parts.head).all() and mesh.nodes[parts.head, 2].min() > 0.5
+    (ear,) = parts.branches
+    assert mesh.nodes[ear, 2].min() > 0.9 and len(set(np.sign(mesh.nodes[ear, 0]))) == 1
+
+
+def test_arms_are_branches_from_left_to_right() -> None:
+    """Counterclockwise from straight ahead (+y): the left arm comes first."""
+    stance = standing_stance(figure())
+    arms = [part for part in parts_of_body(stance) if part.name.startswith("branch")]
+    assert [part.name for part in arms] == ["branch 1", "branch 2"]
+    left, right = (stance.standing[part.nodes] for part in arms)
+    assert left[:, 0].max() < -0.2 and right[:, 0].min() > 0.2
+    assert min(left[:, 2].min(), right[:, 2].min()) > 0.7
+
+
+@pytest.mark.parametrize("make", [column, stool, figure])
+def test_without_a_neck_the_head_is_the_top(make: Callable[[], TetMesh]) -> None:
+    stance = standing_stance(make())
+    assert parts_of(stance.body.mesh).head is None
+    (head,) = (part for part in parts_of_body(stance) if part.name == "head")
+    heights = stance.standing[:, 2]
+    np.testing.assert_array_equal(head.nodes, np.flatnonzero(heights > heights.max() - 0.15 * stance.body.height))

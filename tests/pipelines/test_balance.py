@@ -1,0 +1,49 @@
+"""Short stand that checks the muscles of a file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.assets import pawn
+from egs_warp.cli import main
+from egs_warp.io import write_ply
+from egs_warp.motions.script import motion
+from egs_warp.pipelines import balance
+from egs_warp.pipelines.balance import balance_note
+from egs_warp.pipelines.simulated_run import simulate
+from tests.support.creatures import coarse_pawn
+
+
+def test_a_body_that_falls_over_is_reported_and_one_that_stands_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hard push is beyond any muscles. The check leaves no trace in the run that follows."""
+    creature = coarse_pawn()
+    before = simulate(creature, motion("jump"), frames=3).trajectory
+    monkeypatch.setattr(balance, "_STAND_TIME", 0.3)
+    assert balance_note(creature) is None
+    monkeypatch.setattr(balance, "_STAND_TIME", 4.0)
+    monkeypatch.setattr(balance, "_IMPULSE", 1.5)
+    note = balance_note(creature)
+    assert note is not None
+    assert note.startswith(f"muscles: {creature.muscles.segment_count} segments cannot hold it upright: it tilts by ")
+    after = simulate(creature, motion("jump"), frames=3).trajectory
+    np.testing.assert_array_equal(after.positions, before.positions)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", ["info pawn.ply", "muscles pawn.ply --plot out.png", "animate pawn.ply --out out"])
+def test_every_command_checks_the_muscles_of_a_file(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], coarse: None
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=2000).cloud)
+    fibre = {"name": "spine", "kind": "longitudinal", "from": [0, 0, 0.1], "to": [0, 0, 0.6]}
+    (tmp_path / "own.json").write_text(json.dumps({"fibres": [fibre]}))
+    monkeypatch.setattr(balance, "_IMPULSE", 1.5)
+    flags = ["--frames", "2", "--size", "16"] if line.startswith("animate") else []
+    assert main([*line.split(), "--up", "z", "--muscles", "own.json", *flags]) == 0
+    said = capsys.readouterr()
+    assert "muscles: 4 segments cannot hold it upright: it tilts by " in said.out + said.err
