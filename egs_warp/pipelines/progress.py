@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from itertools import accumulate
@@ -76,7 +77,7 @@ def simulation_bar(*, quiet: bool = False, file: TextIO | None = None) -> Iterat
     """Show a bar on ``file`` (default stderr), and yield the ``progress`` argument of ``simulate``."""
     with (
         tqdm(desc="simulate", unit="frame", smoothing=_SMOOTHING, disable=quiet, file=file) as bar,
-        _redrawn(bar.refresh, is_quiet=quiet),
+        _redrawn(bar.refresh, quiet=quiet, file=file),
     ):
 
         def update(done: int, expected: int) -> None:
@@ -99,8 +100,12 @@ def _stages(name: str, done: Mapping[str, int], *, quiet: bool, file: TextIO | N
 
 
 @contextmanager
-def _redrawn(draw: Callable[[], object], *, is_quiet: bool) -> Iterator[None]:
-    """Call ``draw`` every ``_REFRESH_INTERVAL`` from a thread."""
+def _redrawn(draw: Callable[[], object], *, quiet: bool, file: TextIO | None) -> Iterator[None]:
+    """Call ``draw`` every ``_REFRESH_INTERVAL`` from a thread if ``file`` (default stderr) is a terminal: in the file of
+    a log, each drawing would stay."""
+    if quiet or not (file or sys.stderr).isatty():
+        yield
+        return
     over = Event()
 
     def loop() -> None:
@@ -108,14 +113,12 @@ def _redrawn(draw: Callable[[], object], *, is_quiet: bool) -> Iterator[None]:
             draw()
 
     thread = Thread(target=loop, daemon=True)
-    if not is_quiet:
-        thread.start()
+    thread.start()
     try:
         yield
     finally:
         over.set()
-        if not is_quiet:
-            thread.join()
+        thread.join()
 
 
 class _StageBar:
@@ -145,7 +148,7 @@ class _StageBar:
         if self._bar is None:
             self._bar = self._stack.enter_context(tqdm(**self._options))
             self._stack.push(self._show_end)
-            self._stack.enter_context(_redrawn(self._draw, is_quiet=self._is_quiet))
+            self._stack.enter_context(_redrawn(self._draw, quiet=self._is_quiet, file=self._options["file"]))
         if stage != self._stage:
             self._stage, self._stage_start = stage, self._elapsed()
         self._done = done

@@ -13,6 +13,13 @@ from egs_warp.pipelines.progress import conversion_bar, info_bar, preparation_ba
 from egs_warp.segmentation.clearance import StraddlingPolicy
 
 
+class Terminal(io.StringIO):
+    """Text that claims to be shown by a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
 def drawn(options: SceneOptions, monkeypatch: pytest.MonkeyPatch, told: list[tuple[float, str, float]]) -> list[str]:
     """Return the displayed line after each of ``told``: seconds since the start, stage, completed fraction."""
     clock = [1000.0]
@@ -70,7 +77,7 @@ def test_the_times_move_while_a_stage_reports_nothing(monkeypatch: pytest.Monkey
     clock = [1000.0]
     monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
     monkeypatch.setattr("egs_warp.pipelines.progress._REFRESH_INTERVAL", 0.01)
-    file = io.StringIO()
+    file = Terminal()
     with preparation_bar(file=file) as begins:
         for stage, seconds in (("cage", 0.0), ("body and muscles", 68.0), ("stand", 85.0)):
             clock[0] = 1000.0 + seconds
@@ -87,7 +94,7 @@ def test_a_simulation_is_redrawn_while_a_frame_takes_long(monkeypatch: pytest.Mo
     clock = [1000.0]
     monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
     monkeypatch.setattr("egs_warp.pipelines.progress._REFRESH_INTERVAL", 0.01)
-    file = io.StringIO()
+    file = Terminal()
     with simulation_bar(file=file) as update:
         update(2, 10)
         clock[0] = 1130.0
