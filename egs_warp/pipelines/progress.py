@@ -101,8 +101,8 @@ def _stages(name: str, done: Mapping[str, int], *, quiet: bool, file: TextIO | N
 
 @contextmanager
 def _redrawn(draw: Callable[[], object], *, quiet: bool, file: TextIO | None) -> Iterator[None]:
-    """Call ``draw`` every ``_REFRESH_INTERVAL`` from a thread if ``file`` (default stderr) is a terminal: in the file of
-    a log, each drawing would stay."""
+    """Call ``draw`` every ``_REFRESH_INTERVAL`` from a thread if ``file`` (default stderr) is a terminal; in a log,
+    each drawing would stay."""
     if quiet or not (file or sys.stderr).isatty():
         yield
         return
