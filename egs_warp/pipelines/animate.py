@@ -301,7 +301,7 @@ def _preview_note(options: AnimateOptions, film: Film) -> tuple[str, ...]:
     drawn = min(film.splats.count, PREVIEW_GAUSSIANS)
     return (
         f"preview: {drawn} of {film.splats.count} Gaussians at {width}x{height} pixels; egs-warp render draws the run"
-        " in full (--size sets its pixels)",
+        " in full",
     )
 
 

@@ -10,8 +10,8 @@ import pytest
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.motions.body_parts import ShapeParts, find_shape_parts
 from egs_warp.motions.follow import parts_of_body
-from tests.motions.test_follow import standing_stance
 from tests.support.meshes import UP, carved, column, figure, stool
+from tests.support.stances import standing_stance
 
 
 def doll() -> TetMesh:

@@ -7,15 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
-from egs_warp.fem.body import BodyState, make_body
+from egs_warp.fem.body import BodyState
 from egs_warp.geometry.plane import Plane
-from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
 from egs_warp.motions.follow import Follow, FollowPhase, FollowPlan
 from egs_warp.motions.keyframes import Key, Quantity
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.stance import GroundFrame
 from tests.support.meshes import block_mesh, figure, stool
+from tests.support.stances import standing_stance
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 DT = 1 / 60
@@ -24,13 +23,6 @@ DT = 1 / 60
 @pytest.fixture
 def place() -> Stance:
     return standing_stance(block_mesh())
-
-
-def standing_stance(mesh: TetMesh) -> Stance:
-    """Return the stance of a body of ``mesh`` at rest; forward is +y."""
-    body = make_body(mesh, FLOOR, device="cpu")
-    ground = GroundFrame.on_plane(FLOOR, np.array([0.0, 1.0, 0.0]), body.centre_of_mass(mesh.nodes))
-    return Stance(body, ground, mesh.nodes, mesh.nodes[mesh.nodes[:, 2] < 1e-9], DT)
 
 
 def key(time: float, part: str, quantity: Quantity, value: tuple[float, float, float]) -> Key:

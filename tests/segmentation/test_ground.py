@@ -63,6 +63,7 @@ def test_heights_are_those_of_the_cloth(located: LocatedPlane, folds: tuple[Gaus
     assert abs(off.mean()) < 1e-3 and np.abs(off).mean() < 2e-3 and np.quantile(np.abs(off), 0.99) < 8e-3
 
 
+@pytest.mark.slow
 def test_messages(located: LocatedPlane) -> None:
     assert any(
         note.startswith("the ground is not flat: it differs from its plane by")

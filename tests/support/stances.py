@@ -26,6 +26,13 @@ def block_place(mesh: TetMesh | None = None) -> Stance:
     return Stance(body, ground, standing, standing[standing[:, 2] < 1e-9], DT, (Solid((FLOOR,)),))
 
 
+def standing_stance(mesh: TetMesh) -> Stance:
+    """Return the stance of a body of ``mesh`` at rest; forward is +y."""
+    body = make_body(mesh, FLOOR, device="cpu")
+    ground = GroundFrame.on_plane(FLOOR, np.array([0.0, 1.0, 0.0]), body.centre_of_mass(mesh.nodes))
+    return Stance(body, ground, mesh.nodes, mesh.nodes[mesh.nodes[:, 2] < 1e-9], DT)
+
+
 def moved(place: Stance, angle: float, shift: np.ndarray) -> np.ndarray:
     """(N, 3) nodes of the standing block, rotated by ``angle`` rad about up and translated by ``shift`` (3,)."""
     com = place.body.centre_of_mass(place.standing)
