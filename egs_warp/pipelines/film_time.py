@@ -46,6 +46,6 @@ class FilmTimeNote:
             # The line appears above the bar, which is drawn again below it.
             with tqdm.external_write_mode(file=sys.stderr):
                 self._show_note(
-                    f"the film takes about {film}, after {run} of simulation; --preview draws it smaller and with fewer"
+                    f"the film takes about {film}, after {run} of simulation; a preview draws it smaller and with fewer"
                     " Gaussians"
                 )

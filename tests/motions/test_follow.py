@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
-from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
 from egs_warp.motions.follow import Follow, FollowPhase, FollowPlan
 from egs_warp.motions.keyframes import Key, Quantity
@@ -16,7 +15,6 @@ from egs_warp.motions.sequence import Stance
 from tests.support.meshes import block_mesh, figure, stool
 from tests.support.stances import standing_stance
 
-FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 DT = 1 / 60
 
 

@@ -21,4 +21,4 @@ def test_a_film_slower_than_its_simulation_is_announced_once(
         note.update(done, 300)
     assert len(notes) == count
     if count:
-        assert notes[0].startswith("the film takes about 01:06, after 01:00 of simulation; --preview draws it smaller")
+        assert notes[0].startswith("the film takes about 01:06, after 01:00 of simulation; a preview draws it smaller")
