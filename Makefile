@@ -64,7 +64,7 @@ fuzz: setup
 	status=0; HYPOTHESIS_PROFILE=fuzz $(PYTEST) -m "hypothesis and not (slow or data or example or browser)" || status=1; \
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --minutes $(MINUTES) || status=1; exit $$status
 
-# Small changes of the code that a package's fast tests must notice; goes on where it stopped. PACKAGES and COUNT say how many.
+# Small changes to the code that a package's fast tests must detect; continues where it stopped. PACKAGES and COUNT say how many.
 mutation: setup
 	$(BIN)/python -m tests.mutation --processes $(PROCESSES) $(PACKAGES:%=--packages %) $(COUNT:%=--count %)
 

@@ -14,7 +14,7 @@ from egs_warp.training.metrics import psnr
 COARSE = 0.05
 """Standard deviation of the blur for ``coarse_psnr``, relative to the hole's side."""
 SHIFTS = np.array([(r * np.cos(t), r * np.sin(t)) for r in (0.5, 0.75, 1.0) for t in np.radians(np.arange(0, 360, 15))])
-"""(72, 2) shifts relative to the hole's side at which true floor is sampled."""
+"""(72, 2) offsets from the hole at which the true floor is sampled, in units of the hole's side."""
 
 
 def similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:

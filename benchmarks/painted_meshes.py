@@ -74,7 +74,8 @@ def _read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def standing(vertices: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the offset to subtract from ``vertices`` (V, 3) and the factor that scales them to 1 high on z = 0."""
+    """Return the offset to subtract from ``vertices`` (V, 3) so that they stand on z = 0 at the origin, and the factor
+    that then scales them to a height of 1."""
     lower, upper = vertices.min(axis=0), vertices.max(axis=0)
     return np.array([*((lower + upper)[:2] / 2), lower[2]]), 1.0 / float(upper[2] - lower[2])
 

@@ -1,4 +1,4 @@
-"""Speed and image difference of the renderer: against gsplat and gswarp on a GPU, against a PyTorch twin on a CPU.
+"""Speed and image difference of the renderer: against gsplat and gswarp on a GPU, against plain PyTorch on a CPU.
 
 Aims: ``cuda_beats_gswarp`` (faster in every cell), ``cuda_within_1_3_of_gsplat`` (geometric mean of all cells),
 ``ahead_of_gsplat_every_cell`` (packed or not, whichever is faster), ``same_picture`` (mean difference below 1e-5, and
@@ -149,7 +149,7 @@ def memory_row(*, seed: int) -> Row:
 
 
 def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
-    """Time 112k Gaussians at 640 x 480: one thread, two threads, and the PyTorch twin on the same tile lists."""
+    """Time 112k Gaussians at 640 x 480: one thread, two threads, and plain PyTorch on the same tile lists."""
     scene = peers.ours_scene(peers.garden_scene(points, grid=1, seed=seed, device="cpu"))
     camera = peers.garden_camera(points, width=640, height=480)
     cloud, view = peers.cloud_of(scene), view_from_camera(camera)

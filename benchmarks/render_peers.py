@@ -1,4 +1,4 @@
-"""The other renderers of ``benchmarks/render.py`` with a common signature, and a plain PyTorch twin."""
+"""The other renderers of ``benchmarks/render.py`` with a common signature, and compositing in plain PyTorch."""
 
 from __future__ import annotations
 

@@ -38,7 +38,8 @@ from table1_rows import MAIN, MOTIONS, ROWS, SAME_SPLIT, SAME_TRAINING, Splittin
 OBJECTS = ("chair", "plant", "microphone")
 HELD_OUT = ("spot", "stool")
 FROM_PHOTOS = "lego"
-"""Proxy of the NeRF-synthetic model, built from its photos (``lego_proxy.py``); used only on request and in no aim."""
+"""Proxy of the NeRF-synthetic model, built from its photos (``lego_proxy.py``); evaluated only on request, and part of
+no aim."""
 CHOOSING = ("cat", "vase", "table")
 """Objects on which the settings below were chosen."""
 DEGREES, MIN_ERROR, DEPTH, GROWTH = 4.0, 7e-4, 4, 20.0

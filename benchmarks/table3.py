@@ -83,7 +83,7 @@ def segment_parts(name: str, device: str) -> Parts:
 
 
 def cameras_in(plane: Plane, located: LocatedPlane, side: int) -> list[Camera]:
-    """Return four cameras with their centres in the plane that look along it."""
+    """Return four cameras that look along the plane, with their centres in it."""
     tall = 2.0 * float(plane.heights(located.centre))
     middle = located.centre - plane.heights(located.centre) * plane.normal
     return ring_cameras(plane, middle, tall, count=4, elevations=(0.0,), size=side, margin=1.15)

@@ -9,5 +9,5 @@ _LINK = re.compile(r"^\[[^]]*\]\((assets/pages/[\w-]+\.html)\).*\n", re.MULTILIN
 
 
 def on_page_markdown(markdown: str, files: Any, **_: Any) -> str:
-    """Edit the text of each page, called by mkdocs; ``files`` are those of the site."""
+    """Remove the links to missing pages from the text of a page, for mkdocs; ``files`` are the files of the site."""
     return _LINK.sub(lambda link: link[0] if files.get_file_from_path(link[1]) else "", markdown)

@@ -36,7 +36,7 @@ def eye(degrees: float, elevation: float = 28.0, away: float = 3.2) -> np.ndarra
 
 
 def camera(place: np.ndarray, fov: float = 38.0, target: np.ndarray = MIDDLE) -> Camera:
-    """Return a camera that looks at the object."""
+    """Return a camera at ``place`` that looks at ``target``, by default the object."""
     return Camera.look_at(place, target, np.array([0.0, 0.0, 1.0]), width=SIDE, height=SIDE, vertical_fov_degrees=fov)
 
 

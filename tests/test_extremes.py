@@ -1,5 +1,5 @@
-"""A Gaussian with arbitrary values is rejected with the attribute's name, or images, gradients, motion, splits and
-training stay finite and all other Gaussians are unchanged bit by bit.
+"""A Gaussian with arbitrary values is either rejected, with the name of the attribute, or does no harm: images,
+gradients, motion, splits and training stay finite, and all other Gaussians keep every bit.
 """
 
 from __future__ import annotations

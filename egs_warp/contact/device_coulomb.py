@@ -1,4 +1,4 @@
-"""Coulomb solve of a step's contacts on a GPU, asynchronously; ``coulomb_forces`` is the version on the host.
+"""Asynchronous Coulomb solve of a step's contacts on a GPU; ``coulomb_forces`` is the version on the host.
 
 There is no continuation: a solve that fails is repeated on the host (``DeviceNewtonIterate.newton_steps``). The kernel
 is in ``kernels/contact/coulomb.py``.

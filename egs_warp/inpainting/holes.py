@@ -80,7 +80,7 @@ class Hole:
             for corners in outline.outlines:
                 cv2.fillPoly(mask, [corners], (1,))
         except (ValueError, cv2.error) as error:
-            raise UserError("plane.json: its hole is damaged; make it again with egs-warp segment") from error
+            raise UserError("plane.json: its hole is not valid; write the file again with egs-warp segment") from error
         return cls(PlaneWindow(plane, outline.centre, outline.texel, rows, columns), mask > 0)
 
     def drawn_on(self, window: PlaneWindow) -> np.ndarray:

@@ -218,7 +218,7 @@ def _text_poses(data: bytes, path: Path) -> list[_Pose]:
     poses = []
     may_be_points = False
     for at, line in _text_lines(data, path):
-        # Lines of points are long, and few begin like an image.
+        # Only the beginning is split: lines of points are long, and few begin like the line of an image.
         words = line[:_IMAGE_START].split(maxsplit=9)
         if may_be_points and not words[0].isdecimal() and _is_point_line(words[:3]):
             may_be_points = False

@@ -296,7 +296,7 @@ class _Asset:
             elif degree < len(SH_COUNTS):
                 sh += [of(name) for name in names]
         if (scales < 0.0).any():
-            # A review draft of the extension defined them so.
+            # A review draft of the extension stored the logarithms of scales.
             notes.append("scales are negative: read as logarithms")
             log_scales = scales
         else:

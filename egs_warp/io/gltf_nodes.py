@@ -14,7 +14,7 @@ from egs_warp.errors import UserError
 
 INSTANCING = "EXT_mesh_gpu_instancing"
 _FLAT = 1e-9
-"""Ratio of the smallest to the largest singular value up to which a transform is flat."""
+"""Ratio of the smallest to the largest singular value up to which a transform counts as singular."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def placements(
         is_wanted: returns True for the index of a mesh that is to be placed.
 
     Raises:
-        UserError: the nodes do not form a tree, or a transform is flat or not finite.
+        UserError: the nodes do not form a tree, or a transform is singular or not finite.
     """
     nodes, scenes = tree.get("nodes", []), tree.get("scenes", [])
     parents = {child: number for number, node in enumerate(nodes) for child in node.get("children", [])}
@@ -94,7 +94,7 @@ def _placed(
         transforms = whole[None] if instancing is None else whole @ _instances(instancing["attributes"], accessor)
         sizes = np.linalg.svd(np.nan_to_num(transforms[:, :3, :3], nan=0.0, posinf=0.0, neginf=0.0), compute_uv=False)
         if not np.isfinite(transforms).all() or (sizes[:, 2] <= _FLAT * sizes[:, 0]).any():
-            raise UserError(f"{source}: a transform of its nodes is flat or not finite; export it again")
+            raise UserError(f"{source}: the transform of a node is singular or not finite; export it again")
         found.append(Placement(mesh, transforms))
     return found
 

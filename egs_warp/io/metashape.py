@@ -39,9 +39,9 @@ def read_metashape(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], l
     or has no valid camera.
     """
     data = read_bytes(source, at_most=MAX_TEXT_BYTES)
-    # A document type can define entities that expand to any size.
+    # A document type declaration can define entities that expand to any size.
     if b"<!DOCTYPE" in data.replace(b"\0", b""):
-        raise UserError(f"{source}: it has a document type, which Metashape does not write; {_EXPORT}")
+        raise UserError(f"{source}: it has a document type declaration, which Metashape does not write; {_EXPORT}")
     try:
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError, RecursionError) as error:

@@ -49,7 +49,7 @@ class FoundFile:
     reason: str = ""
     """Reason why there is no path, if it is not just that there is no such file."""
     by_name: bool = False
-    """True if the file is not where its name says."""
+    """True if the file is not at the path that the poses state, and was found by its name."""
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ class HoleOutline:
                 raise ValueError
             return cls(centre, texel, (rows, columns), outlines)
         except (TypeError, KeyError, ValueError, OverflowError, AttributeError) as error:
-            raise UserError(f"{path}: its hole is damaged; make it again with egs-warp segment") from error
+            raise UserError(f"{path}: its hole is not valid; write the file again with egs-warp segment") from error
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ _JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
 _MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap")
 """Folders of COLMAP models or of their numbered folders, in order of preference."""
 _DISTORTED = "distorted/sparse"
-"""Folder of the model before the undistortion, which belongs to the original photos."""
+"""Folder of the COLMAP model of the original photos, before their undistortion."""
 _BETWEEN = ("sparse", "colmap", "distorted")
 """Names of folders between the model and the folder of the data set."""
 _MAX_DEPTH = 3

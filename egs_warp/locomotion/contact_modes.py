@@ -109,7 +109,7 @@ class ModeRegionOptimum:
     """Optimum of the QP of one mode region."""
 
     x: np.ndarray
-    """(m + 3n,)."""
+    """(m + 3n,) activations and contact forces (a, f), as in ``CoulombProgram``."""
     objective: float
     contact: np.ndarray
     """(k,) contact of each active mode constraint that raises the objective."""

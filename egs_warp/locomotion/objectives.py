@@ -45,7 +45,7 @@ class Objective:
 
 
 def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
-    """Return the objective that the centre of mass has velocity ``target`` (3,) m/s."""
+    """Return the objective that drives the velocity of the centre of mass to ``target`` (3,) m/s."""
     return Objective("com", body.mean_rows, np.asarray(target, float), weight)
 
 
@@ -123,15 +123,15 @@ AnyObjective = Objective | AngularMomentumObjective | LoadObjective
 
 
 def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
-    """Return the objective that all nodes have velocities ``target`` (N, 3) m/s, each weighted by its mass fraction:
-    motion towards a pose."""
+    """Return the objective that drives the velocities of all nodes to ``target`` (N, 3) m/s, each weighted by its mass
+    fraction: motion towards a pose."""
     shares = body.mass_roots
     return Objective("pose", sparse.csr_matrix(sparse.diags(shares)), shares * target.ravel(), weight)
 
 
 def deformation_velocities(body: SoftBody, positions: np.ndarray, target: np.ndarray, weight: float) -> Objective:
-    """Return the objective that the body stretches and shears at the rates of the ``target`` velocities, which lead to
-    a pose. Finer deformations are left to elasticity, and translation and rotation to their own objectives.
+    """Return the objective that makes the body stretch and shear at the rates of the ``target`` velocities, which lead
+    to a pose. Finer deformations are left to elasticity, and translation and rotation to their own objectives.
 
     The six rows are orthonormal in the mass-weighted mean, so the weight is comparable with that of
     ``node_velocities``.
@@ -212,8 +212,8 @@ WORLD = Coordinates(np.eye(3), False)
 def part_velocity(
     body: SoftBody, part: BodyPart, target: np.ndarray, weight: float, coordinates: Coordinates = WORLD
 ) -> Objective:
-    """Return the objective that the centre of ``part`` has velocity ``target`` (3,) m/s in ``coordinates``. Applied to
-    the base, in coordinates relative to the centre of mass, it controls a landing."""
+    """Return the objective that drives the velocity of the centre of ``part`` to ``target`` (3,) m/s in
+    ``coordinates``. Applied to the base, in coordinates relative to the centre of mass, it controls a landing."""
     shares = np.zeros(len(body.node_mass))
     shares[part.nodes] = part.masses / part.masses.sum()
     if coordinates.relative:
@@ -230,8 +230,8 @@ def part_position(
     rate: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Return the objective that the centre of ``part`` approaches position ``target`` (3,) m in ``coordinates`` at
-    ``rate`` 1/s; 1/dt reaches it at the end of the step."""
+    """Return the objective that moves the centre of ``part`` towards position ``target`` (3,) m in ``coordinates`` at
+    ``rate`` 1/s; a rate of 1/dt reaches it at the end of the step."""
     centre = part.centre(state.positions)
     if coordinates.relative:
         centre = centre - body.centre_of_mass(state.positions)
@@ -247,8 +247,8 @@ def part_acceleration(
     dt: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Return the objective that the centre of ``part`` has mean acceleration ``target`` (3,) m/s^2 in ``coordinates``
-    over the step of ``dt`` s."""
+    """Return the objective that drives the mean acceleration of the centre of ``part`` over the step of ``dt`` s to
+    ``target`` (3,) m/s^2 in ``coordinates``."""
     velocity = part.centre(state.velocities)
     if coordinates.relative:
         velocity = velocity - body.centre_of_mass(state.velocities)
@@ -263,8 +263,9 @@ def part_angular_momentum(
     weight: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Return the objective that ``part`` has angular momentum ``target`` (3,) kg m^2/s about its own centre; in
-    relative coordinates it is taken about the centre of mass of the body, with velocities relative to that.
+    """Return the objective that drives the angular momentum of ``part`` about its own centre to ``target`` (3,)
+    kg m^2/s. In relative coordinates, it is the angular momentum about the centre of mass of the body, with velocities
+    relative to it.
 
     Rows are in m/s: angular momentum divided by mass x radius of gyration. For the whole body
     ``AngularMomentumObjective`` is exact; this one uses the lever arms at the start of the step.
@@ -291,8 +292,8 @@ def part_angular_velocity(
     weight: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Return the objective that ``part`` has angular velocity ``target`` (3,) rad/s: that of the rigid body with its
-    angular momentum. Rows are in m/s: angular velocity times radius of gyration."""
+    """Return the objective that drives the angular velocity of ``part``, that of a rigid body with its angular
+    momentum, to ``target`` (3,) rad/s. Rows are in m/s: angular velocity times radius of gyration."""
     momentum = part_angular_momentum(body, part, state, np.zeros(3), weight)
     unit = _gyration(part, state.positions) * part.masses.sum()
     radius = _gyration(part, state.positions)
@@ -301,7 +302,7 @@ def part_angular_velocity(
 
 
 def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, weight: float, rate: float) -> Objective:
-    """Return the objective that the area of the convex hull of ``part``, projected along ``up`` (3,), approaches
+    """Return the objective that drives the area of the convex hull of ``part``, projected along ``up`` (3,), towards
     ``target`` m^2 at ``rate`` 1/s.
 
     Rows are in m/s: dA/dt divided by the perimeter of the hull is the speed at which its sides move outwards.
@@ -324,8 +325,8 @@ def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, w
 
 
 def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float) -> Objective:
-    """Return the objective that each node of ``part`` has velocity ``target`` (k, 3) m/s, with equal weights: position
-    and shape at once."""
+    """Return the objective that drives the velocities of the nodes of ``part`` to ``target`` (k, 3) m/s, with equal
+    weights: position and shape at once."""
     count = len(part.nodes)
     columns = (3 * part.nodes[:, None] + np.arange(3)).ravel()
     share = np.sqrt(1.0 / count)
@@ -336,8 +337,8 @@ def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float
 
 
 def no_slip_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> Objective:
-    """Return the objective that contacts do not slide, each weighted by its load; ``loads`` (n,) are fractions of the
-    body weight."""
+    """Return the objective that keeps contacts from sliding, each weighted by its load; ``loads`` (n,) are fractions of
+    the body weight."""
     shares = np.sqrt(np.repeat(loads, 3))
     shares[::3] = 0.0
     rows = sparse.csr_matrix(contacts.jacobian.multiply(shares[:, None]))

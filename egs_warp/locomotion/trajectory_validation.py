@@ -9,7 +9,7 @@ from egs_warp.io.limits import MAX_COORDINATE
 from egs_warp.locomotion.trajectory import Trajectory
 
 MAX_DURATION = 86_400.0
-"""s, maximum duration of a run, one day. The number of frames is 60 times as large."""
+"""Maximum duration of a run, s: one day."""
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     "time": ("states",),
     "dt": ("steps",),
@@ -75,7 +75,7 @@ def check_trajectory(t: Trajectory) -> None:
         if values.dtype.kind not in "iuf":
             raise ValueError(f"{name} is not numeric")
         if name not in _MAY_BE_NAN and not (np.abs(values) <= MAX_COORDINATE).all():
-            raise ValueError(f"{name} has values that are not finite or too large")
+            raise ValueError(f"{name} has values that are too large or not finite")
         if name in _POSITIVE and not (values > 0.0).all():
             raise ValueError(f"{name} is not positive")
     for name, below in _INDICES.items():

@@ -92,7 +92,7 @@ class CreatureOptions:
             advice = f"give a Coulomb coefficient from 0 to {MAX_FRICTION:g}"
             raise ArgumentError("friction", advice, value=self.friction)
         if self.metres_per_unit is not None and not 1e-9 <= self.metres_per_unit <= 1e9:
-            # Single precision does not represent other lengths; ``make_body`` checks which of these fit the body.
+            # The bounds keep lengths within the range of single precision; ``make_body`` checks the height of the body.
             advice = "give a positive number, from 1e-9 to 1e9"
             raise ArgumentError("metres_per_unit", advice, value=self.metres_per_unit)
 

@@ -144,7 +144,7 @@ class RenderData:
         if self.muscle_bounds.shape != (count,) or not np.isfinite(self.muscle_bounds).all():
             raise ValueError("muscle_bounds has a wrong shape or values that are not finite")
         if not (np.abs(ends.data) <= MAX_COORDINATE).all():
-            raise ValueError("muscle_end_weights has values that are not finite or too large")
+            raise ValueError("muscle_end_weights has values that are too large or not finite")
 
 
 def _check_rows(name: str, values: np.ndarray, shape: tuple[int, ...], minimum: int, below: int) -> None:

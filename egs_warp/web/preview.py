@@ -21,9 +21,9 @@ from egs_warp.web.recording import splat_arrays
 from egs_warp.web.server import FrameFeed
 
 _OUTLIERS = 0.5
-"""Percentage of the opaque Gaussians that are ignored at each end of an axis for the size of the still capture."""
+"""Percentage of the opaque Gaussians that are ignored at each end of an axis when the capture is measured."""
 _OPAQUE = 0.3
-"""Opacity above which a Gaussian counts for the size."""
+"""Opacity above which a Gaussian is used to measure the capture."""
 _FOV_DEGREES = 30.0
 _DISTANCE = 1.0 / np.tan(np.radians(0.5 * _FOV_DEGREES))
 """Distance of the camera at which half of the picture's height is one body height, body heights."""

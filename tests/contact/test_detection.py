@@ -26,7 +26,7 @@ GRAVITY = 9.81
 
 
 def seven_points(cloud: GaussianCloud, gamma: float = 3.0) -> np.ndarray:
-    """(n, 7, 3) mean and the six ends of T+ and T-, one Gaussian at a time (slow twin)."""
+    """(n, 7, 3) mean and the six ends of T+ and T-, one Gaussian at a time (slow reference)."""
     rows = []
     for mean, (w, x, y, z), log_scale in zip(
         cloud.means.numpy(), cloud.rotations.numpy(), cloud.log_scales.numpy(), strict=True

@@ -109,7 +109,7 @@ def assembly_gram(corners: np.ndarray) -> np.ndarray:
 
 
 def test_rigid_motion_costs_nothing(bent: Bent) -> None:
-    """A rotation causes no energy, force or damping; internal forces have no net force or torque."""
+    """A rigid motion causes no elastic energy, force or damping; internal forces have no net force or torque."""
     assembly, x, damping = bent
     nodes = assembly.mesh.nodes
     motion = Rotation.from_rotvec([1.0, 2.0, -0.5]).as_matrix().T

@@ -93,7 +93,7 @@ def test_levelled_and_raised_are_inverse() -> None:
 
 
 def test_top_is_where_a_vertical_line_meets_the_ground() -> None:
-    """On level and on sloping ground."""
+    """The ground is wavy and tilted, and the vertical is 20 degrees from its normal."""
     field = tilted(wavy_ground())
     up = Rotation.from_rotvec(np.radians(20.0) * field.axes[0]).apply(field.normal)
     point = field.origin + 2.1 * field.axes[0] + 1.7 * field.axes[1] + 0.4 * field.normal

@@ -229,7 +229,7 @@ def test_holes_that_are_none(change: dict, tmp_path: Path) -> None:
     path.write_text(planes(HOLE))
     assert read_planes(path)[0].hole is not None
     path.write_text(planes(HOLE | change))
-    with pytest.raises(UserError, match=r"its hole is damaged; make it again with egs-warp segment"):
+    with pytest.raises(UserError, match=r"its hole is not valid; write the file again with egs-warp segment"):
         read_planes(path)
 
 

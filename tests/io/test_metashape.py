@@ -135,7 +135,7 @@ def test_metashape_leaves_out_what_is_not_aligned(tmp_path: Path) -> None:
         ("<document><chunk>", "not readable XML (no element found"),
         ("<document><chunk/></document>", "it has no chunk with cameras; export the cameras again as XML"),
         ("<document><chunk><cameras/></chunk></document>", "it has no cameras; export the cameras again as XML"),
-        ('<!DOCTYPE a [<!ENTITY b "c">]><document><chunk/></document>', "it has a document type, which Metashape does"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><document><chunk/></document>', "it has a document type declaration, which"),
         (
             document(kind="spherical"),
             "camera 00 has a sensor of type 'spherical'; give one of frame, fisheye, equidist",

@@ -39,8 +39,8 @@ def test_new_values_replace_the_known_ones() -> None:
 @pytest.mark.parametrize(
     ("facts", "message"),
     [
-        ({"hole": {"texels": [8, 6]}}, "its hole is damaged; make it again with egs-warp segment"),
-        ({"hole": 3}, "its hole is damaged; make it again with egs-warp segment"),
+        ({"hole": {"texels": [8, 6]}}, "its hole is not valid; write the file again with egs-warp segment"),
+        ({"hole": 3}, "its hole is not valid; write the file again with egs-warp segment"),
         ({"ground": {"spacing": 1.0}}, "its ground is damaged; make it again with egs-warp segment"),
         ({"ground": [1, 2]}, "its ground is damaged; make it again with egs-warp segment"),
         (

@@ -92,7 +92,7 @@ def test_a_missing_misplaced_or_late_push_is_detected() -> None:
 
 
 def sliding(t: Trajectory) -> np.ndarray:
-    """Return the contacts whose friction does most work."""
+    """Return the five contacts whose friction dissipates the most energy."""
     way = np.diff(t.positions, axis=0)[t.contact_step[:, None], t.contact_nodes]
     moved = np.einsum("cw,cwi->ci", t.contact_weights, way)
     level = t.contact_force * [1.0, 1.0, 0.0]

@@ -98,7 +98,8 @@ def check(creature: Creature, one: StepReport, other: StepReport) -> None:
 
 
 def test_each_world_equals_a_single_run(creature: Creature, jump: Trajectory) -> None:
-    """30 steps of a jump, from the ground and back to it, on three grounds with three strengths."""
+    """30 steps of a jump, from before take-off until after landing, in three worlds with different friction and
+    activations."""
     dt, _ = solver_steps(creature.body)
     starts = [BodyState(jump.positions[FIRST], jump.velocities[FIRST])] * 3
     activations = np.stack([strength * jump.activations[FIRST:][:STEPS] for strength in STRENGTHS], axis=1)

@@ -306,7 +306,7 @@ def test_a_block_iterates_as_osqp_and_ends_at_the_optimum(seed: int, device: str
         device=device,
         block_dim=mode_search.BLOCK,
     )
-    # A row at its bound to rounding may be counted on either side.
+    # A row that is at its bound, up to rounding, may be counted on either side.
     sure = np.minimum(np.abs(at - lower + pushes), np.abs(upper - at - pushes)) > 1e-9
     np.testing.assert_array_equal(guessed.numpy()[sure], expected[sure])
     assert sure.sum() > m - 3 and np.count_nonzero(expected) > 2

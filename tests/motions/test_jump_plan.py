@@ -49,7 +49,7 @@ def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTa
     push = plan.speed_up**2 / (2.0 * way)
     least, deepest = plan.extension + 0.02 * height, 0.26 * com_height
     assert 0.0 < plan.extension < target.height and plan.crouch_depth > 0.0
-    # At 2.8 g; higher if the crouch is as deep as the body allows, lower if it is as shallow as a thrust needs.
+    # The thrust has 2.8 g; more if the crouch is as deep as the body allows, less if it is as shallow as is possible.
     if plan.crouch_depth > deepest - 1e-9:
         assert plan.crouch_depth == pytest.approx(deepest) and push > 2.8 * GRAVITY
     elif way < least + 1e-9:
@@ -66,9 +66,9 @@ def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTa
     assert apex == pytest.approx(target.height, abs=GRAVITY * STEP**2)
     assert time == pytest.approx(plan.flight_time, abs=1.5 * STEP)
 
-    # Distance: the lean, half the forward speed during the thrust and all of it in flight; the rest is the distance by
-    # which the feet are placed ahead of the body. The forward speed from the crouch is neglected: the planned path is
-    # slightly longer.
+    # The distance is the sum of the lean, the paths of the thrust at half the forward speed and of the flight at the
+    # full speed, and the distance by which the feet land ahead of the body. The forward speed from the crouch is
+    # neglected, so the planned path is slightly longer.
     way = plan.lean + plan.speed_forward * (0.5 * plan.thrust_time + plan.flight_time)
     assert way + plan.landing_lag == pytest.approx(target.distance, rel=1e-9)
     assert plan.lean == pytest.approx(LEAN_FRACTION * target.distance)

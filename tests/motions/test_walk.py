@@ -1,4 +1,4 @@
-"""Walks of coarse bodies on four feet, on two feet and on one base: their plan, and every step of them audited."""
+"""Walks of coarse bodies on four feet, on two feet and on one base: their plans, and an audit of every step."""
 
 from __future__ import annotations
 

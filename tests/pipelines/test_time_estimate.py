@@ -27,7 +27,7 @@ def _estimates(text: str, frames: int | None = None) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("text", ["jump", "hop x2 0.4 0.2", "twist 60", "twist 180", "walk 0.2", "jump 0 0.1, turn 30"])
 def test_the_estimate_is_within_a_factor_of_two(text: str) -> None:
-    """The last frames are excluded; a twist decides in the air whether it needs another jump."""
+    """The last ``NEAR`` frames are excluded. Only in the air is it known whether a twist needs another jump."""
     done, expected = _estimates(text).T
     count = len(done)
     far = done < count - NEAR

@@ -1,4 +1,4 @@
-"""Gradients of the renderer against finite differences of the float64 twin."""
+"""Gradients of the renderer against finite differences of the float64 reference."""
 
 from __future__ import annotations
 
@@ -115,8 +115,8 @@ def many_splats(count: int = 800) -> tuple[dict[str, np.ndarray], Camera]:
 
 
 def test_directional_derivative_of_a_crowded_scene(device: str) -> None:
-    """A step along the gradient changes the float64 twin's loss as predicted, for hundreds of overlapping splats with
-    early stops."""
+    """A step along the gradient changes the loss of the float64 reference as predicted, for hundreds of overlapping
+    splats with early stops."""
     values, camera = many_splats(300)
     got = gradients(values, camera, device)
     random = np.random.default_rng(3)

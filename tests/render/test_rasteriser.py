@@ -1,4 +1,4 @@
-"""The renderer against a slow NumPy twin, symmetries and closed forms."""
+"""The renderer against a slow NumPy reference, symmetries and closed forms."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_antialiased_mode_and_background_image(device: str) -> None:
 
 
 def test_long_thin_splats_do_not_cancel(device: str) -> None:
-    """Needles of 1000 : 1 on the screen match the twin; the usual conic form in float32 would lose every digit."""
+    """Needles of 1000 : 1 on the screen match the reference; the usual conic form in float32 would lose every digit."""
     values = random_scene(60, seed=5)
     values["log_scales"] = np.tile([1.0, -7.0, -9.0], (60, 1))
     camera = camera_of(200, 160)

@@ -1,9 +1,9 @@
-"""``make mutation``: small changes of the code, one by one, that the fast tests of a package must detect.
+"""Small changes to the code, one at a time, that the fast tests of a package must detect (``make mutation``).
 
-``python -m tests.mutation --help``. Each process has its own copy of the package and of the tests, and its own kernel
-cache. Results are appended to a session file at once, so that an interrupted run can be continued; a result is valid
-while the changed file is unchanged. Survivors that reveal no gap in the tests are listed with reasons in
-``tests/support/surviving_mutants/``. Nothing is downloaded; only cosmic-ray's operators and pytest are needed.
+``python -m tests.mutation --help`` lists the options. Each process has its own copy of the package and of the tests,
+and its own kernel cache. Results are appended to a session file at once, so that an interrupted run can be continued; a
+result is valid while the changed file is unchanged. Survivors that reveal no gap in the tests are listed with reasons
+in ``tests/support/surviving_mutants/``. Nothing is downloaded; only cosmic-ray's operators and pytest are needed.
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ def test_runs_that_cannot_be_resumed_are_reported(views: list[TrainingView], tmp
     assert error_of(views) == f"{path}: no checkpoint of an interrupted training here; start without resuming"
     cut_off(views, path, 3, resume=False)
     assert error_of(views[:9]) == (
-        f"{path}: it belongs to other photos, flags or another version of egs-warp; start the training again"
+        f"{path}: it belongs to other photos, other flags or another version of egs-warp; start the training again"
     )
     path.write_bytes(path.read_bytes()[:300])
     assert error_of(views) == f"{path}: the checkpoint is damaged; start the training again"

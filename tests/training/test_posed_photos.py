@@ -119,7 +119,7 @@ def moving_blots() -> list[np.ndarray]:
         ([np.zeros((HEIGHT, WIDTH), np.uint8)] * 8, False),
         # Too few to be sure.
         ([255 - mask for mask in silhouettes(8)[:3]], False),
-        # One mask in black and white the other way round does not change what the others show.
+        # One mask with the opposite colours does not change what the others show.
         ([*(255 - mask for mask in silhouettes(8)[:7]), silhouettes(8)[7]], False),
     ],
 )

@@ -50,7 +50,7 @@ class Fronts:
     entry_offsets: wp.array[wp.int32]
     """(S + 1,) offset of each block's matrix entries in ``entries``."""
     entries: wp.array[wp.int32]
-    """(nnz,) matrix entries, grouped by block."""
+    """(nnz,) indices of the matrix entries, grouped by block."""
     entry_places: wp.array[wp.int32]
     """(nnz,) position of each of ``entries`` in its front."""
     factor_offsets: wp.array[wp.int32]

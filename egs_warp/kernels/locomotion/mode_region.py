@@ -32,7 +32,8 @@ CONE_FRACTION = 1.0 - 1e-6
 ZERO_SPEED = 1e-9
 """Tangential speed, in units of sqrt(g H), below which the slip has no direction."""
 MIN_MULTIPLIER = 1e-3
-"""Smallest multiplier of a bound that is worth crossing, relative to the objective per unit of the row."""
+"""Fraction of the objective that the multiplier of a mode constraint, in objective per unit of its row, must exceed for
+the constraint to be worth crossing."""
 MIN_GAIN_FRACTION = 5e-3
 """Smallest relative decrease of the objective for which the search continues in the next region."""
 MAX_START_VIOLATION = 0.02
