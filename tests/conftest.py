@@ -1,10 +1,11 @@
-"""Fixtures: devices, and the folder of real captures."""
+"""Fixtures: devices, a browser, and the folder of real captures."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import warp as wp
@@ -54,6 +55,15 @@ def no_scene_cache(monkeypatch: pytest.MonkeyPatch) -> None:
 def data_dir() -> Path:
     """Return the folder of real captures; tests that use it have the marker ``data``."""
     return _DATA
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """One browser for all tests: Playwright can run only once in a process."""
+    from tests.support.chromium import started
+
+    with started() as browser:
+        yield browser
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])

@@ -15,7 +15,7 @@ from egs_warp.io import read_capture
 from egs_warp.io.writing import WRITERS
 from egs_warp.web.page import PAGE
 from tests.support.captures import make_cloud
-from tests.support.chromium import NEEDED, started
+from tests.support.chromium import NEEDED
 
 PACKAGES = PAGE.parent / "client" / "node_modules"
 pytestmark = [
@@ -42,7 +42,7 @@ READ = """async ([text, fileName]) => {
 
 
 @pytest.fixture(scope="module")
-def page() -> Iterator[Any]:
+def page(chromium: Any) -> Iterator[Any]:
     def answer(route: Any) -> None:
         name = route.request.url.removeprefix(ADDRESS).lstrip("/")
         if name:
@@ -50,11 +50,11 @@ def page() -> Iterator[Any]:
         else:
             route.fulfill(body=MODULES, content_type="text/html")
 
-    with started() as chromium:
-        page = chromium.new_page()
-        page.route(f"{ADDRESS}/**", answer)
-        page.goto(ADDRESS)
-        yield page
+    page = chromium.new_page()
+    page.route(f"{ADDRESS}/**", answer)
+    page.goto(ADDRESS)
+    yield page
+    page.close()
 
 
 # Spark does not read version 4 of .spz, nor glTF.
