@@ -21,7 +21,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the package and its tests to be mutated; before that, all tests that must fail pass."""
     folder = tmp_path_factory.mktemp("spoiled")
     shutil.copy(ROOT / "pyproject.toml", folder)
-    for name in ("egs_warp", "tests"):
+    for name in ("egs_warp", "tests", "benchmarks/contact_states"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     tests = sorted({mutation.test for mutation in ALL})
     right = run_tests(folder, *tests)

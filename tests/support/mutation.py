@@ -84,7 +84,7 @@ class Copy:
     def __init__(self, folder: Path, kernels: Path) -> None:
         self.folder = folder
         self._kernels = folder / "kernels"
-        for name in ("egs_warp", "tests"):
+        for name in ("egs_warp", "tests", "benchmarks/contact_states"):
             shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("client", "corpus", "*.pyc"))
         for name in ("pyproject.toml", "README.md", "docs", "examples"):
             copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
