@@ -43,7 +43,7 @@ def _spoilt(name: str, value: float, row: int = -1) -> Any:
         (_spoilt("time", 1e9), "spans more than a day"),
         (_spoilt("body_axes", 2.0), "body_axes are not orthonormal"),
         (_spoilt("front", 0.5), "front is not a unit vector along the ground"),
-        (lambda t: replace(t, height=np.inf), "height has values that are not finite"),
+        (lambda t: replace(t, height=np.inf), "height has values that are too large or not finite"),
         (lambda t: replace(t, gravity=np.zeros(3)), "gravity is zero"),
         (lambda t: replace(t, rest_positions=0.0 * t.rest_positions), "tets have no positive volume"),
         (lambda t: replace(t, dt=t.dt[:-1]), "activations has shape"),
