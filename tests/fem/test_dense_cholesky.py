@@ -15,7 +15,9 @@ pytest.importorskip("torch")
 
 import torch
 
-from egs_warp.fem.dense_cholesky import DenseCholesky
+from egs_warp.fem.cuda_graphs import GraphStream
+from egs_warp.fem.dense_cholesky import DenseCholesky, _TriangularInverse
+from egs_warp.kernels.fem.triangles import MAX_ROWS
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 
@@ -57,6 +59,15 @@ def test_matrices_of_every_size_are_inverted_by_halves(count: int, device: str) 
             assert np.abs(matrix @ factors.solve(right) - right).max() < 1e-11
     entries[-1] = np.nan
     assert not dense.update(entries, diagonal) and not dense.is_ready and not thin.update(entries, diagonal)
+
+
+@pytest.mark.parametrize("count", [3, 64, 65, 129, 500, 1704])
+def test_diagonal_blocks_fill_one_thread_block(count: int) -> None:
+    """They are even, as large as the kernel allows within a factor of two, and cover the matrix."""
+    inverse = _TriangularInverse(count, GraphStream(torch.device("cpu")))
+    side, size = inverse._side, inverse._size
+    assert side % 2 == 0 and side <= MAX_ROWS and (2 * side > MAX_ROWS or size == side)
+    assert count <= size <= 1.1 * count + 2 and size % side == 0
 
 
 @pytest.mark.parametrize("device", DEVICES)

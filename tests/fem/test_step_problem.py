@@ -4,13 +4,16 @@ residual, both momenta are conserved; free fall, spin, drag, and a column that s
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState, SoftBody, make_body
 from egs_warp.fem.multifrontal import MultifrontalLdl
-from egs_warp.fem.step_problem import StepProblem
+from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.geometry.plane import Plane
 from egs_warp.muscles.muscle_set import automatic_muscles
 from egs_warp.muscles.tension import MuscleEnergy
@@ -109,6 +112,18 @@ def test_an_indefinite_stiffness_is_projected_and_keeps_the_momenta(
     assert factors.negative_pivots == 0
     impulses = np.random.default_rng(7).standard_normal((squashed.velocities.size, 3))
     assert np.abs(problem.momenta @ tangent.solve(impulses) - problem.rotation_modes.T @ impulses).max() < 1e-10
+
+
+def test_only_queued_factors_without_a_result_are_replaced() -> None:
+    """A tangent whose factors exist, or are ready, is used as it is; else those of a positive definite approximation at
+    the same velocities take their place."""
+    near: list[np.ndarray] = []
+    problem: Any = SimpleNamespace(factor_near=lambda factors, velocities: near.append(velocities))
+    velocities = np.zeros((4, 3))
+    queued, ready = (SimpleNamespace(is_ready=is_ready) for is_ready in (False, True))
+    given: list[tuple[Any, np.ndarray | None]] = [(queued, None), (ready, velocities), (queued, velocities)]
+    assert [Tangent(problem, *each).wait() for each in given] == [True, True, False]
+    assert len(near) == 1 and near[0] is velocities
 
 
 @pytest.mark.parametrize("inverting", [False, True])

@@ -29,13 +29,13 @@ def test_displayed_time_is_steady_and_never_decreases(chromium: Any, session: Se
                 const look = () => {
                     const elapsed = performance.now() - began;
                     shown.push([egs.live.clock.time, elapsed / 1000]);
-                    if (elapsed < 3000) requestAnimationFrame(look); else resolve(shown);
+                    if (shown.length < 30) requestAnimationFrame(look); else resolve(shown);
                 };
                 look();
             })"""
         )
         shown, elapsed = np.array(shown).T
-        assert len(shown) > 20 and np.diff(shown).min() >= 0.0 and shown[-1] > shown[0]
+        assert np.diff(shown).min() >= 0.0 and shown[-1] > shown[0]
         # If the solver is slower than the screen, a frame of the solver is shown in several images; if the screen is
         # slow, an image advances by the time that has passed.
         assert (np.diff(shown) < 0.1 + np.diff(elapsed)).all()
