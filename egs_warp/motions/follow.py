@@ -183,7 +183,9 @@ class Follow:
         upright = self.controller.turn_towards(measurement, pose) * 0.7 * self._rate
         velocity, spin = self.controller.balance_targets(measurement, velocity, upright, dt)
         if not {("body", Quantity.POSITION), ("body", Quantity.VELOCITY)} & ruled:
-            rules.append(centre_of_mass_velocity(self.body, self.ground.axes.T @ velocity, self.weights.com))
+            # A key that bends the body shifts its centre of mass, so keys have priority over its place above the feet.
+            weight = self.weights.landing * self.weights.com
+            rules.append(centre_of_mass_velocity(self.body, self.ground.axes.T @ velocity, weight))
         if not {("body", Quantity.ORIENTATION), ("body", Quantity.ANGULAR_MOMENTUM)} & ruled:
             rules.append(AngularMomentumObjective(measurement.inertia @ spin, self.weights.spin))
         # The shape at rest moves with the centre of mass.

@@ -53,7 +53,7 @@ class Weights:
     pose: float = 0.02
     landing: float = 0.1
     """Fraction of ``com``, ``up`` and ``spin`` that applies from touch-down on, when the body only has to come to rest,
-    at no given time."""
+    at no given time. The same fraction of ``com`` applies while the body follows key frames."""
 
 
 @dataclass(frozen=True)

@@ -125,13 +125,13 @@ def test_hops_land_on_their_squares(script: str, ground: dict) -> None:
 
 @pytest.mark.slow
 def test_the_head_follows_its_key_and_the_body_comes_to_rest(tmp_path: Path) -> None:
-    """The key is at 0.03; the measured error is 0.001. A body that only stands misses it by 0.03."""
+    """The key is at 0.05; the measured error is 0.0014. A body that only stands misses it by 0.05."""
     file = tmp_path / "keys.csv"
-    file.write_text("time,part,quantity,x,y,z\n0.5,head,position,0.03,0,0\n")
+    file.write_text("time,part,quantity,x,y,z\n0.5,head,position,0.05,0,0\n")
     sequence, (reached,), (end,) = run(f"trajectory {file}")
     follow = sequence.done[0].motion
     assert isinstance(follow, Follow) and sequence.is_finished and follow.notes() == []
     assert follow.plan_record().worst_miss["position"] < 0.002
     held = follow._measure("head", Quantity.POSITION, BodyState(end, 0 * end))
-    assert np.allclose(held, [0.03, 0.0, 0.0], atol=0.002)
+    assert np.allclose(held, [0.05, 0.0, 0.0], atol=0.002)
     assert reached.tilt_degrees < 2.0 and reached.airborne_frames == 0.0
