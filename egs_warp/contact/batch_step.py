@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
+import warp as wp
 
 from egs_warp.contact.batch_contacts import BatchContacts, BatchDetector, coulomb_forces_batch, padded
 from egs_warp.contact.coupled_step import (
@@ -17,17 +18,16 @@ from egs_warp.contact.coupled_step import (
     ACTIVATION_RESIDUAL,
     COULOMB_TOLERANCE,
     MAX_ACTIVATION_ROUNDS,
-    MAX_COULOMB_FAILURES,
     MAX_CREEP,
     MAX_SINK,
-    MIN_STEP_LENGTH,
     PUSH_OUT_FRACTION,
 )
 from egs_warp.contact.newton import DELASSUS_REGULARIZATION
-from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS
+from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, NewtonProgress
 from egs_warp.fem.batch_problem import BatchMomentumProjection, BatchProblem, apply_inverse
-from egs_warp.fem.batched import BatchedRecord, nonzero
-from egs_warp.kernels.contact.newton_convergence import REFACTOR_RATIO, RESIDUAL_WINDOW
+from egs_warp.fem.batched import BatchedRecord, launch_on, nonzero
+from egs_warp.kernels.contact import newton_convergence as rule
+from egs_warp.precision import real
 
 
 class StageTimer(Protocol):
@@ -221,24 +221,25 @@ class BatchSolver:
         ``last`` round. Return the result and the last linearisations.
         """
         with self.stages("elasticity"):
-            state = _NewtonState.begin(velocities, forces, *task.contact_free_residual(velocities, forces))
-        for iteration in range(1, MAX_NEWTON_STEPS + 1):
+            free, size = task.contact_free_residual(velocities, forces)
+        state = _NewtonState.begin(velocities, forces, free, self._progress(task.problem, size, last=last))
+        for _ in range(MAX_NEWTON_STEPS):
             active = nonzero(state.active)
             if len(active) == 0:
                 break
             part, search = task.subset(active), state.subset(active)
-            search.iterations.fill_(iteration)
-            slow = self._newton_step(part, search, response.subset(active), first=iteration == 1)
-            to_check = nonzero(search.is_near_end)
-            if len(to_check) > 0 and not last:
+            self._newton_step(part, search, response.subset(active))
+            search.active.copy_(~search.had(rule.ENDED | rule.FAILED))
+            to_check = nonzero(search.had(rule.NEAR_END) & ~search.had(rule.ENDED))
+            if len(to_check) > 0:
                 self._check_penetration(part.subset(to_check), search, to_check)
-            fresh = nonzero(slow & search.active)
+            fresh = nonzero(search.had(rule.NEEDS_TANGENT) & search.active)
             if len(fresh) > 0:
                 again = part.subset(fresh)
                 with self.stages("factor"):
                     factored = again.problem.factor(search.velocities[fresh], again.tensions)
                 response.scatter(active[fresh], self.linearize(again.problem, again.contacts))
-                search.tangent_is_current[fresh] = True
+                search.progress[fresh, rule.TANGENT_IS_CURRENT] = 1.0
                 search.is_singular[fresh] = ~factored
                 search.active[fresh] = factored
             if search is not state:
@@ -246,12 +247,20 @@ class BatchSolver:
         ends = (
             state.velocities,
             state.forces,
-            state.converged,
-            state.iterations,
+            state.had(rule.ENDED),
+            state.progress[:, rule.STEPS].long(),
             state.is_singular,
             state.contacts_added,
         )
         return BatchResult(*ends), response
+
+    def _progress(self, problem: BatchProblem, size: torch.Tensor, *, last: bool) -> torch.Tensor:
+        """Return (c, ROW_SIZE), the progress at the start of a round with residuals ``size`` (c,)."""
+        coulomb_tolerance = COULOMB_TOLERANCE * problem.residual_scale / problem.body.body.mass
+        first = NewtonProgress(self.tolerance, -1.0 if last else ACTIVATION_RESIDUAL, coulomb_tolerance)
+        progress = torch.as_tensor(first.row, device=size.device).repeat(len(size), 1)
+        progress[:, rule.RESIDUAL] = size
+        return progress
 
     def _check_penetration(self, task: _RoundInputs, search: _NewtonState, rows: torch.Tensor) -> None:
         """Find points to add in the worlds of ``task``, which are the rows ``rows`` of ``search``, and end the round of
@@ -262,14 +271,9 @@ class BatchSolver:
         joined = added.any(dim=1)
         search.contacts_added[rows], search.active[rows] = joined, ~joined
 
-    def _newton_step(
-        self, task: _RoundInputs, search: _NewtonState, response: BatchLinearization, *, first: bool
-    ) -> torch.Tensor:
-        """Take one Newton step in each world of ``search``, in place. Return (c,) bool, True where the tangent must
-        be updated.
-        """
+    def _newton_step(self, task: _RoundInputs, search: _NewtonState, response: BatchLinearization) -> None:
+        """Take one Newton step in each world of ``search``, in place."""
         problem = task.problem
-        coulomb_tolerance = COULOMB_TOLERANCE * problem.residual_scale / problem.body.body.mass
         with self.stages("substitute"):
             solved, _ = apply_inverse(
                 problem, search.contact_free_residual.flatten(1)[:, :, None], response.momentum_projection
@@ -278,43 +282,39 @@ class BatchSolver:
         target_forces, violation = self.solve_coulomb(
             task.contacts, response, free_velocities, task.normal_bias, task.frictions, search.forces
         )
-        violated = violation > coulomb_tolerance
-        search.coulomb_failures.add_(violated)
         force_velocities = (response.columns @ target_forces.flatten(1)[:, :, None]).view_as(free_velocities)
         change, force_change = free_velocities + force_velocities - search.velocities, target_forces - search.forces
-        before = search.residual_norm.clone()
-        better, whole = torch.zeros((2, len(before)), dtype=torch.bool, device=before.device)
-        maximum = search.recent_residuals.amax(dim=1)
-        maximum = torch.where(maximum >= 0.0, maximum, torch.inf)
-        waiting, length = torch.arange(len(before), device=before.device), 1.0
-        while length > MIN_STEP_LENGTH and len(waiting) > 0:
+        waiting, length = torch.arange(len(violation), device=violation.device), 1.0
+        while len(waiting) > 0:
             trial = search.velocities[waiting] + length * change[waiting]
             trial_forces = search.forces[waiting] + length * force_change[waiting]
             with self.stages("elasticity"):
                 free, size = task.subset(waiting).contact_free_residual(trial, trial_forces)
-            limit = ((1.0 - 1e-4 * length) * maximum[waiting]).clamp(min=self.tolerance)
-            good = size.isfinite() & (size < limit) if not first else size.isfinite()
+            progress = search.progress[waiting]
+            _judge(progress, size, violation[waiting])
+            search.progress[waiting] = progress
+            good = has_outcome(progress, rule.ACCEPTED)
             at = waiting[good]
-            better[at] = True
-            whole[at] = length == 1.0
             search.velocities[at], search.forces[at] = trial[good], trial_forces[good]
-            search.contact_free_residual[at], search.residual_norm[at] = free[good], size[good]
-            waiting, length = waiting[~good], 0.5 * length
-        recent = torch.cat([search.recent_residuals[:, 1:], search.residual_norm[:, None]], dim=1)
-        search.recent_residuals.copy_(torch.where(better[:, None], recent, search.recent_residuals))
-        search.converged.copy_(whole & (search.residual_norm <= self.tolerance) & ~violated)
-        search.is_near_end.copy_(
-            whole
-            & (before > ACTIVATION_RESIDUAL)
-            & (search.residual_norm <= ACTIVATION_RESIDUAL)
-            & ~violated
-            & ~search.converged
-        )
-        failed = (~better & search.tangent_is_current) | (search.coulomb_failures > MAX_COULOMB_FAILURES)
-        search.active.copy_(~search.converged & ~failed)
-        search.tangent_is_current.fill_(False)
-        slow = ~better | ~whole | violated
-        return slow if first else slow | (search.residual_norm > REFACTOR_RATIO * before)
+            search.contact_free_residual[at] = free[good]
+            waiting, length = waiting[has_outcome(progress, rule.SHORTEN)], 0.5 * length
+
+
+def _judge(progress: torch.Tensor, sizes: torch.Tensor, violations: torch.Tensor) -> None:
+    """Judge the trials of c worlds (see ``NewtonProgress.judge``); ``progress`` (c, ROW_SIZE) is updated in place."""
+    running = torch.empty(len(sizes), dtype=torch.int32, device=sizes.device)
+    launch_on(
+        sizes.device,
+        rule.judge_steps_kernel,
+        len(sizes),
+        inputs=[torch.inf, (sizes, real), (violations, real), (torch.zeros_like(sizes), real)],
+        outputs=[(progress, real), (running, wp.int32)],
+    )
+
+
+def has_outcome(progress: torch.Tensor, bits: int) -> torch.Tensor:
+    """Return (c,) bool, True for worlds whose last trial had any of ``bits``; ``progress`` is (c, ROW_SIZE)."""
+    return (progress[:, rule.OUTCOME].long() & bits) > 0
 
 
 @dataclass(frozen=True)
@@ -354,34 +354,24 @@ class _NewtonState(BatchedRecord):
     """(c, K, 3) newtons."""
     contact_free_residual: torch.Tensor
     """(c, N, 3) N s, residual without contact forces."""
-    residual_norm: torch.Tensor
-    """(c,) norm of the residual with contact forces, divided by dt x weight."""
-    recent_residuals: torch.Tensor
-    """(c, RESIDUAL_WINDOW) residuals after the last steps; unused entries are -1."""
-    coulomb_failures: torch.Tensor
-    """(c,) int64, number of steps whose forces violated Coulomb's law."""
-    iterations: torch.Tensor
-    """(c,) int64."""
+    progress: torch.Tensor
+    """(c, ROW_SIZE) progress of the round (``NewtonProgress``)."""
     active: torch.Tensor
     """(c,) bool, True while the world is being solved."""
-    tangent_is_current: torch.Tensor
-    """(c,) bool, True if the tangent is that of the present velocities."""
-    converged: torch.Tensor
-    """(c,) bool."""
     is_singular: torch.Tensor
     """(c,) bool, True if a tangent could not be factored."""
-    is_near_end: torch.Tensor
-    """(c,) bool, True if the last step came near enough to the solution to search for points to add."""
     contacts_added: torch.Tensor
-    """(c,) bool, True if that search found points to add."""
+    """(c,) bool, True if points must be added before the next step."""
 
     @classmethod
     def begin(
-        cls, velocities: torch.Tensor, forces: torch.Tensor, free: torch.Tensor, size: torch.Tensor
+        cls, velocities: torch.Tensor, forces: torch.Tensor, free: torch.Tensor, progress: torch.Tensor
     ) -> _NewtonState:
         """Create the state at the start of a round, with all worlds active."""
-        count, device = len(size), size.device
-        numbers = torch.zeros((2, count), dtype=torch.int64, device=device)
-        flags = torch.zeros((6, count), dtype=torch.bool, device=device)
+        flags = torch.zeros((3, len(progress)), dtype=torch.bool, device=progress.device)
         flags[0] = True
-        return cls(velocities, forces, free, size, size.new_full((count, RESIDUAL_WINDOW), -1.0), *numbers, *flags)
+        return cls(velocities, forces, free, progress, *flags)
+
+    def had(self, bits: int) -> torch.Tensor:
+        """Return (c,) bool, True for worlds whose last trial had any of ``bits`` as its outcome."""
+        return has_outcome(self.progress, bits)

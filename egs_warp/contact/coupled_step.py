@@ -14,13 +14,12 @@ import numpy as np
 
 from egs_warp.contact.detection import ContactDetector, ContactSet, push_out_speeds
 from egs_warp.contact.newton import ContactLinearization, NewtonIterate, PenetrationCheck
-from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, ConvergenceState
+from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, NewtonProgress
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.step_problem import StepProblem
+from egs_warp.kernels.contact.newton_convergence import ACCEPTED, ENDED, FAILED, NEAR_END, NEEDS_TANGENT, SHORTEN
 from egs_warp.muscles.tension import MuscleEnergy
 
-MIN_STEP_LENGTH = 1e-3
-"""Step length below which the line search fails, as a fraction of a Newton step."""
 MAX_ACTIVATION_ROUNDS = 6
 """Maximum number of rounds of a step. Points may be added to the contact set after each round except the last."""
 PUSH_OUT_FRACTION = 0.2
@@ -40,10 +39,6 @@ MAX_CREEP = 0.02
 """``MAX_SINK`` for a point that would end deeper than the penetration tolerance itself."""
 COULOMB_TOLERANCE = 1e-6
 """Violation of Coulomb's law at the end of a step, as a fraction of dt g, the speed that free fall gains in a step."""
-MAX_COULOMB_FAILURES = 3
-"""Maximum number of Newton steps of a round whose forces violate Coulomb's law by more than ``COULOMB_TOLERANCE``. With
-more, the solve fails and the step is halved.
-"""
 
 
 @dataclass(frozen=True)
@@ -95,10 +90,10 @@ class CoupledSolver:
         """
         return push_out_speeds(contacts.gaps, dt, self.push_out_cap, PUSH_OUT_FRACTION, self.penetration_tolerance)
 
-    def convergence_state(self, problem: StepProblem, *, last: bool = False) -> ConvergenceState:
-        """Return the state of the Newton loop at the start of a round. In the ``last`` round no points are added."""
+    def progress(self, problem: StepProblem, *, last: bool = False) -> NewtonProgress:
+        """Return the progress at the start of a round. In the ``last`` round no points are added."""
         coulomb_tolerance = COULOMB_TOLERANCE * problem.residual_scale / problem.body.mass
-        return ConvergenceState(self.tolerance, 0.0 if last else ACTIVATION_RESIDUAL, coulomb_tolerance)
+        return NewtonProgress(self.tolerance, -1.0 if last else ACTIVATION_RESIDUAL, coulomb_tolerance)
 
     def solve(
         self,
@@ -172,57 +167,26 @@ class CoupledSolver:
         """
         problem, contacts = response.tangent.problem, response.contacts
         normal_bias = self.normal_bias(contacts, problem.dt)
-        friction = self.detector.geometry.friction
-        convergence = self.convergence_state(problem, last=last)
-        tangents, coulomb_failures, tangent_is_current = 0, 0, False
+        friction, progress, tangents = self.detector.geometry.friction, self.progress(problem, last=last), 0
         iterate = response.iterate_at(tension, velocities, forces)
-        while convergence.steps < MAX_NEWTON_STEPS:
-            steps = iterate.newton_steps(normal_bias, friction, convergence)
-            iterate, trial, violation = steps.base, steps.trial, steps.coulomb_violation
-            convergence, tangent_is_current = (
-                convergence.after_steps(*steps.accepted_residuals),
-                tangent_is_current and not steps.accepted_residuals,
-            )
-            satisfies_coulomb = violation <= convergence.coulomb_tolerance
-            coulomb_failures += not satisfies_coulomb
-            length = 1.0
-            while (
-                not (better := convergence.is_acceptable(trial.residual_norm, length))
-                and length > 2.0 * MIN_STEP_LENGTH
-            ):
-                length *= 0.5
-                trial = iterate.line_search_point(steps.forces, length)
-            if better:
-                before, iterate = iterate, trial
-                # By linearity, the contact velocities after a full step are those of the Coulomb solve.
-                satisfies_coulomb = satisfies_coulomb and length == 1.0
-                ended = satisfies_coulomb and iterate.residual_norm <= convergence.tolerance
-                slow = (
-                    convergence.converges_slowly(iterate.residual_norm, before.residual_norm) or not satisfies_coulomb
-                )
-                activates = (
-                    not last
-                    and satisfies_coulomb
-                    and (ended or convergence.may_activate_contacts(iterate.residual_norm, before.residual_norm))
-                )
-                convergence = convergence.after_steps(iterate.residual_norm)
-                if activates:
-                    wider = self._with_penetrating_points(problem, contacts, iterate)
-                    if wider is not None:
-                        return _result(iterate, ended, convergence.steps, tangents), wider
-                if ended:
-                    return _result(iterate, True, convergence.steps, tangents), None
-            else:
-                convergence, slow = convergence.after_failed_step(), True
-                if tangent_is_current:
-                    break
-            if coulomb_failures > MAX_COULOMB_FAILURES:
+        while progress.steps < MAX_NEWTON_STEPS:
+            steps = iterate.newton_steps(normal_bias, friction, progress)
+            iterate, trial = steps.base, steps.trial
+            while progress.has(SHORTEN):
+                trial = iterate.line_search_point(steps.forces, progress.length)
+                progress.judge(trial.residual_norm, steps.coulomb_violation)
+            if progress.has(ACCEPTED):
+                iterate, ended = trial, progress.has(ENDED)
+                wider = self._with_penetrating_points(problem, contacts, trial) if progress.has(NEAR_END) else None
+                if ended or wider is not None:
+                    return _result(trial, ended, progress.steps, tangents), wider
+            if progress.has(FAILED):
                 break
-            tangent_is_current = False
-            if slow:
+            if progress.has(NEEDS_TANGENT):
                 iterate = iterate.with_new_tangent()
-                tangents, tangent_is_current = tangents + 1, True
-        return _result(iterate, False, convergence.steps, tangents), None
+                tangents += 1
+                progress.renew_tangent()
+        return _result(iterate, False, progress.steps, tangents), None
 
 
 def _result(end: NewtonIterate, converged: bool, iterations: int, tangents: int) -> CoupledResult:

@@ -13,17 +13,16 @@ from functools import cached_property
 
 import numpy as np
 
-from egs_warp.contact.coulomb import FAILURE_TOLERANCE
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.device_newton_workspace import FROM_BASE, FROM_TRIAL, NewtonWorkspace, TrialReadback
 from egs_warp.contact.device_selection import DeviceContactSelector
 from egs_warp.contact.device_step import SolveEnd, StepWorkspace
 from egs_warp.contact.newton import ContactLinearization, NewtonStepResult, PenetrationCheck
-from egs_warp.contact.newton_convergence import ConvergenceState
+from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.dense_cholesky import DenseCholesky
 from egs_warp.fem.step_problem import Tangent
-from egs_warp.kernels.contact.newton_convergence import FIRST_RESIDUAL
+from egs_warp.kernels.contact.newton_convergence import OUTCOME, REPEAT
 from egs_warp.launching import round_up
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy
@@ -281,65 +280,58 @@ class DeviceNewtonIterate:
         return workspace.trial_iterate
 
     def newton_steps(
-        self, shift: np.ndarray, friction: float, convergence: ConvergenceState | None = None
+        self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
     ) -> NewtonStepResult:
         """Run the Newton loop on the device and block until it ends (arguments as in ``NewtonIterate``).
 
-        A loop that is already queued from this iterate with the same parameters is used. Without ``convergence`` one
-        step is taken. If the Coulomb solve of the last step failed, it is repeated on the host.
+        A loop that is already queued from this iterate with the same parameters is used. Without ``progress`` one step
+        is taken. If the Coulomb solve of the last step failed, it is repeated on the host.
         """
         response, workspace = self.linearization, self.linearization.workspace
         owner, problem, count = response.owner, response.tangent.problem, response.contacts.count
-        convergence = convergence or ConvergenceState(0.0, 0.0, np.inf, max_steps=1)
+        progress = progress or NewtonProgress(0.0, -1.0, np.inf, max_steps=1)
         assert owner.current is response
         if (
             workspace.pending_iterate is not self
-            or workspace.convergence != convergence
+            or not np.array_equal(workspace.started, progress.row)
             or not workspace.coulomb.has_uploaded(shift, friction)
         ):
             base = self._slot()
             if base == FROM_BASE and workspace.trial_iterate is not None:
                 # The contact velocities in the buffer are those of the trial.
                 workspace.reevaluate(base=base)
-            workspace.start_newton(problem, shift, friction, convergence, base=base, residual_norm=self._residual_norm)
+            if self._residual_norm is not None:
+                progress.begin(self._residual_norm)
+            workspace.start_newton(problem, shift, friction, progress, base=base)
         readback = workspace.wait_newton()
         if self._tangent_pending and not owner.factors.is_ready:
             workspace.base_iterate = workspace.trial_iterate = workspace.pending_iterate = None
             self._wait_tangent()
-            return self.newton_steps(shift, friction, convergence)
+            return self.newton_steps(shift, friction, progress)
         self._tangent_pending = False
-        if readback.steps_taken == 0:
+        if readback.progress[OUTCOME] == 0.0:
             # The plan was rejected, so the loop has not run. The device still holds this iterate as its trial.
             workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = None, self, None
-            return self.newton_steps(shift, friction, convergence)
-        sizes, first = readback.step_residuals, self
-        if len(sizes) == 1:
-            if self._contact_velocities is None:
-                self.set_values(
-                    float(readback.convergence[FIRST_RESIDUAL]) / problem.residual_scale,
-                    readback.previous_contact_velocities,
-                    self._penetration,
-                )
-        else:
+            return self.newton_steps(shift, friction, progress)
+        is_one_step = progress.take(readback.progress)
+        first, before = self, progress.previous_residual
+        if not is_one_step:
             forces = readback.forces_before[: 3 * count].reshape(-1, 3).copy()
-            first = response.iterate(
-                self.tension,
-                forces,
-                float(sizes[-2]),
-                readback.previous_contact_velocities,
-                readback.velocities_before,
-                None,
-            )
+            velocities = readback.velocities_before.reshape(-1, 3).copy()
+            first = DeviceNewtonIterate(response, self.tension, velocities, forces)
+        if first._contact_velocities is None:
+            first.set_values(before, readback.previous_contact_velocities, first._penetration)
         forces, violation = readback.forces[: 3 * count].reshape(-1, 3).copy(), float(readback.coulomb_violation[0])
         end = response.parse_iterate(self.tension, forces, readback)
         if end._penetration is not None and end._penetration.is_penetrating:
             end._penetration = replace(end._penetration, deepest=owner.selector.deepest(workspace.capacity))
         workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = first, end, None
         owner.last_solve = SolveEnd(end.velocities, problem.dt, response.contacts.points, workspace.capacity)
-        if violation > FAILURE_TOLERANCE:
+        if progress.has(REPEAT):
             forces, violation = response.solve_coulomb(first.free_contact_velocities, shift, friction, first.forces)
             end = first.line_search_point(forces)
-        return NewtonStepResult(tuple(sizes[:-1] / problem.residual_scale), first, forces, violation, end)
+            progress.judge(end.residual_norm, violation)
+        return NewtonStepResult(first, forces, violation, end)
 
     def with_new_tangent(self) -> DeviceNewtonIterate:
         """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles. It

@@ -3,11 +3,11 @@
 The kernels are in ``kernels/contact/iterate.py`` and ``kernels/contact/newton_convergence.py``. One vector holds an
 iterate (see ``NewtonWorkspace.parts``). There are two, base and trial, and a start buffer that the host fills.
 
-A Newton loop is three graphs. ``_enqueue_convergence`` copies the packed ``ConvergenceState`` and sets the loop
-condition. ``_enqueue_next_step`` is the loop body: it solves Coulomb's law at the contact-free velocities of the last
-trial, makes that trial the base, takes the full Newton step to a new trial, evaluates the residual, the contact-free
-velocities and the penetration test there, and updates the loop condition. ``_enqueue_end`` prefetches the contacts of
-the next step and starts the download.
+A Newton loop is three graphs. ``_enqueue_loop_start`` copies the row of ``NewtonProgress`` and sets the loop condition.
+``_enqueue_next_step`` is the loop body: it solves Coulomb's law at the contact-free velocities of the last trial, makes
+that trial the base, takes the full Newton step to a new trial, evaluates the residual, the contact-free velocities and
+the penetration test there, and judges the trial. ``_enqueue_end`` prefetches the contacts of the next step and starts
+the download.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ import numpy as np
 import torch
 import warp as wp
 
+from egs_warp.contact.coulomb import FAILURE_TOLERANCE
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.device_coulomb import CoulombWorkspace
 from egs_warp.contact.device_step import StepWorkspace, vectors
-from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, ConvergenceState
+from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
 from egs_warp.fem.step_problem import StepProblem
@@ -54,24 +55,14 @@ class TrialReadback(NamedTuple):
     """(3K,) newtons, contact forces of the last Coulomb solve."""
     penetration: np.ndarray
     """(5,), packed ``PenetrationCheck``."""
-    convergence: np.ndarray
-    """Packed state of the loop after ``check_convergence_kernel``, followed by the residual after each step, N s."""
+    progress: np.ndarray
+    """(ROW_SIZE,) row of ``NewtonProgress`` after the loop."""
     previous_contact_velocities: np.ndarray
     """(3K,) m/s, contact-free velocities of the contacts at the start of the last step. ``velocities_before`` (3N,)
     m/s and ``forces_before`` (3K,) newtons belong to the same iterate.
     """
     velocities_before: np.ndarray
     forces_before: np.ndarray
-
-    @property
-    def steps_taken(self) -> int:
-        """Number of steps that the loop has taken."""
-        return int(self.convergence[convergence_kernels.STEPS_TAKEN])
-
-    @property
-    def step_residuals(self) -> np.ndarray:
-        """(steps_taken,) N s, residual after each step of the loop."""
-        return self.convergence[convergence_kernels.HEADER_SIZE :][: self.steps_taken]
 
 
 class NewtonWorkspace:
@@ -104,7 +95,7 @@ class NewtonWorkspace:
         """(3,) length of the step, 1 if contact forces act (else 0), slot to start from. ``target_forces`` (3K,)
         newtons.
         """
-        parts = [1, width, size, 1, width, 5, convergence_kernels.HEADER_SIZE + MAX_NEWTON_STEPS, width, size, width]
+        parts = [1, width, size, 1, width, 5, convergence_kernels.ROW_SIZE, width, size, width]
         self._packed_readback, self._host_readback = owner.zeros(sum(parts)), owner.stream.pinned(sum(parts))
         (
             self.residual_norm,
@@ -114,11 +105,11 @@ class NewtonWorkspace:
             self._solved_forces,
             *others,
         ) = self._packed_readback.split(parts)
-        penetration, self._convergence_state, self._previous_contact_velocities, *self._previous_iterate = others
+        penetration, self._progress, self._previous_contact_velocities, *self._previous_iterate = others
         self._penetrating_count, self._min_gap, self._internal_torque = penetration.split([1, 1, 3])
         self.readback = TrialReadback(*np.split(self._host_readback.numpy(), np.cumsum(parts)[:-1]))
-        # Newton loop: packed state, loop condition, event at its end.
-        self._convergence_upload = PinnedUpload(owner.stream, convergence_kernels.HEADER_SIZE)
+        # Newton loop: row of progress, loop condition, event at its end.
+        self._progress_upload = PinnedUpload(owner.stream, convergence_kernels.ROW_SIZE)
         self._loop_condition, self._always_enabled = (
             torch.full((1,), each, dtype=torch.int32, device=count.device) for each in (0, 1)
         )
@@ -141,8 +132,8 @@ class NewtonWorkspace:
         """Host objects of the iterates in the slots base and trial; None if there is none."""
         self.pending_iterate: Any = None
         """Iterate at the start of a queued Newton loop whose result has not been read."""
-        self.convergence: ConvergenceState | None = None
-        """State that was uploaded last."""
+        self.started = np.zeros(0)
+        """(ROW_SIZE,) row of progress with which the last loop was started."""
 
     def trial_parts(self) -> Any:
         """Return the ``parts`` of the last trial."""
@@ -301,32 +292,32 @@ class NewtonWorkspace:
         problem: StepProblem,
         normal_bias: np.ndarray,
         friction: float,
-        convergence: ConvergenceState,
+        progress: NewtonProgress,
         *,
         base: float,
-        residual_norm: float | None = None,
         enabled: torch.Tensor | None = None,
     ) -> None:
         """Start the Newton loop on the device, asynchronously; ``wait_newton`` blocks for its result.
 
-        Each step uses the Coulomb forces at its own start. The test of ``convergence`` ends the loop.
+        Each step uses the Coulomb forces at its own start. The loop ends at the first step that needs the host.
 
         Args:
             problem: the step.
             normal_bias: (n,) m/s.
             friction: Coulomb coefficient.
-            convergence: state and tolerances of the loop.
+            progress: progress of the round.
             base: slot to start from, ``FROM_BASE`` or ``FROM_TRIAL``.
-            residual_norm: residual there divided by dt x weight; None reads that of the last trial.
             enabled: (1,) int32 on the device; 0 skips the loop. None always runs it.
         """
         dt, ratio = problem.dt, 1.0 + problem.dt * problem.drag
-        self.convergence, self.owner.last_solve = convergence, None
+        self.started, self.owner.last_solve = progress.row.copy(), None
+        row = progress.row.copy()
+        row[convergence_kernels.UNIT] = problem.residual_scale
         with self.owner.stream:
             self.coulomb.upload(normal_bias, friction)
-            self._convergence_upload.set(convergence.pack(problem.residual_scale, residual_norm))
-            work = partial(self._enqueue_convergence, base, self._always_enabled if enabled is None else enabled)
-            self._graphs.run(("convergence", base, enabled is None), work)
+            self._progress_upload.set(row)
+            work = partial(self._enqueue_loop_start, base, self._always_enabled if enabled is None else enabled)
+            self._graphs.run(("loop start", base, enabled is None), work)
             self._graphs.repeat((dt, ratio), lambda: self._enqueue_next_step(dt, ratio), self._loop_condition)
             self._run(self._enqueue_end, dt)
             self._newton_event = self.owner.stream.record_event(self._newton_event)
@@ -337,17 +328,21 @@ class NewtonWorkspace:
             self._newton_event.synchronize()
         return self.readback
 
-    def _enqueue_convergence(self, base: float, usual: torch.Tensor) -> None:
+    def _enqueue_loop_start(self, base: float, enabled: torch.Tensor) -> None:
         if base == FROM_BASE:
             self._trial.copy_(self._base)
-        self._convergence_state[: convergence_kernels.HEADER_SIZE].copy_(self._convergence_upload.device)
+        self._progress.copy_(self._progress_upload.device)
         self._launch(
-            convergence_kernels.init_convergence_kernel,
+            convergence_kernels.begin_loop_kernel,
             1,
-            [as_warp(usual, wp.int32), as_warp(self.residual_norm, real)],
-            [as_warp(self._convergence_state, real), as_warp(self._loop_condition, wp.int32)],
+            [as_warp(enabled, wp.int32), as_warp(self.residual_norm, real)],
+            self._loop_state(),
         )
         self.trial_input.copy_(self._full_step)
+
+    def _loop_state(self) -> list[wp.array]:
+        """Return the progress and the loop condition, which both kernels of the loop write."""
+        return [as_warp(self._progress[None], real), as_warp(self._loop_condition, wp.int32)]
 
     def _enqueue_next_step(self, dt: float, ratio: float) -> None:
         """Take a Newton step from the last trial and update the loop condition."""
@@ -356,10 +351,16 @@ class NewtonWorkspace:
         self.enqueue_newton(dt, ratio)
         self._enqueue_penetration()
         self._launch(
-            convergence_kernels.check_convergence_kernel,
+            convergence_kernels.judge_steps_kernel,
             1,
-            [as_warp(each, real) for each in (self.residual_norm, self.coulomb_violation, self._penetrating_count)],
-            [as_warp(self._convergence_state, real), as_warp(self._loop_condition, wp.int32)],
+            [
+                FAILURE_TOLERANCE,
+                *(
+                    as_warp(each, real)
+                    for each in (self.residual_norm, self.coulomb_violation, self._penetrating_count)
+                ),
+            ],
+            self._loop_state(),
         )
 
     def _enqueue_end(self, dt: float) -> None:

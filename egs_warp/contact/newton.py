@@ -17,7 +17,7 @@ import numpy as np
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.host_newton import HostNewtonWorkspace, IterateBuffer, address_of, host_newton_workspace
-from egs_warp.contact.newton_convergence import ConvergenceState
+from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.simd_elasticity import SimdElasticity
 from egs_warp.fem.step_problem import StepProblem, Tangent
@@ -247,17 +247,17 @@ class NewtonIterate(Protocol):
         ...
 
     def newton_steps(
-        self, shift: np.ndarray, friction: float, convergence: ConvergenceState | None = None
+        self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
     ) -> NewtonStepResult:
         """Take Newton steps, each with the contact forces that satisfy Coulomb's law at its contact-free velocities.
 
-        Without ``convergence``, and on the host, it is one step. A GPU takes steps until one is not acceptable or the
-        test of ``convergence`` returns to the host; all but the last are accepted.
+        Without ``progress``, and on the host, it is one step. A GPU takes steps until one needs the host; all but the
+        last are accepted.
 
         Args:
             shift: (n,) m/s, bias of the normal velocities.
             friction: Coulomb coefficient.
-            convergence: state of the Newton loop.
+            progress: progress of the round; the last step is judged by it.
         """
         ...
 
@@ -270,8 +270,6 @@ class NewtonIterate(Protocol):
 class NewtonStepResult:
     """Result of one or more Newton steps. The caller decides on the last one."""
 
-    accepted_residuals: tuple[float, ...]
-    """Residuals after the accepted steps before the last one."""
     base: NewtonIterate
     """Iterate at the start of the last step."""
     forces: np.ndarray
@@ -282,13 +280,20 @@ class NewtonStepResult:
 
 
 def _newton_step(
-    iterate: NativeNewtonIterate | NumpyNewtonIterate, shift: np.ndarray, friction: float
+    iterate: NativeNewtonIterate | NumpyNewtonIterate,
+    shift: np.ndarray,
+    friction: float,
+    progress: NewtonProgress | None,
 ) -> NewtonStepResult:
     """Take one Newton step from an iterate on the host."""
     forces, violation = iterate.linearization.solve_coulomb(
         iterate.free_contact_velocities, shift, friction, iterate.forces
     )
-    return NewtonStepResult((), iterate, forces, violation, iterate.line_search_point(forces))
+    trial = iterate.line_search_point(forces)
+    if progress is not None:
+        progress.begin(iterate.residual_norm)
+        progress.judge(trial.residual_norm, violation)
+    return NewtonStepResult(iterate, forces, violation, trial)
 
 
 def _linearization_at(iterate: NativeNewtonIterate | NumpyNewtonIterate) -> ContactLinearization:
@@ -356,10 +361,10 @@ class NativeNewtonIterate:
         return type(self)(response, self.tension, *state_and_norm)
 
     def newton_steps(
-        self, shift: np.ndarray, friction: float, convergence: ConvergenceState | None = None
+        self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
     ) -> NewtonStepResult:
         """Take one Newton step with the contact forces that satisfy Coulomb's law."""
-        return _newton_step(self, shift, friction)
+        return _newton_step(self, shift, friction, progress)
 
     def with_new_tangent(self) -> Self:
         """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""
@@ -425,10 +430,10 @@ class NumpyNewtonIterate:
         )
 
     def newton_steps(
-        self, shift: np.ndarray, friction: float, convergence: ConvergenceState | None = None
+        self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
     ) -> NewtonStepResult:
         """Take one Newton step with the contact forces that satisfy Coulomb's law."""
-        return _newton_step(self, shift, friction)
+        return _newton_step(self, shift, friction, progress)
 
     def with_new_tangent(self) -> Self:
         """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""

@@ -1,77 +1,105 @@
-"""Convergence test of the Newton loop with contact (Eq. 4, 8).
+"""Progress of Newton's method with contact in one world (Eq. 4, 8).
 
-The host loop in ``coupled_step`` uses the methods of ``ConvergenceState``. The GPU loop uses the kernels of
-``kernels/contact/newton_convergence.py``, which read the packed state.
+The rule is a kernel, ``kernels/contact/newton_convergence.py``, which also judges the steps of the loop on a GPU and of
+many worlds (``batch_step``); here it runs on a CPU.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
+import warp as wp
 
-from egs_warp.contact.coulomb import FAILURE_TOLERANCE
-from egs_warp.kernels.contact.newton_convergence import MIN_DECREASE, REFACTOR_RATIO, RESIDUAL_WINDOW
+from egs_warp.kernels.contact import newton_convergence as kernels
+from egs_warp.launching import launch_cached, thread_local_cache
+from egs_warp.precision import real
 
 MAX_NEWTON_STEPS = 60
 """Maximum number of Newton steps of a round."""
 
 
-@dataclass(frozen=True)
-class ConvergenceState:
-    """State and tolerances of one Newton loop (round). Residuals are divided by dt x weight."""
+class NewtonProgress:
+    """Progress of one round of Newton's method. Residuals are divided by dt x weight."""
 
-    tolerance: float
-    """Residual at which the loop ends."""
-    activation_residual: float
-    """Residual below which the loop first searches for penetrating points; 0 disables the search."""
-    coulomb_tolerance: float
-    """Maximum violation of Coulomb's law, m/s."""
-    steps: int = 0
-    recent_residuals: tuple[float, ...] = ()
-    """Residuals after the last accepted steps. A step must end below the largest of them."""
-    max_steps: int = MAX_NEWTON_STEPS
-    """Number of steps in the round at which the GPU loop stops and returns to the host."""
-
-    def is_acceptable(self, size: float, length: float = 1.0) -> bool:
-        """Return True if the line search may accept a point.
-
-        The test is non-monotone, because contacts that open, close or begin to slide change the forces at once.
+    def __init__(
+        self,
+        tolerance: float,
+        activation_residual: float,
+        coulomb_tolerance: float,
+        *,
+        max_steps: int = MAX_NEWTON_STEPS,
+    ) -> None:
+        """Start a round.
 
         Args:
-            size: residual at the point; not finite where an element is inverted.
-            length: fraction of the Newton step.
+            tolerance: residual at which the round ends.
+            activation_residual: residual below which points that penetrate too far are first searched for; they are
+                searched for again at the end. Negative values disable both searches.
+            coulomb_tolerance: largest violation of Coulomb's law, m/s.
+            max_steps: number of steps of the round after which a loop on a GPU returns to the host.
         """
-        limit = max((1.0 - MIN_DECREASE * length) * max(self.recent_residuals, default=np.inf), self.tolerance)
-        return bool(np.isfinite(size)) and size < limit
+        self.row = np.full(kernels.ROW_SIZE, -1.0)
+        """(ROW_SIZE,) the columns that ``kernels/contact/newton_convergence.py`` lists."""
+        self.row[: kernels.RECENT_RESIDUALS] = 0.0
+        self.row[[kernels.RESIDUAL, kernels.PREVIOUS_RESIDUAL]] = -1.0
+        self.row[[kernels.LENGTH, kernels.UNIT]] = 1.0
+        self.row[kernels.TOLERANCE], self.row[kernels.ACTIVATION_RESIDUAL] = tolerance, activation_residual
+        self.row[kernels.COULOMB_TOLERANCE], self.row[kernels.MAX_STEPS] = coulomb_tolerance, max_steps
 
-    def converges_slowly(self, size: float, before: float) -> bool:
-        """Return True if a step from residual ``before`` to ``size`` shows that the tangent should be updated."""
-        return self.steps > 0 and size > REFACTOR_RATIO * before
+    @property
+    def steps(self) -> int:
+        """Number of steps that were judged."""
+        return int(self.row[kernels.STEPS])
 
-    def may_activate_contacts(self, size: float, before: float) -> bool:
-        """Return True if a step from residual ``before`` to ``size`` passes the activation threshold."""
-        return before > self.activation_residual >= size
+    @property
+    def length(self) -> float:
+        """Fraction of the Newton step that the next trial takes."""
+        return float(self.row[kernels.LENGTH])
 
-    def after_steps(self, *sizes: float) -> ConvergenceState:
-        """Return the state after accepted steps to residuals ``sizes``."""
-        recent = (*self.recent_residuals, *sizes)[-RESIDUAL_WINDOW:]
-        return replace(self, steps=self.steps + len(sizes), recent_residuals=recent)
+    @property
+    def previous_residual(self) -> float:
+        """Residual before the last trial."""
+        return float(self.row[kernels.PREVIOUS_RESIDUAL])
 
-    def after_failed_step(self) -> ConvergenceState:
-        """Return the state after a step that was not accepted."""
-        return replace(self, steps=self.steps + 1)
+    def has(self, bits: int) -> bool:
+        """Return True if the outcome of the last trial has any of ``bits``."""
+        return bool(int(self.row[kernels.OUTCOME]) & bits)
 
-    def pack(self, unit: float, size: float | None) -> np.ndarray:
-        """Pack the state for ``init_convergence_kernel`` and ``check_convergence_kernel``.
+    def begin(self, residual: float) -> None:
+        """Set the ``residual`` at the start of the next step, unless it is known."""
+        if self.row[kernels.RESIDUAL] < 0.0:
+            self.row[kernels.RESIDUAL] = residual
+
+    def judge(self, residual: float, violation: float) -> None:
+        """Judge a trial.
 
         Args:
-            unit: dt x weight, N s. The packed residuals are in N s.
-            size: residual at the start of the loop; None uses that of the last trial.
+            residual: residual there; not finite where an element is inverted.
+            violation: violation of Coulomb's law by its forces, m/s.
         """
-        start = -1.0 if size is None else unit * size
-        residuals = unit * np.array([self.tolerance, self.activation_residual]), unit * np.array(self.recent_residuals)
-        padding = np.full(RESIDUAL_WINDOW - len(self.recent_residuals), -1.0)
-        # The loop also stops at a numerical failure of the Coulomb solve, which the host then repeats.
-        terms = np.array([min(self.coulomb_tolerance, FAILURE_TOLERANCE), float(self.max_steps), 0.0])
-        return np.concatenate([[float(self.steps), start, start], residuals[0], terms, padding, residuals[1]])
+        values, arrays = _buffers(kernels.ROW_SIZE)
+        values[:] = residual, violation, 0.0, *self.row
+        inputs, outputs = [np.inf, *arrays[:3]], arrays[3:]
+        launch_cached(kernels.judge_steps_kernel, 1, inputs=inputs, outputs=outputs, device=arrays[0].device)
+        self.row[:] = values[3:]
+
+    def take(self, row: np.ndarray) -> bool:
+        """Take over the ``row`` (ROW_SIZE,) of a loop on a GPU, and return True if the loop made only one trial."""
+        before = self.steps
+        self.row[:] = row
+        self.row[kernels.UNIT] = 1.0
+        undecided = self.has(kernels.SHORTEN | kernels.REPEAT)
+        return self.steps - before + undecided == 1
+
+    def renew_tangent(self) -> None:
+        """Record that the tangent is that of the present velocities."""
+        self.row[kernels.TANGENT_IS_CURRENT] = 1.0
+
+
+@thread_local_cache(1)
+def _buffers(columns: int) -> tuple[np.ndarray, list[wp.array]]:
+    """Return memory for the three inputs of ``judge_steps_kernel`` and a row of progress, and the kernel's arrays."""
+    values = np.zeros(3 + columns)
+    parts = [values[k : k + 1] for k in range(3)]
+    inputs = [wp.array(part, dtype=real, device="cpu", copy=False) for part in parts]
+    row = wp.array(values[None, 3:], dtype=real, device="cpu", copy=False)
+    return values, [*inputs, row, wp.zeros(1, dtype=int, device="cpu")]

@@ -19,7 +19,7 @@ from egs_warp.contact.device_newton import DeviceContactLinearization, DeviceCon
 from egs_warp.contact.device_newton_workspace import FROM_BASE, FROM_START, FROM_TRIAL, NewtonWorkspace
 from egs_warp.contact.device_step import vectors
 from egs_warp.contact.newton import ContactLinearization
-from egs_warp.contact.newton_convergence import ConvergenceState
+from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
 from egs_warp.fem.dense_cholesky import DenseCholesky
@@ -51,7 +51,7 @@ class DevicePlanner:
         planner: planner on the host, with the same settings.
         owner: builder of contact linearisations on the device.
         linear: builder of linear steps on the device.
-        convergence_state: function that returns the convergence state of a step's first Newton loop.
+        progress: function that returns the progress of Newton's method at the start of a step's first round.
     """
 
     def __init__(
@@ -59,11 +59,11 @@ class DevicePlanner:
         planner: StepPlanner,
         owner: DeviceContactLinearizer,
         linear: DeviceLinearSteps,
-        convergence_state: Callable[[StepProblem], ConvergenceState],
+        progress: Callable[[StepProblem], NewtonProgress],
     ) -> None:
         assert isinstance(planner.factors, DenseCholesky)
         self.planner, self.owner, self.linear, self.factors = planner, owner, linear, planner.factors
-        self.convergence_state = convergence_state
+        self.progress = progress
         self.objective_staging, self.other_staging = StagingBuffer(owner.stream), StagingBuffer(owner.stream)
         muscles, body = planner.muscles, planner.body
         self.members = owner.tensor(planner.synergies.members.toarray())
@@ -367,9 +367,9 @@ class PlanWorkspace:
         skips the solve."""
         with self.body.stream:
             self._plan_event = self.body.stream.record_event(self._plan_event)
-        convergence = self.owner.convergence_state(start.problem)
+        progress = self.owner.progress(start.problem)
         self.newton.start_newton(
-            start.problem, start.normal_bias, start.friction, convergence, base=FROM_TRIAL, enabled=enabled
+            start.problem, start.normal_bias, start.friction, progress, base=FROM_TRIAL, enabled=enabled
         )
         if self._plan_event is not None:
             self._plan_event.synchronize()

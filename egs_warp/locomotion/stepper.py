@@ -531,4 +531,4 @@ def _make_device_planner(planner: StepPlanner, linearizer: ContactLinearizer, so
     from egs_warp.locomotion.device_plan import DevicePlanner
 
     assert isinstance(linearizer, DeviceContactLinearizer) and isinstance(planner.linear_steps, DeviceLinearSteps)
-    return DevicePlanner(planner, linearizer, planner.linear_steps, solver.convergence_state)
+    return DevicePlanner(planner, linearizer, planner.linear_steps, solver.progress)

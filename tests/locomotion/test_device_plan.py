@@ -144,17 +144,17 @@ def test_the_solve_continues_from_the_end_of_the_plan(
             name,
             lambda *given, name=name, real=real, **named: asked.append(name) or real(*given, **named),
         )
-    course = stepper.solver.convergence_state(start.problem)
+    progress, again = stepper.solver.progress(start.problem), stepper.solver.progress(start.problem)
     first = response.iterate_at(tension, plan.velocities, plan.forces)
-    stretch = first.newton_steps(start.normal_bias, start.friction, course)
-    assert asked == [] and first.residual_norm > 0.0 and len(stretch.accepted_residuals) > 1
+    stretch = first.newton_steps(start.normal_bias, start.friction, progress)
+    assert asked == [] and first.residual_norm > 0.0 and progress.steps > 1
     second = response.iterate_at(tension, plan.velocities.copy(), plan.forces)
     assert second.residual_norm == pytest.approx(first.residual_norm, rel=1e-7)
     np.testing.assert_allclose(second.free_contact_velocities, first.free_contact_velocities, rtol=0, atol=1e-10)
-    other = second.newton_steps(start.normal_bias, start.friction, course)
+    other = second.newton_steps(start.normal_bias, start.friction, again)
     ahead, beyond = stretch.trial, other.trial
     assert asked == ["start_trial", "start_newton"] and stretch.coulomb_violation < 1e-10
-    np.testing.assert_allclose(other.accepted_residuals, stretch.accepted_residuals, rtol=1e-3, atol=1e-7)
+    np.testing.assert_allclose(again.row, progress.row, rtol=1e-3, atol=1e-7)
     np.testing.assert_allclose(other.forces, stretch.forces, rtol=0, atol=1e-7 * stepper.body.weight)
     np.testing.assert_allclose(beyond.velocities, ahead.velocities, rtol=0, atol=1e-10)
     assert ahead.penetration is not None and beyond.penetration is not None
@@ -173,9 +173,9 @@ def test_a_replan_equals_that_of_the_host(creature: Creature, stepper: Locomotio
     assert found is not None
     response, plan = found
     tension = MuscleEnergy.of(stepper.muscles, plan.activations)
-    course = stepper.solver.convergence_state(start.problem)
+    progress = stepper.solver.progress(start.problem)
     stretch = response.iterate_at(tension, plan.velocities, plan.forces).newton_steps(
-        start.normal_bias, start.friction, course
+        start.normal_bias, start.friction, progress
     )
     end = stretch.trial if last else stretch.base
     prospect = PredictedStep(response, start.normal_bias, plan.activations, end.velocities, end.forces)
@@ -247,7 +247,7 @@ def test_a_restart_equals_that_of_the_host(
     stretch = (
         found[0]
         .iterate_at(MuscleEnergy.of(stepper.muscles, found[1].activations), found[1].velocities, found[1].forces)
-        .newton_steps(start.normal_bias, start.friction, stepper.solver.convergence_state(start.problem))
+        .newton_steps(start.normal_bias, start.friction, stepper.solver.progress(start.problem))
     )
     assert (
         stretch.coulomb_violation < 1e-9

@@ -1,6 +1,4 @@
-"""Convergence test of the Newton loop with contact on a GPU (Eq. 4, 8); ``egs_warp/contact/newton_convergence.py`` has
-the same test for the host.
-"""
+"""The rule that accepts and shortens Newton steps on motion and contact, in any number of worlds (Eq. 4, 8)."""
 
 import warp as wp
 
@@ -16,97 +14,155 @@ MIN_DECREASE = 1e-4
 """Sufficient decrease of a full step, as a fraction of the largest recent residual."""
 RESIDUAL_WINDOW = 3
 """Number of recent residuals; a step must end below the largest of them."""
+MIN_STEP_LENGTH = 1e-3
+"""Step length below which the line search fails, as a fraction of a Newton step."""
+MAX_COULOMB_FAILURES = 3
+"""Maximum number of Newton steps of a round whose forces violate Coulomb's law by more than the tolerance. With more,
+the solve fails and the step is halved.
+"""
 (
     STEPS,
     RESIDUAL,
-    FIRST_RESIDUAL,
+    PREVIOUS_RESIDUAL,
+    LENGTH,
+    COULOMB_FAILURES,
+    TANGENT_IS_CURRENT,
+    OUTCOME,
+    UNIT,
     TOLERANCE,
     ACTIVATION_RESIDUAL,
     COULOMB_TOLERANCE,
     MAX_STEPS,
-    STEPS_TAKEN,
     RECENT_RESIDUALS,
-) = range(9)
-"""Indices into the packed state: steps so far, residual at the start of the next step, residual at the start of the
-loop, the fields of ``ConvergenceState``, step limit, steps taken by this loop, and ``RESIDUAL_WINDOW`` recent
+) = range(13)
+"""Columns of the progress of a world: steps of the round so far, residual at the start of the next step (-1: that of
+the last trial), residual before the last trial, fraction of the Newton step of the next trial, steps that violated
+Coulomb's law, 1 if the tangent is that of the present velocities, outcome of the last trial, unit of the residuals of
+trials (the stored ones are divided by it), tolerances (``NewtonProgress``), step limit, and ``RESIDUAL_WINDOW`` recent
 residuals, -1 where there is none.
 """
-HEADER_SIZE = RECENT_RESIDUALS + RESIDUAL_WINDOW
+ROW_SIZE = RECENT_RESIDUALS + RESIDUAL_WINDOW
+ACCEPTED, SHORTEN, NEEDS_TANGENT, ENDED, NEAR_END, FAILED, REPEAT = 1, 2, 4, 8, 16, 32, 64
+"""Bits of an outcome. ``ACCEPTED``: the trial is the new iterate. ``SHORTEN``: try half of the step. ``NEEDS_TANGENT``:
+update the tangent before the next step. ``ENDED``: the equations hold. ``NEAR_END``: search for points that penetrate
+too far. ``FAILED``: give up. ``REPEAT``: the Coulomb solve failed numerically; nothing was decided.
+"""
 
 _REFACTOR_RATIO, _MIN_DECREASE, _WINDOW = (
     wp.constant(real(REFACTOR_RATIO)),
     wp.constant(real(MIN_DECREASE)),
     wp.constant(RESIDUAL_WINDOW),
 )
-_STEPS, _RESIDUAL, _FIRST_RESIDUAL = wp.constant(STEPS), wp.constant(RESIDUAL), wp.constant(FIRST_RESIDUAL)
-_TOLERANCE = wp.constant(TOLERANCE)
-_ACTIVATION_RESIDUAL, _COULOMB_TOLERANCE, _MAX_STEPS = (
-    wp.constant(ACTIVATION_RESIDUAL),
-    wp.constant(COULOMB_TOLERANCE),
-    wp.constant(MAX_STEPS),
-)
-_STEPS_TAKEN, _RECENT, _HEADER = wp.constant(STEPS_TAKEN), wp.constant(RECENT_RESIDUALS), wp.constant(HEADER_SIZE)
+_MIN_LENGTH, _MAX_FAILURES = wp.constant(real(MIN_STEP_LENGTH)), wp.constant(real(MAX_COULOMB_FAILURES))
+_STEPS, _RESIDUAL, _PREVIOUS = wp.constant(STEPS), wp.constant(RESIDUAL), wp.constant(PREVIOUS_RESIDUAL)
+_LENGTH, _FAILURES, _CURRENT = wp.constant(LENGTH), wp.constant(COULOMB_FAILURES), wp.constant(TANGENT_IS_CURRENT)
+_OUTCOME, _UNIT, _TOLERANCE = wp.constant(OUTCOME), wp.constant(UNIT), wp.constant(TOLERANCE)
+_ACTIVATION_RESIDUAL, _COULOMB_TOLERANCE = wp.constant(ACTIVATION_RESIDUAL), wp.constant(COULOMB_TOLERANCE)
+_MAX_STEPS, _RECENT = wp.constant(MAX_STEPS), wp.constant(RECENT_RESIDUALS)
+_ACCEPTED, _SHORTEN, _NEEDS_TANGENT = wp.constant(ACCEPTED), wp.constant(SHORTEN), wp.constant(NEEDS_TANGENT)
+_ENDED, _NEAR_END = wp.constant(ENDED), wp.constant(NEAR_END)
+_FAILED, _REPEAT = wp.constant(FAILED), wp.constant(REPEAT)
 
 
 @wp.kernel
-def init_convergence_kernel(
+def begin_loop_kernel(
     # In:
     enabled: wp.array[int],
     sizes: wp.array[real],
     # In and out:
-    state: wp.array[real],
+    progress: wp.array2d[real],
     # Out:
-    condition_out: wp.array[int],
+    running_out: wp.array[int],
 ):
-    """Set the loop condition to ``enabled``. A negative residual in the packed ``state`` is replaced by
-    ``sizes[0]``, the residual of the last trial.
+    """Prepare the rows of ``progress`` for a loop of trials: clear the outcome, take an unknown residual from
+    ``sizes``, that of the last trial, and set the loop condition to ``enabled``.
     """
-    if state[_RESIDUAL] < real(0.0):
-        state[_RESIDUAL] = sizes[0]
-    state[_FIRST_RESIDUAL] = state[_RESIDUAL]
-    condition_out[0] = enabled[0]
+    world = wp.tid()
+    if progress[world, _RESIDUAL] < real(0.0):
+        progress[world, _RESIDUAL] = sizes[world] / progress[world, _UNIT]
+    progress[world, _PREVIOUS] = progress[world, _RESIDUAL]
+    progress[world, _OUTCOME] = real(0.0)
+    running_out[world] = enabled[world]
+
+
+@wp.func
+def judge_step(progress: wp.array2d[real], world: int, size: real, violation: real, failure_tolerance: real) -> int:
+    """Update row ``world`` of ``progress`` after a trial of residual ``size``, and return the outcome."""
+    before = progress[world, _RESIDUAL]
+    progress[world, _PREVIOUS] = before
+    if violation > failure_tolerance:
+        return _REPEAT
+    length = progress[world, _LENGTH]
+    tolerance = progress[world, _TOLERANCE]
+    maximum = real(-1.0)
+    for k in range(_WINDOW):
+        maximum = wp.max(maximum, progress[world, _RECENT + k])
+    # The test is not monotone, because contacts that open, close or begin to slide change the forces at once.
+    limit = wp.max((real(1.0) - _MIN_DECREASE * length) * maximum, tolerance)
+    if maximum < real(0.0):
+        limit = real(wp.inf)
+    is_accepted = wp.isfinite(size) and size < limit
+    if not is_accepted and length > real(2.0) * _MIN_LENGTH:
+        progress[world, _LENGTH] = real(0.5) * length
+        return _SHORTEN
+    progress[world, _LENGTH] = real(1.0)
+    is_first = progress[world, _STEPS] == real(0.0)
+    progress[world, _STEPS] += real(1.0)
+    is_violated = violation > progress[world, _COULOMB_TOLERANCE]
+    if is_violated:
+        progress[world, _FAILURES] += real(1.0)
+    was_current = progress[world, _CURRENT] > real(0.0)
+    progress[world, _CURRENT] = real(0.0)
+    outcome = int(0)
+    if progress[world, _FAILURES] > _MAX_FAILURES:
+        outcome |= _FAILED
+    if not is_accepted:
+        outcome |= _NEEDS_TANGENT
+        if was_current:
+            outcome |= _FAILED
+        return outcome
+    outcome |= _ACCEPTED
+    for k in range(_WINDOW - 1):
+        progress[world, _RECENT + k] = progress[world, _RECENT + k + 1]
+    progress[world, _RECENT + _WINDOW - 1] = size
+    progress[world, _RESIDUAL] = size
+    # By linearity, the contact velocities after a full step are those of the Coulomb solve.
+    is_consistent = length == real(1.0) and not is_violated
+    if not is_consistent or (not is_first and size > _REFACTOR_RATIO * before):
+        outcome |= _NEEDS_TANGENT
+    if is_consistent:
+        is_end = size <= tolerance
+        activation = progress[world, _ACTIVATION_RESIDUAL]
+        if is_end:
+            outcome |= _ENDED
+        if activation >= real(0.0) and (is_end or (before > activation and size <= activation)):
+            outcome |= _NEAR_END
+    return outcome
 
 
 @wp.kernel
-def check_convergence_kernel(
+def judge_steps_kernel(
+    # Model:
+    failure_tolerance: real,
     # In:
     sizes: wp.array[real],
-    violation: wp.array[real],
+    violations: wp.array[real],
     penetrating: wp.array[real],
     # In and out:
-    state: wp.array[real],
+    progress: wp.array2d[real],
     # Out:
-    condition_out: wp.array[int],
+    running_out: wp.array[int],
 ):
-    """Test whether the loop on the device may take another step without the host.
+    """Judge the last trial of each world, and decide whether a loop on the device may go on without the host.
 
-    The last step ended at the residual ``sizes[0]`` in N s. Its forces violate Coulomb's law by ``violation[0]`` m/s,
-    and ``penetrating[0]`` points penetrate too far. The residual after each step is stored behind the header of
-    ``state``.
+    Trials ended at the residuals ``sizes``, in the unit of the row. Their forces violate Coulomb's law by
+    ``violations`` in m/s, where more than ``failure_tolerance`` is a numerical failure, and ``penetrating`` points
+    penetrate too far.
     """
-    size = sizes[0]
-    before = state[_RESIDUAL]
-    maximum = real(-1.0)
-    for k in range(_WINDOW):
-        maximum = wp.max(maximum, state[_RECENT + k])
-    limit = wp.max((real(1.0) - _MIN_DECREASE) * maximum, state[_TOLERANCE])
-    if maximum < real(0.0):
-        limit = real(wp.inf)
-    proceed = int(0)
-    if size > state[_TOLERANCE] and size < limit and violation[0] <= state[_COULOMB_TOLERANCE]:
-        proceed = 1
-    if state[_STEPS] > real(0.0) and size > _REFACTOR_RATIO * before:
-        proceed = 0
-    if penetrating[0] > real(0.0) and before > state[_ACTIVATION_RESIDUAL] and size <= state[_ACTIVATION_RESIDUAL]:
-        proceed = 0
-    steps_taken = int(state[_STEPS_TAKEN])
-    state[_HEADER + steps_taken] = size
-    state[_STEPS_TAKEN] = real(steps_taken + 1)
-    state[_STEPS] += real(1.0)
-    if state[_STEPS] >= state[_MAX_STEPS]:
-        proceed = 0
-    for k in range(_WINDOW - 1):
-        state[_RECENT + k] = state[_RECENT + k + 1]
-    state[_RECENT + _WINDOW - 1] = size
-    state[_RESIDUAL] = size
-    condition_out[0] = proceed
+    world = wp.tid()
+    outcome = judge_step(progress, world, sizes[world] / progress[world, _UNIT], violations[world], failure_tolerance)
+    progress[world, _OUTCOME] = real(outcome)
+    is_plain = outcome == _ACCEPTED or (outcome == (_ACCEPTED | _NEAR_END) and penetrating[world] == real(0.0))
+    running_out[world] = int(0)
+    if is_plain and progress[world, _STEPS] < progress[world, _MAX_STEPS]:
+        running_out[world] = int(1)
