@@ -19,7 +19,6 @@ from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.host_newton import HostNewtonWorkspace, IterateBuffer, address_of, host_newton_workspace
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.body import BodyState
-from egs_warp.fem.simd_elasticity import SimdElasticity
 from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.muscles.tension import MuscleEnergy
 
@@ -88,9 +87,7 @@ class ContactLinearization:
 
     def iterate_at(self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray) -> NewtonIterate:
         """Return the Newton iterate at ``velocities`` (N, 3) and contact ``forces`` (n, 3), under ``tension``."""
-        if _elements_on_host(self.tangent):
-            return NativeNewtonIterate.at(self, tension, velocities, forces)
-        return NumpyNewtonIterate(self, tension, velocities, forces)
+        return NativeNewtonIterate.at(self, tension, velocities, forces)
 
 
 class ContactLinearizer(Protocol):
@@ -167,18 +164,11 @@ class HostContactLinearizer:
         """Take one Newton step with fixed contact forces. This needs one right-hand side; a linearisation needs three
         for each contact.
         """
-        problem = tangent.problem
-        if _elements_on_host(tangent):
-            workspace, state = (
-                host_newton_workspace(contacts.node_count),
-                IterateBuffer.of(contacts, velocities, forces),
-            )
-            workspace.trial(problem, tension, state)
-            workspace.newton(tangent, state, rest=True)
-            return state.free_velocities if problem.is_inversion_free(state.free_velocities) else None
-        residual = problem.residual(velocities, tension).ravel() - problem.dt * contacts.nodal_forces(forces)
-        end = velocities - tangent.solve(residual).reshape(velocities.shape)
-        return end if problem.is_inversion_free(end) else None
+        problem, workspace = tangent.problem, host_newton_workspace(contacts.node_count)
+        state = IterateBuffer.of(contacts, velocities, forces)
+        workspace.trial(problem, tension, state)
+        workspace.newton(tangent, state, rest=True)
+        return state.free_velocities if problem.is_inversion_free(state.free_velocities) else None
 
 
 @dataclass(frozen=True)
@@ -279,39 +269,9 @@ class NewtonStepResult:
     trial: NewtonIterate
 
 
-def _newton_step(
-    iterate: NativeNewtonIterate | NumpyNewtonIterate,
-    shift: np.ndarray,
-    friction: float,
-    progress: NewtonProgress | None,
-) -> NewtonStepResult:
-    """Take one Newton step from an iterate on the host."""
-    forces, violation = iterate.linearization.solve_coulomb(
-        iterate.free_contact_velocities, shift, friction, iterate.forces
-    )
-    trial = iterate.line_search_point(forces)
-    if progress is not None:
-        progress.begin(iterate.residual_norm)
-        progress.judge(trial.residual_norm, violation)
-    return NewtonStepResult(iterate, forces, violation, trial)
-
-
-def _linearization_at(iterate: NativeNewtonIterate | NumpyNewtonIterate) -> ContactLinearization:
-    """Return the linearisation of the same contacts with the tangent at the iterate."""
-    old = iterate.linearization.tangent
-    return ContactLinearization.of(
-        old.problem.tangent(old.factors, iterate.velocities, iterate.tension), iterate.linearization.contacts
-    )
-
-
-def _elements_on_host(tangent: Tangent) -> bool:
-    """Return True if the elements are on a CPU, which implies that the factors are there too."""
-    return isinstance(tangent.problem.body.assembly.elements, SimdElasticity)
-
-
 @dataclass(frozen=True, eq=False)
 class NativeNewtonIterate:
-    """``NewtonIterate`` evaluated by CPU kernels; equal to ``NumpyNewtonIterate``."""
+    """``NewtonIterate`` evaluated by CPU kernels."""
 
     linearization: ContactLinearization
     tension: MuscleEnergy | None
@@ -364,79 +324,19 @@ class NativeNewtonIterate:
         self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
     ) -> NewtonStepResult:
         """Take one Newton step with the contact forces that satisfy Coulomb's law."""
-        return _newton_step(self, shift, friction, progress)
+        forces, violation = self.linearization.solve_coulomb(self.free_contact_velocities, shift, friction, self.forces)
+        trial = self.line_search_point(forces)
+        if progress is not None:
+            progress.begin(self.residual_norm)
+            progress.judge(trial.residual_norm, violation)
+        return NewtonStepResult(self, forces, violation, trial)
 
     def with_new_tangent(self) -> Self:
         """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""
-        return replace(self, linearization=_linearization_at(self), state=self.state.copy())
+        old, contacts = self.linearization.tangent, self.linearization.contacts
+        tangent = old.problem.tangent(old.factors, self.velocities, self.tension)
+        return replace(self, linearization=ContactLinearization.of(tangent, contacts), state=self.state.copy())
 
 
 def _workspace_of(response: ContactLinearization) -> HostNewtonWorkspace:
     return host_newton_workspace(response.contacts.node_count)
-
-
-@dataclass(frozen=True)
-class NumpyNewtonIterate:
-    """``NewtonIterate`` in NumPy arrays, each computed on first use. Used for elements on a GPU without torch."""
-
-    linearization: ContactLinearization
-    tension: MuscleEnergy | None
-    velocities: np.ndarray
-    forces: np.ndarray
-    penetration: None = None
-
-    @cached_property
-    def _free_residual(self) -> np.ndarray:
-        """(N, 3) N s, residual without contact forces."""
-        return self.linearization.tangent.problem.residual(self.velocities, self.tension)
-
-    @property
-    def residual_norm(self) -> float:
-        """Norm of the residual with contact forces, divided by dt x weight; not finite where an element is inverted."""
-        return self._residual_norm
-
-    @cached_property
-    def _residual_norm(self) -> float:
-        problem = self.linearization.tangent.problem
-        rest = self._free_residual.ravel() - problem.dt * self.linearization.contacts.nodal_forces(self.forces)
-        return float(np.linalg.norm(rest)) / problem.residual_scale
-
-    @property
-    def is_inversion_free(self) -> bool:
-        """True if no element is inverted."""
-        return self.linearization.tangent.problem.is_inversion_free(self.velocities)
-
-    @cached_property
-    def _free_velocities(self) -> np.ndarray:
-        """(3N,) m/s after a Newton step without contact forces."""
-        return self.velocities.ravel() - self.linearization.tangent.solve(self._free_residual.ravel())
-
-    @property
-    def free_contact_velocities(self) -> np.ndarray:
-        """(3n,) m/s, contact velocities after a Newton step without contact forces."""
-        return self._contact_velocities
-
-    @cached_property
-    def _contact_velocities(self) -> np.ndarray:
-        return self.linearization.contacts.contact_velocities(self._free_velocities)
-
-    def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> Self:
-        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
-        end = (self._free_velocities + self.linearization.columns @ forces.ravel()).reshape(self.velocities.shape)
-        return replace(
-            self,
-            velocities=self.velocities + length * (end - self.velocities),
-            forces=self.forces + length * (forces - self.forces),
-        )
-
-    def newton_steps(
-        self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
-    ) -> NewtonStepResult:
-        """Take one Newton step with the contact forces that satisfy Coulomb's law."""
-        return _newton_step(self, shift, friction, progress)
-
-    def with_new_tangent(self) -> Self:
-        """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""
-        other = replace(self, linearization=_linearization_at(self))
-        vars(other)["_free_residual"] = self._free_residual
-        return other

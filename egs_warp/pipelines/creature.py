@@ -217,7 +217,7 @@ def creature_in_cage(
         progress: Called with the name of each stage as it starts.
     """
     progress("contact")
-    device, frame, cage = str(cloud.device), standing.frame, standing.cage
+    device, frame, cage = _simulation_device(cloud), standing.frame, standing.cage
     solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in options.solids)
     field = None
     if options.ground is not None:
@@ -289,7 +289,7 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
         sag: Fraction of its height by which the body sags, which defines the stiffness (``make_body``).
         muscles_file: Muscles (``body_muscles``); the automatic ones depend on the stiffness.
     """
-    device = str(creature.cloud.device)
+    device = _simulation_device(creature.cloud)
     body, geometry = creature.body, replace(creature.geometry, friction=friction)
     up = -body.gravity / np.linalg.norm(body.gravity)
     new_body = make_body(creature.cage.mesh, GROUND, up=up, sag=sag, device=device)
@@ -297,6 +297,18 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
     stepper = LocomotionStepper(new_body, muscles, geometry, settings=creature.stepper.settings, device=device)
     stepper, start, _ = _rest_state(stepper, creature.limbs)
     return replace(creature, stepper=stepper, start=start)
+
+
+def _simulation_device(cloud: GaussianCloud) -> str:
+    """Return the device of the body's steps: that of ``cloud``, or the CPU if PyTorch is missing or cannot use the GPU,
+    since the matrices of a GPU are in its tensors."""
+    if cloud.device.is_cpu:
+        return str(cloud.device)
+    try:
+        import torch
+    except ImportError:
+        return "cpu"
+    return str(cloud.device) if torch.cuda.is_available() else "cpu"
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,76 @@
+"""Newton iterates with contact in NumPy, from the equation of the step (Eq. 4, 8): a reference for CPU and GPU."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from egs_warp.contact.newton import ContactLinearization
+from egs_warp.muscles.tension import MuscleEnergy
+
+
+@dataclass(frozen=True)
+class ReferenceIterate:
+    """Velocities (N, 3) m/s and contact forces (n, 3) N; the residual there, and the Newton step from there."""
+
+    linearization: ContactLinearization
+    tension: MuscleEnergy | None
+    velocities: np.ndarray
+    forces: np.ndarray
+
+    @cached_property
+    def free_residual(self) -> np.ndarray:
+        """(N, 3) N s, residual without contact forces."""
+        return self.linearization.tangent.problem.residual(self.velocities, self.tension)
+
+    @cached_property
+    def residual(self) -> np.ndarray:
+        """(3N,) N s, residual with contact forces."""
+        response = self.linearization
+        pushes = response.contacts.nodal_forces(self.forces)
+        return self.free_residual.ravel() - response.tangent.problem.dt * pushes
+
+    @property
+    def residual_norm(self) -> float:
+        """Norm of the residual with contact forces, divided by dt x weight; not finite where an element is inverted."""
+        return float(np.linalg.norm(self.residual)) / self.linearization.tangent.problem.residual_scale
+
+    @property
+    def is_inversion_free(self) -> bool:
+        """True if no element is inverted."""
+        return self.linearization.tangent.problem.is_inversion_free(self.velocities)
+
+    @cached_property
+    def free_velocities(self) -> np.ndarray:
+        """(3N,) m/s after a Newton step without contact forces."""
+        return self.velocities.ravel() - self.linearization.tangent.solve(self.free_residual.ravel())
+
+    @property
+    def free_contact_velocities(self) -> np.ndarray:
+        """(3n,) m/s, contact velocities after a Newton step without contact forces."""
+        return self.linearization.contacts.contact_velocities(self.free_velocities)
+
+    @property
+    def velocities_with_fixed_forces(self) -> np.ndarray:
+        """(N, 3) m/s after a Newton step with the same contact forces."""
+        return self.velocities - self.linearization.tangent.solve(self.residual).reshape(self.velocities.shape)
+
+    def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> Self:
+        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
+        end = (self.free_velocities + self.linearization.columns @ forces.ravel()).reshape(self.velocities.shape)
+        return replace(
+            self,
+            velocities=self.velocities + length * (end - self.velocities),
+            forces=self.forces + length * (forces - self.forces),
+        )
+
+    def with_new_tangent(self) -> Self:
+        """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""
+        old, contacts = self.linearization.tangent, self.linearization.contacts
+        tangent = old.problem.tangent(old.factors, self.velocities, self.tension)
+        other = replace(self, linearization=ContactLinearization.of(tangent, contacts))
+        vars(other)["free_residual"] = self.free_residual
+        return other
