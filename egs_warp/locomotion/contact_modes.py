@@ -2,26 +2,26 @@
 modes (Eq. 9, 13).
 
 Contact forces are a function of the activations, affine in each region of fixed contact modes. ``search_modes`` solves
-one QP in each region that it visits. Its kernels are in ``egs_warp.kernels.locomotion.mode_region``, the version for a
-GPU is ``device_search``. See docs/concepts/locomotion.md#modes.
+one QP in each region that it visits; ``device_search`` is the version in one kernel. See
+docs/concepts/locomotion.md#modes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import warp as wp
+from scipy.linalg import get_lapack_funcs
 
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.kernels.locomotion import mode_region as kernels
-from egs_warp.launching import launch_cached, thread_local_cache, zeros
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
-from egs_warp.precision import real
 
 FREE, STICK, SLIDE = kernels.FREE, kernels.STICK, kernels.SLIDE
+_getrf, _getrs = get_lapack_funcs(("getrf", "getrs"), dtype=np.float64)
+_MIN_PIVOT = 1e-14
+"""Smallest pivot of the equations of the forces, as a fraction of the largest."""
 
 
 @dataclass(frozen=True)
@@ -261,63 +261,69 @@ class ModeRegion:
     @classmethod
     def of(cls, program: CoulombProgram, modes: ContactModes, friction: FrictionDirections = CONE) -> ModeRegion | None:
         """Return the region of ``modes``, or None if the equations of its contact forces are singular."""
-        faces = len(friction.sides)
-        m, n = program.activation_count, program.contact_count
+        m, mu = program.activation_count, program.friction
         stick, slide, free = (np.flatnonzero(modes.kind == kind) for kind in (STICK, SLIDE, FREE))
-        contact = np.concatenate([stick, slide, np.tile(stick, faces), slide, slide, free])
+        forces = _forces(program, modes, stick, slide)
+        if forces is None:
+            return None
+        # x = (a, f) as an affine function of the activations, with the constant in the last column.
+        x = np.vstack([np.eye(m, m + 1), forces])
+        products = program.P @ x
+        cost = x.T @ products
+        vectors = forces.reshape(-1, 3, m + 1)
+        speeds = (program.rows @ x).reshape(-1, 3, m + 1)
+        speeds[:, :, m] += program.offset.reshape(-1, 3)
+        sides = friction.sides * [mu, 1.0, 1.0]
+        slip, turned = modes.slip[slide], modes.slip[slide][:, ::-1] * [-1.0, 1.0]
+        sine, cosine = math.sin(friction.sector), math.cos(friction.sector)
+        edges = np.stack([sine * slip + cosine * turned, sine * slip - cosine * turned])
+        rows = np.concatenate(
+            [
+                np.eye(m, m + 1),
+                *(vectors[stick, 0], vectors[slide, 0]),
+                np.tensordot(sides, vectors[stick], axes=(1, 1)).reshape(-1, m + 1),
+                (edges[:, :, None] @ speeds[slide, 1:]).reshape(-1, m + 1),
+                speeds[free, 0],
+            ]
+        )
         transitions = np.repeat(
             [kernels.TO_FREE, kernels.TO_SLIDE, kernels.TO_OTHER_DIRECTION, kernels.TO_TOUCHING],
-            [len(stick) + len(slide), faces * len(stick), 2 * len(slide), len(free)],
+            [len(stick) + len(slide), len(sides) * len(stick), 2 * len(slide), len(free)],
         )
-        inputs = [np.ascontiguousarray(each) for each in (program.P, program.q, program.rows, program.offset)]
-        inputs += [modes.kind.astype(np.int32), np.ascontiguousarray(modes.slip), np.ascontiguousarray(friction.sides)]
-        row_count, padded_m = m + len(contact), kernels.padded(m)
-        shapes = (3 * n, padded_m), 3 * n, (m, padded_m), m, (row_count, padded_m), row_count
-        slope, offset, P, q, rows, rows_offset = outputs = [np.empty(shape) for shape in shapes]
-        workspace = _workspace(kernels.scratch_size(m, n), 10 * n)
-        launch_cached(
-            kernels.mode_region_kernel,
-            1,
-            inputs=[
-                *(m, n, program.friction, *_addresses(inputs), faces, math.sin(friction.sector)),
-                *(math.cos(friction.sector), workspace.numbers, workspace.scratch, row_count),
-            ],
-            outputs=[*_addresses(outputs), workspace.is_valid_array],
-            device=workspace.device,
+        return cls(
+            force_offset=forces[:, m],
+            force_slope=forces[:, :m],
+            P=0.5 * (cost + cost.T)[:m, :m],
+            q=x[:, :m].T @ program.q + cost[:m, m],
+            rows=rows[:, :m],
+            rows_offset=rows[:, m],
+            contact=np.concatenate([stick, slide, np.tile(stick, len(sides)), slide, slide, free]),
+            transitions=transitions,
         )
-        if not workspace.is_valid[0]:
-            return None
-        return cls(offset, slope[:, :m], P[:, :m], q, rows[:, :m], rows_offset, contact, transitions)
 
 
-class _Workspace:
-    """Reused host buffers of one thread for building mode regions."""
-
-    def __init__(self) -> None:
-        self.device = wp.get_device("cpu")
-        self.is_valid = np.zeros(1, np.int32)
-        self.is_valid_array = wp.array(self.is_valid, dtype=int, device="cpu", copy=False)
-        self.scratch, self.numbers = zeros(0, real, "cpu"), zeros(0, int, "cpu")
-
-    def grown(self, scratch: int, numbers: int) -> _Workspace:
-        """Enlarge the buffers to at least ``scratch`` floats and ``numbers`` integers; return the workspace."""
-        if self.scratch.size < scratch:
-            self.scratch = zeros(scratch, real, "cpu")
-        if self.numbers.size < numbers:
-            self.numbers = zeros(numbers, int, "cpu")
-        return self
-
-
-_thread_workspace = thread_local_cache(1)(_Workspace)
-
-
-def _workspace(scratch: int, numbers: int) -> _Workspace:
-    """Return this thread's workspace with at least these sizes."""
-    return _thread_workspace().grown(scratch, numbers)
-
-
-def _addresses(values: Sequence[np.ndarray]) -> list[int]:
-    return [value.ctypes.data for value in values]
+def _forces(program: CoulombProgram, modes: ContactModes, stick: np.ndarray, slide: np.ndarray) -> np.ndarray | None:
+    """Return the contact forces (3n, m + 1) as an affine function of the activations, with the constant in the last
+    column: those that keep sticking contacts at rest and sliding ones on the ground. None if they are singular."""
+    m, n = program.activation_count, program.contact_count
+    held = np.concatenate([(3 * stick[:, None] + np.arange(3)).ravel(), 3 * slide])
+    # Forces per component that holds a velocity at zero; friction of a sliding contact follows its normal force.
+    spread = np.zeros((3 * n, len(held)))
+    spread[held, np.arange(len(held))] = 1.0
+    normals = np.arange(3 * len(stick), len(held))
+    spread[3 * slide + 1, normals], spread[3 * slide + 2, normals] = -program.friction * modes.slip[slide].T
+    if len(held) == 0:
+        return np.zeros((3 * n, m + 1))
+    rows = program.rows[held]
+    operator = rows[:, m:] @ spread
+    diagonal = operator.diagonal()
+    operator[np.diag_indices_from(operator)] += kernels.DELASSUS_REGULARIZATION * np.abs(diagonal).mean()
+    factor, pivots, _ = _getrf(operator)
+    sizes = np.abs(factor.diagonal())
+    if not sizes.min() > _MIN_PIVOT * sizes.max():
+        return None
+    solved, _ = _getrs(factor, pivots, np.column_stack([rows[:, :m], program.offset[held]]))
+    return -(spread @ solved)
 
 
 def solve_mode_region(

@@ -14,11 +14,11 @@ import warp as wp
 
 from egs_warp.kernels.locomotion import mode_search as kernels
 from egs_warp.kernels.locomotion.active_set import NUMERICAL_FAILURE, OPTIMUM_FOUND
-from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints
-from egs_warp.kernels.locomotion.block_splitting import Splitting
 from egs_warp.kernels.locomotion.mode_region import CONE_FACES
 from egs_warp.kernels.locomotion.relaxed_contact import Relaxed, relaxed_qp_kernel
+from egs_warp.kernels.locomotion.splitting import Splitting
 from egs_warp.launching import PinnedMirror, device_of, round_up, thread_local_cache
+from egs_warp.locomotion.active_set import active_set_arrays
 from egs_warp.locomotion.contact_modes import ContactModes, CoulombProgram, ModeSearchResult
 from egs_warp.precision import real
 
@@ -202,31 +202,12 @@ class RelaxationWorkspace:
 
 
 def _active_set(rows: int, base_rows: int, unknowns: int, cancelled: wp.array) -> tuple[Any, Any, Any]:
-    """Allocate ``UnitConstraints``, ``ActiveSet`` and ``Splitting``.
-
-    Args:
-        rows: row capacity.
-        base_rows: number of base rows of which the rows are combinations.
-        unknowns: capacity of unknowns.
-        cancelled: (1,) int32 on the device; the iterations end when it is set.
-    """
-    zeros = partial(wp.zeros, device=device_of(cancelled))
-    units, active_set, splitting = UnitConstraints(), ActiveSet(), Splitting()
-    units.cancelled = cancelled
-    units.units, units.base_values = zeros((base_rows, unknowns), dtype=real), zeros(base_rows, dtype=real)
-    units.base_rows, units.coefficients = zeros((rows, 3), dtype=int), zeros((rows, 3), dtype=real)
-    for name in ("values_at_origin", "lower", "upper", "slack"):
-        setattr(units, name, zeros(rows, dtype=real))
-    active_set.side, active_set.active = zeros(rows, dtype=int), zeros(unknowns, dtype=int)
-    for name in ("active_rows", "active_columns", "products", "root", "inverse"):
-        setattr(active_set, name, zeros((unknowns, unknowns), dtype=real))
-    active_set.values = zeros(rows, dtype=real)
-    for name in ("multipliers", "z", "dual_direction", "scratch_a", "scratch_b", "entering_row", "orthogonal_part"):
-        setattr(active_set, name, zeros(unknowns, dtype=real))
-    splitting.initial_values, splitting.all_multipliers = zeros(rows, dtype=real), zeros(rows, dtype=real)
+    """Allocate ``UnitConstraints``, ``ActiveSet`` and ``Splitting``, see ``active_set_arrays``."""
+    zeros, splitting = partial(wp.zeros, dtype=real, device=device_of(cancelled)), Splitting()
+    splitting.initial_values, splitting.all_multipliers = zeros(rows), zeros(rows)
     for name in ("rows", "projected", "multipliers", "sums", "right", "between", "step"):
-        setattr(splitting, name, zeros(unknowns, dtype=real))
-    return units, active_set, splitting
+        setattr(splitting, name, zeros(unknowns))
+    return *active_set_arrays(rows, base_rows, unknowns, cancelled), splitting
 
 
 def _launch(kernel: Any, inputs: list[Any], outputs: list[wp.array]) -> Any:

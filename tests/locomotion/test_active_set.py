@@ -163,8 +163,8 @@ def test_whitened_coordinates() -> None:
         assert np.allclose(np.linalg.norm(rows.unit_rows, axis=1), 1.0)
 
 
-def test_two_programs_do_not_share_rows() -> None:
-    """Two QPs of one size share a workspace; an indefinite Hessian raises an error."""
+def test_scaling_the_cost_scales_the_rows() -> None:
+    """Twice the Hessian shortens the rows by sqrt(2); an indefinite Hessian raises an error."""
     (P, q, A, *_), (Q, r, _, *_) = random_program(7), random_program(7)
     first, second = WhitenedQp.of(P, q, A), WhitenedQp.of(2.0 * Q, r + 1.0, A)
     units = second.unit_rows.copy()

@@ -9,10 +9,9 @@ import pytest
 import warp as wp
 
 from egs_warp.contact.coulomb import coulomb_forces
-from egs_warp.kernels.locomotion import block_active_set, block_mode_region, mode_region, mode_search
-from egs_warp.kernels.locomotion.active_set import INFEASIBLE, OPTIMUM_FOUND
-from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints
-from egs_warp.kernels.locomotion.block_splitting import Splitting
+from egs_warp.kernels.locomotion import mode_region, mode_search
+from egs_warp.kernels.locomotion.active_set import INFEASIBLE, OPTIMUM_FOUND, ActiveSet, UnitConstraints
+from egs_warp.kernels.locomotion.splitting import Splitting
 from egs_warp.locomotion import active_set, solvers, strategies
 from egs_warp.locomotion.active_set import WhitenedQp, solve_from_guess
 from egs_warp.locomotion.contact_modes import (
@@ -235,18 +234,8 @@ def test_block_algebra(count: int, device: str) -> None:
 
 def test_tolerances_equal_those_of_the_host() -> None:
     """The kernels repeat these constants, because they do not import host modules."""
-    device_values = (
-        block_mode_region.ROW_TOLERANCE,
-        block_mode_region.BOUND_PADDING,
-        mode_search.INFEASIBLE_COST,
-        block_active_set.PIVOTS,
-    )
-    host_values = (
-        active_set._BOUND_TOLERANCE,
-        solvers._BOUND_PADDING * 3e-5,
-        active_set._INFEASIBLE_COST,
-        active_set._MAX_PIVOTS,
-    )
+    device_values = mode_region.ROW_TOLERANCE, mode_region.BOUND_PADDING, mode_search.INFEASIBLE_COST
+    host_values = active_set._BOUND_TOLERANCE, solvers._BOUND_PADDING * 3e-5, active_set._INFEASIBLE_COST
     assert [float(each) for each in device_values] == pytest.approx(host_values, rel=1e-12)
 
 

@@ -5,10 +5,10 @@ import warp as wp
 from egs_warp.kernels.block import sync_block
 from egs_warp.kernels.deformation.decomposition import align_signs, column, match_columns, rotation_part
 from egs_warp.kernels.locomotion import block_algebra as algebra
-from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints, find_optimum
+from egs_warp.kernels.locomotion.active_set import ActiveSet, UnitConstraints, find_optimum
 from egs_warp.kernels.locomotion.block_elimination import eliminate, inverse_cholesky
-from egs_warp.kernels.locomotion.block_splitting import Splitting, iterate
 from egs_warp.kernels.locomotion.mode_search import BLOCK
+from egs_warp.kernels.locomotion.splitting import Splitting, iterate
 from egs_warp.precision import real
 
 

@@ -95,7 +95,7 @@ def lane_of_block() -> int:
                 if (r < rows && c + 1 < columns) C[r * cs + c + 1] += sum[i][k][1];
             }
     }
-#else
+#elif defined(__CUDA_ARCH__)
     const int across = (columns + 3) / 4, down = (rows + 3) / 4;
     for (int tile = lane; tile < across * down; tile += lanes) {
         const int first = tile / across * 4, begin = tile % across;
@@ -116,6 +116,43 @@ def lane_of_block() -> int:
         for (int t = 0; t < 4 && first + t < rows; ++t)
             for (int s = 0; s < 4 && begin + s * across < columns; ++s)
                 C[(first + t) * cs + begin + s * across] += sum[t][s];
+    }
+#else
+    {
+    #pragma clang fp contract(fast)
+    typedef double v4 __attribute__((ext_vector_type(4), aligned(8)));
+    for (int i = 0; i < rows; i += 4) {
+        const double* a[4];
+        double* to_row[4];
+        for (int t = 0; t < 4; ++t) {
+            a[t] = A + (i + t < rows ? i + t : rows - 1) * as;
+            to_row[t] = C + (i + t) * cs;
+        }
+        const int some = rows - i < 4 ? rows - i : 4;
+        int c = 0;
+        for (; c + 8 <= columns; c += 8) {
+            v4 sum[4][2];
+            for (int t = 0; t < 4; ++t) sum[t][0] = sum[t][1] = 0.0;
+            for (int k = 0; k < inner; ++k) {
+                const v4 b0 = *(const v4*)(B + k * bs + c), b1 = *(const v4*)(B + k * bs + c + 4);
+                for (int t = 0; t < 4; ++t) {
+                    const double by = a[t][k * ak];
+                    sum[t][0] += by * b0;
+                    sum[t][1] += by * b1;
+                }
+            }
+            for (int t = 0; t < some; ++t) {
+                *(v4*)(to_row[t] + c) += sum[t][0];
+                *(v4*)(to_row[t] + c + 4) += sum[t][1];
+            }
+        }
+        for (; c < columns; ++c)
+            for (int t = 0; t < some; ++t) {
+                double sum = 0.0;
+                for (int k = 0; k < inner; ++k) sum += a[t][k * ak] * B[k * bs + c];
+                to_row[t][c] += sum;
+            }
+    }
     }
 #endif
     WAIT;
@@ -202,6 +239,7 @@ def argmax_of_block(value: real, place: int) -> wp.vec2d:
 
 
 _ROWS_BY_VECTOR = """
+#if defined(__CUDA_ARCH__)
     for (int i = 4 * warp; i < rows; i += 4 * warps) {
         const double* row[4];
         double value[4];
@@ -215,13 +253,26 @@ _ROWS_BY_VECTOR = """
             #pragma unroll
             for (int t = 0; t < 4; ++t) value[t] += row[t][k] * by;
         }
-#if defined(__CUDA_ARCH__)
         for (int offset = 16; offset > 0; offset >>= 1)
             for (int t = 0; t < 4; ++t) value[t] += __shfl_xor_sync(0xffffffffu, value[t], offset);
-#endif
         for (int t = 0; t < 4 && i + t < rows; ++t)
             if (own == 0) out.data[i + t] = value[t];
     }
+#else
+    {
+    #pragma clang fp contract(fast)
+    typedef double v4 __attribute__((ext_vector_type(4), aligned(8)));
+    for (int i = 0; i < rows; ++i) {
+        const double* const row = first + (long long)i * stride;
+        v4 sum = 0.0;
+        int k = 0;
+        for (; k + 4 <= columns; k += 4) sum += *(const v4*)(row + k) * *(const v4*)(vector.data + k);
+        double value = (sum[0] + sum[1]) + (sum[2] + sum[3]);
+        for (; k < columns; ++k) value += row[k] * vector.data[k];
+        out.data[i] = value;
+    }
+    }
+#endif
     WAIT;
 """
 
@@ -279,7 +330,6 @@ def multiply_at(
         WAIT;
         return;
     }
-#endif
     for (int c = lane; c < columns; c += lanes) {
         double some[4] = {0.0, 0.0, 0.0, 0.0};
         const double* at = matrix.data + c;
@@ -289,6 +339,26 @@ def multiply_at(
         for (; k < rows; ++k, at += stride) some[0] += *at * vector.data[k];
         out.data[c] = (some[0] + some[1]) + (some[2] + some[3]);
     }
+#else
+    {
+    #pragma clang fp contract(fast)
+    typedef double v4 __attribute__((ext_vector_type(4), aligned(8)));
+    int c = 0;
+    for (; c + 16 <= columns; c += 16) {
+        v4 sum[4];
+        for (int t = 0; t < 4; ++t) sum[t] = 0.0;
+        for (int k = 0; k < rows; ++k)
+            for (int t = 0; t < 4; ++t)
+                sum[t] += vector.data[k] * *(const v4*)(matrix.data + k * stride + c + 4 * t);
+        for (int t = 0; t < 4; ++t) *(v4*)(out.data + c + 4 * t) = sum[t];
+    }
+    for (; c < columns; ++c) {
+        double sum = 0.0;
+        for (int k = 0; k < rows; ++k) sum += matrix.data[k * stride + c] * vector.data[k];
+        out.data[c] = sum;
+    }
+    }
+#endif
     WAIT;
 """)
 )

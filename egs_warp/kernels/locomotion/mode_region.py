@@ -1,14 +1,15 @@
-"""QP of one assignment of contact modes with the activations as its only unknowns, as native CPU code with vectors of
-four.
-
-Host code: ``egs_warp/locomotion/contact_modes.py``.
+"""QP of one assignment of contact modes with the activations as its only unknowns, and the rows that bound its region,
+for all threads of a block on a GPU or one thread on a CPU. See docs/concepts/locomotion.md#modes.
 """
 
 import math
 
 import warp as wp
 
-from egs_warp.kernels.vectors import ROW_ELIMINATION, on_cpu
+from egs_warp.kernels.block import sum_of_block, sync_block
+from egs_warp.kernels.locomotion.active_set import UnitConstraints
+from egs_warp.kernels.locomotion.block_algebra import gemm_add, lane_of_block, multiply, normalize_rows
+from egs_warp.kernels.locomotion.block_elimination import eliminate
 from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
@@ -41,259 +42,408 @@ MAX_START_VIOLATION = 0.02
 START_ROUNDING = 1e-6
 """Amount by which rows are relaxed, for a start that is the only point of its region, for example because contacts are
 redundant."""
-_NO_PIVOT = 1e-14
 
+CURRENT, NEXT, NEXT_SINGLE, WARM_START = 0, 1, 2, 3
+"""Slots of ``Workspace.kinds`` and ``Workspace.slips``."""
+ROW_TOLERANCE = wp.constant(real(1e-8))
+"""Amount by which a row may violate its bounds, multiplied by the length of the row if that exceeds 1."""
 
-def padded(count: int) -> int:
-    """Round ``count`` up to a multiple of eight columns."""
-    return -(-count // 8) * 8
-
-
-def scratch_size(activations: int, contacts: int) -> int:
-    """Return the maximum size of the scratch memory of a region, in float64 numbers."""
-    wide, touches = padded(activations + 1), 3 * contacts
-    row_count = activations + touches
-    return (touches + 5) * wide + max(
-        (touches + 1) * (padded(touches) + wide), row_count * wide + (row_count + activations) * (touches + 1)
-    )
-
-
-@wp.func_native(
-    on_cpu(
-        ROW_ELIMINATION
-        + f"""
-    constexpr int FREE = {FREE}, STICK = {STICK}, SLIDE = {SLIDE};
-    constexpr double SINGULAR = {DELASSUS_REGULARIZATION}, NO_PIVOT = {_NO_PIVOT};
-"""
-        + """
-    const int m = activations, n = contacts, N = m + 3 * n, wide = (m + 8) & ~7, plain = (m + 7) & ~7;
-    const double *const P = (const double*)cost, *const q = (const double*)slope_of_cost;
-    const double *const W = (const double*)rows, *const w = (const double*)offset;
-    const int* const kinds = (const int*)kind;
-    const double *const slips = (const double*)slip, *const faces = (const double*)sides;
-    double* free_scratch = scratch.data;
-    auto take = [&](int count) { double* const block = free_scratch; free_scratch += count; return block; };
-    int *const held = numbers.data, *const touching = held + 3 * n, *const pivots = touching + 3 * n;
-    int *const place = pivots + 3 * n, holds = 0, touches = 0;
-    for (int i = 0; i < n; ++i) {
-        place[i] = touches;
-        for (int t = 0; t < 3 && kinds[i] != FREE; ++t) touching[touches++] = 3 * i + t;
-        for (int t = 0; t < 3 && (kinds[i] == STICK || (kinds[i] == SLIDE && t == 0)); ++t) held[holds++] = 3 * i + t;
-    }
-    // Forces: (held rows) (f) = -(held velocities without forces); the last column is the constant.
-    double* const S = take((touches + 1) * wide);
-    {
-        const int right = (holds + 7) & ~7, stride = right + wide;
-        double* const M = take((holds + 1) * stride);
-        double mean = 0.0;
-        for (int a = 0; a < holds; ++a) {
-            double *const row = M + a * stride;
-            const double* const from = W + held[a] * N;
-            for (int b = 0; b < holds; ++b) {
-                const int f = held[b], i = f / 3;
-                row[b] = from[m + f];
-                if (kinds[i] == SLIDE)
-                    row[b] -= friction * (from[m + f + 1] * slips[2 * i] + from[m + f + 2] * slips[2 * i + 1]);
-            }
-            for (int b = holds; b < right; ++b) row[b] = 0.0;
-            for (int c = 0; c < m; ++c) row[right + c] = -from[c];
-            row[right + m] = -w[held[a]];
-            for (int c = m + 1; c < wide; ++c) row[right + c] = 0.0;
-            mean += __builtin_fabs(row[a]) / holds;
-        }
-        for (int a = 0; a < holds; ++a) M[a * stride + a] += SINGULAR * mean;
-        if (eliminate_rows(M, stride, holds, stride, NO_PIVOT, pivots) < holds) return 0;
-        for (int i = (holds - 1) & ~3; holds > 0 && i >= 0; i -= 4) {
-            const int some = holds - i < 4 ? holds - i : 4;
-            double* const x = M + i * stride + right;
-            if (some == 4)
-                take_off_all(x, stride, 4, M + i * stride + i + 4, stride, x + 4 * stride, stride, wide, holds - i - 4);
-            for (int p = some - 1; p >= 0; p -= 1) {
-                const double* const row = M + (i + p) * stride + i;
-                for (int o = p + 1; o < some; ++o)
-                    for (int c = 0; c < wide; c += 4)
-                        *(v4*)(x + p * stride + c) -= row[o] * *(const v4*)(x + o * stride + c);
-                const double by = 1.0 / row[p];
-                for (int c = 0; c < wide; c += 4) *(v4*)(x + p * stride + c) *= by;
-            }
-        }
-        for (int a = 0; a < holds; ++a) {
-            const int i = held[a] / 3, t = held[a] % 3;
-            double* const to = S + (place[i] + t) * wide;
-            const double* const from = M + a * stride + right;
-            for (int c = 0; c < wide; ++c) to[c] = from[c];
-            for (int s = 0; s < 2 && kinds[i] == SLIDE; ++s)
-                for (int c = 0; c < wide; ++c) to[(s + 1) * wide + c] = -friction * slips[2 * i + s] * from[c];
-        }
-        free_scratch = M;
-    }
-    double *const f = (double*)forces, *const f0 = (double*)forces_offset;
-    for (int k = 0; k < 3 * n; ++k) {
-        f0[k] = 0.0;
-        for (int c = 0; c < plain; ++c) f[k * plain + c] = 0.0;
-    }
-    for (int g = 0; g < touches; ++g) {
-        f0[touching[g]] = S[g * wide + m];
-        for (int c = 0; c < m; ++c) f[touching[g] * plain + c] = S[g * wide + c];
-    }
-    // x = (0, offset) + (1, S) a: the rows of P x that are needed, then x^T P x.
-    double* const X = take((m + touches) * wide);
-    {
-        double *const L = take((m + touches) * (touches + 1)), *const down = take(m * (touches + 1));
-        for (int i = 0; i < m + touches; ++i) {
-            const double* const from = P + (i < m ? i : m + touching[i - m]) * N;
-            for (int c = 0; c < m; ++c) X[i * wide + c] = from[c];
-            for (int c = m; c < wide; ++c) X[i * wide + c] = 0.0;
-            for (int g = 0; g < touches; ++g) L[i * touches + g] = -from[m + touching[g]];
-        }
-        take_off_all(X, wide, m + touches, L, touches, S, wide, wide, touches);
-        for (int i = 0; i < m; ++i)
-            for (int g = 0; g < touches; ++g) down[i * touches + g] = -S[g * wide + i];
-        take_off_all(X, wide, m, down, touches, X + m * wide, wide, wide, touches);
-        free_scratch = L;
-    }
-    double *const Q = (double*)region_cost, *const s = (double*)region_slope;
-    for (int i = 0; i < m; ++i) {
-        s[i] = q[i] + X[i * wide + m];
-        for (int k = 0; k <= i; ++k) Q[i * plain + k] = Q[k * plain + i] = 0.5 * (X[i * wide + k] + X[k * wide + i]);
-        for (int k = m; k < plain; ++k) Q[i * plain + k] = 0.0;
-    }
-    for (int g = 0; g < touches; ++g)
-        for (int i = 0; i < m; ++i) s[i] += S[g * wide + i] * q[m + touching[g]];
-    // Bounds of the region: normal forces, cone faces, slip sectors, normal velocities of free contacts.
-    double *A = (double*)bounds, *b = (double*)bounds_offset;
-    auto write = [&](double by, const double* from) {
-        for (int c = 0; c < m; ++c) A[c] += by * from[c];
-        *b += by * from[m];
-    };
-    auto next = [&]() { A += plain; ++b; };
-    for (int k = 0; k < total * plain; ++k) A[k] = 0.0;
-    for (int k = 0; k < total; ++k) b[k] = 0.0;
-    for (int i = 0; i < m; ++i, next()) A[i] = 1.0;
-    for (int mode = STICK; mode <= SLIDE; ++mode)
-        for (int i = 0; i < n; ++i)
-            if (kinds[i] == mode) { write(1.0, S + place[i] * wide); next(); }
-    for (int face = 0; face < face_count; ++face)
-        for (int i = 0; i < n; ++i)
-            if (kinds[i] == STICK) {
-                const double* const from = S + place[i] * wide;
-                const double* const side = faces + 3 * face;
-                write(friction * side[0], from);
-                write(side[1], from + wide);
-                write(side[2], from + 2 * wide);
-                next();
-            }
-    double *const V = X, *const L = V + 4 * wide;
-    auto speeds = [&](int first, int count) {
-        for (int t = 0; t < count; ++t) {
-            const double* const from = W + (first + t) * N;
-            for (int c = 0; c < m; ++c) V[t * wide + c] = from[c];
-            V[t * wide + m] = w[first + t];
-            for (int c = m + 1; c < wide; ++c) V[t * wide + c] = 0.0;
-            for (int g = 0; g < touches; ++g) L[t * touches + g] = -from[m + touching[g]];
-        }
-        take_off_all(V, wide, count, L, touches, S, wide, wide, touches);
-    };
-    for (int side = 1; side >= -1; side -= 2)
-        for (int i = 0; i < n; ++i)
-            if (kinds[i] == SLIDE) {
-                const double d0 = slips[2 * i], d1 = slips[2 * i + 1];
-                speeds(3 * i + 1, 2);
-                write(sector_sine * d0 - side * sector_cosine * d1, V);
-                write(sector_sine * d1 + side * sector_cosine * d0, V + wide);
-                next();
-            }
-    for (int i = 0; i < n; ++i)
-        if (kinds[i] == FREE) { speeds(3 * i, 1); write(1.0, V); next(); }
-    return 1;
-""",
-        elsewhere="return 0;",
-    )
+_CURRENT = wp.constant(CURRENT)
+_FREE, _STICK, _SLIDE = wp.constant(FREE), wp.constant(STICK), wp.constant(SLIDE)
+_TO_FREE, _TO_SLIDE, _TO_OTHER_DIRECTION, _TO_TOUCHING = (
+    wp.constant(TO_FREE),
+    wp.constant(TO_SLIDE),
+    wp.constant(TO_OTHER_DIRECTION),
+    wp.constant(TO_TOUCHING),
 )
-def mode_region_native(
-    activations: wp.int32,
-    contacts: wp.int32,
-    friction: real,
-    cost: wp.uint64,
-    slope_of_cost: wp.uint64,
-    rows: wp.uint64,
-    offset: wp.uint64,
-    kind: wp.uint64,
-    slip: wp.uint64,
-    sides: wp.uint64,
-    face_count: wp.int32,
-    sector_sine: real,
-    sector_cosine: real,
-    numbers: wp.array[wp.int32],
-    scratch: wp.array[real],
-    total: wp.int32,
-    forces: wp.uint64,
-    forces_offset: wp.uint64,
-    region_cost: wp.uint64,
-    region_slope: wp.uint64,
-    bounds: wp.uint64,
-    bounds_offset: wp.uint64,
-) -> wp.int32:
-    """Compute a mode region as described at ``mode_region_kernel``; return 1, or 0 if the forces cannot be solved
-    for."""
-    ...
+_FACES = wp.constant(CONE_FACES)
+_Faces = wp.types.vector(CONE_FACES, real)
+_ANGLES = [2.0 * math.pi * face / CONE_FACES for face in range(CONE_FACES)]
+COSINES, SINES = (wp.constant(_Faces(*map(each, _ANGLES))) for each in (math.cos, math.sin))
+_FACE_COSINE = wp.constant(real(math.cos(math.pi / CONE_FACES)))
+_SECTOR_SINE, _SECTOR_COSINE = wp.constant(real(math.sin(SLIDE_SECTOR))), wp.constant(real(math.cos(SLIDE_SECTOR)))
+_REGULARIZATION, _BROKEN, _ROUNDING = (
+    wp.constant(real(each)) for each in (DELASSUS_REGULARIZATION, MAX_START_VIOLATION, START_ROUNDING)
+)
+_MIN_PIVOT = wp.constant(real(1e-10))
+"""Smallest admissible pivot, relative to the mean of the diagonal of the Delassus operator."""
+BOUND_PADDING = wp.constant(real(9e-6))
+"""Amount by which bounds are relaxed, as in ``SplittingProgram``."""
 
 
-@wp.kernel
-def mode_region_kernel(
-    # In:
-    activations: wp.int32,
-    contacts: wp.int32,
-    friction: real,
-    cost: wp.uint64,
-    slope_of_cost: wp.uint64,
-    rows: wp.uint64,
-    offset: wp.uint64,
-    kind: wp.uint64,
-    slip: wp.uint64,
-    sides: wp.uint64,
-    face_count: wp.int32,
-    sector_sine: real,
-    sector_cosine: real,
-    numbers: wp.array[wp.int32],
-    scratch: wp.array[real],
-    total: wp.int32,
-    # Out:
-    forces: wp.uint64,
-    forces_offset: wp.uint64,
-    region_cost: wp.uint64,
-    region_slope: wp.uint64,
-    bounds: wp.uint64,
-    bounds_offset: wp.uint64,
-    is_solvable: wp.array[wp.int32],
-) -> None:
-    """Reduce a ``CoulombProgram`` to the region of one assignment of contact modes, with one thread.
+@wp.struct
+class Workspace:
+    """Workspace for at most m activations and n contacts.
 
-    Array arguments are addresses. Matrices over activations have rows of ``padded(m)`` numbers. The rows of ``bounds``
-    are the m activations, then quantities that are nonnegative in the region, in this order: normal forces of sticking,
-    then of sliding contacts; distances to each cone face of sticking contacts; slip of sliding contacts against one,
-    then the other edge of their sector; normal velocities of free contacts.
+    T is the number of force components of closed contacts, h the number of those whose contact velocity is zero, and v
+    the number of contact velocities that bound the region. The region has m rows of the activations and k of the
+    contact modes.
+    """
+
+    held_index: wp.array[int]
+    """(n,) first row of each closed contact among the ``held_forces``."""
+    closed_forces: wp.array[int]
+    """(T,) indices of the force components of closed contacts."""
+    held_forces: wp.array[int]
+    """(h,) indices of the force components whose contact velocities are zero."""
+    speeds: wp.array[int]
+    """(v,) indices of the contact velocities."""
+    base_rows: wp.array2d[int]
+    """(k, 3) indices, among the T forces and v velocities, of the terms of a row."""
+    coefficients: wp.array2d[real]
+    """(k, 3) their coefficients."""
+    contact: wp.array[int]
+    transition: wp.array[int]
+    """(k,) contact of a row, and transition of that contact beyond the row."""
+    first: wp.array[int]
+    """(n,) first row of each contact."""
+    next: wp.array[int]
+    """(k,) next row of the same contact, -1 for none."""
+    equations: wp.array2d[real]
+    """(h, h + m + 1) linear system for the forces, with right-hand sides."""
+    force_map: wp.array2d[real]
+    """(T + v, m + 1) forces and velocities as affine functions of the activations, the constant in the last column."""
+    cost_rows: wp.array2d[real]
+    """(m + T, T) columns of the cost matrix; scratch of ``write_speeds``."""
+    cost_products: wp.array2d[real]
+    """(m + T, m + 1) cost matrix times the affine map; scratch of ``write_speeds``."""
+    cost: wp.array2d[real]
+    """(m, m) Hessian of the cost of the activations."""
+    root: wp.array2d[real]
+    """(m, m) upper triangular U with cost^-1 = U U^T."""
+    slope: wp.array[real]
+    """(m,) gradient of the cost of the activations."""
+    minimum: wp.array[real]
+    """(m,) activations of the unconstrained minimum."""
+    optimum: wp.array[real]
+    """(m,) optimum."""
+    at_minimum: wp.array[real]
+    at_start: wp.array[real]
+    at_optimum: wp.array[real]
+    """(T + v,) forces and velocities at the minimum, the start and the optimum, without the constant."""
+    lengths: wp.array[real]
+    """(m + k,) lengths of the rows before scaling."""
+    bounds: wp.array2d[real]
+    """(2, m + k) lower and upper bounds before scaling."""
+    values: wp.array[real]
+    """(m + 3n,) scratch: products of the QP's matrices with ``trial``."""
+    multipliers: wp.array[real]
+    """(k,) multipliers of the rows of the modes."""
+    kinds: wp.array2d[int]
+    """(4, n) modes of the region being solved, of the region beyond all its active bounds, of the region beyond its
+    strongest active bound only, and the last of these for the best region so far."""
+    slips: wp.array3d[real]
+    """(4, n, 2) slip directions."""
+    start: wp.array[real]
+    """(m,) activations from which the region is entered."""
+    trial: wp.array[real]
+    """(m + 3n,) activations and forces of a trial."""
+
+
+@wp.struct
+class Program:
+    """Packed QP and the offset of each of its parts."""
+
+    packed: wp.array[real]
+    m: int
+    n: int
+    size: int
+    """m + 3n."""
+    friction: real
+    constant: real
+    cost: int
+    slope: int
+    rows: int
+    offset: int
+    lower: int
+    upper: int
+
+
+@wp.func
+def count_of(program: Program, workspace: Workspace, kind: int):
+    """Return the number of contacts in mode ``kind``."""
+    count = int(0)
+    for i in range(program.n):
+        if workspace.kinds[_CURRENT, i] == kind:
+            count += 1
+    return count
+
+
+@wp.func
+def write_row(
+    workspace: Workspace, before: int, row: int, contact: int, transition: int, terms: wp.vec3i, coefficients: wp.vec3d
+):
+    """Write one row that bounds the region and append it to the rows of ``contact``, after row ``before`` (-1: none);
+    return its index."""
+    workspace.contact[row] = contact
+    workspace.transition[row] = transition
+    workspace.next[row] = -1
+    if before >= 0:
+        workspace.next[before] = row
+    else:
+        workspace.first[contact] = row
+    for t in range(3):
+        workspace.base_rows[row, t] = terms[t]
+        workspace.coefficients[row, t] = coefficients[t]
+    return row
+
+
+@wp.func
+def list_contact_rows(program: Program, workspace: Workspace, sticks: int, slides: int):
+    """List the forces of closed contacts, the velocities that bound the region, and the terms of all its rows."""
+    closed_count = 3 * (sticks + slides)
+    mu = program.friction
+    zero = real(0.0)
+    for i in range(lane_of_block(), program.n, wp.block_dim()):
+        before = wp.vec3i(0, 0, 0)
+        kind = workspace.kinds[_CURRENT, i]
+        for j in range(i):
+            other = workspace.kinds[_CURRENT, j]
+            before[other] = before[other] + 1
+        order = before[kind]
+        closed_row = 3 * (before[1] + before[2])
+        held_row = 3 * before[1] + before[2]
+        speed = 2 * before[2] + before[0]
+        workspace.held_index[i] = held_row
+        if kind == _FREE:
+            workspace.speeds[speed] = 3 * i
+            row = 9 * sticks + 3 * slides + order
+            p = closed_count + speed
+            write_row(workspace, -1, row, i, _TO_TOUCHING, wp.vec3i(p, p, p), wp.vec3d(real(1.0), zero, zero))
+        else:
+            for t in range(3):
+                workspace.closed_forces[closed_row + t] = 3 * i + t
+            workspace.held_forces[held_row] = 3 * i
+            terms = wp.vec3i(closed_row, closed_row + 1, closed_row + 2)
+            row = order
+            if kind == _SLIDE:
+                row += sticks
+            last = write_row(workspace, -1, row, i, _TO_FREE, terms, wp.vec3d(real(1.0), zero, zero))
+            if kind == _STICK:
+                workspace.held_forces[held_row + 1] = 3 * i + 1
+                workspace.held_forces[held_row + 2] = 3 * i + 2
+                for face in range(_FACES):
+                    row = sticks + slides + face * sticks + order
+                    coefficient = wp.vec3d(mu * _FACE_COSINE, -COSINES[face], -SINES[face])
+                    last = write_row(workspace, last, row, i, _TO_SLIDE, terms, coefficient)
+            else:
+                workspace.speeds[speed] = 3 * i + 1
+                workspace.speeds[speed + 1] = 3 * i + 2
+                p = closed_count + speed
+                terms = wp.vec3i(p, p + 1, p + 1)
+                d0 = workspace.slips[_CURRENT, i, 0]
+                d1 = workspace.slips[_CURRENT, i, 1]
+                for half in range(2):
+                    side = real(1 - 2 * half)
+                    row = 9 * sticks + slides + half * slides + order
+                    coefficient = wp.vec3d(
+                        _SECTOR_SINE * d0 - side * _SECTOR_COSINE * d1,
+                        _SECTOR_SINE * d1 + side * _SECTOR_COSINE * d0,
+                        zero,
+                    )
+                    last = write_row(workspace, last, row, i, _TO_OTHER_DIRECTION, terms, coefficient)
+    sync_block()
+
+
+@wp.func
+def solve_force_map(program: Program, workspace: Workspace, closed_count: int, held_count: int):
+    """Compute the forces that keep the held contact velocities at zero, as affine functions of the activations.
+
+    Returns: 1, or 0 if a pivot is too small; rows are not exchanged.
+    """
+    lane = lane_of_block()
+    m = program.m
+    width = held_count + m + 1
+    for e in range(lane, held_count * width, wp.block_dim()):
+        a = e / width
+        c = e % width
+        row = program.rows + workspace.held_forces[a] * program.size
+        value = real(0.0)
+        if c < held_count:
+            f = workspace.held_forces[c]
+            i = f / 3
+            value = program.packed[row + m + f]
+            if workspace.kinds[_CURRENT, i] == _SLIDE:
+                value -= program.friction * (
+                    program.packed[row + m + f + 1] * workspace.slips[_CURRENT, i, 0]
+                    + program.packed[row + m + f + 2] * workspace.slips[_CURRENT, i, 1]
+                )
+        elif c < held_count + m:
+            value = -program.packed[row + c - held_count]
+        else:
+            value = -program.packed[program.offset + workspace.held_forces[a]]
+        workspace.equations[a, c] = value
+    sync_block()
+    mean = real(0.0)
+    for a in range(lane, held_count, wp.block_dim()):
+        mean += wp.abs(workspace.equations[a, a]) / real(held_count)
+    mean = sum_of_block(mean)
+    sync_block()
+    for a in range(lane, held_count, wp.block_dim()):
+        workspace.equations[a, a] = workspace.equations[a, a] + _REGULARIZATION * mean
+    sync_block()
+    if eliminate(workspace.equations, held_count, width, _MIN_PIVOT) == 0:
+        return 0
+    for e in range(lane, closed_count * (m + 1), wp.block_dim()):
+        g = e / (m + 1)
+        c = e % (m + 1)
+        f = workspace.closed_forces[g]
+        i = f / 3
+        t = f % 3
+        a = workspace.held_index[i]
+        coefficient = real(1.0)
+        if workspace.kinds[_CURRENT, i] == _STICK:
+            a += t
+        elif t > 0:
+            coefficient = -program.friction * workspace.slips[_CURRENT, i, t - 1]
+        workspace.force_map[g, c] = coefficient * workspace.equations[a, held_count + c]
+    sync_block()
+    return 1
+
+
+@wp.func
+def write_cost(program: Program, workspace: Workspace, closed_count: int):
+    """Compute the quadratic cost of the activations alone by eliminating the forces."""
+    lane = lane_of_block()
+    m = program.m
+    for e in range(lane, (m + closed_count) * closed_count, wp.block_dim()):
+        i = e / closed_count
+        g = e % closed_count
+        row = i
+        if i >= m:
+            row = m + workspace.closed_forces[i - m]
+        workspace.cost_rows[i, g] = program.packed[program.cost + row * program.size + m + workspace.closed_forces[g]]
+    for e in range(lane, (m + closed_count) * (m + 1), wp.block_dim()):
+        i = e / (m + 1)
+        c = e % (m + 1)
+        row = i
+        if i >= m:
+            row = m + workspace.closed_forces[i - m]
+        value = real(0.0)
+        if c < m:
+            value = program.packed[program.cost + row * program.size + c]
+        workspace.cost_products[i, c] = value
+    sync_block()
+    gemm_add(
+        workspace.cost_products, workspace.cost_rows, workspace.force_map, m + closed_count, m + 1, closed_count, 0
+    )
+    # Add the transposed force map times the rows of the forces to the rows of the activations.
+    for e in range(lane, closed_count * (m + 1), wp.block_dim()):
+        g = e / (m + 1)
+        c = e % (m + 1)
+        workspace.equations[g, c] = workspace.cost_products[m + g, c]
+    sync_block()
+    gemm_add(workspace.cost_products, workspace.force_map, workspace.equations, m, m + 1, closed_count, 1)
+    for e in range(lane, m * m, wp.block_dim()):
+        i = e / m
+        k = e % m
+        workspace.cost[i, k] = real(0.5) * (workspace.cost_products[i, k] + workspace.cost_products[k, i])
+    for i in range(lane, m, wp.block_dim()):
+        value = program.packed[program.slope + i] + workspace.cost_products[i, m]
+        for g in range(closed_count):
+            value += workspace.force_map[g, i] * program.packed[program.slope + m + workspace.closed_forces[g]]
+        workspace.slope[i] = value
+    sync_block()
+
+
+@wp.func
+def write_speeds(program: Program, workspace: Workspace, closed_count: int, speeds: int):
+    """Append the contact velocities that bound the region to ``force_map``."""
+    lane = lane_of_block()
+    m = program.m
+    for e in range(lane, speeds * closed_count, wp.block_dim()):
+        s = e / closed_count
+        g = e % closed_count
+        workspace.cost_rows[s, g] = program.packed[
+            program.rows + workspace.speeds[s] * program.size + m + workspace.closed_forces[g]
+        ]
+    for e in range(lane, speeds * (m + 1), wp.block_dim()):
+        s = e / (m + 1)
+        c = e % (m + 1)
+        value = program.packed[program.offset + workspace.speeds[s]]
+        if c < m:
+            value = program.packed[program.rows + workspace.speeds[s] * program.size + c]
+        workspace.cost_products[s, c] = value
+    sync_block()
+    gemm_add(workspace.cost_products, workspace.cost_rows, workspace.force_map, speeds, m + 1, closed_count, 0)
+    for e in range(lane, speeds * (m + 1), wp.block_dim()):
+        s = e / (m + 1)
+        c = e % (m + 1)
+        workspace.force_map[closed_count + s, c] = workspace.cost_products[s, c]
+    sync_block()
+
+
+@wp.func
+def row_value(workspace: Workspace, row: int, values: wp.array[real]):
+    """Return the value of a row, without its constant, from the ``values`` of forces and velocities."""
+    value = real(0.0)
+    for t in range(3):
+        value += workspace.coefficients[row, t] * values[workspace.base_rows[row, t]]
+    return value
+
+
+@wp.func
+def row_offset(workspace: Workspace, row: int, m: int):
+    """Return the constant of a row, its value at zero activations."""
+    value = real(0.0)
+    for t in range(3):
+        value += workspace.coefficients[row, t] * workspace.force_map[workspace.base_rows[row, t], m]
+    return value
+
+
+@wp.func
+def write_rows(
+    program: Program,
+    workspace: Workspace,
+    rows: UnitConstraints,
+    initial_values: wp.array[real],
+    map_rows: int,
+    mode_rows: int,
+):
+    """Write the rows in whitened coordinates, scaled to length 1, and their bounds.
 
     Args:
-        activations: number m.
-        contacts: number n.
-        friction: friction coefficient.
-        cost, slope_of_cost: P (m + 3n, m + 3n) and q (m + 3n,).
-        rows, offset: (3n, m + 3n) and (3n,), affine map to the contact velocities.
-        kind: (n,) int32 mode of each contact.
-        slip: (n, 2) slip direction of sliding contacts.
-        sides: (face_count, 3) faces of the pyramid of sticking contacts, see ``FrictionDirections.sides``.
-        face_count: number of faces.
-        sector_sine, sector_cosine: sine and cosine of half the sector of a sliding contact's slip.
-        numbers: (10n,) int32 scratch.
-        scratch: (``scratch_size``,) scratch.
-        total: number of rows of ``bounds``.
-        forces, forces_offset: (3n, m) and (3n,), contact response.
-        region_cost, region_slope: (m, m) and (m,), quadratic cost of the activations.
-        bounds, bounds_offset: (total, m) and (total,).
-        is_solvable: (1,) 1, or 0 if the forces cannot be solved for.
+        initial_values: (m + mode_rows,) written: row values at the start relative to the minimum.
+        map_rows: number of rows of ``force_map``.
+        mode_rows: number of rows of the contact modes.
     """
-    is_solvable[0] = mode_region_native(
-        activations, contacts, friction, cost, slope_of_cost, rows, offset, kind, slip, sides, face_count, sector_sine,
-        sector_cosine, numbers, scratch, total, forces, forces_offset, region_cost, region_slope, bounds, bounds_offset,
-    )  # fmt: skip
+    lane = lane_of_block()
+    m = program.m
+    for e in range(lane, map_rows * m, wp.block_dim()):
+        rows.units[e / m, e % m] = real(0.0)
+    for e in range(lane, m * m, wp.block_dim()):
+        rows.units[map_rows + e / m, e % m] = workspace.root[e / m, e % m]
+    for row in range(lane, m + mode_rows, wp.block_dim()):
+        for t in range(3):
+            if row < m:
+                rows.base_rows[row, t] = map_rows + row
+                rows.coefficients[row, t] = wp.where(t == 0, real(1.0), real(0.0))
+            else:
+                rows.base_rows[row, t] = workspace.base_rows[row - m, t]
+                rows.coefficients[row, t] = workspace.coefficients[row - m, t]
+    sync_block()
+    gemm_add(rows.units, workspace.force_map, workspace.root, map_rows, m, m, 0)
+    multiply(workspace.force_map, map_rows, m, workspace.minimum, workspace.at_minimum)
+    multiply(workspace.force_map, map_rows, m, workspace.start, workspace.at_start)
+    normalize_rows(rows.units, m, rows.base_rows, rows.coefficients, m + mode_rows, workspace.lengths)
+    for row in range(lane, m + mode_rows, wp.block_dim()):
+        length = workspace.lengths[row]
+        free = real(0.0)
+        start = real(0.0)
+        if row < m:
+            free = workspace.minimum[row]
+            start = workspace.start[row]
+            workspace.bounds[0, row] = program.packed[program.lower + row] - BOUND_PADDING
+            workspace.bounds[1, row] = program.packed[program.upper + row] + BOUND_PADDING
+        else:
+            free = row_value(workspace, row - m, workspace.at_minimum)
+            start = row_value(workspace, row - m, workspace.at_start)
+            lower = -row_offset(workspace, row - m, m)
+            workspace.bounds[0, row] = wp.min(lower, wp.max(start, lower - _BROKEN)) - _ROUNDING - BOUND_PADDING
+            workspace.bounds[1, row] = real(wp.inf)
+        rows.values_at_origin[row] = free / length
+        initial_values[row] = (start - free) / length
+        rows.lower[row] = workspace.bounds[0, row] / length
+        rows.upper[row] = workspace.bounds[1, row] / length
+        rows.slack[row] = ROW_TOLERANCE * wp.max(real(1.0), length) / length
+    sync_block()

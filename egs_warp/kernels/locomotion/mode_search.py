@@ -6,8 +6,14 @@ The host version is ``contact_modes.search_modes``. See docs/concepts/locomotion
 import warp as wp
 
 from egs_warp.kernels.block import sum_of_block, sync_block
-from egs_warp.kernels.locomotion.active_set import INFEASIBLE, NUMERICAL_FAILURE, OPTIMUM_FOUND
-from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints, find_optimum
+from egs_warp.kernels.locomotion.active_set import (
+    INFEASIBLE,
+    NUMERICAL_FAILURE,
+    OPTIMUM_FOUND,
+    ActiveSet,
+    UnitConstraints,
+    find_optimum,
+)
 from egs_warp.kernels.locomotion.block_algebra import (
     apply_factor,
     argmax_of_block,
@@ -16,12 +22,20 @@ from egs_warp.kernels.locomotion.block_algebra import (
     multiply_at,
 )
 from egs_warp.kernels.locomotion.block_elimination import inverse_cholesky
-from egs_warp.kernels.locomotion.block_mode_region import (
+from egs_warp.kernels.locomotion.mode_region import (
     CURRENT,
+    FREE,
+    MIN_GAIN_FRACTION,
+    MIN_MULTIPLIER,
     NEXT,
     NEXT_SINGLE,
     ROW_TOLERANCE,
+    SLIDE,
+    STICK,
+    TO_FREE,
+    TO_SLIDE,
     WARM_START,
+    ZERO_SPEED,
     Program,
     Workspace,
     count_of,
@@ -32,17 +46,7 @@ from egs_warp.kernels.locomotion.block_mode_region import (
     write_rows,
     write_speeds,
 )
-from egs_warp.kernels.locomotion.block_splitting import Splitting, iterate
-from egs_warp.kernels.locomotion.mode_region import (
-    FREE,
-    MIN_GAIN_FRACTION,
-    MIN_MULTIPLIER,
-    SLIDE,
-    STICK,
-    TO_FREE,
-    TO_SLIDE,
-    ZERO_SPEED,
-)
+from egs_warp.kernels.locomotion.splitting import Splitting, iterate
 from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})

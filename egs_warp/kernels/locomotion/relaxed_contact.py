@@ -6,8 +6,14 @@ The host version is ``contact_modes.solve_relaxed``. See docs/concepts/locomotio
 import warp as wp
 
 from egs_warp.kernels.block import sum_of_block, sync_block
-from egs_warp.kernels.locomotion.active_set import NUMERICAL_FAILURE, OPTIMUM_FOUND
-from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints, find_optimum, is_cancelled
+from egs_warp.kernels.locomotion.active_set import (
+    NUMERICAL_FAILURE,
+    OPTIMUM_FOUND,
+    ActiveSet,
+    UnitConstraints,
+    find_optimum,
+    is_cancelled,
+)
 from egs_warp.kernels.locomotion.block_algebra import (
     apply_factor,
     gemm_add,
@@ -17,10 +23,17 @@ from egs_warp.kernels.locomotion.block_algebra import (
     normalize_rows,
 )
 from egs_warp.kernels.locomotion.block_elimination import inverse_cholesky
-from egs_warp.kernels.locomotion.block_mode_region import BOUND_PADDING, COSINES, ROW_TOLERANCE, SINES, Program
-from egs_warp.kernels.locomotion.block_splitting import Splitting, iterate
-from egs_warp.kernels.locomotion.mode_region import CONE_FACES, DELASSUS_REGULARIZATION
+from egs_warp.kernels.locomotion.mode_region import (
+    BOUND_PADDING,
+    CONE_FACES,
+    COSINES,
+    DELASSUS_REGULARIZATION,
+    ROW_TOLERANCE,
+    SINES,
+    Program,
+)
 from egs_warp.kernels.locomotion.mode_search import BLOCK, HEADER_SIZE, INFEASIBLE_COST, crash_start, unpack_program
+from egs_warp.kernels.locomotion.splitting import Splitting, iterate
 from egs_warp.kernels.locomotion.step_program import assemble_contact
 from egs_warp.precision import Vec3, real
 

@@ -30,12 +30,6 @@ LOCOMOTION = [
         "the solver prints its progress",
     ),
     Survivor(
-        "kernels/locomotion/active_set.py",
-        "for row in range(search.side.shape[0]):",
-        "for row in range(search.side.shape[ 1]):",
-        "reached only if rounding lets the factorisation fail for a subset of rows that can be factored together",
-    ),
-    Survivor(
         "locomotion/audit.py",
         "if len(points) == 0:",
         "if len(points) <= 0:",

@@ -8,7 +8,7 @@ therefore update only its coefficients: z = ``share`` z_0 + R^T ``sums``.
 import warp as wp
 
 from egs_warp.kernels.block import sync_block
-from egs_warp.kernels.locomotion.block_active_set import ActiveSet, UnitConstraints, evaluate, gather_active
+from egs_warp.kernels.locomotion.active_set import ActiveSet, UnitConstraints, evaluate, gather_active
 from egs_warp.kernels.locomotion.block_algebra import (
     apply_factor,
     compact_indices,
