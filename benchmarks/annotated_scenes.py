@@ -33,6 +33,8 @@ class DrawnView:
     """(H, W) bool, True on the object."""
     ground: np.ndarray
     """(k, 2) pixels that show the supporting surface."""
+    hidden: np.ndarray | None = None
+    """(H, W) bool, pixels where something in front hides the object; they do not count. None if there are none."""
 
 
 @dataclass(frozen=True)

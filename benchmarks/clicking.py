@@ -30,7 +30,8 @@ click is made on a shallower region."""
 def overlap(cloud: GaussianCloud, object_cloud: GaussianCloud, view: DrawnView) -> tuple[float, np.ndarray, np.ndarray]:
     """Compare ``object_cloud``, rendered alone, with the outline of a view.
 
-    Pixels at which neither ``cloud``, the whole scene, nor the object is opaque are ignored.
+    Pixels at which neither ``cloud``, the whole scene, nor the object is opaque, and those at which something hides the
+    object are ignored.
 
     Returns:
         IoU; (H, W) bool, pixels inside the outline that the object lacks; (H, W) bool, pixels of the object outside the
@@ -38,6 +39,8 @@ def overlap(cloud: GaussianCloud, object_cloud: GaussianCloud, view: DrawnView) 
     """
     alone, whole = (render_gaussians(one, view.camera).alpha.numpy() > 0.5 for one in (object_cloud, cloud))
     counts = whole | alone
+    if view.hidden is not None:
+        counts &= ~view.hidden
     missing, more = view.mask & ~alone & counts, alone & ~view.mask
     union = (view.mask | alone) & counts
     return float((view.mask & alone).sum() / max(union.sum(), 1)), missing, more

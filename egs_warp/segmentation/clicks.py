@@ -111,7 +111,7 @@ def removed_by_clicks(
         if not click.inside and len(at):
             flat[id(click)] = float(at.max())
     on_ground = [click for click in clicks if flat.get(id(click), np.inf) < low]
-    others = [click for click in clicks if not click.inside and click not in on_ground]
+    others = [click for click in clicks if not click.inside and flat.get(id(click), np.inf) >= low]
     if others:
         removed |= ~cut_by_clicks(cloud, nodes, [*mine, *others])
     for click in on_ground:

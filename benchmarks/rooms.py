@@ -1,0 +1,155 @@
+"""Procedural rooms with a known object: overlap, time and clearing of the object from one click, three clicks and masks.
+
+The twenty rooms of ``room_scenes.py`` are captures with labelled Gaussians, and photos of them: toys on duvets, floors,
+grass and furniture, against walls, beside furniture, between other toys, half under a table. Eight photos are
+annotated with the truth. As in ``scene_quality.py``, every other one may be clicked or gives a mask, and the others
+judge the object alone, split at its ground, by the overlap (IoU); pixels where something in front hides the object do
+not count. ``before`` and ``after`` are the numbers of Gaussians of the object before and after the default clearing of
+the ground (fine-tuning). A row is a success if the object has an IoU of at least 0.9, so that it is complete and nothing
+else is included, and if its clearing ends with a finite object within the bound. Stains of a film are not judged.
+
+With ``--train``, each room is trained from its photos first, as a user would; this needs a GPU for all rooms.
+
+Aims: ``one_click`` (success in at least 18 of 20 rooms), ``three_clicks`` (success in all rooms), ``clearing`` (never
+more than 1.5 times as many Gaussians, always finite and not empty).
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from clicking import CLICKED, JUDGED, clicked, found_by, overlap, picture
+from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
+from egs_warp.io.cameras import write_cameras
+from egs_warp.io.video import write_png
+from egs_warp.pipelines.locate_plane import LocatedPlane
+from egs_warp.pipelines.prepare_scene import SceneOptions, segment_scene
+from egs_warp.segmentation.object_spec import ObjectSpec
+from egs_warp.segmentation.votes import MaskedView
+from harness import Row, Table, flags, report, timed
+from room_scenes import ROOMS, Room, build_room
+
+MIN_IOU, MAX_RATIO = 0.9, 1.5
+WAYS = {"1 click": 1, "3 clicks": 3, "masks": 0}
+"""Number of clicks of each way to describe the object."""
+QUICK = ("bear_duvet_wall_wardrobe", "dog_grass_toys", "bear_floor_table", "robot_chair")
+
+
+def trained(room: Room, options: argparse.Namespace) -> GaussianCloud:
+    """Train a capture from the photos of ``room``, as ``egs-warp train`` does."""
+    from egs_warp.pipelines.train_capture import train
+
+    with tempfile.TemporaryDirectory() as folder:
+        names = [f"photo{number}.png" for number in range(len(room.cameras))]
+        for name, photo in zip(names, room.photos(), strict=True):
+            write_png(Path(folder, name), np.rint(255.0 * photo).astype(np.uint8))
+        write_cameras(Path(folder, "cameras.json"), room.cameras, names)
+        return train(
+            folder,
+            iterations=options.train,
+            max_gaussians=room.cloud.count,
+            seed=options.seed,
+            device=options.device,
+        ).cloud
+
+
+def rows_of(room: Room, cloud: GaussianCloud, options: argparse.Namespace) -> tuple[list[Row], np.ndarray]:
+    """Return the row of each way to describe the object, and the pictures of the object in the first judged view."""
+    views = room.drawn.views
+    rows: list[Row] = []
+    pictures = []
+    for way, count in WAYS.items():
+        row: Row = {"room": room.name, "way": way, "gaussians": cloud.count, "iou": 0.0, "success": False}
+        seconds: dict[str, float] = {}
+        try:
+            spec, written = (
+                clicked(room.drawn, cloud, room.cameras, count)
+                if count
+                else (ObjectSpec(masks=tuple(MaskedView(v.camera, v.mask, "mask") for v in views[CLICKED])), [])
+            )
+            located, object_cloud, _ = found_by(cloud, spec, room.cameras, seconds)
+            cleared = cleared_row(cloud, located)
+        except UserError as error:
+            rows.append({**row, "message": str(error)})
+            pictures.append(np.full((320, 320, 3), 255, np.uint8))
+            continue
+        judged = [overlap(cloud, object_cloud, view) for view in views[JUDGED]]
+        ious = [one[0] for one in judged]
+        row |= {"iou": float(np.mean(ious)), "ious": ious, "clicks": written, **cleared}
+        row["seconds"] = {name: 1e-3 * value for name, value in seconds.items()}
+        row["success"] = bool(row["iou"] >= MIN_IOU and is_clear(row))
+        rows.append(row)
+        pictures.append(picture(object_cloud, views[JUDGED][0], *judged[0][1:]))
+    return rows, np.concatenate(pictures, axis=1)
+
+
+def cleared_row(cloud: GaussianCloud, located: LocatedPlane) -> Row:
+    """Return the entries of a row about the default clearing of the ground."""
+    before = int(located.segmentation.object_mask.sum())
+    try:
+        (object_cloud, *_), milliseconds = timed(segment_scene, cloud, located, SceneOptions())
+    except UserError as error:
+        return {"before": before, "after": 0, "finite": False, "clearing_message": str(error)}
+    finite = all(np.isfinite(getattr(object_cloud, name).numpy()).all() for name in ARRAYS)
+    return {"before": before, "after": object_cloud.count, "finite": finite, "clearing_seconds": 1e-3 * milliseconds}
+
+
+def is_clear(row: Row) -> bool:
+    """Return True if the clearing of a row ended with a finite object that is not empty, within the bound."""
+    return row["finite"] and 0 < row["after"] <= MAX_RATIO * row["before"]
+
+
+def judged(rows: Sequence[Row], names: Sequence[str]) -> dict[str, bool]:
+    """Return the aims."""
+    successes = {way: sum(row["success"] for row in rows if row["way"] == way) for way in WAYS}
+    return {
+        "one_click": successes["1 click"] >= 0.9 * len(names),
+        "three_clicks": successes["3 clicks"] == len(names),
+        "clearing": all(is_clear(row) for row in rows if "before" in row),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmark."""
+    parser = flags(
+        __doc__,
+        quick="four rooms",
+        device="cpu",
+        seed="seed of the rooms",
+        plot="image of the object alone in a judged view, from one click, three and masks; red: missing, blue: excess",
+    )
+    parser.add_argument("--only", nargs="*", metavar="ROOM", choices=ROOMS, help="only these rooms")
+    parser.add_argument("--density", type=float, default=1.0, help="factor of the number of Gaussians")
+    parser.add_argument("--train", type=int, metavar="STEPS", help="train each room from its photos, in so many steps")
+    options = parser.parse_args(arguments)
+    names = options.only or (QUICK if options.quick else tuple(ROOMS))
+    rows: list[Row] = []
+    figure: list[np.ndarray] = []
+    table = Table(
+        room="<26", way="<8", IoU=".3f", before="d", after="d", find_s="6.1f", clear_s="6.1f", success="<7", message="<"
+    )
+    for name in names:
+        room = build_room(name, seed=options.seed, density=options.density, device=options.device)
+        cloud = trained(room, options) if options.train else room.cloud
+        more, shown = rows_of(room, cloud, options)
+        rows += more
+        figure.append(shown)
+        for row in more:
+            table.row(
+                *(name, row["way"], row["iou"], row.get("before"), row.get("after")),
+                sum(row["seconds"].values()) if "seconds" in row else None,
+                row.get("clearing_seconds"),
+                "yes" if row["success"] else "no",
+                row.get("message", row.get("clearing_message", " ".join(row.get("clicks", ())))),
+            )
+    report(options, rows, aims=judged(rows, names), packages=["torch"], picture=np.concatenate(figure))
+
+
+if __name__ == "__main__":
+    main()
