@@ -20,7 +20,9 @@ _LOW = 0.03
 _TEXELS = 128
 """Texels across the rim."""
 _SPACING = 2
-"""Texels between new Gaussians."""
+"""Minimum number of texels between new Gaussians."""
+_MAX_GROWTH = 0.2
+"""Maximum number of new Gaussians, as a fraction of the object's."""
 _BRIDGED = 8.0
 """Texels. Gaps in the rim up to twice as wide are bridged."""
 _REACH = 2.0
@@ -32,7 +34,8 @@ _FOOT = 0.05
 def with_underside(object_cloud: GaussianCloud, ground: HeightField, size: float) -> tuple[GaussianCloud, int]:
     """Return the object with flat Gaussians over the opening that its rim at the ground encloses, and their number.
 
-    Heights and colours solve Laplace's equation with the values of the rim.
+    Heights and colours solve Laplace's equation with the values of the rim. There are at most a fifth as many new
+    Gaussians as the object has.
 
     Args:
         object_cloud: Gaussians of the object, scene units.
@@ -70,7 +73,11 @@ def with_underside(object_cloud: GaussianCloud, ground: HeightField, size: float
         return object_cloud, 0
     film = laplace_fill(heights[tuple(near)], unseen)
     painted = laplace_fill(colours[tuple(near)], unseen)
-    new = flat_gaussians(window, unseen, seen, painted, film, spacing=_SPACING, device=str(object_cloud.device))
+    spacing, device = _SPACING, str(object_cloud.device)
+    new = flat_gaussians(window, unseen, seen, painted, film, spacing=spacing, device=device)
+    while new is not None and new.count > _MAX_GROWTH * object_cloud.count:
+        spacing += 1
+        new = flat_gaussians(window, unseen, seen, painted, film, spacing=spacing, device=device)
     if new is None:
         return object_cloud, 0
     new = replace(_of_degree(new, object_cloud.sh.shape[1]), antialiased=object_cloud.antialiased)

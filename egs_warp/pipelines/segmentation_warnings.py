@@ -16,6 +16,11 @@ from egs_warp.segmentation.plane_search import lies_along
 _MIN_EDGE_SHARE = 0.02
 """Length of the object along a picture's edge above which there is a warning, as a fraction of the shorter side; a
 shorter part may be a floater."""
+_ALL_ROUND = 3
+"""Number of a picture's four edges at which an object that touches them surrounds the viewer."""
+_MAX_SHARE = 1.0 / 3.0
+"""Fraction of the capture's Gaussians above which there is a warning."""
+_REMEDY = "click with a minus on what does not belong to it, or mark it with masks"
 _MAX_GAP = 0.03
 """Distance of the object to the ground above which its foot is missing, as a fraction of its size."""
 _FLOOR_DISTANCE = 0.03
@@ -27,7 +32,8 @@ _MAX_FLOOR_SHARE = 0.05
 def segmentation_warnings(
     cloud: GaussianCloud, located: LocatedPlane, object_cloud: GaussianCloud, cameras: Sequence[Camera]
 ) -> list[str]:
-    """Return one line for each warning: the object touches a picture's edge, hangs in the air, or includes floor.
+    """Return one line for each warning: the object touches a picture's edge, hangs in the air, includes floor, or is a
+    large part of the capture.
 
     Args:
         cloud: The capture.
@@ -36,9 +42,15 @@ def segmentation_warnings(
         cameras: Views in which the object is tested.
     """
     warnings = []
-    edges = sum(_touches_edge(object_cloud, camera) for camera in cameras)
-    if edges:
-        warnings.append(f"touches the picture's edge in {edges} of {len(cameras)} views: is it whole?")
+    touched = [_touched_edges(object_cloud, camera) for camera in cameras]
+    all_round, any_edge = sum(edges >= _ALL_ROUND for edges in touched), sum(edges > 0 for edges in touched)
+    if all_round:
+        warnings.append(
+            f"touches the picture's edges all round in {all_round} of {len(cameras)} views: its surroundings are"
+            f" included; {_REMEDY}"
+        )
+    elif any_edge:
+        warnings.append(f"touches the picture's edge in {any_edge} of {len(cameras)} views: is it whole?")
     segmentation = located.segmentation
     means = cloud.means.numpy().astype(np.float64)
     ground = located.ground or located.plane
@@ -49,13 +61,19 @@ def segmentation_warnings(
     share = _floor_share(cloud, located.plane, segmentation.object_mask, located.centre, segmentation.size)
     if share > _MAX_FLOOR_SHARE:
         warnings.append(f"includes {100 * share:.0f} % of the floor around it")
+    elif all_round == 0 and segmentation.object_mask.mean() > _MAX_SHARE:
+        percent = 100.0 * segmentation.object_mask.mean()
+        warnings.append(f"has {percent:.0f} % of the capture's Gaussians; if this is more than the object, {_REMEDY}")
     return warnings
 
 
-def _touches_edge(object_cloud: GaussianCloud, camera: Camera) -> bool:
+def _touched_edges(object_cloud: GaussianCloud, camera: Camera) -> int:
+    """Return the number of the picture's edges at which the object is visible."""
     is_opaque = render_gaussians(object_cloud, camera).alpha.numpy() > 0.5
-    rim = int(is_opaque[0].sum() + is_opaque[-1].sum() + is_opaque[:, 0].sum() + is_opaque[:, -1].sum())
-    return rim > _MIN_EDGE_SHARE * min(camera.width, camera.height)
+    edges = np.array([edge.sum() for edge in (is_opaque[0], is_opaque[-1], is_opaque[:, 0], is_opaque[:, -1])])
+    least = _MIN_EDGE_SHARE * min(camera.width, camera.height)
+    # A short part at each of several edges counts as one edge.
+    return int((edges > least).sum()) or int(edges.sum() > least)
 
 
 def _floor_share(cloud: GaussianCloud, plane: Plane, object_mask: np.ndarray, centre: np.ndarray, size: float) -> float:

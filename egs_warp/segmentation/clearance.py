@@ -18,11 +18,12 @@ from egs_warp.deformation.splitting import SplitRule, child_layout, child_opacit
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
-from egs_warp.geometry.gaussians import GaussianCloud, concatenate
+from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.deformation.splitting import split_kernel
 from egs_warp.kernels.segmentation.clearance import extent_kernel, half_space_kernel
-from egs_warp.launching import empty, launch_rows
+from egs_warp.launching import available_threads, empty, launch_rows
+from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
 
@@ -69,6 +70,9 @@ class StraddlingOptions:
     closer to it without crossing. 0 is the paper's method."""
     fine_reach: float = 0.006
     """Fraction of the object's height. Gaussians that extend no farther across the plane are not split further."""
+    max_growth: float = 0.25
+    """Maximum number of Gaussians that the splitting adds, as a fraction of the object's. Those that extend farthest
+    across the plane are split first. Without this bound, each round doubles the number of straddling Gaussians."""
     cut_rest: bool = True
     """Cut Gaussians that still straddle after training at the plane, as ``SPLIT`` does; the paper leaves them."""
     seed: int = 0
@@ -111,7 +115,8 @@ def clear_plane(
     """Treat the straddling Gaussians of ``cloud``, an object above ``plane``, with ``method``.
 
     ``FINETUNE`` compares with renders of the untouched object above the plane, or with photographs of the whole scene.
-    Gaussians whose means end below the plane are removed.
+    Gaussians whose means end below the plane are removed; if all do, the straddling ones are split instead. The result
+    has at most ``1 + max_growth`` times as many Gaussians as ``cloud``.
 
     Args:
         cloud: Gaussians of the object, scene units.
@@ -139,12 +144,14 @@ def clear_plane(
         views = views_above(cloud, plane, cameras or foot_ring(cloud, plane))
     fine = cloud
     fine_reach = options.fine_reach * float(np.quantile(heights, 0.998))
+    most = int((1.0 + options.max_growth) * cloud.count)
     for _ in range(options.subdivisions):
-        fine = _subdivided(fine, plane, options.reach, fine_reach)
+        fine = _subdivided(fine, plane, options.reach, fine_reach, most)
     tuned = _finetuned(fine, plane, views, surroundings, options, progress)
-    tuned = _nonempty_subset(
-        tuned, plane.heights(tuned.means.numpy()) > 0.0, "after the fine-tune all of their means lie below the plane"
-    )
+    above = plane.heights(tuned.means.numpy()) > 0.0
+    if not above.any():
+        return half_space(cloud, plane, straddling)
+    tuned = tuned.subset(above)
     heights, reach = plane_extents(tuned, plane, options.reach)
     rest = np.abs(heights) < reach
     return half_space(tuned, plane, rest) if options.cut_rest and rest.any() else tuned
@@ -210,19 +217,24 @@ def foot_ring(cloud: GaussianCloud, plane: Plane, *, size: int = 256) -> list[Ca
     return ring_cameras(plane, centre, 1.1 * radius, elevations=(1.0, 10.0, 25.0), size=size)
 
 
-def _subdivided(cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure, fine_reach: float) -> GaussianCloud:
+def _subdivided(
+    cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure, fine_reach: float, most: int
+) -> GaussianCloud:
     """Split straddling Gaussians that extend farther than ``fine_reach`` (scene units) in three, along the axis that
-    extends farthest across the plane."""
+    extends farthest across the plane; those that extend farthest first, up to ``most`` Gaussians in all. Children with
+    means below the plane are removed."""
+    offsets, shrink = child_layout(SplitRule.MEASURED)
     heights, extent = plane_extents(cloud, plane, reach)
-    chosen = (np.abs(heights) < extent) & (extent > fine_reach)
-    if not chosen.any():
+    parents = np.flatnonzero((np.abs(heights) < extent) & (extent > fine_reach))
+    farthest = np.argsort(-extent[parents], kind="stable")
+    parents = np.sort(parents[farthest[: max(most - cloud.count, 0) // (len(offsets) - 1)]])
+    if len(parents) == 0:
         return cloud
-    parents, unchanged = np.flatnonzero(chosen), np.flatnonzero(~chosen)
+    unchanged = np.setdiff1d(np.arange(cloud.count), parents)
     rotations_of_parents = Rotation.from_quat(cloud.rotations.numpy()[parents][:, [1, 2, 3, 0]]).as_matrix()
     along = np.abs(np.einsum("nij,i->nj", rotations_of_parents, plane.normal)) * np.exp(
         cloud.log_scales.numpy()[parents]
     )
-    offsets, shrink = child_layout(SplitRule.MEASURED)
     source = np.concatenate([unchanged, np.repeat(parents, len(offsets))]).astype(np.int32)
     axis, step = np.full(len(source), -1, np.int32), np.zeros(len(source), np.float32)
     axis[len(unchanged) :] = np.repeat(along.argmax(axis=1), len(offsets))
@@ -275,6 +287,9 @@ def _finetuned(
     # Gaussians just above the plane take over the appearance of the straddling ones.
     free = np.zeros(whole.count, bool)
     free[: cloud.count] = heights < 3.0 * scale
+    # Most of a large object is outside of all views of its foot.
+    shown = free | _in_pictures(whole, [view.camera for view in views])
+    trained, free = whole.subset(shown), free[shown]
     near = torch.as_tensor(np.flatnonzero(free), device=wp.device_to_torch(cloud.device))
     normal = torch.tensor(plane.normal, dtype=torch.float32, device=near.device)
 
@@ -286,7 +301,7 @@ def _finetuned(
     # of its own colour.
     cut_out = all(view.alpha is not None for view in views)
     result = finetune(
-        whole,
+        trained,
         views,
         options=FinetuneOptions(
             iterations=options.iterations, background=None if cut_out else (0.0, 0.0, 0.0), seed=options.seed
@@ -295,7 +310,20 @@ def _finetuned(
         trainable=free,
         progress=progress,
     )
-    return result.cloud.subset(np.arange(whole.count) < cloud.count)
+    own = np.flatnonzero(shown[: cloud.count])
+    values = {name: getattr(cloud, name).numpy().copy() for name in ARRAYS}
+    for name, array in values.items():
+        array[own] = getattr(result.cloud, name).numpy()[: len(own)]
+    return GaussianCloud.from_numpy(**values, antialiased=cloud.antialiased, device=str(cloud.device))
+
+
+def _in_pictures(cloud: GaussianCloud, cameras: Sequence[Camera]) -> np.ndarray:
+    """(n,) bool, True for Gaussians that reach the picture of one of the ``cameras``, even if others hide them."""
+    reached, threads = np.zeros(cloud.count, bool), available_threads()
+    for camera in cameras:
+        projected = project(cloud, view_from_camera(camera), antialiased=cloud.antialiased, threads=threads)
+        reached |= np.diff(projected.slot_end.numpy(), prepend=0) > 0
+    return reached
 
 
 def straddling_loss(tensors: GaussianTensors, near: Any, normal: Any, offset: float, reach: ExtentMeasure) -> Any:

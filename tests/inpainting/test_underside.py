@@ -67,3 +67,14 @@ def test_a_closed_underside_is_unchanged() -> None:
     thing = ball()
     same, count = with_underside(thing, ground, SIZE)
     assert same is thing and count == 0
+
+
+def test_a_coarse_object_gets_few_gaussians() -> None:
+    """There are at most a fifth as many new Gaussians as the object has, and they cover the same opening."""
+    ground, whole = wavy_ground(0.03, spacing=0.04), ball(-0.2 * RADIUS)
+    thing = whole.subset(ground.heights(whole.means.numpy()) > 0.005)
+    fine, many = with_underside(thing, ground, SIZE)
+    coarse, few = with_underside(thing.subset(np.arange(0, thing.count, 2)), ground, SIZE)
+    assert 0 < few <= 0.2 * (coarse.count - few) < many
+    reach = [np.ptp(one.means.numpy()[-count:], axis=0)[:2] for one, count in ((fine, many), (coarse, few))]
+    np.testing.assert_allclose(reach[1], reach[0], atol=0.1)

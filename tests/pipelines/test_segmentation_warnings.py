@@ -44,6 +44,36 @@ def test_an_object_at_the_edge_of_pictures(located_ball: tuple[GaussianCloud, Lo
     ]
 
 
+def test_surroundings_that_came_along(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
+    """A wall and a ceiling about the ball are visible at three edges of one picture and at no edge of the others."""
+    cloud, located = located_ball
+    near = [replace(CAMERAS[0], fx=4.0 * CAMERAS[0].fx, fy=4.0 * CAMERAS[0].fy), *CAMERAS[1:]]
+    assert segmentation_warnings(cloud, located, cloud.subset(located.segmentation.object_mask), near) == [
+        "touches the picture's edges all round in 1 of 4 views: its surroundings are included; click with a minus on"
+        " what does not belong to it, or mark it with masks"
+    ]
+
+
+def test_an_object_that_is_most_of_the_capture(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
+    cloud, located = located_ball
+    few = np.arange(cloud.count) < 3000
+    small = cloud.subset(few)
+    segmentation = replace(
+        located.segmentation,
+        **{f"{name}_mask": getattr(located.segmentation, f"{name}_mask")[few] for name in ("object", "buried")},
+        floater_mask=located.segmentation.floater_mask[few],
+    )
+    (line,) = segmentation_warnings(
+        small, replace(located, segmentation=segmentation), small.subset(segmentation.object_mask), CAMERAS
+    )
+    percent = round(100 * segmentation.object_mask.mean())
+    assert percent in range(45, 51)
+    assert line == (
+        f"has {percent} % of the capture's Gaussians; if this is more than the object, click with a minus on what does"
+        " not belong to it, or mark it with masks"
+    )
+
+
 def test_an_object_without_its_foot(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
     """The lowest part of a ball of one unit is missing up to 0.17: a tenth of its size, the diagonal of its box."""
     cloud, located = located_ball

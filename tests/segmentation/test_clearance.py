@@ -19,6 +19,7 @@ from egs_warp.segmentation.clearance import (
     ExtentMeasure,
     StraddlingOptions,
     StraddlingPolicy,
+    _in_pictures,
     _subdivided,
     clear_plane,
     foot_ring,
@@ -141,8 +142,8 @@ def test_straddling_gaussians_are_split_in_three(device: str) -> None:
         device=device,
     )
     # Both reach through the plane by 0.3.
-    assert _subdivided(cloud, PLANE, ExtentMeasure.ELLIPSOID, 0.31) is cloud
-    split = _subdivided(cloud, PLANE, ExtentMeasure.ELLIPSOID, 0.29)
+    assert _subdivided(cloud, PLANE, ExtentMeasure.ELLIPSOID, 0.31, 100) is cloud
+    split = _subdivided(cloud, PLANE, ExtentMeasure.ELLIPSOID, 0.29, 100)
     np.testing.assert_allclose(PLANE.heights(split.means.numpy()), [0.5, 0.05, 0.15, 0.25, 0.05, 0.15], atol=1e-5)
     np.testing.assert_allclose(covariances(split)[0], covariances(cloud)[2], atol=1e-8)
     arms = split.means.numpy()[1:4].astype(np.float64) - cloud.means.numpy()[0]
@@ -152,6 +153,82 @@ def test_straddling_gaussians_are_split_in_three(device: str) -> None:
     assert opacities[0] == pytest.approx(cloud.opacities()[2])
     for child, parent in zip(range(1, 6), [0, 0, 0, 1, 1], strict=True):
         assert 0.0 < opacities[child] < cloud.opacities()[parent]
+
+
+def tall_object(count: int = 600, straddling: float = 0.05) -> GaussianCloud:
+    """An object of height 1 on the floor, of which a share of the Gaussians straddles the floor, by about as much as
+    measured in a bedroom: their extents are 0.03 to 0.3 of the height, and most are tilted."""
+    random = np.random.default_rng(5)
+    low = round(straddling * count)
+    means = random.uniform([-0.3, -0.3, 0.2], [0.3, 0.3, 1.0], (count, 3))
+    means[:low, 2] = random.uniform(0.001, 0.02, low)
+    scales = np.full((count, 3), np.log(0.02))
+    scales[:low] = np.log(random.uniform(0.01, 0.1, (low, 3)))
+    return GaussianCloud.from_numpy(
+        means,
+        random.normal(size=(count, 4)),
+        scales,
+        np.full(count, 3.0),
+        random.uniform(-1.0, 1.0, (count, 1, 3)),
+    )
+
+
+def test_subdivision_starts_with_the_farthest_extents_and_is_bounded() -> None:
+    """Without a bound, five rounds multiply the straddling Gaussians more than twentyfold."""
+    cloud = tall_object()
+    heights, extent = plane_extents(cloud, FLOOR)
+    crossing = np.flatnonzero(np.abs(heights) < extent)
+    assert 25 <= len(crossing) <= 35
+    first = _subdivided(cloud, FLOOR, ExtentMeasure.ELLIPSOID, 0.006, cloud.count + 3)
+    assert cloud.count < first.count <= cloud.count + 2
+    sizes = [one.log_scales.numpy().sum(axis=1) for one in (cloud, first)]
+    missing = cloud.means.numpy()[~np.isin(*sizes)]
+    np.testing.assert_array_equal(missing, cloud.means.numpy()[[crossing[np.argmax(extent[crossing])]]])
+    free, bounded = cloud, cloud
+    for _ in range(5):
+        free = _subdivided(free, FLOOR, ExtentMeasure.ELLIPSOID, 0.006, 1 << 30)
+        bounded = _subdivided(bounded, FLOOR, ExtentMeasure.ELLIPSOID, 0.006, 750)
+    assert free.count > cloud.count + 20 * len(crossing)
+    assert 740 <= bounded.count <= 750
+
+
+@pytest.mark.parametrize("straddling", [0.05, 1.0])
+def test_clearing_is_finite_and_keeps_the_number_of_gaussians(straddling: float) -> None:
+    """Also where all Gaussians straddle the plane, as those of a carpet, and some are as thin as any of a capture."""
+    pytest.importorskip("torch")
+    cloud = tall_object(straddling=straddling)
+    scales = cloud.log_scales.numpy().copy()
+    scales[::7, 1] = -12.0
+    cloud = replace(cloud, log_scales=wp.array(scales, dtype=wp.vec3, device="cpu"))
+    cameras = foot_ring(cloud, FLOOR, size=48)[::6]
+    options = StraddlingOptions(iterations=12)
+    cleared = clear_plane(cloud, FLOOR, StraddlingPolicy.FINETUNE, cameras=cameras, options=options)
+    assert 0.9 * cloud.count <= cleared.count <= (1.0 + options.max_growth) * cloud.count
+    for name in ("means", "rotations", "log_scales", "opacity_logits", "sh"):
+        assert np.isfinite(getattr(cleared, name).numpy()).all()
+    assert (FLOOR.heights(cleared.means.numpy()) > 0.0).all()
+
+
+def test_an_object_that_training_moves_below_the_plane_is_split(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("torch")
+    cloud = tall_object()
+    below = replace(cloud, means=wp.array(cloud.means.numpy() - [0.0, 0.0, 2.0], dtype=wp.vec3, device="cpu"))
+    monkeypatch.setattr("egs_warp.segmentation.clearance._finetuned", lambda *_: below)
+    cleared, split = (
+        clear_plane(cloud, FLOOR, method, cameras=foot_ring(cloud, FLOOR, size=16)[:1])
+        for method in (StraddlingPolicy.FINETUNE, StraddlingPolicy.SPLIT)
+    )
+    for name in ("means", "log_scales", "opacity_logits"):
+        np.testing.assert_array_equal(getattr(cleared, name).numpy(), getattr(split, name).numpy())
+
+
+def test_gaussians_outside_all_pictures() -> None:
+    """Hidden Gaussians are in the picture; those beside and behind the camera are not."""
+    eye, up = np.array([0.0, -4.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    camera = Camera.look_at(eye, np.zeros(3), up, width=32, height=32)
+    cloud = round_ones(np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0], [9.0, 0.0, 0.0], [0.0, -9.0, 0.0]]), 0.2)
+    np.testing.assert_array_equal(_in_pictures(cloud, [camera]), [True, True, False, False])
+    assert not _in_pictures(cloud, []).any()
 
 
 def test_foot_cameras_are_low_and_centred_on_the_foot() -> None:
@@ -224,6 +301,7 @@ def test_an_object_that_clearing_leaves_empty_is_an_error_of_that_stage() -> Non
             PLANE,
             ExtentMeasure.ELLIPSOID,
             0.0,
+            1000,
         )
 
 

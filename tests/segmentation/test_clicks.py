@@ -144,6 +144,18 @@ def test_a_negative_click_on_the_floor_removes_nothing() -> None:
     assert two.background_mask[floor.hits].all()
 
 
+def test_negative_clicks_on_a_ball_and_on_the_floor() -> None:
+    """Each click removes what it removes alone."""
+    cloud = balls((-1.0, 1.0))
+    mine, floor = click(cloud, (-0.5, -0.5, 0.5)), click(cloud, (-0.5, -0.9, 0.0), inside=False)
+    other = click(cloud, (0.5, -0.5, 0.5), inside=False)
+    one = segment(cloud, FLOOR, ObjectSpec.of_clicks([mine, other]))
+    for clicks in ([mine, other, floor], [mine, floor, other]):
+        two = segment(cloud, FLOOR, ObjectSpec.of_clicks(clicks))
+        np.testing.assert_array_equal(one.object_mask, two.object_mask)
+        assert two.background_mask[floor.hits].all()
+
+
 def test_detached_parts_in_the_air_are_added_and_standing_ones_are_not() -> None:
     """A blossom less than two cells off belongs to the ball; one as near on the floor does not."""
     random = np.random.default_rng(3)
