@@ -1,4 +1,4 @@
-"""Procedural rooms with a known object: toys on duvets, floors, grass and furniture, as captures with labelled Gaussians.
+"""Procedural rooms with a known object, as captures with labelled Gaussians: toys on duvets, floors, grass, furniture.
 
 A room is built directly as a capture: surfaces are sampled, and each sample becomes a flat Gaussian. Like a trained
 capture, it has large Gaussians on plain surfaces, Gaussians that bridge the object and what it touches and have mixed
@@ -30,7 +30,7 @@ Relief = Callable[[np.ndarray], np.ndarray]
 
 VIEWS = 8
 """Annotated photos."""
-_PHOTOS = 24
+_PHOTOS = 16
 """Photos, without the annotated ones."""
 _SIDES = (320, 240)
 """Sides of a photo, pixels."""
@@ -203,16 +203,16 @@ def _relief(support: str, random: np.random.Generator) -> Relief | None:
     if support not in ("duvet", "grass"):
         return None
     count, amplitude, sunk = (26, 0.16, 0.04) if support == "duvet" else (40, 0.06, 0.02)
-    angles, shifts, phases = random.uniform(0.0, np.pi, count), random.uniform(-2.5, 2.5, (2, count)), random.uniform(
-        0.0, 6.0, count
+    angles, shifts, phases = (
+        random.uniform(0.0, np.pi, count),
+        random.uniform(-2.5, 2.5, (2, count)),
+        random.uniform(0.0, 6.0, count),
     )
     heights, widths = amplitude * random.uniform(0.3, 1.0, count), random.uniform(0.07, 0.22, count)
 
     def folds(points: np.ndarray) -> np.ndarray:
         total = np.zeros(len(points))
-        for angle, across, along, phase, height, width in zip(
-            angles, *shifts, phases, heights, widths, strict=True
-        ):
+        for angle, across, along, phase, height, width in zip(angles, *shifts, phases, heights, widths, strict=True):
             u = points @ [np.cos(angle), np.sin(angle)] - along
             v = points @ [-np.sin(angle), np.cos(angle)] - across + 0.12 * np.sin(3.0 * u + phase)
             total += height * np.exp(-((v / width) ** 2) - (u / 1.1) ** 2)
@@ -296,9 +296,7 @@ def _bridge(fields: dict[str, np.ndarray], is_object: np.ndarray, random: np.ran
     fields["sh"] = sh
 
 
-def _blades(
-    relief: Relief, things: list[_Thing], density: float, random: np.random.Generator
-) -> dict[str, np.ndarray]:
+def _blades(relief: Relief, things: list[_Thing], density: float, random: np.random.Generator) -> dict[str, np.ndarray]:
     """Return blades of grass: long, thin, nearly upright Gaussians outside all solids."""
     count = int(9000 * density)
     flat = 2.2 * random.uniform(-1.0, 1.0, (count, 2))

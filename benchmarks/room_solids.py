@@ -70,9 +70,7 @@ class Solid:
         """Return the solid scaled and turned by ``degrees`` about the vertical axis, both about the origin, then moved
         by ``shift`` (3,)."""
         turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-        return replace(
-            self, centre=scale * turn @ self.centre + shift, half=scale * self.half, turn=turn @ self.turn
-        )
+        return replace(self, centre=scale * turn @ self.centre + shift, half=scale * self.half, turn=turn @ self.turn)
 
 
 def ellipsoid(centre: Sequence[float], half: Sequence[float], colour: Colour, *, tilt: float = 0.0) -> Solid:

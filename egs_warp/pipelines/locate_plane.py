@@ -17,6 +17,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.capture import Capture
 from egs_warp.io.planes import PlaneRecord
 from egs_warp.segmentation.base_plane import guess_up
+from egs_warp.segmentation.framing import with_framing
 from egs_warp.segmentation.ground import ROUGH, measure_ground
 from egs_warp.segmentation.object_mask import TOUCHING, segment
 from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
@@ -106,6 +107,7 @@ def locate_plane(
         UserError: There is no plane under the object, or no object.
     """
     notes: list[str] = []
+    spec = with_framing(cloud, spec, cameras)
     if plane is not None:
         segmentation = segment(cloud, plane, spec)
         return LocatedPlane(plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, ())
@@ -199,7 +201,7 @@ def with_measured_ground(
         note = f"the ground seems rough by {rough} of the object's height, but views differ by {noise}: taken as flat"
         return replace(located, notes=(*located.notes, note))
     try:
-        segmentation = segment(cloud, measured.field, spec, size=located.size)
+        segmentation = segment(cloud, measured.field, with_framing(cloud, spec, cameras), size=located.size)
     except UserError as error:
         note = f"the ground is rough by {rough} of the object's height, but taken for flat ({error})"
         return replace(located, notes=(*located.notes, note))

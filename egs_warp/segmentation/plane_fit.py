@@ -13,7 +13,7 @@ from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.plane import Plane
 
 _MAX_PIXELS = 20_000
-"""Maximum number of pixels of each view; more do not improve a fit of three numbers."""
+"""Maximum number of pixels of all views together; more do not improve a fit of three numbers."""
 _MIN_PIXELS = 30
 _TRIALS = 300
 _TUKEY = 2.0
@@ -114,6 +114,7 @@ class _Pixels:
 def _gather(views: Sequence[PlaneView], random: np.random.Generator) -> _Pixels:
     if not views:
         raise UserError("plane: there are no views; give at least one picture with its camera and mask")
+    most = _MAX_PIXELS // len(views)
     origins, rays, depths, first = [], [], [], []
     for number, view in enumerate(views):
         shape = (view.camera.height, view.camera.width)
@@ -125,8 +126,8 @@ def _gather(views: Sequence[PlaneView], random: np.random.Generator) -> _Pixels:
                 )
         valid = view.mask & (view.depth > 0.0) & np.isfinite(view.depth)
         chosen = np.flatnonzero(valid)
-        if len(chosen) > _MAX_PIXELS:
-            chosen = np.sort(random.choice(chosen, _MAX_PIXELS, replace=False))
+        if len(chosen) > most:
+            chosen = np.sort(random.choice(chosen, most, replace=False))
         rays.append(camera_rays(view.camera).reshape(-1, 3)[chosen])
         depths.append(np.asarray(view.depth, float).ravel()[chosen])
         origins.append(np.broadcast_to(view.camera.centre, (len(chosen), 3)))

@@ -1,0 +1,65 @@
+"""Background from the framing of photos: photographers keep the object in the picture, and what most photos do not show
+is not part of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.segmentation.clicks import Click
+from egs_warp.segmentation.object_spec import ObjectSpec
+
+_MIN_PHOTOS, _MAX_PHOTOS = 8, 32
+"""Number of photos below which framing says nothing, and number above which they are thinned out evenly."""
+_MAX_SHARE = 0.25
+"""Share of the photos of the object in whose frame a Gaussian may lie and still be background. Shares from 0.1 to 0.5
+give the same object in the procedural rooms."""
+_HITS, _SOLID = 8, 0.3
+"""Number of Gaussians next to a point that stand for a click, and their minimum opacity."""
+
+
+def with_framing(cloud: GaussianCloud, spec: ObjectSpec, cameras: Sequence[Camera]) -> ObjectSpec:
+    """Return ``spec`` with a click beside the object that hits all background known from the framing of the photos.
+
+    The photos of the object are those whose frame contains its point. Nothing is added to a box or to masks, which say
+    more, nor if there are few photos or no such background.
+
+    Args:
+        cloud: the capture.
+        spec: the user's description of the object.
+        cameras: cameras of the photos.
+    """
+    if spec.point is None or spec.masks:
+        return spec
+    showing = [camera for camera in cameras if _in_frame(spec.point[None], camera)[0]]
+    if len(showing) < _MIN_PHOTOS:
+        return spec
+    showing = showing[:: -(-len(showing) // _MAX_PHOTOS)]
+    means = cloud.means.numpy().astype(np.float64)
+    share = sum(_in_frame(means, camera).astype(np.float64) for camera in showing) / len(showing)
+    beside = np.flatnonzero(share <= _MAX_SHARE)
+    if len(beside) == 0:
+        return spec
+    clicks = spec.clicks
+    if not any(click.inside for click in clicks):
+        solid = np.flatnonzero((cloud.opacities() > _SOLID) & (share > _MAX_SHARE))
+        if len(solid) == 0:
+            return spec
+        nearest = KDTree(means[solid]).query(spec.point, k=min(_HITS, len(solid)))[1]
+        clicks = (Click(spec.point, solid[np.ravel(nearest)]), *clicks)
+    wanted = np.concatenate([click.hits for click in clicks if click.inside])
+    return replace(spec, clicks=(*clicks, Click(spec.point, np.setdiff1d(beside, wanted), inside=False)))
+
+
+def _in_frame(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """(n,) bool, True for ``points`` (n, 3) inside the camera's picture, even if something hides them."""
+    across, down, depth = camera.rotation @ points.T + camera.translation[:, None]
+    ahead = depth > camera.near
+    depth = np.where(ahead, depth, 1.0)
+    u, v = camera.cx + camera.fx * across / depth, camera.cy + camera.fy * down / depth
+    return ahead & (u >= 0.0) & (u < camera.width) & (v >= 0.0) & (v < camera.height)
