@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 GAMMA = 3.0
 """Extent of a Gaussian in standard deviations, as in Eq. (3)."""
+_MIN_CROP = 16
+"""Minimum side of a cropped view, pixels."""
 
 
 class ExtentMeasure(enum.Enum):
@@ -287,7 +289,8 @@ def _finetuned(
     # Gaussians just above the plane take over the appearance of the straddling ones.
     free = np.zeros(whole.count, bool)
     free[: cloud.count] = heights < 3.0 * scale
-    # Most of a large object is outside of all views of its foot.
+    views = _cropped(views, cloud.subset(free[: cloud.count]))
+    # Most of a large object, and of its surroundings, is outside of all views of its foot.
     shown = free | _in_pictures(whole, [view.camera for view in views])
     trained, free = whole.subset(shown), free[shown]
     near = torch.as_tensor(np.flatnonzero(free), device=wp.device_to_torch(cloud.device))
@@ -315,6 +318,35 @@ def _finetuned(
     for name, array in values.items():
         array[own] = getattr(result.cloud, name).numpy()[: len(own)]
     return GaussianCloud.from_numpy(**values, antialiased=cloud.antialiased, device=str(cloud.device))
+
+
+def _cropped(views: Sequence[TrainingView], foot: GaussianCloud) -> list[TrainingView]:
+    """Crop ``views`` to the Gaussians ``foot``, and leave out views that do not show them; all of ``views`` if none
+    does."""
+    means, radii = foot.means.numpy().astype(np.float64), GAMMA * np.exp(foot.log_scales.numpy().max(axis=1))
+    crops = []
+    for view in views:
+        camera = view.camera
+        across, down, depth = camera.rotation @ means.T + camera.translation[:, None]
+        ahead = depth > np.maximum(camera.near, radii)
+        if not ahead.any():
+            continue
+        low, high = [], []
+        for focal, middle, offset, side in (
+            (camera.fx, camera.cx, across, camera.width),
+            (camera.fy, camera.cy, down, camera.height),
+        ):
+            places, reach = middle + focal * offset[ahead] / depth[ahead], focal * radii[ahead] / depth[ahead]
+            low.append(int(np.clip(np.floor((places - reach).min()), 0, side)))
+            high.append(int(np.clip(np.ceil((places + reach).max()), 0, side)))
+        (left, top), (right, bottom) = low, high
+        if min(right - left, bottom - top) < _MIN_CROP:
+            continue
+        box = slice(top, bottom), slice(left, right)
+        window = replace(camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top)
+        alpha, weight = (None if one is None else one[box] for one in (view.alpha, view.weight))
+        crops.append(replace(view, camera=window, image=view.image[box], alpha=alpha, weight=weight))
+    return crops or list(views)
 
 
 def _in_pictures(cloud: GaussianCloud, cameras: Sequence[Camera]) -> np.ndarray:

@@ -222,6 +222,26 @@ def test_an_object_that_training_moves_below_the_plane_is_split(monkeypatch: pyt
         np.testing.assert_array_equal(getattr(cleared, name).numpy(), getattr(split, name).numpy())
 
 
+def test_views_are_cropped_to_the_foot() -> None:
+    """A crop shows the same pixels of the foot as the whole picture; a view from which the foot is out of sight is left
+    out."""
+    pytest.importorskip("torch")
+    from egs_warp.segmentation.clearance import _cropped
+
+    cloud = tall_object()
+    foot = cloud.subset(cloud.means.numpy()[:, 2] < 0.1)
+    eye, up = np.array([0.5, -6.0, 0.4]), np.array([0.0, 0.0, 1.0])
+    cameras = [Camera.look_at(eye, np.array([0.0, y, 0.4]), up, width=320, height=240) for y in (0.0, -12.0)]
+    views = views_above(foot, FLOOR, cameras)
+    (crop,) = _cropped(views, foot)
+    assert crop.image.shape[0] * crop.image.shape[1] < 0.2 * views[0].image.shape[0] * views[0].image.shape[1]
+    (again,) = views_above(foot, FLOOR, [crop.camera])
+    assert again.alpha is not None and crop.alpha is not None and views[0].alpha is not None
+    np.testing.assert_allclose(crop.alpha, again.alpha, atol=2e-3)
+    assert crop.alpha.sum() == pytest.approx(views[0].alpha.sum(), rel=1e-3)
+    assert _cropped(views[1:], foot) == views[1:]
+
+
 def test_gaussians_outside_all_pictures() -> None:
     """Hidden Gaussians are in the picture; those beside and behind the camera are not."""
     eye, up = np.array([0.0, -4.0, 0.0]), np.array([0.0, 0.0, 1.0])
