@@ -20,7 +20,7 @@ from annotated_scenes import DrawnScene, DrawnView
 from egs_warp.assets.object import KEY_LIGHT
 from egs_warp.assets.surface import SurfaceSamples, flat_gaussians
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.geometry.gaussians import ARRAYS, SH_BAND_0, GaussianCloud
 from egs_warp.render import render_gaussians
 from egs_warp.segmentation.selection_masks import masks_from_selection
 from egs_warp.segmentation.votes import MaskedView, blending_votes
@@ -42,49 +42,49 @@ _HAZE_SHARE = 0.01
 
 
 @dataclass(frozen=True)
-class RoomPlan:
-    """What is in a room."""
+class SceneLayout:
+    """Toy, support and neighbours in a room."""
 
     toy: str
     """Name in ``TOYS``."""
     support: str
     """``duvet``, ``floor``, ``carpet``, ``grass``, ``table``, ``chair``, ``sofa`` or ``shelf``."""
-    beside: tuple[str, ...] = ()
+    neighbours: tuple[str, ...] = ()
     """``wall``, ``wardrobe``, ``toys``, ``pillow``, or ``table`` for one that the toy is half under."""
     turned: float = 0.0
     """Rotation of the toy about the vertical axis, degrees."""
 
 
-ROOMS: Mapping[str, RoomPlan] = {
-    "bear_duvet_wall_wardrobe": RoomPlan("bear", "duvet", ("wall", "wardrobe")),
-    "rabbit_duvet_pillow": RoomPlan("rabbit", "duvet", ("pillow",), 30.0),
-    "dog_duvet_toys": RoomPlan("dog", "duvet", ("toys",), -40.0),
-    "duck_duvet_wall": RoomPlan("duck", "duvet", ("wall",), 60.0),
-    "robot_floor_wall": RoomPlan("robot", "floor", ("wall",), 10.0),
-    "bear_floor_wardrobe": RoomPlan("bear", "floor", ("wardrobe",), 20.0),
-    "dog_carpet_toys": RoomPlan("dog", "carpet", ("toys",), 70.0),
-    "blocks_floor_table": RoomPlan("blocks", "floor", ("table",), 25.0),
-    "bear_floor_table": RoomPlan("bear", "floor", ("table",), -15.0),
-    "rabbit_grass": RoomPlan("rabbit", "grass", (), 15.0),
-    "duck_grass": RoomPlan("duck", "grass", (), -70.0),
-    "dog_grass_toys": RoomPlan("dog", "grass", ("toys",), 120.0),
-    "bear_chair": RoomPlan("bear", "chair"),
-    "robot_chair": RoomPlan("robot", "chair", (), 20.0),
-    "rabbit_chair_wall": RoomPlan("rabbit", "chair", ("wall",), 80.0),
-    "duck_table": RoomPlan("duck", "table", (), 45.0),
-    "blocks_table_toys": RoomPlan("blocks", "table", ("toys",), -20.0),
-    "robot_carpet_wall_wardrobe": RoomPlan("robot", "carpet", ("wall", "wardrobe"), -10.0),
-    "bear_sofa": RoomPlan("bear", "sofa"),
-    "dog_shelf": RoomPlan("dog", "shelf", (), 75.0),
+SCENES: Mapping[str, SceneLayout] = {
+    "bear_duvet_wall_wardrobe": SceneLayout("bear", "duvet", ("wall", "wardrobe")),
+    "rabbit_duvet_pillow": SceneLayout("rabbit", "duvet", ("pillow",), 30.0),
+    "dog_duvet_toys": SceneLayout("dog", "duvet", ("toys",), -40.0),
+    "duck_duvet_wall": SceneLayout("duck", "duvet", ("wall",), 60.0),
+    "robot_floor_wall": SceneLayout("robot", "floor", ("wall",), 10.0),
+    "bear_floor_wardrobe": SceneLayout("bear", "floor", ("wardrobe",), 20.0),
+    "dog_carpet_toys": SceneLayout("dog", "carpet", ("toys",), 70.0),
+    "blocks_floor_table": SceneLayout("blocks", "floor", ("table",), 25.0),
+    "bear_floor_table": SceneLayout("bear", "floor", ("table",), -15.0),
+    "rabbit_grass": SceneLayout("rabbit", "grass", (), 15.0),
+    "duck_grass": SceneLayout("duck", "grass", (), -70.0),
+    "dog_grass_toys": SceneLayout("dog", "grass", ("toys",), 120.0),
+    "bear_chair": SceneLayout("bear", "chair"),
+    "robot_chair": SceneLayout("robot", "chair", (), 20.0),
+    "rabbit_chair_wall": SceneLayout("rabbit", "chair", ("wall",), 80.0),
+    "duck_table": SceneLayout("duck", "table", (), 45.0),
+    "blocks_table_toys": SceneLayout("blocks", "table", ("toys",), -20.0),
+    "robot_carpet_wall_wardrobe": SceneLayout("robot", "carpet", ("wall", "wardrobe"), -10.0),
+    "bear_sofa": SceneLayout("bear", "sofa"),
+    "dog_shelf": SceneLayout("dog", "shelf", (), 75.0),
 }
-"""The rooms by name."""
+"""Layouts of the rooms by name."""
 
 _FLOOR = {"table": -2.0, "chair": -1.6, "sofa": -1.0, "shelf": -1.6}
 """Height of the floor where the object stands on furniture."""
 
 
 @dataclass(frozen=True)
-class Room:
+class SyntheticScene:
     """A capture of a room with its truth."""
 
     name: str
@@ -101,8 +101,8 @@ class Room:
         return [np.clip(render_gaussians(self.cloud, one).colour.numpy(), 0.0, 1.0) for one in self.cameras]
 
 
-def build_room(name: str, *, seed: int = 0, density: float = 1.0, device: str | None = None) -> Room:
-    """Build the room ``name`` of ``ROOMS``.
+def build_scene(name: str, *, seed: int = 0, density: float = 1.0, device: str | None = None) -> SyntheticScene:
+    """Build the room ``name`` of ``SCENES``.
 
     Args:
         name: name of the room.
@@ -110,25 +110,25 @@ def build_room(name: str, *, seed: int = 0, density: float = 1.0, device: str | 
         density: factor of the number of Gaussians.
         device: Warp device.
     """
-    plan, random = ROOMS[name], np.random.default_rng([seed, list(ROOMS).index(name)])
-    relief = _relief(plan.support, random)
-    things = _things(plan, relief)
-    parts = [_of_solids(things, number, relief, density, random) for number in range(len(things))]
+    layout, random = SCENES[name], np.random.default_rng([seed, list(SCENES).index(name)])
+    relief = _relief(layout.support, random)
+    groups = _solid_groups(layout, relief)
+    parts = [_of_solids(groups, number, relief, density, random) for number in range(len(groups))]
     if relief is not None:
-        parts.append(_of_ground(plan.support, relief, things, density, random))
-    if plan.support in _FLOOR:
-        level = _FLOOR[plan.support]
-        parts.append(_of_ground("floor", lambda points: np.full(len(points), level), things, density, random))
+        parts.append(_of_ground(layout.support, relief, groups, density, random))
+    if layout.support in _FLOOR:
+        level = _FLOOR[layout.support]
+        parts.append(_of_ground("floor", lambda points: np.full(len(points), level), groups, density, random))
     fields = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     is_object = np.repeat([number == 0 for number in range(len(parts))], [len(part["means"]) for part in parts])
     _bridge(fields, is_object, random)
-    if plan.support == "grass":
+    if layout.support == "grass":
         assert relief is not None
-        fields, is_object = _joined(fields, is_object, _blades(relief, things, density, random))
+        fields, is_object = _added(fields, is_object, _blades(relief, groups, density, random))
     haze = _haze(fields, random)
-    fields, is_object = _joined(fields, is_object, haze)
-    cameras = [_camera(plan, random) for _ in range(_PHOTOS + VIEWS)]
-    cloud = GaussianCloud.from_numpy(**fields, device=device)
+    fields, is_object = _added(fields, is_object, haze)
+    cameras = [_camera(layout, random) for _ in range(_PHOTOS + VIEWS)]
+    cloud = GaussianCloud.from_numpy(*(fields[name] for name in ARRAYS), device=device)
     whole = [MaskedView(one, np.ones((one.height, one.width), bool), "photo") for one in cameras]
     kept = blending_votes(cloud, whole).inside > 0.0
     kept |= random.uniform(size=len(kept)) < _UNSEEN_SHARE
@@ -137,7 +137,7 @@ def build_room(name: str, *, seed: int = 0, density: float = 1.0, device: str | 
     chosen = np.linspace(0, len(cameras) - 1, VIEWS).round().astype(int)
     drawn = DrawnScene(name, None, None, tuple(_annotated(cloud, is_object, cameras[k]) for k in chosen))
     photos = tuple(camera for k, camera in enumerate(cameras) if k not in chosen)
-    return Room(name, cloud, is_object, photos, drawn)
+    return SyntheticScene(name, cloud, is_object, photos, drawn)
 
 
 def _annotated(cloud: GaussianCloud, is_object: np.ndarray, camera: Camera) -> DrawnView:
@@ -147,44 +147,44 @@ def _annotated(cloud: GaussianCloud, is_object: np.ndarray, camera: Camera) -> D
 
 
 @dataclass(frozen=True)
-class _Thing:
+class _SolidGroup:
     """Solids with one spacing of Gaussians."""
 
     solids: list[solids.Solid]
     spacing: float
 
 
-def _things(plan: RoomPlan, relief: Relief | None) -> list[_Thing]:
-    """Return the things of a room; the first one is the object."""
-    toy = [one.moved((0, 0, 0), plan.turned) for one in solids.TOYS[plan.toy]()]
+def _solid_groups(layout: SceneLayout, relief: Relief | None) -> list[_SolidGroup]:
+    """Return the groups of a room; the first one is the object."""
+    toy = [one.moved((0, 0, 0), layout.turned) for one in solids.TOYS[layout.toy]()]
     rear = max(_reach(one, 1) for one in toy)
-    things = [_Thing(toy, 0.022)]
+    groups = [_SolidGroup(toy, 0.022)]
 
     def level(x: float, y: float) -> float:
         around = np.array([x, y]) + 0.25 * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
         return 0.0 if relief is None else float(relief(around).mean())
 
-    floor = _FLOOR.get(plan.support, -1.5 if plan.support == "duvet" else 0.0)
+    floor = _FLOOR.get(layout.support, -1.5 if layout.support == "duvet" else 0.0)
     make = {"table": lambda: solids.table(0.0), "chair": solids.chair, "sofa": solids.sofa, "shelf": solids.shelf}
-    if plan.support in make:
-        things.append(_Thing(make[plan.support](), 0.05))
-    for name in plan.beside:
+    if layout.support in make:
+        groups.append(_SolidGroup(make[layout.support](), 0.05))
+    for name in layout.neighbours:
         if name == "wall":
-            at = rear if plan.support != "chair" else 0.62
-            things.append(_Thing([solids.box((-4, at, floor), (4, at + 0.1, 4.5), (0.45, 0.50, 0.47))], 0.13))
+            at = rear if layout.support != "chair" else 0.62
+            groups.append(_SolidGroup([solids.box((-4, at, floor), (4, at + 0.1, 4.5), (0.45, 0.50, 0.47))], 0.13))
         elif name == "wardrobe":
             side = min(one.centre[0] for one in toy) - 0.3
-            things.append(_Thing(solids.wardrobe(side, floor), 0.08))
+            groups.append(_SolidGroup(solids.wardrobe(side, floor), 0.08))
         elif name == "table":
             over = [one.moved((0.5, 1.3, 0.0)) for one in solids.table(1.3)]
-            things.append(_Thing(over, 0.05))
+            groups.append(_SolidGroup(over, 0.05))
         elif name == "pillow":
-            things.append(_Thing(solids.pillow((0.1, 0.75, level(0.1, 0.75))), 0.035))
+            groups.append(_SolidGroup(solids.pillow((0.1, 0.75, level(0.1, 0.75))), 0.035))
         else:
             for toy_name, x, y in (("duck", -0.72, 0.12), ("blocks", 0.66, 0.3), ("rabbit", 0.1, 0.95)):
                 other = [one.moved((x, y, level(x, y)), 50.0 * x, 0.8) for one in solids.TOYS[toy_name]()]
-                things.append(_Thing(other, 0.03))
-    return things
+                groups.append(_SolidGroup(other, 0.03))
+    return groups
 
 
 def _reach(one: solids.Solid, axis: int) -> float:
@@ -223,16 +223,16 @@ def _relief(support: str, random: np.random.Generator) -> Relief | None:
 
 
 def _of_solids(
-    things: list[_Thing], number: int, relief: Relief | None, density: float, random: np.random.Generator
+    groups: list[_SolidGroup], number: int, relief: Relief | None, density: float, random: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Return the Gaussians of the surface of one thing that is outside all other solids and above the ground."""
+    """Return the Gaussians of the surface of one group that is outside all other solids and above the ground."""
     parts = []
-    own = things[number]
+    own = groups[number]
     spacing = own.spacing / np.sqrt(density)
     for one in own.solids:
         samples = one.samples(spacing, random)
         visible = np.ones(len(samples.points), bool)
-        for other in (other for thing in things for other in thing.solids if other is not one):
+        for other in (other for group in groups for other in group.solids if other is not one):
             visible &= ~other.contains(samples.points)
         if relief is not None:
             visible &= samples.points[:, 2] > relief(samples.points[:, :2])
@@ -243,7 +243,7 @@ def _of_solids(
 
 
 def _of_ground(
-    kind: str, relief: Relief, things: list[_Thing], density: float, random: np.random.Generator
+    kind: str, relief: Relief, groups: list[_SolidGroup], density: float, random: np.random.Generator
 ) -> dict[str, np.ndarray]:
     """Return the Gaussians of the ground outside all solids; it is darker next to the object."""
     spacing, reach, colour = {
@@ -259,7 +259,7 @@ def _of_ground(
     slopes = [(relief(flat + e) - relief(flat - e)) / (2.0 * step) for e in step * np.eye(2)]
     normals = np.column_stack([-slopes[0], -slopes[1], np.ones(len(flat))])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    outside = ~np.any([one.contains(points) for thing in things for one in thing.solids], axis=0)
+    outside = ~np.any([one.contains(points) for group in groups for one in group.solids], axis=0)
     samples = SurfaceSamples(points[outside], normals[outside], spacing)
     pattern = {"duvet": 4.0, "grass": 9.0, "carpet": 7.0, "floor": 2.0}[kind]
     stripes = 1.0 + 0.25 * np.sin(pattern * samples.points[:, :1]) * np.sin(0.7 * pattern * samples.points[:, 1:2])
@@ -277,7 +277,7 @@ def _painted(
     noise = random.normal(1.0, 0.02 if plain else 0.10, (len(samples.points), 1))
     colour = np.clip(1.3 * albedo * lit[:, None] * noise, 0.0, 1.0) ** (1.0 / 2.2)
     cloud = flat_gaussians(samples, ((colour - 0.5) / SH_BAND_0)[:, None], random=random, device="cpu")
-    return {key: getattr(cloud, key).numpy() for key in ("means", "rotations", "log_scales", "opacity_logits", "sh")}
+    return {key: getattr(cloud, key).numpy() for key in ARRAYS}
 
 
 def _bridge(fields: dict[str, np.ndarray], is_object: np.ndarray, random: np.random.Generator) -> None:
@@ -288,7 +288,7 @@ def _bridge(fields: dict[str, np.ndarray], is_object: np.ndarray, random: np.ran
         own, other = np.flatnonzero(side), np.flatnonzero(~side)
         away, nearest = KDTree(means[other]).query(means[own])
         near = (away < _BRIDGE) & (random.uniform(size=len(own)) < 0.5)
-        wide, across = own[near], other[nearest[near]]
+        wide, across = own[near], other[np.ravel(nearest)[near]]
         scales[wide] += random.uniform(0.4, 1.1, (len(wide), 1))
         scales[wide, 2] = scales[wide].max(axis=1) - random.uniform(0.2, 1.0, len(wide))
         share = random.uniform(0.1, 0.5, (len(wide), 1, 1))
@@ -296,13 +296,15 @@ def _bridge(fields: dict[str, np.ndarray], is_object: np.ndarray, random: np.ran
     fields["sh"] = sh
 
 
-def _blades(relief: Relief, things: list[_Thing], density: float, random: np.random.Generator) -> dict[str, np.ndarray]:
+def _blades(
+    relief: Relief, groups: list[_SolidGroup], density: float, random: np.random.Generator
+) -> dict[str, np.ndarray]:
     """Return blades of grass: long, thin, nearly upright Gaussians outside all solids."""
     count = int(9000 * density)
     flat = 2.2 * random.uniform(-1.0, 1.0, (count, 2))
     length = random.uniform(0.02, 0.05, count)
     means = np.column_stack([flat, relief(flat) + length])
-    outside = ~np.any([one.contains(means) for thing in things for one in thing.solids], axis=0)
+    outside = ~np.any([one.contains(means) for group in groups for one in group.solids], axis=0)
     means, length = means[outside], length[outside]
     lean = Rotation.from_rotvec(random.normal(0.0, 0.35, (len(means), 3)) * [1.0, 1.0, 0.0])
     green = np.array([0.25, 0.45, 0.12]) * random.uniform(0.6, 1.3, (len(means), 1))
@@ -327,21 +329,21 @@ def _haze(fields: dict[str, np.ndarray], random: np.random.Generator) -> dict[st
     }
 
 
-def _joined(
+def _added(
     fields: dict[str, np.ndarray], is_object: np.ndarray, more: dict[str, np.ndarray]
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    joined = {key: np.concatenate([fields[key], more[key]]) for key in fields}
-    return joined, np.concatenate([is_object, np.zeros(len(more["means"]), bool)])
+    longer = {key: np.concatenate([fields[key], more[key]]) for key in fields}
+    return longer, np.concatenate([is_object, np.zeros(len(more["means"]), bool)])
 
 
-def _camera(plan: RoomPlan, random: np.random.Generator) -> Camera:
+def _camera(layout: SceneLayout, random: np.random.Generator) -> Camera:
     """Return a camera held by hand on the accessible side of the object, in portrait or landscape."""
     low, high = (-180.0, 180.0)
-    if plan.support in ("chair", "sofa", "shelf") or set(plan.beside) & {"wall", "table"}:
+    if layout.support in ("chair", "sofa", "shelf") or set(layout.neighbours) & {"wall", "table"}:
         low, high = (-150.0, -30.0)
-    if "wardrobe" in plan.beside:
-        low, high = (-105.0, -30.0) if "wall" in plan.beside else (-105.0, 75.0)
-    under = "table" in plan.beside or plan.support == "shelf"
+    if "wardrobe" in layout.neighbours:
+        low, high = (-105.0, -30.0) if "wall" in layout.neighbours else (-105.0, 75.0)
+    under = "table" in layout.neighbours or layout.support == "shelf"
     azimuth, elevation = np.radians([random.uniform(low, high), random.uniform(8.0, 32.0 if under else 55.0)])
     away = random.uniform(1.9, 3.2) * np.array(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
@@ -363,7 +365,7 @@ def _in_any_frame(
     cloud: GaussianCloud, cameras: list[Camera], random: np.random.Generator
 ) -> tuple[GaussianCloud, list[Camera]]:
     """Return the capture and its cameras in an arbitrary frame and unit of length."""
-    turn = Rotation.random(random_state=random)
+    turn = Rotation.random(rng=random)
     scale, shift = float(random.uniform(0.4, 2.5)), random.normal(size=3)
     rotations = turn * Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]])
     moved = GaussianCloud.from_numpy(

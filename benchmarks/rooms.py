@@ -9,7 +9,7 @@ the ground (fine-tuning). A row is a success if the object has an IoU of at leas
 nothing else is included, and if its clearing ends with a finite object within the bound. Stains of a film are not
 judged. ``warnings`` in the JSON are those that ``egs-warp segment`` prints.
 
-With ``--train``, each room is trained from its photos first, as a user would; this needs a GPU for all rooms.
+With ``--train``, each capture is trained from the photos first, as a user would; for all rooms this needs a GPU.
 
 Aims: ``one_click`` (success in at least nine tenths of the rooms), ``three_clicks`` (success in all rooms),
 ``clearing`` (never more than 1.5 times as many Gaussians, always finite and not empty), ``reported`` (an object
@@ -37,53 +37,53 @@ from egs_warp.pipelines.segmentation_warnings import segmentation_warnings
 from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.segmentation.votes import MaskedView
 from harness import Row, Table, flags, report, timed
-from room_scenes import ROOMS, Room, build_room
+from room_scenes import SCENES, SyntheticScene, build_scene
 
 MIN_IOU, UNUSABLE_IOU, MAX_RATIO = 0.9, 0.5, 1.5
-WAYS = {"1 click": 1, "3 clicks": 3, "masks": 0}
-"""Number of clicks of each way to describe the object."""
+CLICKS = {"1 click": 1, "3 clicks": 3, "masks": 0}
+"""Number of clicks of each description of the object; 0 for masks."""
 QUICK = ("bear_duvet_wall_wardrobe", "dog_grass_toys", "bear_floor_table", "robot_chair")
 
 
-def trained(room: Room, options: argparse.Namespace) -> GaussianCloud:
-    """Train a capture from the photos of ``room``, as ``egs-warp train`` does."""
+def trained(scene: SyntheticScene, options: argparse.Namespace) -> GaussianCloud:
+    """Train a capture from the photos of ``scene``, as ``egs-warp train`` does."""
     from egs_warp.pipelines.train_capture import train
 
     with tempfile.TemporaryDirectory() as folder:
-        names = [f"photo{number}.png" for number in range(len(room.cameras))]
-        for name, photo in zip(names, room.photos(), strict=True):
+        names = [f"photo{number}.png" for number in range(len(scene.cameras))]
+        for name, photo in zip(names, scene.photos(), strict=True):
             write_png(Path(folder, name), np.rint(255.0 * photo).astype(np.uint8))
-        write_cameras(Path(folder, "cameras.json"), room.cameras, names)
+        write_cameras(Path(folder, "cameras.json"), scene.cameras, names)
         return train(
             folder,
             iterations=options.train,
-            max_gaussians=room.cloud.count,
+            max_gaussians=scene.cloud.count,
             seed=options.seed,
             device=options.device,
         ).cloud
 
 
-def rows_of(room: Room, cloud: GaussianCloud, options: argparse.Namespace) -> tuple[list[Row], np.ndarray]:
-    """Return the row of each way to describe the object, and the pictures of the object in the first judged view."""
-    views = room.drawn.views
+def rows_of(scene: SyntheticScene, cloud: GaussianCloud, options: argparse.Namespace) -> tuple[list[Row], np.ndarray]:
+    """Return the row of each description of the object, and the pictures of the object in the first judged view."""
+    views = scene.drawn.views
     rows: list[Row] = []
     pictures = []
-    for way, count in WAYS.items():
-        row: Row = {"room": room.name, "way": way, "gaussians": cloud.count, "iou": 0.0, "success": False}
+    for how, count in CLICKS.items():
+        row: Row = {"scene": scene.name, "how": how, "gaussians": cloud.count, "iou": 0.0, "success": False}
         seconds: dict[str, float] = {}
         try:
             spec, written = (
-                clicked(room.drawn, cloud, room.cameras, count)
+                clicked(scene.drawn, cloud, scene.cameras, count)
                 if count
                 else (ObjectSpec(masks=tuple(MaskedView(v.camera, v.mask, "mask") for v in views[CLICKED])), [])
             )
-            located, object_cloud, _ = found_by(cloud, spec, room.cameras, seconds)
+            located, object_cloud, _ = found_by(cloud, spec, scene.cameras, seconds)
             cleared = cleared_row(cloud, located)
         except UserError as error:
             rows.append({**row, "message": str(error)})
             pictures.append(np.full((320, 320, 3), 255, np.uint8))
             continue
-        eyes = picture_cameras(located.plane, located.centre, located.size, room.cameras)
+        eyes = picture_cameras(located.plane, located.centre, located.size, scene.cameras)
         judged = [overlap(cloud, object_cloud, view) for view in views[JUDGED]]
         ious = [one[0] for one in judged]
         row |= {"iou": float(np.mean(ious)), "ious": ious, "clicks": written, **cleared}
@@ -111,9 +111,9 @@ def is_clear(row: Row) -> bool:
     return row["finite"] and 0 < row["after"] <= MAX_RATIO * row["before"]
 
 
-def judged(rows: Sequence[Row], names: Sequence[str]) -> dict[str, bool]:
+def aims_of(rows: Sequence[Row], names: Sequence[str]) -> dict[str, bool]:
     """Return the aims."""
-    successes = {way: sum(row["success"] for row in rows if row["way"] == way) for way in WAYS}
+    successes = {how: sum(row["success"] for row in rows if row["how"] == how) for how in CLICKS}
     return {
         "one_click": successes["1 click"] >= 0.9 * len(names),
         "three_clicks": successes["3 clicks"] == len(names),
@@ -131,31 +131,39 @@ def main(arguments: Sequence[str] | None = None) -> None:
         seed="seed of the rooms",
         plot="image of the object alone in a judged view, from one click, three and masks; red: missing, blue: excess",
     )
-    parser.add_argument("--only", nargs="*", metavar="ROOM", choices=ROOMS, help="only these rooms")
+    parser.add_argument("--only", nargs="*", metavar="ROOM", choices=SCENES, help="only these rooms")
     parser.add_argument("--density", type=float, default=1.0, help="factor of the number of Gaussians")
-    parser.add_argument("--train", type=int, metavar="STEPS", help="train each room from its photos, in so many steps")
+    parser.add_argument("--train", type=int, metavar="STEPS", help="train the captures from photos, in so many steps")
     options = parser.parse_args(arguments)
-    names = options.only or (QUICK if options.quick else tuple(ROOMS))
+    names = options.only or (QUICK if options.quick else tuple(SCENES))
     rows: list[Row] = []
     figure: list[np.ndarray] = []
     table = Table(
-        room="<26", way="<8", IoU=".3f", before="d", after="d", find_s="6.1f", clear_s="6.1f", success="<7", message="<"
+        scene="<26",
+        how="<8",
+        IoU=".3f",
+        before="d",
+        after="d",
+        find_s="6.1f",
+        clear_s="6.1f",
+        success="<7",
+        message="<",
     )
     for name in names:
-        room = build_room(name, seed=options.seed, density=options.density, device=options.device)
-        cloud = trained(room, options) if options.train else room.cloud
-        more, shown = rows_of(room, cloud, options)
+        scene = build_scene(name, seed=options.seed, density=options.density, device=options.device)
+        cloud = trained(scene, options) if options.train else scene.cloud
+        more, shown = rows_of(scene, cloud, options)
         rows += more
         figure.append(shown)
         for row in more:
             table.row(
-                *(name, row["way"], row["iou"], row.get("before"), row.get("after")),
+                *(name, row["how"], row["iou"], row.get("before"), row.get("after")),
                 sum(row["seconds"].values()) if "seconds" in row else None,
                 row.get("clearing_seconds"),
                 "yes" if row["success"] else "no",
                 row.get("message", row.get("clearing_message", " ".join(row.get("clicks", ())))),
             )
-    report(options, rows, aims=judged(rows, names), packages=["torch"], picture=np.concatenate(figure))
+    report(options, rows, aims=aims_of(rows, names), packages=["torch"], picture=np.concatenate(figure))
 
 
 if __name__ == "__main__":

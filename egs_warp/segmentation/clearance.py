@@ -146,9 +146,9 @@ def clear_plane(
         views = views_above(cloud, plane, cameras or foot_ring(cloud, plane))
     fine = cloud
     fine_reach = options.fine_reach * float(np.quantile(heights, 0.998))
-    most = int((1.0 + options.max_growth) * cloud.count)
+    max_count = int((1.0 + options.max_growth) * cloud.count)
     for _ in range(options.subdivisions):
-        fine = _subdivided(fine, plane, options.reach, fine_reach, most)
+        fine = _subdivided(fine, plane, options.reach, fine_reach, max_count)
     tuned = _finetuned(fine, plane, views, surroundings, options, progress)
     above = plane.heights(tuned.means.numpy()) > 0.0
     if not above.any():
@@ -220,16 +220,16 @@ def foot_ring(cloud: GaussianCloud, plane: Plane, *, size: int = 256) -> list[Ca
 
 
 def _subdivided(
-    cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure, fine_reach: float, most: int
+    cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure, fine_reach: float, max_count: int
 ) -> GaussianCloud:
     """Split straddling Gaussians that extend farther than ``fine_reach`` (scene units) in three, along the axis that
-    extends farthest across the plane; those that extend farthest first, up to ``most`` Gaussians in all. Children with
-    means below the plane are removed."""
+    extends farthest across the plane; those that extend farthest come first, up to ``max_count`` Gaussians in all.
+    Children with means below the plane are removed."""
     offsets, shrink = child_layout(SplitRule.MEASURED)
     heights, extent = plane_extents(cloud, plane, reach)
     parents = np.flatnonzero((np.abs(heights) < extent) & (extent > fine_reach))
     farthest = np.argsort(-extent[parents], kind="stable")
-    parents = np.sort(parents[farthest[: max(most - cloud.count, 0) // (len(offsets) - 1)]])
+    parents = np.sort(parents[farthest[: max(max_count - cloud.count, 0) // (len(offsets) - 1)]])
     if len(parents) == 0:
         return cloud
     unchanged = np.setdiff1d(np.arange(cloud.count), parents)

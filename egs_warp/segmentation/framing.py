@@ -42,8 +42,8 @@ def with_framing(cloud: GaussianCloud, spec: ObjectSpec, cameras: Sequence[Camer
     showing = showing[:: -(-len(showing) // _MAX_PHOTOS)]
     means = cloud.means.numpy().astype(np.float64)
     share = sum(_in_frame(means, camera).astype(np.float64) for camera in showing) / len(showing)
-    beside = np.flatnonzero(share <= _MAX_SHARE)
-    if len(beside) == 0:
+    background = np.flatnonzero(share <= _MAX_SHARE)
+    if len(background) == 0:
         return spec
     clicks = spec.clicks
     if not any(click.inside for click in clicks):
@@ -53,7 +53,7 @@ def with_framing(cloud: GaussianCloud, spec: ObjectSpec, cameras: Sequence[Camer
         nearest = KDTree(means[solid]).query(spec.point, k=min(_HITS, len(solid)))[1]
         clicks = (Click(spec.point, solid[np.ravel(nearest)]), *clicks)
     wanted = np.concatenate([click.hits for click in clicks if click.inside])
-    return replace(spec, clicks=(*clicks, Click(spec.point, np.setdiff1d(beside, wanted), inside=False)))
+    return replace(spec, clicks=(*clicks, Click(spec.point, np.setdiff1d(background, wanted), inside=False)))
 
 
 def _in_frame(points: np.ndarray, camera: Camera) -> np.ndarray:

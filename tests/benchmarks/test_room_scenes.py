@@ -38,10 +38,12 @@ def test_samples_are_even_on_the_surface(scenes: ModuleType) -> None:
 
 def test_there_are_twenty_rooms(scenes: ModuleType) -> None:
     """At least 20, with all toys, on every kind of support and beside every kind of neighbour."""
-    plans = scenes.ROOMS.values()
-    assert len(plans) >= 20 and {plan.toy for plan in plans} == set(scenes.solids.TOYS)
-    assert {"duvet", "floor", "carpet", "grass", "table", "chair", "sofa", "shelf"} == {plan.support for plan in plans}
-    assert {"wall", "wardrobe", "toys", "pillow", "table"} == {name for plan in plans for name in plan.beside}
+    layouts = scenes.SCENES.values()
+    assert len(layouts) >= 20 and {layout.toy for layout in layouts} == set(scenes.solids.TOYS)
+    assert {"duvet", "floor", "carpet", "grass", "table", "chair", "sofa", "shelf"} == {
+        layout.support for layout in layouts
+    }
+    assert {"wall", "wardrobe", "toys", "pillow", "table"} == {name for layout in layouts for name in layout.neighbours}
 
 
 @pytest.mark.slow
@@ -49,18 +51,18 @@ def test_there_are_twenty_rooms(scenes: ModuleType) -> None:
 def test_a_room_and_its_truth(scenes: ModuleType, name: str) -> None:
     """Equal arguments give equal bits. The object is in the middle of every annotated photo, and the outline is that of
     the labelled Gaussians; the cameras are upright."""
-    room, again = (scenes.build_room(name, density=0.3, device="cpu") for _ in range(2))
+    scene, again = (scenes.build_scene(name, density=0.3, device="cpu") for _ in range(2))
     for array in ARRAYS:
-        np.testing.assert_array_equal(getattr(room.cloud, array).numpy(), getattr(again.cloud, array).numpy())
-    other = scenes.build_room(name, seed=1, density=0.3, device="cpu")
-    assert other.cloud.count != room.cloud.count
-    assert 0.05 < room.is_object.mean() < 0.4
-    middle = room.cloud.means.numpy()[room.is_object].mean(axis=0)
-    for view in room.drawn.views:
+        np.testing.assert_array_equal(getattr(scene.cloud, array).numpy(), getattr(again.cloud, array).numpy())
+    other = scenes.build_scene(name, seed=1, density=0.3, device="cpu")
+    assert other.cloud.count != scene.cloud.count
+    assert 0.05 < scene.is_object.mean() < 0.4
+    middle = scene.cloud.means.numpy()[scene.is_object].mean(axis=0)
+    for view in scene.drawn.views:
         x, y, z = view.camera.rotation @ middle + view.camera.translation
         u, v = view.camera.cx + view.camera.fx * x / z, view.camera.cy + view.camera.fy * y / z
         assert abs(u / view.camera.width - 0.5) < 0.25 and abs(v / view.camera.height - 0.5) < 0.25
         assert 0.01 < view.mask.mean() < 0.5 and view.hidden is not None and not (view.mask & view.hidden).any()
-    rights = np.array([camera.rotation[0] for camera in room.cameras])
+    rights = np.array([camera.rotation[0] for camera in scene.cameras])
     spread = np.linalg.eigvalsh(rights.T @ rights)
     assert spread[0] < 0.1 * spread[1]
