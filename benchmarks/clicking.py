@@ -41,7 +41,7 @@ def overlap(cloud: GaussianCloud, object_cloud: GaussianCloud, view: DrawnView) 
     counts = whole | alone
     if view.hidden is not None:
         counts &= ~view.hidden
-    missing, more = view.mask & ~alone & counts, alone & ~view.mask
+    missing, more = view.mask & ~alone & counts, alone & ~view.mask & counts
     union = (view.mask | alone) & counts
     return float((view.mask & alone).sum() / max(union.sum(), 1)), missing, more
 

@@ -78,6 +78,20 @@ def test_overlap_counts_missing_and_excess_pixels(annotated: ModuleType, clickin
     assert more.sum() == (own & ~shifted).sum() and 0 < missing.sum() <= (shifted & ~own).sum()
 
 
+def test_overlap_ignores_hidden_pixels(annotated: ModuleType, clicking: ModuleType) -> None:
+    """Something hides the left half of a ball: that half is neither in excess nor missing."""
+    ball = round_ones(shell(), 0.03)
+    camera = front()
+    own = clicking.render_gaussians(ball, camera).alpha.numpy() > 0.5
+    left = np.indices(own.shape)[1] < 60
+    view = annotated.DrawnView(camera, own & ~left, np.zeros((0, 2)), own & left)
+    iou, missing, more = clicking.overlap(ball, ball, view)
+    assert iou == 1.0 and not missing.any() and not more.any()
+    half = annotated.DrawnView(camera, own & ~left, np.zeros((0, 2)))
+    iou, _, more = clicking.overlap(ball, ball, half)
+    assert iou < 0.6 and (more == (own & left)).all()
+
+
 def test_prompts_are_at_the_innermost_pixel(clicking: ModuleType) -> None:
     mask = np.zeros((60, 80), bool)
     mask[10:31, 20:61] = True
