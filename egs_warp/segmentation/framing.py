@@ -16,9 +16,9 @@ from egs_warp.segmentation.object_spec import ObjectSpec
 
 _MIN_PHOTOS, _MAX_PHOTOS = 8, 32
 """Number of photos below which framing says nothing, and number above which they are thinned out evenly."""
-_MAX_SHARE = 0.25
+_MAX_SHARE = 0.1
 """Share of the photos of the object in whose frame a Gaussian may lie and still be background. Shares from 0.1 to 0.5
-give the same object in the procedural rooms."""
+give the same object for a bear on a duvet; a small one spares objects that were photographed in parts."""
 _HITS, _SOLID = 8, 0.3
 """Number of Gaussians next to a point that stand for a click, and their minimum opacity."""
 
