@@ -173,6 +173,7 @@ def simulate(
     style: Style | None = None,
     pushes: Sequence[Push] = (),
     get_up: bool = True,
+    ends_at_fall: bool = False,
     activations: np.ndarray | None = None,
     parts: Callable[[], Path] | None = None,
     resume: Path | None = None,
@@ -190,6 +191,7 @@ def simulate(
         style: Style of jumps; None is the default.
         pushes: Pushes during the run.
         get_up: If the body falls, get up and continue.
+        ends_at_fall: If the body falls, end the run at the step at which that is detected.
         activations: (steps, M) m, prescribed muscle activations of each solver step. The motion then only defines what
             is measured, and the run ends with the last row.
         parts: Returns the folder that receives the finished steps; None writes none.
@@ -203,6 +205,7 @@ def simulate(
     motion = script(motion) if isinstance(motion, str) else motion
     if activations is not None:
         activations = checked_activations(creature, activations, step)
+    get_up = get_up and not ends_at_fall
     place = initial_stance(creature, step=step, style=style)
     expected = motion.check(place)
     sequence = MotionSequence(place, motion.parts(creature.body.height))
@@ -230,6 +233,7 @@ def simulate(
         parts=parts,
         resume=resume,
         finished=lambda: frames is None and is_over(),
+        aborted=lambda: ends_at_fall and watch.fallen is not None,
         kicks=PushKicks(place, pushes),
         activations=activations,
         progress=lambda last: progress(
