@@ -10,7 +10,6 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.stepper import LocomotionStepper
-from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.fall_monitor import FallMonitor
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.push import Push
@@ -116,11 +115,3 @@ def test_an_interrupted_take_is_continued(
         perform(tmp_path / "parts", resumed=False, last=interrupted)
     assert positions(perform(tmp_path / "parts", resumed=True)) == whole
     assert calls <= count - interrupted + 10, "at most the steps of an unfinished part are solved again"
-
-
-@pytest.mark.slow
-def test_a_jump_that_falls_lands_in_a_gentler_take() -> None:
-    """Asked for three body heights ahead and one up, the coarse pawn tumbles."""
-    run, takes = simulate_takes(coarse_pawn(), motion("jump 3 1"))
-    assert takes[0].state is State.FALLEN and takes[-1].state in (State.DONE, State.NOT_AS_REQUESTED)
-    assert run.sequence.done[0].motion.is_at_rest and measure(run.trajectory).tilt_degrees < 5.0
