@@ -220,7 +220,7 @@ class Take:
     """One simulation of a run."""
 
     change: str | None
-    """What is gentler than requested; None in the first take."""
+    """Gentler form of a motion, for messages; None in the first take."""
     state: State
     """State of the first motion that failed; the worst state of all motions if none did."""
     note: str

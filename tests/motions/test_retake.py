@@ -57,7 +57,7 @@ def test_walks_take_shorter_steps_to_the_same_place(text: str, place: Stance) ->
 
 
 def test_other_motions_have_no_retake() -> None:
-    """What stands, follows key frames or beats, or is controlled has nothing that could be gentler."""
+    """Standing, getting up, and motions under commands, beats or key frames are as gentle as they are requested."""
     assert [name for name, kind in MOTIONS.items() if not kind.retakes] == [
         "drive",
         "stand",
