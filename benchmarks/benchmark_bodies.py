@@ -106,6 +106,18 @@ def _obj(path: Path, picture_of_material: dict[str, str]) -> _Textured:
     )
 
 
+def _plain_obj(path: Path) -> _Textured:
+    """Read a Wavefront OBJ file of triangles without textures, as light grey."""
+    lines = [line.split() for line in path.read_text().splitlines()]
+    vertices = np.array([words[1:4] for words in lines if words[:1] == ["v"]], np.float64)
+    corners = [[int(part.split("/")[0]) - 1 for part in words[1:4]] for words in lines if words[:1] == ["f"]]
+    count = len(corners)
+    grey = np.full((1, 1, 3), 200, np.uint8)
+    return _Textured(
+        _standing(vertices), np.array(corners, np.int32), np.zeros((count, 3, 2)), (grey,), np.zeros(count, int)
+    )
+
+
 def _glb(path: Path) -> _Textured:
     """Read the only mesh of a binary glTF file whose nodes have no rotation, with its first texture."""
     data = path.read_bytes()
@@ -225,6 +237,8 @@ _MAKERS: dict[str, Callable[[str], Body]] = {
     ),
     "cat": _mesh(lambda: _glb(_meshes() / "cat" / "cat.glb")),
     "spot": _mesh(lambda: _obj(_meshes() / "spot" / "spot_triangulated.obj", {"": "spot_texture.png"})),
+    "cow": _mesh(lambda: _plain_obj(_meshes() / "cow" / "cow.obj")),
+    "cheburashka": _mesh(lambda: _plain_obj(_meshes() / "cheburashka" / "cheburashka.obj")),
     "figurine": _built_in(figurine),
     "pawn": _built_in(pawn),
     "stool": _built_in(stool),

@@ -107,6 +107,11 @@ def add_parser(commands: Commands) -> None:
         "--frames", type=int, help="number of frames at 60 Hz, the first at rest (default: until the body is at rest)"
     )
     motion.add_argument("--no-get-up", action="store_true", help="end the run if the body falls")
+    motion.add_argument(
+        "--no-retakes",
+        action="store_true",
+        help="if the body falls, show that instead of simulating a gentler motion (docs/motions/retakes.md)",
+    )
     body.add_argument(
         "--front",
         help="direction in which the body faces and moves: x,y,z or an axis, as --front=-x (default: estimated)",
@@ -342,6 +347,7 @@ def _options(args: argparse.Namespace) -> AnimateOptions:
         shadow=not args.no_shadow,
         preview=args.preview,
         get_up=not args.no_get_up,
+        retakes=not args.no_retakes,
         source=Path(args.capture).name,
         creature=CreatureOptions(**flags("metres_per_unit", "friction")),
     )

@@ -74,6 +74,7 @@ def roll_out(
     parts: Callable[[], Path] | None = None,
     resume: Path | None = None,
     finished: Callable[[], bool] = lambda: False,
+    aborted: Callable[[], bool] = lambda: False,
     kicks: Callable[[float, float], np.ndarray | None] = lambda time, dt: None,
     activations: np.ndarray | None = None,
     progress: Callable[[int], object] = lambda frame: None,
@@ -93,6 +94,7 @@ def roll_out(
         parts: function that returns the folder in which steps are recorded (``Recorder``).
         resume: folder of a recording whose steps are not solved again (``Replay``).
         finished: function that returns True once the motion has finished.
+        aborted: function that returns True if the run ends before the step for which the motion has just been called.
         kicks: function of time and step size, s, that returns the velocities (N, 3) m/s which external pushes add to
             the nodes in that step, or None.
         activations: (steps, M) m, prescribed activations, which replace the planned ones; the run ends with the last
@@ -126,6 +128,8 @@ def roll_out(
         for part in range(per_frame):
             with one_blas_thread():
                 objectives = motion.objectives(state, reports[-1] if reports else None, dt)
+            if aborted():
+                break
             kick = kicks(state.time, dt)
             step_activations = None if activations is None else activations[frame * per_frame + part]
             prescribed = [each for each in (kick, step_activations) if each is not None]
@@ -148,7 +152,7 @@ def roll_out(
             shown.append(len(reports))
         progress(frame)
         resting = resting + 1 if finished() else 0
-        if stopped or resting == REST_FRAMES:
+        if stopped or resting == REST_FRAMES or aborted():
             break
     return RolloutResult(recorder.trajectory(), tuple(reports), np.array(shown), stopped)
 

@@ -16,7 +16,9 @@ _JUMP_HEIGHT = 0.3
 """Height in body heights of the jump in which a ball turns about the up axis."""
 
 
-def move_along(stance: Stance, route: Route, step_length: float, *, speed: float = 1.0) -> BodyMotion:
+def move_along(
+    stance: Stance, route: Route, step_length: float, *, speed: float = 1.0, step_fraction: float = 1.0
+) -> BodyMotion:
     """Return the motion that moves a body along a route.
 
     Args:
@@ -24,6 +26,7 @@ def move_along(stance: Stance, route: Route, step_length: float, *, speed: float
         route: route to follow.
         step_length: length of the steps of a walk, m.
         speed: relative to the nominal speed.
+        step_fraction: fraction of the longest and most turned steps of a walk that its steps use.
 
     Raises:
         UserError: if the body cannot move, or the route leads over a step in the ground.
@@ -33,12 +36,14 @@ def move_along(stance: Stance, route: Route, step_length: float, *, speed: float
         return Crawl(stance, route, speed=speed)
     if base is SupportKind.ROUND_BASE:
         return Roll(stance, route, speed=speed)
-    return Walk(stance, route, step_length, speed=speed)
+    return Walk(stance, route, step_length, speed=speed, step_fraction=step_fraction)
 
 
-def turn_in_place(stance: Stance, angle: float, step_length: float, *, speed: float = 1.0) -> BodyMotion:
+def turn_in_place(
+    stance: Stance, angle: float, step_length: float, *, speed: float = 1.0, step_fraction: float = 1.0
+) -> BodyMotion:
     """Return the motion that turns the body by ``angle`` radians on the spot. A ball, which stands on a point, turns in
     a jump; other bodies turn as in ``move_along``."""
     if stance.base() is SupportKind.ROUND_BASE:
         return Turn(stance, JumpTarget(0.0, _JUMP_HEIGHT * stance.body.height), angle)
-    return move_along(stance, turn_route(angle), step_length, speed=speed)
+    return move_along(stance, turn_route(angle), step_length, speed=speed, step_fraction=step_fraction)

@@ -20,6 +20,7 @@ from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.keyframes import Key, read_keyframes
 from egs_warp.motions.request import MAX_TARGET, MAX_TURN, MotionRequest
+from egs_warp.motions.retake import Retake
 from egs_warp.motions.route import Route, path_route, read_path, straight_route
 from egs_warp.motions.sequence import BodyMotion, MotionTask, Stance
 from egs_warp.motions.stand import StandFor
@@ -29,6 +30,8 @@ from egs_warp.motions.values import Value
 
 _STEP = 0.1
 """Default length of a step, in body heights."""
+_STEP_FRACTION = "step_fraction"
+"""Value of a retake: length and turn of the steps, as a fraction of the usual ones."""
 _REST_FRAMES = 120
 """Frames after the requested time within which a standing body that was pushed comes to rest."""
 _CLOSING_FRAMES = 300
@@ -54,6 +57,8 @@ class MotionKind:
     """True if the motion consists of jumps, which have a style."""
     beats: bool = False
     """True if the motion accepts a file of beats instead of its numbers."""
+    retakes: tuple[Retake, ...] = ()
+    """Changes of the motion for the first and each further retake after a fall."""
 
     def usage(self, name: str) -> str:
         """Describe the parameters of the motion called ``name``, for messages."""
@@ -88,8 +93,12 @@ def _twist_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
 
 
 def _route_tasks(request: MotionRequest, values: Mapping[str, float], route: Route, height: float) -> list[MotionTask]:
-    length = values.get("step_length", _STEP) * height
-    return _repeat_task(request, values, lambda stance: move_along(stance, route, length, speed=values["speed"]))
+    length, fraction = values.get("step_length", _STEP) * height, values.get(_STEP_FRACTION, 1.0)
+    return _repeat_task(
+        request,
+        values,
+        lambda stance: move_along(stance, route, length, speed=values["speed"], step_fraction=fraction),
+    )
 
 
 def _walk_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
@@ -111,7 +120,12 @@ def _walk_along_tasks(request: MotionRequest, height: float) -> list[MotionTask]
 def _turn_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     angle = float(np.radians(request.asked["heading_degrees"]))
     values, length = {**request.asked, "distance": 0.0}, _STEP * height
-    return _repeat_task(request, values, lambda stance: turn_in_place(stance, angle, length, speed=values["speed"]))
+    fraction = values.get(_STEP_FRACTION, 1.0)
+    return _repeat_task(
+        request,
+        values,
+        lambda stance: turn_in_place(stance, angle, length, speed=values["speed"], step_fraction=fraction),
+    )
 
 
 def _stand_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
@@ -124,8 +138,13 @@ def _get_up_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
 
 
 def _run_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
-    route, length = straight_route(request.asked["distance"] * height), MAX_TARGET * height
-    return _repeat_task(request, request.asked, lambda stance: move_along(stance, route, length, speed=_SPEED.maximum))
+    asked, route = request.asked, straight_route(request.asked["distance"] * height)
+    speed, fraction = asked.get("speed", _SPEED.maximum), asked.get(_STEP_FRACTION, 1.0)
+    return _repeat_task(
+        request,
+        asked,
+        lambda stance: move_along(stance, route, MAX_TARGET * height, speed=speed, step_fraction=fraction),
+    )
 
 
 def _dance_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
@@ -199,18 +218,36 @@ def _length(name: str, default: float, *, is_exclusive: bool = False) -> Value:
     return Value(name, default, 0.0, MAX_TARGET, "body heights", is_exclusive=is_exclusive)
 
 
+_SOFT = {"timing": 1.25, "squash": 1.5}
+_JUMP_RETAKES = (
+    Retake("slower and softer", style=_SOFT),
+    Retake("slower, softer, lower and shorter", {"distance": 0.6, "height": 0.6, "heading_degrees": 0.6}, style=_SOFT),
+)
+_WALK_RETAKES = (
+    Retake("in steps of half the length", replacements={_STEP_FRACTION: 0.5}),
+    Retake("in steps of a quarter of the length", replacements={_STEP_FRACTION: 0.25}),
+)
+_RUN_RETAKES = tuple(
+    replace(
+        retake, change=f"at the speed of a walk, {retake.change}", replacements={**retake.replacements, "speed": 1.0}
+    )
+    for retake in _WALK_RETAKES
+)
+
 MOTIONS: Mapping[str, MotionKind] = {
     "jump": MotionKind(
         (_length("distance", 0.5), _length("height", 0.2, is_exclusive=True)),
         _jump_tasks,
         lambda request: 120,
         jumps=True,
+        retakes=_JUMP_RETAKES,
     ),
     "hop": MotionKind(
         (_length("distance", 0.7, is_exclusive=True), _length("height", 0.3, is_exclusive=True)),
         _hop_tasks,
         lambda request: 150,
         jumps=True,
+        retakes=_JUMP_RETAKES,
     ),
     "twist": MotionKind(
         (
@@ -221,6 +258,7 @@ MOTIONS: Mapping[str, MotionKind] = {
         _twist_tasks,
         lambda request: 480,
         jumps=True,
+        retakes=_JUMP_RETAKES,
     ),
     "walk": MotionKind(
         (
@@ -230,6 +268,7 @@ MOTIONS: Mapping[str, MotionKind] = {
         ),
         _walk_tasks,
         lambda request: _frames_of_walk(abs(request.asked["distance"]), request),
+        retakes=_WALK_RETAKES,
     ),
     "walk to": MotionKind(
         (
@@ -242,22 +281,26 @@ MOTIONS: Mapping[str, MotionKind] = {
         lambda request: _frames_of_walk(
             _path_length(np.array([[request.asked["ahead"], request.asked["left"]]])), request
         ),
+        retakes=_WALK_RETAKES,
     ),
     "walk along": MotionKind(
         (_STEP_LENGTH, _SPEED),
         _walk_along_tasks,
         lambda request: _frames_of_walk(_path_length(_path(request)) + 2.0 * _TURN_PATH, request),
         file="a file of points, as in walk along way.csv",
+        retakes=_WALK_RETAKES,
     ),
     "run": MotionKind(
         (Value("distance", 1.0, -MAX_TARGET, MAX_TARGET, "body heights"),),
         _run_tasks,
         lambda request: 170 + int(np.ceil(36 * abs(request.asked["distance"]) / _MIN_STEP)),
+        retakes=_RUN_RETAKES,
     ),
     "turn": MotionKind(
         (Value("heading_degrees", 90.0, -MAX_TURN, MAX_TURN, "degrees"), _SPEED),
         _turn_tasks,
         lambda request: _frames_of_walk(_FULL_TURN_PATH * abs(request.asked["heading_degrees"]) / 360.0, request),
+        retakes=_WALK_RETAKES,
     ),
     "drive": MotionKind(
         (),
@@ -307,12 +350,23 @@ def kind_of_request(request: MotionRequest) -> MotionKind:
 
 def tasks_of_request(request: MotionRequest, height: float) -> list[MotionTask]:
     """Return the tasks of ``request``, with all repeats, for a body of ``height`` metres, in the style of the request
-    if it has one."""
-    parts, style = kind_of_request(request).build_tasks(request, height), request.style
-    if style is None:
-        return parts
-    return [replace(part, begin=partial(_begin_with_style, style, part.begin)) for part in parts]
+    if it has one. The tasks of a retake are gentler, and are judged by the values of the request."""
+    kind = kind_of_request(request)
+    parts = kind.build_tasks(request, height)
+    if request.retake == 0:
+        return parts if request.style is None else [_styled(part, request.style, {}) for part in parts]
+    change = kind.retakes[request.retake - 1]
+    gentler = kind.build_tasks(replace(request, asked=change.values(request.asked)), height)
+    begins = [_styled(part, request.style, change.style).begin for part in gentler]
+    return [replace(part, begin=begin) for part, begin in zip(parts, begins, strict=True)]
 
 
-def _begin_with_style(style: Style, begin: Callable[[Stance], BodyMotion], stance: Stance) -> BodyMotion:
-    return begin(replace(stance, style=style))
+def _styled(task: MotionTask, style: Style | None, factors: Mapping[str, float]) -> MotionTask:
+    """Return ``task`` in ``style``, that of the run if it is None, multiplied by ``factors``."""
+    return replace(task, begin=partial(_begin_in_style, style, factors, task.begin))
+
+
+def _begin_in_style(
+    style: Style | None, factors: Mapping[str, float], begin: Callable[[Stance], BodyMotion], stance: Stance
+) -> BodyMotion:
+    return begin(replace(stance, style=(style or stance.style).scaled(factors)))

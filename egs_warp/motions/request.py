@@ -37,3 +37,5 @@ class MotionRequest:
     """Time limit of a motion that is not in the registry, s."""
     style: Style | None = None
     """Style of its jumps, if it differs from that of the run."""
+    retake: int = 0
+    """Number of times that the motion has been made gentler (``egs_warp.motions.retake``)."""

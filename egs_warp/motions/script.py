@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.io.text import parse_json, read_text, whole_number
 from egs_warp.motions.beats import parse_beats
@@ -74,6 +76,19 @@ class Script:
     def parts(self, height: float) -> list[MotionTask]:
         """Return the tasks of all motions in order, for a body of ``height`` metres."""
         return [part for request in self.requests for part in tasks_of_request(request, height)]
+
+    def retake(self, number: int) -> tuple[Script, str] | None:
+        """Return the script for a retake after a fall in the motion with this ``number`` (0, 1, ...), and what is
+        changed, for messages; None if that motion has no gentler form."""
+        ends = np.cumsum([request.repeat for request in self.requests])
+        index = int(np.searchsorted(ends, number, side="right"))
+        request = self.requests[index]
+        retakes = kind_of_request(request).retakes
+        if request.retake == len(retakes):
+            return None
+        gentler = replace(request, retake=request.retake + 1)
+        change = f"{request.name} {retakes[request.retake].change}"
+        return Script((*self.requests[:index], gentler, *self.requests[index + 1 :])), change
 
     def check(self, stance: Stance) -> list[float]:
         """Return the expected duration in seconds of each motion, for a body that stands at ``stance``.

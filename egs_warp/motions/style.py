@@ -32,6 +32,11 @@ class Style:
             if not MIN_FACTOR <= value <= MAX_FACTOR:
                 raise ArgumentError(name, f"give a number from {MIN_FACTOR:g} to {MAX_FACTOR:g}", value=value)
 
+    def scaled(self, factors: Mapping[str, float]) -> Style:
+        """Return the style with its numbers multiplied by ``factors``, within the bounds."""
+        scaled = {name: value * factors.get(name, 1.0) for name, value in vars(self).items()}
+        return Style(**{name: min(max(value, MIN_FACTOR), MAX_FACTOR) for name, value in scaled.items()})
+
     def __str__(self) -> str:
         """Return the text that ``read_style`` reads: a preset's name, or all numbers."""
         values = vars(self)

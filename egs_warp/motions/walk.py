@@ -65,6 +65,7 @@ class Walk:
         step_length: float,
         *,
         speed: float = 1.0,
+        step_fraction: float = 1.0,
         control: WalkControl | None = None,
     ) -> None:
         """Plan the walk of the body that stands at ``stance``.
@@ -74,6 +75,7 @@ class Walk:
             route: route to follow.
             step_length: step length in metres; it is reduced to the longest step that the body can make.
             speed: relative to the nominal speed.
+            step_fraction: fraction of the longest and most turned steps that are used.
             control: weights and gains.
 
         Raises:
@@ -107,7 +109,7 @@ class Walk:
             raise UserError(
                 f"walk: friction {stance.friction:g} cannot turn the body about a side of its base; jump or hop"
             )
-        self.planar_poses = route(limits)
+        self.planar_poses = route(StepLimits(step_fraction * limits.length, step_fraction * limits.turn))
         """(P+1, 3) planar poses of the body before the first and after each step, see ``motions.route``."""
         check_route(stance, self.planar_poses)
         step_count, lift, timing = len(self.planar_poses) - 1, self._posture.lift, self._posture.timing

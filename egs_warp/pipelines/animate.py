@@ -37,7 +37,8 @@ from egs_warp.pipelines.progress import preparation_bar, simulation_bar
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run
 from egs_warp.pipelines.shot import MAX_SIDE, MIN_SIDE, Shot
-from egs_warp.pipelines.simulated_run import check_frames, simulate
+from egs_warp.pipelines.simulated_run import check_frames
+from egs_warp.pipelines.takes import simulate_takes
 
 PREVIEW_GAUSSIANS = 50_000
 """Gaussians of a preview."""
@@ -66,6 +67,9 @@ class AnimateOptions:
     """Pushes during the run (``egs_warp.motions.push``)."""
     get_up: bool = True
     """If the body falls, get up and continue."""
+    retakes: bool = True
+    """If the body falls and nothing pushes it, simulate its motion again in a gentler form
+    (``egs_warp.pipelines.takes``)."""
     frames: int | None = None
     """Frames at 60 Hz, the first at rest; None runs until the last motion has come to rest."""
     size: int = 512
@@ -138,6 +142,7 @@ class AnimateOptions:
             "shadow": self.shadow,
             "preview": self.preview,
             "get_up": self.get_up,
+            "retakes": self.retakes,
             **self.shot.to_json(),
             "up": _numbers(up),
             "plane": None if plane is None else [*map(float, plane.normal), plane.offset],
@@ -215,6 +220,11 @@ def animate(
         notes = [*creature.notes, *fronts, *warnings, *([] if balance is None else [balance])]
         for note in notes:
             show_note(note)
+
+        def add_note(note: str) -> None:
+            notes.append(note)
+            show_note(note)
+
         film_note = None
         if not options.preview and creature.cloud.count > PREVIEW_GAUSSIANS:
             seconds = picture_seconds(creature, size=options.picture_size, shadow=options.shadow)
@@ -226,15 +236,17 @@ def animate(
                 if film_note is not None:
                     film_note.update(done, expected)
 
-            performance = simulate(
+            performance, takes = simulate_takes(
                 creature,
                 requested_motion,
+                retakes=options.retakes,
                 frames=options.frames,
                 style=jump_style,
                 pushes=pushes,
                 get_up=options.get_up,
                 parts=lambda: run.file(PARTS),
-                resume=_recorded(run),
+                resume=run.path / PARTS if run.resumed else None,
+                show_note=add_note,
                 progress=show_progress,
             )
         # Saved first: an error while rendering does not lose the simulation.
@@ -275,6 +287,7 @@ def animate(
             asked=options.to_json(up=up, plane=plane),
             ending=performance.ending,
             film=film.file,
+            takes=takes,
         )
         report.write(run.file("report.json"))
         if not isinstance(out, RunFolder):
@@ -303,12 +316,6 @@ def _preview_note(options: AnimateOptions, film: Film) -> tuple[str, ...]:
         f"preview: {drawn} of {film.splats.count} Gaussians at {width}x{height} pixels; egs-warp render draws the run"
         " in full",
     )
-
-
-def _recorded(run: RunFolder) -> Path | None:
-    """Return the folder with the finished steps of a resumed run; None if there are none."""
-    folder = run.path / PARTS
-    return folder if run.resumed and any(folder.glob("*.npz")) else None
 
 
 def _numbers(vector: Direction | None) -> tuple[float, ...] | None:

@@ -110,5 +110,6 @@ def missed_targets(requested: Mapping[str, float], reached: MotionOutcome) -> li
         # A jump may rise higher than requested, onto a step.
         error = target - value if name == "height" else abs(target - value)
         if error > max(absolute, relative * abs(target)):
-            missed.append(f"{name.partition('_')[0]} {value:.2g} of {target:g} {_UNITS[name]}")
+            text = f"{value:.0f}" if name == "heading_degrees" else f"{value:.2g}"
+            missed.append(f"{name.partition('_')[0]} {text} of {target:g} {_UNITS[name]}")
     return missed

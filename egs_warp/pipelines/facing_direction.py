@@ -38,15 +38,21 @@ _OPAQUE = 0.8
 """Coverage above which a pixel belongs to the body."""
 _SILHOUETTE = 0.5
 """Weight of the coverage relative to the colours, 0 to 1."""
-_HIGH, _LOW = 0.7, 0.3
-"""Heights above which the head is, and below which the feet are, body heights."""
+_HIGH, _TOP, _LOW = 0.7, 0.85, 0.3
+"""Heights above which the upper part and the top are, and below which the feet are, body heights. The upper part of an
+animal on four legs is mostly its trunk, the top is its head."""
 _MAX_HEAD_ASPECT = 2.7
-"""Ratio of width to depth above which a head is taken for the back of a chair."""
-_SYMMETRY, _LEAN, _PHOTOS = 2.0, 1.5, 1.0
-"""Weights of the symmetric fraction of a picture, of a lean of one body height, and of photos that are all from one
-direction; the weight of detail is 1."""
+"""Ratio of width to depth above which an upper part is a plate."""
+_SYMMETRY, _LEAN, _TOP_LEAN, _PHOTOS = 2.0, 1.5, 1.0, 1.0
+"""Weights of the symmetric fraction of a picture, of leans of the upper part and of the top by one body height, and of
+photos that are all from one direction; the weight of detail is 1."""
 _CLEAR_MARGIN = 0.4
-"""Difference between the scores of front and back above which a result is clear; 1.5 times the detail gives it."""
+"""Difference between the scores of front and alternative above which a result is clear; 1.5 times the detail gives
+it."""
+_MIN_SYMMETRY = 0.1
+"""Smallest difference between the symmetry about the best plane and the median over all planes of a clear result."""
+_MIN_APART = np.radians(60.0)
+"""Smallest angle between the front and its alternative."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +63,19 @@ class Front:
     """(3,) Unit vector along the ground, in the frame of the body."""
     reason: str | None
     """Explanation of an estimate; None if the direction was given."""
+    alternative: np.ndarray | None = None
+    """(3,) Unit vector along the ground, the next best direction of an estimate that is not clear."""
 
     def description(self, frame: BodyFrame) -> str:
         """Return one line for the user; ``frame`` is that of the body in the capture."""
-        direction = ",".join(f"{x:.2f}" for x in frame.axes.T @ self.direction)
-        return (
-            f"front is {direction}, as given"
-            if self.reason is None
-            else f"front is taken to be {direction} ({self.reason})"
+        direction, alternative = (
+            None if vector is None else ",".join(f"{x:.2f}" for x in frame.axes.T @ vector)
+            for vector in (self.direction, self.alternative)
         )
+        if self.reason is None:
+            return f"front is {direction}, as given"
+        other = "" if alternative is None else f", but may be {alternative}"
+        return f"front is taken to be {direction}{other} ({self.reason})"
 
 
 def find_front(
@@ -88,21 +98,24 @@ def find_front(
     richer = np.log(np.maximum(detail, 1e-12) / np.maximum(np.roll(detail, _VIEWS // 2), 1e-12))
     angles = np.pi * np.arange(2 * _VIEWS) / _VIEWS
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    lean = _lean(mesh) @ directions.T
-    symmetric = np.tile(mirrored - np.median(mirrored), 2)
+    lean, top_lean = (_lean(mesh, height) @ directions.T for height in (_HIGH, _TOP))
+    symmetric_part = np.tile(mirrored - np.median(mirrored), 2)
     richer = np.stack([richer, 0.5 * (richer + np.roll(richer, -1))], axis=1).ravel()
     photos = np.zeros(len(directions)) if seen_from is None else seen_from[:2] @ directions.T
-    score = _SYMMETRY * symmetric + richer + _LEAN * lean + _PHOTOS * photos
+    score = _SYMMETRY * symmetric_part + richer + _LEAN * lean + _PHOTOS * photos
     length = _length(mesh)
     along = length @ directions.T
     allowed = np.abs(along) > np.abs(along).max() - 1e-9 if lengthwise else np.full(len(directions), True)
-    best = int(np.argmax(np.where(allowed, score, -np.inf)))
+    total = score + _TOP_LEAN * top_lean
+    best = int(np.argmax(np.where(allowed, total, -np.inf)))
     if lengthwise:
         angle = np.arctan2(*(np.sign(along[best]) * length)[::-1])
     else:
-        # The maximum of a parabola through the best score and its neighbours.
+        # The maximum of a parabola through the best score and its neighbours. The lean of the top only selects a
+        # direction: a head may be turned.
         before, at, after = score[best - 1], score[best], score[(best + 1) % len(score)]
-        angle = angles[best] + 0.5 * (before - after) / min(before - 2.0 * at + after, -1e-12) * np.pi / _VIEWS
+        offset = 0.5 * (before - after) / min(before - 2.0 * at + after, -1e-12)
+        angle = angles[best] + np.clip(offset, -1.0, 1.0) * np.pi / _VIEWS
     symmetric = f"the body is {100.0 * mirrored[best % _VIEWS]:.0f} % symmetric about this direction"
     reasons = [
         "the body lies along this direction" if lengthwise else symmetric,
@@ -111,10 +124,14 @@ def find_front(
     ]
     if abs(photos[best]) > 0.05:
         reasons.append(f"it was photographed from {'the front' if photos[best] > 0.0 else 'behind'}")
-    ahead = float(score[best] - score[(best + _VIEWS) % len(score)])
-    sure = "clearly" if ahead > _CLEAR_MARGIN else "narrowly"
-    why = f"guessed: {', '.join(reasons)}; {sure} better than the opposite; if it is wrong, give the front"
-    return Front(np.array([np.cos(angle), np.sin(angle), 0.0]), why)
+    apart = np.abs(np.angle(np.exp(1j * (angles - angles[best]))))
+    second = int(np.argmax(np.where(allowed & (apart >= _MIN_APART), total, -np.inf)))
+    margin = float(total[best] - total[second])
+    is_clear = margin > _CLEAR_MARGIN and (lengthwise or symmetric_part[best] > _MIN_SYMMETRY)
+    sure = "clearly" if is_clear else "not clearly"
+    why = f"guessed: {', '.join(reasons)}; {sure} better than the next best direction; if it is wrong, give the front"
+    alternative = None if is_clear else np.array([*directions[second], 0.0])
+    return Front(np.array([np.cos(angle), np.sin(angle), 0.0]), why, alternative)
 
 
 def _length(mesh: TetMesh) -> np.ndarray:
@@ -201,23 +218,25 @@ def _detail(picture: np.ndarray, height: float) -> float:
     return float(np.sqrt(difference / max(float(inside.sum()), 1.0)))
 
 
-def _lean(mesh: TetMesh) -> np.ndarray:
-    """Return the horizontal offset (2,) of the head from the feet, body heights.
+def _lean(mesh: TetMesh, above: float) -> np.ndarray:
+    """Return the horizontal offset (2,) of the part that is higher than ``above`` from the feet, body heights.
 
-    If the upper part is a thin plate, such as the back of a chair, return only the offset across the plate, negated.
+    If that part is a thin plate that is offset across its plane, such as the back of a chair, return only the offset
+    across the plate, negated.
     """
     middles, volumes, height = mesh.nodes[mesh.tets].mean(axis=1), mesh.volumes(), float(mesh.nodes[:, 2].max())
 
     def middle(part: np.ndarray) -> np.ndarray:
         return np.average(middles[part, :2], axis=0, weights=volumes[part]) if part.any() else np.zeros(2)
 
-    head, feet = middles[:, 2] > _HIGH * height, middles[:, 2] < _LOW * height
+    head, feet = middles[:, 2] > above * height, middles[:, 2] < _LOW * height
     if not head.any() or not feet.any():
         return np.zeros(2)
     lean = (middle(head) - middle(feet)) / height
     arms = middles[head, :2] - middle(head)
     moments, axes = np.linalg.eigh((arms * volumes[head, None]).T @ arms)
     if moments[1] > _MAX_HEAD_ASPECT**2 * max(moments[0], 1e-300):
-        thin = axes[:, 0]
-        return -(lean @ thin) * thin
+        thin, wide = axes.T
+        if abs(lean @ thin) >= abs(lean @ wide):
+            return -(lean @ thin) * thin
     return lean

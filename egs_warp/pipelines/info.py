@@ -102,6 +102,8 @@ class BodyInfo:
         """Return the lines for the terminal; lengths without a unit are in body heights."""
         frame, height = self.standing.frame, self.body.height
         up, ahead = (_numbers(frame.axes.T @ view) for view in (GROUND.normal, self.front.direction))
+        alternative = self.front.alternative
+        other = "" if alternative is None else f", but may be {_numbers(frame.axes.T @ alternative)}"
         plane = Plane(frame.axes[2], -float(frame.axes[2] @ frame.origin))
         size = np.ptp(self.place.ground.local(self.place.standing), axis=0) / height
         mesh, kinds = self.standing.cage.mesh, self._kinds()
@@ -109,7 +111,7 @@ class BodyInfo:
             f"capture  {self.source}: {self.count} Gaussians",
             f"up       {up}",
             f"ground   {_numbers(plane.normal, 4)},{plane.offset:.4g}",
-            f"front    {ahead}" + (" as given" if self.front.reason is None else f" ({self.front.reason})"),
+            f"front    {ahead}{other}" + (" as given" if self.front.reason is None else f" ({self.front.reason})"),
             f"height   {height / frame.scale:.4g} of the capture's units, {height:.4g} m; {size[0]:.2f} long,"
             f" {size[1]:.2f} wide",
             f"cage     {len(mesh.nodes)} nodes, {len(mesh.tets)} tetrahedra",

@@ -216,6 +216,22 @@ class GaussianCounts:
 
 
 @dataclass(frozen=True)
+class Take:
+    """One simulation of a run."""
+
+    change: str | None
+    """Gentler form of a motion, for messages; None in the first take."""
+    state: State
+    """State of the first motion that failed; the worst state of all motions if none did."""
+    note: str
+    """Why it failed; empty if it did not."""
+
+    def to_json(self) -> dict[str, JsonValue]:
+        """Return an element of ``takes``."""
+        return {"change": self.change, "state": self.state.value, "note": self.note}
+
+
+@dataclass(frozen=True)
 class Report:
     """Contents of ``report.json``."""
 
@@ -238,6 +254,8 @@ class Report:
     versions: Mapping[str, str] = field(default_factory=versions)
     film: str | None = None
     """Name of the video in the folder of the run; None if it was not filmed."""
+    takes: tuple[Take, ...] = ()
+    """Simulations of the run in order; empty if it was simulated once (``egs_warp.pipelines.takes``)."""
 
     def __repr__(self) -> str:
         return f"Report({self.source!r}, {self.summary().splitlines()[0]!r})"
@@ -267,6 +285,7 @@ class Report:
             "device": self.device,
             "seed": self.seed,
             "film": self.film,
+            "takes": [take.to_json() for take in self.takes],
         }
 
     def write(self, path: Path) -> None:
@@ -278,7 +297,12 @@ class Report:
         groups = [list(group) for _, group in groupby(self.motion, key=lambda motion: motion.name)]
         result = ", then ".join(map(_result, groups)) or "no motion began"
         state = "" if self.state is State.DONE else f"{self.state.value}: "
-        return f"{state}{result}\n{verdict(self.audit)}"
+        shown = retakes = ""
+        if self.takes and self.takes[-1].state is State.FALLEN:
+            retakes = f"; {len(self.takes)} takes fell, this is the first"
+        elif self.takes:
+            shown = f"take {len(self.takes)} ({self.takes[-1].change}): "
+        return f"{state}{shown}{result}{retakes}\n{verdict(self.audit)}"
 
 
 AUDIT_LIMITS = {
@@ -323,6 +347,7 @@ def report_of_run(
     asked: Mapping[str, JsonValue],
     ending: EndCause | None = None,
     film: str | None = None,
+    takes: tuple[Take, ...] = (),
 ) -> Report:
     """Create the report of a run.
 
@@ -341,11 +366,12 @@ def report_of_run(
         asked: Requested options.
         ending: Cause that ended the last motion early.
         film: Name of the video.
+        takes: Simulations of the run, if there were several.
     """
     mesh = creature.cage.mesh
     return Report(
         source=source,
-        motion=_motion_reports(trajectory, done, ending or EndCause()),
+        motion=motion_reports(trajectory, done, ending or EndCause()),
         audit=audit(trajectory, energy=energy, newton_unconverged=sum(not step.converged for step in steps)),
         energy=EnergyTotals.of(energy),
         qp=QpCounts.of(steps, frames),
@@ -358,10 +384,12 @@ def report_of_run(
         seed=seed,
         asked=asked,
         film=film,
+        takes=takes,
     )
 
 
-def _motion_reports(trajectory: Trajectory, done: Sequence[MotionRecord], ending: EndCause) -> tuple[MotionReport, ...]:
+def motion_reports(trajectory: Trajectory, done: Sequence[MotionRecord], ending: EndCause) -> tuple[MotionReport, ...]:
+    """Return the reports of the started motions ``done``; ``ending`` is the cause that ended the last one early."""
     reports = []
     for entry, (first, last) in zip(done, spans_of(done, trajectory.time), strict=True):
         reached = measure(trajectory, first=first, last=last)

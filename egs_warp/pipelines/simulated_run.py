@@ -28,6 +28,8 @@ from egs_warp.pipelines.time_estimate import RemainingFrames
 FILMED_FROM = (0.82, -0.57, 0.27)
 """Direction from the body to the camera of a film: ahead, left and up. It is 35 degrees off the face, so that the face
 is seen in three quarters and a path ahead is not foreshortened to a point."""
+_MAX_AZIMUTH = np.radians(60.0)
+"""Largest angle about the vertical between the camera of a film and a face of which the estimate is not clear."""
 FIELD_OF_VIEW = 30.0
 """Vertical field of view of the camera of a film, degrees."""
 _MAX_GET_UP_TIME = 120.0
@@ -112,9 +114,9 @@ class SimulatedRun:
         low[2] = min(low[2], 0.0)
         middle = 0.5 * (low + high)
         distance = float(np.linalg.norm(high - low))
-        direction = (
-            np.array(FILMED_FROM) if scene is None else self._clear_side(scene, middle, _OCCLUSION_DISTANCE * distance)
-        )
+        direction = self._usual_view()
+        if scene is not None:
+            direction = self._clear_side(scene, middle, _OCCLUSION_DISTANCE * distance, direction)
         if view_from is not None:
             directions = np.atleast_2d(view_from) @ (ground.axes @ self.creature.frame.axes).T
             directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -132,11 +134,25 @@ class SimulatedRun:
         )
         return framed(camera, self.trajectory.positions.reshape(-1, 3))
 
-    def _clear_side(self, scene: GaussianCloud, middle: np.ndarray, reach: float) -> np.ndarray:
+    def _usual_view(self) -> np.ndarray:
+        """Return the direction (3,) to the camera if nothing hides the body, ground axes: ``FILMED_FROM``, or half-way
+        between both candidates if the estimate of the front is not clear."""
+        alternative = self.creature.front.alternative
+        if alternative is None:
+            return np.array(FILMED_FROM)
+        ahead, left, up = FILMED_FROM
+        x, y = self.place.ground.axes[:2] @ alternative
+        between = float(np.arctan2(y, x))
+        side = np.sign(left if np.isclose(abs(between), np.pi) else between)
+        azimuth = side * min(0.5 * abs(between), _MAX_AZIMUTH)
+        level = np.hypot(ahead, left)
+        return np.array([level * np.cos(azimuth), level * np.sin(azimuth), up])
+
+    def _clear_side(self, scene: GaussianCloud, middle: np.ndarray, reach: float, usual: np.ndarray) -> np.ndarray:
         """Return the direction (3,) from ``middle`` (3,) to the camera, ground axes.
 
-        Of eight sides, it is the one nearest to the default whose occlusion by Gaussians nearer than ``reach`` (m)
-        exceeds the minimum by at most ``_OCCLUSION_TOLERANCE``.
+        Of eight sides, it is the one nearest to the direction ``usual`` (3,) whose occlusion by Gaussians nearer than
+        ``reach`` (m) exceeds the minimum by at most ``_OCCLUSION_TOLERANCE``.
         """
         height = self.creature.body.height
         local = self.place.ground.local(scene.means.numpy().astype(np.float64)) - middle
@@ -145,7 +161,7 @@ class SimulatedRun:
         log_areas = np.sort(scene.log_scales.numpy()[standing].astype(np.float64), axis=1)[:, 1:].sum(axis=1)
         hidden = 2.0 * np.pi * scene.opacities()[standing] * np.exp(log_areas) / distances[standing] ** 2
         level = local[standing, :2]
-        ahead, left, _ = FILMED_FROM
+        ahead, left, _ = usual
         rotations = np.exp(0.25j * np.pi * np.array([0, 1, -1, 2, -2, 3, -3, 4]))
         sides = (ahead + 1j * left) * rotations
         directions = np.stack([sides.real, sides.imag], axis=1) / np.abs(sides)[:, None]
@@ -173,6 +189,7 @@ def simulate(
     style: Style | None = None,
     pushes: Sequence[Push] = (),
     get_up: bool = True,
+    ends_at_fall: bool = False,
     activations: np.ndarray | None = None,
     parts: Callable[[], Path] | None = None,
     resume: Path | None = None,
@@ -190,6 +207,7 @@ def simulate(
         style: Style of jumps; None is the default.
         pushes: Pushes during the run.
         get_up: If the body falls, get up and continue.
+        ends_at_fall: If the body falls, end the run at the step at which that is detected.
         activations: (steps, M) m, prescribed muscle activations of each solver step. The motion then only defines what
             is measured, and the run ends with the last row.
         parts: Returns the folder that receives the finished steps; None writes none.
@@ -203,6 +221,7 @@ def simulate(
     motion = script(motion) if isinstance(motion, str) else motion
     if activations is not None:
         activations = checked_activations(creature, activations, step)
+    get_up = get_up and not ends_at_fall
     place = initial_stance(creature, step=step, style=style)
     expected = motion.check(place)
     sequence = MotionSequence(place, motion.parts(creature.body.height))
@@ -230,6 +249,7 @@ def simulate(
         parts=parts,
         resume=resume,
         finished=lambda: frames is None and is_over(),
+        aborted=lambda: ends_at_fall and watch.fallen is not None,
         kicks=PushKicks(place, pushes),
         activations=activations,
         progress=lambda last: progress(

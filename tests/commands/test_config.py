@@ -56,7 +56,7 @@ def test_an_interrupted_run_has_its_file(tmp_path: Path, monkeypatch: pytest.Mon
         parts().mkdir()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("egs_warp.pipelines.animate.simulate", interrupted)
+    monkeypatch.setattr("egs_warp.pipelines.takes.simulate", interrupted)
     assert cli.main(flags) == 130
     kept = yaml.safe_load((tmp_path / "a" / "run.yaml").read_text())
     assert (kept["friction"], kept["qp"]) == (0.7, "daqp")
@@ -64,7 +64,7 @@ def test_an_interrupted_run_has_its_file(tmp_path: Path, monkeypatch: pytest.Mon
     def refused(*_: object, **__: object) -> None:
         raise UserError("jump: this body cannot")
 
-    monkeypatch.setattr("egs_warp.pipelines.animate.simulate", refused)
+    monkeypatch.setattr("egs_warp.pipelines.takes.simulate", refused)
     assert cli.main([*flags[:-1], str(tmp_path / "b")]) == 2
     assert not (tmp_path / "b").exists()
 

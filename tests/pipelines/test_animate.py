@@ -52,7 +52,7 @@ def performance() -> SimulatedRun:
 def run(performance: SimulatedRun, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Report]:
     """``animate`` without the simulation."""
     monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", lambda *_, **__: performance.creature)
-    monkeypatch.setattr("egs_warp.pipelines.animate.simulate", lambda *_, **__: performance)
+    monkeypatch.setattr("egs_warp.pipelines.takes.simulate", lambda *_, **__: performance)
 
     def animated(out: Path, *, overwrite: bool = False) -> Report:
         return animate(thing().cloud, out, plane=thing().plane, options=OPTIONS, quiet=True, overwrite=overwrite)
@@ -127,7 +127,7 @@ def test_a_run_that_is_cut_off_leaves_its_steps(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("egs_warp.pipelines.animate.simulate", interrupted)
+        patch.setattr("egs_warp.pipelines.takes.simulate", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run(tmp_path)
     assert not finished(tmp_path) and sorted(os.listdir(tmp_path)) == [MANIFEST, PARTS]

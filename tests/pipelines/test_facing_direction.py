@@ -13,8 +13,9 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.pipelines.creature import CreatureOptions, PlacedCage, choose_front, make_creature, place_cage
-from egs_warp.pipelines.facing_direction import Front, mean_view
+from egs_warp.pipelines.facing_direction import Front, _lean, mean_view
 from tests.support.frames import Lying
+from tests.support.meshes import carved
 
 DOWN = np.array([0.0, -1.0, 0.0])
 """Facing direction of the built-in figures."""
@@ -80,6 +81,36 @@ def plain_box(width: float, depth: float) -> Lying:
         device="cpu",
     )
     return Lying(cloud, Plane(np.array([0.0, 0.0, 1.0]), 0.0))
+
+
+@pytest.mark.slow
+def test_a_box_without_features_has_an_alternative() -> None:
+    """The message names both directions."""
+    box = plain_box(0.9, 0.5)
+    standing = place_cage(box.cloud, plane=box.plane, nodes=60)
+    found, _ = front_of(standing)
+    assert found.alternative is not None and degrees(found.direction, found.alternative) > 59.0
+    other = ",".join(f"{x:.2f}" for x in standing.frame.axes.T @ found.alternative)
+    told = found.description(standing.frame)
+    assert f", but may be {other} (guessed: " in told and "not clearly better than the next best direction" in told
+
+
+def test_a_head_leans_ahead_and_a_back_leans_behind() -> None:
+    """The upper part of a cow is a plate along its trunk; its top is the head alone."""
+
+    def cow(centres: np.ndarray) -> np.ndarray:
+        x, y, z = centres.T
+        legs = (np.abs(np.abs(x) - 0.6) < 0.1) & (z < 0.4)
+        return legs | ((np.abs(y) < 0.1) & (z > 0.4) & (z < 0.8)) | ((x > 0.55) & (z > 0.8))
+
+    def chair(centres: np.ndarray) -> np.ndarray:
+        return (centres[:, 2] < 0.5) | (centres[:, 0] < -0.2)
+
+    upper, top = (_lean(carved((1.6, 0.4, 1.0), 0.1, cow), height) for height in (0.7, 0.85))
+    assert 0.1 < upper[0] < 0.5 < top[0] < 0.8 and np.abs([upper[1], top[1]]).max() < 0.01
+    for height in (0.7, 0.85):
+        ahead, left = _lean(carved((0.6, 0.6, 1.0), 0.1, chair), height)
+        assert ahead == pytest.approx(0.25, abs=0.01) and abs(left) < 0.01
 
 
 @pytest.mark.slow

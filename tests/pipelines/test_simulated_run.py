@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
+from egs_warp.pipelines.facing_direction import Front
 from egs_warp.pipelines.simulated_run import FILMED_FROM, SimulatedRun
 from tests.support.grounds import level, sheet
 from tests.support.scenes import lying, round_ones
@@ -22,7 +23,7 @@ def side(scene: GaussianCloud) -> np.ndarray:
     ground = SimpleNamespace(local=lambda points: points)
     body = SimpleNamespace(height=1.0)
     stub: Any = SimpleNamespace(creature=SimpleNamespace(body=body), place=SimpleNamespace(ground=ground))
-    way = SimulatedRun._clear_side(stub, scene, MIDDLE, 4.0)
+    way = SimulatedRun._clear_side(stub, scene, MIDDLE, 4.0, np.array(FILMED_FROM))
     return way[:2] / np.hypot(*way[:2])
 
 
@@ -48,3 +49,18 @@ def test_an_occluder_turns_the_camera_and_a_wall_behind_it_does_not() -> None:
     turned = side(concatenate(FLOOR, wall(USUAL, 1.5)))
     assert -0.1 < turned @ USUAL < 0.8, "the nearest side that is clear"
     assert side(concatenate(FLOOR, wall(USUAL, 4.5))) == pytest.approx(USUAL)
+
+
+@pytest.mark.parametrize(("degrees", "azimuth"), [(None, None), (90.0, 45.0), (-100.0, -50.0), (180.0, -60.0)])
+def test_an_unclear_front_is_filmed_from_between_both_candidates(degrees: float | None, azimuth: float | None) -> None:
+    """The body faces x."""
+    other = None if degrees is None else np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
+    front = Front(np.array([1.0, 0.0, 0.0]), "guessed", other)
+    ground = SimpleNamespace(axes=np.eye(3))
+    stub: Any = SimpleNamespace(creature=SimpleNamespace(front=front), place=SimpleNamespace(ground=ground))
+    way = SimulatedRun._usual_view(stub)
+    if azimuth is None:
+        assert way.tolist() == list(FILMED_FROM)
+        return
+    assert np.degrees(np.arctan2(way[1], way[0])) == pytest.approx(azimuth)
+    assert np.linalg.norm(way) == pytest.approx(np.linalg.norm(FILMED_FROM))

@@ -1,0 +1,25 @@
+"""Gentler forms of the motions, in which a run is simulated again after a fall (docs/motions/retakes.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Retake:
+    """Change of a motion for a retake."""
+
+    change: str
+    """Description that follows the name of the motion in messages."""
+    factors: Mapping[str, float] = field(default_factory=dict)
+    """Factors on the requested values by name; a motion without a value ignores its factor."""
+    replacements: Mapping[str, float] = field(default_factory=dict)
+    """Values by name that replace those requested, or the fixed values of a motion that has no such parameter."""
+    style: Mapping[str, float] = field(default_factory=dict)
+    """Factors on the style of jumps (``egs_warp.motions.style``)."""
+
+    def values(self, requested: Mapping[str, float]) -> dict[str, float]:
+        """Return the values with which the motion is performed instead of those ``requested``."""
+        scaled = {name: self.factors.get(name, 1.0) * value for name, value in requested.items()}
+        return {**scaled, **self.replacements}

@@ -1,0 +1,68 @@
+"""Retakes: the motion that fell becomes gentler, and is judged by what was requested."""
+
+from __future__ import annotations
+
+import pytest
+
+from egs_warp.motions.jump import Jump
+from egs_warp.motions.repertoire import MOTIONS
+from egs_warp.motions.script import Script, motion
+from egs_warp.motions.sequence import BodyMotion, Stance
+from egs_warp.motions.walk import Walk
+
+
+def retaken(script: Script, *numbers: int) -> tuple[Script, str]:
+    """Return ``script`` after falls in the motions ``numbers``, and the last change."""
+    change = ""
+    for number in numbers:
+        retake = script.retake(number)
+        assert retake is not None
+        script, change = retake
+    return script, change
+
+
+def begun(script: Script, place: Stance) -> list[BodyMotion]:
+    return [part.begin(place) for part in script.parts(place.body.height)]
+
+
+def test_the_motion_that_fell_becomes_softer_and_then_lower(place: Stance) -> None:
+    """Motion 2 is the second of the two hops, which are changed together."""
+    script = motion("jump 0.5 0.2, hop 0.5 0.2 x2, jump 0.4 0.2")
+    softer, change = retaken(script, 2)
+    assert [request.retake for request in softer.requests] == [0, 1, 0] and change == "hop slower and softer"
+    lower, change = retaken(softer, 3, 3)
+    assert [request.retake for request in lower.requests] == [0, 1, 2]
+    assert change == "jump slower, softer, lower and shorter" and lower.retake(3) is None
+    asked = [part.asked for part in script.parts(1.0)]
+    assert [part.asked for part in softer.parts(1.0)] == asked == [part.asked for part in lower.parts(1.0)]
+    usual, soft, low = (begun(each, place)[3] for each in (script, softer, lower))
+    assert isinstance(usual, Jump) and isinstance(soft, Jump) and isinstance(low, Jump)
+    assert soft.target == usual.target and soft.plan == usual.plan
+    height = place.body.height
+    assert (low.target.distance, low.target.height) == pytest.approx((0.24 * height, 0.12 * height))
+    jump = begun(retaken(motion("jump 0.4 0.2"), 0)[0], place)[0]
+    assert isinstance(jump, Jump) and jump.target == usual.target
+    assert jump.plan.thrust_time > usual.plan.thrust_time
+    assert jump.plan.landing_rate == pytest.approx(usual.plan.landing_rate / 1.5)
+
+
+@pytest.mark.parametrize("text", ["walk 0.5", "walk to 0.4,0.2", "turn 90", "run 0.5"])
+def test_walks_take_shorter_steps_to_the_same_place(text: str, place: Stance) -> None:
+    walks = [begun(retaken(motion(text), *[0] * count)[0], place)[0] for count in (0, 1, 2)]
+    usual, half, quarter = (walk for walk in walks if isinstance(walk, Walk))
+    for walk, count in ((half, 2), (quarter, 4)):
+        steps = walk.gait.step_count / usual.gait.step_count
+        assert steps == pytest.approx(count, rel=0.3)
+        assert walk.planar_poses[-1] == pytest.approx(usual.planar_poses[-1], abs=1e-9)
+
+
+def test_other_motions_have_no_retake() -> None:
+    """Standing, getting up, and motions under commands, beats or key frames are as gentle as they are requested."""
+    assert [name for name, kind in MOTIONS.items() if not kind.retakes] == [
+        "drive",
+        "stand",
+        "get up",
+        "dance",
+        "trajectory",
+    ]
+    assert motion("stand 1, jump").retake(0) is None
