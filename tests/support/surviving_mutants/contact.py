@@ -60,12 +60,6 @@ CONTACT = [
         "points that are not selected go to an extra column, which is cut off",
     ),
     Survivor(
-        "contact/batch_step.py",
-        "limit = ((1.0 - 1e-4 * length) * maximum[waiting]).clamp(min=self.tolerance)",
-        "limit = ((1.0 - 1e-4 % length) * maximum[waiting]).clamp(min=self.tolerance)",
-        "the same for full steps; a half step may be worse by a ten-thousandth than the rule allows",
-    ),
-    Survivor(
         "contact/batch_contacts.py",
         "matrices = start.new_empty((worlds, size, (size + 4) // 4, 4))",
         "matrices = start.new_empty((worlds, size, (size + 4) // 3, 4))",
@@ -106,18 +100,6 @@ CONTACT = [
         "sinking = torch.where(gaps < task.start_gaps - allowed, gaps, 0.0)",
         "sinking = torch.where(gaps < task.start_gaps - allowed, gaps, 1.0)",
         "a point that does not sink is added neither with gap 0 nor with 1 m: only deep ones are",
-    ),
-    Survivor(
-        "contact/batch_step.py",
-        "slow = self._newton_step(part, search, response.subset(active), first=iteration == 1)",
-        "slow = self._newton_step(part, search, response.subset(active), first=iteration == 0)",
-        "in the first iteration there are no recent residuals: any finite one is accepted",
-    ),
-    Survivor(
-        "contact/batch_step.py",
-        "while length > MIN_STEP_LENGTH and len(waiting) > 0:",
-        "while length > MIN_STEP_LENGTH and len(waiting) != 0:",
-        "a count is never negative",
     ),
     Survivor(
         "contact/coulomb.py",
