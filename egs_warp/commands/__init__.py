@@ -6,7 +6,7 @@ Input: command-line flags. Output: files and an exit status. No other package ha
 GROUPS = {
     "getting started": ("doctor", "samples"),
     "captures": ("pose", "train", "convert"),
-    "scenes": ("plane", "segment", "inpaint"),
+    "scenes": ("pick", "plane", "segment", "inpaint"),
     "motion": ("info", "muscles", "animate", "resume", "live"),
     "finished runs": ("render", "view", "export"),
 }

@@ -19,7 +19,14 @@ from egs_warp.commands.flags import (
     parse_direction,
     parse_up,
 )
-from egs_warp.commands.scene_flags import add_flat_flag, add_object_flags, add_overwrite_flag, print_note, start_device
+from egs_warp.commands.scene_flags import (
+    add_flat_flag,
+    add_object_flags,
+    add_overwrite_flag,
+    check_no_scene_flags,
+    print_note,
+    start_device,
+)
 from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
 
@@ -39,6 +46,7 @@ EXAMPLES = (
     "pawn.ply --up z --out out/jump",
     'scan.spz --motion "hop x3, twist 180" --camera follow --size 1280x720 --out out/hop',
     "room.ply --object 0,0,0.5 --up=-y --motion walk --out out/walk",
+    "room.ply --object picked.json --out out/picked",
     "thing.ply --up z --background transparent --out out/cut_out",
     "--config out/jump/run.yaml --friction 0.4 --out out/slippery",
 )
@@ -209,9 +217,7 @@ def _animate_capture(args: argparse.Namespace) -> Report:
     from egs_warp.io.video import ffmpeg_program
     from egs_warp.pipelines.animate import animate
 
-    for name in ("cameras", "view", "mask_model", "straddling", "inpainter", "trust", "no_inpaint"):
-        if getattr(args, name) not in (None, False):
-            raise UserError(f"--{name.replace('_', '-')}: needs --object, which selects the object of a scene")
+    check_no_scene_flags(args)
     options = _options(args)
     shot, background_path = shot_of(args)
     ffmpeg_program()
@@ -271,6 +277,10 @@ def _animate_scene(args: argparse.Namespace) -> Report:
     inpainter = chosen_inpainter(args)
     view_from = parse_direction("view-from", args.view_from) if args.view_from is not None else None
     scene_input = read_scene(args)
+    front = options.creature.front if options.creature.front is not None else scene_input.front
+    options = replace(options, shot=shot, creature=replace(options.creature, front=front))
+    if scene_input.is_object_alone:
+        return _animate_whole(args, scene_input, replace(options, view_from=view_from, notes=scene_input.notes))
     scene_options = SceneOptions(
         clearing=clearing_of(args), flat=args.flat, inpaint=not args.no_inpaint, inpainter=inpainter
     )
@@ -290,7 +300,6 @@ def _animate_scene(args: argparse.Namespace) -> Report:
             background=scene.background,
             options=replace(
                 options,
-                shot=shot,
                 view_from=view_from if view_from is not None else viewing_directions(scene, scene_input.cameras),
                 notes=(*scene_input.notes, *scene.notes),
                 creature=replace(
@@ -299,6 +308,28 @@ def _animate_scene(args: argparse.Namespace) -> Report:
                     seen_from=mean_view(scene_input.cameras, scene.located.centre),
                 ),
             ),
+            show_note=print_note,
+        )
+        run.finish()
+    return report
+
+
+def _animate_whole(args: argparse.Namespace, scene_input: SceneInput, options: AnimateOptions) -> Report:
+    """Animate a picked object that is the whole capture; see ``_animate_capture``."""
+    from egs_warp.io.run_folder import run_folder
+    from egs_warp.pipelines.animate import animate
+
+    for note in scene_input.notes:
+        print_note(note)
+    with run_folder(args.out, overwrite=args.overwrite, resume=args.resume) as run:
+        run.begin_with(lambda: write_config(run.file(NAME), args, args.parser))
+        report = animate(
+            scene_input.cloud,
+            run,
+            motion=args.motion,
+            up=scene_input.up,
+            plane=scene_input.plane,
+            options=options,
             show_note=print_note,
         )
         run.finish()

@@ -12,9 +12,9 @@ from egs_warp.errors import UserError
 if TYPE_CHECKING:
     import numpy as np
 
+    from egs_warp.geometry.gaussians import GaussianCloud
     from egs_warp.geometry.plane import Plane
     from egs_warp.inpainting.inpainters import Inpainter
-    from egs_warp.io.capture import Capture
 
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 """Subparsers that a command adds its parser to."""
@@ -154,7 +154,7 @@ def parse_plane(text: str) -> Plane:
     return plane
 
 
-def guessed_up(capture: Capture) -> tuple[np.ndarray, str]:
+def guessed_up(capture: GaussianCloud) -> tuple[np.ndarray, str]:
     """Estimate the up direction of a capture; return the (3,) unit vector and a note for the user."""
     from egs_warp.pipelines.creature import estimated_up
 

@@ -5,9 +5,14 @@ from __future__ import annotations
 import argparse
 
 from egs_warp.commands.flags import Commands, guessed_up, named_path, parse_direction, parse_up
-from egs_warp.commands.scene_flags import print_note, start_device
+from egs_warp.commands.scene_flags import add_object_flags, check_no_scene_flags, print_note, start_device
 
-EXAMPLES = ("pawn.ply", "chair.ply --up=-y --plot info.png", "toy.spz --front 0,0,1 --muscles own.json --plot info.png")
+EXAMPLES = (
+    "pawn.ply",
+    "chair.ply --up=-y --plot info.png",
+    "toy.spz --front 0,0,1 --muscles own.json --plot info.png",
+    "room.ply --object picked.json",
+)
 
 
 def add_parser(commands: Commands) -> None:
@@ -26,6 +31,7 @@ def add_parser(commands: Commands) -> None:
         "--front",
         help="direction in which the body faces and moves: x,y,z or an axis, such as --front=-x (default: estimated)",
     )
+    add_object_flags(info)
     info.add_argument(
         "--metres-per-unit", type=float, help="scale of the capture (default: such that the body is 1 m tall)"
     )
@@ -34,32 +40,41 @@ def add_parser(commands: Commands) -> None:
         type=named_path,
         help="JSON file with muscle fibres (docs/motions/muscles.md; default: placed automatically)",
     )
-    info.set_defaults(run=_info)
+    info.set_defaults(run=_info, device="cpu")
 
 
 def _info(args: argparse.Namespace) -> int:
-    from egs_warp.commands.scene_input import plane_of
+    from egs_warp.commands.scene_input import plane_of, read_scene
     from egs_warp.errors import UserError
     from egs_warp.io import read_capture
     from egs_warp.pipelines.creature import CreatureOptions
     from egs_warp.pipelines.info import draw_info, inspect_capture
+    from egs_warp.pipelines.locate_plane import locate_plane
     from egs_warp.pipelines.progress import info_bar
 
     if args.plot is not None and args.plot.suffix.lower() != ".png":
         raise UserError(f"--plot {args.plot}: give a file name that ends in .png")
     start_device("cpu")
     options = CreatureOptions(metres_per_unit=args.metres_per_unit)
-    up = parse_up(args.up) if args.up is not None else None
-    plane = plane_of(args.plane) if args.plane is not None else None
     front = parse_direction("front", args.front) if args.front is not None else None
-    capture = read_capture(args.capture)
-    notes = capture.notes
-    if plane is None and up is None:
-        up, note = guessed_up(capture)
-        notes = (*notes, note)
+    if args.object is not None:
+        scene = read_scene(args)
+        located = locate_plane(scene.cloud, scene.object, cameras=scene.cameras, up=scene.up, plane=scene.plane)
+        cloud, up, plane = scene.cloud.subset(located.segmentation.object_mask), None, located.plane
+        front = front if front is not None else scene.front
+        notes = (*scene.notes, *located.notes)
+    else:
+        check_no_scene_flags(args)
+        up = parse_up(args.up) if args.up is not None else None
+        plane = plane_of(args.plane) if args.plane is not None else None
+        capture = read_capture(args.capture)
+        cloud, notes = capture.cloud, capture.notes
+        if plane is None and up is None:
+            up, note = guessed_up(capture)
+            notes = (*notes, note)
     with info_bar() as begins:
         info = inspect_capture(
-            capture.cloud,
+            cloud,
             source=args.capture,
             up=up,
             plane=plane,

@@ -6,23 +6,27 @@ import argparse
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.flags import Commands, add_planning_flags, guessed_up, named_path, parse_direction, parse_up
-from egs_warp.commands.scene_flags import print_note, start_device
+from egs_warp.commands.scene_flags import add_object_flags, check_no_scene_flags, print_note, start_device
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from egs_warp.commands.scene_input import SceneInput
+    from egs_warp.geometry.gaussians import GaussianCloud
+    from egs_warp.geometry.height_field import HeightField
     from egs_warp.geometry.plane import Plane
-    from egs_warp.io.capture import Capture
     from egs_warp.web.session import Session
 
 EXAMPLES = (
     "pawn.ply --up z",
     "scan.spz --nodes 150 --friction 0.5",
     "out/scene/object.ply --plane out/scene/plane.json --background out/scene/background.ply",
+    "room.ply --object picked.json",
 )
 
 
@@ -56,6 +60,7 @@ def add_parser(commands: Commands) -> None:
         "--front",
         help="direction in which the body faces and moves: x,y,z or an axis, such as --front=-x (default: estimated)",
     )
+    add_object_flags(live.add_argument_group("object in a scene"))
     page = live.add_argument_group("page")
     page.add_argument("--background", type=named_path, help="background capture, for example background.ply of a run")
     page.add_argument("--port", type=int, default=0, help="port on 127.0.0.1 (default: any free port)")
@@ -66,9 +71,7 @@ def add_parser(commands: Commands) -> None:
 def _live(args: argparse.Namespace) -> int:
     import webbrowser
 
-    from egs_warp.commands.scene_input import plane_of
     from egs_warp.errors import UserError
-    from egs_warp.io import read_capture
     from egs_warp.io.run_folder import check_out
     from egs_warp.io.text import parse_json, read_text
     from egs_warp.launching import reserve_core
@@ -86,6 +89,64 @@ def _live(args: argparse.Namespace) -> int:
         check_nodes(args.nodes)
     if args.muscles is not None:
         parse_json(read_text(args.muscles), args.muscles)
+    if args.object is not None and args.background is not None:
+        raise UserError("--background: with --object the rest of the scene is the background; leave one of them out")
+    source = _read_scene(args) if args.object is not None else _read_capture(args)
+    feed = PreviewFeed(preview_of(source.cloud, title=Path(args.capture).name, up=source.up, plane=source.plane))
+    server = PageServer([], port=args.port, feed=feed)
+    with server.serve_in_background() as thread:
+        print(f"open {server.address}\nend with Ctrl-C", flush=True)
+        if not args.no_browser:
+            webbrowser.open(server.address)
+        try:
+            prepared = source.prepared(feed.show_stage)
+            session = _session(args, prepared, begin_stage=feed.show_stage)
+        except UserError as error:
+            feed.show_error(str(error))
+            raise
+        scene = session.creature.placed(prepared.background) if prepared.background is not None else None
+        with reserve_core():
+            session.start()
+            feed.start(LiveFeed(session, scene=scene))
+            try:
+                wait_for_end(thread)
+            finally:
+                session.stop()
+    return 0
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A capture with its ground, and the object in it."""
+
+    cloud: GaussianCloud
+    """The object, or the whole capture until ``prepared``."""
+    up: np.ndarray | None
+    plane: Plane | None
+    front: np.ndarray | None
+    ground: HeightField | None = None
+    background: GaussianCloud | None = None
+    scene: SceneInput | None = None
+    """Scene of the object; None if the capture is the object."""
+
+    def prepared(self, begin_stage: Callable[[str], object]) -> _Source:
+        """Return the object, separated from its scene."""
+        from egs_warp.pipelines.prepare_scene import SceneOptions
+
+        if self.scene is None or self.scene.is_object_alone:
+            return self
+        scene = self.scene.prepared(SceneOptions(), begin_stage=begin_stage)
+        for note in scene.notes:
+            print_note(note)
+        return _Source(scene.object, None, scene.plane, self.front, scene.ground, scene.background)
+
+
+def _read_capture(args: argparse.Namespace) -> _Source:
+    """Read a capture that contains only the object."""
+    from egs_warp.commands.scene_input import ground_of, plane_of
+    from egs_warp.io import read_capture
+
+    check_no_scene_flags(args)
     up = parse_up(args.up) if args.up is not None else None
     plane = plane_of(args.plane) if args.plane is not None else None
     start_device(args.device)
@@ -96,29 +157,27 @@ def _live(args: argparse.Namespace) -> int:
     if plane is None and up is None:
         up, note = guessed_up(capture)
         print_note(note)
-    feed = PreviewFeed(preview_of(capture.cloud, title=Path(args.capture).name, up=up, plane=plane))
-    server = PageServer([], port=args.port, feed=feed)
-    with server.serve_in_background() as thread:
-        print(f"open {server.address}\nend with Ctrl-C", flush=True)
-        if not args.no_browser:
-            webbrowser.open(server.address)
-        try:
-            session = _session(args, capture, up=up, plane=plane, begin_stage=feed.show_stage)
-        except UserError as error:
-            feed.show_error(str(error))
-            raise
-        scene = session.creature.placed(background.cloud_aligned_with(capture)) if background is not None else None
-        with reserve_core():
-            session.start()
-            feed.start(LiveFeed(session, scene=scene))
-            try:
-                _wait(thread)
-            finally:
-                session.stop()
-    return 0
+    front = parse_direction("front", args.front) if args.front is not None else None
+    behind = background.cloud_aligned_with(capture) if background is not None else None
+    return _Source(capture.cloud, up, plane, front, ground_of(args.plane, flat=False), behind)
 
 
-def _wait(thread: threading.Thread) -> None:
+def _read_scene(args: argparse.Namespace) -> _Source:
+    """Read a scene and the selection of its object."""
+    from egs_warp.commands.scene_input import read_scene
+
+    front = parse_direction("front", args.front) if args.front is not None else None
+    scene = read_scene(args)
+    for note in scene.notes:
+        print_note(note)
+    up = scene.up
+    if scene.plane is None and up is None:
+        up, note = guessed_up(scene.cloud)
+        print_note(note)
+    return _Source(scene.cloud, up, scene.plane, front if front is not None else scene.front, scene=scene)
+
+
+def wait_for_end(thread: threading.Thread) -> None:
     """Wait until ``thread`` ends or Ctrl-C."""
     with suppress(KeyboardInterrupt):
         while thread.is_alive():
@@ -126,16 +185,8 @@ def _wait(thread: threading.Thread) -> None:
             thread.join(timeout=0.5)
 
 
-def _session(
-    args: argparse.Namespace,
-    capture: Capture,
-    *,
-    up: np.ndarray | None,
-    plane: Plane | None,
-    begin_stage: Callable[[str], object],
-) -> Session:
-    """Build the creature of ``capture`` and return a session that is not started."""
-    from egs_warp.commands.scene_input import ground_of
+def _session(args: argparse.Namespace, source: _Source, *, begin_stage: Callable[[str], object]) -> Session:
+    """Build the creature of ``source`` and return a session that is not started."""
     from egs_warp.locomotion.settings import LocomotionSettings
     from egs_warp.pipelines.creature import CreatureOptions, make_creature
     from egs_warp.pipelines.progress import preparation_bar
@@ -143,12 +194,11 @@ def _session(
     from egs_warp.web.presplit import presplit_gaussians
     from egs_warp.web.session import Session, SessionOptions
 
-    front = parse_direction("front", args.front) if args.front is not None else None
     options = CreatureOptions(
         friction=args.friction,
         metres_per_unit=args.metres_per_unit,
-        ground=ground_of(args.plane, flat=False),
-        front=front,
+        ground=source.ground,
+        front=source.front,
         muscles_file=args.muscles,
         settings=LocomotionSettings(qp_solver=args.qp, strategy=args.strategy),
         nodes=_nodes(args),
@@ -159,10 +209,10 @@ def _session(
             update_bar(stage)
             begin_stage(stage)
 
-        creature = make_creature(capture.cloud, up=up, plane=plane, options=options, progress=begins)
+        creature = make_creature(source.cloud, up=source.up, plane=source.plane, options=options, progress=begins)
         begins("split")
         drawn_as = live_render_data(creature, presplit_gaussians(creature))
-    if front is None:
+    if source.front is None:
         print_note(creature.front.description(creature.frame))
     session_options = SessionOptions(source=Path(args.capture).name, takes=args.out, muscles_file=args.muscles)
     return Session(creature, drawn_as, session_options)

@@ -15,6 +15,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.lens import Undistortion
 from egs_warp.io.cameras import PosedImage
 from egs_warp.io.limits import MAX_COORDINATE, check_pixels, picture_size, read_bytes
+from egs_warp.io.picked import PickedObject, read_picked
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.mask_model import OnnxClickModel, SalientModel
 from egs_warp.segmentation.object_spec import Box, ObjectSpec
@@ -24,8 +25,8 @@ from egs_warp.segmentation.votes import MaskedView
 MAX_MASK_SIDE = 800
 """Maximum side of a mask, pixels; larger masks are reduced to a half, a third, ... of their size."""
 _HELP = (
-    "give a mask.png, a folder of masks, a point x,y,z, a box x0,y0,z0,x1,y1,z1, a pixel u,v with --view, or clicks "
-    "+u,v@photo on the object and -u,v@photo next to it"
+    "give a picked.json, a mask.png, a folder of masks, a point x,y,z, a box x0,y0,z0,x1,y1,z1, a pixel u,v with "
+    "--view, or clicks +u,v@photo on the object and -u,v@photo next to it"
 )
 _MAX_DIGITS = 10
 """Maximum length of a camera number."""
@@ -33,6 +34,8 @@ _SALIENT = "salient"
 """Value that selects the salient object of each photo."""
 _CLICK = re.compile(r"([+-]?)([0-9.]+),([0-9.]+)@(.+)", re.DOTALL)
 """A click: sign, u, v and photo."""
+_PICKED = re.compile(r"(.+\.json)(?::(.+))?", re.DOTALL | re.IGNORECASE)
+"""A file of ``egs-warp pick`` and, optionally, the name of an object in it."""
 
 
 def read_object(
@@ -87,6 +90,21 @@ def read_object(
         masks = masks_of_clicks(cloud, clicks, [one.camera for one in posed or ()], model)
         return ObjectSpec(masks=tuple(masks), clicks=tuple(clicks))
     return replace(specs[0], clicks=tuple(clicks)) if specs else ObjectSpec.of_clicks(clicks)
+
+
+def picked_object(texts: Sequence[str], cloud: GaussianCloud) -> PickedObject | None:
+    """Return the object of the value ``picked.json`` or ``picked.json:NAME``; None for other values of ``--object``.
+
+    Raises ``UserError`` for a damaged file, an unknown name, and further values.
+    """
+    for text in texts:
+        match = _PICKED.fullmatch(text)
+        if match is None:
+            continue
+        if len(texts) > 1:
+            raise UserError(f"--object: {text} is a whole object; leave the other {len(texts) - 1} values out")
+        return read_picked(match[1], cloud).named(match[2], match[1])
+    return None
 
 
 def _path_exists(text: str) -> bool:

@@ -6,6 +6,7 @@ import argparse
 import sys
 
 from egs_warp.commands.flags import named_path
+from egs_warp.errors import UserError
 
 
 def add_object_flags(parser: argparse._ActionsContainer, *, common: argparse._ActionsContainer | None = None) -> None:
@@ -13,9 +14,9 @@ def add_object_flags(parser: argparse._ActionsContainer, *, common: argparse._Ac
     (common or parser).add_argument(
         "--object",
         action="append",
-        help="select the object of a scene: mask.png, folder of masks, point x,y,z, box x0,y0,z0,x1,y1,z1, pixel u,v "
-        "of --view, salient (the salient object of each photo, needs egs-warp[salient]), or clicks, each with a flag "
-        "of its own: +u,v@photo on the object, -u,v@photo next to it",
+        help="select the object of a scene: picked.json of egs-warp pick, mask.png, folder of masks, point x,y,z, box "
+        "x0,y0,z0,x1,y1,z1, pixel u,v of --view, salient (the salient object of each photo, needs egs-warp[salient]), "
+        "or clicks, each with a flag of its own: +u,v@photo on the object, -u,v@photo next to it",
     )
     parser.add_argument(
         "--mask-model",
@@ -28,6 +29,13 @@ def add_object_flags(parser: argparse._ActionsContainer, *, common: argparse._Ac
         help="cameras of the scene: cameras.json, transforms.json or a COLMAP model (default: a ring of cameras)",
     )
     parser.add_argument("--view", help="name or number of the camera of a single mask or a pixel")
+
+
+def check_no_scene_flags(args: argparse.Namespace) -> None:
+    """Raise ``UserError`` for flags that need ``--object``, which is missing."""
+    for name in ("cameras", "view", "mask_model", "straddling", "inpainter", "trust", "no_inpaint"):
+        if getattr(args, name, None) not in (None, False):
+            raise UserError(f"--{name.replace('_', '-')}: needs --object, which selects the object of a scene")
 
 
 def add_flat_flag(parser: argparse._ActionsContainer) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from egs_warp.commands.flags import parse_plane, parse_up
-from egs_warp.commands.object_flag import read_object
+from egs_warp.commands.object_flag import picked_object, read_object
 from egs_warp.commands.scene_flags import print_note, start_device
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
@@ -25,6 +25,10 @@ from egs_warp.segmentation.object_spec import ObjectSpec
 
 if TYPE_CHECKING:
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions
+
+_SOLID, _MAX_REST = 0.3, 0.02
+"""Opacity of a Gaussian that counts, and the share of such Gaussians outside of an object below which the object is the
+whole capture."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +44,11 @@ class SceneInput:
     up: np.ndarray | None
     """(3,) unit vector, from ``--up``; None without that flag."""
     plane: Plane | None
-    """Plane of ``--plane``; None to estimate it."""
+    """Plane of ``--plane``, or of a picked object; None to estimate it."""
     notes: tuple[str, ...]
     """Notes of the reader for the user."""
+    front: np.ndarray | None = None
+    """(3,) facing direction of a picked object; None to estimate it."""
 
     @property
     def object(self) -> ObjectSpec:
@@ -52,15 +58,26 @@ class SceneInput:
         return self.spec
 
     @property
+    def is_object_alone(self) -> bool:
+        """True if a picked object is nearly the whole capture: there is no scene from which to separate it."""
+        if self.spec is None or self.spec.picked is None:
+            return False
+        solid = self.cloud.opacities() > _SOLID
+        return int((solid & ~self.spec.picked).sum()) < _MAX_REST * int(solid.sum())
+
+    @property
     def cameras(self) -> list[Camera]:
         """Cameras without their photos."""
         return [one.camera for one in self.posed]
 
-    def prepared(self, options: SceneOptions) -> PreparedScene:
+    def prepared(
+        self, options: SceneOptions, *, begin_stage: Callable[[str], object] = lambda stage: None
+    ) -> PreparedScene:
         """Segment the scene with ``prepare_scene`` and show a progress bar; a scene that was prepared before is read
         from the cache (``egs_warp.pipelines.scene_cache``).
 
-        Photos next to the cameras, if any, serve for fine-tuning.
+        Photos next to the cameras, if any, serve for fine-tuning. ``begin_stage`` is called with the name of each stage
+        as it starts.
         """
         from egs_warp.pipelines.prepare_scene import prepare_scene
         from egs_warp.pipelines.progress import scene_bar
@@ -73,6 +90,12 @@ class SceneInput:
             print_note(f"the scene was prepared before, and is read from {cache_folder()}")
             return scene
         with scene_bar(options.stages) as show_progress:
+
+            def progress(stage: str, done: float) -> None:
+                show_progress(stage, done)
+                if done == 0.0:
+                    begin_stage(stage)
+
             scene = prepare_scene(
                 self.cloud,
                 self.object,
@@ -81,7 +104,7 @@ class SceneInput:
                 up=self.up,
                 plane=self.plane,
                 options=options,
-                progress=show_progress,
+                progress=progress,
             )
         note = write_scene(key, scene)
         if note is not None:
@@ -111,12 +134,18 @@ def read_scene(args: argparse.Namespace) -> SceneInput:
     capture = read_capture(args.capture, device=args.device)
     poses = read_posed_images(args.cameras).relative_to(capture.origin) if args.cameras else None
     posed = poses.images if poses is not None else ()
-    spec = None
+    spec, front = None, None
     if args.object is None and args.mask_model is not None:
         raise UserError("--mask-model: it needs clicks; give --object +u,v@photo")
-    if args.object is not None:
+    picked = picked_object(args.object or (), capture.cloud)
+    if picked is not None:
+        if args.mask_model is not None:
+            raise UserError("--mask-model: it needs clicks, and a picked object is given; leave one of them out")
+        spec, front = ObjectSpec(picked=picked.gaussians), picked.front
+        plane = picked.plane.plane if plane is None and up is None else plane
+    elif args.object is not None:
         spec = read_object(args.object, capture.cloud, posed, view=args.view, mask_model=args.mask_model)
     notes = capture.notes
     if poses is not None:
         notes = (*notes, *poses.messages)
-    return SceneInput(capture, posed, spec, up, plane, notes)
+    return SceneInput(capture, posed, spec, up, plane, notes, front)

@@ -115,7 +115,7 @@ class BodyInfo:
             f"height   {height / frame.scale:.4g} of the capture's units, {height:.4g} m; {size[0]:.2f} long,"
             f" {size[1]:.2f} wide",
             f"cage     {len(mesh.nodes)} nodes, {len(mesh.tets)} tetrahedra",
-            f"stands   on {self._stands()}",
+            f"stands   on {self.stands()}",
         ]
         for number, (foot, sole) in enumerate(zip(self.feet, self.soles() / height, strict=True), start=1):
             lines.append(
@@ -138,7 +138,8 @@ class BodyInfo:
     def _kinds(self) -> dict[FibreKind, int]:
         return dict(Counter(self.muscles.fibre_kinds[fibre] for fibre in self.muscles.fibre_from_segment))
 
-    def _stands(self) -> str:
+    def stands(self) -> str:
+        """Return what the body stands on, for the user."""
         if self.base is SupportKind.FEET:
             return f"{len(self.feet)} feet, numbered anticlockwise from straight ahead"
         return {

@@ -306,7 +306,7 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everyw
         reach = float(np.abs(up) @ half)
         lowest = middle - 0.5 * reach * up
         least_share = 0.5
-    elif spec.masks:
+    elif spec.masks or spec.picked is not None:
         lowest = _low_point(cloud, spec, means, up)
     else:
         lowest = _lowest_point(spec, up)
@@ -335,9 +335,12 @@ def _lowest_point(spec: ObjectSpec, up: np.ndarray) -> np.ndarray | None:
 
 
 def _low_point(cloud: GaussianCloud, spec: ObjectSpec, means: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return a point (3,) in the lower third of the masked object, never below its foot."""
-    votes = votes_of_masks(cloud, spec.masks)
-    inside = votes.inside * (votes.share_inside() > 0.5) * (votes.share_seen() > 0.02)
+    """Return a point (3,) in the lower third of the masked or picked object, never below its foot."""
+    if spec.picked is not None:
+        inside = spec.picked * cloud.opacities()
+    else:
+        votes = votes_of_masks(cloud, spec.masks)
+        inside = votes.inside * (votes.share_inside() > 0.5) * (votes.share_seen() > 0.02)
     if inside.sum() <= 0.0:
         raise UserError("object: no part of the capture is visible inside the masks; check masks and cameras")
     order = np.argsort(means @ up)

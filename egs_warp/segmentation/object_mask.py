@@ -67,7 +67,7 @@ def segment(
     Args:
         cloud: the capture.
         plane: the ground.
-        spec: masks, a box or a point, and clicks.
+        spec: masks, a box, a point or picked Gaussians, and clicks.
         size: size of the object, scene units, if known; replaces the guess.
         hover: maximum height of the object above the ground, as a fraction of its size.
 
@@ -78,6 +78,8 @@ def segment(
     scene = SceneAbovePlane.of(cloud, plane)
     if spec.masks:
         claimed_by_user, unknown = _masked(scene, spec)
+    elif spec.picked is not None:
+        claimed_by_user, unknown = spec.picked, np.zeros(cloud.count, bool)
     else:
         claimed_by_user = spec.box.holds(scene.means) if spec.box is not None else np.ones(cloud.count, bool)
         unknown = np.zeros(cloud.count, bool)
@@ -149,6 +151,8 @@ def _of_size(
     claimed = claimed_by_user & near & bool(spec.masks)
     standing = (scene.heights > floor) & scene.is_under(chosen, 3.0 * foot, size)
     at_foot = ~above & (scene.heights > 0.0) & (claimed if spec.masks else standing)
+    if spec.picked is not None:
+        at_foot |= ~above & (scene.heights > 0.0) & spec.picked
     faint = ~scene.is_opaque & above & (claimed_by_user | unknown) & near
     object_mask = (chosen | at_foot | faint) & ~removed
     for click in spec.clicks:
@@ -211,6 +215,10 @@ def _body(
     """(n,) bool, the connected parts of the object, all of them higher than ``foot``; (n,) bool, all other parts that
     are small; and (n,) bool, Gaussians that clicks removed."""
     core = (claimed_by_user | unknown) & scene.is_opaque & (scene.heights > foot)
+    if spec.picked is not None:
+        if not core.any():
+            raise UserError(_NOTHING_ABOVE, check=("plane",))
+        return core, np.zeros_like(core), np.zeros_like(core)
     # An uneven floor must not connect to the object, so Gaussians that lie flat near the plane connect nothing.
     lying = core & scene.is_level & (scene.heights < 3.0 * foot) & (not spec.masks)
     indices = np.flatnonzero(core & ~lying)

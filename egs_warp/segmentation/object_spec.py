@@ -28,8 +28,8 @@ class Box:
 
 @dataclass(frozen=True)
 class ObjectSpec:
-    """The user's description of the object: exactly one of masks, box and point; clicks add to it and remove from
-    it."""
+    """The user's description of the object: exactly one of masks, box, point and picked Gaussians; clicks add to it and
+    remove from it."""
 
     masks: tuple[MaskedView, ...] = ()
     box: Box | None = None
@@ -37,6 +37,8 @@ class ObjectSpec:
     """(3,) on or in the object, scene units."""
     clicks: tuple[Click, ...] = ()
     """Clicks; each adds the Gaussians that it hits and those connected to them, or removes them."""
+    picked: np.ndarray | None = None
+    """(n,) bool, the Gaussians of the object as the user has picked them; nothing is searched for."""
 
     @classmethod
     def of_clicks(cls, clicks: Sequence[Click]) -> ObjectSpec:

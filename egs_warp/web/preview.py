@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import secrets
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -24,8 +25,9 @@ _OUTLIERS = 0.5
 """Percentage of the opaque Gaussians that are ignored at each end of an axis when the capture is measured."""
 _OPAQUE = 0.3
 """Opacity above which a Gaussian is used to measure the capture."""
-_FOV_DEGREES = 30.0
-_DISTANCE = 1.0 / np.tan(np.radians(0.5 * _FOV_DEGREES))
+FOV_DEGREES = 30.0
+"""Vertical field of view of the initial camera."""
+DISTANCE = 1.0 / np.tan(np.radians(0.5 * FOV_DEGREES))
 """Distance of the camera at which half of the picture's height is one body height, body heights."""
 
 
@@ -49,15 +51,31 @@ def preview_of(
         up: (3,) up direction in the capture's frame; may be None if there is a plane.
         plane: Ground plane in the capture's frame; None for a plane below the capture.
     """
+    frame, bounds = page_frame(cloud, up=up, plane=plane)
+    facts = {"title": title, "preparing": True, "camera": camera_facts(bounds)}
+    return still_run(to_body_frame(cloud, frame), bounds, facts)
+
+
+def page_frame(
+    cloud: GaussianCloud, *, up: np.ndarray | None = None, plane: Plane | None = None
+) -> tuple[BodyFrame, np.ndarray]:
+    """Return a frame in which the capture stands upright and is one high, and the lower and the upper corner (2, 3) of
+    its bounds, without outliers.
+
+    Args:
+        cloud: The capture.
+        up: (3,) up direction in the capture's frame; may be None if there is a plane.
+        plane: Ground plane in the capture's frame; None for a plane below the capture.
+    """
     means, opacities = cloud.means.numpy().astype(np.float64), cloud.opacities()
     opaque = means[opacities > _OPAQUE] if (opacities > _OPAQUE).any() else means
     if plane is None:
-        assert up is not None, "preview_of requires up or a plane"
+        assert up is not None, "page_frame requires up or a plane"
         up = up / np.linalg.norm(up)
         plane = Plane(up, -float(np.percentile(opaque @ up, _OUTLIERS)))
     frame = upright_frame(opaque, np.ones(len(opaque)), plane)
     frame = frame.scaled(1.0 / max(float(np.percentile(frame.points(opaque)[:, 2], 100.0 - _OUTLIERS)), 1e-9))
-    return _run_of_one_frame(to_body_frame(cloud, frame), _bounds(frame, opaque), title=title)
+    return frame, _bounds(frame, opaque)
 
 
 def _bounds(frame: BodyFrame, points: np.ndarray) -> np.ndarray:
@@ -65,16 +83,21 @@ def _bounds(frame: BodyFrame, points: np.ndarray) -> np.ndarray:
     return np.percentile(frame.points(points), [_OUTLIERS, 100.0 - _OUTLIERS], axis=0)
 
 
-def _run_of_one_frame(splats: GaussianCloud, bounds: np.ndarray, *, title: str) -> Preview:
-    """Return the Gaussians as a run whose cage is one tetrahedron at a corner of the box ``bounds`` (2, 3)."""
+def camera_facts(bounds: np.ndarray, *, distance: float = DISTANCE) -> dict[str, Any]:
+    """Return the entry ``camera`` of a header: a camera at ``distance``, body heights, from the middle of ``bounds``
+    (2, 3)."""
+    direction = np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM)
+    position = bounds.mean(axis=0) + distance * direction
+    return {"position": position.tolist(), "forward": (-direction).tolist(), "fov": FOV_DEGREES}
+
+
+def still_run(splats: GaussianCloud, bounds: np.ndarray, facts: Mapping[str, Any]) -> Preview:
+    """Return the Gaussians as a run of one frame, whose cage is one tetrahedron at a corner of the box ``bounds``
+    (2, 3). ``facts`` are entries of its header: at least title and camera."""
     low, high = bounds
     nodes = np.array([[(low, high)[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
-    middle = 0.5 * (low + high)
-    direction = np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM)
     facts = {
-        "title": title,
         "session": secrets.token_hex(8),
-        "preparing": True,
         "rate": FRAME_RATE,
         "frames": 1,
         "height": 1.0,
@@ -88,12 +111,8 @@ def _run_of_one_frame(splats: GaussianCloud, bounds: np.ndarray, *, title: str) 
         "notes": [],
         "fibres": [],
         "antialiased": splats.antialiased,
-        "camera": {
-            "position": (middle + _DISTANCE * direction).tolist(),
-            "forward": (-direction).tolist(),
-            "fov": _FOV_DEGREES,
-        },
         "degree": {"splats": splats.sh_degree, "scene": 0},
+        **facts,
     }
     no_indices = np.zeros(0, np.int32)
     arrays = {

@@ -34,6 +34,14 @@ const ICONS = {
   help:
     '<circle cx="12" cy="12" r="8.5"/>' +
     '<path d="M9.5 9.5a2.5 2.5 0 1 1 3.5 2.3c-.7.3-1 .8-1 1.7M12 16.5v.01" stroke-linecap="round"/>',
+  plus: '<circle cx="12" cy="12" r="8.5"/><path d="M12 8v8M8 12h8"/>',
+  minus: '<circle cx="12" cy="12" r="8.5"/><path d="M8 12h8"/>',
+  brush: '<path d="M4 20c4 0 5-1.5 5-4l9-11 2 2-11 9c-2.5 0-3 2-5 4z" stroke-linejoin="round"/>',
+  undo: '<path d="M8 4L3.5 8.5 8 13M4 8.5h10a5.5 5.5 0 0 1 0 11H9" stroke-linejoin="round"/>',
+  redo: '<path d="M16 4l4.5 4.5L16 13M20 8.5H10a5.5 5.5 0 0 0 0 11h5" stroke-linejoin="round"/>',
+  object: '<path d="M12 3l8 4.5v9L12 21l-8-4.5v-9z" stroke-linejoin="round"/><path d="M12 9v6M9 12h6"/>',
+  save: '<path d="M12 4v11M7 10.5L12 15.5l5-5M4 19.5h16" stroke-linejoin="round"/>',
+  bin: '<path d="M5 7h14M9 7V4h6v3M7 7l1 13h8l1-13" stroke-linejoin="round"/>',
   curves: '<path d="M3 20V4M3 20h18M6 15c3 0 3-8 6-8s3 6 9 4"/>',
 } as const;
 

@@ -1,5 +1,6 @@
 // Sources of frames: a file with all frames of a run, or a socket that sends frames during the simulation.
 
+import type { PickNews } from "./pick_news";
 import { readFrame, readFrames, readHeader, type Frame, type Header, type Style } from "./packets";
 
 export interface FrameSource {
@@ -59,6 +60,7 @@ export type News =
   | { type: "preparing"; stage: string }
   | { type: "failed"; text: string }
   | { type: "ready" }
+  | PickNews
   | { type?: undefined; error: string };
 
 /** A live session: receives frames and messages, and sends commands. */

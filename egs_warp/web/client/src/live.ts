@@ -8,12 +8,11 @@ import { Gizmos } from "./gizmos";
 import { createKeySheet } from "./key_sheet";
 import { PushTool } from "./push_tool";
 import { createSlider, type Slider } from "./slider";
+import { Toasts } from "./toasts";
 import type { LiveSource, News } from "./frame_source";
 import type { Viewer } from "./viewer";
 
 type State = Extract<News, { type: "state" }>;
-/** Time for which a message is shown, ms. */
-const TOAST_TIME = 7000;
 /** Duration of the flash of a button whose key was pressed, ms. */
 const FLASH_TIME = 400;
 /** Time within which the session reports a request that changes something, ms. */
@@ -57,7 +56,7 @@ export class Live {
   private readonly nextLabel = element("output", { class: "next", title: "Motion that comes next" });
   private readonly pauseButton: HTMLButtonElement;
   private readonly recordButton: HTMLButtonElement;
-  private readonly toasts = element("div", { class: "toasts", role: "status", "aria-live": "polite" });
+  private readonly toasts = new Toasts();
   private readonly settingsSheet: HTMLElement;
   private readonly helpSheet: HTMLElement;
   private readonly sliders: { friction: Slider; sag: Slider };
@@ -177,7 +176,7 @@ export class Live {
     const labels = element("div", { class: "labels" }, this.speedLabel, this.nextLabel);
     const time = element("div", {}, this.pauseButton, step, labels);
     const dock = element("footer", { class: "dock live" }, time, pad, actions);
-    return [dock, this.settingsSheet, this.helpSheet, this.toasts];
+    return [dock, this.settingsSheet, this.helpSheet, this.toasts.element];
   }
 
   /** Advance by `elapsed` wall-clock seconds; return true if the shown time has changed. */
@@ -291,10 +290,7 @@ export class Live {
 
   private showMessage(line: string, isError = false): void {
     this.messages.push(line);
-    const toast = element("p", { class: isError ? "toast wrong" : "toast" }, line);
-    this.toasts.append(toast);
-    while (this.toasts.childElementCount > 3) this.toasts.firstElementChild?.remove();
-    setTimeout(() => toast.remove(), TOAST_TIME);
+    this.toasts.show(line, isError);
   }
 
   private togglePause(): void {

@@ -28,6 +28,8 @@ export interface Facts {
   antialiased: boolean;
   /** True for the still capture that is shown while its creature is prepared. */
   preparing?: boolean;
+  /** True for a capture whose objects are picked. */
+  picking?: boolean;
   /** Only for live sessions: identifier of the session and limits of its sliders. */
   session?: string;
   limits?: { friction: [number, number]; sag: [number, number]; style: [number, number] };

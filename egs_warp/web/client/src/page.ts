@@ -6,6 +6,7 @@ import { createKeySheet } from "./key_sheet";
 import { Legend } from "./legend";
 import { VideoRecorder } from "./video_recorder";
 import { Live } from "./live";
+import { Pick } from "./pick";
 import { Player } from "./player";
 import { Preparation } from "./preparation";
 import { LiveSource, type FrameSource } from "./frame_source";
@@ -50,6 +51,8 @@ export class Page {
   readonly player: Player;
   /** Only for live sessions. */
   readonly live: Live | undefined;
+  /** Only where objects are picked. */
+  readonly pick: Pick | undefined;
   private readonly charts: Charts;
   private readonly legend: Legend;
   private readonly keySheet = createKeySheet(HELP);
@@ -78,7 +81,9 @@ export class Page {
     }
     const preparation =
       first instanceof LiveSource && first.header.facts.preparing ? new Preparation(first) : undefined;
-    if (first instanceof LiveSource && preparation === undefined) {
+    if (first instanceof LiveSource && first.header.facts.picking) {
+      this.pick = new Pick(first, this.viewers[0] as Viewer);
+    } else if (first instanceof LiveSource && preparation === undefined) {
       this.live = new Live(first, this.viewers[0] as Viewer);
     }
     for (const viewer of this.viewers) {
@@ -91,7 +96,7 @@ export class Page {
     this.playButton.classList.add("play");
     this.legend = new Legend(first.header.arrays.has("plan"));
     const recorded = preparation === undefined ? [this.playbackBar()] : [preparation.element];
-    const controls = this.live?.elements() ?? [...recorded, this.keySheet];
+    const controls = this.pick?.elements() ?? this.live?.elements() ?? [...recorded, this.keySheet];
     const notes = element("div", { class: "notes" }, this.legend.element, this.charts.panel);
     root.append(this.toolbar(), notes, ...controls);
     this.charts.panel.hidden = true;
@@ -121,7 +126,7 @@ export class Page {
 
   private isShown(name: LayerToggle, viewer: Viewer): boolean {
     // A captured scene contains its own ground.
-    return name !== "ground" || !viewer.hasScene;
+    return name !== "ground" || !(viewer.hasScene || this.pick !== undefined);
   }
 
   /** Fractional index of the frame that is shown. */
@@ -155,18 +160,25 @@ export class Page {
     }
     const follow = element("input", { type: "checkbox", id: "follow" });
     follow.addEventListener("change", () => this.setFollow(follow.checked));
-    views.append(element("label", {}, follow, element("span", {}, "Follow the creature")));
+    if (this.pick === undefined) {
+      views.append(element("label", {}, follow, element("span", {}, "Follow the creature")));
+    }
     const toggle = (opened: HTMLElement, other: HTMLElement) => () => {
       opened.hidden = !opened.hidden;
       other.hidden = true;
     };
     const what = this.live === undefined ? "Record a video of the whole run" : "Record a video of this view";
     const record = button("record", what, () => this.record(record));
+    const camera = button("view", "Camera", toggle(views, layers));
+    if (this.pick !== undefined) {
+      const picture = button("camera", "Screenshot", () => void this.screenshot());
+      return element("nav", { class: "tools", "aria-label": "View" }, camera, picture, views);
+    }
     return element(
       "nav",
       { class: "tools", "aria-label": "View" },
       button("layers", "Layers", toggle(layers, views)),
-      button("view", "Camera", toggle(views, layers)),
+      camera,
       button("curves", "Curves (c)", () => this.toggleCurves()),
       button("camera", this.live === undefined ? "Screenshot (s)" : "Screenshot", () => void this.screenshot()),
       record,
@@ -246,6 +258,10 @@ export class Page {
   private keyDown(event: KeyboardEvent): void {
     const hasModifier = event.ctrlKey || event.metaKey || event.altKey;
     const { target } = event;
+    if (this.pick !== undefined) {
+      if (!(target instanceof HTMLSelectElement) && this.pick.keyDown(event)) event.preventDefault();
+      return;
+    }
     const isTyping = target instanceof HTMLSelectElement || (this.live && target instanceof HTMLInputElement);
     if (isTyping || hasModifier) return;
     if (this.live?.keyDown(event)) {

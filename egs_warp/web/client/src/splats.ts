@@ -6,21 +6,31 @@ import * as THREE from "three";
 import { floatTexture, TEXTURE_WIDTH } from "./cage";
 import { bytesOf, floatsOf, indicesOf, type Header } from "./packets";
 import { DEFORM_GLSL } from "./deform.glsl";
+import { MARK_GLSL } from "./mark.glsl";
 
 export interface DeformedSplats {
   generator: SplatGenerator;
   /** Regenerate the splats after the cage has changed. */
   update(): void;
+  /** Light up the splats of an object and dim those of none; only for splats with `hasMarks`. */
+  mark(labels: Uint8Array, active: number): void;
+}
+
+interface SplatOptions {
+  isStatic: boolean;
+  shadow?: { texture: THREE.Texture; region: THREE.Vector4 };
+  hasMarks?: boolean;
 }
 
 /** Create the splats `name` of a run, deformed by the maps in `cage`.
  *
- * Static splats all use the first tetrahedron. A `shadow` darkens the splats near the ground. */
+ * Static splats all use the first tetrahedron. A `shadow` darkens the splats near the ground. With `hasMarks`, the
+ * colour of a splat depends on the object to which it belongs. */
 export function deformedSplats(
   header: Header,
   name: "splats" | "scene",
   cage: THREE.DataTexture,
-  { isStatic, shadow }: { isStatic: boolean; shadow?: { texture: THREE.Texture; region: THREE.Vector4 } },
+  { isStatic, shadow, hasMarks = false }: SplatOptions,
 ): DeformedSplats {
   const means = floatsOf(header, `${name}_means`);
   const count = means.length / 3;
@@ -48,6 +58,8 @@ export function deformedSplats(
   for (let k = 0; k < arm; k++) arms.values.set(armRows.subarray(15 * k, 15 * k + 15), 16 * k);
   const bandScales = [...floatsOf(header, `${name}_band_scales`), ...new Array<number>(16).fill(0)];
   const eye = new THREE.Vector3();
+  const marks = hasMarks ? markTexture(count) : undefined;
+  const activeMark = dyno.dynoInt(-1, "egsActiveMark");
   const uniforms = {
     splats: dyno.dynoSampler2D(splats.texture, "egsSplats"),
     arms: dyno.dynoSampler2D(arms.texture, "egsArms"),
@@ -59,6 +71,8 @@ export function deformedSplats(
     shadeRegion: dyno.dynoVec4(shadow?.region ?? new THREE.Vector4(), "egsShadeRegion"),
     eye: dyno.dynoVec3(eye, "egsEye"),
     degree: dyno.dynoConst("int", degree),
+    marks: dyno.dynoSampler2D(marks?.texture ?? cage, "egsMarks"),
+    activeMark,
   };
   const covGenerator = dyno.dynoBlock({ index: "int" }, { covsplat: dyno.CovSplat }, ({ index }) => {
     if (index === undefined) throw new Error("Spark gave no index");
@@ -74,13 +88,17 @@ export function deformedSplats(
         shadeRegion: "vec4",
         eye: "vec3",
         degree: "int",
+        marks: "sampler2D",
+        activeMark: "int",
       },
       outTypes: { covsplat: dyno.CovSplat },
       inputs: { index, ...uniforms },
-      globals: () => [dyno.defineGsplat, dyno.defineCovSplat, DEFORM_GLSL],
+      globals: () => [dyno.defineGsplat, dyno.defineCovSplat, DEFORM_GLSL, MARK_GLSL],
       statements: ({ inputs: i, outputs }) => [
         `${outputs.covsplat} = egsDeformed(${i.index}, ${i.splats}, ${i.arms}, ${i.bands}, ${i.bandScales}, ` +
           `${i.cage}, ${i.shade}, ${i.shadeRegion}, ${i.eye}, ${i.degree});`,
+        `${outputs.covsplat}.rgba.rgb = ` +
+          `egsMarked(${outputs.covsplat}.rgba.rgb, ${i.marks}, ${i.index}, ${i.activeMark});`,
       ],
     });
     return { covsplat: deform.outputs.covsplat };
@@ -93,7 +111,26 @@ export function deformedSplats(
     },
   });
   generator.frustumCulled = false;
-  return { generator, update: () => generator.updateVersion() };
+  return {
+    generator,
+    update: () => generator.updateVersion(),
+    mark: (labels, active) => {
+      if (marks === undefined) return;
+      marks.values.set(labels);
+      marks.texture.needsUpdate = true;
+      activeMark.value = labels.some((label) => label > 0) ? active : -1;
+      generator.updateVersion();
+    },
+  };
+}
+
+/** Create a texture with one byte per splat. */
+function markTexture(count: number): { texture: THREE.DataTexture; values: Uint8Array } {
+  const rows = Math.max(1, Math.ceil(count / TEXTURE_WIDTH));
+  const values = new Uint8Array(TEXTURE_WIDTH * rows);
+  const texture = new THREE.DataTexture(values, TEXTURE_WIDTH, rows, THREE.RedFormat, THREE.UnsignedByteType);
+  texture.needsUpdate = true;
+  return { texture, values };
 }
 
 /** Create a texture with one RGB texel per coefficient above band 0. */

@@ -65,7 +65,10 @@ export class Viewer {
     const rest = floatsOf(header, "rest");
     this.positions = new Float32Array(rest);
     this.cage = new Cage(rest, indicesOf(header, "tets"));
-    this.splats = deformedSplats(header, "splats", this.cage.texture, { isStatic: false });
+    this.splats = deformedSplats(header, "splats", this.cage.texture, {
+      isStatic: false,
+      hasMarks: header.facts.picking ?? false,
+    });
     this.splatRenderer = splatRenderer(this.renderer, header.facts.antialiased, () => this.invalidate());
     this.scene.add(this.splatRenderer.spark, this.splats.generator);
     this.overlays = new Overlays(header, (frame) => this.computeCentre(frame.positions));
@@ -299,6 +302,12 @@ export class Viewer {
       };
       this.canvas.toBlob(finish, "image/png");
     });
+  }
+
+  /** Light up the splats of the object `active`; `labels` has the number of the object of each splat, 0 for none. */
+  mark(labels: Uint8Array, active: number): void {
+    this.splats.mark(labels, active);
+    this.invalidate();
   }
 
   /** Add an object to the scene. */

@@ -1,0 +1,154 @@
+"""``egs-warp pick``: choose objects of a capture, their ground and their front on a page in the browser."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from egs_warp.commands.flags import Commands, guessed_up, named_path
+from egs_warp.commands.live import wait_for_end
+from egs_warp.commands.scene_flags import add_object_flags, print_note
+from egs_warp.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from egs_warp.commands.scene_input import SceneInput
+    from egs_warp.geometry.camera import Camera
+    from egs_warp.io.picked import PickedObject
+
+EXAMPLES = (
+    "room.ply",
+    "room.ply --cameras POSED --out out/toy/picked.json",
+    "room.ply --object 0,0,0.5",
+)
+_DISTANCE = 1.25
+"""Distance of the initial camera relative to that of a preview, which leaves space for the arrows."""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the subparsers ``commands``."""
+    pick = commands.add_parser("pick", help="choose objects, their ground and their front in the browser")
+    pick.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
+    pick.add_argument(
+        "--out",
+        type=named_path,
+        default=Path("out/pick/picked.json"),
+        metavar="FILE",
+        help="file to write (out/pick/picked.json); if it exists, its objects are shown first; films are written "
+        "next to it",
+    )
+    add_object_flags(pick)
+    pick.add_argument("--up", help="axis that points up: x, y, z, -x, -y or -z, such as --up=-y (default: estimated)")
+    pick.add_argument("--plane", help="ground plane: plane.json, or nx,ny,nz,d (default: estimated)")
+    pick.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
+    pick.add_argument("--port", type=int, default=0, help="port on 127.0.0.1 (default: any free port)")
+    pick.add_argument("--no-browser", action="store_true", help="print the address, but do not open the browser")
+    pick.set_defaults(run=_pick)
+
+
+def _pick(args: argparse.Namespace) -> int:
+    import webbrowser
+
+    from egs_warp.commands.scene_input import read_scene
+    from egs_warp.deformation.rigid import to_body_frame
+    from egs_warp.io.picked import read_picked
+    from egs_warp.web.page import page_text
+    from egs_warp.web.pick_feed import PickFeed
+    from egs_warp.web.pick_session import PickSession, PickSource
+    from egs_warp.web.preview import DISTANCE, camera_facts, page_frame, still_run
+    from egs_warp.web.server import PageServer, check_port
+
+    # Report errors that can be detected before any long work.
+    page_text()
+    check_port(args.port)
+    if args.out.suffix.lower() != ".json":
+        raise UserError(f"--out {args.out}: give a file name that ends in .json")
+    scene = read_scene(args)
+    for note in scene.notes:
+        print_note(note)
+    cloud, up = scene.cloud, scene.up
+    if scene.plane is None and up is None:
+        up, note = guessed_up(cloud)
+        print_note(note)
+    kept = read_picked(args.out, cloud).objects if args.out.exists() else ()
+
+    def first() -> Sequence[PickedObject]:
+        return (*kept, _given_object(scene)) if scene.spec is not None else kept
+
+    frame, bounds = page_frame(cloud, up=up, plane=scene.plane)
+    placed = to_body_frame(cloud, frame)
+    centre = _looked_at(scene.cameras)
+    source = PickSource(
+        cloud,
+        placed,
+        frame,
+        Path(args.capture).name,
+        args.out,
+        _Commands(args),
+        first,
+        None if centre is None else frame.points(centre),
+    )
+    camera = camera_facts(bounds, distance=_DISTANCE * DISTANCE)
+    shown = still_run(placed, bounds, {"title": Path(args.capture).name, "picking": True, "camera": camera})
+    session = PickSession(source)
+    server = PageServer([], port=args.port, feed=PickFeed(session, shown))
+    with server.serve_in_background() as thread:
+        print(f"open {server.address}\nend with Ctrl-C", flush=True)
+        if not args.no_browser:
+            webbrowser.open(server.address)
+        session.start()
+        try:
+            wait_for_end(thread)
+        finally:
+            session.stop()
+    return 0
+
+
+def _given_object(scene: SceneInput) -> PickedObject:
+    """Return the object of ``--object`` and the plane under it, as the other commands find them."""
+    from egs_warp.io.picked import PickedObject
+    from egs_warp.pipelines.locate_plane import locate_plane
+
+    located = locate_plane(scene.cloud, scene.object, cameras=scene.cameras, up=scene.up, plane=scene.plane)
+    return PickedObject("object 1", located.segmentation.object_mask, located.known(), scene.front)
+
+
+@dataclass(frozen=True)
+class _Commands:
+    """``PickCommands`` with the capture, cameras and device of ``args``."""
+
+    args: argparse.Namespace
+
+    def _shared(self, value: str) -> list[str]:
+        shared = [self.args.capture, f"--object={value}", f"--device={self.args.device}"]
+        return shared if self.args.cameras is None else [*shared, f"--cameras={self.args.cameras}"]
+
+    def animate(self, value: str, motion: str) -> tuple[list[str], Path]:
+        number = 1
+        while (folder := self.args.out.parent / f"film-{number}").exists():
+            number += 1
+        return ["animate", *self._shared(value), f"--motion={motion}", f"--out={folder}"], folder
+
+    def live(self, value: str) -> list[str]:
+        return ["live", *self._shared(value), "--no-browser", f"--out={self.args.out.parent / 'takes'}"]
+
+    def view(self, folder: Path) -> list[str]:
+        return ["view", str(folder), "--no-browser"]
+
+
+def _looked_at(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """Return the point (3,) that is nearest to the optical axes of all ``cameras``; None for fewer than three."""
+    import numpy as np
+
+    if len(cameras) < 3:
+        return None
+    across = [np.eye(3) - np.outer(camera.rotation[2], camera.rotation[2]) for camera in cameras]
+    centres = [camera.centre for camera in cameras]
+    matrix = np.sum(across, axis=0)
+    if np.linalg.cond(matrix) > 1e6:
+        return None
+    return np.linalg.solve(matrix, np.sum([one @ centre for one, centre in zip(across, centres, strict=True)], axis=0))

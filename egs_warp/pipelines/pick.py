@@ -1,0 +1,276 @@
+"""Picking of objects by hand: state, history and proposals, without the page that shows them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.meshing.body_gaussians import centred, representatives
+from egs_warp.segmentation.base_plane import find_base_plane
+from egs_warp.segmentation.clicks import Click, click_at
+from egs_warp.segmentation.interactive import ClickGraph, segment_by_clicks
+from egs_warp.segmentation.object_spec import Segmentation
+from egs_warp.segmentation.plane_search import find_planes
+from egs_warp.segmentation.table_top import planes_below, surface_around
+
+_MIN_SUPPORT = 0.15
+"""Share of the visible surface below which the widest plane is not taken for the ground of a scene."""
+_MAX_BELOW = 0.3
+"""Share of the opaque Gaussians above which a plane has too much below it to be the ground."""
+_STANDING = 0.03
+"""Height above the ground, as a fraction of the capture's, from which Gaussians stand on it."""
+_MAX_TABLE_DISTANCE, _MIN_SURROUNDING_SHARE = 0.7, 0.25
+"""A table top replaces the wide plane if the click is nearer to it than this multiple, and if this share of the
+object's surroundings lies on it, as in ``locate_plane``."""
+_MAX_SHARE = 1.0 / 3.0
+"""Share of the capture above which an object is reported as large, if it is also wide."""
+_MAX_EXTENT = 0.6
+"""Fraction of the capture's diagonal along the ground above which an object is wide."""
+_SEED_COUNT = 8
+"""Number of Gaussians next to the middle of a scene from which the proposal starts."""
+_OPAQUE = 0.3
+MAX_STEPS = 100
+"""Maximum number of changes that can be undone."""
+
+
+@dataclass(frozen=True)
+class Pick:
+    """One object: what the user has marked, and what follows from it."""
+
+    name: str
+    plane: Plane
+    """Ground of the object."""
+    mask: np.ndarray
+    """(n,) bool, its Gaussians."""
+    clicks: tuple[Click, ...] = ()
+    front: np.ndarray | None = None
+    """(3,) facing direction that the user has given; None to estimate it."""
+    proposal: np.ndarray | None = None
+    """(n,) bool, Gaussians from which the clicks start: those of a file, or of a proposal; None for none."""
+    is_guess: bool = False
+    """True if the proposal is a guess, which a click elsewhere replaces."""
+    is_plane_given: bool = False
+    """True if the user has put the plane where it is."""
+
+    @property
+    def points(self) -> np.ndarray:
+        """(k,) int, indices of the Gaussians."""
+        return np.flatnonzero(self.mask)
+
+
+@dataclass(frozen=True)
+class PickState:
+    """All objects at one time."""
+
+    picks: tuple[Pick, ...]
+    active: int = 0
+
+    @property
+    def pick(self) -> Pick:
+        """The active object."""
+        return self.picks[self.active]
+
+    def with_pick(self, pick: Pick) -> PickState:
+        """Return the state with the active object replaced by ``pick``."""
+        return replace(self, picks=(*self.picks[: self.active], pick, *self.picks[self.active + 1 :]))
+
+    def with_new(self, pick: Pick) -> PickState:
+        """Return the state with a further object, which becomes the active one."""
+        return PickState((*self.picks, pick), len(self.picks))
+
+    def selecting(self, index: int) -> PickState:
+        """Return the state with object ``index`` active."""
+        return replace(self, active=min(max(index, 0), len(self.picks) - 1))
+
+    def without_active(self) -> PickState:
+        """Return the state without the active object; the last one is emptied instead."""
+        if len(self.picks) == 1:
+            empty = np.zeros_like(self.pick.mask)
+            return self.with_pick(Pick(self.pick.name, self.pick.plane, empty, is_plane_given=self.pick.is_plane_given))
+        rest = (*self.picks[: self.active], *self.picks[self.active + 1 :])
+        return PickState(rest, min(self.active, len(rest) - 1))
+
+    def free_name(self) -> str:
+        """Return a name for a new object."""
+        names = {one.name for one in self.picks}
+        return next(f"object {number}" for number in range(1, len(names) + 2) if f"object {number}" not in names)
+
+    def labels(self) -> np.ndarray:
+        """(n,) uint8, number of the object of each Gaussian, from 1; 0 for the rest. The active object has
+        precedence."""
+        labels = np.zeros(len(self.pick.mask), np.uint8)
+        for number, one in enumerate(self.picks, start=1):
+            labels[one.mask] = number
+        labels[self.pick.mask] = self.active + 1
+        return labels
+
+
+class PickHistory:
+    """States that can be undone and redone."""
+
+    def __init__(self, state: PickState) -> None:
+        self._states, self._at = [state], 0
+
+    @property
+    def state(self) -> PickState:
+        """The current state."""
+        return self._states[self._at]
+
+    @property
+    def can_undo(self) -> bool:
+        """True if there is an earlier state."""
+        return self._at > 0
+
+    @property
+    def can_redo(self) -> bool:
+        """True if there is a state that was undone."""
+        return self._at < len(self._states) - 1
+
+    def push(self, state: PickState) -> None:
+        """Make ``state`` the current one; states that were undone are dropped."""
+        self._states = [*self._states[: self._at + 1], state][-MAX_STEPS - 1 :]
+        self._at = len(self._states) - 1
+
+    def amend(self, state: PickState) -> None:
+        """Replace the current state without a step of its own."""
+        self._states[self._at] = state
+
+    def move(self, *, redo: bool) -> bool:
+        """Undo a step, or redo one; return False if there is none."""
+        if not (self.can_redo if redo else self.can_undo):
+            return False
+        self._at += 1 if redo else -1
+        return True
+
+
+def stroke_at(
+    cloud: GaussianCloud, camera: Camera, pixels: Sequence[tuple[float, float]], *, inside: bool
+) -> Click | None:
+    """Return the click whose hits are those of all ``pixels`` of ``camera``'s picture; None if nothing is there."""
+    clicks = [click_at(cloud, camera, u, v, inside=inside) for u, v in pixels]
+    found = [click for click in clicks if click is not None]
+    if not found:
+        return None
+    return replace(found[0], hits=np.unique(np.concatenate([click.hits for click in found])))
+
+
+def marked(graph: ClickGraph, pick: Pick, click: Click) -> Pick:
+    """Return ``pick`` after one more click. A first click that misses a guessed proposal replaces it."""
+    hits_proposal = pick.proposal is not None and bool(pick.proposal[click.hits].any())
+    if pick.is_guess and click.inside and not hits_proposal:
+        pick = replace(pick, proposal=None)
+    return resegmented(graph, replace(pick, clicks=(*pick.clicks, click), is_guess=False))
+
+
+def resegmented(graph: ClickGraph, pick: Pick) -> Pick:
+    """Return ``pick`` with the Gaussians that its clicks select above its plane."""
+    return replace(pick, mask=segment_by_clicks(graph, pick.clicks, pick.plane, proposal=pick.proposal))
+
+
+def on_table_top(graph: ClickGraph, pick: Pick) -> Pick:
+    """Return ``pick`` on the table top under its lowest click, if there is one above its plane and the user has not
+    given the plane."""
+    points = [click.point for click in pick.clicks if click.inside]
+    if pick.is_plane_given or not points:
+        return pick
+    up = pick.plane.normal
+    lowest = min(points, key=lambda point: float(point @ up))
+    for plane in planes_below(graph.cloud, up, lowest):
+        if plane.heights(lowest) > _MAX_TABLE_DISTANCE * pick.plane.heights(lowest):
+            break
+        standing = resegmented(graph, replace(pick, plane=plane))
+        if not standing.mask.any():
+            continue
+        nothing = np.zeros_like(standing.mask)
+        found = Segmentation(standing.mask, nothing, nothing, size_of(graph, standing))
+        if found.size > 0.0 and surface_around(graph.cloud, plane, found) > _MIN_SURROUNDING_SHARE:
+            return standing
+    return pick
+
+
+def proposed(graph: ClickGraph, up: np.ndarray, *, centre: np.ndarray | None = None) -> Pick:
+    """Return what is found without a click: the ground and the object in the middle.
+
+    A capture without a wide plane below it is one object on its base.
+
+    Args:
+        graph: the prepared capture.
+        up: (3,) up direction.
+        centre: (3,) point at which the cameras look; None for the middle of what stands on the ground.
+    """
+    cloud = graph.cloud
+    opaque = cloud.opacities() > _OPAQUE
+    planes = find_planes(cloud, up)
+    plane = planes[0].plane if planes and planes[0].support > _MIN_SUPPORT else None
+    if plane is not None:
+        heights = plane.heights(graph.means[opaque])
+        if (heights < -_STANDING * np.quantile(heights, 0.99)).mean() > _MAX_BELOW:
+            plane = None
+    if plane is None:
+        plane = _base_plane(cloud, up)
+        whole = plane.heights(graph.means) > 0.0
+        return Pick("object 1", plane, whole, proposal=whole, is_guess=True)
+    heights = plane.heights(graph.means)
+    tall = float(np.quantile(heights[opaque], 0.99)) if opaque.any() else 0.0
+    standing = np.flatnonzero(opaque & (heights > max(_STANDING * tall, 0.0)))
+    empty = Pick("object 1", plane, np.zeros(cloud.count, bool))
+    if len(standing) == 0:
+        return empty
+    middle = np.median(graph.means[standing], axis=0) if centre is None else centre
+    away = np.linalg.norm(graph.means[standing] - middle, axis=1)
+    hits = standing[np.argsort(away, kind="stable")[:_SEED_COUNT]]
+    guess = resegmented(graph, replace(empty, clicks=(Click(graph.means[hits[0]], hits),)))
+    if _is_large(graph, guess):
+        # Rather nothing than half of a room.
+        return empty
+    return replace(guess, clicks=(), proposal=guess.mask, is_guess=True)
+
+
+def _base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:
+    """Return the plane on which a capture of one object stands."""
+    near, anchor = centred(representatives(cloud))
+    try:
+        return find_base_plane(near, up).moved(anchor)
+    except UserError:
+        lowest = float(np.quantile(cloud.means.numpy() @ up, 0.005))
+        return Plane(up, -lowest)
+
+
+def size_of(graph: ClickGraph, pick: Pick) -> float:
+    """Return the diagonal of the object's bounding box, without outliers; 0 without an object."""
+    if not pick.mask.any():
+        return 0.0
+    low, high = np.quantile(graph.means[pick.mask], [0.005, 0.995], axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def _is_large(graph: ClickGraph, pick: Pick) -> bool:
+    """Return True if the object has a large part of the capture and is wide: it may include other things."""
+    along = np.stack(pick.plane.tangents(), axis=1)
+    extent, whole = (
+        float(np.linalg.norm(np.subtract(*np.quantile(points @ along, [0.99, 0.01], axis=0))))
+        for points in (graph.means[pick.mask], graph.middles)
+    )
+    return int(pick.mask.sum()) > _MAX_SHARE * len(pick.mask) and extent > _MAX_EXTENT * whole
+
+
+def pick_warnings(graph: ClickGraph, pick: Pick) -> tuple[str, ...]:
+    """Return warnings about an object, each with a remedy."""
+    count = int(pick.mask.sum())
+    if count == 0:
+        return ()
+    warnings = []
+    if _is_large(graph, pick):
+        share = 100.0 * count / len(pick.mask)
+        warnings.append(f"it has {share:.0f} % of the capture; if other things lit up, remove them")
+    size = size_of(graph, pick)
+    lowest = float(np.quantile(pick.plane.heights(graph.means[pick.mask]), 0.002))
+    if lowest > 0.1 * size:
+        warnings.append(f"it hangs {lowest / size:.2f} of its size above the ground; drag the ground to its feet")
+    return tuple(warnings)

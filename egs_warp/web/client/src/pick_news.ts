@@ -1,0 +1,50 @@
+// Events of the session of egs-warp pick (egs_warp/web/pick_session.py).
+
+export type Vector = [number, number, number];
+
+/** The objects, and the ground and front of the active one; lengths in the frame of the page. */
+export interface PickState {
+  type: "pick";
+  objects: { name: string; count: number }[];
+  active: number;
+  /** Unit normal and offset of the ground n.x + d = 0. */
+  plane: [number, number, number, number];
+  /** Point of the ground under the object. */
+  anchor: Vector;
+  /** Diagonal of the object. */
+  size: number;
+  /** Front that the user has given. */
+  front: Vector | null;
+  undo: boolean;
+  redo: boolean;
+  warnings: string[];
+  /** True if the object is a guess. */
+  proposal: boolean;
+}
+
+/** Measured properties of the active object. */
+export interface BodyNews {
+  type: "body";
+  measuring?: boolean;
+  rows: [string, string][];
+  /** Motions, and why the body cannot perform one. */
+  motions: { name: string; why: string | null }[];
+  /** Given or estimated front. */
+  front: Vector | null;
+}
+
+/** Progress of a command that the page has started; it may serve a page of its own. */
+export interface JobNews {
+  type: "animate" | "live";
+  text: string;
+  running: boolean;
+  failed: boolean;
+  address?: string;
+}
+
+export type PickNews =
+  | PickState
+  | BodyNews
+  | JobNews
+  | { type: "labels"; data: string }
+  | { type: "work"; text: string };

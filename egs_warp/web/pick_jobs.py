@@ -1,0 +1,89 @@
+"""Commands of egs_warp that the page of ``egs-warp pick`` starts, each in a process of its own."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from typing import IO, Any
+
+_ADDRESS = re.compile(r"open (http://127\.0\.0\.1:\d+/\S*)")
+"""Line with which a command announces its page."""
+_MAX_LINE = 400
+"""Maximum number of characters of a line for the page."""
+_EXIT_TIME = 5.0
+"""Time within which a command ends after a signal, s."""
+
+
+class Job:
+    """A running command. Its output is printed to the terminal; its last line and its page's address are reported."""
+
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        *,
+        on_line: Callable[[str], object],
+        on_address: Callable[[str], object],
+        on_end: Callable[[int, str], object],
+    ) -> None:
+        """Start ``egs-warp`` with ``arguments``.
+
+        Args:
+            arguments: the command and its flags.
+            on_line: called with each line of progress.
+            on_address: called with the address of a page that the command serves.
+            on_end: called with the exit status and the last line.
+        """
+        self._on_line, self._on_address, self._on_end = on_line, on_address, on_end
+        self._last = ""
+        options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        self._process = subprocess.Popen([sys.executable, "-m", "egs_warp.cli", *arguments], **options)
+        streams = (self._process.stdout, self._process.stderr)
+        self._readers = [threading.Thread(target=self._read, args=(stream,), daemon=True) for stream in streams]
+        for reader in self._readers:
+            reader.start()
+        threading.Thread(target=self._wait, name="job", daemon=True).start()
+
+    @property
+    def is_running(self) -> bool:
+        """True until the command has ended."""
+        return self._process.poll() is None
+
+    def stop(self) -> None:
+        """End the command."""
+        if not self.is_running:
+            return
+        self._process.terminate()
+        try:
+            self._process.wait(_EXIT_TIME)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _read(self, stream: IO[bytes]) -> None:
+        """Report the lines of ``stream``; a progress bar ends its lines with a carriage return."""
+        line = bytearray()
+        while byte := stream.read(1):
+            if byte not in b"\r\n":
+                line += byte
+                continue
+            text = line.decode(errors="replace").strip()[:_MAX_LINE]
+            line.clear()
+            if not text:
+                continue
+            if byte == b"\n":
+                print(text, file=sys.stderr, flush=True)
+            address = _ADDRESS.match(text)
+            if address is not None:
+                self._on_address(address[1])
+            elif text != "end with Ctrl-C":
+                self._last = text
+                self._on_line(text)
+
+    def _wait(self) -> None:
+        status = self._process.wait()
+        for reader in self._readers:
+            reader.join()
+        self._on_end(status, self._last)

@@ -1,0 +1,101 @@
+"""``--object picked.json`` on the command line, and the flags of ``egs-warp pick``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.cli import main
+from egs_warp.geometry.plane import Plane
+from egs_warp.io import read_capture
+from egs_warp.io.picked import PickedFile, PickedObject, write_picked
+from egs_warp.io.planes import PlaneRecord
+from tests.support.scenes import write_scene
+
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with a ball on a floor, scene.ply, and picked.json of the ball and of its upper half."""
+    folder = tmp_path_factory.mktemp("scene")
+    write_scene(folder, views=2, size=32)
+    cloud = read_capture(folder / "scene.ply").cloud
+    means = cloud.means.numpy()
+    ball = (np.linalg.norm(means - [0.0, 0.0, 0.5], axis=1) < 0.55) & (means[:, 2] > 0.02)
+    ground, half = PlaneRecord(FLOOR), PlaneRecord(Plane(FLOOR.normal, -0.5))
+    objects = (
+        PickedObject("ball", ball, ground, np.array([0.0, 1.0, 0.0])),
+        PickedObject("upper half", ball & (means[:, 2] > 0.5), half),
+    )
+    write_picked(folder / "picked.json", PickedFile("scene.ply", objects), cloud)
+    return folder
+
+
+@pytest.mark.slow
+def test_segment_takes_a_picked_object_and_its_plane(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for value, lowest in ((f"{scene / 'picked.json'}", 0.0), (f"{scene / 'picked.json'}:upper half", 0.5)):
+        out = tmp_path / f"out-{lowest}"
+        flags = ["--out", str(out), "--flat", "--straddling", "none"]
+        assert main(["segment", str(scene / "scene.ply"), "--object", value, *flags]) == 0
+        means = read_capture(out / "object.ply").means.numpy()
+        assert lowest - 1e-6 < means[:, 2].min() < lowest + 0.05 and means[:, 2].max() > 0.95
+        assert np.linalg.norm(means[:, :2], axis=1).max() < 0.6
+        assert "object: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (["picked.json:bell"], "it has no object 'bell' (did you mean 'ball'?); it has ball, upper half"),
+        (["picked.json", "0,0,1"], "is a whole object; leave the other 1 values out"),
+        (["absent.json"], "make it with egs-warp pick"),
+        (["cameras.json"], "not a file of egs-warp pick"),
+    ],
+)
+def test_a_wrong_value_is_one_line(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], values: list[str], message: str
+):
+    given = [f"--object={scene / value if 'json' in value else value}" for value in values]
+    assert main(["segment", str(scene / "scene.ply"), *given, "--out", str(tmp_path / "out")]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert message in line
+
+
+def test_the_file_of_pick_must_end_in_json(scene: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["pick", str(scene / "scene.ply"), "--out", "picked.txt"]) == 2
+    assert "--out picked.txt: give a file name that ends in .json" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_info_takes_a_picked_object(scene: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["info", str(scene / "scene.ply"), "--object", str(scene / "picked.json")]) == 0
+    lines = capsys.readouterr().out
+    assert "front    0.00,1.00,0.00 as given" in lines and "a round base" in lines
+
+
+@pytest.mark.slow
+def test_animate_takes_a_picked_object(scene: Path, tmp_path: Path, coarse: None):
+    out = tmp_path / "run"
+    flags = ["--frames", "3", "--size", "64", "--straddling", "none", "--no-inpaint", "--flat", "--motion", "stand"]
+    value = f"{scene / 'picked.json'}:ball"
+    assert main(["animate", str(scene / "scene.ply"), "--object", value, "--out", str(out), *flags]) in (0, 3)
+    assert (out / "sheet.png").is_file() and (out / "plane.json").is_file()
+    # The object is the whole capture here, without a scene around it.
+    cloud = read_capture(out / "object.ply").cloud
+    whole = PickedObject("ball", np.ones(cloud.count, bool), PlaneRecord(FLOOR))
+    write_picked(tmp_path / "whole.json", PickedFile("object.ply", (whole,)), cloud)
+    again = [
+        "--object",
+        str(tmp_path / "whole.json"),
+        "--out",
+        str(tmp_path / "again"),
+        "--frames",
+        "3",
+        "--size",
+        "64",
+    ]
+    assert main(["animate", str(out / "object.ply"), *again, "--motion", "stand"]) in (0, 3)
+    assert not (tmp_path / "again" / "plane.json").exists()

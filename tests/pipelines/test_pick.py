@@ -1,0 +1,133 @@
+"""State, history and proposals of picked objects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egs_warp.geometry.gaussians import concatenate
+from egs_warp.geometry.plane import Plane
+from egs_warp.pipelines.pick import (
+    MAX_STEPS,
+    Pick,
+    PickHistory,
+    PickState,
+    marked,
+    on_table_top,
+    pick_warnings,
+    proposed,
+    resegmented,
+    size_of,
+    stroke_at,
+)
+from egs_warp.segmentation.interactive import ClickGraph
+from tests.support.clicking import balls, click, front
+from tests.support.grounds import level
+from tests.support.scenes import lying, round_ones, shell
+
+UP = np.array([0.0, 0.0, 1.0])
+FLOOR = Plane(UP, 0.0)
+EACH = 1500
+
+
+@pytest.fixture(scope="module")
+def apart() -> ClickGraph:
+    """Two balls with a gap between them on a floor."""
+    return ClickGraph.of(balls((-0.6, 0.9), between=1.6))
+
+
+def empty(graph: ClickGraph) -> Pick:
+    """Return an object without clicks."""
+    return Pick("object 1", FLOOR, np.zeros(graph.cloud.count, bool))
+
+
+def test_the_history_undoes_and_redoes_and_forgets_what_was_undone():
+    state = PickState((Pick("a", FLOOR, np.zeros(3, bool)),))
+    history = PickHistory(state)
+    assert not history.can_undo and not history.move(redo=False)
+    states = [replace(state, picks=(replace(state.pick, name=name),)) for name in "bcd"]
+    for one in states[:2]:
+        history.push(one)
+    assert history.move(redo=False) and history.state is states[0] and history.can_redo
+    assert history.move(redo=True) and history.state is states[1] and not history.can_redo
+    history.move(redo=False)
+    history.push(states[2])
+    assert history.state is states[2] and not history.move(redo=True)
+    for _ in range(2 * MAX_STEPS):
+        history.push(state)
+    undone = 0
+    while history.move(redo=False):
+        undone += 1
+    assert undone == MAX_STEPS
+
+
+def test_labels_are_numbers_of_objects_and_the_active_one_has_precedence():
+    masks = np.array([[True, True, False, False], [False, True, True, False]])
+    state = PickState(tuple(Pick(f"object {k + 1}", FLOOR, mask) for k, mask in enumerate(masks)))
+    assert state.labels().tolist() == [1, 1, 2, 0]
+    assert state.selecting(1).labels().tolist() == [1, 2, 2, 0]
+    assert state.free_name() == "object 3"
+    assert [one.name for one in state.without_active().picks] == ["object 2"]
+    last = state.without_active().without_active()
+    assert len(last.picks) == 1 and not last.pick.mask.any()
+    assert state.with_new(last.pick).active == 2
+
+
+def test_the_proposal_of_a_scene_is_its_ground_and_the_object_in_the_middle(apart: ClickGraph):
+    pick = proposed(apart, UP, centre=np.array([0.8, 0.0, 0.5]))
+    assert pick.is_guess and abs(pick.plane.offset) < 0.02 and pick.plane.normal[2] > 0.999
+    assert pick.mask[EACH : 2 * EACH].mean() > 0.9 and not pick.mask[:EACH].any()
+
+
+def test_a_capture_of_one_object_is_proposed_whole():
+    graph = ClickGraph.of(round_ones(shell(), 0.025))
+    pick = proposed(graph, UP)
+    assert pick.is_guess and pick.mask.mean() > 0.95
+    assert pick.plane.normal == pytest.approx(UP) and abs(float(pick.plane.heights(graph.means).min())) < 0.05
+
+
+def test_a_click_elsewhere_replaces_a_guess_and_a_click_beside_corrects_it(apart: ClickGraph):
+    guess = np.arange(apart.cloud.count) < EACH
+    pick = replace(empty(apart), mask=guess, proposal=guess, is_guess=True)
+    other = marked(apart, pick, click(apart.cloud, (0.8, -0.5, 0.5)))
+    assert other.mask[EACH : 2 * EACH].mean() > 0.9 and not other.mask[:EACH].any() and not other.is_guess
+    both = marked(apart, replace(pick, is_guess=False), click(apart.cloud, (0.8, -0.5, 0.5)))
+    assert both.mask[EACH : 2 * EACH].mean() > 0.9 and both.mask[:EACH].mean() > 0.9
+
+
+def test_a_stroke_hits_what_its_pixels_hit(apart: ClickGraph):
+    camera = front()
+    places = [(60.0, 100.0), (62.0, 104.0), (2.0, 2.0)]
+    stroke = stroke_at(apart.cloud, camera, places, inside=True)
+    assert stroke is not None
+    alone = [stroke_at(apart.cloud, camera, [place], inside=True) for place in places]
+    assert alone[2] is None
+    assert set(stroke.hits) == {hit for one in alone[:2] if one is not None for hit in one.hits}
+    assert stroke_at(apart.cloud, camera, places[2:], inside=True) is None
+
+
+def test_an_object_on_a_table_gets_the_table_top_as_its_ground():
+    toy = 0.3 * shell() + [0.0, 0.0, 0.8]
+    table = level((-0.8, -0.8), (0.8, 0.8), 0.8, 0.03)
+    floor = level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.05)
+    graph = ClickGraph.of(concatenate(round_ones(toy, 0.008), lying(np.concatenate([table, floor]))))
+    hit = click(graph.cloud, (0.0, -0.15, 0.95))
+    on_floor = resegmented(graph, replace(empty(graph), clicks=(hit,)))
+    on_table = on_table_top(graph, on_floor)
+    assert on_table.plane.offset == pytest.approx(-0.8, abs=0.02)
+    assert on_table.mask[: len(toy)].mean() > 0.9 and not on_table.mask[len(toy) :].any()
+    given = replace(on_floor, is_plane_given=True)
+    assert on_table_top(graph, given) is given
+
+
+def test_warnings_name_a_remedy(apart: ClickGraph):
+    whole = replace(empty(apart), mask=np.ones(apart.cloud.count, bool))
+    assert pick_warnings(apart, whole) == ("it has 100 % of the capture; if other things lit up, remove them",)
+    ball = replace(empty(apart), mask=np.arange(apart.cloud.count) < EACH)
+    assert pick_warnings(apart, ball) == ()
+    low = replace(ball, plane=Plane(UP, 1.0))
+    (line,) = pick_warnings(apart, low)
+    assert line.startswith("it hangs 0.5") and line.endswith("drag the ground to its feet")
+    assert pick_warnings(apart, empty(apart)) == () and size_of(apart, empty(apart)) == 0.0
