@@ -80,9 +80,8 @@ class StepWorkspace:
         self._ends = vectors(self.positions), vectors(self.ballistic)
         self._gravity = self.tensor(np.tile(body.gravity, len(body.mesh.nodes)))
         self._graphs = GraphCache(self.stream)
-        self.no_tensions = wp.zeros(0, dtype=real, device=body.assembly.device)
         self.gradients = wp.zeros(len(body.mesh.tets), dtype=Mat33, device=body.assembly.device)
-        self.muscle_segments = elements.muscle_segments(MuscleEnergy.of(muscles, np.zeros(muscles.segment_count)))
+        self.muscle_segments = elements.segments(muscles.difference_rows, muscles.rest_lengths)
         self.segment_count = muscles.segment_count
         self._rows = self.tensor(self.muscle_segments.rows.toarray())
         self._directions_upload = PinnedUpload(self.stream, 4 * (3 * self.segment_count + 2 * _CAPACITY_STEP))
@@ -193,7 +192,7 @@ class StepWorkspace:
     def enqueue_factors(self, ends: wp.array, dt: float) -> None:
         """Factor the matrix of the step at the positions ``ends``, without muscles."""
         entries = self.elements.enqueue_entries(ends, self.gradients, dt, factor=dt**2, projected=False)
-        self.factors.enqueue(wp.to_torch(entries))
+        self.factors.enqueue(wp.to_torch(entries)[0])
 
     def enqueue_stiffness(self, problem: StepProblem, tension: MuscleEnergy, velocities: np.ndarray) -> None:
         """Add the stiffness of the muscles under ``tension``, at the end positions that ``velocities`` (N, 3) lead to,
@@ -225,7 +224,7 @@ class StepWorkspace:
 
     def enqueue_gradient(self, ends: wp.array, dt: float, tensions: wp.array, gradient: wp.array) -> None:
         """Compute the internal ``gradient`` in newtons at the positions ``ends``, under the muscles' ``tensions``."""
-        self.elements.enqueue_gradient(ends, self.gradients, dt, self.muscle_segments, tensions, gradient)
+        self.elements.enqueue_gradient(ends, self.gradients, dt, self.muscle_segments, gradient, tensions)
 
 
 def vectors(flat: torch.Tensor) -> wp.array:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+import scipy.sparse as sparse
 import torch
 
 PANEL = 96
@@ -22,17 +24,26 @@ class BatchCholesky:
     """
 
     def __init__(
-        self, slots: int, size: int, device: torch.device, *, panel: int = PANEL, chunk_bytes: int = CHUNK_BYTES
+        self,
+        upper_pattern: sparse.csc_matrix | sparse.csc_array,
+        slots: int,
+        device: torch.device,
+        *,
+        panel: int = PANEL,
+        chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
-        """Allocate factors for ``slots`` worlds with (``size``, ``size``) matrices, 8 slots size^2 bytes.
+        """Allocate factors, 8 slots n^2 bytes.
 
         Args:
+            upper_pattern: (n, n) upper triangle with the diagonal.
             slots: number of worlds.
-            size: number of rows of each matrix.
             device: device of the factors.
             panel: number of columns factored at once.
             chunk_bytes: total size of the matrices processed at once.
         """
+        size = len(upper_pattern.indptr) - 1
+        columns = np.repeat(np.arange(size), np.diff(upper_pattern.indptr))
+        self._lower = torch.as_tensor(columns * size + upper_pattern.indices.astype(np.int64), device=device)
         self.size, self.panel = size, panel
         self.chunk = max(1, chunk_bytes // (8 * size * size))
         """Number of worlds whose matrices are processed at once."""
@@ -40,6 +51,15 @@ class BatchCholesky:
         kind = {"dtype": torch.float64, "device": device}
         self._factors = torch.zeros((slots, size, size), **kind)
         self._inverses = torch.zeros((slots, len(self._starts), panel, panel), **kind)
+
+    def matrices(self, entries: torch.Tensor, diagonal: torch.Tensor) -> torch.Tensor:
+        """Return the lower triangles (k, n, n) of matrices with upper ``entries`` (k, nnz) in the order of the pattern
+        and with ``diagonal`` (n,) added."""
+        matrices = entries.new_zeros(len(entries), self.size * self.size)
+        matrices.index_copy_(1, self._lower, entries)
+        matrices = matrices.view(-1, self.size, self.size)
+        matrices.diagonal(dim1=1, dim2=2).add_(diagonal)
+        return matrices
 
     def factor(self, slots: torch.Tensor, matrices: torch.Tensor) -> torch.Tensor:
         """Factor ``matrices`` into ``slots``.

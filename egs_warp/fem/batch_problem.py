@@ -6,13 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import warp as wp
 
-from egs_warp.fem.batch_elasticity import BatchElasticity
 from egs_warp.fem.batch_factors import CHUNK_BYTES, PANEL, BatchCholesky
-from egs_warp.fem.batched import BatchedRecord, nonzero
+from egs_warp.fem.batched import BatchedRecord, as_warp, nonzero
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.step_problem import MIN_RELATIVE_STIFFNESS
+from egs_warp.fem.warp_elasticity import MuscleSegmentMaps, WarpElasticity
 from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.muscles.tension import LENGTH_FULL_FORCE, LENGTH_ZERO_FORCE
+from egs_warp.precision import Mat33, Vec3, real
+
+_MIN_LENGTH = 1e-300
+"""Lower bound of segment lengths, m; it gives a segment whose ends coincide the direction 0."""
 
 
 class BatchBody:
@@ -36,17 +42,57 @@ class BatchBody:
             panel: as in ``BatchCholesky``.
             chunk_bytes: as in ``BatchCholesky``.
         """
-        self.body = body
-        self.device = torch.device(str(body.assembly.device))
-        size = 3 * len(body.mesh.nodes)
-        self.factors = BatchCholesky(count, size, self.device, panel=panel, chunk_bytes=chunk_bytes)
-        self.elasticity = BatchElasticity(body.assembly, muscles, count, matrices=min(count, self.factors.chunk))
+        self.body, assembly = body, body.assembly
+        self.device = torch.device(str(assembly.device))
+        self.factors = BatchCholesky(assembly.upper_pattern, count, self.device, panel=panel, chunk_bytes=chunk_bytes)
+        matrices = min(count, self.factors.chunk)
+        self.elements = WarpElasticity(
+            assembly.maps, assembly.material, assembly.device, worlds=count, matrices=matrices
+        )
+        self.segments = MuscleSegmentMaps(muscles.difference_rows, muscles.rest_lengths, assembly.device, worlds=count)
         self.mass = torch.as_tensor(body.node_mass, device=self.device)
-        self.gravity = torch.as_tensor(np.asarray(body.gravity, dtype=np.float64), device=self.device)
+        self.gravity, self._difference_rows, self._rest_lengths = (
+            torch.as_tensor(np.asarray(values, dtype=np.float64), device=self.device)
+            for values in (body.gravity, muscles.difference_rows.toarray(), muscles.rest_lengths)
+        )
 
     def centre(self, values: torch.Tensor) -> torch.Tensor:
         """Return the mass-weighted mean (c, 1, 3) of nodal ``values`` (c, N, 3)."""
         return (self.mass[:, None] * values).sum(dim=1, keepdim=True) / self.body.mass
+
+    def add_muscle_stiffness(
+        self, matrices: torch.Tensor, positions: torch.Tensor, tensions: torch.Tensor, factor: float
+    ) -> None:
+        """Add ``factor`` times the Hessian of the muscle energy to the lower triangles of ``matrices``.
+
+        Stiffnesses of at most ``MIN_RELATIVE_STIFFNESS`` times the largest of the same world are dropped, as in
+        ``TensionHessian.rank_one_terms``.
+
+        Args:
+            matrices: (c, 3N, 3N) kg, modified in place.
+            positions: (c, N, 3) m.
+            tensions: (c, M) N, muscle tensions.
+            factor: s^2, multiplies the Hessian.
+        """
+        rows, rest_lengths = self._difference_rows, self._rest_lengths
+        vectors = rows @ positions
+        lengths = vectors.norm(dim=2).clamp(min=_MIN_LENGTH)
+        directions = vectors / lengths[:, :, None]
+        along = ((lengths / rest_lengths - LENGTH_ZERO_FORCE) / (LENGTH_FULL_FORCE - LENGTH_ZERO_FORCE)).clamp(0.0, 1.0)
+        across = tensions * along**2 * (3.0 - 2.0 * along) / lengths
+        stretch = tensions * 6.0 * along * (1.0 - along) / (LENGTH_FULL_FORCE - LENGTH_ZERO_FORCE) / rest_lengths
+        largest = torch.maximum(across.abs(), stretch.abs()).amax(dim=1, keepdim=True).clamp(min=_MIN_LENGTH)
+        across, stretch = (
+            torch.where(rate.abs() > MIN_RELATIVE_STIFFNESS * largest, rate, 0.0) for rate in (across, stretch)
+        )
+        blocks = matrices.view(len(matrices), len(self.mass), 3, len(self.mass), 3)
+        for i in range(3):
+            for k in range(i + 1):
+                rates = (stretch - across) * directions[:, :, i] * directions[:, :, k] + (across if i == k else 0.0)
+                part = rows.T @ (factor * rates[:, :, None] * rows)
+                blocks[:, :, i, :, k] += part
+                if i != k:
+                    blocks[:, :, k, :, i] += part
 
 
 @dataclass(frozen=True)
@@ -100,7 +146,8 @@ class BatchProblem(BatchedRecord):
             modes[:, :, i, k], modes[:, :, j, k] = -arms[:, :, j], arms[:, :, i]
         modes = modes.flatten(1, 2)
         inertia = (modes * common.mass.repeat_interleave(3)[:, None]).mT @ modes
-        gradients = common.elasticity.deformation_gradients(positions)
+        gradients = positions.new_empty(len(positions), len(common.body.mesh.tets), 3, 3)
+        common.elements.enqueue_start(as_warp(positions, Vec3), as_warp(gradients, Mat33))
         inverse = torch.linalg.inv_ex(inertia).inverse
         return cls(common, dt, drag, slots, positions, velocities, gradients, modes, inverse)
 
@@ -125,7 +172,8 @@ class BatchProblem(BatchedRecord):
 
     def is_inversion_free(self, velocities: torch.Tensor) -> torch.Tensor:
         """Return, for each world, True if no element is inverted at the end positions of ``velocities``: (c,) bool."""
-        return self.body.elasticity.is_inversion_free(self.end_positions(velocities))
+        _, determinants = self.body.elements.enqueue_energies(as_warp(self.end_positions(velocities), Vec3), None, 0.0)
+        return wp.to_torch(determinants)[: len(velocities)].amin(dim=1) > 0.0
 
     def rigid_guess(self) -> torch.Tensor:
         """Return the rigid motion (c, N, 3) m/s with the momenta of the state, the initial guess of the solver."""
@@ -136,8 +184,12 @@ class BatchProblem(BatchedRecord):
 
     def internal_gradient(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
         """Return minus the internal forces (c, N, 3) N at the end of the step, with muscle ``tensions`` (c, M) N."""
-        end = self.end_positions(velocities)
-        return self.body.elasticity.gradient(end, self.start_gradients, self.dt, tensions)
+        gradient, body = torch.empty_like(velocities), self.body
+        segments, loads = (None, None) if tensions is None else (body.segments, as_warp(tensions, real))
+        end = as_warp(self.end_positions(velocities), Vec3)
+        start = as_warp(self.start_gradients, Mat33)
+        body.elements.enqueue_gradient(end, start, self.dt, segments, as_warp(gradient, Vec3), loads)
+        return gradient
 
     def momentum_correction(self, internal_gradient: torch.Tensor) -> torch.Tensor:
         """Return the angular velocity (c, 3) rad/s that the projection P^T restores (``StepProblem``)."""
@@ -181,13 +233,16 @@ class BatchProblem(BatchedRecord):
         for muscles, projected in ((True, False), (False, False), (False, True)):
             if (muscles and part_tensions is None) or len(remaining) == 0:
                 continue
-            matrices = self.body.elasticity.matrices(
-                end[remaining], gradients[remaining], self.dt, diagonal, projected=projected
+            entries = self.body.elements.enqueue_entries(
+                as_warp(end[remaining], Vec3),
+                as_warp(gradients[remaining], Mat33),
+                self.dt,
+                factor=self.dt**2,
+                projected=projected,
             )
+            matrices = self.body.factors.matrices(wp.to_torch(entries)[: len(remaining)], diagonal)
             if muscles and part_tensions is not None:
-                self.body.elasticity.add_stiffness(
-                    matrices, end[remaining], part_tensions[remaining], self.dt**2, min_relative=MIN_RELATIVE_STIFFNESS
-                )
+                self.body.add_muscle_stiffness(matrices, end[remaining], part_tensions[remaining], self.dt**2)
             factored[remaining] = self.body.factors.factor(slots[remaining], matrices)
             remaining = nonzero(~factored)
         return factored

@@ -194,7 +194,7 @@ class DeviceLinearSteps:
             self.owner.muscle_segments.enqueue_segment_forces(
                 as_warp(self._tensions, real), vectors(newton.end_positions)
             )
-        )
+        )[0]
 
     def write(self, newton: NewtonWorkspace, segment_forces: torch.Tensor, dt: float, velocities: torch.Tensor) -> None:
         """Write ``LinearStep.velocities`` about the last trial of ``newton``, which must be one without muscles

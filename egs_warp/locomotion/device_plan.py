@@ -435,10 +435,11 @@ class PlanWorkspace:
         newton.trial_input.copy_(self._evaluate_input[base])
         newton.enqueue_residual(dt, ratio)
         segment_forces, ends = owner.linear.segment_forces(newton), vectors(newton.end_positions)
-        torch.sum(wp.to_torch(body.elements.enqueue_energies(ends, body.gradients, time)), dim=0, out=self._energy[0])
-        body.elements.enqueue_gradient(ends, body.gradients, time, None, body.no_tensions, vectors(self._gradient))
+        energies, _ = body.elements.enqueue_energies(ends, body.gradients, time)
+        torch.sum(wp.to_torch(energies)[0], dim=0, out=self._energy[0])
+        body.elements.enqueue_gradient(ends, body.gradients, time, None, vectors(self._gradient))
         entries = body.elements.enqueue_entries(ends, body.gradients, time, factor=1.0, projected=True)
-        self._entries.copy_(wp.to_torch(entries))
+        self._entries.copy_(wp.to_torch(entries)[0])
         body.stream.fork_join(
             [
                 lambda: owner.factors.enqueue(time**2 * self._entries),
