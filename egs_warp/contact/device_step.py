@@ -1,4 +1,4 @@
-"""Start and matrix of a body's step on a GPU: buffers, factorisation, momentum projection and prefetch of contacts.
+"""Start and matrix of a body's step on a GPU: buffers, factorisation and prefetch of contacts.
 
 The kernel is in ``kernels/contact/step_start.py``. ``DeviceContactLinearizer`` in ``device_newton`` adds the
 linearisations to ``StepWorkspace``.
@@ -65,10 +65,6 @@ class StepWorkspace:
         assert isinstance(elements, WarpElasticity)
         self.elements = elements
         size = 3 * len(body.mesh.nodes)
-        self.rotation_response, self.momentum_projection = self.zeros(size, 3), self.zeros(3, size)
-        """(3N, 3) and (3, 3N). ``rotation_response`` times ``momentum_projection`` times a right-hand side is the
-        correction added to its solution.
-        """
         self.masses = self.tensor(body.node_mass)
         self._start_upload = PinnedUpload(self.stream, 2 * size)
         self.positions, self.velocities = self._start_upload.device.split(size)
@@ -192,7 +188,7 @@ class StepWorkspace:
     def enqueue_factors(self, ends: wp.array, dt: float) -> None:
         """Factor the matrix of the step at the positions ``ends``, without muscles."""
         entries = self.elements.enqueue_entries(ends, self.gradients, dt, factor=dt**2, projected=False)
-        self.factors.enqueue(wp.to_torch(entries)[0])
+        self.factors.enqueue_factor(wp.to_torch(entries)[0])
 
     def enqueue_stiffness(self, problem: StepProblem, tension: MuscleEnergy, velocities: np.ndarray) -> None:
         """Add the stiffness of the muscles under ``tension``, at the end positions that ``velocities`` (N, 3) lead to,

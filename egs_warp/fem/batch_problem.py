@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -11,6 +12,8 @@ import warp as wp
 from egs_warp.fem.batch_factors import CHUNK_BYTES, PANEL, BatchCholesky
 from egs_warp.fem.batched import BatchedRecord, as_warp, nonzero
 from egs_warp.fem.body import SoftBody
+from egs_warp.fem.linear_solver import FactorStatus
+from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.fem.step_problem import MIN_RELATIVE_STIFFNESS
 from egs_warp.fem.warp_elasticity import MuscleSegmentMaps, WarpElasticity
 from egs_warp.muscles.muscle_set import MuscleSet
@@ -115,8 +118,7 @@ class BatchProblem(BatchedRecord):
     rotation_modes: torch.Tensor
     """(c, 3N, 3) m, nodal velocities e_k x r of unit rotations about the centre of mass."""
     inverse_inertia: torch.Tensor
-    """(c, 3, 3) 1/(kg m^2), inverse inertia; not finite for a world whose inertia is singular, because an exception
-    would stop all worlds."""
+    """(c, 3, 3) 1/(kg m^2), inverse inertia; not finite for a world whose inertia is singular."""
 
     @classmethod
     def at(
@@ -148,8 +150,7 @@ class BatchProblem(BatchedRecord):
         inertia = (modes * common.mass.repeat_interleave(3)[:, None]).mT @ modes
         gradients = positions.new_empty(len(positions), len(common.body.mesh.tets), 3, 3)
         common.elements.enqueue_start(as_warp(positions, Vec3), as_warp(gradients, Mat33))
-        inverse = torch.linalg.inv_ex(inertia).inverse
-        return cls(common, dt, drag, slots, positions, velocities, gradients, modes, inverse)
+        return cls(common, dt, drag, slots, positions, velocities, gradients, modes, _inverse(inertia))
 
     @property
     def momenta(self) -> torch.Tensor:
@@ -240,48 +241,53 @@ class BatchProblem(BatchedRecord):
                 factor=self.dt**2,
                 projected=projected,
             )
-            matrices = self.body.factors.matrices(wp.to_torch(entries)[: len(remaining)], diagonal)
+            stiffness = None
             if muscles and part_tensions is not None:
-                self.body.add_muscle_stiffness(matrices, end[remaining], part_tensions[remaining], self.dt**2)
-            factored[remaining] = self.body.factors.factor(slots[remaining], matrices)
+                stiffness = partial(
+                    self.body.add_muscle_stiffness,
+                    positions=end[remaining],
+                    tensions=part_tensions[remaining],
+                    factor=self.dt**2,
+                )
+            factors = self.body.factors
+            factors.factor(wp.to_torch(entries)[: len(remaining)], diagonal, slots[remaining], stiffness)
+            factored[remaining] = factors.status[slots[remaining]] == FactorStatus.DEFINITE
             remaining = nonzero(~factored)
         return factored
 
 
-@dataclass(frozen=True)
-class BatchMomentumProjection(BatchedRecord):
-    """Rank-3 correction with which the solutions conserve angular momentum (``Tangent``)."""
-
-    rotation_response: torch.Tensor
-    """(c, 3N, 3) solutions U for the right-hand sides M T."""
-    inverse: torch.Tensor
-    """(c, 3, 3) inverse of (1 + dt alpha) (M T)^T U."""
+@dataclass(frozen=True, eq=False)
+class BatchMomentumProjection(MomentumProjection, BatchedRecord):
+    """``MomentumProjection`` of c worlds."""
 
 
 def apply_inverse(
-    problem: BatchProblem, impulses: torch.Tensor, turning: BatchMomentumProjection | None = None
+    problem: BatchProblem, impulses: torch.Tensor, projection: BatchMomentumProjection | None = None
 ) -> tuple[torch.Tensor, BatchMomentumProjection]:
     """Return the velocity changes J^-1 ``impulses`` and the momentum projection that was used.
 
     Args:
         problem: the step, whose slots hold factors.
         impulses: (c, 3N, m) N s.
-        turning: momentum projection of these factors; computed if None.
+        projection: momentum projection of these factors; computed if None.
 
     Returns:
         (c, 3N, m) m/s, and the momentum projection.
     """
-    factors, momenta = problem.body.factors, problem.momenta
-    if turning is None:
-        both = factors.solve(problem.slots, torch.cat([momenta.mT, impulses], dim=2))
-        response, plain = both[:, :, :3].contiguous(), both[:, :, 3:]
-        turning = BatchMomentumProjection(
-            response, torch.linalg.inv_ex(problem.inertia_ratio * (momenta @ response)).inverse
-        )
-    else:
-        plain = factors.solve(problem.slots, impulses)
-    missing = problem.rotation_modes.mT @ impulses - problem.inertia_ratio * (momenta @ plain)
-    return plain + turning.rotation_response @ (turning.inverse @ missing), turning
+    factors = problem.body.factors
+    if projection is not None:
+        return factors.solve(impulses, problem.slots, projection), projection
+    momenta = problem.momenta.mT.contiguous()
+    both = factors.solve(torch.cat([momenta, impulses], dim=2), problem.slots)
+    projection = BatchMomentumProjection.of(
+        problem.rotation_modes, momenta, problem.inertia_ratio, both[:, :, :3].contiguous(), _inverse
+    )
+    return projection.corrected(impulses, both[:, :, 3:]), projection
+
+
+def _inverse(matrices: torch.Tensor) -> torch.Tensor:
+    """Return the inverses of ``matrices``, not finite for singular ones; an exception would stop all worlds."""
+    return torch.linalg.inv_ex(matrices).inverse
 
 
 def _rotate(vectors: torch.Tensor, arms: torch.Tensor) -> torch.Tensor:

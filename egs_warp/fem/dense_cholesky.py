@@ -16,10 +16,11 @@ import warp as wp
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.cuda_graphs import GraphCache, GraphStream, PinnedUpload
 from egs_warp.fem.dissection import Dissection
+from egs_warp.fem.linear_solver import FactorStatus
 from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.fem.tiled_inverse import TiledInverseFactor
 from egs_warp.kernels.fem import triangles as kernels
-from egs_warp.precision import real
+from egs_warp.precision import Mat33, real
 
 
 class DenseCholesky:
@@ -29,13 +30,13 @@ class DenseCholesky:
     as for a thousand, and a product with L^-1 takes a fiftieth of that time.
     """
 
-    is_host = False
+    is_asynchronous = True
 
     def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array, *, device: str) -> None:
         """Allocate the solver.
 
         Args:
-            upper_pattern: (n, n) upper triangle with the diagonal, entries in the order of ``update``.
+            upper_pattern: (n, n) upper triangle with the diagonal, entries in the order of ``factor``.
             device: PyTorch device.
         """
         count = len(upper_pattern.indptr) - 1
@@ -60,15 +61,21 @@ class DenseCholesky:
             torch.zeros_like(self._entries),
         )
         self._effort_readback, self._effort_graphs = self.stream.pinned(0), GraphCache(self.stream)
-        self._finite = self._ready = self._pending = False
+        self.rotation_response, self.rotation_operator = (
+            self._energy_hessian.new_zeros(shape) for shape in ((count, 3), (3, count))
+        )
+        """(n, 3) and (3, n) of the momentum projection: their product times a right-hand side is added to its
+        solution."""
+        self._momentum_matrices = self._energy_hessian.new_zeros(2, 3, 3)
+        self._finite = self._pending = False
+        self._status = FactorStatus.NONE
 
-    def update(self, entries: np.ndarray | torch.Tensor, diagonal: np.ndarray | None = None) -> bool:
-        """Factor S; see ``LinearSolver.update``. A matrix that is not positive definite has no factors."""
-        self.start_update(entries, diagonal)
-        return self.is_ready
+    def entries_from(self, entries: wp.array) -> torch.Tensor:
+        """Return a copy of ``entries`` on the device; PyTorch must use Warp's stream."""
+        return wp.to_torch(entries).flatten().clone()
 
-    def start_update(self, entries: np.ndarray | torch.Tensor, diagonal: np.ndarray | None = None) -> None:
-        """Factor S asynchronously; see ``LinearSolver.start_update``."""
+    def factor(self, entries: np.ndarray | torch.Tensor, diagonal: np.ndarray | None = None) -> None:
+        """Factor S asynchronously; see ``LinearSolver.factor``. An indefinite matrix has no factors."""
         with self.stream:
             self._entries.copy_(self._to_device(entries))
             self.upload_diagonal(np.zeros(len(self._diagonal)) if diagonal is None else diagonal)
@@ -82,8 +89,8 @@ class DenseCholesky:
             self._uploaded_diagonal = diagonal.copy()
             self._diagonal.copy_(self._to_device(diagonal))
 
-    def enqueue(self, entries: torch.Tensor) -> None:
-        """Queue ``start_update`` with the uploaded diagonal, as part of a graph.
+    def enqueue_factor(self, entries: torch.Tensor) -> None:
+        """Queue ``factor`` with the uploaded diagonal, as part of a graph.
 
         The caller of the graph reports its launch with ``mark_started``.
         """
@@ -91,7 +98,7 @@ class DenseCholesky:
         self._factor()
 
     def enqueue_low_rank(self, directions: torch.Tensor, sign: float) -> None:
-        """Queue the update of the factors from S to S + ``sign`` U^T U; ``verdict`` and ``is_ready`` report the result.
+        """Queue the update of the factors from S to S + ``sign`` U^T U; ``verdict`` and ``status`` report the result.
 
         S must be positive definite. Updates with a negative sign must come last, since their sum may be indefinite.
 
@@ -103,7 +110,7 @@ class DenseCholesky:
         self._verdict_readback.copy_(self.verdict, non_blocking=True)
 
     def mark_started(self) -> None:
-        """Report that factors are queued; ``is_ready`` then waits for them."""
+        """Report that factors are queued; ``status`` then waits for them."""
         self._pending = True
 
     def _factor(self) -> None:
@@ -123,14 +130,14 @@ class DenseCholesky:
         with self.stream:
             if not self._root.factor_with(self._to_device(across), self._to_device(rates)):
                 return False
-        self._ready = True
+        self._status = FactorStatus.DEFINITE
         return True
 
     @property
-    def is_ready(self) -> bool:
-        """True if factors exist; blocks until queued ones are computed."""
+    def status(self) -> FactorStatus:
+        """Status of the factors; blocks until queued ones are computed."""
         self._finish()
-        return self._ready
+        return self._status
 
     def _finish(self) -> None:
         """Wait for queued factors and read their verdict."""
@@ -138,13 +145,14 @@ class DenseCholesky:
             self.stream.wait()
             self._pending = False
             finite, definite = self._verdict_readback.tolist()
-            self._finite, self._ready = finite > 0.0, finite > 0.0 and definite > 0.0
+            self._finite = finite > 0.0
+            self._status = FactorStatus.DEFINITE if self._finite and definite > 0.0 else FactorStatus.NONE
 
     def solve(self, right: np.ndarray, projection: MomentumProjection | None = None) -> np.ndarray:
         """Solve for ``right``; see ``LinearSolver.solve``."""
-        assert self.is_ready, "call update() first"
+        assert self.status is FactorStatus.DEFINITE, "call factor() first"
         with self.stream:
-            plain = self._to_host(self._solve(self._to_device(right)))
+            plain = self._to_host(self.enqueue_solve(self._to_device(right)))
         return plain if projection is None else projection.corrected(right, plain)
 
     @property
@@ -152,10 +160,38 @@ class DenseCholesky:
         """(n, n) R with S^-1 = R^T R on the device: L^-1 with permuted unknowns. Its address never changes."""
         return self._root.inverse
 
-    def _solve(self, right: torch.Tensor) -> torch.Tensor:
+    def enqueue_solve(self, right: torch.Tensor) -> torch.Tensor:
+        """Queue S^-1 ``right``."""
         return self.inverse.T @ (self.inverse @ right)
 
-    def effort_quadratic(
+    def enqueue_momentum_projection(
+        self, rotation_modes: torch.Tensor, mode_momenta: torch.Tensor, rotation_response: torch.Tensor, ratio: float
+    ) -> None:
+        """Queue the momentum projection of the current factors; arguments as the fields of ``MomentumProjection``.
+
+        Since S is symmetric, the correction of a solution is a linear function of its right-hand side b: U P b with
+        P = inverse (T - ratio U)^T. One product with P replaces two.
+        """
+        self.rotation_response.copy_(rotation_response)
+        torch.mm(mode_momenta.T, self.rotation_response, out=self._momentum_matrices[0])
+        wp.launch(
+            kernels.invert_momentum_matrix_kernel,
+            1,
+            inputs=[ratio, as_warp(self._momentum_matrices[:1], Mat33)],
+            outputs=[as_warp(self._momentum_matrices[1:], Mat33)],
+            device=wp.device_from_torch(self.device),
+        )
+        torch.mm(
+            self._momentum_matrices[1],
+            rotation_modes.T - ratio * self.rotation_response.T,
+            out=self.rotation_operator,
+        )
+
+    def enqueue_projected_solve(self, right: torch.Tensor) -> torch.Tensor:
+        """Queue S^-1 ``right`` (n, m) with the momentum projection that was queued last."""
+        return self.enqueue_solve(right).addmm_(self.rotation_response, self.rotation_operator @ right)
+
+    def quadratic_form(
         self,
         entries: np.ndarray,
         gradient: np.ndarray,
@@ -166,7 +202,7 @@ class DenseCholesky:
         dt_ahead: float,
         reference: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the quadratic model of the elastic energy; see ``LinearSolver.effort_quadratic``."""
+        """Compute the quadratic model of the elastic energy; see ``LinearSolver.quadratic_form``."""
         count = vectors.shape[1]
         with self.stream:
             self._effort_upload.set(gradient, weights, reference)
@@ -193,12 +229,12 @@ class DenseCholesky:
         """Return the quadratic and linear terms for the uploaded input as one flat tensor; not finite if there are no
         factors."""
         gradient, weights, reference = self._effort_upload.device.split([len(vectors)] * 3)
-        quadratic, linear = self.enqueue_effort_quadratic(
+        quadratic, linear = self.enqueue_quadratic_form(
             self._effort_entries, gradient, weights, vectors, dt_now, dt_ahead, reference
         )
         return torch.cat([quadratic.flatten(), linear])
 
-    def enqueue_effort_quadratic(
+    def enqueue_quadratic_form(
         self,
         entries: torch.Tensor,
         gradient: torch.Tensor,
@@ -208,8 +244,8 @@ class DenseCholesky:
         dt_ahead: float,
         reference: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Queue ``effort_quadratic`` of device tensors, without synchronization."""
-        moves = dt_now * vectors + dt_ahead * self._solve(weights[:, None] * vectors)
+        """Queue ``quadratic_form`` of device tensors, without synchronization."""
+        moves = dt_now * vectors + dt_ahead * self.enqueue_solve(weights[:, None] * vectors)
         moves[:, -1] -= reference
         flat = self._energy_hessian.view(-1)
         flat[self._upper] = entries

@@ -5,6 +5,7 @@ The kernels are in ``egs_warp.kernels.fem.elasticity`` (GPU) and ``elasticity_cp
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import cached_property, partial
 from typing import Any
 
@@ -14,7 +15,7 @@ import warp as wp
 
 from egs_warp.fem.assembly_topology import AssemblyTopology, Damping, Material
 from egs_warp.fem.linear_solver import LinearSolver
-from egs_warp.fem.multifrontal import SymbolicFactorization
+from egs_warp.fem.multifrontal import MultifrontalLdl, SymbolicFactorization
 from egs_warp.fem.simd_elasticity import SimdElasticity, SimdSegments
 from egs_warp.fem.warp_elasticity import MuscleSegmentMaps, WarpElasticity
 from egs_warp.geometry.tetmesh import TetMesh
@@ -51,6 +52,21 @@ class ElasticAssembly:
     def analysis(self) -> SymbolicFactorization:
         """Symbolic factorization of ``upper_pattern``."""
         return SymbolicFactorization.of(self.upper_pattern)
+
+    def new_solver(self) -> LinearSolver:
+        """Return a linear solver for ``upper_pattern``: dense on a GPU that PyTorch can use, else sparse on the host.
+
+        On an H100 the inverse of a dense factor takes 0.15 ms for 568 nodes and 0.44 ms for 1,064.
+        """
+        if self.device.is_cuda:
+            with suppress(ImportError):
+                import torch
+
+                if torch.cuda.is_available():
+                    from egs_warp.fem.dense_cholesky import DenseCholesky
+
+                    return DenseCholesky(self.upper_pattern, device=str(self.device))
+        return MultifrontalLdl(self.upper_pattern, self.analysis)
 
     def damping(self, positions: np.ndarray, dt: float) -> Damping:
         """Return the damping of a step of ``dt`` seconds that starts at ``positions`` (N, 3) m."""
@@ -127,20 +143,6 @@ class ElasticAssembly:
             projected: project the Hessian of each element to a positive semi-definite one.
         """
         return self.enqueue_hessian(positions, damping, factor=factor, projected=projected).numpy().flatten()
-
-    def entries_for(
-        self,
-        factors: LinearSolver,
-        positions: np.ndarray,
-        damping: Damping | None,
-        *,
-        factor: float = 1.0,
-        projected: bool = False,
-    ) -> Any:
-        """Return ``hessian_entries`` where ``factors`` read them: a NumPy array, or a PyTorch tensor on the device."""
-        if factors.is_host:
-            return self.hessian_entries(positions, damping, factor=factor, projected=projected)
-        return wp.to_torch(self.enqueue_hessian(positions, damping, factor=factor, projected=projected))[0].clone()
 
     def matrix(self, entries: np.ndarray) -> sparse.csc_matrix:
         """Return the upper triangle (3N, 3N) with the given ``entries`` (nnz,)."""

@@ -210,7 +210,7 @@ class DeviceLinearSteps:
         predicted_velocities, _, free, _ = newton.trial_parts()
         group_forces = segment_forces[:, :, None] * self._members[:, None, :]
         impulses = (self._rows.T @ group_forces.flatten(1)).mul_(-dt).view(-1, m)
-        solved = newton.apply_inverse(torch.hstack([impulses, free[:, None]]))
+        solved = self.owner.factors.enqueue_projected_solve(torch.hstack([impulses, free[:, None]]))
         velocities[:, :m] = solved[:, :-1]
         columns = velocities[:, m:-1]
         torch.mul(newton.columns[:, : columns.shape[1]], self.owner.body.weight, out=columns)

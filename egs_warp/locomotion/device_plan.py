@@ -442,7 +442,7 @@ class PlanWorkspace:
         self._entries.copy_(wp.to_torch(entries)[0])
         body.stream.fork_join(
             [
-                lambda: owner.factors.enqueue(time**2 * self._entries),
+                lambda: owner.factors.enqueue_factor(time**2 * self._entries),
                 lambda: owner.linear.write(newton, segment_forces, dt, self._velocities),
             ]
         )
@@ -537,7 +537,7 @@ class PlanWorkspace:
         unit = EFFORT_WEIGHT / (body.body.weight * body.body.height)
         reference = dt * newton.trial_parts()[0]
         masses = body.masses.repeat_interleave(3)
-        quadratic, linear_terms = owner.factors.enqueue_effort_quadratic(
+        quadratic, linear_terms = owner.factors.enqueue_quadratic_form(
             self._entries, self._gradient, masses, self._velocities, dt, time - dt, reference
         )
         form.add_(quadratic, alpha=unit)

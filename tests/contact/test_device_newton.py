@@ -127,7 +127,7 @@ def test_nan_of_an_earlier_step_is_ignored(creature: Creature, device: str, monk
             room._base,
             room._trial,
             room._force_velocities,
-            respond.momentum_projection,
+            respond.factors.rotation_operator,
         ):
             part.fill_(np.nan)
         found = respond.predict_velocities(tangent, contacts, tension, problem.rigid_guess, forces)

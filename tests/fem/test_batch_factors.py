@@ -29,14 +29,21 @@ def test_solutions_equal_those_of_numpy(matrices: np.ndarray, panel: int, chunk_
     right = np.random.default_rng(1).normal(size=(COUNT, SIZE, 3))
     upper = sparse.csc_array(np.triu(np.ones((SIZE, SIZE))))
     factors = BatchCholesky(upper, COUNT, torch.device("cpu"), panel=panel, chunk_bytes=chunk_bytes)
-    every = torch.arange(COUNT)
-    given = torch.from_numpy(np.tril(matrices))
-    assert factors.factor(every, given).tolist() == [True, True, False, False, True]
+    zero, every = torch.zeros(SIZE), torch.arange(COUNT)
+    rows, columns = upper.indices, np.repeat(np.arange(SIZE), np.diff(upper.indptr))
+    entries = torch.from_numpy(matrices[:, columns, rows])
+    factors.factor(entries, zero, every)
+    assert factors.status.tolist() == [2, 2, 0, 0, 2]
     fine = [0, 1, 4]
-    for slots in (every, torch.tensor(fine)):
-        made = factors.solve(slots, torch.from_numpy(right)[slots]).numpy()
-        at = [slots.tolist().index(slot) for slot in fine]
+    for worlds in (every, torch.tensor(fine)):
+        made = factors.solve(torch.from_numpy(right)[worlds], worlds).numpy()
+        at = [worlds.tolist().index(world) for world in fine]
         np.testing.assert_allclose(made[at], np.linalg.solve(matrices[fine], right[fine]), rtol=0, atol=1e-13)
-    assert factors.factor(torch.tensor([2]), torch.from_numpy(matrices[:1].copy())).tolist() == [True]
-    made = factors.solve(torch.tensor([1, 2]), torch.from_numpy(right[1:3])).numpy()
-    np.testing.assert_allclose(made, np.linalg.solve(matrices[[1, 0]], right[1:3]), rtol=0, atol=1e-13)
+    # Twice the first matrix, as the sum of it, a diagonal and a term.
+    half = torch.from_numpy(np.tril(matrices[:1]))
+    diagonal = half[0].diagonal()
+    factors.factor(entries[:1], diagonal, torch.tensor([2]), lambda lower: lower.add_(half - torch.diag(diagonal)))
+    assert factors.status.tolist() == [2, 2, 2, 0, 2]
+    made = factors.solve(torch.from_numpy(right[1:3]), torch.tensor([1, 2])).numpy()
+    expected = np.linalg.solve(np.stack([matrices[1], 2.0 * matrices[0]]), right[1:3])
+    np.testing.assert_allclose(made, expected, rtol=0, atol=1e-13)

@@ -18,9 +18,7 @@ def on_device(
     creature: Creature, device: str, patch: pytest.MonkeyPatch, settings: LocomotionSettings | None = None
 ) -> LocomotionStepper:
     """Return a stepper of the ``creature``'s body and muscles on ``device``."""
-    patch.setattr(
-        "egs_warp.locomotion.stepper.linear_solver_on", lambda _, pattern: DenseCholesky(pattern, device=device)
-    )
+    patch.setattr(ElasticAssembly, "new_solver", lambda assembly: DenseCholesky(assembly.upper_pattern, device=device))
     patch.setattr("egs_warp.fem.elasticity.SimdElasticity", WarpElasticity)
     mesh, material = creature.body.assembly.mesh, creature.body.assembly.material
     body = replace(creature.body, assembly=ElasticAssembly(mesh, material, device=device))

@@ -510,7 +510,7 @@ def effort_panel_kernel(
     linear: wp.array2d[real],
     quadratic: wp.array2d[real],
 ) -> None:
-    """Compute the quadratic model of the elastic energy (``LinearSolver.effort_quadratic``).
+    """Compute the quadratic model of the elastic energy (``LinearSolver.quadratic_form``).
 
     Each panel gives the displacements X (``moves``), their ``products`` H X and the terms ``linear`` X^T g. The blocks
     of ``quadratic`` X^T H X follow after all panels. Several launches may share the work through ``counters`` (3,):
