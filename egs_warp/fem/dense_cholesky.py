@@ -14,7 +14,7 @@ import torch
 import warp as wp
 
 from egs_warp.fem.batched import as_warp
-from egs_warp.fem.cuda_graphs import GraphCache, GraphStream, PinnedUpload
+from egs_warp.fem.cuda_graphs import GraphStream
 from egs_warp.fem.dissection import Dissection
 from egs_warp.fem.linear_solver import FactorStatus
 from egs_warp.fem.momentum_projection import MomentumProjection
@@ -56,11 +56,6 @@ class DenseCholesky:
         """(2,) on the host and on the device: nonzero if the entries are finite, and if the matrix is positive
         definite."""
         self._factored = self.stream.run_captured(self._factor)
-        self._effort_upload, self._effort_entries = (
-            PinnedUpload(self.stream, 3 * count),
-            torch.zeros_like(self._entries),
-        )
-        self._effort_readback, self._effort_graphs = self.stream.pinned(0), GraphCache(self.stream)
         self.rotation_response, self.rotation_operator = (
             self._energy_hessian.new_zeros(shape) for shape in ((count, 3), (3, count))
         )
@@ -203,36 +198,10 @@ class DenseCholesky:
         reference: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute the quadratic model of the elastic energy; see ``LinearSolver.quadratic_form``."""
-        count = vectors.shape[1]
         with self.stream:
-            self._effort_upload.set(gradient, weights, reference)
-            self._effort_entries.copy_(self._to_device(entries))
-            columns = self._to_device(vectors)
-            if self._effort_readback.numel() < count * count + count:
-                self._effort_readback = self.stream.pinned(count * count + count)
-                self._effort_graphs.forget()
-
-            def work() -> None:
-                result = self._effort(columns, dt_now, dt_ahead)
-                self._effort_readback[: len(result)].copy_(result, non_blocking=True)
-
-            if isinstance(vectors, torch.Tensor):
-                self._effort_graphs.run((columns.data_ptr(), count, dt_now, dt_ahead), work)
-            else:
-                # Vectors on the host are uploaded to a different address each time, so no graph is captured.
-                work()
-            self.stream.wait()
-        quadratic, linear = np.split(self._effort_readback.numpy()[: count * count + count], [count * count])
-        return quadratic.reshape(count, count).copy(), linear.copy()
-
-    def _effort(self, vectors: torch.Tensor, dt_now: float, dt_ahead: float) -> torch.Tensor:
-        """Return the quadratic and linear terms for the uploaded input as one flat tensor; not finite if there are no
-        factors."""
-        gradient, weights, reference = self._effort_upload.device.split([len(vectors)] * 3)
-        quadratic, linear = self.enqueue_quadratic_form(
-            self._effort_entries, gradient, weights, vectors, dt_now, dt_ahead, reference
-        )
-        return torch.cat([quadratic.flatten(), linear])
+            inputs = map(self._to_device, (entries, gradient, weights, vectors))
+            quadratic, linear = self.enqueue_quadratic_form(*inputs, dt_now, dt_ahead, self._to_device(reference))
+            return self._to_host(quadratic), self._to_host(linear)
 
     def enqueue_quadratic_form(
         self,
