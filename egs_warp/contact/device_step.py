@@ -1,6 +1,6 @@
 """Start and matrix of a body's step on a GPU: buffers, factorisation and prefetch of contacts.
 
-The kernel is in ``kernels/contact/step_start.py``. ``DeviceContactLinearizer`` in ``device_newton`` adds the
+The kernel is in ``kernels/fem/step_start.py``. ``DeviceContactLinearizer`` in ``device_newton`` adds the
 linearisations to ``StepWorkspace``.
 """
 
@@ -21,7 +21,7 @@ from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
 from egs_warp.fem.dense_cholesky import DenseCholesky
 from egs_warp.fem.step_problem import MIN_RELATIVE_STIFFNESS, StepProblem
 from egs_warp.fem.warp_elasticity import WarpElasticity
-from egs_warp.kernels.contact import step_start as kernels
+from egs_warp.kernels.fem import step_start as kernels
 from egs_warp.launching import round_up
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy
@@ -121,13 +121,13 @@ class StepWorkspace:
         lanes = 1 if device.is_cpu else kernels.BLOCK
         wp.launch(
             kernels.step_start_kernel,
-            lanes,
-            inputs=[dt, as_warp(self.masses, real), vectors(self.positions), vectors(self.velocities)],
+            (1, lanes),
+            inputs=[dt, as_warp(self.masses, real), *map(_one_world, (self.positions, self.velocities))],
             outputs=[
-                vectors(self.lever_arms),
-                as_warp(self.rotation_modes, real),
+                _one_world(self.lever_arms),
+                as_warp(self.rotation_modes[None], real),
                 as_warp(self.inverse_inertia, Mat33),
-                vectors(self.rigid_guess),
+                _one_world(self.rigid_guess),
             ],
             device=device,
             block_dim=lanes,
@@ -226,3 +226,8 @@ class StepWorkspace:
 def vectors(flat: torch.Tensor) -> wp.array:
     """View a ``flat`` tensor (3N,) as a Warp array of N vectors."""
     return as_warp(flat.view(-1, 3), Vec3)
+
+
+def _one_world(flat: torch.Tensor) -> wp.array:
+    """View a ``flat`` tensor (3N,) as a Warp array (1, N) of vectors."""
+    return as_warp(flat.view(1, -1, 3), Vec3)

@@ -10,14 +10,15 @@ import torch
 import warp as wp
 
 from egs_warp.fem.batch_factors import CHUNK_BYTES, PANEL, BatchCholesky
-from egs_warp.fem.batched import BatchedRecord, as_warp, nonzero
+from egs_warp.fem.batched import BatchedRecord, as_warp, launch_on, nonzero
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.linear_solver import FactorStatus
 from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.fem.step_problem import MIN_RELATIVE_STIFFNESS
 from egs_warp.fem.warp_elasticity import MuscleSegmentMaps, WarpElasticity
+from egs_warp.kernels.fem import step_start as kernels
 from egs_warp.muscles.muscle_set import MuscleSet
-from egs_warp.muscles.tension import LENGTH_FULL_FORCE, LENGTH_ZERO_FORCE
+from egs_warp.muscles.tension import force_length_factor
 from egs_warp.precision import Mat33, Vec3, real
 
 _MIN_LENGTH = 1e-300
@@ -81,9 +82,8 @@ class BatchBody:
         vectors = rows @ positions
         lengths = vectors.norm(dim=2).clamp(min=_MIN_LENGTH)
         directions = vectors / lengths[:, :, None]
-        along = ((lengths / rest_lengths - LENGTH_ZERO_FORCE) / (LENGTH_FULL_FORCE - LENGTH_ZERO_FORCE)).clamp(0.0, 1.0)
-        across = tensions * along**2 * (3.0 - 2.0 * along) / lengths
-        stretch = tensions * 6.0 * along * (1.0 - along) / (LENGTH_FULL_FORCE - LENGTH_ZERO_FORCE) / rest_lengths
+        share, _, slope = force_length_factor(lengths / rest_lengths)
+        across, stretch = tensions * share / lengths, tensions * slope / rest_lengths
         largest = torch.maximum(across.abs(), stretch.abs()).amax(dim=1, keepdim=True).clamp(min=_MIN_LENGTH)
         across, stretch = (
             torch.where(rate.abs() > MIN_RELATIVE_STIFFNESS * largest, rate, 0.0) for rate in (across, stretch)
@@ -118,7 +118,9 @@ class BatchProblem(BatchedRecord):
     rotation_modes: torch.Tensor
     """(c, 3N, 3) m, nodal velocities e_k x r of unit rotations about the centre of mass."""
     inverse_inertia: torch.Tensor
-    """(c, 3, 3) 1/(kg m^2), inverse inertia; not finite for a world whose inertia is singular."""
+    """(c, 3, 3) 1/(kg m^2), inverse inertia."""
+    rigid_guess: torch.Tensor
+    """(c, N, 3) m/s, rigid motion with the momenta of the state, the initial guess of the solver."""
 
     @classmethod
     def at(
@@ -141,16 +143,21 @@ class BatchProblem(BatchedRecord):
             dt: step size, s.
             drag: alpha of the Rayleigh damping, 1/s.
         """
-        arms = positions - common.centre(positions)
-        modes = arms.new_zeros((*arms.shape, 3))
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            modes[:, :, i, k], modes[:, :, j, k] = -arms[:, :, j], arms[:, :, i]
-        modes = modes.flatten(1, 2)
-        inertia = (modes * common.mass.repeat_interleave(3)[:, None]).mT @ modes
+        modes = positions.new_empty(len(positions), 3 * len(common.mass), 3)
+        inverse_inertia = positions.new_empty(len(positions), 3, 3)
+        arms, guess = torch.empty_like(positions), torch.empty_like(positions)
+        lanes = 1 if common.elements.device.is_cpu else kernels.BLOCK
+        launch_on(
+            common.device,
+            kernels.step_start_kernel,
+            (len(positions), lanes),
+            inputs=[dt, (common.mass, real), (positions, Vec3), (velocities, Vec3)],
+            outputs=[(arms, Vec3), (modes, real), (inverse_inertia, Mat33), (guess, Vec3)],
+            block_dim=lanes,
+        )
         gradients = positions.new_empty(len(positions), len(common.body.mesh.tets), 3, 3)
         common.elements.enqueue_start(as_warp(positions, Vec3), as_warp(gradients, Mat33))
-        return cls(common, dt, drag, slots, positions, velocities, gradients, modes, _inverse(inertia))
+        return cls(common, dt, drag, slots, positions, velocities, gradients, modes, inverse_inertia, guess)
 
     @property
     def momenta(self) -> torch.Tensor:
@@ -175,13 +182,6 @@ class BatchProblem(BatchedRecord):
         """Return, for each world, True if no element is inverted at the end positions of ``velocities``: (c,) bool."""
         _, determinants = self.body.elements.enqueue_energies(as_warp(self.end_positions(velocities), Vec3), None, 0.0)
         return wp.to_torch(determinants)[: len(velocities)].amin(dim=1) > 0.0
-
-    def rigid_guess(self) -> torch.Tensor:
-        """Return the rigid motion (c, N, 3) m/s with the momenta of the state, the initial guess of the solver."""
-        arms = self.positions - self.body.centre(self.positions)
-        spin = (self.inverse_inertia @ (self.momenta @ self.velocities.flatten(1)[:, :, None]))[:, :, 0]
-        rotated = _rotate(self.dt * spin, arms)
-        return self.body.centre(self.velocities) + (rotated - arms) / self.dt
 
     def internal_gradient(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
         """Return minus the internal forces (c, N, 3) N at the end of the step, with muscle ``tensions`` (c, M) N."""
@@ -288,11 +288,3 @@ def apply_inverse(
 def _inverse(matrices: torch.Tensor) -> torch.Tensor:
     """Return the inverses of ``matrices``, not finite for singular ones; an exception would stop all worlds."""
     return torch.linalg.inv_ex(matrices).inverse
-
-
-def _rotate(vectors: torch.Tensor, arms: torch.Tensor) -> torch.Tensor:
-    """Rotate ``arms`` (c, n, 3) by the rotation vectors ``vectors`` (c, 3) rad."""
-    half = 0.5 * vectors.norm(dim=1, keepdim=True)
-    axis = (0.5 * torch.sinc(half / torch.pi) * vectors)[:, None].expand_as(arms)
-    once = torch.linalg.cross(axis, arms)
-    return arms + 2.0 * (half.cos()[:, :, None] * once + torch.linalg.cross(axis, once))

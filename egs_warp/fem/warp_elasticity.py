@@ -84,7 +84,7 @@ class WarpElasticity:
             worlds: maximum number of worlds.
             matrices: maximum number of worlds whose matrices are computed in one call.
         """
-        self._device, self._material = device, material
+        self.device, self._material = device, material
         self._node_count, self._tet_count = len(maps.corner_offsets) - 1, len(maps.tets)
         self._tets = wp.array(maps.tets, dtype=wp.vec4i, device=device)
         self._rest_inverses = wp.array(maps.rest_inverses, dtype=Mat33, device=device)
@@ -109,15 +109,15 @@ class WarpElasticity:
 
     def node_vectors(self) -> wp.array:
         """Return an array (1, N) of zero vectors."""
-        return zeros((1, self._node_count), Vec3, self._device)
+        return zeros((1, self._node_count), Vec3, self.device)
 
     def new_start(self) -> wp.array:
         """Return an array for the deformation gradients (1, T) at the start of a step."""
-        return empty((1, self._tet_count), Mat33, self._device)
+        return empty((1, self._tet_count), Mat33, self.device)
 
     def segments(self, rows: sparse.csr_matrix, rest_lengths: np.ndarray) -> MuscleSegmentMaps:
         """Return the maps of muscle segments with difference ``rows`` (M, N) and ``rest_lengths`` (M,) m."""
-        return MuscleSegmentMaps(rows, rest_lengths, self._device)
+        return MuscleSegmentMaps(rows, rest_lengths, self.device)
 
     @property
     def _model(self) -> list:
@@ -137,7 +137,7 @@ class WarpElasticity:
             (positions.shape[0], self._tet_count),
             inputs=[self._tets, self._rest_inverses, positions],
             outputs=[_by_world(gradients)],
-            device=self._device,
+            device=self.device,
         )
 
     def enqueue_energies(self, positions: wp.array, start: wp.array | None, dt: float) -> tuple[wp.array, wp.array]:
@@ -148,7 +148,7 @@ class WarpElasticity:
             (positions.shape[0], self._tet_count),
             inputs=[*self._model, *self._state(positions, start, dt)],
             outputs=[self._energies, self._determinants],
-            device=self._device,
+            device=self.device,
         )
         return self._energies, self._determinants
 
@@ -181,14 +181,14 @@ class WarpElasticity:
             (worlds, self._tet_count),
             inputs=[*self._model, *self._state(positions, start, dt)],
             outputs=[self._corner_gradients],
-            device=self._device,
+            device=self.device,
         )
         launch_cached(
             kernels.gather_forces_kernel,
-            (worlds, self._node_count, lanes_on(self._device)),
+            (worlds, self._node_count, lanes_on(self.device)),
             inputs=[*self._corners, *ends, self._corner_gradients, forces],
             outputs=[_by_world(gradient)],
-            device=self._device,
+            device=self.device,
         )
 
     def enqueue_entries(
@@ -203,14 +203,14 @@ class WarpElasticity:
             (positions.shape[0], self._tet_count),
             inputs=[*self._model, *self._state(positions, start, dt)],
             outputs=[self._blocks],
-            device=self._device,
+            device=self.device,
         )
         launch_cached(
             kernels.gather_matrix_kernel,
             (positions.shape[0], self._blocks_of[2].shape[0]),
             inputs=[*self._blocks_of, self._blocks, factor],
             outputs=[self._entries],
-            device=self._device,
+            device=self.device,
         )
         return self._entries
 

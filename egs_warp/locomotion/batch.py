@@ -235,7 +235,7 @@ class BatchStepper:
         """
         problem = self._problem(state, dt, 0.0)
         contacts, previous_forces, start_gaps = self._detect(problem, state)
-        velocities = problem.rigid_guess()
+        velocities = problem.rigid_guess
         failed = ~problem.factor(velocities, None)
         contacts, result = self.solver.solve(
             *(problem, contacts, self.solver.linearize(problem, contacts)),
@@ -350,7 +350,7 @@ class BatchStepper:
             not positive definite.
         """
         solver, stages = self.solver, self._stages
-        velocities, bias = problem.rigid_guess(), solver.normal_bias(contacts, problem.dt)
+        velocities, bias = problem.rigid_guess.clone(), solver.normal_bias(contacts, problem.dt)
         with stages("factor"):
             failed = ~problem.factor(velocities, None)
         with stages("elasticity"):
