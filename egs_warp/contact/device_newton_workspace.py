@@ -121,10 +121,8 @@ class NewtonWorkspace:
         """
         self._tensions = as_warp(self.tensions, real)
         self._base, self._trial = owner.zeros(3 * size + width), owner.zeros(3 * size + width)
-        self.end_positions, self._gradient, self._residual, self._solved, self._force_velocities, self._half_solved = (
-            owner.zeros(6, size)
-        )
-        self._torque, self._rotation = owner.zeros(2, 3)
+        self.end_positions, self._gradient, self._residual, self._force_velocities = owner.zeros(4, size)
+        self._torque = owner.zeros(3)
         self._graphs = GraphCache(owner.stream)
         self.base_iterate: Any = None
         self.trial_iterate: Any = None
@@ -458,17 +456,15 @@ class NewtonWorkspace:
             end: (3N,) m/s, overwritten with the result.
         """
         factors = self.owner.factors
-        torch.mv(factors.inverse, residual, out=self._half_solved)
-        torch.mv(factors.inverse.T, self._half_solved, out=self._solved)
-        torch.mv(factors.rotation_operator, residual, out=self._rotation)
+        solved, rotation = factors.enqueue_vector_solve(residual)
         self._launch(
             kernels.free_velocity_kernel,
             self._node_count,
             [
                 as_warp(factors.rotation_response, real),
                 vectors(velocities),
-                vectors(self._solved),
-                as_warp(self._rotation, real),
+                vectors(solved),
+                as_warp(rotation, real),
             ],
             [vectors(end)],
         )

@@ -62,6 +62,8 @@ class DenseCholesky:
         """(n, 3) and (3, n) of the momentum projection: their product times a right-hand side is added to its
         solution."""
         self._momentum_matrices = self._energy_hessian.new_zeros(2, 3, 3)
+        self._half_solved, self._solved = self._energy_hessian.new_zeros(2, count)
+        self._rotation = self._energy_hessian.new_zeros(3)
         self._finite = self._pending = False
         self._status = FactorStatus.NONE
 
@@ -186,22 +188,40 @@ class DenseCholesky:
         """Queue S^-1 ``right`` (n, m) with the momentum projection that was queued last."""
         return self.enqueue_solve(right).addmm_(self.rotation_response, self.rotation_operator @ right)
 
+    def enqueue_vector_solve(self, right: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Queue the solution for one right-hand side without allocations.
+
+        Args:
+            right: (n,).
+
+        Returns:
+            S^-1 ``right`` (n,) and (3,), whose product with ``rotation_response`` must be added to it. The next call
+            overwrites both.
+        """
+        torch.mv(self.inverse, right, out=self._half_solved)
+        torch.mv(self.inverse.T, self._half_solved, out=self._solved)
+        torch.mv(self.rotation_operator, right, out=self._rotation)
+        return self._solved, self._rotation
+
     def quadratic_form(
         self,
-        entries: np.ndarray,
-        gradient: np.ndarray,
-        weights: np.ndarray,
-        vectors: np.ndarray,
+        entries: np.ndarray | torch.Tensor,
+        gradient: np.ndarray | torch.Tensor,
+        weights: np.ndarray | torch.Tensor,
+        vectors: np.ndarray | torch.Tensor,
         *,
         dt_now: float,
         dt_ahead: float,
-        reference: np.ndarray,
+        reference: np.ndarray | torch.Tensor,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute the quadratic model of the elastic energy; see ``LinearSolver.quadratic_form``."""
         with self.stream:
-            inputs = map(self._to_device, (entries, gradient, weights, vectors))
-            quadratic, linear = self.enqueue_quadratic_form(*inputs, dt_now, dt_ahead, self._to_device(reference))
-            return self._to_host(quadratic), self._to_host(linear)
+            matrix, slope, masses, columns, offset = map(
+                self._to_device, (entries, gradient, weights, vectors, reference)
+            )
+            terms = self.enqueue_quadratic_form(matrix, slope, masses, columns, dt_now, dt_ahead, offset)
+            quadratic, linear = map(self._to_host, terms)
+            return quadratic, linear
 
     def enqueue_quadratic_form(
         self,

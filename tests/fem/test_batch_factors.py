@@ -42,7 +42,11 @@ def test_solutions_equal_those_of_numpy(matrices: np.ndarray, panel: int, chunk_
     # Twice the first matrix, as the sum of it, a diagonal and a term.
     half = torch.from_numpy(np.tril(matrices[:1]))
     diagonal = half[0].diagonal()
-    factors.factor(entries[:1], diagonal, torch.tensor([2]), lambda lower: lower.add_(half - torch.diag(diagonal)))
+
+    def add_term(lower: torch.Tensor) -> None:
+        lower += half - torch.diag(diagonal)
+
+    factors.factor(entries[:1], diagonal, torch.tensor([2]), add_term)
     assert factors.status.tolist() == [2, 2, 2, 0, 2]
     made = factors.solve(torch.from_numpy(right[1:3]), torch.tensor([1, 2])).numpy()
     expected = np.linalg.solve(np.stack([matrices[1], 2.0 * matrices[0]]), right[1:3])
