@@ -27,7 +27,7 @@ import scipy.sparse as sparse
 import torch
 
 from egs_warp.assets import pawn
-from egs_warp.fem.batch_factors import BatchCholesky
+from egs_warp.fem.panel_cholesky import PanelCholesky
 from egs_warp.locomotion.batch import BatchStepper
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.stepper import LocomotionStepper
@@ -158,7 +158,7 @@ def matrices(size: int, count: int, device: torch.device) -> list[Row]:
     zero = torch.zeros(size, dtype=torch.float64, device=device)
     rows: list[Row] = [{"size": size, "panel": None, "factor": took(torch.linalg.cholesky_ex, matrix)}]
     for panel in PANELS:
-        factors = BatchCholesky(upper, count, device, panel=panel)
+        factors = PanelCholesky(upper, count, device, panel=panel)
         row: Row = {"size": size, "panel": panel, "factor": took(factors.factor, entries, zero, slots)}
         for columns in (1, 96):
             right = torch.ones((count, size, columns), dtype=torch.float64, device=device)

@@ -20,9 +20,9 @@ from egs_warp.contact.device_step import SolveEnd, StepWorkspace
 from egs_warp.contact.newton import ContactLinearization, NewtonStepResult, PenetrationCheck
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.body import SoftBody
-from egs_warp.fem.dense_cholesky import DenseCholesky
 from egs_warp.fem.linear_solver import FactorStatus
 from egs_warp.fem.step_problem import Tangent
+from egs_warp.fem.tiled_cholesky import TiledCholesky
 from egs_warp.kernels.contact.newton_convergence import OUTCOME, REPEAT
 from egs_warp.launching import round_up
 from egs_warp.muscles.muscle_set import MuscleSet
@@ -38,7 +38,7 @@ class DeviceContactLinearizer(StepWorkspace):
     """
 
     def __init__(
-        self, factors: DenseCholesky, body: SoftBody, muscles: MuscleSet, selector: DeviceContactSelector
+        self, factors: TiledCholesky, body: SoftBody, muscles: MuscleSet, selector: DeviceContactSelector
     ) -> None:
         super().__init__(factors, body, muscles, selector)
         self._workspaces: dict[int, NewtonWorkspace] = {}

@@ -18,8 +18,8 @@ from egs_warp.contact.device_selection import DeviceContactSelector
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
-from egs_warp.fem.dense_cholesky import DenseCholesky
 from egs_warp.fem.step_problem import MIN_RELATIVE_STIFFNESS, StepProblem
+from egs_warp.fem.tiled_cholesky import TiledCholesky
 from egs_warp.fem.warp_elasticity import WarpElasticity
 from egs_warp.kernels.fem import step_start as kernels
 from egs_warp.launching import round_up
@@ -58,7 +58,7 @@ class StepWorkspace:
     """
 
     def __init__(
-        self, factors: DenseCholesky, body: SoftBody, muscles: MuscleSet, selector: DeviceContactSelector
+        self, factors: TiledCholesky, body: SoftBody, muscles: MuscleSet, selector: DeviceContactSelector
     ) -> None:
         self.factors, self.body, self.stream, self.selector = factors, body, factors.stream, selector
         elements = body.assembly.elements

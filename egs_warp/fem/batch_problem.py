@@ -9,11 +9,11 @@ import numpy as np
 import torch
 import warp as wp
 
-from egs_warp.fem.batch_factors import CHUNK_BYTES, PANEL, BatchCholesky
 from egs_warp.fem.batched import BatchedRecord, as_warp, launch_on, nonzero
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.linear_solver import FactorStatus
 from egs_warp.fem.momentum_projection import MomentumProjection
+from egs_warp.fem.panel_cholesky import CHUNK_BYTES, PANEL, PanelCholesky
 from egs_warp.fem.step_problem import MIN_RELATIVE_STIFFNESS
 from egs_warp.fem.warp_elasticity import MuscleSegmentMaps, WarpElasticity
 from egs_warp.kernels.fem import step_start as kernels
@@ -43,12 +43,12 @@ class BatchBody:
             body: the body, on the device of the batch.
             muscles: its muscles.
             count: maximum number of worlds.
-            panel: as in ``BatchCholesky``.
-            chunk_bytes: as in ``BatchCholesky``.
+            panel: as in ``PanelCholesky``.
+            chunk_bytes: as in ``PanelCholesky``.
         """
         self.body, assembly = body, body.assembly
         self.device = torch.device(str(assembly.device))
-        self.factors = BatchCholesky(assembly.upper_pattern, count, self.device, panel=panel, chunk_bytes=chunk_bytes)
+        self.factors = PanelCholesky(assembly.upper_pattern, count, self.device, panel=panel, chunk_bytes=chunk_bytes)
         matrices = min(count, self.factors.chunk)
         self.elements = WarpElasticity(
             assembly.maps, assembly.material, assembly.device, worlds=count, matrices=matrices

@@ -59,9 +59,9 @@ class ElasticAssembly:
         """
         if self.device.is_cpu:
             return MultifrontalLdl(self.upper_pattern, self.analysis)
-        from egs_warp.fem.dense_cholesky import DenseCholesky
+        from egs_warp.fem.tiled_cholesky import TiledCholesky
 
-        return DenseCholesky(self.upper_pattern, device=str(self.device))
+        return TiledCholesky(self.upper_pattern, device=str(self.device))
 
     def damping(self, positions: np.ndarray, dt: float) -> Damping:
         """Return the damping of a step of ``dt`` seconds that starts at ``positions`` (N, 3) m."""

@@ -17,10 +17,10 @@ from egs_warp.contact.batch_step import BatchLinearization, BatchResult, BatchSo
 from egs_warp.contact.coupled_step import CoupledSolver
 from egs_warp.contact.detection import ContactGeometry, ContactSet
 from egs_warp.contact.selection import ContactSelector
-from egs_warp.fem.batch_factors import CHUNK_BYTES, PANEL
 from egs_warp.fem.batch_problem import BatchBody, BatchProblem, apply_inverse
 from egs_warp.fem.batched import BatchedRecord, nonzero
 from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.fem.panel_cholesky import CHUNK_BYTES, PANEL
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.settling import SETTLING_STEP, SETTLING_STEPS, has_settled
 from egs_warp.locomotion.stepper import MAX_HALVINGS, PREDICTION_ITERATIONS, StepReport, WarmStart

@@ -22,8 +22,8 @@ from egs_warp.contact.newton import ContactLinearization
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.batched import as_warp
 from egs_warp.fem.cuda_graphs import GraphCache, PinnedUpload
-from egs_warp.fem.dense_cholesky import DenseCholesky
 from egs_warp.fem.step_problem import StepProblem, Tangent
+from egs_warp.fem.tiled_cholesky import TiledCholesky
 from egs_warp.kernels.locomotion import step_program as kernels
 from egs_warp.kernels.locomotion.active_set import OPTIMUM_FOUND
 from egs_warp.kernels.locomotion.mode_search import HEADER_SIZE
@@ -61,7 +61,7 @@ class DevicePlanner:
         linear: DeviceLinearSteps,
         progress: Callable[[StepProblem], NewtonProgress],
     ) -> None:
-        assert isinstance(planner.factors, DenseCholesky)
+        assert isinstance(planner.factors, TiledCholesky)
         self.planner, self.owner, self.linear, self.factors = planner, owner, linear, planner.factors
         self.progress = progress
         self.objective_staging, self.other_staging = StagingBuffer(owner.stream), StagingBuffer(owner.stream)

@@ -500,9 +500,9 @@ def _make_linearizer(
         return HostContactLinearizer()
     from egs_warp.contact.device_newton import DeviceContactLinearizer
     from egs_warp.contact.device_selection import DeviceContactSelector
-    from egs_warp.fem.dense_cholesky import DenseCholesky
+    from egs_warp.fem.tiled_cholesky import TiledCholesky
 
-    assert isinstance(factors, DenseCholesky)
+    assert isinstance(factors, TiledCholesky)
     selector = DeviceContactSelector(solver.detector, solver.points, factors.stream, solver.penetration_tolerance)
     return DeviceContactLinearizer(factors, body, muscles, selector)
 

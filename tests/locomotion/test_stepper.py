@@ -176,12 +176,12 @@ def test_device_factors_give_the_same_hop(device: str, monkeypatch: pytest.Monke
     of sparse factors. The body stands on four feet; with more, rounding decides which points carry the load.
     """
     steps, corners = 10 if device == "cpu" else 30, GRID[[0, 4, 20, 24]]
-    dense_factors = pytest.importorskip("egs_warp.fem.dense_cholesky")
+    dense_factors = pytest.importorskip("egs_warp.fem.tiled_cholesky")
     expected, _ = run_hop(muscular_block(feet=corners), steps)
     made: list[object] = []
 
     def dense(assembly: ElasticAssembly) -> object:
-        made.append(dense_factors.DenseCholesky(assembly.upper_pattern, device=device))
+        made.append(dense_factors.TiledCholesky(assembly.upper_pattern, device=device))
         return made[-1]
 
     monkeypatch.setattr(ElasticAssembly, "new_solver", dense)

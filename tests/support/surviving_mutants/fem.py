@@ -42,7 +42,7 @@ FEM = [
         "a count is never negative",
     ),
     Survivor(
-        "fem/batch_factors.py",
+        "fem/panel_cholesky.py",
         "self.chunk = max(1, chunk_bytes // (8 * size * size))",
         "self.chunk = max(1, chunk_bytes - (8 * size * size))",
         "it changes the number of worlds per pass; results are the same",

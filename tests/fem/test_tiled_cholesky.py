@@ -15,11 +15,25 @@ pytest.importorskip("torch")
 import torch
 
 from egs_warp.fem.cuda_graphs import GraphStream
-from egs_warp.fem.dense_cholesky import DenseCholesky, _TriangularInverse
+from egs_warp.fem.tiled_cholesky import TiledCholesky, TiledInverseFactor, _TriangularInverse
 from egs_warp.kernels.fem.triangles import MAX_ROWS
 from tests.support.factors import has_factors, is_definite
+from tests.support.slab_matrices import slab_matrix
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
+SIZES = [
+    ([1], 0),
+    ([7], 0),
+    ([64], 0),
+    ([65], 0),
+    ([259], 0),
+    ([1, 1], 1),
+    ([100, 1, 65], 70),
+    ([64, 128], 64),
+    ([200, 190, 210, 150], 129),
+    ([1, 504, 426, 468], 305),
+]
+"""Unknowns of the slabs and of the separator."""
 
 
 def entries_of(upper: sparse.csc_matrix, seed: int, diagonal: float) -> np.ndarray:
@@ -47,7 +61,7 @@ def band(count: int) -> sparse.csc_matrix:
 def test_matrices_of_every_size_are_inverted_by_halves(count: int, device: str) -> None:
     """With an added diagonal, by dense and sparse factors; a NaN is rejected."""
     upper = pattern(count)
-    dense, thin = DenseCholesky(upper, device=device), MultifrontalLdl(upper)
+    dense, thin = TiledCholesky(upper, device=device), MultifrontalLdl(upper)
     random = np.random.default_rng(count)
     right = random.normal(size=(count, 3))
     for seed in range(3):
@@ -78,7 +92,7 @@ def test_slabs_of_a_long_body_are_factored_at_once(device: str) -> None:
     upper = band(count)
     slabs = Dissection.of(upper)
     assert len(slabs.parts) > 2
-    factors = DenseCholesky(upper, device=device)
+    factors = TiledCholesky(upper, device=device)
     random = np.random.default_rng(0)
     right, across, rates = random.normal(size=(count, 5)), random.normal(size=(count, 3)), np.array([2.0, -0.01, 1.0])
     for seed in range(4):
@@ -106,7 +120,7 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
     dense factors, but its sum with a term may have.
     """
     upper = pattern(60)
-    dense, thin = DenseCholesky(upper, device=device), MultifrontalLdl(upper)
+    dense, thin = TiledCholesky(upper, device=device), MultifrontalLdl(upper)
     random = np.random.default_rng(7)
     right = random.normal(size=(60, 40))
     across, rates = random.normal(size=(60, 8)), 0.1 * random.normal(size=8)
@@ -153,7 +167,7 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
 def test_low_rank_terms_need_no_new_factorization(count: int, device: str) -> None:
     """Positive, then negative terms; if the sum is indefinite, there are no factors until the next matrix."""
     upper, random = pattern(60), np.random.default_rng(5)
-    factors, right = DenseCholesky(upper, device=device), random.normal(size=(60, 4))
+    factors, right = TiledCholesky(upper, device=device), random.normal(size=(60, 4))
     directions = np.vstack([random.normal(size=(count, 60)), np.zeros((3, 60))])
     for seed, strengths, definite in [(0, (3.0, 0.1), True), (1, (1e3, 0.0), True), (2, (0.1, 90.0), False)]:
         entries = entries_of(upper, seed, 30.0)
@@ -176,7 +190,7 @@ def test_low_rank_terms_need_no_new_factorization(count: int, device: str) -> No
 @pytest.mark.parametrize("device", DEVICES)
 def test_non_finite_matrices_have_no_factors(device: str) -> None:
     upper = pattern(20)
-    factors = DenseCholesky(upper, device=device)
+    factors = TiledCholesky(upper, device=device)
     for value in (np.nan, np.inf):
         assert not is_definite(factors, np.full(upper.nnz, value)) and not has_factors(factors)
         assert not factors.add_low_rank(np.eye(20), np.ones(20)) and not has_factors(factors)
@@ -188,9 +202,47 @@ def test_non_finite_matrices_have_no_factors(device: str) -> None:
 def test_factors_keep_temporary_memory_of_warp() -> None:
     """Temporary memory of Warp's sorts on the stream must not be freed, in particular not during a capture."""
     upper = band(150)
-    factors, count = DenseCholesky(upper, device="cuda:0"), 1000
+    factors, count = TiledCholesky(upper, device="cuda:0"), 1000
     for seed in range(3):
         keys, values = (wp.array(np.arange(2 * count)[::-1].astype(np.int32), dtype=int, device="cuda:0") for _ in "kv")
         wp.utils.radix_sort_pairs(keys, values, count)
         assert is_definite(factors, entries_of(upper, seed, 12.0))
         assert np.array_equal(keys.numpy()[:count], np.arange(count, 2 * count))
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize(("parts", "between"), SIZES)
+def test_tiles_make_the_inverse_of_a_factor(parts: list[int], between: int) -> None:
+    """Previous contents of the output do not matter; results are bitwise equal, also after an indefinite matrix and for
+    any number of blocks."""
+    count = sum(parts) + between
+    random = np.random.default_rng(count)
+    order = random.permutation(count)
+    *cuts, _ = np.cumsum([*parts, between])
+    *slabs, rest = np.split(order, cuts)
+    given = slab_matrix(parts, between, seed=count)
+    matrix, inverse = torch.zeros((2, count, count), dtype=torch.float64, device="cuda")
+    tiled = TiledInverseFactor(Dissection(slabs, rest), matrix, inverse, GraphStream(matrix.device))
+
+    def make(entries: np.ndarray) -> bool:
+        inverse.fill_(3.0)
+        matrix.copy_(torch.from_numpy(np.tril(entries)))
+        return bool(tiled.factor())
+
+    assert make(given)
+    root = inverse.cpu().numpy()
+    factor = np.linalg.cholesky(given)
+    expected = np.linalg.inv(factor)
+    np.testing.assert_allclose(root[:, order], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    assert np.abs(root[:, order].T @ (root[:, order] @ given) - np.eye(count)).max() < 1e-13
+    for wrong, value in ((0, 0.0), (random.integers(count), -50.0), (count - 1, -1e-3), (count - 1, np.nan)):
+        indefinite = given.copy()
+        indefinite[wrong, wrong] = value
+        assert not make(indefinite)
+        for _ in range(5):
+            assert make(given)
+            np.testing.assert_array_equal(inverse.cpu().numpy(), root)
+    for blocks in (1, 7):
+        tiled._blocks = blocks
+        assert make(given)
+        np.testing.assert_array_equal(inverse.cpu().numpy(), root)

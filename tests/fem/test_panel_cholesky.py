@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse as sparse
 import torch
 
-from egs_warp.fem.batch_factors import BatchCholesky
+from egs_warp.fem.panel_cholesky import PanelCholesky
 
 COUNT, SIZE = 5, 53
 
@@ -28,7 +28,7 @@ def test_solutions_equal_those_of_numpy(matrices: np.ndarray, panel: int, chunk_
     """In all slots, in some of them, and after some slots were overwritten."""
     right = np.random.default_rng(1).normal(size=(COUNT, SIZE, 3))
     upper = sparse.csc_array(np.triu(np.ones((SIZE, SIZE))))
-    factors = BatchCholesky(upper, COUNT, torch.device("cpu"), panel=panel, chunk_bytes=chunk_bytes)
+    factors = PanelCholesky(upper, COUNT, torch.device("cpu"), panel=panel, chunk_bytes=chunk_bytes)
     zero, every = torch.zeros(SIZE), torch.arange(COUNT)
     rows, columns = upper.indices, np.repeat(np.arange(SIZE), np.diff(upper.indptr))
     entries = torch.from_numpy(matrices[:, columns, rows])

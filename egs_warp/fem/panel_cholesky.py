@@ -17,7 +17,7 @@ CHUNK_BYTES = 2**31
 """Total size of the matrices that are processed at once, bytes; temporary memory is a small multiple of it."""
 
 
-class BatchCholesky:
+class PanelCholesky:
     """Dense Cholesky solver for the matrices of several worlds, which have one pattern; ``LinearSolver`` with a world
     axis.
 
